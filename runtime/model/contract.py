@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -40,11 +39,11 @@ class Step(Section):
 
 
 def checked_steps(steps: tuple[Step, ...]) -> tuple[Step, ...]:
-    """Steps that can be carried out: one chain, first; joint ones last. Raises ValueError."""
+    """Steps that can be carried out: one chain, first, no joint ones. Raises ValueError."""
     if steps and [index for index, step in enumerate(steps) if step.kind == "chain"] != [0]:
         raise ValueError("must begin with a chain step, the only one")
-    if any(before.kind == "joint" != after.kind for before, after in pairwise(steps)):
-        raise ValueError("nothing but joint steps may follow a joint one")
+    if any(step.kind == "joint" for step in steps):
+        raise ValueError("joint steps belong in refining")
     return steps
 
 

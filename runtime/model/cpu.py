@@ -9,14 +9,13 @@ from dataclasses import replace
 import numpy as np
 
 from runtime.model.assembly import ArrayAssembly, fill_area
-from runtime.model.compiled.joint import INTENSITY, JointState, fill, rays_of
-from runtime.model.compiled.panels import Panels, show_panels
-from runtime.model.contract import Contract, Step
+from runtime.model.compiled.panels import Panels
+from runtime.model.contract import Contract
 from runtime.model.job import Picture
 from runtime.model.reprojection import CENTRE, NEUTRAL, OUTER, START, coarser
 from runtime.model.resample import buffer, resample
 from runtime.model.steps import Problem
-from runtime.model.targets import FULL, SUBCODE, Pictures, fill_targets, phase_codes, without_alpha
+from runtime.model.targets import FULL, Pictures, fill_targets, phase_codes
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, I16, U8
@@ -46,13 +45,11 @@ class CpuState:
         self._contract, self._size, self._threads = contract, stack, max(1, threads)
         self._by_kind: dict[tuple[int, int], Panels] = {}  # by channels and reduction
         self._pairs: dict[str, tuple[I16, I16]] = {}  # of both eyes or outer panels; sizes follow the viewer
-        self._joint: dict[int, JointState] = {}
-        self._stepped: JointState | None = None
         self._drawn: tuple[PixelRect, ...] = ()  # where the layers hold more than even panels
         self._layers: U8 = np.full((3, stack.height_px, stack.width_px, 4), 255, np.uint8)
 
     def begin(self, pictures: Sequence[Picture], problem: Problem) -> AbstractContextManager[None]:
-        self._problem, self._stepped = problem, None
+        self._problem = problem
         self._full = self._panels = self._panels_of(1)
         if (reduction := problem.reduction) > 1:
             self._panels = self._panels_of(reduction)
@@ -89,40 +86,6 @@ class CpuState:
     def correct(self, panel: int, *, size: float, shown: bool) -> None:
         self._panels.step(panel, size=size, shown=shown, fading=self._fading())
 
-    def start_joint(self) -> None:
-        panels, problem = self._whole(), self._problem
-        joint = self._joint.get(problem.channels)
-        if joint is None:
-            sizes = np.array([(self._size.height_px, self._size.width_px)] * 4)
-            joint = JointState(sizes, channels=problem.channels, threads=self._threads)
-            self._joint[problem.channels] = joint
-        rasters = (*panels.rasters, panels.rasters[CENTRE])  # rays go through the centre panel's pixels
-        joint.sizes = np.array([(raster.height_px, raster.width_px) for raster in rasters])
-        panels.spread = {}
-        panels.show(self._layers, problem.boxes)
-        for n, box in enumerate(problem.boxes):
-            codes = without_alpha(np.ascontiguousarray(self._layers[n][box.slices]), problem.channels)
-            fill(joint.panels[n], codes, SUBCODE)
-        asked = self._pair("asked", *panels.size)
-        intensities = (np.arange(256) * INTENSITY).astype(np.int16)
-        width, height = panels.size
-        fill_targets(replace(self._pictures, table=intensities), [asked])
-        for image, numbers in zip(asked, joint.targets, strict=True):
-            numbers[:height, : width * problem.channels] = image.reshape(height, -1)
-        joint.start()
-        self._stepped = joint
-
-    def joint(self, step: Step) -> None:
-        problem, joint = self._problem, self._stepped
-        assert joint is not None
-        fade, fading = None, self._fading()
-        if fading is not None:
-            columns = np.zeros(joint.panels.shape[2], np.float32)
-            columns[: fading[0].size * problem.channels] = np.repeat(fading[0], problem.channels)
-            fade = columns, fading[1]
-        rays = rays_of(problem.rays(step.places), joint.sizes)
-        joint.step(rays, size=step.size, momentum=step.momentum, floor=step.floor, fade=fade)
-
     def finish(self) -> U8:
         boxes = self._problem.boxes
         if self._drawn != boxes:
@@ -130,15 +93,11 @@ class CpuState:
                 for area in box.beside(width_px=self._size.width_px, height_px=self._size.height_px):
                     fill_area(layer, area, (NEUTRAL, NEUTRAL, NEUTRAL))
             self._drawn = boxes
-        if self._stepped is None:
-            self._whole().show(self._layers, boxes)
-        else:
-            panels = dict(enumerate(self._stepped.last))
-            show_panels(panels, self._layers, boxes, channels=self._problem.channels, threads=self._threads)
+        self._whole().show(self._layers, boxes)
         return self._layers
 
     def close(self) -> None:
-        self._by_kind, self._joint = {}, {}
+        self._by_kind = {}
 
     def _panels_of(self, reduction: int) -> Panels:
         """The problem's panels on rasters so many times coarser than their own."""

@@ -1,22 +1,21 @@
-"""Joint steps along a still picture's own rays: what the solver made, improved for what is really looked at.
+"""Simultaneous steps along a still picture's own rays: layers improved for the rays that are really looked along.
 
 The solver's pictures lie on the centre panel's pixels, but the rays of a picture's own pixels cross all panels anywhere
-between those. What one interpolation in and three out lose on the way no step on the panels' pixels can know. These
-steps (`compiled.joint`) look along the rays themselves, each a little wider than a panel's pixel, and move all panels.
+between those. What is lost by one interpolation in and three out, no step on the panels' pixels can see. These steps
+(`compiled.phasors`) follow the picture's rays themselves and move all panels.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from runtime.model.compiled.joint import INTENSITY, JointState, fill, rays_of
 from runtime.model.compiled.loops import TILE
 from runtime.model.compiled.panels import show_panels
-from runtime.model.contract import Step
+from runtime.model.compiled.phasors import INTENSITY, PhasorState, fill, rays_of
+from runtime.model.contract import Places, Step
 from runtime.model.reprojection import CENTRE, reprojection
-from runtime.model.steps import PLACES
 from runtime.model.targets import SUBCODE, without_alpha
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
@@ -24,6 +23,11 @@ from runtime.optics.views import image_from_raster, stack_from_eye
 from runtime.records import F64, U8
 from runtime.support.threads import at_once
 
+PLACES: Mapping[Places, Sequence[tuple[float, float]]] = {  # right and up, standard deviations
+    "middle": ((0.0, 0.0),),
+    "rising": ((1.0, 1.0), (-1.0, -1.0)),
+    "falling": ((1.0, -1.0), (-1.0, 1.0)),
+}
 DRIFT_PX = 1 / 4  # no row of rays lies like the next one: to lay each exactly would take a third of a step
 MAX_BEND_PX = 0.2  # of a row, from the parabola that the kernel takes for a tile of it
 MIN_WEIGHT = 0.05  # of a homography, beside its middle's: what is nearer to the eye's own plane is not looked along
@@ -68,7 +72,7 @@ def refined(
         return np.array(found)
 
     sizes = np.array([(box.height_px, box.width_px)] * 3 + [(looked.height_px, looked.width_px)])
-    state = JointState(sizes, channels=channels, threads=threads)
+    state = PhasorState(sizes, channels=channels, threads=threads)
     looks = [rays_of(rays(step), sizes) for step in steps]
     pixels = TILE // channels
     for look in looks:

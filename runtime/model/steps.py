@@ -16,14 +16,13 @@ import numpy as np
 from runtime.model.assembly import Assembly
 from runtime.model.chain import ChainFrame, ColumnLaw
 from runtime.model.compiled.passes import fade_codes
-from runtime.model.contract import Contract, Places, Step
+from runtime.model.contract import Contract, Step
 from runtime.model.fade import Fade
 from runtime.model.job import Picture
-from runtime.model.reprojection import CENTRE, FRONT, OUTER, REAR, START, coarser, reprojection, spreads
+from runtime.model.reprojection import CENTRE, FRONT, OUTER, REAR, START, coarser, spreads
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.tilt import coarse_layer_from_seen
-from runtime.optics.views import stack_from_eye
 from runtime.records import F64, I16, Layers
 from runtime.support.threads import at_once
 
@@ -102,31 +101,12 @@ class Problem:
         at_once(lambda panel: fade_codes(panel.reshape(rows, -1), ends, START, channels), list(panels.values()))
         return panels
 
-    def rays(self, places: Places) -> F64:
-        """(rays, 3, 3, 3): each panel's pixels from the centre panel's, as left and right eyes in turn see them in line
-        from where a joint step takes them to be."""
-        sides = PLACES[places] if self.eye_sigma_mm > 0 else PLACES["middle"]
-        right, up = stack_from_eye(self.eyes_m.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
-        rasters = self.rasters
-        found = []
-        for across, down in sides:
-            moved_m = self.eye_sigma_mm / 1e3 * (across * right + down * up)
-            for eye_m in self.eyes_m + moved_m:
-                seen = [reprojection(self.stack, rasters, eye_m, of=n, on=CENTRE) for n in OUTER]
-                found.append([seen[0], np.eye(3), seen[1]])
-        return np.array(found)
-
     def centre_from(self, plane_from_raster: F64) -> F64:
         """3x3: the centre panel's pixels from a raster's on its plane."""
         return self.stack.panel(CENTRE).raster_from_plane() @ plane_from_raster
 
 
 BLURRED_COARSE_PX = 0.4  # standard deviation, coarse pixels, of what unsure eyes see: with less, light is lost
-PLACES: Mapping[Places, Sequence[tuple[float, float]]] = {  # right and up, standard deviations
-    "middle": ((0.0, 0.0),),
-    "rising": ((1.0, 1.0), (-1.0, -1.0)),
-    "falling": ((1.0, -1.0), (-1.0, 1.0)),
-}
 Answer = Mapping[int, I16]  # per outer panel, (rows, columns[, 3]) on the network's raster, sixteenths of a code
 Network = Callable[[tuple[I16, I16]], Answer]
 
@@ -150,12 +130,6 @@ class SolverState(Protocol):
     def correct(self, panel: int, *, size: float, shown: bool) -> None:
         """Change one outer panel by both eyes' residuals along the rays through each of its pixels, when the centre
         panel is the best one for the outer panels."""
-
-    def start_joint(self) -> None:
-        """Joint steps go on from the outer panels, and from the centre panel that suits them."""
-
-    def joint(self, step: Step) -> None:
-        """Change all panels by what both eyes see wrong (`compiled.joint`)."""
 
     def finish(self) -> Layers:
         """(N, h, w, 4): the centre panel closed, all of them in 8-bit codes, even beside the boxes;
@@ -196,11 +170,6 @@ def run_steps(
         if index and deadline_ns is not None and perf_counter_ns() >= deadline_ns:
             break
         done += 1
-        if step.kind == "joint":
-            if steps[index - 1].kind != "joint":
-                state.start_joint()
-            state.joint(step)
-            continue
         shown = {n: index == last[n] for n in OUTER}
         changed: tuple[int, ...] = OUTER
         if step.kind == "chain":
@@ -214,6 +183,6 @@ def run_steps(
 
 
 def _last_change(steps: Sequence[Step], panel: int) -> int:
-    """The last step that changes an outer panel before joint ones do."""
+    """The last step that changes an outer panel."""
     kinds = {"chain", "front" if panel == FRONT else "rear"}
     return max(index for index, step in enumerate(steps) if step.kind in kinds)

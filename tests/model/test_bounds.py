@@ -11,7 +11,7 @@ import pytest
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("held_by", ["test_compiled.py", "test_joint.py"])
+@pytest.mark.parametrize("held_by", ["test_compiled.py", "test_phasors.py"])
 def test_no_index_lies_beside_an_array(tmp_path: Path, held_by: str) -> None:
     environment = os.environ | {"NUMBA_BOUNDSCHECK": "1", "XDG_CACHE_HOME": str(tmp_path)}
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(Path(__file__).with_name(held_by))]

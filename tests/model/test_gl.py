@@ -14,7 +14,6 @@ from runtime.errors import ContextLost, InputError, MissingPart
 from runtime.evaluation.displayed import displayed, expected_db
 from runtime.model import still
 from runtime.model.backends import choose
-from runtime.model.contract import Step
 from runtime.model.cpu import CpuBackend
 from runtime.model.gl.backend import GlBackend
 from runtime.model.job import Job, Part
@@ -329,26 +328,3 @@ def test_nothing_grows_while_a_viewer_walks(gl: GlBackend) -> None:
     assert len(gl.passes._targets) == targets
     opengl.close()
     assert len(gl.passes._targets) < targets
-
-
-JOINT = tuple(Step(kind="joint", size=1.45, momentum=0.4, places=places) for places in ("middle", "rising", "falling"))
-JOBS: dict[str, Callable[[Job], Job]] = {
-    "whole": lambda job: job,
-    "a part": lambda job: replace(job, part=PART),
-    "grey": lambda job: replace(job, channels=1),
-}
-
-
-@pytest.mark.parametrize("tilt", [None, TILT], ids=["even", "tilted"])
-@pytest.mark.parametrize("job", JOBS)
-@pytest.mark.parametrize("sigma_mm", [0.0, UNSURE_MM])
-def test_joint_steps_are_those_of_the_processor(sigma_mm: float, job: str, tilt: Tilt | None, gl: GlBackend) -> None:
-    stack, pair = replace(STACK, tilt=tilt), eyes(0.6)
-    predictors = both("fast", stack, gl)
-    session = predictors[0].session
-    session.contract = session.contract.model_copy(update={"steps": (*session.contract.steps[:1], *JOINT)})
-    pictures = cards(pair, stack, grey=job == "grey")
-    found = [layers_of(p, pictures, pair, sigma_mm=sigma_mm, changed=JOBS[job]) for p in predictors]
-    assert within_one(*found) >= 0.93  # what begins a twelfth of a pixel apart stays apart by a little
-    shown = [displayed(layers, pictures, stack, eyes_m=pair, fov_deg=FOV_DEG, similarity=False) for layers in found]
-    assert abs(shown[0].quality.psnr_db - shown[1].quality.psnr_db) <= 0.05

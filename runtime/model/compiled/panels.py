@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 
 from runtime.model.compiled.along import ANYWHERE_PX, EDGE_PX, new_layout, work_row, work_tiles
-from runtime.model.compiled.joint import JointState, rays_of
 from runtime.model.compiled.loops import PIECE, numbers_of
 from runtime.model.compiled.passes import blur, close_centre, correct, extrapolate_rows, fade_codes, show
+from runtime.model.compiled.phasors import PhasorState, rays_of
 from runtime.model.compiled.warp import warped
 from runtime.model.reprojection import CENTRE, EYES, FRONT, MAX_SPREAD_PX, OUTER, REAR, START, reprojection, spreads
 from runtime.model.resample import buffer
@@ -238,7 +238,7 @@ def warm_up() -> None:
         panels.step(FRONT, size=1.0, shown=True)
     layers = np.zeros((3, 32, 64, 4), np.uint8)
     panels.show(layers, boxes)
-    joint = JointState(np.array([(32, 64)] * 4), channels=3, threads=1)
+    joint = PhasorState(np.array([(32, 64)] * 4), channels=3, threads=1)
     joint.step(panels._rays, size=1.0, momentum=0.5, floor=0.1)
     whole, same = (slice(0, 32), slice(0, 64)), np.eye(3)
     warped(layers[0], same, out=layers[1], rows=whole[0], columns=whole[1])

@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 
 from runtime.errors import InputError, ModelFailure
 from runtime.model.chain import ColumnLaw
-from runtime.model.contract import Contract, Step
+from runtime.model.contract import Contract
 from runtime.model.fade import CORRECTED_SHARE
 from runtime.model.gl.assembly import left_in
-from runtime.model.gl.joint import RAYS, GlJoint
 from runtime.model.gl.programs import Image, Passes
 from runtime.model.job import Picture
 from runtime.model.reprojection import CENTRE, FRONT, NEUTRAL, OUTER, REAR, START, coarser, reprojection, spreads
@@ -71,7 +70,6 @@ class GlState:
             self._problem = problem
             self._grey = problem.channels == 1
             self._rasters, self._reduction = problem.rasters, 1
-            self._stepped: GlJoint | None = None
             self._outer = {}
             taken = self._taken(pictures)
             self._want(taken, self._wanted())
@@ -140,20 +138,6 @@ class GlState:
             self._draw("correct", result, {**lacks, **outer, **self._wanted()}, {**places, **how})
         self._swap(panel)
 
-    def start_joint(self) -> None:
-        self._whole()
-        centre = self._image(CENTRE, "begun")
-        images = {**self._wanted(), **{NAMES[n]: self._panel(n) for n in OUTER}}
-        self._draw("centre", (centre,), images, self._through())
-        self._stepped = GlJoint(self._passes, self._joint_image)
-        self._stepped.start({REAR: self._panel(REAR), CENTRE: centre, FRONT: self._panel(FRONT)})
-
-    def joint(self, step: Step) -> None:
-        assert self._stepped is not None
-        targets = {eye: self._image(CENTRE, f"wanted {eye}", dtype="f1") for eye in EYES}
-        how = {"size": step.size, "momentum": step.momentum, "floor": step.floor}
-        self._stepped.step(self._problem.rays(step.places), targets, **how, ends=self._fade())
-
     def finish(self) -> Layers:
         self._whole()
         width, height = self._stack.width_px, self._stack.height_px
@@ -200,13 +184,6 @@ class GlState:
     def _draw_layers(self, images: tuple[Image, ...]) -> None:
         """The solution: one image a panel, RGBA in 8 bits."""
         boxes = self._problem.boxes
-        if self._stepped is not None:
-            panels = {NAMES[n] if n != CENTRE else "centre": image for n, image in self._stepped.panels.items()}
-            sizes = {f"{name}_size": image.size for name, image in panels.items()}
-            names = ((CENTRE, "centre"), *NAMES.items())
-            places = {f"{name}_origin": (boxes[n].u0, boxes[n].v0) for n, name in names}
-            self._draw("show", images, panels, {**sizes, **places})
-            return
         outer = {NAMES[n]: self._panel(n) for n in OUTER} | {f"{NAMES[n]}_mean": self._mean(n) for n in OUTER}
         where: dict[str, Any] = {
             f"{name}_origin": (boxes[n].u0, boxes[n].v0) for n, name in ((CENTRE, "centre"), *NAMES.items())
@@ -354,10 +331,6 @@ class GlState:
         components = 1 if self._grey else 4
         size = self._stack.width_px, self._stack.height_px
         return Image(self._texture((name, panel), *size, components, dtype=dtype), *_size(self._rasters[panel]))
-
-    def _joint_image(self, panel: int, name: str, dtype: str) -> Image:
-        """Rays go through the centre panel's pixels."""
-        return self._image(CENTRE if panel == RAYS else panel, name, dtype=dtype)
 
     def _grown(self, name: str, width_px: int, height_px: int, *, components: int | None = None) -> Image:
         """An image of the network's raster, whose size follows the viewer; its texture only grows."""

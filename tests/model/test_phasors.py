@@ -1,4 +1,4 @@
-"""Joint steps: the kernel is the mathematics told at its top; light gets better on rays that no step saw."""
+"""The simultaneous step: the kernel is the reference in torch; light gets better on rays that no step saw."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from itertools import pairwise
 import cv2
 import numpy as np
 import pytest
+import torch
 
-from runtime.model.compiled.joint import FULL, INTENSITY, JointState, rays_of
+from model_export.light import Views, step
+from runtime.model.compiled.phasors import FULL, INTENSITY, PhasorState, Rays, rays_of
 from runtime.model.contract import Step
 from runtime.model.own_rays import refined
 from runtime.model.predictor import load_predictor
-from runtime.model.reprojection import CENTRE, reprojection
 from runtime.model.still import solve_still
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, Tilt
@@ -27,65 +28,18 @@ STEPS = tuple(Step(kind="joint", size=size, momentum=0.5) for size in (1.6, 1.45
 WHOLE = PixelRect(0, 0, 480, 270)
 
 
-def sampled(image: F64, u: F64, v: F64) -> F64:
-    """Bilinear samples of (rows, columns) at continuous pixel positions; NaN beside it."""
-    height, width = image.shape
-    x, y = u - 0.5, v - 0.5
-    left, top = np.clip(np.floor(x), 0, width - 2).astype(int), np.clip(np.floor(y), 0, height - 2).astype(int)
-    a, b = np.clip(x - left, 0, 1), np.clip(y - top, 0, 1)
-    upper = image[top, left] * (1 - a) + image[top, left + 1] * a
-    lower = image[top + 1, left] * (1 - a) + image[top + 1, left + 1] * a
-    beside = (u < 0) | (u > width) | (v < 0) | (v > height)
-    return np.where(beside, np.nan, upper * (1 - b) + lower * b)
-
-
-def plain_step(panels: F64, last: F64, targets: F64, seen: F64, size: float, momentum: float) -> tuple[F64, F64]:
-    """One step of one channel by the definition: panels (3, h, w) with momentum and without, targets (2, h, w)."""
-    height, width = panels.shape[1:]
-    v, u = np.mgrid[0:height, 0:width] + 0.5
-
-    def places(matrix: F64) -> tuple[F64, F64]:
-        x, y, w = (row[0] * u + row[1] * v + row[2] for row in matrix)
-        return x / w, y / w
-
-    wrong, weight = [], []
-    for ray, of_panels in enumerate(seen):
-        inside = np.ones((height, width), bool)
-        total = np.zeros((height, width))
-        for panel, matrix in zip(panels, of_panels, strict=True):
-            x, y = places(matrix)
-            inside &= (x >= 0.5) & (x <= width - 0.5) & (y >= 0.5) & (y <= height - 0.5)
-            total += np.nan_to_num(sampled(panel, x, y))
-        slope = np.sin(np.pi * total) * inside
-        wrong.append(slope * (np.sin(np.pi / 2 * total) ** 2 - targets[ray % 2]))
-        weight.append(slope**2)
-    made = []
-    for n, panel in enumerate(panels):
-        back = [places(np.linalg.inv(of_panels[n])) for of_panels in seen]
-        up = sum(np.nan_to_num(sampled(image, *at)) for image, at in zip(wrong, back, strict=True))
-        down = sum(np.nan_to_num(sampled(image, *at)) for image, at in zip(weight, back, strict=True))
-        made.append(np.clip(panel - size * up / (1.5 * np.pi * np.maximum(down, 0.1 * len(seen))), 0, 1))
-    return np.array(made) + momentum * (np.array(made) - last), np.array(made)
-
-
-def problem(stack: PanelStack, pair: F64, seed: int = 1) -> tuple[F64, F64, F64]:
-    """Panels (3, h, w), targets (2, h, w), seen (2, 3, 3, 3)."""
+def problem(stack: PanelStack, pair: F64, *, own: bool = False, seed: int = 1) -> tuple[F64, F64, Views]:
+    """Panels (3, h, w), targets (2, h, w), and the rays of pictures' own pixels or of the centre panel's."""
     random = np.random.default_rng(seed)
     images = [cv2.GaussianBlur(random.random((stack.height_px, stack.width_px)), (0, 0), 2.0) for _ in range(5)]
     images = [np.clip(0.5 + 3 * (image - 0.5), 0, 1) for image in images]
-    rasters = [stack.panel(n) for n in range(3)]
-    seen = np.array(
-        [
-            [np.eye(3) if n == CENTRE else reprojection(stack, rasters, eye, of=n, on=CENTRE) for n in range(3)]
-            for eye in pair
-        ]
-    )
-    return np.array(images[:3]), np.array(images[3:]), seen
+    views = Views.of(stack, pair, width_px=stack.width_px, height_px=stack.height_px, fov_deg=FOV_DEG if own else None)
+    return np.array(images[:3]), np.array(images[3:]), views
 
 
-def state_of(panels: F64, targets: F64, channels: int, threads: int) -> JointState:
+def state_of(panels: F64, targets: F64, channels: int, threads: int) -> PhasorState:
     height, width = panels.shape[1:]
-    state = JointState(np.array([(height, width)] * 4), channels=channels, threads=threads)
+    state = PhasorState(np.array([(height, width)] * 4), channels=channels, threads=threads)
     for n in range(3):
         state.panels[n, :height, : width * channels] = np.rint(np.repeat(panels[n], channels, axis=1) * FULL)
     for side in range(2):
@@ -95,26 +49,36 @@ def state_of(panels: F64, targets: F64, channels: int, threads: int) -> JointSta
     return state
 
 
+def rays_to(views: Views, state: PhasorState) -> Rays:
+    seen = views.panels_from_rays.numpy()
+    return rays_of(seen / seen[..., 2:, 2:], state.sizes)
+
+
 @pytest.mark.parametrize("stack", [STACK, TILTED], ids=["even", "tilted"])
 @pytest.mark.parametrize(("channels", "threads"), [(1, 1), (3, 2)])
-@pytest.mark.parametrize("roll_deg", [0, 20])
-def test_a_step_is_the_definitions(stack: PanelStack, channels: int, threads: int, roll_deg: float) -> None:
-    panels, targets, seen = problem(stack, eyes(0.6, 0.05, 0.1, roll_deg=roll_deg))
-    state, last = state_of(panels, targets, channels, threads), panels
-    rays = rays_of(seen, state.sizes)
+@pytest.mark.parametrize(
+    ("pair", "own"),
+    [(eyes(0.6, 0.05, 0.1), False), (eyes(0.6, 0.05, 0.1, roll_deg=20), False), (eyes(0.8, 0.01, 0.02), True)],
+    ids=["drawn", "rolled", "own rays"],
+)
+def test_a_step_is_the_references(stack: PanelStack, channels: int, threads: int, pair: F64, own: bool) -> None:
+    panels, targets, views = problem(stack, pair, own=own)
+    state = state_of(panels, targets, channels, threads)
+    ahead = last = torch.from_numpy(panels)[:, None]
     for size in (1.6, 1.4):
-        panels, last = plain_step(panels, last, targets, seen, size, 0.5)
-        state.step(rays, size=size, momentum=0.5, floor=0.1)
-    found = state.last[:, :270, : 480 * channels : channels] / FULL
-    off = np.abs(found - last)
-    assert (off < 2e-3).mean() > 0.975  # where a ray leaves a panel, it counts or not with a whole tile of its row
-    assert off.mean() < 1.5e-3
+        last, ahead = step(last, ahead, torch.from_numpy(targets)[:, None], views, size=size, momentum=0.5)
+        state.step(rays_to(views, state), size=size, momentum=0.5, floor=0.1)
+    off = np.abs(state.last[:, :270, : 480 * channels : channels] / FULL - last[:, 0].numpy())
+    # Where a ray leaves a panel, it counts or not with a whole tile of its row; a picture's rows are not level on the
+    # panels, and the kernel takes each piece of them for a straight one.
+    assert (off < (1e-2 if own else 2e-3)).mean() > (0.95 if own else 0.975)
+    assert np.median(off) < 1e-3
 
 
 def test_many_steps_with_momentum_do_not_diverge() -> None:
-    panels, targets, seen = problem(STACK, eyes(0.6))
+    panels, targets, views = problem(STACK, eyes(0.6))
     state = state_of(panels, targets, 1, 2)
-    rays, changes = rays_of(seen, state.sizes), []
+    rays, changes = rays_to(views, state), []
     for _ in range(60):
         before = state.last.copy()
         state.step(rays, size=1.3, momentum=0.6, floor=0.1)
