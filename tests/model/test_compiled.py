@@ -143,8 +143,8 @@ def test_the_eyes_see_no_less_however_unsure_they_are(
         predictor = load_predictor(name, CARDS, ModelSettings(threads=1))
         made = solve_still(*pictures, eyes_m=pair, fov_deg=FOV_DEG, predictor=predictor, eye_sigma_mm=sigma_mm).layers
         views = displayed(made, pictures, CARDS, eyes_m=pair, fov_deg=FOV_DEG, similarity=False)
-        how: Any = {"eyes_m": pair, "fov_deg": FOV_DEG, "sigmas_mm": (sigma_mm,)}
-        found.append(expected_db(views, made, CARDS, **how).popitem()[1] if sigma_mm else views.quality.psnr_db)
+        expected = expected_db(views, made, sigmas_mm=(sigma_mm,)).popitem()[1]
+        found.append(expected if sigma_mm else views.quality.psnr_db)
         predictor.close()
     assert found[1] - found[0] >= LEAST_DB
 

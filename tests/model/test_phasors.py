@@ -71,7 +71,7 @@ def test_a_step_is_the_references(stack: PanelStack, channels: int, threads: int
     off = np.abs(state.last[:, :270, : 480 * channels : channels] / FULL - last[:, 0].numpy())
     # Where a ray leaves a panel, it counts or not with a whole tile of its row; a picture's rows are not level on the
     # panels, and the kernel takes each piece of them for a straight one.
-    assert (off < (1e-2 if own else 2e-3)).mean() > (0.95 if own else 0.975)
+    assert (off < (1e-2 if own else 2e-3)).mean() > (0.9 if own else 0.975)
     assert np.median(off) < 1e-3
 
 
