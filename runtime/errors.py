@@ -18,7 +18,7 @@ PASSING = frozenset(
 
 
 def without_secrets(text: str) -> str:
-    """Text in which the name and password of an address (`rtsp://user:password@host`) are left out.
+    """Text in which the name and password of an address (before its `@`) are left out.
 
     >>> without_secrets("rtsp://user:a@b@host/door")
     'rtsp://host/door'

@@ -57,7 +57,7 @@ def test_a_rewritten_configuration_and_its_past_are_read_by_no_more_and_a_link_s
     """A camera's password in it: setup made 0600 to 0644, and the link a file of its own."""
     (tmp_path / "kept").mkdir()
     config, link = tmp_path / "kept" / "display.toml", tmp_path / "phasestack.toml"
-    config.write_text('[content]\nscene = "rtsp://user:secret@cam/1"\n')
+    config.write_text('[content]\nscene = "rtsp://user:secret@cam/1"\n')  # pragma: allowlist secret
     config.chmod(0o600)
     link.symlink_to(config)
     past = rewrite(link, lambda document: put(document, "calibration", {"viewing_m": [0.4, 0.7]}))
