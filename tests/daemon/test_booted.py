@@ -30,7 +30,6 @@ pytestmark = [
         reason=f"needs root and {', '.join(NEEDED)}",
     ),
 ]
-MIRROR = "http://deb.debian.org/debian"
 PACKAGES = "systemd,systemd-sysv,dbus,udev,ca-certificates,libpam-systemd,procps,sudo"
 CONFIG = """
 [stack]
@@ -64,7 +63,7 @@ UP = ("multi-user.target", "phasestack", "phasestack-page")
 
 def debian(root: Path, packages: str) -> None:
     """A fresh Debian 12 with these packages, and this machine's ways to package registries."""
-    command = ["debootstrap", "--variant=minbase", f"--include={packages}", "bookworm", root, MIRROR]
+    command = ["debootstrap", "--variant=minbase", f"--include={packages}", "bookworm", root]
     subprocess.run(command, check=True, capture_output=True, timeout=1200)
     for path in ("/etc/pip.conf", "/etc/ssl/certs/ca-certificates.crt", "/etc/resolv.conf"):
         if Path(path).exists():
