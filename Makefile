@@ -84,7 +84,7 @@ models: $(VENV)/.test
 
 # docs/performance.md and the pages' pictures from the commands (minutes).
 gallery: $(VENV)/.test
-	$(BIN)/python docs/make_gallery.py
+	$(BIN)/python -m docs.make_gallery
 
 # The locks' hashes anew from their pins, as the registry tells them.
 hashes:

@@ -51,7 +51,7 @@ def panels(
     settings = _settings(config)
     if photos is not None and out is not None:
         from calib.photographs import photographs
-        from calib.registration_run import register_photos
+        from calib.registration import register_photos
 
         target = config if write else None
         _report(register_photos(photographs(photos), str(photos), out, settings, config=target), as_json)
@@ -91,11 +91,11 @@ def grey(
 
         _report(lut_from_photographs(out, photographs(photos), stack, panel=panel, source=str(photos)), as_json)
         return
-    from calib.display import alone, open_display, show_until_key
-    from calib.grey_chart import grey_chart
+    from calib.display import grey_layers, open_display, show_until_key
+    from calib.grey_chart import grey_charts
 
     display = open_display(settings, grey_curve=False)
-    show_until_key(display, alone(grey_chart(stack, panel), stack, index=panel), f"the chart of panel {panel}")
+    show_until_key(display, grey_layers(grey_charts(stack, panel)), f"the chart of panel {panel}")
 
 
 @app.command()
@@ -131,7 +131,7 @@ def capture(
 
     Example: phasestack calibrate capture --config /etc/phasestack/phasestack.toml --show --out pairs.csv
     """
-    from calib.capture_run import capture_live, capture_recording
+    from calib.capture import capture_live, capture_recording
     from calib.hardware import SetupHardware
     from calib.keys import TerminalKeys
 

@@ -13,7 +13,6 @@ from tomlkit.exceptions import ParseError
 
 from runtime.config import load_settings
 from runtime.errors import InputError
-from runtime.records import F64
 from runtime.support import untrusted_input
 from runtime.support.artifacts import write_bytes, write_text
 
@@ -78,25 +77,15 @@ def put(document: TOMLDocument, section: str, values: Mapping[str, Any]) -> None
         table[key] = value
 
 
-def put_homographies(document: TOMLDocument, matrices: F64) -> None:
-    """Set every panel's homography (N, 3, 3), making the tables where there are none."""
-    for table, matrix in zip(_panels_tables(document, len(matrices)), matrices, strict=True):
-        table["homography"] = matrix.tolist()
-
-
-def put_lut(document: TOMLDocument, panel: int, lut: str, *, panels: int) -> None:
-    """Set one panel's measured grey curve, making the panels' tables where there are none."""
-    _panels_tables(document, panels)[panel]["lut"] = lut
-
-
-def _panels_tables(document: TOMLDocument, count: int) -> Any:
-    """`[[output.panels]]`, made where there are none."""
+def put_panels(document: TOMLDocument, key: str, values: Mapping[int, Any], *, panels: int) -> None:
+    """Set a key of some panels' tables (their homographies, a grey curve); the tables are made where there are none."""
     output: Any = document.setdefault("output", tomlkit.table())
     if "panels" not in output:
         output["panels"] = tomlkit.aot()
-        for _ in range(count):
+        for _ in range(panels):
             output["panels"].append(tomlkit.table())
-    return output["panels"]
+    for index, value in values.items():
+        output["panels"][index][key] = value
 
 
 def put_monitors(document: TOMLDocument, tables: Sequence[Mapping[str, Any]]) -> None:

@@ -1,18 +1,13 @@
-"""The panels while a display is set up: layers, or words, until other ones come; and a person who looks at them."""
+"""The panels while a display is set up: layers until other ones come; and a person who looks at them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from textwrap import wrap
-
-import cv2
 import numpy as np
 import typer
 
 from calib.keys import Key, TerminalKeys, WindowKeys
 from runtime.clock import NS_PER_MS, MonotonicClock
 from runtime.config import Settings
-from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
 from runtime.panels.registry import open_panels, panel_settings
 from runtime.records import U8, PanelFrame
@@ -20,10 +15,6 @@ from runtime.support.gl import offscreen_context
 
 POLL_NS = 50 * NS_PER_MS
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-FONT = cv2.FONT_HERSHEY_SIMPLEX
-MAX_CHARACTERS = 44  # of a line: longer ones would be too small to read from where viewers stand
-MARGIN = 0.1  # of the width on either side: the rims of panels before and behind take light away
-LETTERS = 0.055  # of the height
 
 
 class PanelDisplay:
@@ -87,24 +78,3 @@ def show_until_key(display: PanelDisplay, layers: U8, title: str) -> None:
 def grey_layers(pictures: U8) -> U8:
     """(N, H, W, 4) layers of grey pictures (N, H, W), one for each panel."""
     return np.concatenate([np.repeat(pictures[..., None], 3, axis=-1), np.full_like(pictures[..., None], 255)], axis=-1)
-
-
-def alone(picture: U8, stack: PanelStack, *, index: int) -> U8:
-    """(N, H, W, 4) layers in which one panel shows a grey (H, W) picture and the others turn no light."""
-    pictures = np.zeros((stack.count, *picture.shape), np.uint8)
-    pictures[index] = picture
-    return grey_layers(pictures)
-
-
-def message_layers(stack: PanelStack, lines: Sequence[str]) -> U8:
-    """(N, H, W, 4) layers with lines of text on the middle panel, read from the front; the first one larger."""
-    page = np.zeros((stack.height_px, stack.width_px), np.uint8)
-    plain = [part for line in lines for part in wrap(line.encode("ascii", "replace").decode(), MAX_CHARACTERS)]
-    room = stack.height_px / max(len(plain) + 2, 9)
-    for number, line in enumerate(plain):
-        (long, tall), _ = cv2.getTextSize(line, FONT, 1.0, 2)
-        height = LETTERS * stack.height_px * (1.4 if number == 0 else 1.0)
-        scale = min(height / tall, (1 - 2 * MARGIN) * stack.width_px / max(long, 1), 0.55 * room / tall)
-        place = (round(MARGIN * stack.width_px), round(room * (number + 1.5)))
-        cv2.putText(page, line, place, FONT, scale, 255, max(1, round(2 * scale)), cv2.LINE_AA)
-    return alone(page, stack, index=stack.count // 2)

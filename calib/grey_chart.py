@@ -97,6 +97,13 @@ def grey_chart(stack: PanelStack, panel: int) -> U8:
     return picture
 
 
+def grey_charts(stack: PanelStack, panel: int) -> U8:
+    """(N, H, W) what all panels show: the chart of one, the others clear."""
+    charts = np.zeros((stack.count, stack.height_px, stack.width_px), np.uint8)
+    charts[panel] = grey_chart(stack, panel)
+    return charts
+
+
 def lut_from_photographs(
     out: Path, pictures: Iterable[tuple[str, U8]], stack: PanelStack, *, panel: int, source: str
 ) -> dict[str, Any]:

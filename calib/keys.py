@@ -1,4 +1,4 @@
-"""Keys that a person presses, in the terminal or on a panel's window: one at a time, without waiting."""
+"""What a person types: lines in the terminal; keys, one at a time and without waiting, there or on a panel's window."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 
 class Key(Enum):
-    """What a key means here; a digit's name ends in it."""
+    """What a key means here."""
 
     ACCEPT = auto()
     NEXT = auto()
@@ -19,21 +19,7 @@ class Key(Enum):
     RIGHT = auto()
     UP = auto()
     DOWN = auto()
-    FINER = auto()
-    COARSER = auto()
-    UNDO = auto()
     QUIT = auto()
-    POINT = auto()
-    DIGIT_0 = auto()
-    DIGIT_1 = auto()
-    DIGIT_2 = auto()
-    DIGIT_3 = auto()
-    DIGIT_4 = auto()
-    DIGIT_5 = auto()
-    DIGIT_6 = auto()
-    DIGIT_7 = auto()
-    DIGIT_8 = auto()
-    DIGIT_9 = auto()
 
 
 # What a key means: GLFW's names of it, and its bytes in a terminal.
@@ -45,13 +31,8 @@ _MEANINGS: dict[Key, tuple[str, tuple[bytes, ...]]] = {
     Key.ACCEPT: ("ENTER KP_ENTER SPACE", (b"\n", b"\r", b" ")),
     Key.NEXT: ("N", (b"n",)),
     Key.PREVIOUS: ("P", (b"p",)),
-    Key.FINER: ("F", (b"f",)),
-    Key.COARSER: ("C", (b"c",)),
-    Key.UNDO: ("U BACKSPACE", (b"u", b"\x7f", b"\x08")),
     Key.QUIT: ("Q ESCAPE", (b"q", b"\x04")),
-    Key.POINT: ("PERIOD COMMA KP_DECIMAL", (b".", b",")),
-} | {Key[f"DIGIT_{n}"]: (f"{n} KP_{n}", (b"%d" % n,)) for n in range(10)}  # fmt: skip
-TYPED = {Key.POINT: "."} | {Key[f"DIGIT_{n}"]: str(n) for n in range(10)}
+}
 _OF_BYTES = {data: key for key, (_, pieces) in _MEANINGS.items() for data in pieces}
 
 
@@ -69,32 +50,43 @@ def parse(data: bytes) -> tuple[list[Key], bytes]:
 
 
 class TerminalKeys:
-    """Keys from standard input; a terminal is put into character mode until `close`. The end of input quits."""
+    """Standard input; while keys are asked for a terminal is in character mode. The end of input quits."""
 
     def __init__(self, descriptor: int | None = None, *, quit_at_end: bool = True) -> None:
         """quit_at_end False: without an input (a service, `< /dev/null`) there are no keys, and that is all."""
         self._quit_at_end = quit_at_end
         self._descriptor = _standard_input() if descriptor is None else descriptor
-        self._pending: list[Key] = []
         self._rest = b""
-        self._mode = None
-        if self._descriptor >= 0 and os.isatty(self._descriptor):
+        self._mode: Any = None  # of the terminal, to go back to
+
+    def poll(self) -> Key | None:
+        """The next key, or None. Never waits."""
+        if self._mode is None and self._descriptor >= 0 and os.isatty(self._descriptor):
             import termios
             import tty
 
             self._mode = termios.tcgetattr(self._descriptor)
             tty.setcbreak(self._descriptor)
-
-    def poll(self) -> Key | None:
-        """The next key, or None. Never waits."""
-        if self._descriptor >= 0 and select.select([self._descriptor], [], [], 0)[0]:
-            data = os.read(self._descriptor, 64)
-            keys, self._rest = parse(self._rest + data)
-            self._pending += keys
+        while self._descriptor >= 0 and select.select([self._descriptor], [], [], 0)[0]:
+            data = os.read(self._descriptor, 1)
+            if not data and self._quit_at_end:
+                return Key.QUIT
             if not data:
-                self._descriptor = -1 if not self._quit_at_end else self._descriptor
-                self._pending += [Key.QUIT] if self._quit_at_end else []
-        return self._pending.pop(0) if self._pending else None
+                self._descriptor = -1
+            keys, self._rest = parse(self._rest + data)
+            if keys:
+                return keys[0]
+        return None
+
+    def line(self) -> str:
+        """The next line, waited for; `q` at the end of input."""
+        self.close()
+        data = b""
+        while self._descriptor >= 0 and (read := os.read(self._descriptor, 1)) != b"\n":
+            if not read:
+                return "q"
+            data += read
+        return data.decode(errors="replace").strip() if self._descriptor >= 0 else "q"
 
     def close(self) -> None:
         """Give the terminal back. May be called twice."""

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from runtime.optics.stack import PanelStack
 from runtime.records import F64
@@ -79,19 +78,3 @@ def true_from_ideal_seen(panel: PlacedPanel, eye_m: ArrayLike, stack: PanelStack
         raise ValueError("an eye in a panel's plane sees nothing through it")
     matrix = np.linalg.solve(seen, stack_from_pixels(ideal_panel(stack, index), stack) - eye)
     return np.asarray(matrix / matrix[2, 2] + 0.0, dtype=np.float64)  # + 0.0: no -0.0 in a file
-
-
-def misplaced(
-    stack: PanelStack, *, shift_m: float, turn_deg: float, gap_m: float, random: np.random.Generator
-) -> tuple[PlacedPanel, ...]:
-    """A stack as hands build it: every panel off to the side and up by up to `shift_m`, turned about a random axis
-    by up to `turn_deg`, every gap off by up to `gap_m`."""
-    panels, x_m = [], stack.x_m[0]
-    for index in range(stack.count):
-        if index:
-            x_m += stack.x_m[index] - stack.x_m[index - 1] + random.uniform(-gap_m, gap_m)
-        axis = random.normal(size=3)
-        turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * np.radians(turn_deg) * random.uniform())
-        centre = np.array([x_m, *random.uniform(-shift_m, shift_m, size=2)])
-        panels.append(PlacedPanel(turn.as_matrix(), centre))
-    return tuple(panels)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,26 +20,11 @@ from runtime.support.figures import in_words
 COLOURS = {"X": "#c0392b", "Y": "#27803b", "Z": "#2260a8"}
 
 
-@dataclass(frozen=True, slots=True)
-class Points:
-    """The pairs behind a calibration."""
-
-    names: tuple[str, ...]
-    stack_m: F64  # (K, 3) known
-    fitted_m: F64  # (K, 3) where the calibration puts them, frame `stack`
-    used: NDArray[np.bool_]  # (K,)
-
-    @property
-    def residual_m(self) -> F64:
-        """(K, 3) calibrated minus known."""
-        return self.fitted_m - self.stack_m
-
-
 class StoredPairs(Lenient):
     """`[data]` of a calibration file: the pairs behind it, where it holds them."""
 
     sensor_m: tuple[Vector3, ...]
-    stack_m: tuple[Vector3, ...]
+    stack_m: tuple[Vector3, ...]  # known
     used: tuple[bool, ...]
     names: tuple[str, ...]
 
@@ -50,6 +34,14 @@ class StoredPairs(Lenient):
         if len(sizes) > 1 or not any(self.used):
             raise ValueError("names, used, sensor_m and stack_m do not fit together")
         return self
+
+
+class Points(NamedTuple):
+    """The pairs behind a calibration."""
+
+    names: tuple[str, ...]
+    residual_m: F64  # (K, 3) where the calibration puts them less where they are, frame `stack`
+    used: NDArray[np.bool_]  # (K,)
 
 
 def write_report(file: Path, out: Path, *, viewing: CalibrationSettings) -> dict[str, Any]:
@@ -80,7 +72,7 @@ def _stored_points(data: Any, calibration: Calibration, *, source: Path) -> Poin
     if not isinstance(data, dict) or "sensor_m" not in data:
         return None
     found = validated(StoredPairs, data, source=f"{source}: data")
-    return Points(found.names, np.array(found.stack_m), calibration.points(found.sensor_m), np.array(found.used))
+    return Points(found.names, calibration.points(found.sensor_m) - found.stack_m, np.array(found.used))
 
 
 def residual_figure(points: Points, *, limit_m: float) -> bytes:

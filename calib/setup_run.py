@@ -7,9 +7,10 @@ from typing import Any
 
 import typer
 
-from calib.hardware import SetupHardware, SimulatedHardware
-from calib.keys import Key, TerminalKeys
+from calib.hardware import SetupHardware
+from calib.keys import TerminalKeys
 from calib.setup_steps import STEPS, Setup, Step, Stopped
+from calib.simulated import SimulatedHardware
 from runtime.config import load_settings
 from runtime.errors import InputError, PhasestackError
 from runtime.support import untrusted_input
@@ -47,12 +48,11 @@ def run_setup(
     done = read_progress(progress_path(config))
     keys = TerminalKeys()
     hardware = (
-        SimulatedHardware(keys.poll, settings.stack.stack(), say=say, seed=seed)
+        SimulatedHardware(keys.poll, settings.stack.stack(), say=say, photos=photos, seed=seed)
         if simulate
         else SetupHardware(keys.poll, photos=photos)
     )
-    setup = Setup(config, out, hardware, say, done)
-    say("setting up a display: Enter: do it; n: skip (what is done stays); p: the step before; q: stop, go on later")
+    setup = Setup(config, out, hardware, say, keys.line, done)
     try:
         finished = walk_through(setup)
     finally:
@@ -64,45 +64,33 @@ def run_setup(
 def walk_through(setup: Setup) -> bool:
     """Every step until the last, or q. True where the end was reached."""
     number = next((n for n, step in enumerate(STEPS) if step.name not in setup.done), 0)
-    problem = ""
     while number < len(STEPS):
         step = STEPS[number]
-        _announce(setup, step, number, problem=problem)
-        key, problem = setup.hardware.key(), ""
-        if key is Key.QUIT:
+        state = "done before" if step.name in setup.done else "not done yet"
+        setup.say(f"\nStep {number + 1} of {len(STEPS)}: {step.title}\n{step.what}\n({state})")
+        try:
+            answer = setup.ask("Enter: do it; n: skip, what is done stays; p: the step before", "do it")
+        except Stopped:
             return False
-        if key in (Key.PREVIOUS, Key.LEFT):
+        if answer == "p":
             number = max(0, number - 1)
-        elif key in (Key.NEXT, Key.RIGHT):
+        elif answer == "n" or (answer == "do it" and _is_done(setup, step)):
             number += 1
-        elif key is Key.ACCEPT:
-            problem = _problem_of(setup, step)
-            number += not problem
     return True
 
 
-def _announce(setup: Setup, step: Step, number: int, *, problem: str) -> None:
-    """A step, in the terminal and on the panels; what was wrong with it, if it was tried, on the panels."""
-    state = "done before" if step.name in setup.done else "not done yet"
-    lines = [f"Step {number + 1} of {len(STEPS)}: {step.title}", step.what, f"({state})",
-             "Enter: do it   n: skip   p: back   q: stop"]  # fmt: skip
-    setup.say("\n" + "\n".join(lines))
-    setup.hardware.show_words(setup.settings, [*lines, problem] if problem else lines)
-
-
-def _problem_of(setup: Setup, step: Step) -> str:
-    """Run a step; returns what was wrong with it, empty where it is done."""
+def _is_done(setup: Setup, step: Step) -> bool:
+    """Run a step."""
     try:
         figures = step.run(setup)
     except (Stopped, PhasestackError) as error:
         stopped = "stopped: what was not finished is not written into the configuration"
-        problem = stopped if isinstance(error, Stopped) else f"it did not work: {error}"
-        setup.say(problem)
-        return problem
+        setup.say(stopped if isinstance(error, Stopped) else f"it did not work: {error}")
+        return False
     setup.done[step.name] = figures
     write_json(progress_path(setup.config), {"done": setup.done})
     setup.say(f"step {step.name}: done: {figures['text']}")
-    return ""
+    return True
 
 
 def summarise(setup: Setup, *, finished: bool) -> tuple[dict[str, Any], str]:

@@ -5,34 +5,35 @@ from __future__ import annotations
 import os
 import shlex
 import subprocess
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import tomlkit
 
 from calib.board import boards
-from calib.capture_run import capture_live
-from calib.config_file import put, put_lut, put_monitors, rewrite
-from calib.grey_chart import grey_chart, lut_from_photographs
+from calib.capture import capture_live
+from calib.config_file import put, put_monitors, put_panels, read_document, rewrite
+from calib.grey_chart import grey_charts, lut_from_photographs
 from calib.hardware import Say, SetupHardware
-from calib.keys import TYPED, Key
-from calib.registration_run import register_photos
-from calib.service_files import gather
+from calib.keys import Key
+from calib.registration import register_photos
 from calib.solve_run import solve_file
-from calib.viewpoints import IPD_M
-from runtime.config import Settings, load_settings
+from runtime.config import NAMES_OR_PATHS, PATHS, Settings, load_settings
 from runtime.errors import InputError
 from runtime.panels.geometry import Arrow, mounting_of
 from runtime.panels.monitors import Monitor
 from runtime.sensor.registry import DRIVERS
 from runtime.support import untrusted_input
+from runtime.support.artifacts import OutputFolder, write_bytes, write_text
 
 Figures = dict[str, Any]
 MIN_PAIRS = 9
 SERVICE_FOLDER = "/etc/phasestack"
+MAX_BYTES = 64 << 20  # of a file that the service reads
 ARROWS: dict[Key, Arrow] = {Key.UP: "up", Key.DOWN: "down", Key.LEFT: "left", Key.RIGHT: "right"}
+YES_NO = {Key.ACCEPT: True, Key.NEXT: False}
 
 
 class Stopped(Exception):
@@ -47,6 +48,7 @@ class Setup:
     out: Path  # folder of reports, and of what the configuration names
     hardware: SetupHardware
     say: Say
+    line: Callable[[], str]  # that the person types
     done: dict[str, Figures] = field(default_factory=dict)  # of earlier steps, by name
 
     @property
@@ -54,20 +56,13 @@ class Setup:
         """The configuration as it is now."""
         return load_settings(self.config if untrusted_input.is_there(self.config) else None)
 
-    def ask(self, question: str, keys: str, *, before: str = "") -> Key:
-        """The key that answers a question, asked in the terminal and on the panels. before: what went wrong.
-
-        Raises Stopped for q.
-        """
-        if before:
-            self.say(before)
-        self.say(f"{question}  ({keys}; q: stop)")
-        lines = (*question.splitlines(), f"{keys}; q: stop", before)
-        self.hardware.show_words(self.settings, [line for line in lines if line])
-        key = self.hardware.key()
-        if key is Key.QUIT:
+    def ask(self, question: str, default: str = "") -> str:
+        """The line that answers a question, `default` for an empty one. Raises Stopped for q."""
+        self.say(f"{question} [{default or 'Enter'}; q: stop]")
+        answer = self.line()
+        if answer == "q":
             raise Stopped
-        return key
+        return answer or default
 
     def write(self, change: Callable[[Any], None]) -> None:
         """Change the configuration by a function of its document. Raises InputError."""
@@ -90,46 +85,27 @@ def identify(setup: Setup) -> Figures:
     monitors = hardware.monitors()
     if len(monitors) < count:
         raise InputError(setup.config, "stack.x_m", f"{len(monitors)} monitors for {count} panels")
-    free, taken = list(range(len(monitors))), list[int]()  # the first of those that are free shows its card
+    free = list(range(len(monitors)))  # the first of them shows its card
     tables: list[dict[str, Any]] = []
 
-    def ask(question: str, keys: str, answers: Container[Key]) -> Key:
+    def ask(question: str, keys: str, answers: Mapping[Key, Any]) -> Any:
         setup.say(f"{monitors[free[0]]} shows its card, the others are clear. {question} ({keys}; q: stop)")
         hardware.show_card(free[0], [question, f"{keys}; q: stop"])
         while (key := hardware.key()) not in answers:
             if key is Key.QUIT:
                 raise Stopped
-        return key
+        return answers[key]
 
-    arrows: list[Arrow] = []  # of the panels that are taken, and of the next one once it is known
-    asked = 0  # of the panel: whether it is the one, its arrow, its writing
     while len(tables) < count:
         place = {0: "the rearmost, at the backlight", count - 1: "the front one"}.get(len(tables), "the next one")
-        question, keys, answers = (
-            (f"Is it panel {len(tables)}, {place}?", "Enter: yes, n: another monitor", {Key.ACCEPT, Key.NEXT}),
-            ("Which way does its arrow point, seen from the front?", "arrow keys", set(ARROWS)),
-            ("Does its writing read rightly?", "Enter: yes, n: it is mirrored", {Key.ACCEPT, Key.NEXT}),
-        )[asked]
-        key = ask(question, f"{keys}, u: one back", answers | {Key.UNDO})
-        if key is Key.UNDO:
-            if asked == 0 and taken:
-                free.insert(0, taken.pop())
-                tables.pop()
-                asked = 3
-            elif asked == 2:
-                arrows.pop()
-            asked = max(0, asked - 1)
-        elif asked == 0 and key is Key.NEXT:
+        if not ask(f"Is it panel {len(tables)}, {place}?", "Enter: yes, n: another monitor", YES_NO):
             free.append(free.pop(0))
-        elif asked < 2:
-            arrows += [ARROWS[key]] if asked == 1 else []
-            asked += 1
-        else:
-            rotation_deg, mirror = mounting_of(arrows[-1], mirrored=key is Key.NEXT)
-            named = _name_of(monitors[free[0]], monitors)
-            tables.append(named | {"rotation_deg": rotation_deg, "mirror": mirror})
-            taken.append(free.pop(0))
-            asked = 0
+            continue
+        arrow = ask("Which way does its arrow point, seen from the front?", "arrow keys", ARROWS)
+        readable = ask("Does its writing read rightly?", "Enter: yes, n: it is mirrored", YES_NO)
+        rotation_deg, mirror = mounting_of(arrow, mirrored=not readable)
+        named = _name_of(monitors[free.pop(0)], monitors)
+        tables.append(named | {"rotation_deg": rotation_deg, "mirror": mirror})
     setup.write(lambda document: put_monitors(document, tables))
     return {"text": f"{count} bound to their monitors"}
 
@@ -140,113 +116,41 @@ def _name_of(monitor: Monitor, monitors: Sequence[Monitor]) -> dict[str, Any]:
     return {"edid_serial": monitor.serial} if monitor.serial and alone else {"connector": monitor.connector}
 
 
-@dataclass
-class Dial:
-    """A number that arrows change, or that is typed."""
-
-    name: str
-    value: float
-    step: float
-    low: float
-    high: float
-    show: Callable[[float], str]
-    unknown: float | None = None  # the value to begin with, where 0 says that nothing is known
-
-    def turn(self, steps: int) -> None:
-        if self.unknown is not None and (self.value == 0 or self.value + steps * self.step < self.low):
-            self.value = self.unknown if steps > 0 else 0.0
-        else:
-            self.value = min(max(self.value + steps * self.step, self.low), self.high)
-
-    def take(self, typed: str) -> str:
-        """What was typed, in the unit that it is shown in; returns why it can't be (empty: it is)."""
-        unit = 1e-3 if self.show is _mm else 1.0
-        try:
-            value = float(typed) * unit
-        except ValueError:
-            return f"{typed} is no number"
-        if not self.low <= value <= self.high:
-            return f"{typed}: {self.name} is between {self.show(self.low)} and {self.show(self.high)}"
-        self.value = value
-        return ""
-
-
-def _mm(value: float) -> str:
-    return f"{value * 1e3:.1f} mm" if value else "not known"
-
-
-def _m(value: float) -> str:
-    return f"{value:.2f} m"
-
-
 def geometry(setup: Setup) -> Figures:
     """Size of the panels, their gap, and where viewers stand: about; registration finds the gap exactly."""
     stack, calibration = setup.settings.stack, setup.settings.calibration
+
+    def length_m(question: str, value_m: float, unit_m: float = 1e-3) -> float:
+        """What is typed, in metres; the value as it is, to the digit, for an empty line."""
+        while True:
+            answer = setup.ask(f"{question}, {'mm' if unit_m == 1e-3 else 'm'}", f"{value_m / unit_m:.6g}")
+            try:
+                typed = float(answer) * unit_m
+            except ValueError:
+                setup.say(f"{answer} is no number")
+                continue
+            return value_m if abs(typed - value_m) < 1e-8 else round(typed, 7)
+
+    size: dict[str, Any] = {
+        "width_m": length_m("width of a panel's picture", stack.width_m),
+        "height_m": length_m("its height", stack.height_m),
+    }
     gap_m = (stack.x_m[-1] - stack.x_m[0]) / (len(stack.x_m) - 1)
-    dials = [
-        Dial("width of a panel's picture", stack.width_m, 0.0001, 0.02, 5.0, _mm),
-        Dial("its height", stack.height_m, 0.0001, 0.02, 5.0, _mm),
-        Dial("from panel to panel", gap_m, 0.001, 0.002, 0.5, _mm),
-        Dial("nearest viewer", calibration.viewing_m[0], 0.05, 0.2, 5.0, _m),
-        Dial("farthest viewer", calibration.viewing_m[1], 0.05, 0.25, 8.0, _m),
-        Dial("the eye separation of who will calibrate, if it is known (an optician's PD)", calibration.ipd_m, 0.0005,
-             0.05, 0.08, _mm, unknown=IPD_M),
-    ]  # fmt: skip
-    _turn_dials(setup, dials)
-    width_m, height_m, found_m, near_m, far_m, ipd_m = (round(dial.value, 5) for dial in dials)
-    size: dict[str, Any] = {"width_m": width_m, "height_m": height_m}
-    if abs(found_m - gap_m) > 1e-6:  # else distances that were measured stay as they are
+    typed_m = length_m("from panel to panel", gap_m)
+    if typed_m != gap_m:  # else distances that were measured stay as they are
         middle = (len(stack.x_m) - 1) / 2
-        size["x_m"] = [round((index - middle) * found_m, 6) for index in range(len(stack.x_m))]
-    viewing: dict[str, Any] = {"viewing_m": [near_m, far_m]}
-    if ipd_m != calibration.ipd_m:
-        viewing["ipd_m"] = ipd_m
+        size["x_m"] = [round((index - middle) * typed_m, 7) for index in range(len(stack.x_m))]
+    near_m = length_m("nearest viewer", calibration.viewing_m[0], 1.0)
+    far_m = length_m("farthest viewer", calibration.viewing_m[1], 1.0)
+    ipd_m = length_m("eye separation of who will calibrate (an optician's PD; 0: not known)", calibration.ipd_m)
 
     def change(document: Any) -> None:
         put(document, "stack", size)
-        put(document, "calibration", viewing)
+        put(document, "calibration", {"viewing_m": [near_m, far_m], "ipd_m": ipd_m})
 
     setup.write(change)
-    return {"text": f"{_mm(width_m)} by {_mm(height_m)}; viewers {_m(near_m)} to {_m(far_m)} away"}
-
-
-def _turn_dials(setup: Setup, dials: list[Dial]) -> None:
-    chosen, coarse = 0, 1  # which dial; how many of its steps at once
-    typed, problem, before = "", "", list[tuple[int, float]]()  # what the dials were, to take back
-    while True:
-        lines = [f"{'>' if dial is dials[chosen] else ' '} {dial.name}: {dial.show(dial.value)}" for dial in dials]
-        lines[chosen] += f" -> {typed}" if typed else ""
-        keys = "digits, or left, right (f, c: finer, coarser): change; up, down: another number; u: one back"
-        key, problem = setup.ask("\n".join(lines), f"{keys}; Enter: {'take it' if typed else 'all are right'}",
-                                 before=problem), ""  # fmt: skip
-        if key in (Key.LEFT, Key.RIGHT) or (typed and key is Key.ACCEPT):
-            before.append((chosen, dials[chosen].value))
-        if key not in TYPED and key not in (Key.ACCEPT, Key.UNDO):
-            typed = ""
-        match key:
-            case key if key in TYPED:
-                typed += TYPED[key]
-            case Key.ACCEPT if typed:
-                typed, problem = "", dials[chosen].take(typed)
-            case Key.ACCEPT:
-                return
-            case Key.UNDO if typed:
-                typed = typed[:-1]
-            case Key.UNDO if before:
-                chosen, value = before.pop()
-                dials[chosen].value = value
-            case Key.UP:
-                chosen = (chosen - 1) % len(dials)
-            case Key.DOWN:
-                chosen = (chosen + 1) % len(dials)
-            case Key.FINER:
-                coarse = max(coarse // 10, 1)
-            case Key.COARSER:
-                coarse = min(coarse * 10, 100)
-            case Key.LEFT:
-                dials[chosen].turn(-coarse)
-            case Key.RIGHT:
-                dials[chosen].turn(coarse)
+    width_mm, height_mm = (1e3 * size[name] for name in ("width_m", "height_m"))
+    return {"text": f"{width_mm:.1f} by {height_mm:.1f} mm; viewers {near_m:.2f} to {far_m:.2f} m away"}
 
 
 def registration(setup: Setup) -> Figures:
@@ -265,23 +169,16 @@ def grey(setup: Setup) -> Figures:
     stack = setup.settings.stack.stack()
     known = [bool(panel.lut) for panel in setup.settings.output.panels] or [False] * stack.count
     residuals = [0.0]
-    number, problem = 0, ""
-    while number < stack.count:
+    for number in range(stack.count):
         state = "has a curve" if known[number] else "has no curve yet"
-        keys = "Enter: measure it; n: leave it; u: the panel before"
-        key, problem = setup.ask(f"panel {number} {state}", keys, before=problem), ""
-        if key in (Key.UNDO, Key.PREVIOUS, Key.LEFT):
-            number = max(0, number - 1)
-        elif key in (Key.NEXT, Key.RIGHT):
-            number += 1
-        elif key is Key.ACCEPT:
+        while setup.ask(f"panel {number} {state}: measure it? y or n", "y") == "y":
             try:
                 residuals.append(_measure_grey(setup, number))
             except InputError as error:
-                problem = f"it did not work: {error}"
+                setup.say(f"it did not work: {error}")
                 continue
             known[number] = True
-            number += 1
+            break
     if not any(known):
         setup.say("no panel has a curve: gammas stay as they are configured")
         raise Stopped
@@ -293,12 +190,10 @@ def _measure_grey(setup: Setup, panel: int) -> float:
     """One panel's LUT into the configuration; returns how far the curve is off, of the range. Raises InputError."""
     settings = setup.settings
     stack = settings.stack.stack()
-    charts = np.zeros((stack.count, stack.height_px, stack.width_px), np.uint8)
-    charts[panel] = grey_chart(stack, panel)
-    pictures = setup.hardware.photographs(settings, charts, panel=panel, say=setup.say)
+    pictures = setup.hardware.photographs(settings, grey_charts(stack, panel), panel=panel, say=setup.say)
     path = (setup.out / "grey" / f"panel-{panel}.csv").resolve()
     summary = lut_from_photographs(path, pictures, stack, panel=panel, source="photographs")
-    setup.write(lambda document: put_lut(document, panel, str(path), panels=stack.count))
+    setup.write(lambda document: put_panels(document, "lut", {panel: str(path)}, panels=stack.count))
     residual = float(summary["residual"])
     setup.say(f"panel {panel}: taken, measured to {100 * residual:.2f}%")
     return residual
@@ -307,26 +202,19 @@ def _measure_grey(setup: Setup, panel: int) -> float:
 def sensor(setup: Setup) -> Figures:
     """Which depth sensor sees the viewer; tried at once."""
     settings = setup.settings
-    names = [name for name in DRIVERS if name not in ("replay", "fixed")]
-    if setup.hardware.simulated:
-        names = ["replay"]
-    chosen, problem = names.index(settings.sensor.driver) if settings.sensor.driver in names else 0, ""
+    names = ["replay"] if setup.hardware.simulated else [name for name in DRIVERS if name not in ("replay", "fixed")]
+    default = settings.sensor.driver if settings.sensor.driver in names else names[0]
     while True:
-        question = f"depth sensor: {names[chosen]}"
-        key, problem = setup.ask(question, "up, down: another; Enter: try it", before=problem), ""
-        if key in (Key.UP, Key.DOWN):
-            chosen = (chosen + (1 if key is Key.DOWN else -1)) % len(names)
-        if key is not Key.ACCEPT:
-            continue
-        update: dict[str, Any] = {"driver": names[chosen]}
-        if settings.sensor.driver != names[chosen]:
+        chosen = setup.ask(f"depth sensor ({', '.join(names)})", default)
+        update: dict[str, Any] = {"driver": chosen}
+        if settings.sensor.driver != chosen:
             update["source"] = ""
         tried = settings.model_copy(update={"sensor": settings.sensor.model_copy(update=update)})
         try:
             name = setup.hardware.open_sensor(tried)
             break
         except InputError as error:
-            problem = f"it does not work: {error}"
+            setup.say(f"it does not work: {error}")
     setup.write(lambda document: put(document, "sensor", update))
     return {"text": name}
 
@@ -364,6 +252,36 @@ def service(setup: Setup) -> Figures:
         if result.returncode != 0:
             raise InputError(setup.config, "service", f"{command}: {result.stderr.strip() or 'failed'}")
     return {"text": f"{len(files)} files, applied: {told} (the files before: *.~1~)"}
+
+
+def gather(config: Path, out: Path) -> list[str]:
+    """Write the configuration with its calibration and grey curves beside it; returns the files' names.
+
+    Other files that it names stay where they are, named in full. Raises InputError where one cannot be read.
+    """
+    if not config.exists():
+        raise InputError(config, "", "there is nothing to install yet: the steps before this one")
+    settings = load_settings(config)
+    document: Any = read_document(config)
+    copies: dict[str, bytes] = {}
+    for section, key in (*PATHS, *NAMES_OR_PATHS):
+        value = getattr(getattr(settings, section), key)
+        if value and key in document.get(section, {}):
+            document[section][key] = value
+    if settings.calibration.file:
+        copies["calibration.toml"] = untrusted_input.read_bytes(settings.calibration.file, most_bytes=MAX_BYTES)
+        document["calibration"]["file"] = "calibration.toml"
+    for number, panel in enumerate(settings.output.panels):
+        if panel.lut:
+            name = f"panel-{number}.csv"
+            copies[name] = untrusted_input.read_bytes(panel.lut, most_bytes=MAX_BYTES)
+            document["output"]["panels"][number]["lut"] = name
+    with OutputFolder(out) as folder:
+        for name, data in copies.items():
+            write_bytes(folder.staging / name, data)
+        write_text(folder.staging / "phasestack.toml", tomlkit.dumps(document))
+        load_settings(folder.staging / "phasestack.toml")
+    return sorted(["phasestack.toml", *copies])
 
 
 STEPS = (

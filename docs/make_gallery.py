@@ -1,6 +1,6 @@
 """Writes docs/performance.md, from one demo and one report, and the pages' pictures. `make gallery` (minutes), or
 
-    python docs/make_gallery.py [--work FOLDER] [--keep] [REPORT OPTION ...]
+    python -m docs.make_gallery [--work FOLDER] [--keep] [REPORT OPTION ...]
 
 `--keep` takes what an earlier call left in the work folder. Other options (`--quick`, say) are the report's.
 """
@@ -23,13 +23,13 @@ from PIL import Image, ImageDraw
 
 import phasestack
 from calib.board import boards as boards_of
-from calib.placed import PlacedPanel
-from calib.simulator import Exposure, Scene, camera_from_stack, camera_rays, phone, photograph
+from calib.placed import ideal_panel
 from runtime.config import StackGeometry
 from runtime.optics.alignment import align, shown_layers
 from runtime.optics.retina import seen_by
 from runtime.records import PanelFrame
 from runtime.report.pairs import Painter, eyes_at
+from tests.calib.simulator import Camera, camera_from_stack, photograph
 
 DOCS = Path(__file__).resolve().parent
 IMAGES = DOCS / "images"
@@ -148,12 +148,11 @@ def kinds(folder: Path) -> Image.Image:
 
 def boards() -> Image.Image:
     """The boards of three panels as a phone sees them from the left."""
-    stack, random = StackGeometry().stack(), np.random.default_rng(0)
-    panels = tuple(PlacedPanel(np.eye(3), np.array([x_m, 0.0, 0.0])) for x_m in stack.x_m)
-    lens = phone(random=random, size=0.2)
+    stack = StackGeometry().stack()
+    panels = [ideal_panel(stack, index) for index in range(stack.count)]
     pose = camera_from_stack(np.array([0.44, -0.26, 0.07]), towards_m=np.array([0.0, -0.06, 0.0]))
-    scene = Scene(stack, panels, boards_of(stack))
-    return Image.fromarray(photograph(scene, lens, pose, Exposure(), random=random, rays=camera_rays(lens)))
+    camera = Camera(800, 600, 610.0)
+    return Image.fromarray(photograph(boards_of(stack), panels, stack, camera, pose, np.random.default_rng(0)))
 
 
 def look_into(folder: Path) -> None:

@@ -20,9 +20,9 @@ def setup(
 ) -> None:
     """Set a display up: which monitor is which panel, sizes, registration by photographs, sensor, calibration.
 
-    Driven by keys alone, in the terminal or on a panel's window; what is asked stands on the panels too. Every step
-    can be skipped and repeated; q stops, and the same command goes on there. At the end: the figures of each step,
-    and a configuration that is valid.
+    It asks in the terminal; where panels show something, keys on their windows count too. Every step can be skipped
+    and repeated; q stops, and the same command goes on there. At the end: the figures of each step, and a
+    configuration that is valid.
 
     Example: phasestack setup --simulate --config try.toml --out try
     """

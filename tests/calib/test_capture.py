@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from calib.capture import Walk
 from calib.commands import app
 from calib.keys import Key
 from calib.pairs import PairsFile, read_pairs
 from calib.viewpoints import grid
-from calib.walk import EyeWindow, Walk
 from runtime.clock import NS_PER_S
 from runtime.errors import InputError
 from runtime.eyes.demo_geometry import demo_stack_from_sensor
@@ -36,16 +36,6 @@ def eyes_at(stack_m: np.ndarray, *, noise_m: float = 0.0, random: np.random.Gene
     return EyePoints(sensor + (random.normal(scale=noise_m, size=(2, 3)) if random else 0.0), np.array([0.9, 0.9]))
 
 
-def test_the_median_over_the_window_ignores_a_wild_sample() -> None:
-    window = EyeWindow()
-    place = np.array([0.5, 0.0, 0.1])
-    for number in range(15):
-        window.add(number * STEP_NS, eyes_at(place + (5.0 if number == 7 else 0.0)))
-    measured = window.measure()
-    assert measured is not None
-    np.testing.assert_allclose(measured[0], eyes_at(place).eyes_m.mean(0), atol=1e-12)
-
-
 def walk(path: Path, said: list[str]) -> Walk:
     return Walk(PairsFile(path), grid()[:3], say=said.append)
 
@@ -53,20 +43,6 @@ def walk(path: Path, said: list[str]) -> Walk:
 def stand(at: Walk, place: np.ndarray, *, start_ns: int = 0) -> None:
     for number in range(15):
         at.see(start_ns + number * STEP_NS, eyes_at(place), "A1")
-
-
-def test_enter_takes_a_viewpoint_and_goes_to_the_next(tmp_path: Path) -> None:
-    said: list[str] = []
-    person = walk(tmp_path / "pairs.csv", said)
-    person.begin()
-    for number, viewpoint in enumerate(grid()[:3]):
-        stand(person, viewpoint.midpoint_m, start_ns=number * NS_PER_S)
-        person.press(Key.ACCEPT)
-    assert person.finished
-    pairs = read_pairs(tmp_path / "pairs.csv")
-    np.testing.assert_allclose(pairs.stack_m, [v.midpoint_m for v in grid()[:3]], atol=1e-8)
-    np.testing.assert_allclose(pairs.sensor_m, [eyes_at(v.midpoint_m).eyes_m.mean(0) for v in grid()[:3]], atol=1e-8)
-    assert pairs.sensor_serial == "A1"
 
 
 def test_restless_eyes_are_not_taken(tmp_path: Path) -> None:
@@ -77,19 +53,6 @@ def test_restless_eyes_are_not_taken(tmp_path: Path) -> None:
     person.press(Key.ACCEPT)
     assert "hold still" in said[-1]
     assert not (tmp_path / "pairs.csv").exists()
-
-
-def test_it_resumes_where_it_stopped(tmp_path: Path) -> None:
-    said: list[str] = []
-    first = walk(tmp_path / "pairs.csv", said)
-    stand(first, grid()[0].midpoint_m)
-    first.press(Key.ACCEPT)
-    first.press(Key.QUIT)
-    assert first.finished
-    assert first.summary()["skipped"] == [v.name for v in grid()[1:3]]
-    second = walk(tmp_path / "pairs.csv", said)
-    second.begin()
-    assert said[-1].startswith(grid()[1].name)
 
 
 def test_a_viewpoint_is_taken_anew_from_the_one_after_it(tmp_path: Path) -> None:

@@ -39,9 +39,9 @@ def test_a_closed_input_quits_and_an_idle_one_says_nothing() -> None:
     reading, writing = os.pipe()
     keys = TerminalKeys(reading)
     assert keys.poll() is None
-    os.write(writing, b"nf")
-    assert [keys.poll(), keys.poll(), keys.poll()] == [Key.NEXT, Key.FINER, None]
+    os.write(writing, b"np344.2\n")
+    assert [keys.poll(), keys.poll(), keys.line(), keys.poll()] == [Key.NEXT, Key.PREVIOUS, "344.2", None]
     os.close(writing)
-    assert keys.poll() is Key.QUIT
+    assert (keys.poll(), keys.line()) == (Key.QUIT, "q")
     keys.close()
     os.close(reading)

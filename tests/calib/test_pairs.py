@@ -77,15 +77,6 @@ def test_pairs_of_two_sensors_are_not_mixed(tmp_path: Path) -> None:
         read_pairs(file(tmp_path, text))
 
 
-def test_an_accepted_pair_is_on_disk_when_accept_returns(tmp_path: Path) -> None:
-    path = tmp_path / "deep" / "pairs.csv"
-    taking = PairsFile(path)
-    for number in range(3):
-        taking.accept(captured(f"v{number}", x=number))
-        assert len(read_pairs(path)) == number + 1
-    assert read_pairs(path).sensor_serial == "A1"
-
-
 def test_it_resumes_and_replaces_a_viewpoint_that_is_taken_again(tmp_path: Path) -> None:
     path = tmp_path / "pairs.csv"
     PairsFile(path).accept(captured("v0", x=1.0))
@@ -102,19 +93,6 @@ def test_a_file_of_another_sensor_is_not_gone_on_with(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="sensor A1, this one is of B2"):
         PairsFile(path).accept(captured("v1", serial="B2"))
     assert len(read_pairs(path)) == 1
-
-
-def test_a_crash_while_writing_leaves_the_pairs_that_were_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "pairs.csv"
-    taking = PairsFile(path)
-    taking.accept(captured("v0"))
-    monkeypatch.setattr(Path, "replace", lambda *_: (_ for _ in ()).throw(OSError("power lost")))
-    with pytest.raises(InputError, match="cannot be written"):
-        taking.accept(captured("v1"))
-    assert len(read_pairs(path)) == 1
-    assert [found.name for found in tmp_path.iterdir()] == ["pairs.csv"]
 
 
 def test_a_file_of_something_else_is_not_overwritten(tmp_path: Path) -> None:

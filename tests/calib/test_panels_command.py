@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,13 +15,12 @@ from typer.testing import CliRunner
 from calib.board import PER_PANEL, board, marks
 from calib.commands import app
 from calib.detect_marks import find_marks
-from calib.photographs import read_photograph
-from calib.placed import PlacedPanel, misplaced, true_from_ideal_seen
+from calib.placed import PlacedPanel, true_from_ideal_seen
 from calib.viewpoints import viewing_place_m
 from runtime.config import Settings, StackGeometry, load_settings
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
-from tests.calib.photo_scenes import error_over_panel_px, in_frame_of, simulated_photographs
+from tests.calib.simulator import error_over_panel_px, in_frame_of, misplaced, simulated_photographs
 
 run = CliRunner()
 STACK = StackGeometry().stack()
@@ -44,7 +42,7 @@ def truth() -> tuple[PlacedPanel, PlacedPanel, PlacedPanel]:
 
 @pytest.fixture(scope="module")
 def pictures(truth: tuple[PlacedPanel, PlacedPanel, PlacedPanel]) -> list[np.ndarray]:
-    return simulated_photographs(STACK, truth, count=7, megapixels=6.0, random=np.random.default_rng(3))
+    return simulated_photographs(STACK, truth, count=7, random=np.random.default_rng(3))
 
 
 @pytest.fixture
@@ -143,26 +141,3 @@ def test_photographs_that_cannot_be_used_are_named_and_nothing_is_written(
     assert "\n" not in text
     assert config.read_text() == CONFIG
     assert not (tmp_path / "r").exists()
-
-
-def test_a_bad_photograph_among_good_ones_is_left_out_and_named(
-    tmp_path: Path, photos: Path, pictures: list[np.ndarray]
-) -> None:
-    replaced(photos, 2, blurred(pictures[1]))
-    told = panels("--photos", str(photos), "--out", str(tmp_path / "r"))
-    assert told["used"] == 6
-    assert any(note.startswith("2.bmp") and note.endswith("left out") for note in told["notes"])
-
-
-def test_a_photograph_of_too_many_pixels_is_refused_by_its_header(tmp_path: Path) -> None:
-    small = cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1].tobytes()
-    header = b"IHDR" + (30_000).to_bytes(4, "big") * 2 + small[24:29]
-    (tmp_path / "a.png").write_bytes(small[:12] + header + zlib.crc32(header).to_bytes(4, "big") + small[33:])
-    with pytest.raises(InputError, match=r"30000 x 30000 pixels; at most 250,000,000"):
-        read_photograph(tmp_path / "a.png")
-
-
-def test_a_file_that_is_no_picture_is_named(tmp_path: Path, photos: Path) -> None:
-    (photos / "0.jpg").write_bytes(b"not a picture")
-    with pytest.raises(InputError, match=r"0\.jpg: is not a photograph"):
-        panels("--photos", str(photos), "--out", str(tmp_path / "r"))

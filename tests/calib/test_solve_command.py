@@ -10,7 +10,6 @@ import pytest
 from typer.testing import CliRunner
 
 from calib.commands import app
-from calib.solution import METHODS
 from runtime.errors import InputError
 from runtime.eyes.calibration import load_calibration
 from runtime.eyes.demo_geometry import demo_stack_from_sensor
@@ -49,34 +48,12 @@ def test_the_runtime_loads_what_solve_writes(tmp_path: Path) -> None:
     assert loaded.file.date.endswith("+00:00")
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_every_method_can_be_asked_for(tmp_path: Path, method: str) -> None:
-    told = solve(write_pairs(tmp_path, measured(sigma_m=0.002)), tmp_path / "c.toml", "--method", method)
-    assert told["method"] == method
-    assert {row["method"] for row in told["methods"]} == set(METHODS)
-    assert load_calibration(tmp_path / "c.toml").file.method == method
-
-
 def test_the_sensors_serial_travels_from_the_pairs_to_the_runtimes_check(tmp_path: Path) -> None:
     path = write_pairs(tmp_path, measured())
     lines = path.read_text().splitlines()
     path.write_text("\n".join([lines[0] + ",sensor_serial", *[line + ",A1" for line in lines[1:]]]))
     solve(path, tmp_path / "c.toml")
     assert "A1" in load_calibration(tmp_path / "c.toml").serial_warning("B2")
-
-
-def test_outliers_are_named(tmp_path: Path) -> None:
-    sensor = measured(sigma_m=0.003)
-    sensor[[4, 20]] += [0.2, -0.3, 0.1]
-    told = solve(write_pairs(tmp_path, sensor), tmp_path / "c.toml")
-    assert told["method"] == "robust"
-    assert told["outliers"] == ["line 6", "line 22"]
-    assert any("line 6, line 22: rejected" in warning for warning in told["warnings"])
-
-
-@pytest.mark.parametrize("count", [0, 1, 2])
-def test_fewer_than_three_pairs_are_refused(tmp_path: Path, count: int) -> None:
-    assert "at least 3" in refusal(write_pairs(tmp_path, measured()[:count], KNOWN_M[:count]), tmp_path)
 
 
 @pytest.mark.parametrize("count", [3, 4, 5, 6])
@@ -127,12 +104,3 @@ def test_pairs_that_do_not_fit_are_refused_with_a_hint(tmp_path: Path) -> None:
     message = refusal(write_pairs(tmp_path, sensor), tmp_path, "--method", "seed")
     assert "more than 50 mm" in message
     assert "robust" in message
-
-
-def test_past_versions_are_kept(tmp_path: Path) -> None:
-    out, texts = tmp_path / "c.toml", []
-    for seed in range(3):
-        solve(write_pairs(tmp_path, measured(sigma_m=0.002, seed=seed)), out)
-        texts.append(out.read_text())
-    kept = [(tmp_path / name).read_text() for name in ("c.1.toml", "c.2.toml", "c.toml")]
-    assert kept == texts

@@ -13,8 +13,8 @@ import pytest
 from calib.config_file import put, read_document, rewrite, save
 from calib.pairs import PairsFile, read_pairs
 from calib.photographs import read_photograph
-from calib.service_files import gather
 from calib.setup_run import read_progress
+from calib.setup_steps import gather
 from runtime.errors import InputError
 from runtime.panels.lut import measured_curve
 

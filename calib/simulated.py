@@ -1,0 +1,86 @@
+"""A display that is not there, for `setup --simulate`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from calib.hardware import Named, Poll, Sample, Say, SetupHardware
+from calib.photographs import photographs
+from calib.viewpoints import Viewpoint
+from runtime.clock import NS_PER_S
+from runtime.config import Settings
+from runtime.errors import InputError
+from runtime.eyes.demo_geometry import demo_sensor_from_stack
+from runtime.optics.stack import PanelStack
+from runtime.panels.monitors import Monitor
+from runtime.records import U8, EyePoints
+
+SENSOR_NOISE_M = 0.003
+STANDING_M = 0.002  # how exactly a person finds the place where the lines fuse, an axis
+SAMPLES_HERE = 16  # of the sensor, at 30 a second, while the person stands somewhere
+
+
+class SimulatedHardware(SetupHardware):
+    """Its monitors are mixed up, a person stands where asked to; the terminal says what one would see.
+
+    The depth sensor stands where the built-in recording's does, so that `run` can replay that afterwards.
+    """
+
+    simulated = True
+
+    def __init__(
+        self, keys: Poll, stack: PanelStack, *, say: Say, photos: Path = Path("photos"), seed: int = 0
+    ) -> None:
+        super().__init__(keys, photos=photos)
+        self._random = random = np.random.default_rng(seed)
+        # Monitor k is panel order[k]; some stand on their heads, some are seen from behind.
+        self.order = random.permutation(stack.count).tolist()
+        self.mounted = [(int(random.choice([0, 180])), str(random.choice(["none", "horizontal"]))) for _ in self.order]
+        self._stack, self._say = stack, say
+        self._seen_ns = self._left = 0  # when the newest sample was taken; samples that are still to come here
+        self._here, self._off_m = "", np.zeros(3)
+
+    def monitors(self) -> tuple[Monitor, ...]:
+        width, height = self._stack.width_px, self._stack.height_px
+        return tuple(
+            Monitor(f"SIM-{n}", f"S{n}", "simulated", n * width, 0, width, height, 60.0)
+            for n in range(self._stack.count)
+        )
+
+    def show_card(self, number: int, words: Sequence[str]) -> None:
+        rotation_deg, mirror = self.mounted[number]
+        self._say(
+            f"(simulated: it is panel {self.order[number]}; its arrow points {'down' if rotation_deg else 'up'}, its "
+            f"writing {'is mirrored' if mirror != 'none' else 'reads rightly'})"
+        )
+
+    def photographs(self, settings: Settings, pictures: U8, *, panel: int | None, say: Say) -> Iterator[Named]:
+        folder = self._photos if panel is None else self._photos / f"grey-{panel}"
+        if not folder.is_dir():
+            raise InputError(folder, "", "holds no photographs: a simulated display has none (n: skip)")
+        return photographs(folder)
+
+    def open_sensor(self, settings: Settings) -> str:
+        return "a simulated sensor, where the built-in recording's stands"
+
+    def sample(self, standing_at: Viewpoint) -> Sample | None:
+        if self._here != standing_at.name:
+            self._here, self._off_m = standing_at.name, self._random.normal(scale=STANDING_M, size=3)
+            self._left = SAMPLES_HERE
+        if not self._left:
+            return None
+        self._left -= 1
+        self._seen_ns += NS_PER_S // 30
+        to_sensor = demo_sensor_from_stack()
+        seen = (standing_at.eyes_m() + self._off_m) @ to_sensor[:3, :3].T + to_sensor[:3, 3]
+        return (
+            self._seen_ns,
+            EyePoints(seen + self._random.normal(scale=SENSOR_NOISE_M, size=(2, 3)), np.ones(2)),
+            "demo",
+        )
+
+    def chart(self, settings: Settings) -> Callable[[Viewpoint], None] | None:
+        return None
