@@ -4,19 +4,17 @@
 
 It leaves the file that was shown beside the run's pictures, so that it can be shown on a display, too:
 
-    phasestack run --scene out/content/gltf/bar.gltf
+    phasestack run --scene out/content/gltf/ring.glb
 """
 
 from __future__ import annotations
 
 import argparse
-import base64
 import json
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -145,46 +143,8 @@ def splats(folder: Path) -> Made:
 
 
 def gltf(folder: Path) -> Made:
-    """A bar of two bones that bends, with a colour at each corner."""
-    heights = np.repeat(np.linspace(0, 4, 33), 4)
-    corners = np.tile([[-0.4, -0.4], [0.4, -0.4], [0.4, 0.4], [-0.4, 0.4]], (33, 1))
-    positions = np.column_stack([corners[:, 0], heights, corners[:, 1]]).astype("<f4")
-    colours = np.column_stack([heights / 4, 0.5 + corners[:, 0], 0.5 + corners[:, 1], 1 + 0 * heights]).astype("<f4")
-    share = np.clip((heights - 1.2) / 1.6, 0, 1)
-    weights = np.column_stack([1 - share, share, 0 * share, 0 * share]).astype("<f4")
-    joints = np.tile(np.array([0, 1, 0, 0], np.uint8), (len(heights), 1))
-    faces = [[4 * k + a, 4 * k + b, 4 * k + 4 + a, 4 * k + b, 4 * k + 4 + b, 4 * k + 4 + a]
-             for k in range(32) for a, b in ((0, 3), (3, 2), (2, 1), (1, 0))]  # fmt: skip
-    faces += [[0, 1, 2, 0, 2, 3], [128, 130, 129, 128, 131, 130]]
-    down = np.eye(4, dtype="<f4")
-    down[3, 1] = -2.0  # its columns, as the file has them
-    turn = np.array([[0, 0, 0, 1], [0, 0, 0.5, 0.8660254], [0, 0, -0.5, 0.8660254], [0, 0, 0, 1]], "<f4")
-    arrays: list[tuple[np.ndarray, str, int]] = [
-        (positions, "VEC3", 5126), (colours, "VEC4", 5126), (joints, "VEC4", 5121), (weights, "VEC4", 5126),
-        (np.concatenate(faces).astype("<u2").reshape(-1, 1), "SCALAR", 5123),
-        (np.stack([np.eye(4, dtype="<f4").ravel(), down.ravel()]), "MAT4", 5126),
-        (np.array([[0.0], [1.0], [3.0], [4.0]], "<f4"), "SCALAR", 5126), (turn, "VEC4", 5126),
-    ]  # fmt: skip
-    data, views, accessors = b"", [], []
-    for number, (array, kind, component) in enumerate(arrays):
-        data += b"\0" * (-len(data) % 4)
-        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": array.nbytes})
-        accessors.append({"bufferView": number, "componentType": component, "type": kind, "count": len(array)})
-        data += np.ascontiguousarray(array).tobytes()
-    names = ("POSITION", "COLOR_0", "JOINTS_0", "WEIGHTS_0")
-    primitive = {"attributes": {name: number for number, name in enumerate(names)}, "indices": 4}
-    table: dict[str, Any] = {
-        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0, 1]}],
-        "nodes": [{"mesh": 0, "skin": 0}, {"children": [2]}, {"translation": [0, 2, 0]}],
-        "meshes": [{"primitives": [primitive]}], "skins": [{"joints": [1, 2], "inverseBindMatrices": 5}],
-        "animations": [{"name": "bend", "samplers": [{"input": 6, "output": 7}],
-                        "channels": [{"sampler": 0, "target": {"node": 2, "path": "rotation"}}]}],
-        "accessors": accessors, "bufferViews": views,
-        "buffers": [{"byteLength": len(data),
-                     "uri": "data:application/octet-stream;base64," + base64.b64encode(data).decode()}],
-    }  # fmt: skip
-    (folder / "bar.gltf").write_text(json.dumps(table))
-    return str(folder / "bar.gltf"), "rotation_deg = [0, 0, 25]"
+    """A mesh with vertex colours, as one binary file."""
+    return mesh(folder, ".glb")
 
 
 def playlist(folder: Path) -> Made:

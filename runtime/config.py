@@ -219,9 +219,6 @@ class ContentSettings(Section):
         description="the axes of a mesh or splats that are up and towards the viewer, as `+z -y`; auto: glTF's "
         "own, else guessed from the extent",
     )
-    animation: str = Field(
-        "", description="which animation of a glTF plays: its name or number (from 0), `none`; empty: the first"
-    )
     library: str = Field("", description="folder whose pictures, films, models and playlists the page offers")
     stream_options: dict[str, str] = Field(
         default_factory=dict,

@@ -6,7 +6,7 @@ half a pixel on average.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,12 +25,6 @@ class Edges:
     apex: I32  # (e, 2) per face: its third vertex
     normals: F64  # (t, 3) of faces, not normalised
     centres: F64  # (t, 3)
-
-    def moved(self, shape: Shape) -> Edges:
-        """The same edges of a shape whose vertices are elsewhere."""
-        corner = shape.positions_m.astype(np.float64)[shape.triangles]
-        normals = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        return replace(self, normals=normals, centres=corner.mean(1))
 
 
 def edges_of(shape: Shape) -> Edges:

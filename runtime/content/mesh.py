@@ -1,4 +1,4 @@
-"""Meshes drawn with one lamp: glTF/GLB read by `gltf`, OBJ, PLY and STL by trimesh."""
+"""Meshes drawn with one lamp: glTF/GLB, OBJ, PLY and STL, read by trimesh."""
 
 from __future__ import annotations
 
@@ -6,17 +6,16 @@ import io
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from runtime.clock import NS_PER_S
 from runtime.content.base import ContentInfo
-from runtime.content.gltf import file_of, load_gltf, texture_of
+from runtime.content.gltf import check_gltf, cut_alpha, file_of
 from runtime.content.placing import SceneFile
 from runtime.content.ply import read_header
-from runtime.content.rig import Binding, Node, Rig
 from runtime.content.shapes import Shape
 from runtime.content.triangles import DrawnPart, Part, TriangleSource
 from runtime.errors import InputError, one_line
@@ -28,49 +27,53 @@ from runtime.support.untrusted_input import LIMITS
 log = logging.getLogger("phasestack.content")
 
 UNCOLOURED = (0.70, 0.74, 0.80)  # of a file that says nothing of colours
+WHITE = (1.0, 1.0, 1.0)
 GLTF = (".glb", ".gltf")
 STL_HEAD, STL_FACET = 84, 50  # bytes of a binary file's head and of each of its triangles
 LARGEST_COORDINATE = 1e15  # products of three still fit in float32's range
+LARGEST_TEXTURE_PX = 4096
 
 
 @dataclass(frozen=True, slots=True)
 class MeshData:
     """A loaded file, in its own coordinates."""
 
-    parts: tuple[Part, ...]  # each in its own frame
-    rig: Rig  # that places and moves them
-    low: F64  # (3,) corner of the box that holds it, however it moves; in the scene's frame
+    parts: tuple[Part, ...]
+    low: F64  # (3,) corner of the box that holds it
     high: F64
 
 
-def prepare(file: SceneFile) -> Callable[[Any], MeshSource]:
+def prepare(file: SceneFile) -> Callable[[Any], TriangleSource]:
     """Read it and make its outlines ready; the answer uploads them. Raises InputError."""
-    data = load_mesh(file.path, animation=file.settings.animation)
+    data = load_mesh(file.path)
     parts = []
     for number, part in enumerate(data.parts):
         progress.tell(f"{file.path.name}: outlines", number, len(data.parts))
         parts.append(DrawnPart(part))
-    matrix = file.placed(data.low, data.high)
-    info = ContentInfo(file.path.stem, moving=data.rig.moves, background=file.background)
-    return lambda context: MeshSource(parts, matrix, context=context, info=info, rig=data.rig)
+    places = [file.placed(data.low, data.high)] * len(parts)
+    info = ContentInfo(file.path.stem, background=file.background)
+    return lambda context: TriangleSource(parts, places, context=context, info=info)
 
 
-def load_mesh(path: Path, *, animation: str = "") -> MeshData:
-    """Read a file. Raises InputError: unreadable, over a limit, no faces, NaN vertices, a texture missing.
-
-    animation: which one of a glTF plays; empty: the first.
-    """
+def load_mesh(path: Path) -> MeshData:
+    """Read a file. Raises InputError: unreadable, over a limit, no faces, NaN vertices, a texture missing."""
     progress.tell(f"reading {path.name}", 0)
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
-    if path.suffix.lower() in GLTF:
-        return _boxed(path, *load_gltf(path, data, animation=animation))
     _check_counts(path, data)
     pictures: dict[int, U8] = {}
     with np.errstate(all="ignore"):  # coordinates beyond any scene overflow; they are refused below
-        parts = [_part(mesh, path, pictures) for mesh in _loaded(path, data)]
+        placed, parts = _loaded(path, data), []
+        for number, (mesh, matrix) in enumerate(placed):
+            progress.tell(f"{path.name}: parts", number, len(placed))
+            parts.append(_part(mesh, matrix, path, pictures))
     triangles = sum(len(part.shape.triangles) for part in parts)
     untrusted_input.within(triangles, LIMITS.triangles, source=path, field="faces")
-    return _boxed(path, parts, Rig((Node(),), (0,), (Binding(0),) * len(parts)))
+    _check(path, parts)
+    low, high = (
+        np.asarray(end([end(part.shape.positions_m, axis=0) for part in parts], axis=0), np.float64)
+        for end in (np.min, np.max)
+    )
+    return MeshData(tuple(parts), low, high)
 
 
 def _check(path: Path, parts: Sequence[Part]) -> None:
@@ -90,21 +93,6 @@ def _check(path: Path, parts: Sequence[Part]) -> None:
         raise InputError(path, "faces", "none has an area")
 
 
-def _boxed(path: Path, parts: Sequence[Part], rig: Rig) -> MeshData:
-    """With the box that holds all of it, however it moves."""
-    _check(path, parts)
-    corners = []
-    for number, time_s in enumerate(rig.times_s()):
-        progress.tell(f"{path.name}: places", number)
-        with np.errstate(all="ignore"):  # what overflows is refused by its box
-            for shape, matrix in rig.posed([part.shape for part in parts], time_s):
-                points = shape.positions_m @ matrix[:3, :3].T + matrix[:3, 3]
-                corners += [points.min(0), points.max(0)]
-    if not (np.abs(corners) <= LARGEST_COORDINATE).all():  # nor NaN
-        raise InputError(path, "nodes", f"place vertices beyond {LARGEST_COORDINATE:g}")
-    return MeshData(tuple(parts), rig, np.min(corners, axis=0), np.max(corners, axis=0))
-
-
 def _check_counts(path: Path, data: bytes) -> None:
     """What a file promises, before its loader takes memory for it. Raises InputError."""
     suffix, promised = path.suffix.lower(), 0
@@ -118,11 +106,17 @@ def _check_counts(path: Path, data: bytes) -> None:
     untrusted_input.within(promised, LIMITS.triangles, source=path, field="faces")
 
 
-def _loaded(path: Path, data: bytes) -> list[Any]:
-    """Every trimesh of a file that has faces. Raises InputError."""
+def _loaded(path: Path, data: bytes) -> list[tuple[Any, F64]]:
+    """Every trimesh of a file that has faces, and 4x4 scene_from_mesh. Raises InputError."""
     import trimesh
 
     kind = path.suffix.lower().removeprefix(".")
+
+    @cache
+    def beside(name: str) -> bytes:
+        field = "uri" if path.suffix.lower() in GLTF else "texture"
+        place = file_of(name, source=path, field=field)
+        return untrusted_input.read_bytes(place, most_bytes=LIMITS.file_bytes, source=path, field=field)
 
     class Beside(trimesh.resolvers.FilePathResolver):
         """What a loader reads beside a file: it passes over what it does not get, so that this keeps why."""
@@ -133,9 +127,8 @@ def _loaded(path: Path, data: bytes) -> list[Any]:
 
         def get(self, name: str) -> bytes:
             try:
-                beside = file_of(name, source=path, field="texture")
-                found = untrusted_input.read_bytes(beside, most_bytes=LIMITS.file_bytes, source=path, field="texture")
-                if not name.lower().endswith(".mtl"):
+                found = beside(name)
+                if path.suffix.lower() not in GLTF and not name.lower().endswith(".mtl"):
                     image = decoded_picture(found, source=path, field="texture", name=untrusted_input.shown(name))
                     self.pixels += image.width * image.height
                     untrusted_input.within(self.pixels, LIMITS.texture_pixels, source=path, field="textures' pixels")
@@ -148,43 +141,49 @@ def _loaded(path: Path, data: bytes) -> list[Any]:
                 raise
             return found
 
+    if path.suffix.lower() in GLTF:
+        check_gltf(path, data, beside)
     progress.tell(f"{path.name}: triangles", 0)
     resolver = Beside(str(path))
     # Of an OBJ only names and comments can be other than ASCII, and exporters differ in how they write them.
     file = io.StringIO(data.decode("utf-8", errors="replace")) if kind == "obj" else io.BytesIO(data)
     try:
-        geometries: list[Any] = list(trimesh.load_scene(file, file_type=kind, resolver=resolver, process=False).dump())
+        scene = trimesh.load_scene(file, file_type=kind, resolver=resolver, process=False)
+        placed = [(scene.geometry[name], matrix) for matrix, name in map(scene.graph.get, scene.graph.nodes_geometry)]
     except Exception as error:  # loaders raise whatever their parsers do
+        if resolver.refused is not None:
+            raise resolver.refused from None
         problem = one_line(str(error), most=120)
         raise InputError(path, "", f"cannot be read as a mesh ({type(error).__name__}: {problem})") from None
     if resolver.refused is not None:
         raise resolver.refused
-    meshes = [item for item in geometries if getattr(item, "faces", None) is not None and len(item.faces)]
-    for mesh in meshes:
+    placed = [(mesh, matrix) for mesh, matrix in placed if len(getattr(mesh, "faces", ()))]
+    for mesh, _ in placed:
         if mesh.visual.kind == "texture" and not resolver.has_materials:  # it has the loader's own then
             mesh.visual = trimesh.visual.ColorVisuals(mesh)
-    return meshes
+    return placed
 
 
-def _part(mesh: Any, path: Path, pictures: dict[int, U8]) -> Part:
-    """Of a trimesh: its texture alone, as other viewers show it, or colours of its faces or vertices, or grey."""
+def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8]) -> Part:
+    """Of a trimesh: its material, and colours of its faces or vertices; grey where it has none of them."""
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(path, "faces", "are no triangles of vertices that are there")
     normals = np.asarray(mesh.vertex_normals)
     visual, kind = mesh.visual, mesh.visual.kind
-    picture, colour, colours = None, (1.0, 1.0, 1.0), None
+    picture, colour, colours = None, WHITE, None
     uv: Any
     if kind == "texture":
         picture, colour = _material(visual.material, pictures)
+        colours = visual.vertex_attributes.get("color")
         if path.suffix.lower() == ".ply":  # which has no materials; the loader's own is grey
-            colour = (1.0, 1.0, 1.0)
+            colour = WHITE
     elif kind == "vertex":
         colours = visual.vertex_colors
     elif kind == "face":
         colours, normals = np.repeat(visual.face_colors, 3, axis=0), np.repeat(mesh.face_normals, 3, axis=0)
         vertices, faces = vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3)
-    else:
+    elif path.suffix.lower() not in GLTF:  # which is white where it says nothing
         colour = UNCOLOURED
     if picture is None or visual.uv is None:
         picture, uv = None, np.zeros((len(vertices), 2))
@@ -192,15 +191,19 @@ def _part(mesh: Any, path: Path, pictures: dict[int, U8]) -> Part:
         uv = np.column_stack([visual.uv[:, 0], 1.0 - visual.uv[:, 1]])
     if not np.isfinite(uv).all():
         raise InputError(path, "texture coordinates", "are not all finite")
+    vertices, normals = vertices @ matrix[:3, :3].T + matrix[:3, 3], normals @ np.linalg.pinv(matrix[:3, :3])
+    normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    if np.linalg.det(matrix[:3, :3]) < 0:
+        faces = faces[:, ::-1]
     positions, normals, uv = (array.astype(np.float32) for array in (vertices, normals, uv))
     shape = Shape(positions, normals, uv, faces.astype(np.int32))
     return Part(shape, picture=picture, colour=colour, vertex_colours=None if colours is None else _unit(colours))
 
 
 def _unit(colours: Any) -> F32:
-    """(n, 3) colours of either type as floats in [0, 1]."""
+    """(n, 3) colours, integers or fractions, as floats in [0, 1]."""
     numbers = np.asarray(colours)[..., :3]
-    scale = np.float32(255.0 if numbers.dtype == np.uint8 else 1.0)
+    scale = np.float32(np.iinfo(numbers.dtype).max if numbers.dtype.kind == "u" else 1.0)
     return np.asarray(np.clip(numbers.astype(np.float32) / scale, 0.0, 1.0), dtype=np.float32)
 
 
@@ -209,35 +212,18 @@ def _material(material: Any, pictures: dict[int, U8]) -> tuple[U8 | None, tuple[
 
     A texture's colour is white where it says black: exporters write so who mean the texture alone.
     """
-    image, factor = getattr(material, "image", None), getattr(material, "diffuse", None)
+    is_gltf = hasattr(material, "baseColorTexture")
+    if is_gltf:
+        image, factor = material.baseColorTexture, material.baseColorFactor
+    else:
+        image, factor = getattr(material, "image", None), getattr(material, "diffuse", None)
     red, green, blue = _unit(np.ones(3) if factor is None else factor).tolist()
     if image is None:
-        return None, UNCOLOURED if factor is None else (red, green, blue)
-    if id(image) not in pictures:
-        pictures[id(image)] = texture_of(image)
-    return pictures[id(image)], (red, green, blue) if red or green or blue else (1.0, 1.0, 1.0)
-
-
-class MeshSource(TriangleSource):
-    """A loaded mesh at its place in the stack frame, and moving where its file says so."""
-
-    def __init__(
-        self, parts: Sequence[DrawnPart], stack_from_scene: F64, *, context: Any, info: ContentInfo, rig: Rig
-    ) -> None:
-        self._stack_from_scene, self._rig = stack_from_scene, rig
-        self._at_rest = [part.part.shape for part in parts]
-        self._posed_for: float | None = None
-        super().__init__(parts, [stack_from_scene] * len(parts), context=context, info=info)
-
-    def places(self, time_ns: int) -> Sequence[F64]:
-        """Deforms the parts that bend, too."""
-        period_ns = round(self._rig.duration_s * NS_PER_S)
-        time_s = time_ns % period_ns / NS_PER_S if period_ns else 0.0
-        if time_s != self._posed_for:
-            placed = self._rig.posed(self._at_rest, time_s)
-            for part, at_rest, (shape, _) in zip(self.parts, self._at_rest, placed, strict=True):
-                if shape is not at_rest:
-                    part.deform(shape)
-            self.stack_from_parts = [self._stack_from_scene @ matrix for _, matrix in placed]
-            self._posed_for = time_s
-        return self.stack_from_parts
+        return None, UNCOLOURED if factor is None and not is_gltf else (red, green, blue)
+    if id(material) not in pictures:
+        image = image.convert("RGBA")
+        image.thumbnail((LARGEST_TEXTURE_PX, LARGEST_TEXTURE_PX))
+        rgba = pictures[id(material)] = np.array(image)
+        if is_gltf:
+            cut_alpha(rgba, material)
+    return pictures[id(material)], (red, green, blue) if red or green or blue else WHITE

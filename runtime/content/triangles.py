@@ -148,14 +148,6 @@ class DrawnPart:
         layout = _layout(outline_program, self._outline_buffer, ("in_clip", "in_coverage", *names), (4, 1, 3, 2, 3))
         self._outline = context.vertex_array(outline_program, [layout])
 
-    def deform(self, shape: Shape) -> None:
-        """Another shape: the same triangles, their vertices elsewhere."""
-        self.vertices[:, :3], self.vertices[:, 3:6] = shape.positions_m, shape.normals
-        self._buffer.write(self.vertices)
-        if self.edges is not None:
-            self.edges = self.edges.moved(shape)
-        self.corners_m = camera.box_corners(shape.positions_m.min(0), shape.positions_m.max(0))
-
     def draw_outline(self, corners: F32, vertices: I32) -> None:
         """Ramps (k, 6, 5) along its outline, each corner with the attributes of a vertex (k, 6)."""
         packed = np.concatenate([corners.reshape(-1, 5), self.vertices[vertices.reshape(-1), 3:]], axis=1)

@@ -32,7 +32,6 @@ class Limits:
     triangles: int = 2_000_000  # of a mesh, all instances together
     splats: int = 3_000_000
     instances: int = 2000  # times that meshes stand in a glTF scene
-    nodes: int = 5000  # of a glTF scene that moves, bones among them
     depth: int = 64  # how deep JSON or a glTF scene may nest
     load_s: float = 120.0  # loading of one piece of content is given up after this
     start_s: float = 600.0  # a start is given up where content and model are not ready after this

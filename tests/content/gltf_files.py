@@ -1,4 +1,4 @@
-"""glTF files written by hand: one buffer, what the tests say of nodes, skins and animations."""
+"""glTF files written by hand: arrays in one buffer, and what the tests say of them."""
 
 from __future__ import annotations
 
@@ -53,49 +53,3 @@ class Buffer:
 
 SQUARE = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]
 SQUARE_FACES = [0, 1, 2, 0, 2, 3]
-
-
-def moving_square(path: Path, *, kind: str = "LINEAR") -> Path:
-    """A square that goes from x = -3 to x = 3 in two seconds."""
-    b = Buffer()
-    primitive = {"attributes": {"POSITION": b.add(SQUARE)}, "indices": b.add(SQUARE_FACES, np.uint16)}
-    keys = [[-3, 0, 0], [3, 0, 0]]
-    if kind == "CUBICSPLINE":
-        keys = [[0, 0, 0], [-3, 0, 0], [0, 0, 0], [0, 0, 0], [3, 0, 0], [0, 0, 0]]
-    sampler = {"input": b.add([0.0, 2.0]), "output": b.add(keys), "interpolation": kind}
-    channel = {"sampler": 0, "target": {"node": 0, "path": "translation"}}
-    return b.write(path, primitive, animations=[{"name": "slide", "samplers": [sampler], "channels": [channel]}])
-
-
-def bending_bar(path: Path) -> Path:
-    """A bar along y from 0 to 4, of two bones; the upper one turns by 90 degrees about z in a second."""
-    b = Buffer()
-    heights = np.arange(0, 4.01, 0.5)
-    points = np.array([[x, y, 0.0] for y in heights for x in (-0.3, 0.3)])
-    faces = [[i, i + 1, i + 2, i + 1, i + 3, i + 2] for i in range(0, len(points) - 2, 2)]
-    upper = np.clip(points[:, 1] - 1.5, 0, 1)
-    weights = np.column_stack([1 - upper, upper, np.zeros((len(points), 2))])
-    joints = np.tile([0, 1, 0, 0], (len(points), 1))
-    down = np.eye(4)
-    down[1, 3] = -2.0
-    attributes = {
-        "POSITION": b.add(points),
-        "JOINTS_0": b.add(joints, np.uint8),
-        "WEIGHTS_0": b.add(weights),
-    }
-    primitive = {"attributes": attributes, "indices": b.add(np.concatenate(faces), np.uint16)}
-    bound = b.add([np.eye(4).T.ravel(), down.T.ravel()])
-    half = np.sqrt(0.5)
-    sampler = {"input": b.add([0.0, 1.0]), "output": b.add([[0, 0, 0, 1], [0, 0, half, half]])}
-    return b.write(
-        path,
-        primitive,
-        scenes=[{"nodes": [0, 1]}],
-        nodes=[
-            {"mesh": 0, "skin": 0, "translation": [50, 50, 50]},  # which a skin leaves out
-            {"children": [2]},
-            {"translation": [0, 2, 0]},
-        ],
-        skins=[{"joints": [1, 2], "inverseBindMatrices": bound}],
-        animations=[{"samplers": [sampler], "channels": [{"sampler": 0, "target": {"node": 2, "path": "rotation"}}]}],
-    )

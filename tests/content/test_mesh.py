@@ -12,8 +12,9 @@ from PIL import Image
 
 from runtime.config import ContentSettings
 from runtime.content.camera import project
-from runtime.content.mesh import MeshSource, load_mesh, prepare
+from runtime.content.mesh import load_mesh, prepare
 from runtime.content.placing import SceneFile, guessed_axes
+from runtime.content.triangles import TriangleSource
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.support.untrusted_input import LIMITS
@@ -22,7 +23,7 @@ from tests.content.conftest import panel_view
 EYE = (0.7, 0.05, 0.1)
 
 
-def source_of(path: Path, context: Any, stack: PanelStack, **settings: Any) -> MeshSource:
+def source_of(path: Path, context: Any, stack: PanelStack, **settings: Any) -> TriangleSource:
     return prepare(SceneFile(path, ContentSettings(**settings), stack))(context)
 
 
@@ -88,7 +89,7 @@ def test_a_vertex_lands_where_the_projection_says(tmp_path: Path, context: Any, 
     assert np.hypot(columns[farthest] + 0.5 - expected[0], rows[farthest] + 0.5 - expected[1]) < 2.5
 
 
-def depth_of(source: MeshSource) -> tuple[float, float]:
+def depth_of(source: TriangleSource) -> tuple[float, float]:
     """Its rearmost and its foremost vertex, metres along x."""
     (part,), (matrix,) = source.parts, source.stack_from_parts
     x_m = part.positions @ matrix[0, :3] + matrix[0, 3]

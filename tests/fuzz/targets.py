@@ -46,7 +46,6 @@ from runtime.sensor.recording import RecordingWriter
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.sensor.replay import ReplayDriver
 from runtime.support.untrusted_input import parsed_json
-from tests.content.gltf_files import bending_bar, moving_square
 from tests.content.test_hostile import PNG_URI, gltf, textured
 from tests.panels.edids import block
 from tests.sensor.fake_usb import encode
@@ -235,17 +234,9 @@ def gltfs() -> list[bytes]:
     return [json.dumps(gltf()).encode(), json.dumps(textured(0, [{"source": 0}], [{"uri": PNG_URI}])).encode()]
 
 
-def rigs() -> list[bytes]:
-    """Nodes that move, bones."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "a.gltf"
-        return [make(path).read_bytes() for make in (moving_square, bending_bar)]
-
-
 def mesh(path: Path) -> object:
-    """Loaded, its outlines looked for, and posed at a time that no key has."""
-    data = load_mesh(path)
-    return [DrawnPart(part) for part in data.parts], data.rig.posed([part.shape for part in data.parts], 0.377)
+    """Loaded, and its outlines looked for."""
+    return [DrawnPart(part) for part in load_mesh(path).parts]
 
 
 def splats() -> list[bytes]:
@@ -318,7 +309,6 @@ TARGETS: dict[str, Target] = {
     "glb": Target(lambda: [box("glb"), box("glb", texture=True)], file("a.glb", mesh)),
     "obj": Target(lambda: [box("obj")], file("a.obj", mesh)),
     "ply": Target(lambda: [box("ply", encoding=form) for form in ("binary", "ascii")], file("a.ply", mesh)),
-    "rig": Target(rigs, file("a.gltf", mesh)),
     "stl": Target(lambda: [box("stl"), box("stl_ascii")], file("a.stl", mesh)),
     "splat": Target(splats, file("a.ply", lambda path: load_gaussians(read_header(path)))),
     "playlist": Target(
