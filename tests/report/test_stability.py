@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from runtime.commands.stability import stability
 from runtime.errors import InputError
-from runtime.report.stability import poses, suite
+from runtime.report.stability import optics, suite
 from runtime.report.stability.trial import Answer, Case, Trial, refusal, settle
 
 FIELDS = {"name", "stage", "condition", "forward_error", "backward_error", "behaviour", "tolerance", "passed"}
@@ -53,23 +53,20 @@ def test_the_long_cases_pass_too(tmp_path: Path) -> None:
     assert done.exit_code == 0
 
 
-STAGES = {
-    "eye pose", "RPU", "phase", "Jones optics", "retina", "solve", "network", "tracker", "calibration",
-    "unsure eyes",
-}  # fmt: skip
+STAGES = {"eye pose", "RPU", "phase", "Jones optics", "solve", "network", "tracker", "calibration"}
 
 
 def test_a_failing_case_makes_the_command_exit_with_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A pose that is wrong by a millionth: the command, on the poses alone, with one defect put into the optics."""
-    real = poses.stack_from_eye
+    real = optics.stack_from_eye
 
     def bent(eye: ArrayLike) -> np.ndarray:
         pose = real(eye)
         pose[0, 0] += 1e-6
         return pose
 
-    monkeypatch.setattr(poses, "stack_from_eye", bent)
-    monkeypatch.setattr(suite, "every_trial", lambda fits, full: poses.trials())
+    monkeypatch.setattr(optics, "stack_from_eye", bent)
+    monkeypatch.setattr(suite, "every_trial", lambda fits, full: optics.trials())
     done = command("--out", str(tmp_path))
     assert done.exit_code == 1
     assert "FAILS eye pose" in done.output
@@ -110,16 +107,6 @@ def test_a_case_is_held_to_what_was_recorded_and_five_per_cent() -> None:
     assert not without.passed and "no limit is recorded" in without.note
 
 
-def answer(forward: float, tolerance: float = 1e-9, *, warned: bool = False) -> Trial:
-    return Trial("stage", "name", lambda: Answer(forward, tolerance, warned=warned))
-
-
-def test_an_unexpected_warning_fails_and_an_expected_one_passes() -> None:
-    warned = Trial("stage", "name", lambda: Answer(0.0, 1.0, warned=True), expected="warns")
-    assert not settle(answer(0.0, warned=True)).passed
-    assert settle(warned).passed and settle(warned).behaviour == "warns"
-
-
 def test_only_the_codes_own_errors_count_as_a_refusal() -> None:
     def refuses() -> None:
         raise InputError("file", "field", "is wrong")
@@ -137,6 +124,6 @@ def test_only_the_codes_own_errors_count_as_a_refusal() -> None:
 def test_every_case_states_what_the_design_asks_for(record: tuple[dict, Path]) -> None:
     for case in record[0]["cases"]:
         assert case.keys() >= FIELDS
-        assert case["behaviour"] in {"answers", "warns", "refuses"}
+        assert case["behaviour"] in {"answers", "refuses"}
         if case["behaviour"] != "refuses":
             assert case["forward_error"] <= case["tolerance"]

@@ -2,33 +2,26 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
-from typing import Any
 
 import numpy as np
 
 from runtime.config import ModelSettings
 from runtime.evaluation.displayed import displayed
-from runtime.model.chain import chain_modes
 from runtime.model.predictor import Predictor, load_predictor
-from runtime.model.session import ModelSession
 from runtime.model.still import solve_still
-from runtime.model.targets import FULL
-from runtime.model.unrolled import UnrolledPredictor
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8
 from runtime.report.pairs import eyes_at
 from runtime.report.stability.solve import Method, Problem
 from runtime.report.stability.trial import Answer, Trial, refusal
 
-STAGE, UNSURE = "network", "unsure eyes"
+STAGE = "network"
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 192, 108)
 FOV_DEG = 40.0
 MODELS = ("fast", "balanced", "best")
-ROWS, PANEL_CODE = 8, 1 / 255
 FLOOR = 0.0005  # an eighth of a code: what another processor's rounding may move
 
 
@@ -82,53 +75,6 @@ def stressed(model: str, images: Sequence[U8], eyes_m: F64, stack: PanelStack = 
     return Answer(10 ** (-seen.quality.psnr_db / 20), 1.0)
 
 
-def session_of(model: str) -> ModelSession:
-    """A shipped model's network."""
-    predictor = ready(model, STACK)
-    assert isinstance(predictor, UnrolledPredictor)
-    return predictor.session
-
-
-def answer_of(model: str, need: F64, doubt: tuple[float, float, float]) -> F64:
-    """(2, rows, columns) rear and front for what the right eye lacks (rows, columns), the left one the opposite."""
-    session = session_of(model)
-    columns = 2 * session.contract.cell_px
-    cells = need.shape[1] // columns
-    codes = np.rint(need * FULL).astype(np.int16).reshape(ROWS, cells, columns)
-    modes: Mapping[str, Any] = dict(
-        zip(("waves", "shifted_waves", "spectrum", "modes_in"), chain_modes(cells), strict=True)
-    )
-    shape = (ROWS, cells + 1, columns)
-    feeds = {"left": -codes, "right": codes, **modes, "doubt": np.array(doubt, np.float32)}
-    found = session.run(feeds, {"rear": shape, "front": shape, "check": (1,)})
-    return np.stack([found[name].reshape(ROWS, -1) for name in ("rear", "front")]) / FULL
-
-
-def unsure(model: str, sigma_columns: float) -> Answer:
-    """One wave, even along rows and within cells, against its own least squares.
-
-    Even in every cell, the centre's parallax nothing: g = s/(s² + 8(1 - m²)cos(2ws)-terms + floor)·2·need per mode of
-    the chain (the network's docstring). What an even pattern has of doubt is its mode's own frequency; the floor is
-    bounded, not known: the answer must lie between none and a hundredth.
-    """
-    cell = session_of(model).contract.cell_px
-    cells, k = 12, 3
-    angle = np.pi * k / (cells + 1)
-    along = np.repeat(np.sin(angle * np.arange(1, cells + 1)), 2 * cell) * 0.05
-    need = np.tile(along, (ROWS, 1))
-    rear, front = answer_of(model, need, (sigma_columns, 0.0, 0.0))
-    s2 = (4 * np.sin(angle / 2)) ** 2
-    m2 = np.exp(-((sigma_columns * angle / (2 * cell)) ** 2))
-    noise = 8 * (1 - m2) + 8 * (1 - s2 / 8) * (m2 - m2 * m2)
-    at = np.repeat(np.cos(angle * (np.arange(cells + 1) + 0.5)), 2 * cell)
-    found = float((front - rear).mean(axis=0) @ at / (at @ at) / 2)
-    wanted = [-2 * 0.05 * math.sqrt(m2 * s2) / (m2 * s2 + noise + floor) for floor in (0.0, 0.05)]
-    off = max(min(wanted) - found, found - max(wanted), 0.0)
-    return Answer(
-        off, PANEL_CODE, 1 / (m2 * s2 + noise + 1e-3), note=f"{found:.4f}, between {wanted[0]:.4f} and {wanted[1]:.4f}"
-    )
-
-
 def smooth(stack: PanelStack) -> list[U8]:
     """(h, w, 3) for each eye: an ordinary picture and its like, a little aside."""
     y, x = np.mgrid[0 : stack.height_px, 0 : stack.width_px]
@@ -141,7 +87,7 @@ def solver(model: str) -> Method:
     """A model as a method of the solve stage, on 8-bit pictures."""
 
     def solve(problem: Problem) -> F32:
-        images = [np.rint(image * 255).astype(np.uint8) for image in problem.wanted]
+        images = [np.rint(image * 255).astype(np.uint8) for image in problem.pictures]
         predictor = ready(model, problem.stack)
         done = solve_still(*images, eyes_m=problem.eyes_m, fov_deg=problem.fov_deg, predictor=predictor)
         return done.layers[..., :3].astype(np.float32) / np.float32(255)
@@ -162,9 +108,6 @@ def trials(*, full: bool = False) -> Iterator[Trial]:
                 yield Trial(STAGE, f"{model}: {kind}{place}", run, measure="intensity", floor=FLOOR)
         if full or model == "balanced":
             yield from _poses(model, full=full)
-        for columns in (0.0, 0.01, 0.13, 1.0, 6.0, 100.0):
-            run = partial(unsure, model, columns)
-            yield Trial(UNSURE, f"{model}: a wave, doubt of {columns:g} columns", run, measure="phase")
     aside = eyes_at(distance_m=3.0, angle_deg=85.0)
     nothing = partial(stressed, "balanced", smooth(STACK), aside)
     yield refusal(STAGE, "85 degrees aside: no ray crosses all panels", nothing)

@@ -1,10 +1,9 @@
 """How stiff the two-eye problem is, and what each method makes of it.
 
 The stiff part is the lowest frequency of the difference between the eyes: one cycle across the panels, which the
-outer panels must carry by their parallax. Its eigenvalue is 3 - |1 + exp(2iks_0) + exp(2iks_2)|. What is wanted has
-that wave, finer ones, and a common part that any panel can show. What a method's panels show is told by rays of 50
-digits, and how good it could be by the exact least squares within the box (scipy): neither shares anything with the
-methods.
+outer panels must carry by their parallax. Its eigenvalue is 3 - |1 + exp(2iks_0) + exp(2iks_2)|. The target has
+that wave, finer ones, and a common part that any panel can show. What a method's panels show is traced here, ray by
+ray, and how good it could be is the exact least squares within the bounds (scipy): neither shares code with them.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ from scipy.sparse import csr_matrix
 
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64
-from runtime.report.stability import exact
 from runtime.report.stability.trial import Answer, Trial
 
 STAGE = "solve"
@@ -40,7 +38,7 @@ def waves(parts: Sequence[tuple[int, float]]) -> F64:
 
 
 class Problem:
-    """Two eyes that want a common picture and a difference between them, in grey."""
+    """Two eyes whose targets are a common picture and a difference between them, in grey."""
 
     def __init__(self, *, gap_m: float, ipd_m: float, distance_m: float) -> None:
         self.stack = PanelStack(WIDTH_M, HEIGHT_M, (-gap_m, 0.0, gap_m), WIDTH_PX, HEIGHT_PX)
@@ -49,7 +47,7 @@ class Problem:
         self.fov_deg = math.degrees(2 * math.atan(WIDTH_M / 2 / self.distance_m))
         difference, common = waves([(1, AMPLITUDE), *FINER]), waves(COMMON)
         self.targets = [1.5 + common + sign * difference / 2 for sign in (-1, 1)]  # phase of each column
-        self.wanted: list[F32] = [
+        self.pictures: list[F32] = [
             np.broadcast_to(
                 np.sin(np.pi / 2 * target).astype(np.float32)[None, :, None] ** 2, (HEIGHT_PX, WIDTH_PX, 3)
             ).copy()
@@ -57,17 +55,16 @@ class Problem:
         ]
 
     def condition(self) -> float:
-        """Largest over smallest eigenvalue for that wave; the smallest would lose digits in doubles."""
-        k = 2 * exact.mp.pi / exact.mpf(WIDTH_M)
+        """Largest over smallest eigenvalue for that wave."""
         parallaxes_m = [self.ipd_m / 2 * x_m / (self.distance_m - x_m) for x_m in (-self.gap_m, self.gap_m)]
-        c = 1 + sum(exact.mp.exp(2j * k * exact.mpf(parallax_m)) for parallax_m in parallaxes_m)
+        c = 1 + sum(np.exp(4j * np.pi / WIDTH_M * parallax_m) for parallax_m in parallaxes_m)
         return float((3 + abs(c)) / (3 - abs(c)))
 
-    def left_over(self, layers: F32) -> float:
-        """RMS of what is missing of the wanted phases over both eyes, relative to how they vary: 1 for flat grey."""
+    def residual(self, layers: F32) -> float:
+        """RMS residual of the target phases over both eyes, relative to how they vary: 1 for mid-grey."""
         flat = np.asarray(layers, np.float64).mean(axis=-1).reshape(self.stack.count * HEIGHT_PX * WIDTH_PX)
         missing, whole = 0.0, 0.0
-        for side, (matrix, columns) in enumerate(exact_operator(*self.geometry)):
+        for side, (matrix, columns) in enumerate(traced(*self.geometry)):
             target = self.targets[side][columns]
             missing += float(((matrix @ flat - target) ** 2).sum())
             whole += float(((target - 1.5) ** 2).sum())
@@ -75,64 +72,52 @@ class Problem:
 
 
 @lru_cache(maxsize=64)
-def exact_operator(gap_m: float, ipd_m: float, distance_m: float) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
-    """Each eye's rays that cross every panel, by 50 digits: (rays, N·h·w) bilinear weights, and their columns."""
-    fov_deg = math.degrees(2 * math.atan(WIDTH_M / 2 / distance_m))
-    stack = PanelStack(WIDTH_M, HEIGHT_M, (-gap_m, 0.0, gap_m), WIDTH_PX, HEIGHT_PX)
-    half, found = exact.mpf("0.5"), []
+def traced(gap_m: float, ipd_m: float, distance_m: float) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
+    """Each eye's rays that cross every panel: (rays, N·h·w) bilinear weights, and the columns of its picture."""
+    focal, found = WIDTH_PX * distance_m / WIDTH_M, []
+    v, u = np.mgrid[0:HEIGHT_PX, 0:WIDTH_PX] + 0.5
     for sign in (-1, 1):
-        eye = exact.vector([distance_m, sign * ipd_m / 2, 0.0])
-        upper: list[list[tuple[int, dict[int, float]]]] = []
-        for v in range(HEIGHT_PX // 2):  # the eyes are level with the middle: the lower half mirrors the upper
-            upper.append([])
-            for u in range(WIDTH_PX):
-                ray = exact.ray(eye, u + half, v + half, width_px=WIDTH_PX, height_px=HEIGHT_PX, fov_deg=fov_deg)
-                weights: dict[int, float] = {}
-                for number in range(3):
-                    x, y = exact.on_panel(eye, ray, stack, number)
-                    if not (half < x < WIDTH_PX - half and half < y < HEIGHT_PX - half):
-                        break
-                    left, top = int(exact.mp.floor(x - half)), int(exact.mp.floor(y - half))
-                    fx, fy = x - half - left, y - half - top
-                    for row, wy in ((top, 1 - fy), (top + 1, fy)):
-                        for column, wx in ((left, 1 - fx), (left + 1, fx)):
-                            if wx * wy:
-                                weights[(number * HEIGHT_PX + row) * WIDTH_PX + column] = float(wx * wy)
-                else:
-                    upper[-1].append((u, weights))
-        lower = [[(u, {_mirrored(i): w for i, w in row.items()}) for u, row in line] for line in reversed(upper)]
-        columns = [u for line in upper + lower for u, _ in line]
-        rows = [row for line in upper + lower for _, row in line]
-        lengths = np.cumsum([0, *(len(row) for row in rows)])
-        data = np.array([w for row in rows for w in row.values()])
-        indices = np.array([i for row in rows for i in row])
-        found.append((csr_matrix((data, indices, lengths), shape=(len(rows), 3 * HEIGHT_PX * WIDTH_PX)), columns))
+        eye = np.array([distance_m, sign * ipd_m / 2])
+        back = eye / np.hypot(*eye)
+        across = (u - WIDTH_PX / 2) / focal
+        x, y = -back[0] - across * back[1], -back[1] + across * back[0]  # the rays' directions; z is up
+        z = -(v - HEIGHT_PX / 2) / focal
+        weights, indices, inside = [], [], np.ones(u.shape, bool)
+        for number, x_m in enumerate((-gap_m, 0.0, gap_m)):
+            t = (x_m - eye[0]) / x
+            column = ((eye[1] + t * y) / WIDTH_M + 0.5) * WIDTH_PX - 0.5
+            row = (0.5 - t * z / HEIGHT_M) * HEIGHT_PX - 0.5
+            inside &= (column > 0) & (column < WIDTH_PX - 1) & (row > 0) & (row < HEIGHT_PX - 1)
+            left, top = np.floor(column), np.floor(row)
+            for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
+                share = np.abs(1 - down - (row - top)) * np.abs(1 - right - (column - left))
+                weights.append(share)
+                indices.append((number * HEIGHT_PX + top + down) * WIDTH_PX + left + right)
+        data, places = (np.stack(parts)[:, inside].T for parts in (weights, indices))
+        rays = np.arange(0, data.size + 1, data.shape[1])
+        matrix = csr_matrix(
+            (data.ravel(), places.ravel().astype(int), rays), shape=(len(data), 3 * HEIGHT_PX * WIDTH_PX)
+        )
+        found.append((matrix, np.broadcast_to(np.arange(WIDTH_PX), u.shape)[inside]))
     return found[0], found[1]
-
-
-def _mirrored(index: int) -> int:
-    """The pixel that is as far below the middle of its panel as another is above it."""
-    panel, row, column = index // (HEIGHT_PX * WIDTH_PX), index // WIDTH_PX % HEIGHT_PX, index % WIDTH_PX
-    return (panel * HEIGHT_PX + HEIGHT_PX - 1 - row) * WIDTH_PX + column
 
 
 @lru_cache(maxsize=64)
 def optimum(gap_m: float, ipd_m: float, distance_m: float) -> float:
-    """What is left of it at least, by any values from 0 to 1 that are the same in every row, as the wanted are."""
+    """The least residual of any values from 0 to 1 that are the same in every row, as the targets are."""
     problem = Problem(gap_m=gap_m, ipd_m=ipd_m, distance_m=distance_m - gap_m)
-    parts = exact_operator(gap_m, ipd_m, distance_m)
-    half = [len(columns) // 2 for _, columns in parts]  # the other half is its mirror image, and wants the same
-    targets = np.concatenate([problem.targets[side][parts[side][1][: half[side]]] for side in (0, 1)])
-    rows = np.vstack([parts[side][0].toarray()[: half[side]] for side in (0, 1)])
+    parts = traced(gap_m, ipd_m, distance_m)
+    targets = np.concatenate([problem.targets[side][parts[side][1]] for side in (0, 1)])
+    rows = np.vstack([matrix.toarray() for matrix, _ in parts])
     same_rows = rows.reshape(len(rows), 3, HEIGHT_PX, WIDTH_PX).sum(axis=2).reshape(len(rows), -1)
     best = lsq_linear(same_rows, targets, bounds=(0, 1), tol=1e-9)
     return math.sqrt(2 * best.cost / float(((targets - 1.5) ** 2).sum()))
 
 
 def converges(method: Method, gap_m: float, ipd_m: float, distance_m: float) -> Answer:
-    """What a method leaves of what is wanted, against the least that any panel values leave."""
+    """A method's residual against the least that any panel values leave."""
     problem = Problem(gap_m=gap_m, ipd_m=ipd_m, distance_m=distance_m)
-    left, least = problem.left_over(method(problem)), optimum(*problem.geometry)
+    left, least = problem.residual(method(problem)), optimum(*problem.geometry)
     note = f"no panel values leave less than {least:.3g}"
     if left < 0.98 * least - FLOOR:
         return Answer(math.nan, 1.0, problem.condition(), note=f"{left:.3g} is impossible: {note}")

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
-from runtime.report.stability import calibration, networks, phases, poses, retina, rpu, solve, tracking
+from runtime.report.stability import calibration, networks, optics, solve, tracking
 from runtime.report.stability.calibration import Fit
 from runtime.report.stability.trial import Case, Trial, settle
 from runtime.support.artifacts import write_text
@@ -24,10 +24,7 @@ SOLVERS = (*networks.MODELS, "sart")
 
 def every_trial(fits: Mapping[str, Fit], *, full: bool) -> Iterator[Trial]:
     """What there is to try. `fits` are the calibration's solvers by rule."""
-    yield from poses.trials()
-    yield from rpu.trials()
-    yield from phases.trials()
-    yield from retina.trials()
+    yield from optics.trials()
     yield from solve.trials({name: networks.solver(name) for name in SOLVERS})
     yield from networks.trials(full=full)
     yield from tracking.trials(full=full)

@@ -9,9 +9,8 @@ from typing import Literal
 
 from runtime.errors import PhasestackError
 
-Behaviour = Literal["answers", "warns", "refuses"]
+Behaviour = Literal["answers", "refuses"]
 EPS64 = 2.0**-52
-EPS32 = 2.0**-23
 WORSE = 1.05  # than recorded a case may be at most
 
 
@@ -23,7 +22,6 @@ class Answer:
     tolerance: float  # largest forward error that passes, stated before the trial is run
     condition: float = 1.0  # how much the problem itself enlarges a relative error of its input
     backward_error: float | None = None  # relative change of the input that explains the result; None: the forward one
-    warned: bool = False
     note: str = ""
 
 
@@ -89,17 +87,16 @@ def settle(trial: Trial, *, limit: float | None = None) -> Case:
         return _unanswered(trial, "answers", "it answered where no answer exists")
     if trial.floor is not None:
         answer = _held_to(answer, limit, trial.floor)
-    behaviour: Behaviour = "warns" if answer.warned else "answers"
     return Case(
         name=trial.name,
         stage=trial.stage,
         condition=answer.condition,
         forward_error=answer.forward_error,
         backward_error=answer.forward_error if answer.backward_error is None else answer.backward_error,
-        behaviour=behaviour,
+        behaviour="answers",
         tolerance=answer.tolerance,
         # A NaN compares false with everything: it fails.
-        passed=behaviour == trial.expected and answer.forward_error <= answer.tolerance,
+        passed=trial.expected == "answers" and answer.forward_error <= answer.tolerance,
         measure=trial.measure,
         note=answer.note,
     )
