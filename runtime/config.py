@@ -125,9 +125,7 @@ class StackGeometry(Section):
 class SensorSettings(Section):
     """Which depth sensor delivers eye positions or images."""
 
-    driver: str = Field(
-        "replay", description="replay, openni2, usb-camera, usb-eyes, fixed, or a class of yours: `module:Class`"
-    )
+    driver: str = Field("replay", description="replay, openni2, usb-camera, fixed, or a class of yours: `module:Class`")
     source: str = Field("demo", description="what to open: a recording, `demo`, a serial number, a device URI")
     timeout_s: Annotated[float, within(0.001, 600.0, "s")] = Field(
         0.5, description="without a new sample for this long the sensor counts as stalled"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from runtime.sensor.usb_devices import KNOWN_DEVICES
 
 HEADER = """\
-# Depth cameras and eye trackers that phasestack knows: the group plugdev, and whoever sits at the seat, may open
+# Depth cameras that phasestack knows: the group plugdev, and whoever sits at the seat, may open
 # them; they are never put to sleep. Made by systemd/make_udev_rules.py from runtime/sensor/usb_devices.py.
 ACTION=="remove", GOTO="phasestack_end"
 SUBSYSTEM!="usb", GOTO="phasestack_end"

@@ -10,11 +10,10 @@ from typing import Any
 from runtime.config import StackGeometry
 from runtime.model.session import ModelSession
 from runtime.report import focal, moving
-from runtime.report.frontier import Method, MethodResult, measure, shipped_and_references
+from runtime.report.frontier import Method, MethodResult, apart, measure, shipped_and_references
 from runtime.report.page import Page, Section, describe
 from runtime.report.pairs import StillPair, procedural_pairs, read_pairs
 from runtime.report.sections import focal_section, frontier_section, moving_section
-from runtime.report.worker import apart
 
 QUOTE = "light_db at a tracking error of 1 mm: what both eyes' pupils make of the panels' pixels"
 Progress = Callable[[str], None]

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, field, replace
+from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeVar
 
 import numpy as np
 
+from runtime.errors import FatalError, PhasestackError
 from runtime.evaluation.solved import PairQuality, SolvedPair
 from runtime.evaluation.trials import timed
 from runtime.optics.carried import intensities
@@ -19,13 +24,14 @@ from runtime.optics.light import ONE_RAY, squared_error
 from runtime.optics.quality import psnr_db
 from runtime.records import U8
 from runtime.report.pairs import StillPair
-from runtime.report.worker import apart
 from runtime.support.artifacts import write_text
 
 if TYPE_CHECKING:
     from runtime.model.predictor import Predictor
     from runtime.optics.stack import PanelStack
 
+P = ParamSpec("P")
+T = TypeVar("T")
 Kind = Literal["network", "iterative"]
 SHIPPED = ("balanced", "fast", "best")  # the default first: a report's first figure
 SART = (1, 3, 10, 30)
@@ -132,6 +138,23 @@ def measure(
             viewer = viewers if method is methods[0] else None
             found[method.name].append(pair_result(pair, run, viewer=viewer))
             yield f"{method.name}, {pair.name}", _together(method, pair, run, found[method.name])
+
+
+def apart(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+    """Call an importable function in a fresh process: its memory and threads are its own. Raises FatalError."""
+    # What it prints goes to stderr: stdout may be somebody's JSON.
+    with ProcessPoolExecutor(1, get_context("spawn"), initializer=os.dup2, initargs=(2, 1)) as pool:
+        try:
+            return pool.submit(_called, function, args, kwargs).result()
+        except BrokenProcessPool:
+            raise FatalError(f"{function.__name__}: the measuring process has died") from None
+
+
+def _called(function: Callable[..., T], args: Any, kwargs: Any) -> T:
+    try:
+        return function(*args, **kwargs)
+    except PhasestackError as error:  # other classes of ours do not come through a pipe
+        raise FatalError(str(error)) from None
 
 
 def run_method(method: Method, pair: StillPair, threads: int) -> MethodRun:

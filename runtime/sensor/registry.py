@@ -14,7 +14,6 @@ DRIVERS = {  # that come with phasestack
     "replay": "replay:ReplayDriver",
     "fixed": "fixed:FixedDriver",
     "openni2": "openni2:OpenNI2Driver",
-    "usb-eyes": "usb_eyes:UsbEyesDriver",
     "usb-camera": "usb_camera:UsbCameraDriver",
 }
 

@@ -1,9 +1,9 @@
-"""USB depth cameras and eye trackers that are known: finding and resetting them, and a doctor's view of them."""
+"""USB depth cameras that are known, as `doctor` reports them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from runtime.errors import MissingPart, SensorLost
@@ -15,25 +15,23 @@ SUPER_SPEED = 4
 
 
 class KnownDevice(NamedTuple):
-    """One USB device, and the driver of ours that opens it."""
+    """One USB device, which the driver `openni2` opens."""
 
     vendor_id: int
     product_id: int
     name: str
-    driver: str
     needs_usb3: bool = False
 
 
 KNOWN_DEVICES: tuple[KnownDevice, ...] = (
-    KnownDevice(0x045E, 0x02D8, "Microsoft Kinect v2 (Kinect for Windows)", "openni2", needs_usb3=True),
-    KnownDevice(0x045E, 0x02C4, "Microsoft Kinect v2 (Xbox One)", "openni2", needs_usb3=True),
-    KnownDevice(0x1D27, 0x0600, "ASUS Xtion", "openni2"),
-    KnownDevice(0x1D27, 0x0601, "ASUS Xtion / PrimeSense", "openni2"),
-    KnownDevice(0x1D27, 0x0609, "PrimeSense Carmine", "openni2"),
-    KnownDevice(0x2BC5, 0x0401, "Orbbec Astra", "openni2"),
-    KnownDevice(0x2BC5, 0x0403, "Orbbec Astra Pro", "openni2"),
-    KnownDevice(0x2BC5, 0x0407, "Orbbec Astra Mini S", "openni2"),
-    KnownDevice(0x1209, 0x0001, "phasestack eye tracker (pid.codes test number)", "usb-eyes"),
+    KnownDevice(0x045E, 0x02D8, "Microsoft Kinect v2 (Kinect for Windows)", needs_usb3=True),
+    KnownDevice(0x045E, 0x02C4, "Microsoft Kinect v2 (Xbox One)", needs_usb3=True),
+    KnownDevice(0x1D27, 0x0600, "ASUS Xtion"),
+    KnownDevice(0x1D27, 0x0601, "ASUS Xtion / PrimeSense"),
+    KnownDevice(0x1D27, 0x0609, "PrimeSense Carmine"),
+    KnownDevice(0x2BC5, 0x0401, "Orbbec Astra"),
+    KnownDevice(0x2BC5, 0x0403, "Orbbec Astra Pro"),
+    KnownDevice(0x2BC5, 0x0407, "Orbbec Astra Mini S"),
 )
 _BY_ID = {(device.vendor_id, device.product_id): device for device in KNOWN_DEVICES}
 
@@ -48,7 +46,6 @@ class UsbDevice:
     serial: str  # empty: has none, or may not be read
     speed: int  # libusb's number, 0: unknown
     is_accessible: bool
-    handle: Any = field(compare=False, repr=False)  # usb.core.Device
 
     @property
     def usb_id(self) -> str:
@@ -77,8 +74,8 @@ def _described(device: Any, known: KnownDevice) -> UsbDevice:
     except (usb.core.USBError, NotImplementedError, ValueError):
         accessible = False  # pyusb says ValueError ("no langid") where strings may not be read
     finally:
-        usb.util.dispose_resources(device)  # reading the serial opened it; whoever uses it opens it again
-    return UsbDevice(known, device.bus or 0, device.address or 0, serial, device.speed or 0, accessible, device)
+        usb.util.dispose_resources(device)  # reading the serial opened it
+    return UsbDevice(known, device.bus or 0, device.address or 0, serial, device.speed or 0, accessible)
 
 
 def find_devices(backend: Any = None) -> list[UsbDevice]:
@@ -94,37 +91,3 @@ def find_devices(backend: Any = None) -> list[UsbDevice]:
         raise SensorLost(f"the USB bus cannot be listed: {error}") from None
     found = [_described(device, known) for device, known in pairs if known is not None]
     return sorted(found, key=lambda d: (d.bus, d.address))
-
-
-def find_device(*, source: str, serial: str, driver: str, backend: Any = None) -> UsbDevice:
-    """The one device of a driver that a source (a serial number, or empty for any) names.
-
-    A serial number, once known, has the last word. Raises SensorLost where it is not plugged in, or more than
-    one fits: it is never guessed.
-    """
-    wanted = serial or ("" if source in ("", "demo", "any") else source)
-    fitting = [
-        device
-        for device in find_devices(backend)
-        if device.known.driver == driver and (not wanted or device.serial == wanted)
-    ]
-    name = wanted or source or "any"
-    if not fitting:
-        raise SensorLost(f"no device for driver {driver} is plugged in ({name})")
-    if len(fitting) > 1:
-        serials = ", ".join(device.serial or "without serial" for device in fitting)
-        raise SensorLost(f"several devices fit ({serials}): set sensor.source to one's serial number")
-    return fitting[0]
-
-
-def reset_device(device: UsbDevice) -> None:
-    """Reset a device that hangs; it comes back under a new address. Raises SensorLost where it can't be."""
-    import usb.core
-    import usb.util
-
-    try:
-        device.handle.reset()
-    except (usb.core.USBError, NotImplementedError) as error:
-        raise SensorLost(f"{device.known.name}: cannot be reset ({error})") from None
-    finally:
-        usb.util.dispose_resources(device.handle)

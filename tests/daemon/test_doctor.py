@@ -69,7 +69,7 @@ def test_what_is_wrong_is_named_and_the_rest_is_still_checked(tmp_path: Path, te
 
 
 def test_a_real_sensor_with_the_demos_calibration_is_a_failure(tmp_path: Path) -> None:
-    _, checks = examined(tmp_path, '[sensor]\ndriver = "usb-eyes"\nsource = ""')
+    _, checks = examined(tmp_path, '[sensor]\ndriver = "openni2"\nsource = ""')
     assert checks["calibration"]["state"] == "fail"
     assert "calibrate" in checks["calibration"]["remedy"]
     assert checks["usb"]["state"] == "fail"

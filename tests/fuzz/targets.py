@@ -41,14 +41,12 @@ from runtime.optics.stack import PanelStack
 from runtime.panels.edid import parse
 from runtime.panels.lut import measured_curve
 from runtime.records import EyePoints, Intrinsics, SensorFrame
-from runtime.sensor.eye_packets import EyePacket, PacketReader
 from runtime.sensor.recording import RecordingWriter
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.sensor.replay import ReplayDriver
 from runtime.support.untrusted_input import parsed_json
 from tests.content.test_hostile import PNG_URI, gltf, textured
 from tests.panels.edids import block
-from tests.sensor.fake_usb import encode
 from tests.sensor.taken import taken_until
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 64, 36)
@@ -106,15 +104,6 @@ def recording(path: Path) -> object:
     driver = ReplayDriver(str(path), SimulatedClock())
     driver.open()
     return len(taken_until(driver, 1 << 62))
-
-
-def eye_packets() -> list[bytes]:
-    return [b"".join(encode(EyePacket(k, 1000 * k, EYES if k % 3 else None)) for k in range(12))]
-
-
-def eye_packet(data: bytes, folder: Path) -> object:
-    reader = PacketReader()
-    return [reader.feed(data[at : at + 37]) for at in range(0, len(data), 37)]
 
 
 # Tables
@@ -292,7 +281,6 @@ def request(data: bytes, folder: Path) -> None:
 
 TARGETS: dict[str, Target] = {
     "recording": Target(recordings, file("a.mcap", recording)),
-    "eye-packets": Target(eye_packets, eye_packet),
     "config": Target(configs, file("a.toml", load_settings)),
     "panels": Target(panels, file("a.json", lambda path: load_stack(path, width_px=64, height_px=36))),
     "calibration": Target(lambda: [DEMO_FILE.read_bytes()], file("a.toml", load_calibration)),

@@ -65,8 +65,13 @@ def test_ctrl_c_ends_it_properly(tmp_path: Path) -> None:
 
 def test_a_sensor_that_gives_nothing_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("runtime.commands.record.FIRST_SAMPLE_S", 0.3)
-    with pytest.raises(FatalError, match="usb-eyes"):
-        record_to(tmp_path / "a.mcap", settings(driver="usb-eyes"), images=False, seconds=1)
+    with pytest.raises(FatalError, match="usb-camera"):
+        record_to(
+            tmp_path / "a.mcap",
+            settings(driver="usb-camera", source="/dev/video77", fov_deg=60.0),
+            images=False,
+            seconds=1,
+        )
     assert list(tmp_path.iterdir()) == []
 
 
