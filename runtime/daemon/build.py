@@ -172,7 +172,7 @@ def build_run(
         else BrowserPanels(options.browser, clock)
     )
     cleanup.callback(panels.close)
-    maker = SolverMaker(settings, stack, calibration, panels_group=lambda: panels.group)
+    maker = SolverMaker(settings, stack, calibration, contexts_lost=lambda: panels.contexts_lost)
     solver: SolverHost
     if simulated:
         solver = SimulatedSolver(maker(context=context, simulated=True), clock)

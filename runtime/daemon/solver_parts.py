@@ -21,12 +21,9 @@ from runtime.model.backends import Choice, Wanted, choose
 from runtime.model.predictor import Predictor, load_predictor
 from runtime.optics.stack import PanelStack
 from runtime.records import SolveRequest
-from runtime.support.gl import offscreen_context
-from runtime.support.gl_sharing import ShareGroup, SharingContext, leave_context
+from runtime.support.gl import leave_context, offscreen_context
 
 log = logging.getLogger("phasestack.solver")
-
-PanelsGroup = Callable[[], ShareGroup | None]  # that panels show textures of at present
 
 WARM_EYES_M = ((0.6, -0.031, 0.0), (0.6, 0.031, 0.0))
 
@@ -40,13 +37,12 @@ class RunningSolver:
     backend: Choice  # of every model
     context: Any  # current on this thread
     owns_context: bool  # it is released with the rest
-    group: ShareGroup | None  # the context's
-    panels_group: PanelsGroup
+    contexts_lost: Callable[[], int]
     generation: int
     _held: RunState = field(init=False)  # whose content and model are this solver's to close
 
     def __post_init__(self) -> None:
-        self._held = self.run.state
+        self._held, self._lost_before = self.run.state, self.contexts_lost()
 
     @property
     def is_newest(self) -> bool:
@@ -65,8 +61,8 @@ class RunningSolver:
         return self.run.state.content
 
     def step(self, request: SolveRequest) -> SolverStep:
-        if self.panels_group() is not self.group or (self.group is not None and self.group.lost):
-            raise ContextLost("the panels have another OpenGL context")
+        if self.contexts_lost() != self._lost_before:
+            raise ContextLost("the panels have lost their OpenGL context")
         state = self.run.state  # before looking whether it is another solver's
         if not self.is_newest:
             raise Stopped(LEFT_BEHIND)
@@ -77,26 +73,13 @@ class RunningSolver:
         return self.run.state.settings.loop.simulated_stage_ms
 
     def close(self) -> None:
-        stand_in = self._stand_in()
         state = self.run.state if self.is_newest else self._held
         own = [leave_context, self.context.release] if self.owns_context else []
-        own += [] if stand_in is None else [stand_in.release]
         for release in (state.content.close, state.predictor.close, self.backend.backend.close, *own):
             try:
                 release()
             except Exception as error:  # of a context that is lost there is nothing to release
                 log.warning("solver: closing it: %s", error)
-
-    def _stand_in(self) -> SharingContext | None:
-        """A context of the group, current: textures outlive the solver's own, which may be lost, and are released in
-        this one. None: they go with their context."""
-        if not self.owns_context or self.group is None or self.group.lost:
-            return None
-        try:
-            return self.group.stand_in()
-        except Exception as error:
-            log.warning("solver: its textures stay: %s", error)
-            return None
 
 
 class SolverMaker:
@@ -108,33 +91,33 @@ class SolverMaker:
         stack: PanelStack,
         calibration: Calibration,
         *,
-        panels_group: PanelsGroup = lambda: None,
+        contexts_lost: Callable[[], int] = lambda: 0,
     ) -> None:
-        """panels_group: the share group that solutions are shown from, asked from any thread."""
+        """contexts_lost: by the panels, so far; asked from any thread."""
         self._settings, self._stack, self._calibration = settings, stack, calibration
         self.run: RunCell | None = None  # from the first solver on
         self.parts: RunningSolver | None = None  # the newest
         self._wanted: Wanted = settings.model.backend
-        self._panels_group = panels_group
+        self._contexts_lost = contexts_lost
         self._prepared: tuple[ContentSettings, Opener] | None = None  # read, and not made into a source yet
 
     def __call__(self, *, context: Any = None, simulated: bool = False) -> RunningSolver:
-        """context: one to use together with the panels; None: one of this thread's own, which shares textures with
-        theirs where that can be. Raises FatalError; leaves nothing open then."""
-        own, group = context is None, self._shared_group()
+        """context: one to use together with the panels; None: one of this thread's own. Raises FatalError; leaves
+        nothing open then."""
+        own = context is None
         generation = self.run.begin() if self.run is not None else 0
         settings = self.run.state.settings if self.run is not None else self._settings
         with ExitStack() as undo:
             opener = self._opener(settings.content)
             if own:
-                context = offscreen_context() if group is None else group.context()
+                context = offscreen_context()
                 undo.callback(context.release)
             predictor = ready_predictor(settings, self._stack)
             undo.callback(predictor.close)
             self._prepared = None
             content = opener(context)
             undo.callback(content.close)
-            backend = self._chosen(predictor, context, group, simulated=simulated)
+            backend = self._chosen(predictor, context, simulated=simulated)
             undo.callback(backend.backend.close)
             predictor.set_backend(backend.backend)
             if self.run is None:
@@ -148,8 +131,7 @@ class SolverMaker:
             backend,
             context,
             owns_context=own,
-            group=group,
-            panels_group=self._shared_group,
+            contexts_lost=self._contexts_lost,
             generation=generation,
         )
         if parts.is_newest:
@@ -163,18 +145,13 @@ class SolverMaker:
             prepared = self._prepared = content, prepare_content(content, self._stack)
         return prepared[1]
 
-    def _shared_group(self) -> ShareGroup | None:
-        """Of the panels, where solutions may be left in textures; a solver that never draws any is kept apart."""
-        group = None if self._settings.model.backend == "cpu" else self._panels_group()
-        return None if group is None or group.lost else group
-
-    def _chosen(self, predictor: Predictor, context: Any, group: ShareGroup | None, *, simulated: bool) -> Choice:
+    def _chosen(self, predictor: Predictor, context: Any, *, simulated: bool) -> Choice:
         """The backend; the one that was found before, where a solver is made anew.
 
         Simulated time has no use for a faster one, and two of its runs are the same to the byte.
         """
         wanted = "cpu" if simulated and self._wanted == "auto" else self._wanted
-        choice = choose(wanted, predictor, lambda: context, group=group)
+        choice = choose(wanted, predictor, lambda: context)
         self._wanted = "gl" if choice.backend.name == "gl" else "cpu"
         return choice
 

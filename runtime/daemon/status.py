@@ -19,7 +19,6 @@ from runtime.content.registry import MESHES, PLAYLISTS
 from runtime.content.scenes import SCENES
 from runtime.daemon.build import Run
 from runtime.daemon.commands import PLACING
-from runtime.errors import ContextLost
 from runtime.frame.presenter import Presenter, Refresh
 from runtime.model.predictor import SHIPPED
 from runtime.optics.retina import seen_by
@@ -136,11 +135,8 @@ def pictures(run: Run) -> dict[str, Any]:
     refresh = run.presenter.last
     if refresh is None:
         return {"frame": None, "jpegs": {}}
-    try:
-        fov_deg = run.presenter.run_cell.state.settings.content.fov_deg
-        jpegs = pictures_of(refresh, run.presenter.stack, fov_deg=fov_deg)
-    except ContextLost:  # its layers were in textures: the next refresh has others
-        jpegs = {}
+    fov_deg = run.presenter.run_cell.state.settings.content.fov_deg
+    jpegs = pictures_of(refresh, run.presenter.stack, fov_deg=fov_deg)
     return {"frame": refresh.account.frame, "jpegs": {name: b64encode(jpeg).decode() for name, jpeg in jpegs.items()}}
 
 
@@ -152,7 +148,7 @@ def pictures_of(refresh: Refresh, stack: PanelStack, *, fov_deg: float) -> dict[
     """JPEGs of a refresh: `layer-0`, ... rear to front, `seen-left`, `seen-right`; none where nothing was shown yet.
 
     Layers are as they were solved, made small, and seen from the eyes that they were solved for: what is exact would
-    cost more than a refresh. Raises ContextLost where the layers' textures are no more.
+    cost more than a refresh.
     """
     frame, account = refresh.frame, refresh.account
     is_flat = frame.solved is None or (frame.flat is not None and frame.flatness > 0.5)

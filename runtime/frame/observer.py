@@ -19,7 +19,7 @@ import numpy as np
 
 from runtime.clock import NS_PER_S
 from runtime.content.base import ContentSource
-from runtime.errors import ContentFailure, ContextLost
+from runtime.errors import ContentFailure
 from runtime.evaluation.contact_sheet import Moment
 from runtime.evaluation.displayed import EyeViews, displayed
 from runtime.frame.presenter import Refresh
@@ -270,7 +270,7 @@ class RunObserver:
         account = refresh.account
         try:
             layers = shown_layers(refresh.frame)
-        except (ValueError, ContextLost):
+        except ValueError:
             return None
         if self._keep_light and account.frame % self._keep_light == self._keep_light - 1 and self._output is not None:
             info = {

@@ -20,7 +20,7 @@ from runtime.frame.pacing import Pacer
 from runtime.frame.policy import Flatness, wants_flat
 from runtime.frame.run_state import RunCell
 from runtime.frame.solver import SolverStep
-from runtime.frame.solver_host import SOLVING_STAGES, SolverHost, still_there
+from runtime.frame.solver_host import SOLVING_STAGES, SolverHost
 from runtime.frame.states import Conditions, Lateness, Part, StateMachine
 from runtime.frame.stats import RunStats
 from runtime.frame.viewer import Viewer
@@ -172,7 +172,7 @@ class Presenter:
         self._receive(woke_ns)
         times.lap("sensor")
         eyes = self.viewer.at(timing.photon_ns)
-        news = still_there(self.solver.news())
+        news = self.solver.news()
         frame, limited = self._compose(timing, eyes, news)
         times.lap("track")
         report, lost = self._present(frame)

@@ -7,8 +7,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Protocol
 
-import numpy as np
-
 from runtime.clock import NS_PER_MS, Clock
 from runtime.frame.solver import SolverStep
 from runtime.records import SolveRequest
@@ -59,14 +57,6 @@ class SolverHost(ABC):
 def taken_in(news: SolverStep, step: SolverStep) -> SolverStep:
     """The news with what a step made; the newest wins, and what failed is as the last step found it."""
     return SolverStep(step.solution or news.solution, step.flat or news.flat, step.missing)
-
-
-def still_there(news: SolverStep) -> SolverStep:
-    """The news without a solution whose textures went with their context: the flat picture is shown until the next."""
-    solution = news.solution
-    if solution is None or isinstance(solution.made, np.ndarray) or not solution.made.lost:
-        return news
-    return replace(news, solution=None)
 
 
 def total_ns(stage_ms: Mapping[str, float]) -> int:

@@ -162,11 +162,11 @@ class SolverThread(SolverHost):
                 if request is not None:
                     self._step(attempt, parts, request)
         except (ContextLost, Stopped) as error:
-            log.error("solver: %s", _line(error))  # a record that held the error would hold its textures
-            attempt.error, attempt.busy_since_ns = error, self._clock.now_ns()
+            log.error("solver: %s", _line(error))  # a record that held the error would hold what it held
+            attempt.error, attempt.busy_since_ns = error.with_traceback(None), self._clock.now_ns()
         except BaseException as error:  # what no step answers with: a bug of ours, or a library's
             log.exception("solver: unexpected error")
-            attempt.error, attempt.busy_since_ns = error, self._clock.now_ns()
+            attempt.error, attempt.busy_since_ns = error.with_traceback(None), self._clock.now_ns()
         finally:
             parts.close()
             if attempt.abandoned.is_set():  # what it held is hundreds of MiB

@@ -12,7 +12,6 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from runtime.browser.link import BrowserLink
 from runtime.browser.still import stack_table
-from runtime.errors import ContextLost
 from runtime.records import Layers, pixels_of
 from runtime.support.artifacts import to_json
 
@@ -78,10 +77,7 @@ class _Page:
             self.news.clear()
 
     async def _send_layers(self, kind: str, layers: Layers, version: int, solved_for_m: Any) -> None:
-        try:
-            pixels = await asyncio.to_thread(lambda: pixels_of(layers).tobytes())
-        except ContextLost:
-            return
+        pixels = await asyncio.to_thread(lambda: pixels_of(layers).tobytes())
         self._sent[kind], self._under_way = version, True
         await self._say({"layers": kind, "solved_for_m": solved_for_m})
         await self._socket.send_bytes(pixels)

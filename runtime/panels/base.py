@@ -5,23 +5,17 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 
 from runtime.records import PanelFrame, PresentReport
-from runtime.support.gl_sharing import ShareGroup
 
 
 class PanelSink(ABC):
     """All panels of the stack. One frame is on all of them or on none."""
 
     name: str
+    contexts_lost = 0  # so far: with the panels' GL context others on the same GPU are gone, too
 
     @property
     def period_ns(self) -> int | None:
         """Between two vertical blanks, as the monitor that sets the pace says; None: there is none, or unknown."""
-        return None
-
-    @property
-    def group(self) -> ShareGroup | None:
-        """The share group whose textures are shown as they are; another one when its context was lost and made anew;
-        None: there is none, frames carry arrays. Any thread may ask."""
         return None
 
     @abstractmethod

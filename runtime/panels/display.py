@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import glfw as _glfw
@@ -14,7 +15,6 @@ from runtime.errors import MissingPart, PanelLost
 from runtime.panels import edid, xlib
 from runtime.panels.monitors import Monitor, Rectangle, in_order
 from runtime.support.gl import MINIMUM_VERSION
-from runtime.support.gl_sharing import ShareGroup, gl_function, shared
 
 log = logging.getLogger("phasestack.panels")
 
@@ -22,6 +22,15 @@ glfw: Any = _glfw  # its stubs are wrong about bytes, None and pointers
 
 # GLFW's own answer to an error is a Python warning; here every error has someone who catches it.
 glfw.ERROR_REPORTING = "exception"
+
+
+@cache
+def gl_function(name: str) -> int:
+    """Where an OpenGL function is, the same in every context; 0: there is none.
+
+    Kept: moderngl never lets go of the numbers that it is given, 20 KiB a context.
+    """
+    return int(glfw.get_proc_address(name) or 0)
 
 
 class WindowContext:
@@ -95,7 +104,6 @@ class Display:
         self.faults: list[str] = []
         self._windows: list[Window] = []
         self._outputs: dict[str, int] = {}
-        self.group: ShareGroup | None = None  # of the root's context, once there is one
         _connect()
         glfw.set_monitor_callback(self._monitor_changed)
 
@@ -112,7 +120,6 @@ class Display:
                 self._adopt(glfw.create_window(16, 16, "phasestack", None, None))
             except glfw.GLFWError as error:
                 raise PanelLost(f"no OpenGL on the X server: {_text(error)}") from None
-            self.group = shared()
         return self._windows[0]
 
     def monitors(self) -> tuple[Monitor, ...]:
@@ -136,7 +143,7 @@ class Display:
         return "; ".join(faults)
 
     def close_windows(self) -> None:
-        """Close all but the root: its group's textures stay, and with them what a solver has in them."""
+        """Close all but the root."""
         self._close_from(1)
         self.faults.clear()
         if self._windows:
@@ -144,8 +151,6 @@ class Display:
 
     def close(self) -> None:
         """Close every window. May be called twice."""
-        if self.group is not None:
-            self.group.close()
         if self._windows:
             glfw.make_context_current(None)
         self._close_from(0)

@@ -10,7 +10,6 @@ from runtime.optics.alignment import EVEN_CODE, is_identity, scale_and_shift
 from runtime.panels import lut
 from runtime.panels.geometry import layer_from_screen, permutes_pixels
 from runtime.records import Layers, PanelFrame, pixels_of
-from runtime.support.gl_sharing import LayerTextures, ShareGroup, lies_in
 
 VERTEX = """#version 330 core
 // One triangle that covers the framebuffer; pixel: the monitor's pixels, top left origin, v down.
@@ -94,14 +93,11 @@ void main() {
 
 
 class FrameTextures:
-    """The layers of the newest frame in one share group: uploaded where they are not in it and their version is
-    another one."""
+    """The layers of the newest frame, uploaded where their version is another one."""
 
-    def __init__(
-        self, context: moderngl.Context, size_px: tuple[int, int], *, count: int, group: ShareGroup | None = None
-    ) -> None:
-        """size_px: columns and rows of a layer; group: the context's; layers in its textures are shown from there."""
-        self._context, self._group = context, group
+    def __init__(self, context: moderngl.Context, size_px: tuple[int, int], *, count: int) -> None:
+        """size_px: columns and rows of a layer."""
+        self._context = context
         self.size_px, self._count = size_px, count
         self._solved: tuple[moderngl.Texture, ...] = ()
         self._flat: tuple[moderngl.Texture, ...] = ()
@@ -111,14 +107,12 @@ class FrameTextures:
     def lacks(self, frame: PanelFrame) -> tuple[bool, bool]:
         """Whether its solution, and its flat picture, are seen and not here yet."""
         return (
-            shows_solved(frame)
-            and frame.solved_version != self._solved_version
-            and not lies_in(frame.solved, self._group),
-            shows_flat(frame) and frame.flat_version != self._flat_version and not lies_in(frame.flat, self._group),
+            shows_solved(frame) and frame.solved_version != self._solved_version,
+            shows_flat(frame) and frame.flat_version != self._flat_version,
         )
 
     def upload(self, frame: PanelFrame) -> None:
-        """Take in what the frame shows and is not here yet. Raises ContextLost."""
+        """Take in what the frame shows and is not here yet."""
         lacks_solved, lacks_flat = self.lacks(frame)
         if lacks_solved and frame.solved is not None:
             self._solved_version = None  # until it is here as a whole
@@ -129,12 +123,10 @@ class FrameTextures:
             self._flat = self._written(self._flat, frame.flat)
             self._flat_version = frame.flat_version
 
-    def use(self, frame: PanelFrame, index: int) -> None:
+    def use(self, index: int) -> None:
         """Bind one panel's where a Painter looks for them, in the context that is current."""
-        for unit, (layers, uploaded) in enumerate(((frame.solved, self._solved), (frame.flat, self._flat))):
-            if isinstance(layers, LayerTextures) and lies_in(layers, self._group):
-                layers.textures[index].use(unit)
-            elif uploaded:
+        for unit, uploaded in enumerate((self._solved, self._flat)):
+            if uploaded:
                 uploaded[index].use(unit)
 
     def release(self) -> None:
@@ -209,7 +201,7 @@ class Painter:
         self._program["aligned"] = not is_identity(matrix)
         self._program["solved_from_shown"] = scale_and_shift(matrix)
         self._program["flatness"] = 1.0 if frame.solved is None else float(frame.flatness)
-        textures.use(frame, index)
+        textures.use(index)
         self._curve.use(2)
         self._array.render(moderngl.TRIANGLES, vertices=3)
 

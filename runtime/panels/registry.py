@@ -10,7 +10,6 @@ from runtime.config import OutputSettings, PanelSettings
 from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
 from runtime.records import PanelFrame, PresentReport
-from runtime.support.gl_sharing import ShareGroup, shared
 
 if TYPE_CHECKING:
     import moderngl
@@ -23,18 +22,12 @@ class OffscreenPanels(PanelSink):
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
-        self._group = shared()
-
-    @property
-    def group(self) -> ShareGroup | None:
-        return self._group
 
     def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
         return PresentReport(frame.number, self._clock.now_ns(), 0.0)
 
     def close(self) -> None:
-        if self._group is not None:
-            self._group.close()
+        """Nothing is held."""
 
 
 class BrowserPanels(PanelSink):

@@ -10,17 +10,16 @@ import moderngl
 
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock
 from runtime.config import PanelSettings
-from runtime.errors import ContextLost, PanelLost
+from runtime.errors import PanelLost
 from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
 from runtime.panels.card import identity_card
-from runtime.panels.display import Display, Window, connected_monitors, glfw
+from runtime.panels.display import Display, Window, connected_monitors, gl_function, glfw
 from runtime.panels.monitors import Monitor, bind, check_modes, refresh_difference
 from runtime.panels.presentation import FrameTextures, Painter
 from runtime.panels.watch import PlacementWatch
 from runtime.records import U8, PanelFrame, PresentReport
 from runtime.support.gl import offscreen_context
-from runtime.support.gl_sharing import ShareGroup, gl_function
 
 log = logging.getLogger("phasestack.panels")
 
@@ -40,8 +39,8 @@ class WindowPanels(PanelSink):
     Once a second every window and monitor is compared with what was bound (a question a refresh, some 0.1 ms).
     Where a monitor, a window or the context is lost or became another, every window is closed, `present` raises
     PanelLost, and a later `present` builds it anew: half a second later, or as soon as X says that a missing
-    monitor is there. A hidden window's context, which all share, stays unless it is what was lost: what a solver
-    has in its textures stays, too. The death of the X server ends the process with exit status 75, to be started again.
+    monitor is there. A hidden window's context, which all share, stays unless it is what was lost. The death of the X
+    server ends the process with exit status 75, to be started again.
     Uses GLFW, so: one thread, the main one. The `content` context is current again after every call.
     """
 
@@ -81,11 +80,6 @@ class WindowPanels(PanelSink):
         refresh_hz = self.monitors[0].refresh_hz if self.monitors else 0.0
         return round(NS_PER_S / refresh_hz) if refresh_hz else None
 
-    @property
-    def group(self) -> ShareGroup | None:
-        display = self._display
-        return None if display is None else display.group
-
     def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
         """Show a frame on every panel at once; an unchanged one stays as it is, where it is still shown.
 
@@ -98,7 +92,7 @@ class WindowPanels(PanelSink):
                 self._open()
                 log.info("panels are back: %s", ", ".join(str(monitor) for monitor in self.monitors))
             return self._present(frame, unchanged)
-        except (PanelLost, ContextLost, glfw.GLFWError, moderngl.Error) as error:
+        except (PanelLost, glfw.GLFWError, moderngl.Error) as error:
             self._lost = str(error)
             self._context_lost = self._context_lost or not isinstance(error, PanelLost)
             self._retreat()
@@ -169,7 +163,7 @@ class WindowPanels(PanelSink):
         if difference := refresh_difference(self.monitors):
             log.warning("%s", difference)
         display.root.make_current()
-        self._textures = FrameTextures(display.root.context, layer_px, count=len(self._panels), group=display.group)
+        self._textures = FrameTextures(display.root.context, layer_px, count=len(self._panels))
         for number, (panel, monitor) in enumerate(zip(self._panels, self.monitors, strict=True)):
             window = display.fullscreen_window(monitor, title=f"panel {number}")
             screen_px = monitor.width_px, monitor.height_px
@@ -206,6 +200,7 @@ class WindowPanels(PanelSink):
     def _drop(self) -> None:
         self._away = True
         display, self._display = self._display, None
+        self.contexts_lost += self._context_lost
         self._context_lost = False
         self._forget()
         if display is not None:

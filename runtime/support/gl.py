@@ -38,6 +38,13 @@ def offscreen_context() -> moderngl.Context:
         ) from None
 
 
+def leave_context() -> None:
+    """Have no context current on this thread: one that is released while it is current stays as long as the process."""
+    egl, pointer = ctypes.CDLL(EGL["libegl"]), ctypes.c_void_p
+    egl.eglGetCurrentDisplay.restype, egl.eglMakeCurrent.argtypes = pointer, [pointer] * 4
+    egl.eglMakeCurrent(egl.eglGetCurrentDisplay(), None, None, None)
+
+
 @cache
 def _gl_finish() -> Any:
     return ctypes.CDLL(EGL["libgl"]).glFinish

@@ -19,7 +19,7 @@ class DrawnPanels(OffscreenPanels):
         self, context: moderngl.Context, *, clock: Clock, size_px: tuple[int, int], panels: tuple[PanelSettings, ...]
     ) -> None:
         super().__init__(clock)
-        self._textures = FrameTextures(context, size_px, count=len(panels), group=self._group)
+        self._textures = FrameTextures(context, size_px, count=len(panels))
         self._context = context
         self._painters: list[Painter] = []
         self._targets: list[moderngl.Framebuffer] = []

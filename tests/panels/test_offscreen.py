@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import moderngl
@@ -16,10 +15,7 @@ from runtime.config import PanelSettings
 from runtime.optics.alignment import align, shown_layers
 from runtime.optics.stack import PanelStack
 from runtime.records import Layers, PanelFrame
-from runtime.support.gl import offscreen_context
-from runtime.support.gl_sharing import ShareGroup
 from tests.panels.drawn import DrawnPanels
-from tests.support.left_in_textures import on_a_thread_of_its_own
 
 WIDTH, HEIGHT = 48, 32
 TINY = PanelStack(0.5, 0.3, (-0.1, 0.0, 0.1), WIDTH, HEIGHT)
@@ -202,36 +198,6 @@ def test_a_new_solution_is_shown_where_only_its_version_tells_it_from_the_old(si
     for version in (1, 2):
         sink.present(PanelFrame(version, smooth(version), version))
         assert np.array_equal(codes(sink.read_back()), codes(smooth(version)))
-
-
-def test_layers_that_another_thread_left_in_textures_are_shown_as_arrays_are(
-    sink: DrawnPanels, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    frame = aligned(smooth(1), smooth(2))
-    sink.present(frame)
-    expected = sink.read_back()
-    assert sink.group is not None and sink._textures is not None
-    left = on_a_thread_of_its_own(sink.group, smooth(1))
-    monkeypatch.setattr(sink._textures, "_written", None)  # nothing is uploaded
-    sink.present(replace(frame, solved=left, solved_version=frame.solved_version + 1))
-    for one, other in zip(sink.read_back(), expected, strict=True):
-        assert np.array_equal(one, other)
-
-
-def test_layers_of_another_group_are_uploaded(sink: DrawnPanels, context: moderngl.Context) -> None:
-    frame = aligned(smooth(1), smooth(2))
-    sink.present(frame)
-    expected = sink.read_back()
-    with offscreen_context() as other:
-        left = on_a_thread_of_its_own(ShareGroup(), smooth(1))
-        context.__enter__()
-        sink.present(replace(frame, solved=left, solved_version=frame.solved_version + 1))
-        for one, another in zip(sink.read_back(), expected, strict=True):
-            assert np.array_equal(one, another)
-        other.__enter__()
-        left.group.close()
-    other.release()
-    context.__enter__()
 
 
 def aligned(solved: NDArray[np.uint8], flat: NDArray[np.uint8]) -> PanelFrame:
