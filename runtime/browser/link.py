@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import base64
 import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+import cv2
 import numpy as np
 
 from runtime.optics.stack import PanelStack
-from runtime.records import F64, PanelFrame
+from runtime.records import F64, EyePoints, PanelFrame, SensorFrame
 
 SAMPLES_MAX = 256  # that wait for the sensor
 CAPTURES_MAX = 512  # whose time on the page is remembered
+OVERLAY_PX = 320  # width of the camera's picture that pages are shown
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,11 +37,16 @@ class BrowserLink:
     is_sensor: bool = True  # the page's eyes are the viewer's; else a camera's are
     noise_mm: float = 0.2  # of the simulated sensor: standard deviation of an axis
     latency_ms: float = 0.0
-    gap_wanted_m: float | None = None  # between neighbouring panels, where a page asks for another one
+    is_camera: bool = False  # the viewer's page sends pictures of its own camera
+    camera_fov_deg: float = 65.0  # their width; most cameras in or on a screen
+    wishes: dict[str, float] = field(default_factory=dict)  # of a page, that need a new start: gap_mm, camera
+    moment: Any = None  # the newest that was measured: layers, and what eyes should see of them
+    found: dict[str, Any] | None = None  # the newest picture of a camera, and the pupils in it
     frame: PanelFrame | None = None  # that the panels were given
     shown: tuple[PanelFrame | None, dict[str, Any]] = (None, {})  # by the newest refresh, and what is known of it
     news: dict[object, Callable[[], None]] = field(default_factory=dict)  # whom to tell of a refresh, by page
     _arrived: threading.Condition = field(default_factory=threading.Condition)
+    _picture: tuple[bytes, float] | None = None  # of the page's camera, and when by the page's clock
     _samples: deque[SeenEyes] = field(default_factory=lambda: deque(maxlen=SAMPLES_MAX))
     _captures: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=CAPTURES_MAX))
 
@@ -66,6 +74,39 @@ class BrowserLink:
             self._samples.clear()
         return samples
 
+    def send_picture(self, coded: bytes, page_ms: float) -> None:
+        """Take in a picture of the page's camera; one that was not looked at yet goes."""
+        with self._arrived:
+            self._picture = coded, page_ms
+            self._arrived.notify()
+
+    def picture(self, timeout_s: float) -> tuple[bytes, float] | None:
+        """The newest picture that was not taken yet; waits for one."""
+        with self._arrived:
+            if self._picture is None:
+                self._arrived.wait(timeout_s)
+            taken, self._picture = self._picture, None
+        return taken
+
+    def looked_at(self, finder: Any) -> Callable[[SensorFrame], EyePoints | None]:
+        """What finds eyes in a camera's pictures, while pages are told of what is found."""
+
+        def find(frame: SensorFrame) -> EyePoints | None:
+            eyes: EyePoints | None = finder.find(frame)
+            if frame.colour is not None and self.news:
+                height, width = frame.colour.shape[:2]
+                size = (OVERLAY_PX, round(OVERLAY_PX * height / width))
+                small: Any = cv2.resize(frame.colour[..., ::-1], size, interpolation=cv2.INTER_AREA)
+                coded = base64.b64encode(cv2.imencode(".jpg", small)[1].tobytes()).decode()
+                pupils = finder.pupils
+                pupils_px = None if pupils is None else np.asarray(pupils.eyes_px) * (OVERLAY_PX / width)
+                self.found = {"url": f"data:image/jpeg;base64,{coded}", "size": size, "pupils_px": pupils_px,
+                              "reason": finder.reason}  # fmt: skip
+                self._tell()
+            return eyes
+
+        return find
+
     def captured(self, capture_ns: int, page_ms: float) -> None:
         """Remember which instant of the page a capture is."""
         self._captures.append((capture_ns, page_ms))
@@ -77,5 +118,8 @@ class BrowserLink:
     def refreshed(self, account: dict[str, Any]) -> None:
         """The panels show `frame`, and this is known of it."""
         self.shown = self.frame, account
+        self._tell()
+
+    def _tell(self) -> None:
         for tell in tuple(self.news.values()):
             tell()

@@ -29,12 +29,15 @@ def viewer_html(
     fov_deg: float,
     title: str,
     lines: Sequence[str] = (),
+    follows: bool = True,
 ) -> str:
     """The page. layers: (N, h, w, 3 or 4), rear to front, as the panels show them to eyes (2, 3), frame `stack`.
 
     wanted: an (h, w, 3) picture for each eye, `fov_deg` wide; () where none is known; lines: what stands below.
+    follows: outer panels follow the head until one says otherwise.
     """
     scene = {"stack": stack_table(stack), "eyes_m": eyes_m, "fov_deg": fov_deg, "title": title, "lines": list(lines)}
+    scene["follows"] = follows
     parts = {
         "TITLE": html.escape(title),
         "CSS": asset("look.css"),

@@ -27,6 +27,7 @@ from runtime.page.server import application
 
 SIZE_PX = {"width_px": 960, "height_px": 540}  # without a configuration: solved often on a small machine
 WEBCAM_FOV_DEG = 65.0  # of most cameras in or on a screen; a configuration says it of others
+SLOW_PAGE_S = 2.0  # without a picture of a page's camera
 MEASURED_EVERY_S = 4.0  # the light at the eyes
 
 
@@ -35,7 +36,10 @@ def settings_of(config: Path | None, *, scene: str | None, model: str | None, we
     settings = load_settings(config) if config else changed(Settings(), "stack", SIZE_PX, source="try")
     settings = with_options(settings, scene=scene, model=model)
     if settings.sensor.driver != "usb-camera" or not webcam:
-        sensor = {"driver": "usb-camera", "source": "", "fov_deg": WEBCAM_FOV_DEG} if webcam else {"driver": "browser"}
+        sensor: dict[str, Any] = (
+            {"driver": "usb-camera", "source": "", "fov_deg": WEBCAM_FOV_DEG} if webcam else {"driver": "browser"}
+        )
+        sensor["timeout_s"] = SLOW_PAGE_S
         settings = changed(settings, "sensor", sensor, source="try")
     every = max(1, round(MEASURED_EVERY_S * settings.loop.rate_hz))
     return changed(settings, "loop", {"evaluate_every": every}, source="try")
@@ -48,8 +52,8 @@ def try_display(settings: Settings, *, port: int, opens: bool, seconds: float | 
     ends_s = float("inf") if seconds is None else time.monotonic() + seconds
 
     def until() -> str:
-        if link.gap_wanted_m is not None:
-            return "another gap between the panels is asked for"
+        if link.wishes:
+            return f"the page asks for {', '.join(link.wishes)}"
         return "its time is up" if time.monotonic() > ends_s else ""
 
     with tempfile.TemporaryDirectory(prefix="phasestack-") as folder:
@@ -62,24 +66,27 @@ def try_display(settings: Settings, *, port: int, opens: bool, seconds: float | 
                 webbrowser.open(url)
             while True:
                 run_daemon(partial(_as_it_is, settings), RunOptions(measure=True, browser=link, until=until))
-                if link.gap_wanted_m is None:
+                if not link.wishes:
                     return
-                settings = _with_gap(settings, link)
+                settings = _as_wished(settings, link)
 
 
 def _as_it_is(settings: Settings) -> Settings:
     return settings
 
 
-def _with_gap(settings: Settings, link: BrowserLink) -> Settings:
-    """The gap that a page asked for; scene and model as they were."""
-    gap_m, link.gap_wanted_m = link.gap_wanted_m or 0.0, None
+def _as_wished(settings: Settings, link: BrowserLink) -> Settings:
+    """The gap and the sensor that a page asked for; scene and model as they were."""
+    wishes, link.wishes = link.wishes, {}
     account = link.shown[1]
     settings = with_options(settings, scene=account.get("scene"), model=account.get("model"))
-    middle = (len(settings.stack.x_m) - 1) / 2
-    x_m = tuple((n - middle) * gap_m for n in range(len(settings.stack.x_m)))
-    settings = changed(settings, "stack", {"x_m": x_m}, source="try")
-    link.stack = settings.stack.stack()
+    if "gap_mm" in wishes:
+        middle = (len(settings.stack.x_m) - 1) / 2
+        x_m = tuple((n - middle) * wishes["gap_mm"] * 1e-3 for n in range(len(settings.stack.x_m)))
+        settings = changed(settings, "stack", {"x_m": x_m}, source="try")
+    if "camera" in wishes:
+        link.is_camera, link.is_sensor = bool(wishes["camera"]), not wishes["camera"]
+    link.found, link.stack = None, settings.stack.stack()
     return settings
 
 

@@ -32,7 +32,7 @@ from runtime.panels.registry import BrowserPanels, open_panels
 from runtime.plan.savings import Saving
 from runtime.records import RefreshAccount
 from runtime.sensor.base import Sensor
-from runtime.sensor.browser import BrowserEyes
+from runtime.sensor.browser import BrowserCamera, BrowserEyes
 from runtime.sensor.registry import open_sensor
 from runtime.sensor.samples import FindEyes, RecordedSamples, Samples
 from runtime.sensor.worker import SensorWorker
@@ -151,12 +151,13 @@ def build_run(
         log.warning("%s", warning)
 
     def make_driver() -> Sensor:
-        if options.browser is not None and options.browser.is_sensor:
-            return BrowserEyes(options.browser, clock)
+        if options.browser is not None and (options.browser.is_sensor or options.browser.is_camera):
+            return (BrowserEyes if options.browser.is_sensor else BrowserCamera)(options.browser, clock)
         return open_sensor(settings.sensor, clock, latency_ms=settings.loop.sensor_latency_ms)
 
     def make_find() -> FindEyes:
-        return EyeFinder(settings).find
+        finder = EyeFinder(settings)
+        return finder.find if options.browser is None else options.browser.looked_at(finder)
 
     driver = make_driver()
     samples: Samples

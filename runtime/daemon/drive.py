@@ -6,16 +6,20 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from runtime.browser.still import viewer_html
 from runtime.config import Settings
-from runtime.daemon.build import Host, RunOptions, build_run
+from runtime.daemon.build import Host, Run, RunOptions, build_run
 from runtime.evaluation.run_output import RunOutput
 from runtime.optics.alignment import shown_layers
-from runtime.records import RefreshAccount
+from runtime.records import U8, RefreshAccount
 from runtime.support import progress
 from runtime.support.background import wait_for_all
 from runtime.support.figures import lines_of
 
 JOBS_END_WITHIN_S = 0.5  # what is still loading at the end
+USUAL_M, IPD_M = 0.6, 0.063  # where a viewer would be who was not there
 
 
 def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> dict[str, Any]:
@@ -43,9 +47,21 @@ def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> 
             last = run.presenter.last
             has_picture = last is not None and (last.frame.solved is not None or last.frame.flat is not None)
             layers = shown_layers(last.frame) if last is not None and has_picture else None
-            output.finish(summary, layers, run.observer.eye_views, run.observer.moment)
+            unseen = "" if last is None or layers is None else _unseen(layers, last.account, run, settings)
+            output.finish(summary, layers, run.observer.eye_views, run.observer.moment, unseen=unseen)
     wait_for_all(JOBS_END_WITHIN_S)
     return summary
+
+
+def _unseen(layers: U8, account: RefreshAccount, run: Run, settings: Settings) -> str:
+    """The last refresh to look into, where nothing was measured."""
+    stack, is_flat = run.presenter.stack, account.solved_for_m is None
+    away_m = max(USUAL_M, stack.x_m[-1] + USUAL_M / 2)
+    eyes_m = np.array([[away_m, -IPD_M / 2, 0.0], [away_m, IPD_M / 2, 0.0]])
+    eyes_m = eyes_m if account.eyes_m is None else account.eyes_m
+    title = "Nobody was seen: the picture for eyes anywhere" if is_flat else "The last refresh, not measured"
+    fov_deg = settings.content.fov_deg
+    return viewer_html(layers, (), stack, eyes_m=eyes_m, fov_deg=fov_deg, title=title, follows=not is_flat)
 
 
 def print_summary(summary: dict[str, Any], out: Path | None) -> None:

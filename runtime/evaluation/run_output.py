@@ -80,9 +80,18 @@ class RunOutput:
         self._later(write)
 
     def finish(
-        self, summary: dict[str, Any], layers: U8 | None, eye_views: EyeViews | None, moment: Moment | None = None
+        self,
+        summary: dict[str, Any],
+        layers: U8 | None,
+        eye_views: EyeViews | None,
+        moment: Moment | None = None,
+        *,
+        unseen: str = "",
     ) -> None:
-        """The last frame, the summary; contact sheet and viewer, of a good moment where one was seen."""
+        """The last frame, the summary; contact sheet and viewer, of a good moment where one was seen.
+
+        unseen: the viewer's page where no two eyes saw anything.
+        """
 
         def write() -> None:
             folder = self._folder.staging
@@ -100,7 +109,9 @@ class RunOutput:
                 sheet = contact_sheet(moment.layers, moment.eye_views, headline=headline(moment.light_db), lines=lines)
             write_png(folder / "contact-sheet.png", sheet)
             views, title = (eye_views, None) if moment is None else (moment.eye_views, moment.light_db)
-            if views is not None:
+            if views is None:
+                write_text(folder / "viewer.html", unseen)
+            else:
                 shown = layers if moment is None else moment.layers
                 write_text(folder / "viewer.html", views.viewer(shown, title=headline(title), lines=lines))
 

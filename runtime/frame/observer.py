@@ -148,6 +148,7 @@ class RunObserver:
         self.means = Means()
         self.eye_views: EyeViews | None = None  # of the newest measured refresh
         self.moment: Moment | None = None  # the best of those measured
+        self.newest: Moment | None = None
         self.light_db: float | None = None  # of that one
         self.last: Refresh | None = None
         self._lines: deque[RefreshAccount] = deque()
@@ -313,6 +314,7 @@ class RunObserver:
 
     def _take(self, measured: Measured | None) -> None:
         if measured is not None:
+            self.newest = measured.moment
             self.eye_views, self.light_db = measured.moment.eye_views, measured.moment.light_db
             if self.moment is None or measured.moment.light_db > self.moment.light_db:
                 self.moment = measured.moment

@@ -8,15 +8,19 @@ import json
 import math
 from typing import Any
 
+import cv2
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from runtime.browser.link import BrowserLink
 from runtime.browser.still import stack_table
+from runtime.optics.carried import intensities
+from runtime.optics.retina import as_codes
 from runtime.records import Layers, pixels_of
 from runtime.support.artifacts import to_json
 
 PAGES_MAX = 8
-RANGES = {"noise_mm": (0.0, 50.0), "latency_ms": (0.0, 1000.0), "gap_mm": (1.0, 500.0)}
+RANGES = {"noise_mm": (0.0, 50.0), "latency_ms": (0.0, 1000.0), "camera_fov_deg": (20.0, 150.0)}
+RANGES |= {"gap_mm": (1.0, 500.0), "camera": (0.0, 1.0)}  # what needs a new start
 
 
 async def live(socket: WebSocket, link: BrowserLink) -> None:
@@ -39,6 +43,8 @@ async def live(socket: WebSocket, link: BrowserLink) -> None:
         del link.news[me]
         if was_viewer and link.is_sensor:
             link.see(None, 0.0)
+        elif was_viewer and link.is_camera:
+            link.wishes["camera"] = 0.0
 
 
 def _tell(loop: asyncio.AbstractEventLoop, news: asyncio.Event) -> None:
@@ -54,16 +60,23 @@ class _Page:
         self.news, self._sent = asyncio.Event(), {"solved": 0, "flat": 0}
         self._under_way = False  # layers that the page has not taken in yet
         self._stack: Any = None
+        self._checks, self._moment = (
+            False,
+            None,
+        )  # it shows a measured moment, not the newest
 
     async def send(self, me: object) -> None:
         told: dict[str, Any] = {}
+        found: Any = None
         while True:
             link, (frame, account) = self._link, self._link.shown
             if self._stack is not link.stack:
                 self._stack, self._sent = link.stack, {"solved": 0, "flat": 0}
-                fields = {"fov_deg": link.fov_deg, "is_sensor": link.is_sensor}
+                fields = {"fov_deg": link.fov_deg, "is_sensor": link.is_sensor, "is_camera": link.is_camera}
                 await self._say({"stack": stack_table(link.stack), **fields})
-            if frame is not None and not self._under_way:
+            if self._checks and link.moment is not None and link.moment is not self._moment and not self._under_way:
+                await self._send_moment(link.moment)
+            if frame is not None and not self._under_way and not self._checks:
                 for kind, layers, version in (
                     ("flat", frame.flat, frame.flat_version),
                     ("solved", frame.solved, frame.solved_version),
@@ -73,6 +86,9 @@ class _Page:
             if account is not told:
                 told = account
                 await self._say({"refresh": told, "viewer": link.is_viewer(me)})
+            if link.found is not found and link.found is not None:
+                found = link.found
+                await self._say({"found": found})
             await self.news.wait()
             self.news.clear()
 
@@ -82,11 +98,37 @@ class _Page:
         await self._say({"layers": kind, "solved_for_m": solved_for_m})
         await self._socket.send_bytes(pixels)
 
+    async def _send_moment(self, moment: Any) -> None:
+        """Layers and, after them, what each eye should see of them, all RGBA."""
+        views = moment.eye_views
+
+        def packed() -> bytes:
+            pictures = [*moment.layers, *(as_codes(intensities(picture)) for picture in views.wanted)]
+            return b"".join(cv2.cvtColor(p[..., :3], cv2.COLOR_RGB2RGBA).tobytes() for p in pictures)
+
+        self._moment, self._under_way = moment, True
+        data = await asyncio.to_thread(packed)
+        height, width = views.wanted[0].shape[:2]
+        await self._say({"layers": "solved", "solved_for_m": views.eyes_m, "target": [width, height]})
+        await self._socket.send_bytes(data)
+
     async def receive(self, me: object) -> None:
+        picture_ms = 0.0
         while True:
-            message = json.loads(await self._socket.receive_text())
+            given = await self._socket.receive()
+            if given["type"] == "websocket.disconnect":
+                raise WebSocketDisconnect(given.get("code", 1000))
+            if given.get("bytes") is not None:
+                if self._link.is_viewer(me) and self._link.is_camera:
+                    self._link.send_picture(given["bytes"], picture_ms)
+                continue
+            message = json.loads(given["text"])
             if not isinstance(message, dict):
                 continue
+            picture_ms = _number(message.get("picture_ms"), picture_ms)
+            if isinstance(message.get("checks"), bool):
+                self._checks, self._moment, self._sent["solved"] = message["checks"], None, 0
+                self.news.set()
             if message.get("drawn"):
                 self._under_way = False
                 self.news.set()
@@ -94,15 +136,18 @@ class _Page:
                 with contextlib.suppress(ValueError, TypeError):
                     self._link.see(message["eyes"], float(message.get("page_ms", 0.0)))
             for name, (least, most) in RANGES.items():
-                value = message.get(name)
-                if isinstance(value, int | float) and math.isfinite(value):
-                    self._set(name, min(max(float(value), least), most))
-
-    def _set(self, name: str, value: float) -> None:
-        if name == "gap_mm":
-            self._link.gap_wanted_m = value * 1e-3
-        else:
-            setattr(self._link, name, value)
+                value = _number(message.get(name), None)
+                if value is None or (name == "camera" and not self._link.is_viewer(me)):
+                    continue
+                value = min(max(value, least), most)
+                if name in ("gap_mm", "camera"):
+                    self._link.wishes[name] = value
+                else:
+                    setattr(self._link, name, value)
 
     async def _say(self, message: dict[str, Any]) -> None:
         await self._socket.send_text(to_json(message))
+
+
+def _number(value: Any, default: Any) -> Any:
+    return float(value) if isinstance(value, int | float) and math.isfinite(value) else default

@@ -1,20 +1,24 @@
-"""Driver `browser`: a page's pointer is the head. With the noise and latency of a sensor that one may think of."""
+"""Driver `browser`: a page's pointer is the head, with a sensor's noise and latency; or its camera sees one."""
 
 from __future__ import annotations
 
 from collections import deque
+from math import radians, tan
+from typing import Any
 
+import cv2
 import numpy as np
 
 from runtime.browser.link import BrowserLink, SeenEyes
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock
-from runtime.errors import SensorLost
-from runtime.records import EyePoints, SensorFrame
+from runtime.errors import SensorLost, SensorTimeout
+from runtime.records import EyePoints, Intrinsics, SensorFrame
 from runtime.sensor.base import Capabilities, DeviceClock, Sensor
 
 AGAIN_NS = NS_PER_S // 30  # a page says where the eyes are as they move: until then they are where they were
 SILENT_NS = 5 * NS_PER_S  # without a word from a page nobody is seen
 LEAST_SIGMA_M = 5e-5
+PICTURE_MAX_PX = 2048
 
 
 class BrowserEyes(Sensor):
@@ -77,3 +81,38 @@ class BrowserEyes(Sensor):
 
     def close(self) -> None:
         self._waiting = None
+
+
+class BrowserCamera(Sensor):
+    """Pictures of a page's own camera. No depth: how far away eyes are follows from their distance."""
+
+    name = "browser"
+    capabilities = Capabilities(colour=True)
+
+    def __init__(self, link: BrowserLink, clock: Clock) -> None:
+        self._link, self._clock = link, clock
+        self._times, self._number, self._captured_ns = DeviceClock(), 0, 0
+
+    def open(self) -> None:
+        self._times = DeviceClock()
+
+    def read_newest(self, timeout_s: float) -> SensorFrame:
+        found = self._link.picture(timeout_s)
+        if found is None:
+            raise SensorTimeout("the page sends no picture of its camera")
+        coded, page_ms = found
+        capture_ns = self._times.host_ns(round(page_ms * NS_PER_MS), arrival_ns=self._clock.now_ns())
+        self._link.captured(capture_ns, page_ms)
+        picture: Any = cv2.imdecode(np.frombuffer(coded, np.uint8), cv2.IMREAD_COLOR)
+        if picture is None or max(picture.shape) > PICTURE_MAX_PX:
+            raise SensorTimeout("the page sends what is no picture of a camera")
+        self._number += 1
+        self._captured_ns = max(capture_ns, self._captured_ns + 1)
+        height, width = picture.shape[:2]
+        focal = width / 2 / tan(radians(self._link.camera_fov_deg) / 2)
+        intrinsics = Intrinsics(width, height, focal, focal, width / 2, height / 2)
+        colour = np.ascontiguousarray(picture[..., ::-1])
+        return SensorFrame(self._number, self._captured_ns, colour=colour, intrinsics=intrinsics)
+
+    def close(self) -> None:
+        """Nothing is held."""

@@ -11,9 +11,10 @@ export async function opened({ width = 1280, height = 800, origin = null, ...mor
   const browser = await chromium.launch({
     executablePath: "/usr/bin/chromium",
     args: ["--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
-      "--disable-background-networking", "--disable-component-update", "--disable-sync"],
+      "--disable-background-networking", "--disable-component-update", "--disable-sync",
+      "--use-fake-device-for-media-stream"], // a test pattern
   });
-  const context = await browser.newContext({ viewport: { width, height }, ...more });
+  const context = await browser.newContext({ viewport: { width, height }, permissions: ["camera"], ...more });
   const elsewhere = [], errors = [];
   context.on("request", (request) => {
     const url = request.url();

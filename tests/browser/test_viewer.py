@@ -23,8 +23,12 @@ from runtime.optics.light import panels_from_centre
 from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack, Tilt
 from runtime.optics.views import image_from_stack
+from runtime.records import SensorFrame
 from runtime.report.pairs import Painter, eyes_at
+from runtime.sensor.recording import recording_to
+from runtime.sensor.recording_format import RecordingHeader
 from tests.browser.tracer import Panels, light
+from tests.test_cli import phasestack as phasestack_command
 
 HERE = Path(__file__).parent
 STACK = StackGeometry().stack()
@@ -176,3 +180,15 @@ def test_a_result_opens_in_a_browser_and_is_a_notebook_s_picture(monkeypatch: py
     assert opened == [path.as_uri()] and "window.phasestack" in path.read_text()
     assert result._repr_html_().startswith("<iframe srcdoc=") and result._repr_html_().count("<") == 2
     shutil.rmtree(path.parent)
+
+
+def test_a_run_that_saw_nobody_can_be_looked_into_too(tmp_path: Path) -> None:
+    with recording_to(tmp_path / "r.mcap", RecordingHeader(driver="openni2", serial="A1")) as writer:
+        for number in range(10):
+            writer.write(SensorFrame(number + 1, number * 33_000_000))
+    config, out = tmp_path / "c.toml", tmp_path / "out"
+    config.write_text('[stack]\nwidth_px = 64\nheight_px = 36\n[model]\nname = "fast"\nbackend = "cpu"\n')
+    options = ["--config", config, "--replay", tmp_path / "r.mcap", "--headless", "--max-speed", "--out", out]
+    assert phasestack_command("run", *options).returncode == 0
+    page = (out / "viewer.html").read_text()
+    assert "Nobody was seen" in page and page.count("data:image/png;base64,") == 3 and '"follows": false' in page

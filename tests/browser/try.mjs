@@ -32,6 +32,14 @@ say("the picture is one", size > 5000);
 say("figures are told", await until(async () => /[\d.]+ refreshes a second/.test(await page.textContent(".figures"))));
 await page.screenshot({ path: `${folder}/try.png` });
 
+await page.click("[data-mode=target]");
+say("what was asked for is shown", await until(() => page.evaluate(() => / dB against/.test(document.querySelector(".light").textContent))));
+await page.screenshot({ path: `${folder}/target.png` });
+await page.click("[data-mode=left]");
+const solved = (await status()).solution;
+await page.mouse.move(220, 160);
+say("and the newest again", await until(async () => (await status()).solution > solved && await page.evaluate(() => document.querySelector(".light").textContent === "")));
+
 await page.check("[name=held]");
 say("the solver is held", await until(async () => (await status()).paused));
 const held = (await status()).solution;
@@ -71,6 +79,12 @@ say("back: tracking", await until(async () => (await status()).state === "tracki
 await page.fill("[name=gap_mm]", "40");
 await page.keyboard.press("Enter");
 say("another gap", await until(async () => (await page.evaluate(() => fetch("/now/about").then((a) => a.json()))).stack?.x_m[2] === 0.04, 120000));
+await page.check("[name=camera]");
+say("its camera is the sensor", await until(() => page.evaluate(() => /no viewer/.test(document.querySelector(".found figcaption").textContent)), 120000)
+  && (await status()).eyes_m === null);
+await page.screenshot({ path: `${folder}/camera.png` });
+await page.uncheck("[name=camera]");
+say("and the pointer again", await until(async () => (await status()).state === "tracking", 120000));
 say("and the scene stays", await until(async () => { const s = await status(); return s.scene === "texture" && s.state === "tracking"; }, 120000));
 say("elsewhere", elsewhere);
 say("errors", errors.filter((text) => !/status of (503|409)/.test(text)));

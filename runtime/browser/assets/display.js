@@ -281,16 +281,18 @@ export class Display {
     this.maps = null;
   }
 
-  // What an eye should see.
+  // What an eye should see; null: that is not known.
   target(side, image) {
-    const g = this.g, texture = g.createTexture();
+    const g = this.g, texture = image && g.createTexture();
+    g.deleteTexture(this.targets[side]);
+    this.targets[side] = texture;
+    if (!image) return;
     g.activeTexture(g.TEXTURE1);
     g.bindTexture(g.TEXTURE_2D, texture);
     g.pixelStorei(g.UNPACK_COLORSPACE_CONVERSION_WEBGL, g.NONE);
     g.texImage2D(g.TEXTURE_2D, 0, g.RGBA8, g.RGBA, g.UNSIGNED_BYTE, image);
     g.generateMipmap(g.TEXTURE_2D);
     g.texParameteri(g.TEXTURE_2D, g.TEXTURE_MIN_FILTER, g.LINEAR_MIPMAP_LINEAR);
-    this.targets[side] = texture;
   }
 
   // The panels show the solution by these maps, mixed with the flat picture.

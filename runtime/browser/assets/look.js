@@ -44,6 +44,7 @@ export class Look {
     this.state = ""; // why this is not what two eyes should see
     this.told = () => {}; // called where the head has moved
     this.onframe = () => {};
+    this.onmode = () => {}; // called where another mode is chosen, with whether it needs what eyes should see
     this.$("h1").textContent = title;
     this.#modes();
     this.#controls();
@@ -148,6 +149,7 @@ export class Look {
     if (mode === "apart") return this.#apart(width, height);
     if (checks) {
       g.clear(g.COLOR_BUFFER_BIT);
+      if (!display.targets[0]) return; // a moment is being measured
       const { width: pw, height: ph } = this.scene.picture, fit = Math.min(w / pw, h / ph), pic = { width: Math.floor(pw * fit), height: Math.floor(ph * fit) };
       sides.forEach((side, k) => {
         const left = (k % across) * w + ((w - pic.width) >> 1), below = height - (Math.floor(k / across) + 1) * h + ((h - pic.height) >> 1);
@@ -295,13 +297,15 @@ export class Look {
       box.append(button);
     });
     this.$(".modes").append(...Object.entries(groups).map(([name, box]) => (box.prepend(node("span", name)), box)));
-    this.choose(this.scene.picture && this.canvas.clientWidth >= 500 ? "parallel" : "left");
+    this.choose(this.scene.eyes_m && this.canvas.clientWidth >= 500 ? "parallel" : "left");
   }
 
   choose(mode) {
     this.mode = mode;
     for (const button of this.$(".modes").querySelectorAll("button")) button.setAttribute("aria-pressed", String(button.dataset.mode === mode));
-    this.$(".hint").textContent = MODES.find(([key]) => key === mode)[3];
+    const [, , group, hint] = MODES.find(([key]) => key === mode);
+    this.$(".hint").textContent = hint;
+    this.onmode(group === "Check");
     this.draw();
   }
 

@@ -17,6 +17,7 @@ async function begin() {
   wanted.forEach((picture, side) => look.display.target(side, picture));
   look.$(".more").append(...scene.lines.map((line) => Object.assign(document.createElement("p"), { textContent: line })));
   Object.assign(window.phasestack, look.doors);
+  look.doors.align(scene.follows);
   look.draw();
 }
 

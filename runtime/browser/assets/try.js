@@ -12,11 +12,15 @@ const CONTROLS = `
 <label>Sensor's latency, ms <input type="number" name="latency_ms" min="0" max="1000" step="5"></label>
 <label>Eyes apart, mm <input type="number" name="ipd_mm" min="45" max="80" step="1"></label>
 <label>Turns a minute <input type="number" name="turntable" min="-60" max="60" step="1" value="0"></label>
+<label class="tick"><input type="checkbox" name="camera"> this browser's camera sees the head</label>
+<label hidden>Camera's picture is wide, degrees <input type="number" name="camera_fov_deg" min="20" max="150" step="1" value="65"></label>
+<figure class="found" hidden><svg role="img" aria-label="What the camera sees, and the pupils found in it"></svg><figcaption></figcaption></figure>
 <label class="tick"><input type="checkbox" name="held"> hold the solver: alignment alone follows the head</label>
 <label class="tick"><input type="checkbox" name="lost"> eyes lost: nobody before the display</label></form>
 <p class="told" role="status"></p><p><a href="/operator">the operator's page</a></p>`;
 
 let look = null, socket = null, viewer = false, sensor = true, lastSent = 0, follows = null, ipd_m = 0.063, newest = null, pending = null;
+let checks = false, camera = null, lookedAt = null;
 let layersSeen = { solved: false, flat: false }, first = null;
 const latencies = [], drawn = [];
 const main = document.querySelector("main");
@@ -55,12 +59,13 @@ async function wish(command, value = null) {
 function build({ stack, fov_deg }) {
   main.replaceChildren();
   const title = stack.x_m.length > 2 ? `${stack.x_m.length} panels, live` : "two panels, live";
-  look = new Look(main, { stack, fov_deg, eyes_m: null }, { title, eyesAt: (head) => eyesNow(head) });
+  const picture = { width: stack.width_px, height: stack.height_px };
+  look = new Look(main, { stack, fov_deg, picture, eyes_m: null }, { title, eyesAt: (head) => eyesNow(head) });
   look.told = see;
-  look.follows = true;
+  look.onmode = check;
   main.querySelector(".more").innerHTML = CONTROLS;
   for (const [name, value] of [["noise_mm", 0.2], ["latency_ms", 0], ["ipd_mm", ipd_m * 1000]]) form(name).value = value;
-  for (const name of ["noise_mm", "latency_ms", "gap_mm"]) form(name).addEventListener("change", (event) => say({ [name]: Number(event.target.value) }));
+  for (const name of ["noise_mm", "latency_ms", "gap_mm", "camera_fov_deg"]) form(name).addEventListener("change", (event) => say({ [name]: Number(event.target.value) }));
   form("ipd_mm").addEventListener("change", (event) => {
     ipd_m = Math.max(45, Math.min(80, Number(event.target.value))) / 1000;
     look.moveTo(look.head);
@@ -70,9 +75,65 @@ function build({ stack, fov_deg }) {
   form("turntable").addEventListener("change", (event) => wish("place", { turntable_per_min: Number(event.target.value) }));
   form("held").addEventListener("change", (event) => wish(event.target.checked ? "pause" : "resume"));
   form("lost").addEventListener("change", see);
+  form("camera").addEventListener("change", (event) => film(event.target.checked));
   main.querySelector("form").addEventListener("submit", (event) => event.preventDefault());
   look.onframe = painted;
   about();
+}
+
+// What eyes should see is known of moments that are measured: such a mode shows the newest one instead of what is live.
+function check(on) {
+  if (on === checks) return;
+  checks = on;
+  for (const side of [0, 1]) look.display.target(side, null);
+  main.querySelector(".light").textContent = on ? "A moment is being measured …" : "";
+  say({ checks });
+}
+
+// This browser's own camera, where it is permitted: a picture at a time, the next one once that was looked at.
+async function film(on) {
+  camera?.getTracks().forEach((track) => track.stop());
+  camera = null;
+  if (!on) return say({ camera: 0 });
+  try {
+    camera = await navigator.mediaDevices.getUserMedia({ video: { width: { ideal: 640 }, frameRate: { ideal: 30 } } });
+  } catch (error) {
+    form("camera").checked = false;
+    return told(`no camera: ${error.message}`);
+  }
+  const mine = camera, video = Object.assign(document.createElement("video"), { srcObject: mine, muted: true, playsInline: true });
+  await video.play();
+  say({ camera: 1 });
+  const canvas = document.createElement("canvas");
+  while (camera === mine) {
+    const scale = Math.min(1, 640 / video.videoWidth), taken_ms = performance.now();
+    Object.assign(canvas, { width: video.videoWidth * scale, height: video.videoHeight * scale });
+    canvas.getContext("2d").drawImage(video, 0, 0, canvas.width, canvas.height);
+    const coded = await [0.85, 0.6, 0.3].reduce(async (before, quality) => { // as fine as a message may be long
+      const blob = await before;
+      return blob && blob.size < 60000 ? blob : new Promise((done) => canvas.toBlob(done, "image/jpeg", quality));
+    }, null);
+    if (camera !== mine) return;
+    const answered = new Promise((done) => { lookedAt = done; setTimeout(done, 250); });
+    say({ picture_ms: taken_ms });
+    if (socket?.readyState === WebSocket.OPEN) socket.send(coded);
+    await answered;
+  }
+}
+
+function found({ url, size: [width, height], pupils_px, reason }) {
+  lookedAt?.();
+  const box = main.querySelector(".found");
+  box.hidden = false;
+  const svg = box.querySelector("svg"), made = (name, attributes) => {
+    const shape = document.createElementNS("http://www.w3.org/2000/svg", name);
+    for (const [key, value] of Object.entries(attributes)) shape.setAttribute(key, value);
+    return shape;
+  };
+  svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
+  const rings = (pupils_px ?? []).map(([cx, cy], side) => made("circle", { cx, cy, r: 6, class: `pupil ${side ? "right" : "left"}` }));
+  svg.replaceChildren(made("image", { href: url, width, height }), ...rings);
+  box.querySelector("figcaption").textContent = pupils_px ? "what the camera sees, and the pupils found" : `no viewer: ${reason}`;
 }
 
 function painted() {
@@ -91,7 +152,7 @@ function take({ refresh, viewer: mine }) {
   if (!look) return;
   look.used = refresh.eyes_m ?? look.used;
   look.sigma_m = (refresh.eye_sigma_mm ?? 0) / 1000;
-  const flatness = layersSeen.solved ? (layersSeen.flat ? refresh.flatness : 0) : 1;
+  const flatness = checks ? 0 : layersSeen.solved ? (layersSeen.flat ? refresh.flatness : 0) : 1;
   const same = before && look.flatness === flatness && JSON.stringify(before.eyes_m) === JSON.stringify(refresh.eyes_m);
   look.flatness = flatness;
   look.state = refresh.state === "tracking" ? "" : `${refresh.state}: ${refresh.reason}`;
@@ -100,8 +161,14 @@ function take({ refresh, viewer: mine }) {
 }
 
 function load(bytes) {
-  const { layers: kind, solved_for_m } = pending;
-  look.display.load(kind, new Uint8Array(bytes));
+  const { layers: kind, solved_for_m, target } = pending, { width_px, height_px, x_m } = look.stack, size = 4 * width_px * height_px * x_m.length;
+  look.display.load(kind, new Uint8Array(bytes, 0, size));
+  if (target) {
+    const [width, height] = target, length = 4 * width * height;
+    look.scene.picture = { width, height };
+    for (const side of [0, 1])
+      look.display.target(side, new ImageData(new Uint8ClampedArray(bytes, size + side * length, length), width, height));
+  }
   layersSeen[kind] = true;
   if (kind === "solved") look.scene.eyes_m = solved_for_m ?? look.scene.eyes_m;
   look.draw();
@@ -121,8 +188,13 @@ function connect() {
       const same = look && ["width_px", "height_px"].every((k) => look.stack[k] === message.stack[k]) && look.stack.x_m.length === message.stack.x_m.length;
       if (same) look.turnTo(message.stack);
       else build(message);
+      form("camera").checked = message.is_camera;
+      form("camera_fov_deg").parentElement.hidden = sensor;
+      if (sensor) main.querySelector(".found").hidden = true;
       form("gap_mm").value = Math.round(1e5 * (message.stack.x_m[1] - message.stack.x_m[0])) / 100;
-    } else if (message.refresh) take(message);
+      if (checks) say({ checks });
+    } else if (message.found) found(message.found);
+    else if (message.refresh) take(message);
   };
   socket.onclose = () => {
     if (look) look.state = "phasestack try has ended, or its page was closed";
