@@ -27,7 +27,6 @@ from runtime.support import untrusted_input
 from runtime.support.plausible import check_text, nearest, within
 from runtime.support.plugins import located
 from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG
-from runtime.support.removed import REMOVED_SETTINGS
 
 TABLE_BYTES_MAX = 4 << 20
 
@@ -447,8 +446,6 @@ def _wrong_field(model: type[BaseModel], error: Any) -> tuple[str, str]:
     name = ".".join(str(part) for part in error["loc"])
     message = error["msg"].removeprefix("Value error, ")
     if error["type"] == "extra_forbidden":
-        if model is Settings and name in REMOVED_SETTINGS:
-            return name, f"is no setting any more: {REMOVED_SETTINGS[name]}"
         return name, "is no setting" + nearest(str(error["loc"][-1]), _fields(model, error["loc"][:-1]))
     field, colon, rest = message.partition(": ")
     if colon and error["type"] == "value_error" and field.partition(".")[0] in _fields(model, error["loc"]):

@@ -67,16 +67,6 @@ def test_an_error_in_a_thread_is_told_so_too(tmp_path: Path) -> None:
     assert answer.returncode == 0 and "ZeroDivisionError" in answer.stderr and "Traceback" not in answer.stderr
 
 
-def test_an_interrupt_that_a_library_turned_into_something_else_is_still_one(tmp_path: Path) -> None:
-    body = """
-    try:
-        raise KeyboardInterrupt
-    except KeyboardInterrupt as error:
-        raise ImportError("numpy failed") from error"""
-    answer = broken(body, tmp_path)
-    assert (answer.returncode, answer.stderr) == (130, "")
-
-
 def test_without_memory_it_may_pass(tmp_path: Path) -> None:
     answer = broken("raise MemoryError", tmp_path)
     assert (answer.returncode, answer.stderr) == (75, "phasestack: out of memory (this may pass: start again)\n")

@@ -12,6 +12,7 @@ import os
 import signal
 import sys
 import threading
+from types import FrameType
 from typing import Any
 
 INTERRUPTED, BAD_INPUT, OWN_ERROR, MAY_PASS, NOBODY_READS = 130, 2, 70, 75, 141
@@ -26,14 +27,14 @@ def run_guarded(*, interrupts_leave: bool) -> None:
         from runtime.support.progress import ShownProgress, listening
 
         if interrupts_leave:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+            signal.signal(signal.SIGINT, _interrupted)
         watch_threads()
         with listening(ShownProgress(sys.stderr)):
             code = _code_of(app)
-        _interrupts_leave(interrupts_leave)
     except BaseException as error:
-        _interrupts_leave(interrupts_leave)
         code = _reported(error)
+    if interrupts_leave:  # a second interrupt finds nothing to unwind
+        signal.signal(signal.SIGINT, lambda number, frame: os._exit(INTERRUPTED))
     code = _flushed(code)
     if _has_hung_thread():  # taking down what a library's own thread still runs in would end in an abort
         from runtime.support import logs
@@ -43,10 +44,13 @@ def run_guarded(*, interrupts_leave: bool) -> None:
     sys.exit(code)
 
 
-def _interrupts_leave(wanted: bool) -> None:
-    """From now on a second interrupt finds nothing to unwind: it ends the process at once."""
-    if wanted:
-        signal.signal(signal.SIGINT, lambda number, frame: os._exit(INTERRUPTED))
+def _interrupted(number: int, frame: FrameType | None) -> None:
+    """While a module is imported Python would drop what is raised, and there is nothing to unwind."""
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            os._exit(INTERRUPTED)
+        frame = frame.f_back
+    raise KeyboardInterrupt
 
 
 def _has_hung_thread() -> bool:
@@ -55,11 +59,6 @@ def _has_hung_thread() -> bool:
 
 
 def _code_of(app: Any) -> int:
-    from runtime.support.removed import removed_command
-
-    if gone := removed_command(sys.argv[1:]):
-        _say(f"phasestack: {gone[0]}: is gone: {gone[1]}")
-        return BAD_INPUT
     try:
         app()
     except SystemExit as error:
@@ -73,7 +72,7 @@ def _reported(error: BaseException) -> int:
     """The exit code of what a command was ended by, told in one line."""
     from runtime.errors import PhasestackError, TransientError, one_line
 
-    if _is_interrupt(error):
+    if isinstance(error, KeyboardInterrupt):
         return INTERRUPTED
     if isinstance(error, BrokenPipeError):
         return NOBODY_READS
@@ -90,13 +89,6 @@ def _reported(error: BaseException) -> int:
 
     _say(f"phasestack: {written(error)}")
     return OWN_ERROR
-
-
-def _is_interrupt(error: BaseException | None) -> bool:
-    """An interrupt, or what a library made of one that fell into its import."""
-    while error is not None and not isinstance(error, KeyboardInterrupt):
-        error = error.__cause__ or error.__context__
-    return error is not None
 
 
 def _say(line: str) -> None:

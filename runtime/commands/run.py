@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -45,12 +42,11 @@ def run(
 
     Example: phasestack run --replay demo --headless --max-speed --frames 30 --out out/run
     """
-    with _imports_end_at_once():
-        from runtime.config import Settings, load_settings, with_options
-        from runtime.daemon.build import RunOptions
-        from runtime.daemon.drive import print_summary
-        from runtime.daemon.supervise import run_daemon
-        from runtime.errors import InputError
+    from runtime.config import Settings, load_settings, with_options
+    from runtime.daemon.build import RunOptions
+    from runtime.daemon.drive import print_summary
+    from runtime.daemon.supervise import run_daemon
+    from runtime.errors import InputError
 
     if keep_light and out is None:
         raise InputError("run", "--keep-light", "needs --out")
@@ -70,20 +66,3 @@ def run(
         typer.echo(json.dumps(summary))
     elif "frames" in summary and "NOTIFY_SOCKET" not in os.environ:
         print_summary(summary, out)
-
-
-@contextmanager
-def _imports_end_at_once() -> Iterator[None]:
-    """Within it nothing but imports may happen: nothing is open and nothing is written, so that an interrupt needs no
-    unwinding. As an exception it would be lost where it came while Python releases a module's lock.
-
-    An interrupt that is ignored (a job in the shell's background) or handled stays so.
-    """
-    is_default = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    if is_default:
-        signal.signal(signal.SIGINT, lambda number, frame: os._exit(130))
-    try:
-        yield
-    finally:
-        if is_default:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
