@@ -38,6 +38,5 @@ def page(
     with retry_advised():  # a full disk may pass: the service is started again
         token = token_of(path)
     served = listening("page", port)
-    own_port = served.getsockname()[1]
-    typer.echo(f"the page is at http://{LOOPBACK}:{own_port}/ - its token is in {path}", err=True)
-    server_of(application(Daemon(places), token, port=own_port)).run(sockets=[served])
+    typer.echo(f"the page is at http://{LOOPBACK}:{served.getsockname()[1]}/ - its token is in {path}", err=True)
+    server_of(application(Daemon(places), token)).run(sockets=[served])

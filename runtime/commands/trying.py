@@ -94,13 +94,12 @@ def _as_wished(settings: Settings, link: BrowserLink) -> Settings:
 def _served(link: BrowserLink, socket: Path, port: int) -> Iterator[str]:
     """The page, in a thread; answers its address, token included."""
     token, served = secrets.token_urlsafe(32), listening("try", port)
-    own_port = served.getsockname()[1]
-    server = server_of(application(Daemon((socket,)), token, port=own_port, link=link))
+    server = server_of(application(Daemon((socket,)), token, link=link))
     sockets: dict[str, Any] = {"sockets": [served]}
     thread = threading.Thread(target=server.run, kwargs=sockets, name="page", daemon=True)
     thread.start()
     try:
-        yield f"http://{LOOPBACK}:{own_port}/?token={token}"
+        yield f"http://{LOOPBACK}:{served.getsockname()[1]}/?token={token}"
     finally:
         server.should_exit = True
         thread.join(timeout=5.0)

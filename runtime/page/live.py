@@ -23,12 +23,12 @@ RANGES = {"noise_mm": (0.0, 50.0), "latency_ms": (0.0, 1000.0), "camera_fov_deg"
 RANGES |= {"gap_mm": (1.0, 500.0), "camera": (0.0, 1.0)}  # what needs a new start
 
 
-async def live(socket: WebSocket, link: BrowserLink) -> None:
+async def live(socket: WebSocket, link: BrowserLink, *, protocol: str | None) -> None:
     """One page, from its first message to its last; it is permitted already."""
     if len(link.news) >= PAGES_MAX:
         await socket.close(1013, "too many pages")
         return
-    await socket.accept()
+    await socket.accept(protocol)
     page = _Page(socket, link)
     loop, me = asyncio.get_running_loop(), object()
     link.news[me] = lambda: _tell(loop, page.news)

@@ -1,27 +1,23 @@
-"""The page's web application: what may be seen and done with the token, and nothing without.
+"""The page's web application: its own files for everybody, and nothing of the daemon without the token.
 
-A GET never does anything. What does is a POST from the page itself: the browser says so (`Origin`), or who posts
-gives the token in the request, which no other site can.
+The token comes with every request: the page's script keeps it (`session.js`), where the browser gives it to no other
+site nor port. There is no cookie, so that no other site's request carries what it needs.
 """
 
 from __future__ import annotations
 
 import asyncio
-import base64
-import hashlib
-import re
 from collections.abc import Awaitable, Callable
 from functools import cache
 from importlib.resources import files
 from typing import Any
-from urllib.parse import parse_qs
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
 from starlette.middleware.base import BaseHTTPMiddleware
 from starlette.requests import ClientDisconnect, HTTPConnection, Request
-from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
+from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket
 
@@ -32,14 +28,25 @@ from runtime.daemon.commands import NAMES
 from runtime.errors import InputError
 from runtime.page.connections import REQUEST_S
 from runtime.page.live import live
-from runtime.page.token import cookie_of, same
+from runtime.page.token import same
 from runtime.support.artifacts import to_json
 from runtime.support.untrusted_input import parsed_json
 
 BODY_MAX_BYTES = 65536
 SCRIPT, STYLE = "text/javascript", "text/css"
+PROTOCOL = "phasestack"  # of the WebSocket
 ASSETS = {"page.css": STYLE, "look.css": STYLE}
-ASSETS |= dict.fromkeys(("page.js", "display.js", "look.js", "try.js"), SCRIPT)
+ASSETS |= dict.fromkeys(("session.js", "page.js", "display.js", "look.js", "try.js"), SCRIPT)
+HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
+    "connect-src 'self'; form-action 'none'; base-uri 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
 Handler = Callable[[Request], Awaitable[Response]]
 
 
@@ -54,19 +61,15 @@ class TooLong(ValueError):
     """A request's body."""
 
 
-def application(daemon: Daemon, token: str, *, port: int, link: BrowserLink | None = None) -> Starlette:
-    """The application, on loopback: by another name than this machine's own nobody reaches it.
+def application(daemon: Daemon, token: str, *, link: BrowserLink | None = None) -> Starlette:
+    """The application, on loopback.
 
-    port: that it is served on. Browsers know cookies by the host alone: another display's page has another name.
     link: this page is the display itself; the address with the token opens it.
     """
-    name, cookie = f"phasestack-{port}", cookie_of(token)
 
     def permitted(request: HTTPConnection) -> bool:
         kind, _, given = request.headers.get("authorization", "").partition(" ")
-        if kind.lower() == "bearer":
-            return same(given.strip(), token)
-        return same(request.cookies.get(name, ""), cookie)
+        return kind.lower() == "bearer" and same(given.strip(), token)
 
     def guarded(handler: Handler) -> Handler:
         async def answer(request: Request) -> Response:
@@ -77,28 +80,25 @@ def application(daemon: Daemon, token: str, *, port: int, link: BrowserLink | No
         return answer
 
     async def index(request: Request) -> Response:
-        if link is not None and same(request.query_params.get("token", ""), token):
-            return entered()
-        if not permitted(request):
-            return HTMLResponse(_login(), 401)
         return HTMLResponse(_asset("page.html") if link is None else browser_asset("try.html"))
 
     async def operator(request: Request) -> Response:
         return HTMLResponse(_asset("page.html"))
 
     async def connected(socket: WebSocket) -> None:
-        own = (socket.headers.get("origin") or "").partition("://")[2] == socket.headers.get("host")
-        bearer = socket.headers.get("authorization", "").lower().startswith("bearer ")
-        if link is None or _refused(socket) or not permitted(socket) or not (own or bearer):
+        # A browser's script sets no header of a WebSocket, but the protocols that it offers.
+        offered = [one.strip() for one in socket.headers.get("sec-websocket-protocol", "").split(",")]
+        if link is None or not (permitted(socket) or any(same(one, token) for one in offered)):
             await socket.close(1008)
             return
-        await live(socket, link)
+        await live(socket, link, protocol=PROTOCOL if PROTOCOL in offered else None)
 
     async def asset(request: Request) -> Response:
         name = request.path_params["name"]
         if name not in ASSETS:
             return Response(status_code=404)
-        return Response(_asset(name) if name.startswith("page") else browser_asset(name), media_type=ASSETS[name])
+        own = name.startswith(("page", "session"))
+        return Response(_asset(name) if own else browser_asset(name), media_type=ASSETS[name])
 
     async def look_up(request: Request) -> Response:
         name = request.path_params["name"]
@@ -120,70 +120,22 @@ def application(daemon: Daemon, token: str, *, port: int, link: BrowserLink | No
         code = 200 if answer.get("ok") else 503 if answer.get("running") is False else 409
         return Answer(answer, code)
 
-    async def login(request: Request) -> Response:
-        try:
-            fields = parse_qs((await _body(request)).decode("utf-8", "replace"))
-        except ValueError:  # too long, or the client went away
-            fields = {}
-        if not same(fields.get("token", [""])[0].strip(), token):
-            return HTMLResponse(_login("That is not the token."), 401)
-        return entered()
-
-    def entered() -> Response:
-        answer = RedirectResponse("/", 303)
-        answer.set_cookie(name, cookie, httponly=True, samesite="strict", path="/")
-        return answer
-
     routes: list[BaseRoute] = [
         Route("/", index, methods=["GET"]),
-        Route("/login", login, methods=["POST"]),
         Route("/do", guarded(do), methods=["POST"]),
         Route("/now/{name}", guarded(look_up), methods=["GET"]),
-        Route("/operator", guarded(operator), methods=["GET"]),
+        Route("/operator", operator, methods=["GET"]),
         WebSocketRoute("/live", connected),
-        Route("/{name}", guarded(asset), methods=["GET"]),
+        Route("/{name}", asset, methods=["GET"]),
     ]
     return Starlette(routes=routes, middleware=[Middleware(BaseHTTPMiddleware, dispatch=_guard)])
 
 
 async def _guard(request: Request, handler: Handler) -> Response:
-    """For every request: whose page it comes from, by which name, and what the answer may load."""
-    refused = _refused(request)
-    answer = Answer({"ok": False, "error": refused}, 403) if refused else await handler(request)
-    answer.headers.update(_headers())
+    """What every answer may load."""
+    answer = await handler(request)
+    answer.headers.update(HEADERS)
     return answer
-
-
-def _refused(request: HTTPConnection) -> str:
-    host = request.headers.get("host", "")
-    # A name that another site has made to lead here is none of ours.
-    if re.sub(r":\d*$", "", host) not in ("localhost", "127.0.0.1", "[::1]"):
-        return "not by this name: open http://localhost"
-    if request.scope.get("method", "GET") in ("GET", "HEAD"):
-        return ""
-    origin = request.headers.get("origin")
-    if origin is None:
-        given = request.headers.get("authorization", "").lower().startswith("bearer ")
-        return "" if given else "a browser's request says where it comes from (Origin)"
-    return "" if origin.partition("://")[2] == host else "from another site"
-
-
-@cache
-def _headers() -> dict[str, str]:
-    style = base64.b64encode(hashlib.sha256(_login_style().encode()).digest()).decode()
-    policy = (
-        f"default-src 'none'; script-src 'self'; style-src 'self' 'sha256-{style}'; img-src 'self' data:; "
-        "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
-    )
-    return {
-        "Content-Security-Policy": policy,
-        "X-Content-Type-Options": "nosniff",
-        "X-Frame-Options": "DENY",
-        "Referrer-Policy": "same-origin",
-        "Cross-Origin-Resource-Policy": "same-origin",
-        "Cross-Origin-Opener-Policy": "same-origin",
-        "Cache-Control": "no-store",
-    }
 
 
 async def _body(request: Request) -> bytes:
@@ -203,13 +155,3 @@ async def _body(request: Request) -> bytes:
 @cache
 def _asset(name: str) -> str:
     return (files("runtime.page") / "assets" / name).read_text(encoding="utf-8")
-
-
-def _login_style() -> str:
-    """What stands between the style tags of the login page: the policy allows just this."""
-    return _asset("login.html").partition("<style>")[2].partition("</style>")[0]
-
-
-def _login(problem: str = "") -> str:
-    told = f'<p role="alert">{problem}</p>' if problem else ""
-    return _asset("login.html").replace("<!-- problem -->", told)

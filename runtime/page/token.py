@@ -1,8 +1,7 @@
-"""The page's token: a file that only its owner reads, made where there is none; what a browser keeps instead of it."""
+"""The page's token: a file that only its owner reads, made where there is none."""
 
 from __future__ import annotations
 
-import hashlib
 import hmac
 import os
 import secrets
@@ -60,8 +59,3 @@ def _read(path: Path) -> str:
 def same(given: str, token: str) -> bool:
     """Whether they are the same, in a time that does not tell how much of them is."""
     return hmac.compare_digest(given.encode(), token.encode())
-
-
-def cookie_of(token: str) -> str:
-    """What the browser keeps: made from the token, which can't be found from it."""
-    return hmac.new(token.encode(), b"phasestack page", hashlib.sha256).hexdigest()

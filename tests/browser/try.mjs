@@ -4,7 +4,8 @@ import { opened, say } from "./chromium.mjs";
 const [, , url, folder] = process.argv;
 const origin = new URL(url).origin, token = new URL(url).searchParams.get("token");
 const { browser, context, page: newPage, elsewhere, errors } = await opened({ origin, width: 640, height: 480 });
-const status = async () => (await fetch(`${origin}/now/status`, { headers: { Authorization: `Bearer ${token}` } })).json();
+const now = async (name) => (await fetch(`${origin}/now/${name}`, { headers: { Authorization: `Bearer ${token}` } })).json();
+const status = () => now("status"), about = () => now("about");
 const until = async (holds, within_ms = 60000) => {
   const end = Date.now() + within_ms;
   while (Date.now() < end) {
@@ -78,7 +79,7 @@ await page.evaluate(() => window.phasestack.ready);
 say("back: tracking", await until(async () => (await status()).state === "tracking"));
 await page.fill("[name=gap_mm]", "40");
 await page.keyboard.press("Enter");
-say("another gap", await until(async () => (await page.evaluate(() => fetch("/now/about").then((a) => a.json()))).stack?.x_m[2] === 0.04, 120000));
+say("another gap", await until(async () => (await about()).stack?.x_m[2] === 0.04, 120000));
 await page.check("[name=camera]");
 say("its camera is the sensor", await until(() => page.evaluate(() => /no viewer/.test(document.querySelector(".found figcaption").textContent)), 120000)
   && (await status()).eyes_m === null);

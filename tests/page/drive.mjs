@@ -25,7 +25,7 @@ page.on("request", (request) => { if (!/^(data:|blob:)/.test(request.url()) && !
 page.on("console", (message) => { if (/Content Security Policy/.test(message.text())) violations.push(message.text()); });
 page.on("pageerror", (error) => violations.push(error.message));
 
-const now = () => page.evaluate(async () => (await fetch("/now/status")).json());
+const now = () => page.evaluate(async () => (await fetch("/now/status", { headers: { Authorization: `Bearer ${localStorage.getItem("token")}` } })).json());
 const until = async (holds, within_ms = 60000) => {
   const end = Date.now() + within_ms;
   while (Date.now() < end) {
@@ -48,17 +48,17 @@ await page.goto(origin);
 say("login is accessible", await findings(await evaluated(page)));
 await page.fill("#token", "wrong");
 await page.keyboard.press("Enter");
-await page.waitForSelector("[role=alert]");
+await page.waitForSelector("#refused:not([hidden])");
 say("a wrong token gets nothing", await page.evaluate(async () => {
   const codes = [];
-  for (const path of ["/", "/page.js", "/now/status", "/now/pictures", "/now/log"]) codes.push((await fetch(path)).status);
+  for (const path of ["/now/about", "/now/status", "/now/pictures", "/now/log", "/now/other"]) codes.push((await fetch(path)).status);
   return codes;
 }));
 
 // In, by the keyboard alone.
 await page.fill("#token", token);
 await page.keyboard.press("Enter");
-await page.waitForSelector("#state");
+await page.waitForSelector("#login", { state: "hidden" });
 say("state is shown", await until(async () => ["tracking", "holding", "flat", "degraded"].some((s) => s === null) ||
   /tracking|holding|flat|degraded/.test(await page.textContent("#state"))));
 say("pictures are shown", await until(() => page.evaluate(() =>

@@ -1,5 +1,6 @@
 // The display, live: this page's pointer is the head that the daemon's sensor sees, and this page is the panels.
 import { Look } from "/look.js";
+import { ask, token } from "/session.js";
 
 const AGAIN_MS = 500, STATUS_MS = 500, RETRY_MS = 1000, KEPT = 600; // a head that rests is still there; what latencies are kept
 const PLACE_M = [0.6, 0, 0];
@@ -49,7 +50,7 @@ const told = (text) => (main.querySelector(".told").textContent = text);
 async function wish(command, value = null) {
   told(`${command} …`);
   try {
-    const answer = await (await fetch("/do", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ command, value }) })).json();
+    const answer = await (await ask("/do", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ command, value }) })).json();
     told(answer.ok ? "" : answer.error);
   } catch {
     told("phasestack try has ended.");
@@ -176,7 +177,7 @@ function load(bytes) {
 }
 
 function connect() {
-  socket = new WebSocket(`ws://${location.host}/live`);
+  socket = new WebSocket(`ws://${location.host}/live`, ["phasestack", token()]);
   socket.binaryType = "arraybuffer";
   socket.onmessage = ({ data }) => {
     if (typeof data !== "string") return load(data);
@@ -203,12 +204,12 @@ function connect() {
   };
 }
 
-const status = async () => (await fetch("/now/status")).json();
+const status = async () => (await ask("/now/status")).json();
 const number = (value, digits = 1) => (typeof value === "number" ? value.toFixed(digits) : "–");
 
 async function about() {
   try {
-    const answer = await (await fetch("/now/about")).json();
+    const answer = await (await ask("/now/about")).json();
     if (!answer.ok) throw new Error(answer.error);
     main.querySelector("datalist").replaceChildren(...answer.scenes.map((value) => Object.assign(document.createElement("option"), { value })));
     form("model").replaceChildren(...answer.models.map((value) => Object.assign(document.createElement("option"), { value, textContent: value })));

@@ -1,5 +1,6 @@
 // The operator's page: asks what is new, draws it, and posts what is wished. Nothing is loaded from elsewhere.
 import { drawPlan } from "/display.js";
+import { ask, keep, token } from "/session.js";
 
 const $ = (id) => document.getElementById(id);
 const SVG = "http://www.w3.org/2000/svg";
@@ -240,10 +241,28 @@ $("place-reset").addEventListener("click", () => tell($("place-reset"), "place",
 
 // Asking.
 
+let loggedIn = Promise.resolve(); // once the token is right
+
+function logIn() {
+  if ($("login").open) return;
+  $("refused").hidden = token() === "";
+  $("token").value = "";
+  $("login").showModal();
+  loggedIn = new Promise((done) => $("login").addEventListener("close", done, { once: true }));
+}
+$("login").addEventListener("cancel", (event) => event.preventDefault());
+$("login").querySelector("form").addEventListener("submit", (event) => {
+  event.preventDefault();
+  keep($("token").value.trim());
+  $("login").close();
+});
+
 async function lookUp(name) {
-  const answer = await fetch(`/now/${name}`, { credentials: "same-origin" });
-  if (answer.status === 401) location.reload();
-  return answer.json();
+  await loggedIn;
+  const answer = await ask(`/now/${name}`);
+  if (answer.status !== 401) return answer.json();
+  logIn();
+  return lookUp(name);
 }
 
 function gone(why, hangs = false) {
@@ -338,9 +357,8 @@ async function tell(button, command, value = null, where = $("told")) {
   setText(where, `${command}: asked`);
   let done = false;
   try {
-    const answer = await fetch("/do", {
+    const answer = await ask("/do", {
       method: "POST",
-      credentials: "same-origin",
       headers: { "Content-Type": "application/json" },
       body: JSON.stringify({ command, value }),
     });
