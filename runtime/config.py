@@ -217,10 +217,6 @@ class ContentSettings(Section):
         "own, else guessed from the extent",
     )
     library: str = Field("", description="folder whose pictures, films, models and playlists the page offers")
-    stream_options: dict[str, str] = Field(
-        default_factory=dict,
-        description="for live pictures, as FFmpeg names them: video_size, framerate, input_format, rtsp_transport, ...",
-    )
     scale: Annotated[float, within(0.001, 1000.0, "")] = Field(
         1.0, description="the scene's size, times its own, about the display's middle"
     )

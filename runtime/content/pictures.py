@@ -219,60 +219,12 @@ def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
     return lambda context: source
 
 
-class ScreenSource(ContentSource):
-    """Views of pictures that hang in the plane of the display's centre."""
-
-    def __init__(self, *, layout: Layout, file: SceneFile) -> None:
-        self._layout, self._file = layout, file
-        self._at = -1  # number of the picture whose views these are
-        self._views: list[U8] = []
-        self._screen: PlaneRaster | None = None
-        self._shown: dict[int, WarpedPicture] = {}
-
-    @abstractmethod
-    def picture(self, number: int) -> U8:
-        """The one of a `revision`. Raises ContentFailure."""
-
-    def render(self, view: View, *, time_ns: int) -> U8:
-        number = self.revision(time_ns=time_ns)
-        if number != self._at:
-            try:
-                self._take(number, self.picture(number))
-            except ValueError as error:
-                raise ContentFailure(f"{self.info.name}: {error}") from None
-        assert self._screen is not None
-        which = self._view_for(view)
-        if which not in self._shown:
-            shown = self._views[which]
-            shown = rgba_from_rgb(shown) if shown.shape[2] == 3 else shown
-            self._shown[which] = WarpedPicture(shown, background=self._file.background)
-        matrix = plane_from_pixels(view.pixels_from_stack, self._screen)
-        return self._shown[which].warped(matrix, view)
-
-    def _take(self, number: int, picture: U8) -> None:
-        """Raises ValueError where it is too small."""
-        views = self._layout.views(picture)
-        height, width = views[0].shape[:2]
-        aspect = self._layout.pixel_aspect(width_px=width, height_px=height)
-        self._screen = screen(self._file.stack, width_px=width, height_px=height, pixel_aspect=aspect)
-        self._views, self._shown, self._at = views, {}, number
-
-    def _view_for(self, view: View) -> int:
-        """Which of the pictures an eye gets: its side's, or a quilt's nearest in angle about the vertical."""
-        if len(self._views) <= 2:
-            return min(view.side, len(self._views) - 1)
-        angle = np.arctan2(view.eye_m[1], view.eye_m[0])
-        place = (angle / np.radians(self._file.settings.cone_deg) + 0.5) * (len(self._views) - 1)
-        return int(np.clip(np.rint(place), 0, len(self._views) - 1))
-
-
-class PicturesSource(ScreenSource):
-    """Pictures or videos."""
+class PicturesSource(ContentSource):
+    """Views of pictures or films that hang in the plane of the display's centre."""
 
     def __init__(self, frames: Frames, *, layout: Layout, file: SceneFile) -> None:
         """Raises InputError where the picture is too small for its layout."""
-        super().__init__(layout=layout, file=file)
-        self._frames = frames
+        self._frames, self._layout, self._file = frames, layout, file
         first = frames.frame(0)
         try:
             self._take(0, first)
@@ -287,8 +239,35 @@ class PicturesSource(ScreenSource):
             flat_x_m=0.0 if mono else None,
         )
 
-    def picture(self, number: int) -> U8:
-        return self._frames.frame(number)
+    def render(self, view: View, *, time_ns: int) -> U8:
+        number = self.revision(time_ns=time_ns)
+        if number != self._at:
+            try:
+                self._take(number, self._frames.frame(number))
+            except ValueError as error:
+                raise ContentFailure(f"{self.info.name}: {error}") from None
+        which = self._view_for(view)
+        if which not in self._shown:
+            self._shown[which] = WarpedPicture(rgba_from_rgb(self._views[which]), background=self._file.background)
+        matrix = plane_from_pixels(view.pixels_from_stack, self._screen)
+        return self._shown[which].warped(matrix, view)
+
+    def _take(self, number: int, picture: U8) -> None:
+        """Raises ValueError where it is too small."""
+        views = self._layout.views(picture)
+        height, width = views[0].shape[:2]
+        aspect = self._layout.pixel_aspect(width_px=width, height_px=height)
+        self._screen = screen(self._file.stack, width_px=width, height_px=height, pixel_aspect=aspect)
+        self._shown: dict[int, WarpedPicture] = {}
+        self._views, self._at = views, number  # of the picture of this number
+
+    def _view_for(self, view: View) -> int:
+        """Which of the pictures an eye gets: its side's, or a quilt's nearest in angle about the vertical."""
+        if len(self._views) <= 2:
+            return min(view.side, len(self._views) - 1)
+        angle = np.arctan2(view.eye_m[1], view.eye_m[0])
+        place = (angle / np.radians(self._file.settings.cone_deg) + 0.5) * (len(self._views) - 1)
+        return int(np.clip(np.rint(place), 0, len(self._views) - 1))
 
     def revision(self, *, time_ns: int) -> int:
         return int(time_ns * self._frames.rate_hz / NS_PER_S) % self._frames.count

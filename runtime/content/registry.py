@@ -16,7 +16,7 @@ from runtime.content.placing import SceneFile
 from runtime.content.ply import read_header
 from runtime.content.presets import preset_names
 from runtime.content.scenes import SCENES
-from runtime.errors import InputError, PhasestackError
+from runtime.errors import InputError, PhasestackError, without_secrets
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import raster_from_stack
 from runtime.support import progress, untrusted_input
@@ -69,11 +69,8 @@ def _prepared(file: SceneFile) -> Opener:
 
         return program.prepare(file)
     if "://" in name or name.startswith("/dev/video"):
-        from runtime.content import stream
-
-        return stream.prepare(file)
-    if name.startswith("live:"):
-        raise InputError("content", "scene", f"`live:` is gone: a film plays by its own name, {name[5:]}")
+        problem = "live pictures come from a class of yours (module:Class) or a program (docs/content.md)"
+        raise InputError("content", "scene", f"{untrusted_input.shown(without_secrets(name))}: {problem}")
     if is_plugin(name):
         return _plugin(name, file)
     if not untrusted_input.checked_path(name, source="content", field="scene").exists():

@@ -9,11 +9,9 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import av
 import cv2
 import numpy as np
 import onnx
@@ -30,7 +28,6 @@ from runtime.content.mesh import load_mesh
 from runtime.content.pictures import open_frames
 from runtime.content.playlist import read_playlist
 from runtime.content.ply import read_header
-from runtime.content.stream import Reader
 from runtime.content.triangles import DrawnPart
 from runtime.daemon.server import StatusServer
 from runtime.errors import PhasestackError
@@ -247,16 +244,6 @@ show = [
 """
 
 
-def stream(path: Path) -> object:
-    """Decoded as a stream is, without its thread and its times."""
-    av.logging.set_level(av.logging.PANIC)
-    try:
-        with av.open(str(path)) as container, contextlib.closing(Reader(ContentSettings()).decoded(container)) as found:
-            return sum(1 for _ in islice(found, 5))
-    except (OSError, ValueError, av.error.FFmpegError) as error:  # which its loop tells and tries again
-        raise PhasestackError(str(error)[:100].replace("\n", " ")) from None
-
-
 # Other programs
 
 
@@ -303,7 +290,6 @@ TARGETS: dict[str, Target] = {
         lambda: [PLAYLIST.encode(), b'{"show": [{"scene": "flat", "seconds": 3}]}'],
         file("a.toml", lambda path: read_playlist(path, ContentSettings()), json_marks=b"{"),
     ),
-    "stream": Target(videos, file("a.mp4", stream)),
     "socket": Target(requests, request),
     "edid": Target(lambda: [block(serial_text="S1"), block(serial_number=7)], lambda data, _: parse(data)),
     "json": Target(
