@@ -13,7 +13,7 @@ from calib.viewpoints import Viewpoint
 from runtime.clock import NS_PER_S
 from runtime.config import Settings
 from runtime.errors import InputError
-from runtime.eyes.demo_geometry import demo_sensor_from_stack
+from runtime.eyes.calibration import demo_sensor_from_stack
 from runtime.optics.stack import PanelStack
 from runtime.panels.monitors import Monitor
 from runtime.records import U8, EyePoints

@@ -20,7 +20,7 @@ from runtime.config import Settings, with_options
 from runtime.daemon import supervise
 from runtime.daemon.build import RunOptions
 from runtime.daemon.drive import drive
-from runtime.eyes.demo_geometry import demo_sensor_from_stack
+from runtime.eyes.calibration import demo_sensor_from_stack
 from runtime.eyes.motions import true_eyes
 from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.recording import Recording, recording_to

@@ -13,7 +13,7 @@ import numpy as np
 
 from runtime.clock import NS_PER_S
 from runtime.errors import InputError
-from runtime.eyes.demo_geometry import demo_sensor_from_stack
+from runtime.eyes.calibration import demo_sensor_from_stack
 from runtime.eyes.motions import MOTIONS, observe, path_of, true_eyes
 from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.recording import recording_to

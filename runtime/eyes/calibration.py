@@ -195,3 +195,13 @@ def load_calibration(path: Path | None) -> Calibration:
     check_similarity(matrix, source=file)
     source = "built-in demo" if path is None else str(path)
     return Calibration(matrix, parsed, source, _warnings(matrix, source))
+
+
+def demo_stack_from_sensor() -> F64:
+    """4x4 rigid transform of the demo's sensor, which looks at the viewer along +x, tilted down by 10 degrees."""
+    return load_calibration(None).stack_from_sensor
+
+
+def demo_sensor_from_stack() -> F64:
+    """4x4 inverse of `demo_stack_from_sensor`."""
+    return np.asarray(np.linalg.inv(demo_stack_from_sensor()), np.float64)

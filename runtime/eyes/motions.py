@@ -11,6 +11,7 @@ from runtime.clock import NS_PER_S
 from runtime.records import F64, EyePoints
 
 IPD_M = 0.063
+DROPOUT_S = 0.2  # of every lost face
 NECK_TO_EYES_M = np.array([-0.09, 0.0, 0.14])  # forward (towards the display), aside, up
 
 
@@ -132,7 +133,6 @@ def observe(
     noise_m: float = 0.003,
     outliers: float = 0.05,
     dropout_every_s: float = 4.0,
-    dropout_s: float = 0.2,
     seed: int = 1,
     path: Path = BENCHMARK_PATH,
 ) -> list[Observation]:
@@ -151,7 +151,7 @@ def observe(
         hit = wrong & ((which == eye) | (which == 2))
         eyes[hit, eye] += offset[hit]
     every_s = dropout_every_s or np.inf
-    missing = (times_s > 1.0) & (np.mod(times_s, every_s) >= every_s - dropout_s)
+    missing = (times_s > 1.0) & (np.mod(times_s, every_s) >= every_s - DROPOUT_S)
     confidence = np.ones(2)
     return [
         Observation(round(t * NS_PER_S), None if gone else EyePoints(pair, confidence))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from calib.pairs import COLUMNS
 from calib.viewpoints import grid
-from runtime.eyes.demo_geometry import demo_stack_from_sensor
+from runtime.eyes.calibration import demo_stack_from_sensor
 
 KNOWN_M = np.array([viewpoint.midpoint_m for viewpoint in grid()])  # (27, 3) the grid's viewpoints in `stack`
 

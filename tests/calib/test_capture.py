@@ -19,7 +19,7 @@ from calib.pairs import PairsFile, read_pairs
 from calib.viewpoints import grid
 from runtime.clock import NS_PER_S
 from runtime.errors import InputError
-from runtime.eyes.demo_geometry import demo_stack_from_sensor
+from runtime.eyes.calibration import demo_stack_from_sensor
 from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader

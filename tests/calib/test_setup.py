@@ -23,8 +23,7 @@ from calib.simulated import SimulatedHardware
 from calib.viewpoints import grid
 from runtime.config import Settings, load_settings
 from runtime.errors import InputError
-from runtime.eyes.calibration import load_calibration
-from runtime.eyes.demo_geometry import demo_stack_from_sensor
+from runtime.eyes.calibration import demo_stack_from_sensor, load_calibration
 from runtime.optics.malus import phase_from_intensity
 from runtime.panels.monitors import Monitor
 from tests.calib.simulator import Camera, by_hand, camera_from_stack, misplaced, photograph

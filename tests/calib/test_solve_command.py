@@ -11,8 +11,7 @@ from typer.testing import CliRunner
 
 from calib.commands import app
 from runtime.errors import InputError
-from runtime.eyes.calibration import load_calibration
-from runtime.eyes.demo_geometry import demo_stack_from_sensor
+from runtime.eyes.calibration import demo_stack_from_sensor, load_calibration
 from tests.calib.camera import KNOWN_M, measured, write_pairs
 
 run = CliRunner()

@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from runtime.errors import InputError
 from runtime.eyes.calibration import load_calibration, position_jacobian, similarity_defect
-from runtime.eyes.demo_geometry import demo_stack_from_sensor
 from runtime.records import EyePoints
 
 PUBLISHED = """stack_from_sensor = [
@@ -37,9 +36,11 @@ def refusal(folder: Path, text: str) -> str:
     return message
 
 
-def test_the_demo_calibration_holds_the_demo_geometry_to_the_last_digit() -> None:
+def test_the_demo_camera_is_tilted_down_by_ten_degrees() -> None:
     calibration = load_calibration(None)
-    np.testing.assert_array_equal(calibration.stack_from_sensor, demo_stack_from_sensor())
+    c, s = np.cos(np.deg2rad(10)), np.sin(np.deg2rad(10))
+    turn = np.array([[0.0, -s, c], [-1.0, 0.0, 0.0], [0.0, -c, -s]])
+    np.testing.assert_array_equal(calibration.stack_from_sensor[:3, :3], turn)
     assert calibration.warnings == ()
 
 

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from runtime.commands.record import record
 from runtime.errors import InputError
 from runtime.evaluation.motion_recording import write_motion
-from runtime.eyes.demo_geometry import demo_stack_from_sensor
+from runtime.eyes.calibration import demo_stack_from_sensor
 from runtime.eyes.motions import MOTIONS, observe, path_of, true_eyes
 from runtime.sensor.recording import Recording
 

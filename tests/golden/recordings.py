@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from runtime.clock import NS_PER_S
-from runtime.eyes.demo_geometry import demo_sensor_from_stack
+from runtime.eyes.calibration import demo_sensor_from_stack
 from runtime.eyes.motions import observe, path_of, true_eyes
 from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.recording import recording_to
