@@ -35,7 +35,8 @@ def train(
     data: Annotated[
         Path | None, typer.Option(help="folder of pairs in EyeReal's form; without: procedural ones")
     ] = None,
-    pairs: Annotated[int, typer.Option(min=0, help="only so many procedural pairs; 0: ever new ones")] = 0,
+    scene: Annotated[str, typer.Option(help="a scene or file that the runtime draws, turned, from anywhere")] = "",
+    pairs: Annotated[int, typer.Option(min=0, help="only so many pairs; 0: ever new ones")] = 0,
     panels: Annotated[Path | None, typer.Option(help="panels to learn for; without: any three even ones")] = None,
     iterations: Annotated[int, typer.Option(min=1, help="of gradients, in all")] = 2000,
     batch: Annotated[int, typer.Option(min=1, help="pairs of an iteration")] = 1,
@@ -63,6 +64,7 @@ def train(
         "arch": arch,
         "options": options_of(option),
         "data": str(data or ""),
+        "scene": scene,
         "panels": str(panels or ""),
         "pairs": pairs,
         "iterations": iterations,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -11,17 +13,22 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from model_export.data import CENTRE, PITCH_WIDTH_M, TrainingPair, random_pair
+from model_export.data import CENTRE, PITCH_WIDTH_M, TrainingPair, filling_fov_deg, random_pair, random_place
 from model_export.light import Views
 from model_export.modules import Form
+from runtime.config import ContentSettings
+from runtime.content.base import ContentSource, View
 from runtime.content.eyereal import Pair, read_folder
+from runtime.content.placed import Placing, placed_source
 from runtime.content.presets import preset_names
+from runtime.content.registry import open_content
 from runtime.errors import InputError
 from runtime.optics.malus import phase_from_intensity
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_raster, image_from_stack, stack_from_eye
 from runtime.records import F32, F64, U8
 from runtime.support.artifacts import read_image
+from runtime.support.gl import offscreen_context
 
 PICTURE_FOV_DEG = 40.0  # of the published data set's pictures
 
@@ -38,6 +45,7 @@ class Pairs(Dataset[dict[str, Tensor]]):
     count: int = 0  # so many, again and again; 0: ever new ones
     stack: PanelStack | None = None  # None: random ones
     folder: tuple[Pair, ...] = ()  # pictures; none: procedural pairs
+    scene: str = ""  # that the runtime draws, turned about the vertical, instead
 
     def __getitem__(self, number: int) -> dict[str, Tensor]:
         """The network's input, what the eyes should see, and homographies of the rays where the head really is."""
@@ -68,7 +76,29 @@ class Pairs(Dataset[dict[str, Tensor]]):
                 pair, self.stack or prototype(**self._size), self.form.picture_fov_deg or PICTURE_FOV_DEG
             )
         random = np.random.default_rng([self.seed, number % self.count if self.count else number])
+        if self.scene:
+            return self._drawn(random)
         return random_pair(random, **self._size, stack=self.stack, fov_deg=self.form.picture_fov_deg)
+
+    def _drawn(self, random: np.random.Generator) -> TrainingPair:
+        """The scene at an instant, turned about the vertical, for eyes anywhere before the panels."""
+        width_px, height_px = self.width_px, self.height_px
+        stack, eyes_m = random_place(random, **self._size, stack=self.stack or prototype(**self._size))
+        fov_deg = self.form.picture_fov_deg or filling_fov_deg(stack, eyes_m.mean(axis=0))
+        placing = Placing(rotation_deg=(0.0, 0.0, random.uniform(0, 360)))
+        source, time_ns = placed_source(opened(self.scene, stack, os.getpid()), placing), int(random.integers(10**11))
+        images = []
+        for side, eye in enumerate(eyes_m):
+            projection = image_from_stack(eye, **self._size, fov_deg=fov_deg)
+            picture = source.render(View(eye, side, projection, width_px, height_px), time_ns=time_ns)
+            images.append(np.ascontiguousarray(picture[..., :3]))
+        return TrainingPair(stack, eyes_m, (images[0], images[1]), fov_deg)
+
+
+@lru_cache(maxsize=2)
+def opened(scene: str, stack: PanelStack, _process: int) -> ContentSource:
+    """What draws a scene in this process, on its only thread. Raises InputError."""
+    return open_content(ContentSettings(scene=scene), stack, offscreen_context())
 
 
 def folder_pairs(folder: Path) -> tuple[Pair, ...]:

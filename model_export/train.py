@@ -54,6 +54,7 @@ class Training(Section):
     eye_sigma_mm: Annotated[float, Field(ge=0, le=20)] = 1.0
     validate_every: Annotated[int, Field(ge=1)] = 100
     data: str = ""
+    scene: str = ""
     panels: str = ""
 
 
@@ -155,10 +156,12 @@ def _data(training: Training, form: Form) -> tuple[Pairs, Pairs]:
         stack = replace(stack, **how)
         if stack.count != PANELS:
             raise InputError(training.panels, "x_m", f"has {stack.count} panels; networks of pictures serve {PANELS}")
+    if training.data and training.scene:
+        raise InputError("train", "--data", "and --scene exclude one another")
     folder = folder_pairs(Path(training.data)) if training.data else ()
     held = folder[::-HELD_OUT_SHARE] if len(folder) > 1 else folder
     kept = tuple(pair for pair in folder if pair not in held) or folder
-    how |= {"form": form, "eye_sigma_mm": training.eye_sigma_mm, "stack": stack}
+    how |= {"form": form, "eye_sigma_mm": training.eye_sigma_mm, "stack": stack, "scene": training.scene}
     return (
         Pairs(seed=training.seed, count=len(kept) or training.pairs, folder=kept, **how),
         Pairs(seed=HELD_OUT_SEED, count=len(held) or HELD_OUT, folder=held, **how),

@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from calib.keys import Key, TerminalKeys, parse
 
@@ -23,16 +21,6 @@ from calib.keys import Key, TerminalKeys, parse
 )
 def test_bytes_mean_keys(data: bytes, keys: list[Key]) -> None:
     assert parse(data) == (keys, b"")
-
-
-@given(st.lists(st.sampled_from([b"\x1b[A", b"n", b"\n", b"\x1b[D", b"f"])), st.lists(st.integers(1, 4)))
-def test_an_arrow_may_arrive_in_pieces(sent: list[bytes], cuts: list[int]) -> None:
-    data, rest, found = b"".join(sent), b"", []
-    for cut in [*cuts, len(data) + 1]:
-        keys, rest = parse(rest + data[:cut])
-        data, found = data[cut:], found + keys
-    assert found == parse(b"".join(sent))[0]
-    assert rest == b""
 
 
 def test_a_closed_input_quits_and_an_idle_one_says_nothing() -> None:

@@ -23,16 +23,6 @@ def test_small_theta_is_the_viewers_right_and_small_phi_is_up() -> None:
     assert by_name["R50-phi70-theta90"][2] > by_name["R50-phi90-theta90"][2]
 
 
-@pytest.mark.parametrize("viewpoint", grid()[::5], ids=lambda v: v.name)
-def test_the_eyes_are_level_apart_by_the_ipd_and_equally_far(viewpoint: Viewpoint) -> None:
-    left, right = viewpoint.eyes_m(0.064)
-    assert np.linalg.norm(left - right) == pytest.approx(0.064)
-    np.testing.assert_allclose((left + right) / 2, viewpoint.midpoint_m, atol=1e-15)
-    assert left[2] == pytest.approx(right[2])
-    assert left[1] < right[1]
-    assert np.linalg.norm(left) == pytest.approx(np.linalg.norm(right))
-
-
 def test_the_grid_and_the_volume_follow_the_configured_viewing_range() -> None:
     far = CalibrationSettings(viewing_m=(1.0, 2.0), viewing_side_deg=20, viewing_up_deg=(-10, 10))
     assert {viewpoint.radius_cm for viewpoint in grid(far)} == {100, 150, 200}

@@ -141,22 +141,6 @@ def test_gradients_of_light_and_step_are_finite_differences(stack: PanelStack) -
     assert torch.autograd.gradcheck(steps, (x, size, momentum), **close)
 
 
-def test_a_step_goes_along_the_gradient_of_light() -> None:
-    """Where one bilinear sample is the transpose exactly, between rasters that are only shifted, away from edges."""
-    matrices = torch.eye(3, dtype=torch.float64).repeat(2, 3, 1, 1)
-    matrices[:, :, :2, 2] = torch.tensor([[[0.3, 0.0], [0.0, 0.0], [-0.4, 0.2]], [[-0.6, 0.1], [0.0, 0.0], [0.7, 0.0]]])
-    views, targets = Views(matrices, 12, 8), torch.zeros(2, 2, 8, 12, dtype=torch.float64)
-    x = random_panels(STACK, channels=2).requires_grad_()
-    seen, counts = light(x, views)
-    (((seen - targets) * counts) ** 2).sum().div(2).backward()
-    floor = 100.0  # above every bound: all that is left is the gradient
-    with torch.no_grad():
-        new, ahead = step(x, x, targets, views, size=1.0, momentum=0.5, floor=floor)
-        slope = (x - new) * 1.5 * torch.pi * floor * 2
-        assert torch.allclose(torch.pi / 2 * slope[..., 2:-2, 2:-2], x.grad[..., 2:-2, 2:-2], atol=1e-9)
-        assert torch.allclose(ahead, new + 0.5 * (new - x))
-
-
 def test_a_step_is_bounded_by_the_curvature_and_its_floor() -> None:
     """One pixel, seen through its middle: L5 in numbers."""
     views = Views(torch.eye(3, dtype=torch.float64).repeat(2, 2, 1, 1), 2, 2)
@@ -166,15 +150,6 @@ def test_a_step_is_bounded_by_the_curvature_and_its_floor() -> None:
         s = np.pi * sum(values)
         moved = 0.5 * 2 * (1 - np.cos(s)) / 2 * np.sin(s) / (1.5 * np.pi * max(2 * np.sin(s) ** 2, FLOOR * 2)) * 3 / 2
         assert (x - new).numpy() == pytest.approx(np.full((2, 1, 2, 2), moved), abs=1e-12)
-
-
-def test_a_ray_counts_half_a_pixel_inside_every_panel() -> None:
-    matrices = torch.eye(3, dtype=torch.float64).repeat(2, 3, 1, 1)
-    matrices[0, 0, 0, 2], matrices[1, 2, 1, 2] = 0.1, -2.0  # a tenth of a pixel to the right; two pixels up
-    counts = light(random_panels(STACK), Views(matrices, 12, 8))[1]
-    assert counts[0, 0].all(dim=0).tolist() == [True] * 11 + [False]
-    assert counts[1, 0].all(dim=1).tolist() == [False] * 2 + [True] * 6
-    assert not light(random_panels(STACK), Views(-matrices, 12, 8))[1].any()  # behind the eye
 
 
 def test_the_example_that_bounds_what_panels_could_show_runs(tmp_path: Path, still: tuple[PanelStack, Any]) -> None:

@@ -228,7 +228,7 @@ export class Look {
     });
     over.replaceChildren(...shapes);
     this.$(".point").replaceChildren(...lines);
-    this.#names(x_m.map((x, n) => [panelName(n, count), ...at(x, 0, -height_m / 2 - 0.005).map((p, k) => p / (k ? height : width))]));
+    this.#names(x_m.map((x, n) => [panelName(n, count), ...at(x, -0.36 * width_m, height_m / 2).map((p, k) => p / (k ? height : width))]));
   }
 
   // What a ray's panels show, and what comes of it.

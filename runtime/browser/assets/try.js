@@ -156,7 +156,7 @@ function take({ refresh, viewer: mine }) {
   const flatness = checks ? 0 : layersSeen.solved ? (layersSeen.flat ? refresh.flatness : 0) : 1;
   const same = before && look.flatness === flatness && JSON.stringify(before.eyes_m) === JSON.stringify(refresh.eyes_m);
   look.flatness = flatness;
-  look.state = refresh.state === "tracking" ? "" : `${refresh.state}: ${refresh.reason}`;
+  look.state = refresh.state === "tracking" ? "" : `${refresh.state.split(":")[0]}: ${refresh.reason}`;
   if (!same || before.state !== refresh.state) look.draw();
   if (layersSeen.solved && flatness < 1) first?.();
 }
