@@ -102,18 +102,13 @@ class RunOutput:
                 write_png(folder / f"layer-{n}.png", layer)
             if eye_views is not None:
                 eye_views.write(folder)
-            lines = [*(moment.lines if moment is not None else ()), in_one_line(summary)]
-            if moment is None:
-                sheet = contact_sheet(layers, eye_views, headline=headline(None), lines=lines)
-            else:
-                sheet = contact_sheet(moment.layers, moment.eye_views, headline=headline(moment.light_db), lines=lines)
-            write_png(folder / "contact-sheet.png", sheet)
-            views, title = (eye_views, None) if moment is None else (moment.eye_views, moment.light_db)
-            if views is None:
-                write_text(folder / "viewer.html", unseen)
-            else:
-                shown = layers if moment is None else moment.layers
-                write_text(folder / "viewer.html", views.viewer(shown, title=headline(title), lines=lines))
+            shown, views, title, lines = layers, eye_views, headline(None), [in_one_line(summary)]
+            if moment is not None:
+                shown, views, title = moment.layers, moment.eye_views, headline(moment.light_db)
+                lines = [*moment.lines, *lines]
+            write_png(folder / "contact-sheet.png", contact_sheet(shown, views, headline=title, lines=lines))
+            page = unseen if views is None else views.viewer(shown, title=title, lines=lines)
+            write_text(folder / "viewer.html", page)
 
         self._work.put(write)
 

@@ -60,6 +60,10 @@ def refused(path: Path, **settings: Any) -> str:
     return line
 
 
+def test_an_unknown_name_is_one_line_with_what_there_is() -> None:
+    assert refused(Path("nothing")).startswith("content: scene: `nothing`") and "demo" in refused(Path("nothing"))
+
+
 @pytest.mark.parametrize(("width", "height"), [(60_000, 60_000), (32_000, 32_000), (12000, 12000), (70_000, 2)])
 def test_a_large_picture_is_refused_by_its_header_with_the_figure_and_the_limit(
     tmp_path: Path, width: int, height: int

@@ -11,9 +11,11 @@ import pytest
 
 from runtime.config import ContentSettings
 from runtime.content.base import ContentSource
+from runtime.content.images import WarpedPicture, image_from_view, rgba_from_rgb
 from runtime.content.registry import open_content
 from runtime.errors import ContentFailure, InputError
 from runtime.optics.stack import PanelStack
+from runtime.optics.views import image_from_stack
 from runtime.support.artifacts import write_png
 from tests.content.conftest import panel_view
 
@@ -227,3 +229,14 @@ def test_beside_an_edge_there_is_neither_a_hole_nor_the_near_thing_drawn_out(
     assert (green | ground).mean() > 0.985  # but for the outline's own smoothing
     expected = (60 * 480 / 320) ** 2  # 0.55 m from the eye it is drawn as large as it was from 0.6
     assert green.sum() == pytest.approx(expected, rel=0.08)
+
+
+def test_a_picture_much_larger_than_the_raster_is_averaged_and_not_picked_from(stack: PanelStack) -> None:
+    lines = np.zeros((1080, 1920, 3), np.uint8)
+    lines[:, ::2] = 255
+    view = panel_view((0.7, -0.03, 0.1), stack.panel(1))
+    projection = image_from_stack(view.eye_m, width_px=1920, height_px=1080, fov_deg=60)
+    matrix = image_from_view(projection, view.pixels_from_stack, x_m=0.0)
+    picture = WarpedPicture(rgba_from_rgb(lines), background=(1.0, 1.0, 1.0)).warped(matrix, view)
+    inner = picture[60:-60, 60:-60, 0].astype(int)
+    assert np.abs(inner - 128).max() < 32

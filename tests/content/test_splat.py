@@ -116,22 +116,6 @@ def test_many_splats_deep_agree_with_the_exact_renderer_for_both_eyes(tmp_path: 
         assert np.abs(error.mean()) < 0.5 / 255
 
 
-def test_the_nearer_splat_shows(tmp_path: Path, context: Any, stack: PanelStack) -> None:
-    """Two opaque splats on one ray: the nearer one shows, in whichever order the file has them."""
-    eye = np.array([0.6, 0.0, 0.0])
-    for order in ((0, 1), (1, 0)):
-        table = splat_table(2, degree=0)
-        table["x"], table["y"], table["z"] = [-0.05, 0.05], 0, 0
-        table["opacity"] = 8
-        for axis in range(3):
-            table[f"scale_{axis}"] = np.log(0.005)
-        table["f_dc_0"], table["f_dc_1"], table["f_dc_2"] = [-1.77, 1.77], [1.77, -1.77], -1.77
-        source, _ = placed(written(tmp_path, table[list(order)]), context, stack, fit=False)
-        picture = source.render(panel_view(eye, stack.panel(1)), time_ns=0)
-        assert picture[135, 240, 0] > 245
-        assert picture[135, 240, 1] < 10
-
-
 def test_the_harmonics_are_the_textbook_s() -> None:
     for direction in np.random.default_rng(1).normal(size=(20, 3)):
         direction /= np.linalg.norm(direction)

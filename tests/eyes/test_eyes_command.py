@@ -17,8 +17,7 @@ from runtime.evaluation.motion_recording import write_motion
 from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.support.artifacts import read_image, write_png
-from tests.eyes.benchmark import measure
-from tests.eyes.scene import camera, eileen, frame, grace, scene
+from tests.eyes.scene import camera, eileen, frame, scene
 
 CAMERA = camera(640, 480, 65.0)
 
@@ -95,26 +94,3 @@ def test_without_a_file_the_sensor_is_looked_at(tmp_path: Path) -> None:
     config.write_text('[sensor]\nsource = "second.mcap"\n')
     live = eyes("--config", config)
     assert live.exit_code == 0 and "eyes_m (" in live.stdout
-
-
-def test_the_benchmark_measures_detection_error_sigma_jitter_and_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("tests.eyes.benchmark.TRACKS_MAX", 1)
-    for portrait, name in ((eileen(), "eileen.png"), (grace(), "grace.png")):
-        write_png(tmp_path / name, portrait.picture)
-    rows = [
-        {"file": f"{name}.png", "left": portrait.pupils[0].tolist(), "right": portrait.pupils[1].tolist()}
-        for portrait, name in ((eileen(), "eileen"), (grace(), "grace"))
-    ]
-    (tmp_path / "truth.json").write_text(json.dumps(rows))
-    measured = measure(tmp_path)
-    for camera_row in measured["cameras"]:
-        assert camera_row["right"] == 1 and camera_row["mean_mm"] < 1.2 and camera_row["within_2_sigma"] > 0.7
-    steady = measured["steady"]
-    assert steady["lost"] == 0 and max(steady["right_mm"], steady["up_mm"]) < 0.07 and abs(steady["lag_frames"]) < 0.1
-    assert measured["processor_ms"]["followed"]["p50"] < measured["processor_ms"]["found"]["p50"]
-    rows[1]["left"] = "here"
-    (tmp_path / "truth.json").write_text(json.dumps(rows))
-    with pytest.raises(InputError, match=r"truth\.json: 1: must have"):
-        measure(tmp_path)

@@ -269,25 +269,6 @@ def test_a_kit_that_ends_the_process_or_fails_to_close_is_lost_and_opened_again(
     assert log.count("open") + log.count("open S7") == 3
 
 
-def test_where_no_thread_can_be_started_what_hangs_is_left_behind_later(
-    started: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    gate = threading.Event()
-    worker, _ = started(lambda: gate.wait(20.0))
-    with monkeypatch.context() as exhausted:
-        exhausted.setattr(threading, "_start_new_thread", _no_thread)
-        assert eventually(lambda: worker.state is SensorState.HUNG, within_s=20)
-        time.sleep(0.05)
-        assert worker.state is SensorState.HUNG  # asking raises nothing
-    assert eventually(lambda: worker.state and worker._attempt.number == 2, within_s=20)
-    gate.set()
-    assert eventually(lambda: worker.state is SensorState.RUNNING, within_s=20)
-
-
-def _no_thread(*_: Any) -> None:
-    raise RuntimeError("can't start new thread")  # as the interpreter does at the limit of tasks
-
-
 class Camera(Scripted):
     """Stamps its pictures as the test says."""
 

@@ -31,9 +31,9 @@ def ready(model: str, stack: PanelStack) -> Predictor:
     return load_predictor(model, stack, ModelSettings(threads=1))
 
 
-def predicted(model: str, images: Sequence[U8], eyes_m: F64, stack: PanelStack) -> U8:
+def predicted(model: str, images: Sequence[U8], eyes_m: F64, stack: PanelStack, *, fov_deg: float = FOV_DEG) -> U8:
     """(N, h, w, 3) layers, copied out of the predictor."""
-    done = solve_still(images[0], images[1], eyes_m=eyes_m, fov_deg=FOV_DEG, predictor=ready(model, stack))
+    done = solve_still(images[0], images[1], eyes_m=eyes_m, fov_deg=fov_deg, predictor=ready(model, stack))
     return np.array(done.layers[..., :3])
 
 
@@ -43,7 +43,7 @@ def pictures(kind: str) -> list[U8]:
     left = np.zeros((height, width, 3), np.uint8)
     right = left.copy()
     if kind == "all white":
-        left[:], right[:] = 255, 255
+        left[:] = right[:] = 255
     elif kind == "lines one pixel wide":
         left[:, ::9], right[:, 4::9] = 255, 255
     elif kind == "black for one eye, white for the other":
@@ -88,9 +88,8 @@ def solver(model: str) -> Method:
 
     def solve(problem: Problem) -> F32:
         images = [np.rint(image * 255).astype(np.uint8) for image in problem.pictures]
-        predictor = ready(model, problem.stack)
-        done = solve_still(*images, eyes_m=problem.eyes_m, fov_deg=problem.fov_deg, predictor=predictor)
-        return done.layers[..., :3].astype(np.float32) / np.float32(255)
+        layers = predicted(model, images, problem.eyes_m, problem.stack, fov_deg=problem.fov_deg)
+        return layers.astype(np.float32) / np.float32(255)
 
     return solve
 

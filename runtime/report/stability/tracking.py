@@ -1,10 +1,9 @@
-"""The tracker at extreme time steps, against heads whose way is known."""
+"""The tracker at extreme time steps, against a head that moves evenly: where its eyes are is known at every instant."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -22,48 +21,37 @@ FASTEST = 0.3  # m/s
 FLOOR_M = 1e-6
 
 
-@dataclass(frozen=True, slots=True)
-class Head:
-    """A head that moves evenly: where its eyes are is known at every instant."""
-
-    span_ns: int  # in which it travels TRAVEL_M, or as far as FASTEST takes it
-
-    def eyes_m(self, time_ns: int) -> F64:
-        """(2, 3) left, right; frame `stack`."""
-        length = float(np.linalg.norm(TRAVEL_M))
-        share = min(1.0, FASTEST * self.span_ns / NS_PER_S / length)
-        return EYES_M + TRAVEL_M * share * (time_ns / max(self.span_ns, 1))
+def head_m(time_ns: int, *, span_ns: int) -> F64:
+    """(2, 3) left and right eye, frame `stack`, of a head that goes TRAVEL_M in a span, at FASTEST at most."""
+    share = min(1.0, FASTEST * span_ns / NS_PER_S / float(np.linalg.norm(TRAVEL_M)))
+    return EYES_M + TRAVEL_M * share * (time_ns / max(span_ns, 1))
 
 
 def still(updates: int) -> Answer:
     """A head that does not move must not drift, wherever it came to rest."""
-    tracker = Tracker()
-    confidence = np.ones(2)
-    came = Head(30 * FRAME_NS)
+    tracker, span_ns = Tracker(), 30 * FRAME_NS
     for index in range(updates):
-        eyes = came.eyes_m(min(index, 30) * FRAME_NS)
-        tracker.update(EyePoints(eyes, confidence), capture_ns=index * FRAME_NS)
+        eyes = head_m(min(index * FRAME_NS, span_ns), span_ns=span_ns)
+        tracker.update(EyePoints(eyes, np.ones(2)), capture_ns=index * FRAME_NS)
     found = tracker.at((updates - 1) * FRAME_NS).eyes_m
     assert found is not None
-    return Answer(float(np.abs(found - came.eyes_m(30 * FRAME_NS)).max()), 1e-9, float(updates))
+    return Answer(float(np.abs(found - head_m(span_ns, span_ns=span_ns)).max()), 1e-9, float(updates))
 
 
-def after(steps_ns: list[int], ask_ns: int, *, lost: bool = False) -> Answer:
-    """A head that moves evenly, sampled at odd intervals and asked for at an odd time: where it is then.
+def after(steps_ns: list[int], ahead_ns: int, *, lost: bool = False) -> Answer:
+    """A head sampled at odd intervals: its place so long after the last one.
 
     lost: it was not seen for so long that nobody can know; then an answer is the mistake.
     """
-    tracker = Tracker()
-    now, head = 0, Head(sum(map(abs, steps_ns)) + ask_ns)
-    tracker.update(EyePoints(head.eyes_m(now), np.ones(2)), capture_ns=now)
-    for step in steps_ns:
-        now += step
-        tracker.update(EyePoints(head.eyes_m(now), np.ones(2)), capture_ns=now)
-    estimate = tracker.at(now + ask_ns)
+    tracker, now_ns, span_ns = Tracker(), 0, sum(map(abs, steps_ns)) + ahead_ns
+    for step_ns in (0, *steps_ns):
+        now_ns += step_ns
+        tracker.update(EyePoints(head_m(now_ns, span_ns=span_ns), np.ones(2)), capture_ns=now_ns)
+    estimate = tracker.at(now_ns + ahead_ns)
     if lost or estimate.eyes_m is None:
         right = lost and estimate.eyes_m is None
         return Answer(0.0 if right else math.inf, 1e-3, note=f"label {estimate.label}")
-    error = float(np.abs(estimate.eyes_m - head.eyes_m(now + ask_ns)).max())
+    error = float(np.abs(estimate.eyes_m - head_m(now_ns + ahead_ns, span_ns=span_ns)).max())
     return Answer(error, 1.0, note=f"label {estimate.label}")
 
 
@@ -72,7 +60,7 @@ def trials(*, full: bool = False) -> Iterator[Trial]:
     for updates in (10_000, *((1_000_000,) if full else ())):
         yield Trial(STAGE, f"{updates} updates of a still head", partial(still, updates), measure="m")
     hour, usual = 3600 * NS_PER_S, [FRAME_NS] * 30
-    for name, steps, ask in (
+    for name, steps, ahead in (
         ("the same instant twice", [*usual, 0], 0),
         ("1 ns apart", [*usual, 1], 0),
         ("1 ns apart, all of them", [1] * 100, 0),
@@ -83,5 +71,5 @@ def trials(*, full: bool = False) -> Iterator[Trial]:
         ("asked 60 ms ahead", usual, 60_000_000),
         ("asked an hour ahead", usual, hour),
     ):
-        run = partial(after, steps, ask, lost=ask == hour)
-        yield Trial(STAGE, name, run, measure="m", floor=None if ask == hour else FLOOR_M)
+        run = partial(after, steps, ahead, lost=ahead == hour)
+        yield Trial(STAGE, name, run, measure="m", floor=None if ahead == hour else FLOOR_M)
