@@ -273,24 +273,14 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
         "nodes: are nested deeper than 64",
     ),
     "a circle of nodes": (gltf(nodes=[{"children": [0], "mesh": 0}]), ""),
-    "a child before the first": (gltf(nodes=[{"children": [-1]}]), "cannot be read as a mesh"),
     "a count": (
         gltf(accessors=[{"componentType": 5126, "count": 10**9, "type": "VEC3"}] * 2),
         "accessors[0].count: 1,000,000,000 is over the limit of 20,000,000",
-    ),
-    "a negative count": (
-        gltf(accessors=[{"componentType": 5126, "count": -1, "type": "VEC3"}] * 2),
-        "cannot be read as a mesh",
     ),
     "a buffer that is not there": (
         gltf(buffers=[{"uri": "gone.bin", "byteLength": 9}]),
         "uri: gone.bin is not there",
     ),
-    "a short buffer": (
-        gltf(buffers=[{"uri": "data:base64,MTI=", "byteLength": 9}]),
-        "cannot be read as a mesh",
-    ),
-    "a number for a list": (gltf(buffers=5), "cannot be read as a mesh (TypeError"),
     "nothing": (gltf(meshes=[], nodes=[], scenes=[{"nodes": []}]), "faces: there are none"),
     "a URI with NUL": (gltf(buffers=[{"byteLength": 48, "uri": "a%00b.bin"}]), "uri: the path holds a NUL"),
     "a long name": (
