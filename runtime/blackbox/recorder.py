@@ -1,5 +1,8 @@
 """Keeps the last minutes of a run in memory, and writes them to an MCAP file when asked or at a fault.
 
+Every few seconds what is new goes to a journal on the disk, which a run that ends takes away: after a power cut or a
+kill the next run finds it, and it becomes a file of the kind `cut`.
+
 The file is a recording too: `run --replay` plays its samples through the same code, other tools read the rest. What
 happens is made into bytes at once (the garbage collector never looks through them); a thread of its own writes files.
 """
@@ -17,9 +20,10 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import IO, Any, NamedTuple, Self
 
 import numpy as np
 
@@ -45,10 +49,14 @@ AFTER_FAULT_NS = 5 * NS_PER_S  # what follows a fault is in its file too
 FAULTS_APART_NS = 60 * NS_PER_S  # a fault that repeats does not fill the disk
 STATE_EVERY_NS = NS_PER_S
 WRITTEN_WITHIN_S = 5.0
+JOURNAL_EVERY_NS = 3 * NS_PER_S  # what a power cut takes at most, with a chunk
+CHUNK_BYTES = 16384
+CUT = "cut"
 LINES_KEPT, STATES_KEPT = 200, 50  # for the operator's page
 FILES_MAX = 20  # in the folder
 PREFIX = "blackbox-"
 ASKED = "asked"
+JOURNAL = "journal"
 PART = ".part"
 
 LOG, REFRESH, STATE = "/log", "/refresh", "/state"
@@ -150,6 +158,12 @@ class Recorder(logging.Handler):
         self._waiting_lock, self._is_writing = threading.Lock(), False
         self._waiting: deque[_Asked] = deque()  # for the writer
         self._writer: Job[None] | None = None
+        self._fresh: list[Message] = []  # not in the journal yet
+        self._journal, self._journaled_ns = _Journal(folder), 0
+        self._journaling: Job[None] | None = None
+        if self._most_ns:
+            _find_cut(folder)
+            make_room(folder)
         _sweep(folder)
 
     def watches(self, presenter: Presenter, *, in_stack_frame: bool) -> None:
@@ -177,6 +191,13 @@ class Recorder(logging.Handler):
             self._state, self._state_ns = state, at_ns
             self._keep(STATE, state_message(*state, monotonic_ns=at_ns))
         self._keep(REFRESH, refresh_message(account), account.frame)
+        is_due = at_ns - self._journaled_ns >= JOURNAL_EVERY_NS
+        if self._most_ns and is_due and (self._journaling is None or self._journaling.done):
+            self._journaled_ns = at_ns
+            with self._kept_lock:
+                fresh, self._fresh = self._fresh, []
+            work = partial(self._journal.add, fresh, *self._head(), most_ns=self._most_ns)
+            self._journaling = Job("black box's journal", work)  # beside: no refresh waits for a disk
         if self._fault is not None and at_ns - self._fault[0] >= AFTER_FAULT_NS:
             kind, self._fault = self._fault[1], None
             self.save(kind)
@@ -201,6 +222,8 @@ class Recorder(logging.Handler):
         at_ns = self._presenter.clock.now_ns()
         with self._kept_lock:
             self._kept.append(Message(at_ns, time.time_ns(), topic, data, sequence & 0xFFFFFFFF))
+            if self._most_ns:
+                self._fresh.append(self._kept[-1])
             self._bytes += len(data) + OVERHEAD_BYTES
             while self._kept and (self._bytes > BYTES_MAX or at_ns - self._kept[0].at_ns > self._most_ns):
                 self._bytes -= len(self._kept.popleft().data) + OVERHEAD_BYTES
@@ -210,15 +233,14 @@ class Recorder(logging.Handler):
         if not self._most_ns or self._presenter is None:
             saved("nothing is kept in memory (service.blackbox_minutes is 0)", None)
             return
-        settings = self._presenter.run_cell.state.settings
-        header = RecordingHeader(settings.sensor.driver, self._presenter.samples.serial)
+        header, settings = self._head()
         with self._kept_lock:
             kept = list(self._kept)
         with self._waiting_lock:
             told = [saved]
             if self._waiting and self._waiting[-1].kind == kind:  # not begun: one file is enough for both
                 told = [*self._waiting.pop().told, saved]
-            self._waiting.append(_Asked(kind, kept, header, without_secrets(settings.model_dump_json()), told))
+            self._waiting.append(_Asked(kind, kept, header, settings, told))
             if self._is_writing:
                 return
             self._writer = Job("black box", self._write)
@@ -226,6 +248,13 @@ class Recorder(logging.Handler):
             refused = self._waiting.pop() if self._writer.problem else None
         if refused is not None:
             refused.tell(self._writer.problem, None)
+
+    def _head(self) -> tuple[RecordingHeader, str]:
+        """What stands before the messages of a file."""
+        assert self._presenter is not None
+        settings = self._presenter.run_cell.state.settings
+        header = RecordingHeader(settings.sensor.driver, self._presenter.samples.serial)
+        return header, without_secrets(settings.model_dump_json())
 
     def _write(self) -> None:
         """What waits, one file after the other; on the writer's thread."""
@@ -282,6 +311,9 @@ class Recorder(logging.Handler):
         self._fault = None
         if self._writer is not None:
             self._writer.wait(WRITTEN_WITHIN_S)
+        if self._journaling is not None:
+            self._journaling.wait(WRITTEN_WITHIN_S)
+        self._journal.close()
         self._presenter = None
         super().close()
 
@@ -291,35 +323,108 @@ def write_file(folder: Path, kind: str, kept: list[Message], header: RecordingHe
 
     Its number is above all others in the folder: the wall's clock may be set back.
     """
-    from mcap.writer import CompressionType, Writer
-
     folder.mkdir(parents=True, exist_ok=True)
-    others = (*folder.glob(f"{PREFIX}*.mcap"), *folder.glob(f".{PREFIX}*{PART}"))
-    number = 1 + max(map(_number, others), default=0)
-    path = folder / f"{PREFIX}{number:06}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{kind}.mcap"
+    path = _next_name(folder, kind, datetime.now(UTC))
     part = path.with_name(f".{path.name}{PART}")
-    with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600), "wb") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)  # a part that nobody holds is swept
+    with _opened(part) as file:
         try:
-            writer: Any = Writer(file, compression=CompressionType.LZ4)
-            writer.start(profile="phasestack", library=f"phasestack {version()}")
-            writer.add_metadata(fmt.METADATA_NAME, header.metadata())
-            writer.add_attachment(0, 0, "settings.json", "application/json", settings.encode())
-            channels: dict[str, int] = {}
-            for message in kept:
-                topic = message.topic
-                if topic not in channels:
-                    schema = SCHEMAS[topic]
-                    schema_id = writer.register_schema(schema["title"], "jsonschema", json.dumps(schema).encode())
-                    channels[topic] = writer.register_channel(topic, "json", schema_id)
-                writer.add_message(channels[topic], message.wall_ns, message.data, message.wall_ns, message.sequence)
-            writer.finish()
+            written = _Written(file, header, settings)
+            written.add(kept)
+            written.writer.finish()
             file.flush()
             put_in_place(part, path)
         except BaseException:
             part.unlink(missing_ok=True)
             raise
     return path
+
+
+def _next_name(folder: Path, kind: str, at: datetime) -> Path:
+    others = (*folder.glob(f"{PREFIX}*.mcap"), *folder.glob(f".{PREFIX}*{PART}"))
+    number = 1 + max(map(_number, others), default=0)
+    return folder / f"{PREFIX}{number:06}-{at:%Y%m%dT%H%M%SZ}-{kind}.mcap"
+
+
+def _opened(part: Path) -> IO[bytes]:
+    file = os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600), "wb")
+    fcntl.flock(file, fcntl.LOCK_EX)  # a part that nobody holds is swept
+    return file
+
+
+class _Written:
+    """A file that messages are added to."""
+
+    def __init__(self, file: IO[bytes], header: RecordingHeader, settings: str) -> None:
+        from mcap.writer import CompressionType, Writer
+
+        self.writer: Any = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)
+        self.writer.start(profile="phasestack", library=f"phasestack {version()}")
+        self.writer.add_metadata(fmt.METADATA_NAME, header.metadata())
+        self.writer.add_attachment(0, 0, "settings.json", "application/json", settings.encode())
+        self._channels: dict[str, int] = {}
+
+    def add(self, messages: list[Message]) -> None:
+        for message in messages:
+            topic = message.topic
+            if topic not in self._channels:
+                schema = SCHEMAS[topic]
+                number = self.writer.register_schema(schema["title"], "jsonschema", json.dumps(schema).encode())
+                self._channels[topic] = self.writer.register_channel(topic, "json", number)
+            at_ns = message.wall_ns
+            self.writer.add_message(self._channels[topic], at_ns, message.data, at_ns, message.sequence)
+
+
+class _Journal:
+    """What happened lately, on the disk: two files in turn, each of half the time that is kept or of half the bytes."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._turn, self._begun_ns = folder, 0, 0
+        self._file: IO[bytes] | None = None
+        self._written: _Written | None = None
+
+    def add(self, fresh: list[Message], header: RecordingHeader, settings: str, *, most_ns: int) -> None:
+        """On the disk once this returns. A disk that takes nothing costs the journal alone."""
+        now_ns = time.monotonic_ns()
+        try:
+            if self._file is None or now_ns - self._begun_ns > most_ns // 2 or self._file.tell() > BYTES_MAX // 2:
+                self._turn, self._begun_ns = 1 - self._turn, now_ns
+                if self._file is not None:
+                    self._file.close()
+                self._folder.mkdir(parents=True, exist_ok=True)
+                self._place.unlink(missing_ok=True)
+                self._file = _opened(self._place)
+                self._written = _Written(self._file, header, settings)
+            assert self._written is not None
+            self._written.add(fresh)
+            self._file.flush()
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            log.warning("the black box's journal: %s", error.strerror)
+            self.close()
+
+    @property
+    def _place(self) -> Path:
+        return self._folder / f".{PREFIX}{JOURNAL}{self._turn}{PART}"
+
+    def close(self) -> None:
+        """The run has ended in order: it is not needed."""
+        if self._file is not None:
+            with suppress(OSError):
+                self._file.close()
+            self._file = None
+        for self._turn in (0, 1):
+            with suppress(OSError):
+                self._place.unlink(missing_ok=True)
+
+
+def _find_cut(folder: Path) -> None:
+    """The journals of a run that did not end in order become files of their own."""
+    for journal in sorted(folder.glob(f".{PREFIX}{JOURNAL}*{PART}"), key=lambda path: path.stat().st_mtime):
+        with suppress(OSError), journal.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            at = datetime.fromtimestamp(journal.stat().st_mtime, UTC)
+            journal.rename(path := _next_name(folder, CUT, at))
+            log.warning("the run before was cut: what it was like is in %s", path)
 
 
 def make_room(folder: Path) -> None:

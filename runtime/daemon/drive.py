@@ -48,7 +48,7 @@ def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> 
             has_picture = last is not None and (last.frame.solved is not None or last.frame.flat is not None)
             layers = shown_layers(last.frame) if last is not None and has_picture else None
             unseen = "" if last is None or layers is None else _unseen(layers, last.account, run, settings)
-            output.finish(summary, layers, run.observer.eye_views, run.observer.moment, unseen=unseen)
+            output.finish(summary, layers, run.observer.moment, unseen=unseen)
     wait_for_all(JOBS_END_WITHIN_S)
     return summary
 

@@ -91,7 +91,7 @@ def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
         "solution": account.solution,
         # What was solved for an instant after this light has no age yet.
         "solution_age_now_ms": None if account.solution_age_ms is None else max(0.0, account.solution_age_ms),
-        "light_db": run.observer.light_db,
+        "light_db": None if run.observer.moment is None else run.observer.moment.light_db,
         "photon_now_ms": (account.photon_ns - account.capture_ns) / NS_PER_MS if account.capture_ns else None,
         "rejected_samples": dict(presenter.viewer.refused),
         "sensor_hz": presenter.viewer.rate_hz if "sensor" not in presenter.missing else None,

@@ -135,7 +135,7 @@ class Daemon(Host):
         if self._server is not None and (run := self.run) is not None:
             self._server.publish(lambda: status.snapshot(run, account) | self._news())
         if self._link is not None:
-            self._link.moment = self.run.observer.newest if self.run is not None else None
+            self._link.moment = self.run.observer.moment if self.run is not None else None
             self._link.refreshed(status.shown(presenter, account, self._link))
         if self._metrics is not None:
             stats = presenter.stats

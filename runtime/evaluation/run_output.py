@@ -11,7 +11,6 @@ from typing import Any, TextIO
 
 from runtime.errors import InputError
 from runtime.evaluation.contact_sheet import Moment, contact_sheet, headline
-from runtime.evaluation.displayed import EyeViews
 from runtime.records import U8
 from runtime.support.artifacts import OutputFolder, to_json, write_json, write_png, write_text
 
@@ -80,15 +79,9 @@ class RunOutput:
         self._later(write)
 
     def finish(
-        self,
-        summary: dict[str, Any],
-        layers: U8 | None,
-        eye_views: EyeViews | None,
-        moment: Moment | None = None,
-        *,
-        unseen: str = "",
+        self, summary: dict[str, Any], layers: U8 | None, moment: Moment | None = None, *, unseen: str = ""
     ) -> None:
-        """The last frame, the summary; contact sheet and viewer, of a good moment where one was seen.
+        """The last frame, the summary; stills, contact sheet and viewer of the newest refresh that was measured.
 
         unseen: the viewer's page where no two eyes saw anything.
         """
@@ -100,14 +93,13 @@ class RunOutput:
                 return
             for n, layer in enumerate(layers):
                 write_png(folder / f"layer-{n}.png", layer)
-            if eye_views is not None:
-                eye_views.write(folder)
-            shown, views, title, lines = layers, eye_views, headline(None), [in_one_line(summary)]
+            shown, title, lines, page = layers, headline(None), [in_one_line(summary)], unseen
             if moment is not None:
-                shown, views, title = moment.layers, moment.eye_views, headline(moment.light_db)
-                lines = [*moment.lines, *lines]
+                shown, title, lines = moment.layers, headline(moment.light_db), [*moment.lines, *lines]
+                moment.eye_views.write(folder)
+                page = moment.eye_views.viewer(shown, title=title, lines=lines)
+            views = None if moment is None else moment.eye_views
             write_png(folder / "contact-sheet.png", contact_sheet(shown, views, headline=title, lines=lines))
-            page = unseen if views is None else views.viewer(shown, title=title, lines=lines)
             write_text(folder / "viewer.html", page)
 
         self._work.put(write)

@@ -21,7 +21,7 @@ from runtime.clock import NS_PER_S
 from runtime.content.base import ContentSource
 from runtime.errors import ContentFailure
 from runtime.evaluation.contact_sheet import Moment
-from runtime.evaluation.displayed import EyeViews, displayed
+from runtime.evaluation.displayed import displayed
 from runtime.frame.presenter import Refresh
 from runtime.frame.solver_host import SolverHost
 from runtime.optics.alignment import shown_layers
@@ -146,10 +146,7 @@ class RunObserver:
         self._output, self._on_account, self._simulated = output, on_account, simulated
         self.truth = TrueEyes()
         self.means = Means()
-        self.eye_views: EyeViews | None = None  # of the newest measured refresh
-        self.moment: Moment | None = None  # the best of those measured
-        self.newest: Moment | None = None
-        self.light_db: float | None = None  # of that one
+        self.moment: Moment | None = None  # the newest refresh measured: stills, sheet and viewer are of this one
         self.last: Refresh | None = None
         self._lines: deque[RefreshAccount] = deque()
         self._samples: deque[Refresh] = deque()
@@ -171,10 +168,15 @@ class RunObserver:
         self._advance()
 
     def finish(self) -> None:
-        """No more refreshes: what waits is written and measured, and the last refresh is looked at."""
+        """No more refreshes: what waits is written and measured, and the last refresh is looked at.
+
+        In real time it is not, where another was: whoever stops a run need not wait for that.
+        """
         self.truth.end()
         self._advance()
         last = self.last
+        if self.moment is not None and not self._simulated:
+            return
         if last is None or not self._measure or not _has_picture(last) or last.account.eyes_m is None:
             return
         true_m = self.truth.at(last.account.photon_ns)
@@ -186,9 +188,9 @@ class RunObserver:
             return
         measured = self._compared(last, true_m, pictures)
         if measured is not None:
-            self.eye_views = measured.moment.eye_views
+            self.moment = measured.moment
             if not self.means.values and last.account.state is State.TRACKING:
-                self._take(measured)
+                self.means.add(measured.figures)
 
     @property
     def _busy(self) -> bool:
@@ -314,10 +316,7 @@ class RunObserver:
 
     def _take(self, measured: Measured | None) -> None:
         if measured is not None:
-            self.newest = measured.moment
-            self.eye_views, self.light_db = measured.moment.eye_views, measured.moment.light_db
-            if self.moment is None or measured.moment.light_db > self.moment.light_db:
-                self.moment = measured.moment
+            self.moment = measured.moment
             self.means.add(measured.figures)
 
 
@@ -326,7 +325,7 @@ def _where(account: RefreshAccount) -> tuple[str, ...]:
     assert account.eyes_m is not None and account.solved_for_m is not None
     sure = "" if account.eye_sigma_mm is None else f", sure to {account.eye_sigma_mm:.1f} mm"
     moved_mm = 1000 * float(np.linalg.norm((account.eyes_m - account.solved_for_m).mean(axis=0)))
-    line = f"Refresh {account.frame}, the best of those looked at; eyes {account.eyes_label}{sure}"
+    line = f"Refresh {account.frame}; eyes {account.eyes_label}{sure}"
     return (f"{line}, {moved_mm:.0f} mm from where the layers were solved for: the outer panels were shifted along",)
 
 

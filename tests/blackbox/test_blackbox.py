@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import stat
 import subprocess
 import sys
 import threading
+import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import groupby
@@ -20,6 +22,8 @@ from typing import Any
 import jsonschema
 import numpy as np
 import pytest
+from mcap.exceptions import EndOfFile, RecordLengthLimitExceeded
+from mcap.reader import NonSeekingReader
 
 from runtime.blackbox import recorder as recording
 from runtime.blackbox.recorder import Recorder, make_room, write_file
@@ -33,6 +37,7 @@ from runtime.sensor.recording import Recording, recording_to
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.sensor.replay import demo_recording_path
 from tests.daemon.rig import Rig
+from tests.waiting import eventually
 
 SMALL: dict[str, Any] = {
     "stack": {"width_px": 64, "height_px": 36},
@@ -245,7 +250,7 @@ def test_many_who_ask_in_one_second_get_whole_files_and_each_an_answer(tmp_path:
     assert [problem for problem, _ in answers if problem] == []
     there = sorted(tmp_path.glob("blackbox-*.mcap"))
     assert all(len(read(path)) > 50 for path in there) and there[-1] == answers[-1][1]
-    assert [path for path in tmp_path.iterdir() if path not in there] == []
+    assert not [path for path in tmp_path.iterdir() if path not in there and recording.JOURNAL not in path.name]
 
 
 def test_a_clock_that_was_set_back_does_not_make_the_newest_the_oldest(
@@ -301,3 +306,24 @@ def test_what_a_killed_writer_left_is_swept_by_the_next_and_what_is_being_writte
         assert left.name.endswith(".part")
     (whole,) = tmp_path.iterdir()
     assert busy.returncode == 0 and len(read(whole)) == 1
+
+
+def test_of_a_run_that_was_killed_the_next_finds_all_but_its_last_seconds(tmp_path: Path) -> None:
+    config = tmp_path / "a.toml"
+    config.write_text(f'[stack]\nwidth_px = 64\nheight_px = 36\n[model]\nname = "fast"\nthreads = 1\nbackend = "cpu"\n'
+                      f'[service]\nsocket = "{tmp_path}/s.sock"\n')  # fmt: skip
+    command = [sys.executable, "-m", "runtime.cli", "run", "--config", config, "--replay", "demo", "--headless"]
+    with subprocess.Popen(command, env={**os.environ, "STATE_DIRECTORY": str(tmp_path)}) as run:
+        boxes = tmp_path / "blackbox"
+        assert eventually(lambda: any(path.stat().st_size > 200_000 for path in boxes.glob(".*.part")))
+        killed_ns = time.monotonic_ns()
+        run.kill()
+    Recorder(boxes, minutes=1).close()
+    (cut,) = boxes.iterdir()
+    assert cut.name.endswith("-cut.mcap")
+    at_ns = []
+    with cut.open("rb") as file, suppress(EndOfFile, RecordLengthLimitExceeded):
+        for _, channel, message in NonSeekingReader(file).iter_messages(log_time_order=False):
+            at_ns += [json.loads(message.data)["present_ns"]] if channel.topic == "/refresh" else []
+    assert killed_ns - at_ns[-1] < recording.JOURNAL_EVERY_NS + 2 * NS_PER_S and len(at_ns) > 100
+    assert sum(1 for _ in Recording(cut).samples()) > 50  # it is a recording as others are

@@ -46,7 +46,7 @@ def test_the_sheet_shows_the_moment_with_the_one_figure_to_quote(
     look = displayed(layers, wanted, STACK, eyes_m=EYES, fov_deg=40)
     moment = contact_sheet.Moment(pictures(1)[0], look, 33.25, ("This moment",))
     with RunOutput(tmp_path) as output:
-        output.finish(SUMMARY | {"light_db": 31.0, "quality_frames": 2}, layers, look, moment)
+        output.finish(SUMMARY | {"light_db": 31.0, "quality_frames": 2}, layers, moment)
     assert written[0] == "PSNR 33.2 dB at the eyes (pixels as squares, pupil 4 mm, tracking error 1 mm)"
     assert "This moment" in written
     assert any("light 31.0 dB, mean of 2 refreshes" in text for text in written)
@@ -79,7 +79,7 @@ def test_a_full_disk_abandons_the_files_once_and_the_run_goes_on(
         for frame in range(200):
             output.refresh(line(frame))
         output.light(0, layers=layers, drawn=drawn, info={})
-        output.finish(SUMMARY, layers, None)
+        output.finish(SUMMARY, layers)
     assert "No space left" in output.problem
     assert [record.message for record in caplog.records if "abandoned" in record.message] != []
     assert len([record for record in caplog.records if "abandoned" in record.message]) == 1

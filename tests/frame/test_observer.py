@@ -161,7 +161,7 @@ def test_nothing_measured_is_null(content: ContentSource, solved: Solution) -> N
         "light_db": None, "psnr_db": None, "ssim": None, "carried_db": None, "psnr_db_true_eyes": None,
         "carried_db_true_eyes": None, "quality_frames": 0,
     }  # fmt: skip
-    assert observer.eye_views is None
+    assert observer.moment is None
 
 
 def test_quality_is_of_what_the_panels_show_at_the_eyes_used_and_at_the_true_ones(
@@ -219,18 +219,22 @@ def test_a_short_run_measures_its_last_refresh(content: ContentSource, solved: S
     observer.refreshed(refresh(1, solved))
     observer.finish()
     assert observer.means.summary()["quality_frames"] == 1
-    assert observer.eye_views is not None
-
-
-def test_the_moment_to_show_is_the_best_of_those_measured(content: ContentSource, solved: Solution) -> None:
-    observer, _ = looking(content, measure=True, evaluate_every=1)
-    spoilt = Solution(2, solved.layers // 2, EYES, 0)
-    for number, shown in enumerate((spoilt, solved, spoilt)):
-        observer.refreshed(refresh(number, shown))
-    observer.finish()
     assert observer.moment is not None
-    np.testing.assert_array_equal(observer.moment.layers, shown_layers(refresh(1, solved).frame))
-    assert observer.moment.light_db > observer.means.summary()["light_db"]
+
+
+def test_the_moment_to_show_is_the_last_refresh_by_its_number_and_in_real_time_the_newest_measured(
+    content: ContentSource, solved: Solution
+) -> None:
+    for simulated, shown in ((True, 3), (False, 0)):
+        observer, _ = looking(content, simulated=simulated, measure=True, evaluate_every=1)
+        for number in range(4):
+            observer.refreshed(refresh(number, solved, eyes_m=aside(0.001 * number)))
+            wait_for_all(120.0 if number == 0 else 0.0)
+            if not simulated and number == 0:
+                observer._every = 100
+        observer.finish()
+        assert observer.moment is not None and observer.moment.lines[0].startswith(f"Refresh {shown};")
+        np.testing.assert_array_equal(observer.moment.eye_views.eyes_m, aside(0.001 * shown))
 
 
 def test_in_real_time_one_measurement_is_under_way_at_a_time_and_no_refresh_waits_for_it(
