@@ -13,6 +13,7 @@ from runtime.content.placed import placed_source, placing_of
 from runtime.content.registry import Opener, prepare_content
 from runtime.daemon.commands import PLACING
 from runtime.daemon.solver_parts import RunningSolver, ready_predictor
+from runtime.daemon.trial import try_out
 from runtime.errors import PhasestackError, Stopped
 from runtime.eyes.calibration import Calibration, load_calibration
 from runtime.frame.run_state import LEFT_BEHIND
@@ -90,11 +91,15 @@ class Reconfiguration:
         self.settings = settings = self._read()
         file = settings.calibration.file
         self._calibration = load_calibration(Path(file) if file else None)
-        if self._reload_content or settings.content != self._old.content:
+        has_content = self._reload_content or settings.content != self._old.content
+        has_model = _model_part(settings) != _model_part(self._old)
+        self.progress = "trying it out"
+        try_out(settings, content=has_content, model=has_model, wanted=lambda: not self.abandoned)
+        if has_content:
             self.progress = f"loading {self.settings.content.scene}"
             with listening(self._listen):
                 opener = prepare_content(self.settings.content, self._stack)
-        if _model_part(settings) != _model_part(self._old):
+        if has_model:
             self.progress = f"loading model {self.settings.model.name}"
             predictor = ready_predictor(self.settings, self._stack)
         return opener, predictor

@@ -1,4 +1,4 @@
-"""A model whose inference never ends, for real: 2^62 turns of a loop. No start hangs, no end is an abort."""
+"""Files that never get ready: a model of 2^62 turns of a loop, a scene that takes all memory. Nothing hangs."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,9 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
+from runtime.daemon import trial
 from runtime.model.predictor import model_path
+from tests.daemon.test_changes import Served
 
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE_S = 300
@@ -64,3 +67,32 @@ def test_a_stop_while_it_starts_is_heard_and_no_abort(endless: Path, tmp_path: P
         told = process.communicate(timeout=PATIENCE_S)[1]
     assert process.returncode == 0, told
     assert "stopped" in told and "terminate called" not in told
+
+
+def test_while_it_runs_an_endless_model_is_refused_and_no_thread_of_the_daemon_hangs(
+    endless: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It held a thread for two minutes, and at the end of the daemon for good."""
+    monkeypatch.setattr(trial, "MODEL_S", 10.0)
+    with Served(tmp_path) as served:
+        answer = served.asked("model", str(endless))
+        assert not answer["ok"] and answer["error"].endswith("endless.onnx: is not ready after 10 s")
+        assert not [thread for thread in threading.enumerate() if thread.name.startswith("job reconf")]
+        served.rig.refresh_until_solved()
+
+
+def test_a_scene_that_takes_too_much_memory_ends_another_process_and_the_display_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import trimesh
+
+    trimesh.creation.icosphere(subdivisions=6).export(tmp_path / "ball.stl")
+    (tmp_path / "bad.stl").write_bytes(b"solid no mesh")
+    with Served(tmp_path) as served:
+        asked = [served.asked("scene", str(tmp_path / name)) for name in ("ball.stl", "bad.stl")]
+        assert asked[0].get("ok"), asked
+        assert "bad.stl" in asked[1]["error"]
+        monkeypatch.setattr(trial, "MEMORY_MAX", 16 << 20)
+        answer = served.asked("scene", str(tmp_path / "ball.stl"))
+        assert not answer["ok"] and "ball.stl: takes more than 16 MiB" in answer["error"]
+        served.rig.refresh_until_solved()
