@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from runtime.config import StackGeometry
+from runtime.model.predictor import SHIPPED
 from runtime.model.session import ModelSession
 from runtime.report import focal, moving
 from runtime.report.frontier import Method, MethodResult, apart, measure, shipped_and_references
+from runtime.report.literature import SIZE_PX, literature_section
 from runtime.report.page import Page, Section, describe
 from runtime.report.pairs import StillPair, procedural_pairs, read_pairs
 from runtime.report.sections import focal_section, frontier_section, moving_section
@@ -75,12 +78,21 @@ def whole_report(
         stack = replace(stack, width_px=960, height_px=540)
     page = GrowingPage(out, command, progress)
     methods = shipped_and_references(models, quick=quick)
+    published = "{}x{}".format(*SIZE_PX)
+    like_published: list[MethodResult] = []
     for size, own in _by_size(cases).items():
         title = f"{len(own)} case file{'s' if len(own) > 1 else ''}, {size}"
-        _frontier(page, methods, own, title=title, name=f"cases-{size}", key="methods")
+        results = _frontier(page, methods, own, title=title, name=f"cases-{size}", key="methods")
+        like_published += results if size == published else []
 
     key = "methods_on_built_in_scenes" if cases else "methods"
     _frontier(page, methods, procedural_pairs(stack), title="built-in scenes", name="scenes", key=key)
+    page.doing(f"beside published figures, {published}")
+    if not like_published:
+        small = replace(stack, width_px=SIZE_PX[0], height_px=SIZE_PX[1])
+        found = measure(shipped_and_references(quick=True)[: len(SHIPPED)], islice(procedural_pairs(small), 1))
+        like_published = list({result.name: result for _, result in found}.values())
+    page.put("literature", literature_section(like_published))
     _moving(page, quick=quick)
     if with_focal:
         _focal(page)
@@ -97,7 +109,7 @@ def _by_size(cases: Sequence[StillPair]) -> dict[str, list[StillPair]]:
 
 def _frontier(
     page: GrowingPage, methods: Sequence[Method], pairs: Iterable[StillPair], *, title: str, name: str, key: str
-) -> None:
+) -> list[MethodResult]:
     """One section of pairs that share a resolution; `key`: of the record that its methods are added to."""
     title = f"Error against run time: {title}"
     page.doing(f"{title}: drawing")
@@ -107,6 +119,7 @@ def _frontier(
         results[result.name] = result
         page.record[key] = before + [one.record() for one in results.values()]
         page.put(name, frontier_section(list(results.values()), title=title, name=name))
+    return list(results.values())
 
 
 def _moving(page: GrowingPage, *, quick: bool) -> None:

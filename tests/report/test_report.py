@@ -68,4 +68,5 @@ def test_the_whole_report_is_made_in_one_run(tmp_path: Path) -> None:
     assert len(record["focal"]["cards"]) == 3
     page = (tmp_path / "index.html").read_text()
     assert len(list(tmp_path.glob("*.png"))) == page.count("data:image/png;base64,") == 3
+    assert "27.46" in page and page.count("here, 1 pair(s)") == 3
     assert record["machine"]["processor"] in page and "Not finished" not in page
