@@ -67,7 +67,6 @@ class Daemon(Host):
         signals: Signals,
         notifier: Notifier,
         server: StatusServer | None = None,
-        metrics: Metrics | None = None,
         recorder: Recorder | None = None,
         options: RunOptions | None = None,
     ) -> None:
@@ -75,7 +74,7 @@ class Daemon(Host):
         self._until = (options or RunOptions()).until
         self._link = (options or RunOptions()).browser
         self._read_settings = read_settings
-        self._signals, self._notifier, self._server, self._metrics = signals, notifier, server, metrics
+        self._signals, self._notifier, self._server = signals, notifier, server
         self.recorder = recorder
         self.run: Run | None = None  # set when it has been put together
         self._configured = Settings()  # as last read
@@ -137,9 +136,6 @@ class Daemon(Host):
         if self._link is not None:
             self._link.moment = self.run.observer.moment if self.run is not None else None
             self._link.refreshed(status.shown(presenter, account, self._link))
-        if self._metrics is not None:
-            stats = presenter.stats
-            self._metrics.refresh(account, faults=stats.faults, missed_blanks=stats.missed_blanks)
 
     def watches(self, run: Run) -> None:
         self.run = run
@@ -317,13 +313,16 @@ def run_daemon(read_settings: Callable[[], Settings], options: RunOptions) -> di
             recorder = cleanup.enter_context(Recorder(state_folder() / "blackbox", minutes=service.blackbox_minutes))
         if server is not None:
             cleanup.callback(server.close)
-        metrics = _metrics(service.metrics_port, cleanup)
+            if service.metrics_port:
+                try:
+                    cleanup.callback(Metrics(service.metrics_port, server.status).close)
+                except InputError as error:  # the display does not go dark for its figures
+                    log.error("no metrics: %s", error)
         daemon = Daemon(
             read_settings,
             signals=signals,
             notifier=notifier,
             server=server,
-            metrics=metrics,
             recorder=recorder,
             options=options,
         )
@@ -340,17 +339,3 @@ def run_daemon(read_settings: Callable[[], Settings], options: RunOptions) -> di
         notifier.stopping(summary["stopped"])
     log.info("stopped: %s", summary["stopped"])
     return summary
-
-
-def _metrics(port: int, cleanup: ExitStack) -> Metrics | None:
-    """None where they are off, or can't be served: the display does not go dark for its figures."""
-    if not port:
-        return None
-    metrics = Metrics()
-    try:
-        metrics.serve(port)
-    except InputError as error:
-        log.error("no metrics: %s", error)
-        return None
-    cleanup.callback(metrics.close)
-    return metrics
