@@ -1,194 +1,147 @@
-"""An operator's hour, faster: 20 scenes, models, reloads, lost parts, hung solvers, a busy processor.
+"""The daemon for a while: delays in its threads, four clients that change it, two losses of the sensor a minute.
 
-    python -m tests.soak --rounds 200
+    python -m tests.soak --seconds 1200
 
-Fails where status, page or black box say anything else than what is so, where a refresh is lost, and where memory,
-files or threads grow.
+Fails where it ends otherwise than tracking, where a request gets no answer, and where memory, files or threads grow.
 """
 
 from __future__ import annotations
 
 import argparse
 import gc
-import json
 import os
-import subprocess
-import sys
+import random
+import signal
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import psutil
 
-from runtime.blackbox.recorder import Recorder
-from runtime.clock import NS_PER_S
-from runtime.content.presets import preset_names
-from runtime.content.scenes import SCENES as BUILT_IN
-from runtime.daemon.client import LOOKED_UP_AGAIN_S, Daemon, ask
+from runtime.config import Settings
+from runtime.content.scenes import SCENES
+from runtime.daemon import reconfigure, solver_parts, supervise
+from runtime.daemon.build import RunOptions
+from runtime.daemon.client import ask
 from runtime.errors import SensorLost
-from tests.daemon.rig import TRACKING
-from tests.daemon.test_changes import Served
-from tests.waiting import eventually
+from runtime.frame import solver_thread
+from runtime.sensor.replay import ReplayDriver
+from runtime.support.memory import give_back
 
-SETTINGS: dict[str, dict[str, Any]] = {
+LOST_EVERY_S = 30.0
+WARM_UP = 0.4  # of the time
+REFUSED = ("skipped: a newer change came", "there is no next one", "nobody's", "the loop did not answer", "made anew")
+DELAYS = (
+    (solver_parts.RunningSolver, "step", 0.02, 2.5), (solver_parts.RunningSolver, "close", 0.3, 1.5),
+    (solver_parts, "prepare_content", 0.3, 2.5), (reconfigure, "prepare_content", 0.3, 2.5),
+    (reconfigure.Reconfiguration, "_take_over", 0.3, 2.5), (supervise.Daemon, "_carry_out", 0.05, 0.3),
+)  # fmt: skip  # where, how often, seconds at most
+SETTINGS: dict[str, Any] = {
     "stack": {"width_px": 64, "height_px": 36},
-    "loop": {"rate_hz": 200.0},
-    "tracker": {"hold_s": 0.5},
+    "sensor": {"driver": "replay", "source": "demo", "loop": True},
+    "model": {"name": "fast", "threads": 1, "backend": "cpu"},
+    "output": {"kind": "offscreen"},
 }
-SCENES, MODELS = (*BUILT_IN, *preset_names())[:20], ("balanced", "fast")
-KEPT_MIN = 0.05  # by the black box, so that it is full before memory is looked at
-COUNTED = ("state", "reason", "scene", "model", "paused", "frames", "presented", "dropped", "faults")
-
-
-@dataclass(frozen=True, slots=True)
-class Usage:
-    """What the process holds."""
-
-    resident_mib: float
-    files: int
-    threads: int
-
-    @classmethod
-    def now(cls) -> Usage:
-        gc.collect()
-        process = psutil.Process()
-        return cls(process.memory_info().rss / 2**20, process.num_fds(), process.num_threads())
 
 
 class Soak:
-    """A run with its socket, page and black box; `round` does all that an operator and the world do to it."""
+    """What is done to a daemon beside it, and what came of it."""
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self.recorder = Recorder(folder / "boxes", minutes=KEPT_MIN)
-        self.served = Served(folder, recorder=self.recorder, late_s=60.0, abandon_s=600.0, **SETTINGS)
-        self.page = Daemon((self.served.server.path,))
-        self.without_a_panel = 0
+    def __init__(self, folder: Path, seconds: float) -> None:
+        self.socket, self._end_s, self._warm_s = folder / "s.sock", time.monotonic() + seconds, seconds * WARM_UP
+        self._lost_s, self.lost = 0.0, 0
+        self.answers: Counter[str] = Counter()
+        self.usage: list[tuple[int, int, int]] = []  # MiB, files, threads
+        self.last: dict[str, Any] = {}
 
-    def __enter__(self) -> Soak:
-        self.served.__enter__()
-        self.served.run.observer._on_account = None  # the rig keeps every account: that alone would be a leak
-        return self
+    def delayed(self, work: Callable[..., Any], share: float, most_s: float) -> Callable[..., Any]:
+        def later(*given: Any, **named: Any) -> Any:
+            if random.random() < share:
+                time.sleep(random.uniform(0.0, most_s))
+            return work(*given, **named)
 
-    def __exit__(self, *exception: object) -> None:
-        self.recorder.close()
-        self.served.__exit__(*exception)
+        return later
 
-    def round(self, number: int) -> None:
-        served, rig = self.served, self.served.rig
-        scene, model = SCENES[number % len(SCENES)], MODELS[number % len(MODELS)]
-        assert served.asked("scene", scene)["ok"] and served.asked("model", model)["ok"]
-        refused = served.asked("scene", "nobody's")
-        assert served.asked("reload")["ok"] and not refused["ok"]
-        rig.refresh_until_solved()
-        self._told_is_so(TRACKING)
-        assert served.asked("pause")["paused"] and not served.asked("resume")["paused"]
-        rig.plan.fault = SensorLost("soaked")
-        rig.refresh_until("degraded: sensor")
-        self._told_is_so("degraded: sensor")
-        rig.plan.fault = None
-        rig.refresh_until(TRACKING)
-        panels = rig.break_panels(keep=False)
-        panels.lost = "soaked"
-        self.without_a_panel += len(rig.refreshes(5))
-        self._told_is_so("degraded: panel", refresh=False)
-        rig.presenter.panels = panels._panels
-        self._hang_the_solver()
-        with busy_processor():
-            rig.refreshes(200)
-            self._told_is_so(None)
-        rig.refresh_until(TRACKING)
-        self._told_is_so(TRACKING)
+    def losing(self, read: Callable[..., Any]) -> Callable[..., Any]:
+        def arrived(*given: Any, **named: Any) -> Any:
+            if time.monotonic() - self._lost_s > LOST_EVERY_S:
+                self._lost_s, self.lost = time.monotonic(), self.lost + 1
+                raise SensorLost("soaked")
+            return read(*given, **named)
 
-    def _hang_the_solver(self) -> None:
-        """It is left behind and made anew; what it held is released once it returns."""
-        rig, solver = self.served.rig, self.served.rig.presenter.solver
-        predictor, gate, begun = rig.break_predictor(), threading.Event(), threading.Event()
-        predictor.answer = lambda job: (begun.set(), gate.wait(60.0), predictor.well(job))[-1]
-        rig.refresh_until(begun.is_set)
-        restarts, patience = solver.restarts, (solver._late_ns, solver._abandon_ns)
-        solver._late_ns = solver._abandon_ns = 1
-        rig.refreshes(1)
-        solver._late_ns, solver._abandon_ns = patience
-        rig.refresh_until_solved()
-        gate.set()
-        assert solver.restarts == restarts + 1
-        assert eventually(lambda: not any(hung.thread.is_alive() for hung in solver._hung))
+        return arrived
 
-    def _told_is_so(self, state: str | None, *, refresh: bool = True) -> None:
-        """Status, page and pictures against the run; no refresh goes on meanwhile."""
-        run = self.served.run
-        presenter, stats = run.presenter, run.presenter.stats
-        if refresh:
-            presenter.refresh()
-        status = self.served.status()
-        now = presenter.run_cell.state
-        assert state in (None, status["state"]) and status["state"] == presenter.machine.name
-        assert (status["frames"], status["dropped"]) == (stats.frames, stats.dropped)
-        assert status["dropped"] == self.without_a_panel and status["presented"] == stats.frames - stats.dropped
-        assert status["scene"] == now.settings.content.scene and status["model"] == now.predictor.name
-        time.sleep(LOOKED_UP_AGAIN_S["status"])
-        page = self.page.look_up("status")
-        assert {name: page[name] for name in COUNTED} == {name: status[name] for name in COUNTED}
-        shown = ask([self.served.server.path], {"command": "pictures"})
-        assert shown["frame"] == presenter.last.account.frame and len(shown["jpegs"]) >= presenter.stack.count
+    def client(self, number: int) -> None:
+        """Asks for anything, again and again."""
+        choose = random.Random(number)
+        scenes, plain = [*SCENES, "nobody's"], ("next", "reload", "flat", "resume", "pause", "blackbox", "pictures")
+        while time.monotonic() < self._end_s - 30.0:
+            scene = {"command": "scene", "value": choose.choice(scenes)}
+            model = {"command": "model", "value": choose.choice(["fast", "balanced"])}
+            place = {"command": "place", "value": {"scale": choose.uniform(0.5, 2.0)}}
+            plain = [
+                {"command": name} for name in ("next", "reload", "flat", "resume", "pause", "blackbox", "pictures")
+            ]
+            self._ask(choose.choice([scene, scene, scene, model, place, *plain]))
+            time.sleep(choose.uniform(0.0, 1.5))
 
-    def check_black_box(self) -> None:
-        """What it kept: every refresh of its time, up to the last, and the states that they were in."""
-        from mcap.reader import make_reader
+    def watch(self) -> None:
+        """Looks now and then; at the end puts all back, looks again, and stops the daemon."""
+        process = psutil.Process()
+        while (left_s := self._end_s - time.monotonic()) > 20.0:
+            time.sleep(min(10.0, max(0.1, left_s - 20.0)))
+            if left_s < self._end_s - self._warm_s:
+                gc.collect()
+                give_back()
+                now = process.memory_info().rss >> 20, process.num_fds(), threading.active_count()
+                self.usage.append(now)
+                print(f"{left_s:6.0f} s left: {now[0]} MiB, {now[1]} files, {now[2]} threads", flush=True)
+        for request in ({"command": "scene", "value": "demo"}, {"command": "resume"}):
+            self._ask(request)
+        time.sleep(10.0)
+        self.last = ask([self.socket], {"command": "status"})
+        os.kill(os.getpid(), signal.SIGTERM)
 
-        rig, full_s = self.served.rig, 60 * KEPT_MIN
-        # A look at a busy run's pictures can outlast what the box keeps, and no refresh goes on meanwhile: fill it.
-        began_ns = rig.presenter.clock.now_ns()
-        rig.refresh_until(lambda: rig.presenter.clock.now_ns() - began_ns > full_s * NS_PER_S)
-        answer = self.served.asked("blackbox")
-        last = rig.presenter.last.account.frame
-        with Path(answer["file"]).open("rb") as file:
-            told = [json.loads(message.data) for _, _, message in make_reader(file).iter_messages(["/refresh"])]
-        frames = [refresh["frame"] for refresh in told]
-        assert frames == list(range(frames[0], frames[-1] + 1)) and frames[-1] <= last
-        kept_s = (told[-1]["present_ns"] - told[0]["present_ns"]) / NS_PER_S
-        assert 0.9 * full_s < kept_s <= full_s + 0.1
-        assert {refresh["state"] for refresh in told} <= {"tracking", "holding", "flat", "degraded"}
+    def _ask(self, request: dict[str, Any]) -> None:
+        answer = ask([self.socket], request, timeout_s=90.0)
+        self.answers[
+            "ok" if answer["ok"] else next((why for why in REFUSED if why in answer["error"]), str(answer))
+        ] += 1
 
 
-@contextmanager
-def busy_processor() -> Iterator[None]:
-    """Every core has something else to do."""
-    spinning = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(os.cpu_count() or 1)]
-    try:
-        yield
-    finally:
-        for process in spinning:
-            process.kill()
-            process.wait()
-
-
-def soak(rounds: int, *, warm: int, growth_max: float) -> None:
-    """Raises AssertionError where something piles up, is lost or told wrongly. warm: rounds before memory counts."""
-    with tempfile.TemporaryDirectory(prefix="ps-") as folder, Soak(Path(folder)) as run:
-        for number in range(warm):
-            run.round(number)
-        before, began_s = Usage.now(), time.perf_counter()
-        print(f"warm: {before}")
-        for number in range(warm, warm + rounds):
-            run.round(number)
-            kept_mib, seconds = run.recorder.describe()["kept_mib"], time.perf_counter() - began_s
-            print(f"{number + 1 - warm:5} rounds {seconds:6.0f} s, {kept_mib} MiB kept, {Usage.now()}", flush=True)
-        run.check_black_box()
-        # What a change left to be released in the background may be on its way; a leak stays.
-        eventually(lambda: (now := Usage.now()).threads <= before.threads and now.files <= before.files)
-        after = Usage.now()
-    assert after.resident_mib <= before.resident_mib * (1.0 + growth_max), (before, after)
-    assert after.files <= before.files and after.threads <= before.threads, (before, after)
+def soak(seconds: float, *, growth_mib: int) -> None:
+    """Raises AssertionError where something piles up, is lost or gets no answer."""
+    with ExitStack() as cleanup:
+        folder = Path(cleanup.enter_context(tempfile.TemporaryDirectory(prefix="ps-")))
+        run = Soak(folder, seconds)
+        cleanup.enter_context(patch.dict(os.environ, STATE_DIRECTORY=str(folder)))
+        for owner, name, share, most_s in DELAYS:
+            cleanup.enter_context(patch.object(owner, name, run.delayed(getattr(owner, name), share, most_s)))
+        cleanup.enter_context(patch.object(ReplayDriver, "read_arrived", run.losing(ReplayDriver.read_arrived)))
+        cleanup.enter_context(patch.multiple(solver_thread, LATE_S=0.3, ABANDON_S=1.0))
+        service = {"socket": str(run.socket), "blackbox_minutes": 0.2}
+        settings = Settings.model_validate({**SETTINGS, "service": service})
+        beside = [threading.Timer(8.0, run.client, (number,)) for number in range(4)] + [
+            threading.Thread(target=run.watch)
+        ]
+        for thread in beside:
+            thread.daemon = True
+            thread.start()
+        print(supervise.run_daemon(lambda: settings, RunOptions()))
+    print(run.last["state"], run.lost, "losses", run.last["faults"], dict(run.answers))
+    assert run.last["state"] in ("tracking", "holding", "flat") and set(run.answers) <= {"ok", *REFUSED}
+    assert run.last["dropped"] == 0 and run.last["turn_age_s"] < 1.0
+    (first_mib, files, threads), (last_mib, files_then, threads_then) = run.usage[0], run.usage[-1]
+    assert last_mib - first_mib <= growth_mib and files_then <= files + 4 and threads_then <= threads + 4, run.usage
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rounds", type=int, default=200)
-    soak(parser.parse_args().rounds, warm=len(SCENES), growth_max=0.01)
+    parser.add_argument("--seconds", type=float, default=1200.0)
+    soak(parser.parse_args().seconds, growth_mib=64)

@@ -91,7 +91,7 @@ class Run:
         """summary.json (contract 5.2)."""
         return {
             **self.presenter.summary(simulated=self.simulated),
-            **self.observer.means.summary(),
+            **self.observer.summary(),
             "backend": self.presenter.run_cell.state.predictor.backend,
             "scene": self.presenter.run_cell.state.content.info.name,
             "plan": self.plan_items(),

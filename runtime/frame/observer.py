@@ -11,7 +11,7 @@ import logging
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from queue import Empty, SimpleQueue
 from typing import Any, Protocol
 
@@ -100,28 +100,7 @@ class Output(Protocol):
         """What the panels showed at one refresh."""
 
 
-@dataclass(frozen=True, slots=True)
-class Measured:
-    """What eyes saw of one refresh."""
-
-    moment: Moment  # at the eyes aligned to, against their own truth
-    figures: dict[str, float]  # of FIGURES, those that could be measured
-
-
-class Means:
-    """Over the sampled refreshes."""
-
-    def __init__(self) -> None:
-        self.values: dict[str, list[float]] = {}
-
-    def add(self, figures: dict[str, float]) -> None:
-        for name, value in figures.items():
-            self.values.setdefault(name, []).append(value)
-
-    def summary(self) -> dict[str, Any]:
-        """The measured part of summary.json; None where nothing was measured."""
-        means = {name: round(float(np.mean(self.values[name])), 3) if name in self.values else None for name in FIGURES}
-        return {**means, "quality_frames": len(self.values.get("psnr_db", []))}
+Measured = tuple[Moment, dict[str, float]]  # at the eyes aligned to; of FIGURES, those that could be measured
 
 
 class RunObserver:
@@ -145,7 +124,7 @@ class RunObserver:
         self._measure, self._every, self._keep_light = measure, evaluate_every, keep_light
         self._output, self._on_account, self._simulated = output, on_account, simulated
         self.truth = TrueEyes()
-        self.means = Means()
+        self.measured: dict[str, list[float]] = {}  # of FIGURES, at the sampled refreshes
         self.moment: Moment | None = None  # the newest refresh measured: stills, sheet and viewer are of this one
         self.last: Refresh | None = None
         self._lines: deque[RefreshAccount] = deque()
@@ -188,9 +167,7 @@ class RunObserver:
             return
         measured = self._compared(last, true_m, pictures)
         if measured is not None:
-            self.moment = measured.moment
-            if not self.means.values and last.account.state is State.TRACKING:
-                self.means.add(measured.figures)
+            self._take(measured, counts=not self.measured and last.account.state is State.TRACKING)
 
     @property
     def _busy(self) -> bool:
@@ -309,15 +286,22 @@ class RunObserver:
             if true_m is not None:
                 values.append(seen_db("true", solved_for_m=true_m, eyes_m=true_m))
                 values.append(seen_db("solved", solved_for_m=solved_for_m, eyes_m=true_m))
-            return Measured(moment, dict(zip(FIGURES, values, strict=False)))
+            return moment, dict(zip(FIGURES, values, strict=False))
         except ValueError as error:
             log.info("quality: not measured here (%s)", error)
             return None
 
-    def _take(self, measured: Measured | None) -> None:
+    def _take(self, measured: Measured | None, *, counts: bool = True) -> None:
         if measured is not None:
-            self.moment = measured.moment
-            self.means.add(measured.figures)
+            self.moment, figures = measured
+            for name, value in figures.items() if counts else ():
+                self.measured.setdefault(name, []).append(value)
+
+    def summary(self) -> dict[str, Any]:
+        """The measured part of summary.json: means; None where nothing was measured."""
+        found = self.measured
+        means = {name: round(float(np.mean(found[name])), 3) if name in found else None for name in FIGURES}
+        return {**means, "quality_frames": len(found.get("psnr_db", []))}
 
 
 def _where(account: RefreshAccount) -> tuple[str, ...]:

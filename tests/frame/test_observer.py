@@ -157,7 +157,7 @@ def test_nothing_measured_is_null(content: ContentSource, solved: Solution) -> N
     observer, _ = looking(content)
     observer.refreshed(refresh(1, solved))
     observer.finish()
-    assert observer.means.summary() == {
+    assert observer.summary() == {
         "light_db": None, "psnr_db": None, "ssim": None, "carried_db": None, "psnr_db_true_eyes": None,
         "carried_db_true_eyes": None, "quality_frames": 0,
     }  # fmt: skip
@@ -181,7 +181,7 @@ def test_quality_is_of_what_the_panels_show_at_the_eyes_used_and_at_the_true_one
         drawn = retina_pictures(content, EYES, SMALL, time_ns=0, **how)
         return exact, carried_db(layers, drawn, SMALL, solved_for_m=EYES, eyes_m=eyes_m, **how)
 
-    summary = observer.means.summary()
+    summary = observer.summary()
     assert (summary["psnr_db"], summary["carried_db"]) == pytest.approx(psnr(used), abs=0.001)
     assert (summary["psnr_db_true_eyes"], summary["carried_db_true_eyes"]) == pytest.approx(psnr(true), abs=0.001)
     assert summary["quality_frames"] == 1
@@ -194,9 +194,9 @@ def test_every_so_many_refreshes_are_sampled_while_tracking_and_no_others(
     for number in range(30):
         state = State.TRACKING if number < 15 else State.HOLDING
         observer.refreshed(refresh(number, solved, state=state))
-    assert observer.means.summary()["quality_frames"] == 3
+    assert observer.summary()["quality_frames"] == 3
     observer.finish()
-    assert observer.means.summary()["quality_frames"] == 3
+    assert observer.summary()["quality_frames"] == 3
 
 
 @pytest.mark.parametrize("change", [{"presented": False}, {"eyes_m": None}, {"flatness": 0.5}])
@@ -211,14 +211,14 @@ def test_what_no_eye_saw_and_a_mixture_with_the_flat_picture_are_not_measured(
         seen = replace(seen, account=replace(seen.account, **change))
     observer.refreshed(seen)
     observer.finish()
-    assert observer.means.summary()["psnr_db"] is None
+    assert observer.summary()["psnr_db"] is None
 
 
 def test_a_short_run_measures_its_last_refresh(content: ContentSource, solved: Solution) -> None:
     observer, _ = looking(content, measure=True, evaluate_every=50)
     observer.refreshed(refresh(1, solved))
     observer.finish()
-    assert observer.means.summary()["quality_frames"] == 1
+    assert observer.summary()["quality_frames"] == 1
     assert observer.moment is not None
 
 
@@ -248,7 +248,7 @@ def test_in_real_time_one_measurement_is_under_way_at_a_time_and_no_refresh_wait
     assert solver.tasks[0](solver) is True
     assert wait_for_all(120.0) == 0
     observer.refreshed(refresh(10, solved))
-    assert observer.means.summary()["quality_frames"] == 1
+    assert observer.summary()["quality_frames"] == 1
 
 
 def test_comparing_is_not_the_presenter_s_nor_the_solver_s_work(

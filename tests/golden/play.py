@@ -112,7 +112,7 @@ def play(case: Case, out: Path) -> Played:
             del line["solved_for_m"], line["stage_ms"]
     told = {name: summary.get(name) for name in SUMMARY}
     told["plan"] = [item["what"] for item in summary["plan"]]
-    told["samples"] = runs[0].observer.means.values
+    told["samples"] = runs[0].observer.measured
     return Played(rounded(told), rounded(refreshes), collector.panels, collector.light)
 
 
