@@ -197,9 +197,9 @@ class Rig:
             done.append(self.presenter.refresh())
         return done
 
-    def break_panels(self, *, keep: bool = True) -> BreakablePanels:
+    def break_panels(self) -> BreakablePanels:
         """The panels, from now on in the hands of the test."""
-        panels = BreakablePanels(self.presenter.panels, keep=keep)
+        panels = BreakablePanels(self.presenter.panels)
         self.presenter.panels = panels  # type: ignore[assignment]
         return panels
 
@@ -213,15 +213,14 @@ class Rig:
 class BreakablePanels:
     """Any panels, which are lost while `lost` says so."""
 
-    def __init__(self, panels: Any, *, keep: bool = True) -> None:
-        self._panels, self.lost, self.name, self._keep = panels, "", panels.name, keep
+    def __init__(self, panels: Any) -> None:
+        self._panels, self.lost, self.name = panels, "", panels.name
         self.shown: list[PanelFrame] = []
 
     def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
         if self.lost:
             raise PanelLost(self.lost)
-        if self._keep:
-            self.shown.append(frame)
+        self.shown.append(frame)
         return self._panels.present(frame, unchanged=unchanged)
 
     def close(self) -> None:

@@ -28,19 +28,6 @@ def rig() -> Iterator[Rig]:
         yield made
 
 
-def test_a_run_that_tracks_says_rates_of_now_eyes_and_how_sure_and_the_sensors_rate(rig: Rig) -> None:
-    rig.refresh_until("tracking")
-    rig.refreshes(60)
-    answer, text = told_by(rig)
-    assert re.search(r"^fps_now +[\d.]+", text, re.MULTILINE)
-    assert re.search(r"^sensor_hz +[\d.]+", text, re.MULTILINE)
-    assert re.search(r"^eye_sigma_now_mm +[\d.]+", text, re.MULTILINE)
-    assert answer["eyes_label"] in text
-    assert "photon_ms" in text and "solution_age_ms" in text and "interval_ms" in text
-    assert (answer["paused"], answer["flat_asked"]) == (False, False)
-    assert "paused" not in text
-
-
 def test_eyes_that_are_refused_are_counted_by_reason(rig: Rig) -> None:
     rig.refresh_until("tracking")
     rig.plan.eyes_m = np.array([[-0.7, -0.031, 0.0], [-0.7, 0.031, 0.0]])  # behind the display

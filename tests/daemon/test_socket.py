@@ -197,41 +197,6 @@ def test_when_the_daemon_stops_who_waits_is_told_and_nothing_is_done_later(serve
 # Crowds
 
 
-def test_tricklers_lock_out_nobody(server: StatusServer, path: Path) -> None:
-    """More of them than there are places, each sending a byte now and then, and coming again when it is sent away."""
-    stop = threading.Event()
-    sent = [0]
-
-    def trickle() -> None:
-        while not stop.is_set():
-            try:
-                with connected(path) as client:
-                    while not stop.is_set():
-                        client.sendall(b"x")
-                        sent[0] += 1
-                        stop.wait(0.05)
-            except OSError:
-                stop.wait(0.01)
-
-    threads = [threading.Thread(target=trickle) for _ in range(listener.CLIENTS_MAX + 16)]
-    for thread in threads:
-        thread.start()
-    try:
-        assert eventually(lambda: sent[0] > 3 * len(threads), within_s=20)
-        assert all(ask([path], STATUS)["ok"] for _ in range(20))
-        with ThreadPoolExecutor(1) as pool:
-            asked = pool.submit(ask, [path], {"command": "reload"})
-            command = server.commands.get(timeout=60)
-            command.take()
-            command.done()
-            assert asked.result(timeout=60) == {"ok": True}
-        assert len(server._clients) <= listener.CLIENTS_MAX
-    finally:
-        stop.set()
-        for thread in threads:
-            thread.join()
-
-
 @pytest.fixture
 def hasty(path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[StatusServer]:
     monkeypatch.setattr(listener, "REQUEST_S", 0.3)

@@ -52,14 +52,6 @@ def test_a_place_that_is_none_is_refused_and_the_scene_stays(tmp_path: Path) -> 
         assert status["placing"]["offset_m"] == [0.0, 0.0, 0.0] and status["refused"] == answer["error"]
 
 
-def test_another_model_is_taken_and_one_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    with Served(tmp_path) as served:
-        assert served.asked("model", "balanced")["ok"]
-        assert served.run.parts.run.state.predictor.name == "balanced"
-        assert "nobody" in (answer := served.asked("model", "nobody"))["error"] and not answer["ok"]
-        assert served.run.parts.run.state.settings.model.name == "balanced"
-
-
 @pytest.mark.parametrize("arguments", [[], ["--reset", "--scale", "2"]])
 def test_ctl_place_wants_something_to_change(arguments: list[str]) -> None:
     assert "--scale" in refusal("ctl", "place", *arguments)

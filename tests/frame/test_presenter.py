@@ -346,3 +346,23 @@ def test_other_settings_reach_the_viewer_with_the_next_refresh(stage: Stage) -> 
     stage.refresh(30)
     assert stage.presenter.machine.state is State.FLAT
     assert stage.panels.frame.flatness == 1.0
+
+
+def test_panels_that_take_longer_than_a_period_are_told_by_the_presenter() -> None:
+    stage = Stage()
+    stage.solver.hand_over(solved=solution(1))
+    present = stage.panels.present
+
+    def slow(frame: Any, *, unchanged: bool = False) -> Any:
+        stage.clock.advance_ns(round(1.6 * PERIOD_NS))
+        return present(frame, unchanged=unchanged)
+
+    stage.refresh(150)
+    assert "late" not in stage.presenter.machine.reason
+    stage.panels.present = slow
+    stage.refresh(150)
+    assert stage.presenter.machine.state is State.TRACKING
+    assert "late: " in stage.presenter.machine.reason
+    now = stage.presenter.stats.rates_now()["fps_now"]
+    told_now = int(stage.presenter.machine.reason.split("late: ")[1].split()[0])
+    assert abs(told_now - now) <= 2

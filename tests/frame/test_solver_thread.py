@@ -213,18 +213,6 @@ def test_one_late_step_is_no_fault_and_late_ones_in_a_row_are_until_as_many_are_
     assert shop.host.news().missing == {}
 
 
-def test_where_nothing_is_to_be_done_nothing_is_late(shop: Workshop) -> None:
-    """A head that came to rest after one slow solution is not told of it for ever."""
-    shop.behave = shop.hang
-    shop.post(1)
-    shop.pass_s(2.0)
-    shop.behave = lambda request: SolverStep()
-    shop.gates[0].set()
-    shop.settle()
-    shop.solve(2)
-    assert shop.host.news().missing == {}
-
-
 def test_a_step_that_does_not_return_is_left_behind_and_the_solver_made_anew_serves(shop: Workshop) -> None:
     shop.solve(1)
     shop.behave = shop.hang
@@ -266,20 +254,6 @@ def test_a_solver_that_hangs_again_and_again_leaves_no_more_than_a_few_threads(s
     shop.settle()
     shop.solve(50)
     assert shop.host.news().solution.solved_for_ns == 50
-
-
-def test_those_that_returned_after_all_count_no_more(shop: Workshop) -> None:
-    shop.behave = shop.hang
-    for number in range(1, ABANDONED_MAX + 1):
-        shop.post(number)
-        shop.left()
-    for gate in shop.gates:
-        gate.set()
-    for thread in shop.hung[:ABANDONED_MAX]:
-        thread.join(PATIENCE_S)
-    shop.post(ABANDONED_MAX + 1)
-    shop.left()
-    assert shop.host.restarts == ABANDONED_MAX + 1
 
 
 def test_a_step_that_raises_is_told_at_once_and_the_solver_made_anew(shop: Workshop) -> None:
@@ -339,15 +313,6 @@ def test_tasks_that_wait_behind_a_hung_step_are_done_by_the_solver_made_anew(sho
     shop.host.do(lambda parts: bool(done.put(parts)) or True)
     shop.left()
     assert done.get(timeout=PATIENCE_S) is shop.all[1]
-
-
-def test_closing_does_not_wait_for_ever_for_a_step_that_hangs(shop: Workshop) -> None:
-    shop.behave = shop.hang
-    shop.post(1)
-    shop.host.close(0.01)
-    assert [thread.is_alive() for thread in shop.hung] == [True]
-    shop.gates[0].set()
-    assert shop.closed.get(timeout=PATIENCE_S) == "solver-1"
 
 
 def test_making_it_anew_may_take_as_long_as_at_the_start(shop: Workshop, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,19 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import moderngl
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from runtime.clock import MonotonicClock
-from runtime.config import OutputSettings, PanelSettings
+from runtime.config import PanelSettings
 from runtime.errors import PanelLost
 from runtime.optics.alignment import align, shown_layers
 from runtime.optics.stack import PanelStack
 from runtime.panels import window
 from runtime.panels.display import glfw
-from runtime.panels.registry import open_panels
 from runtime.panels.window import WindowPanels
 from runtime.records import PanelFrame
 from tests.panels.edids import block
@@ -71,13 +68,6 @@ def test_panels_are_found_by_edid_serial_wherever_they_are_plugged_in(x: XServer
     assert sink.monitors[0].model == "EIZ CG2700X"
     sink.present(frame(0))
     assert shows(x, 2, picture(0, 0))
-
-
-def test_a_panel_that_is_not_there_is_named_and_no_window_is_left(x: XServer, context: moderngl.Context) -> None:
-    panels = (*BY_CONNECTOR[:2], PanelSettings(connector="HDMI-7"))
-    with pytest.raises(PanelLost, match=r"panel 2: no monitor with connector HDMI-7 .*DUMMY0"):
-        open_panels(OutputSettings(kind="windows", panels=panels), STACK, MonotonicClock(), context)
-    assert eventually(lambda: not x.screenshot().any())
 
 
 def presents(sink: WindowPanels, number: int) -> bool:
