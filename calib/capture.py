@@ -51,10 +51,6 @@ class EyeWindow:
         while self._samples and self._samples[0][0] <= capture_ns - WINDOW_NS:
             self._samples.popleft()
 
-    def clear(self) -> None:
-        """Forget all: what was seen before does not belong to what comes."""
-        self._samples.clear()
-
     def measure(self) -> tuple[F64, float] | None:
         """Their median (3,), frame `sensor`, and robust RMS distance from it; None with fewer than `MIN_SAMPLES`."""
         if len(self._samples) < MIN_SAMPLES:
@@ -152,7 +148,7 @@ class Walk:
         index = min(max(self._index + step, 0), len(self._left) - 1)
         if index != self._index:
             self._index = index
-            self._window.clear()
+            self._window = EyeWindow()  # what was seen before does not belong to what comes
             self._announce()
 
     def _announce(self) -> None:

@@ -64,10 +64,6 @@ class Setup:
             raise Stopped
         return answer or default
 
-    def write(self, change: Callable[[Any], None]) -> None:
-        """Change the configuration by a function of its document. Raises InputError."""
-        rewrite(self.config, change)
-
 
 @dataclass(frozen=True, slots=True)
 class Step:
@@ -106,7 +102,7 @@ def identify(setup: Setup) -> Figures:
         rotation_deg, mirror = mounting_of(arrow, mirrored=not readable)
         named = _name_of(monitors[free.pop(0)], monitors)
         tables.append(named | {"rotation_deg": rotation_deg, "mirror": mirror})
-    setup.write(lambda document: put_monitors(document, tables))
+    rewrite(setup.config, lambda document: put_monitors(document, tables))
     return {"text": f"{count} bound to their monitors"}
 
 
@@ -148,14 +144,14 @@ def geometry(setup: Setup) -> Figures:
         put(document, "stack", size)
         put(document, "calibration", {"viewing_m": [near_m, far_m], "ipd_m": ipd_m})
 
-    setup.write(change)
+    rewrite(setup.config, change)
     width_mm, height_mm = (1e3 * size[name] for name in ("width_m", "height_m"))
     return {"text": f"{width_mm:.1f} by {height_mm:.1f} mm; viewers {near_m:.2f} to {far_m:.2f} m away"}
 
 
 def registration(setup: Setup) -> Figures:
     """Where the panels truly are, from photographs of the boards."""
-    setup.write(lambda document: None)  # an empty configuration where there was none
+    rewrite(setup.config, lambda document: None)  # an empty configuration where there was none
     settings = setup.settings
     pictures = setup.hardware.photographs(settings, boards(settings.stack.stack()), panel=None, say=setup.say)
     summary = register_photos(pictures, "photographs", setup.out / "registration", settings, config=setup.config)
@@ -193,7 +189,7 @@ def _measure_grey(setup: Setup, panel: int) -> float:
     pictures = setup.hardware.photographs(settings, grey_charts(stack, panel), panel=panel, say=setup.say)
     path = (setup.out / "grey" / f"panel-{panel}.csv").resolve()
     summary = lut_from_photographs(path, pictures, stack, panel=panel, source="photographs")
-    setup.write(lambda document: put_panels(document, "lut", {panel: str(path)}, panels=stack.count))
+    rewrite(setup.config, lambda document: put_panels(document, "lut", {panel: str(path)}, panels=stack.count))
     residual = float(summary["residual"])
     setup.say(f"panel {panel}: taken, measured to {100 * residual:.2f}%")
     return residual
@@ -215,7 +211,7 @@ def sensor(setup: Setup) -> Figures:
             break
         except InputError as error:
             setup.say(f"it does not work: {error}")
-    setup.write(lambda document: put(document, "sensor", update))
+    rewrite(setup.config, lambda document: put(document, "sensor", update))
     return {"text": name}
 
 
@@ -227,7 +223,7 @@ def calibration(setup: Setup) -> Figures:
         setup.say(f"{count} pairs are kept in {pairs_path}; at least {MIN_PAIRS} are needed")
         raise Stopped
     summary = solve_file(pairs_path, target, settings=setup.settings)
-    setup.write(lambda document: put(document, "calibration", {"file": str(target.resolve())}))
+    rewrite(setup.config, lambda document: put(document, "calibration", {"file": str(target.resolve())}))
     text = f"{summary['eye_error_mm']:.1f} mm of error expected at the eye, from {summary['pairs']} pairs"
     return {"text": text, "notes": summary["warnings"]}
 

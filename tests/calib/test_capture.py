@@ -40,11 +40,6 @@ def walk(path: Path, said: list[str]) -> Walk:
     return Walk(PairsFile(path), grid()[:3], say=said.append)
 
 
-def stand(at: Walk, place: np.ndarray, *, start_ns: int = 0) -> None:
-    for number in range(15):
-        at.see(start_ns + number * STEP_NS, eyes_at(place), "A1")
-
-
 def test_restless_eyes_are_not_taken(tmp_path: Path) -> None:
     said: list[str] = []
     person = walk(tmp_path / "pairs.csv", said)
@@ -53,16 +48,6 @@ def test_restless_eyes_are_not_taken(tmp_path: Path) -> None:
     person.press(Key.ACCEPT)
     assert "hold still" in said[-1]
     assert not (tmp_path / "pairs.csv").exists()
-
-
-def test_a_viewpoint_is_taken_anew_from_the_one_after_it(tmp_path: Path) -> None:
-    person = walk(tmp_path / "pairs.csv", [])
-    for start_ns, place in ((0, grid()[1].midpoint_m), (NS_PER_S, grid()[0].midpoint_m)):
-        stand(person, place, start_ns=start_ns)
-        person.press(Key.ACCEPT)
-        person.press(Key.PREVIOUS)
-    pairs = read_pairs(tmp_path / "pairs.csv")
-    np.testing.assert_allclose(pairs.sensor_m, [eyes_at(grid()[0].midpoint_m).eyes_m.mean(0)], atol=1e-8)
 
 
 def recording(path: Path, places: list[np.ndarray], *, true: bool) -> Path:

@@ -93,10 +93,3 @@ def test_a_file_of_another_sensor_is_not_gone_on_with(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="sensor A1, this one is of B2"):
         PairsFile(path).accept(captured("v1", serial="B2"))
     assert len(read_pairs(path)) == 1
-
-
-def test_a_file_of_something_else_is_not_overwritten(tmp_path: Path) -> None:
-    path = file(tmp_path, "my,precious\n1,2\n")
-    with pytest.raises(InputError):
-        PairsFile(path)
-    assert path.read_text() == "my,precious\n1,2\n"

@@ -11,25 +11,17 @@ from torch import nn
 FAULTS = {
     "absent:Module": "`absent` cannot be imported from Python's path",
     "tests.model_export.unservable:Absent": "is no class that derives from torch.nn.Module",
-    "tests.model_export.unservable:NoModule": "is no class that derives from torch.nn.Module",
     "tests.model_export.unservable:WrongInput": "expected input",
     "tests.model_export.unservable:WrongOutput": "channels (3 panels of 3 colours)",
     "tests.model_export.unservable:HalfSize": "height (3 panels of 3 colours)",
     "tests.model_export.unservable:NotFinite": "forward: answers with numbers that are not finite",
-    "tests.model_export.unservable:Double": "forward: answers with torch.float64",
-    "tests.model_export.unservable:Two": "forward: answers with tuple",
     "tests.model_export.unservable:NeedsGpu": "forward",
     "tests.model_export.unservable:Branches": "branches on the values of its input",
     "tests.model_export.unservable:Fourier": "aten::fft_rfft2",
-    "tests.model_export.unservable:Unmade": "__init__: ValueError: no weights here",
     "tests.model_export.unservable:Leaves": "SystemExit",
     "tests.model_export.unservable:OtherFrame": "input_frame",
     "tests.model_export.unservable:Narrow": "--option: width",
 }
-
-
-class NoModule:
-    """Nothing to torch."""
 
 
 class Even(nn.Module):
@@ -67,16 +59,6 @@ class NotFinite(Even):
         return super().forward(eyes) / torch.zeros(1)
 
 
-class Double(Even):
-    def forward(self, eyes: Any) -> Any:
-        return super().forward(eyes).double()
-
-
-class Two(Even):
-    def forward(self, eyes: Any) -> Any:
-        return super().forward(eyes), eyes
-
-
 class NeedsGpu(Even):
     def forward(self, eyes: Any) -> Any:
         return super().forward(eyes.cuda()).cpu()
@@ -92,11 +74,6 @@ class Fourier(Even):
     def forward(self, eyes: Any) -> Any:
         waves = torch.fft.rfft2(super().forward(eyes))
         return torch.fft.irfft2(waves, s=eyes.shape[2:])
-
-
-class Unmade(Even):
-    def __init__(self) -> None:
-        raise ValueError("no weights here")
 
 
 class Leaves(Even):
