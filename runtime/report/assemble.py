@@ -8,9 +8,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from runtime.config import StackGeometry
-from runtime.model.predictor import SHIPPED
-from runtime.model.session import ModelSession
+from runtime.config import ModelSettings, StackGeometry
+from runtime.model.predictor import SHIPPED, load_predictor
 from runtime.report import focal, moving
 from runtime.report.frontier import Method, MethodResult, apart, measure, shipped_and_references
 from runtime.report.literature import SIZE_PX, literature_section
@@ -71,11 +70,12 @@ def whole_report(
     Raises InputError for case files and models with mistakes, before anything is measured.
     """
     cases = read_pairs(pairs) if pairs is not None else []
-    for name in models:
-        ModelSession(Path(name), provider="cpu", threads=1)  # refuses what is none of ours
     stack = StackGeometry().stack()
     if quick:
         stack = replace(stack, width_px=960, height_px=540)
+    for name in models:
+        for each in dict.fromkeys([*(pair.stack for pair in cases), stack]):  # minutes later is too late to refuse it
+            load_predictor(name, each, ModelSettings(threads=1)).close()
     page = GrowingPage(out, command, progress)
     methods = shipped_and_references(models, quick=quick)
     published = "{}x{}".format(*SIZE_PX)

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from runtime.commands.report import report
 from runtime.errors import InputError
+from runtime.model.predictor import model_path
 from runtime.report.assemble import whole_report
 from tests.report.test_pairs import case_folder
 
@@ -35,6 +36,17 @@ def test_mistakes_are_told_before_anything_is_measured_and_nothing_is_written(tm
         assert isinstance(done.exception, InputError), done.output
         assert str(tmp_path) in str(done.exception)
         assert not (tmp_path / "out").exists()
+
+
+def test_a_model_that_does_not_fit_one_of_the_cases_is_refused_before_anything_is_measured(tmp_path: Path) -> None:
+    """It was, after minutes, when its turn came."""
+    (tmp_path / "cases").mkdir()
+    case_folder(tmp_path / "cases", panels={"width_m": 0.5, "height_m": 0.3, "x_m": [-0.05, 0.05]}, off=None)
+    done = command(
+        "--out", str(tmp_path / "out"), "--pairs", str(tmp_path / "cases"), "--model", str(model_path("fast"))
+    )
+    assert isinstance(done.exception, InputError) and "panels" in str(done.exception)
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_report_that_is_stopped_is_a_page_with_what_was_measured(tmp_path: Path) -> None:
