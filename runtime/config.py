@@ -332,10 +332,9 @@ class PlanSettings(Section):
 
 
 class ServiceSettings(Section):
-    """The daemon's socket, metrics and black box."""
+    """The daemon's socket and black box."""
 
     socket: str = Field("/run/phasestack/status.sock", description="status and control socket")
-    metrics_port: Annotated[int, Field(ge=0, le=65535)] = Field(0, description="Prometheus on loopback; 0: off")
     blackbox_minutes: Annotated[float, within(0.0, 60.0, "min")] = Field(
         2.0, description="what the black box keeps in memory, to be written at a fault or by `ctl blackbox`; 0: none"
     )
@@ -353,7 +352,7 @@ class Settings(Section):
     output: OutputSettings = Field(default_factory=OutputSettings, description="panels")
     loop: LoopSettings = Field(default_factory=LoopSettings, description="pacing")
     plan: PlanSettings = Field(default_factory=PlanSettings, description="what is left out")
-    service: ServiceSettings = Field(default_factory=ServiceSettings, description="socket, metrics, black box")
+    service: ServiceSettings = Field(default_factory=ServiceSettings, description="socket, black box")
 
     @model_validator(mode="after")
     def _agree(self) -> Settings:

@@ -58,7 +58,7 @@ def try_display(settings: Settings, *, port: int, opens: bool, seconds: float | 
 
     with tempfile.TemporaryDirectory(prefix="phasestack-") as folder:
         socket = Path(folder) / "status.sock"
-        service = {"socket": str(socket), "metrics_port": 0, "blackbox_minutes": 0.0}
+        service = {"socket": str(socket), "blackbox_minutes": 0.0}
         settings = changed(settings, "service", service, source="try")
         with _served(link, socket, port) as url:
             typer.echo(json.dumps({"url": url}) if as_json else f"look into it: {url}")

@@ -1,1 +1,1 @@
-"""What makes a run a daemon: building, supervising, reconfiguring, metrics, the socket, signals, notifications."""
+"""What makes a run a daemon: building, supervising, reconfiguring, the socket, signals, notifications."""

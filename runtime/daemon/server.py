@@ -101,7 +101,7 @@ class StatusServer(Listener):
             return {"ok": False, "error": "a request is one JSON object on one line"}
         name = request.get("command") if isinstance(request, dict) else None
         if name == "status":
-            return self.status()
+            return self._status()
         if isinstance(name, str) and name in self.lookups:
             return {"ok": True, **self.lookups[name]()}
         try:
@@ -109,8 +109,7 @@ class StatusServer(Listener):
         except ValueError as error:
             return {"ok": False, "error": str(error)}
 
-    def status(self) -> dict[str, Any]:
-        """As `status` answers."""
+    def _status(self) -> dict[str, Any]:
         published_ns, snapshot = self._snapshot
         now_ns = self._clock.now_ns()
         return {

@@ -20,7 +20,6 @@ from runtime.daemon import status
 from runtime.daemon.build import Host, Run, RunOptions
 from runtime.daemon.commands import PLACING, Command
 from runtime.daemon.drive import drive
-from runtime.daemon.metrics import Metrics
 from runtime.daemon.notify import Notifier
 from runtime.daemon.reconfigure import Reconfiguration, moved_since
 from runtime.daemon.server import StatusServer, open_status_server
@@ -313,11 +312,6 @@ def run_daemon(read_settings: Callable[[], Settings], options: RunOptions) -> di
             recorder = cleanup.enter_context(Recorder(state_folder() / "blackbox", minutes=service.blackbox_minutes))
         if server is not None:
             cleanup.callback(server.close)
-            if service.metrics_port:
-                try:
-                    cleanup.callback(Metrics(service.metrics_port, server.status).close)
-                except InputError as error:  # the display does not go dark for its figures
-                    log.error("no metrics: %s", error)
         daemon = Daemon(
             read_settings,
             signals=signals,
