@@ -46,7 +46,7 @@ say("the solver is held", await until(async () => (await status()).paused));
 const held = (await status()).solution;
 await page.mouse.move(420, 300);
 await until(async () => off((await status()).eyes_m, await page.evaluate(() => window.phasestack.eyes())) < 0.001);
-say("while alignment goes on", (await status()).solution === held && (await status()).state === "tracking");
+say("while alignment goes on", await until(async () => (await status()).state === "tracking") && (await status()).solution === held);
 await page.uncheck("[name=held]");
 await page.check("[name=lost]");
 say("eyes lost: flat", await until(async () => (await status()).state === "flat"));
@@ -82,7 +82,7 @@ await page.keyboard.press("Enter");
 say("another gap", await until(async () => (await about()).stack?.x_m[2] === 0.04, 120000));
 await page.check("[name=camera]");
 say("its camera is the sensor", await until(() => page.evaluate(() => /no viewer/.test(document.querySelector(".found figcaption").textContent)), 120000)
-  && (await status()).eyes_m === null);
+  && await until(async () => (await status()).eyes_m === null));
 await page.screenshot({ path: `${folder}/camera.png` });
 await page.uncheck("[name=camera]");
 say("and the pointer again", await until(async () => (await status()).state === "tracking", 120000));

@@ -105,14 +105,14 @@ async function film(on) {
   const mine = camera, video = Object.assign(document.createElement("video"), { srcObject: mine, muted: true, playsInline: true });
   await video.play();
   say({ camera: 1 });
-  const canvas = document.createElement("canvas");
+  const scale = Math.min(1, 640 / video.videoWidth), canvas = new OffscreenCanvas(video.videoWidth * scale, video.videoHeight * scale);
+  const plain = canvas.getContext("2d", { willReadFrequently: true });
   while (camera === mine) {
-    const scale = Math.min(1, 640 / video.videoWidth), taken_ms = performance.now();
-    Object.assign(canvas, { width: video.videoWidth * scale, height: video.videoHeight * scale });
-    canvas.getContext("2d").drawImage(video, 0, 0, canvas.width, canvas.height);
+    const taken_ms = performance.now();
+    plain.drawImage(video, 0, 0, canvas.width, canvas.height);
     const coded = await [0.85, 0.6, 0.3].reduce(async (before, quality) => { // as fine as a message may be long
       const blob = await before;
-      return blob && blob.size < 60000 ? blob : new Promise((done) => canvas.toBlob(done, "image/jpeg", quality));
+      return blob?.size < 60000 ? blob : canvas.convertToBlob({ type: "image/jpeg", quality });
     }, null);
     if (camera !== mine) return;
     const answered = new Promise((done) => { lookedAt = done; setTimeout(done, 250); });
