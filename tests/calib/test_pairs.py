@@ -25,13 +25,6 @@ def captured(viewpoint: str, x: float = 0.1, serial: str = "A1") -> PairRow:
     return PairRow(**places, viewpoint=viewpoint, spread_mm="1.5", sensor_serial=serial)
 
 
-def test_csv_columns_may_come_in_any_order_with_others_between(tmp_path: Path) -> None:
-    text = "note,stack_z,stack_y,stack_x,sensor_z,sensor_y,sensor_x\nhello,6,5,4,3,2,1\n"
-    pairs = read_pairs(file(tmp_path, text))
-    np.testing.assert_array_equal(pairs.sensor_m, [[1, 2, 3]])
-    np.testing.assert_array_equal(pairs.stack_m, [[4, 5, 6]])
-
-
 @pytest.mark.parametrize("wrapped", [False, True])
 def test_json_gives_the_same_as_csv(tmp_path: Path, wrapped: bool) -> None:
     rows = [dict(zip(COLUMNS, values, strict=True)) for values in ([1, 2, 3, 4, 5, 6], [2, 3, 4, 5, 6, 7])]

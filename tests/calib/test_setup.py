@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import stat
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 
 from calib.board import boards
+from calib.config_file import put, rewrite
 from calib.grey_chart import grey_charts
 from calib.keys import Key
 from calib.setup_run import progress_path, read_progress, walk_through
@@ -199,3 +201,16 @@ def test_nothing_is_asked_of_a_terminal_that_is_closed(tmp_path: Path) -> None:
     assert done.returncode == 0
     assert "not done: identify" in done.stdout
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_rewritten_configuration_and_its_past_are_read_by_no_more_and_a_link_stays_one(tmp_path: Path) -> None:
+    """A camera's password in it: setup made 0600 to 0644, and the link a file of its own."""
+    (tmp_path / "kept").mkdir()
+    config, link = tmp_path / "kept" / "display.toml", tmp_path / "phasestack.toml"
+    config.write_text('[content]\nscene = "rtsp://user:secret@cam/1"\n')  # pragma: allowlist secret
+    config.chmod(0o600)
+    link.symlink_to(config)
+    past = rewrite(link, lambda document: put(document, "calibration", {"viewing_m": [0.4, 0.7]}))
+    assert link.is_symlink() and "viewing_m" in config.read_text()
+    assert past is not None and past.parent == config.parent
+    assert [stat.S_IMODE(path.stat().st_mode) for path in (config, past)] == [0o600, 0o600]

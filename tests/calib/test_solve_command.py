@@ -73,13 +73,6 @@ def test_nearly_collinear_points_are_refused_with_what_they_would_cost(tmp_path:
     assert "condition" in message
 
 
-def test_coplanar_points_are_fine_and_said_to_be(tmp_path: Path) -> None:
-    flat = KNOWN_M * [1.0, 1.0, 0.0]
-    told = solve(write_pairs(tmp_path, measured(flat), flat), tmp_path / "c.toml")
-    assert any("one plane" in warning for warning in told["warnings"])
-    np.testing.assert_allclose(told["stack_from_sensor"], demo_stack_from_sensor(), atol=1e-9)
-
-
 @pytest.mark.parametrize("sigma_m", [0.0, 0.01])
 @pytest.mark.parametrize("axis", range(3))
 def test_mirrored_data_are_refused(tmp_path: Path, axis: int, sigma_m: float) -> None:
