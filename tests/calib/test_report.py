@@ -67,9 +67,7 @@ def test_the_published_prototype_is_reported_without_its_points(tmp_path: Path) 
     "data",
     [
         "sensor_m = [[1, 2]]\nstack_m = [[1, 2, 3]]\nused = [true]\nnames = ['a']",
-        "sensor_m = [[1, 2, 3]]",
         "sensor_m = [[1, 2, 3]]\nstack_m = [[1, 2, 3]]\nused = [true, true]\nnames = ['a']",
-        "sensor_m = [[1, 2, 3]]\nstack_m = [[1, 2, 3]]\nused = [false]\nnames = ['a']",
         "sensor_m = [[1, 2, nan]]\nstack_m = [[1, 2, 3]]\nused = [true]\nnames = ['a']",
     ],
 )
