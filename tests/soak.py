@@ -62,7 +62,7 @@ class Soak:
 
     def delayed(self, work: Callable[..., Any], share: float, most_s: float) -> Callable[..., Any]:
         def later(*given: Any, **named: Any) -> Any:
-            if random.random() < share:
+            if random.random() < share and time.monotonic() < self._end_s - 30.0:
                 time.sleep(random.uniform(0.0, most_s))
             return work(*given, **named)
 
@@ -80,14 +80,12 @@ class Soak:
     def client(self, number: int) -> None:
         """Asks for anything, again and again."""
         choose = random.Random(number)
-        scenes, plain = [*SCENES, "nobody's"], ("next", "reload", "flat", "resume", "pause", "blackbox", "pictures")
+        scenes, plain = [*SCENES, "nobody's"], ("next", "reload", "flat", "resume", "pause", "blackbox")
         while time.monotonic() < self._end_s - 30.0:
             scene = {"command": "scene", "value": choose.choice(scenes)}
             model = {"command": "model", "value": choose.choice(["fast", "balanced"])}
             place = {"command": "place", "value": {"scale": choose.uniform(0.5, 2.0)}}
-            plain = [
-                {"command": name} for name in ("next", "reload", "flat", "resume", "pause", "blackbox", "pictures")
-            ]
+            plain = [{"command": name} for name in ("next", "reload", "flat", "resume", "pause", "blackbox")]
             self._ask(choose.choice([scene, scene, scene, model, place, *plain]))
             time.sleep(choose.uniform(0.0, 1.5))
 
