@@ -41,7 +41,7 @@ def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> 
         reason = run.presenter.run(frames=options.frames)
         for sample in run.presenter.samples.recorded_ahead():
             run.observer.sampled(sample)  # the last lights' truth: nothing else is done with it
-        run.observer.finish()
+        run.observer.finish(patient=host is None or not host.stop_reason())
         summary = run.summary() | {"stopped": reason}
         if output is not None:
             last = run.presenter.last

@@ -146,15 +146,15 @@ class RunObserver:
             self._samples.append(refresh)
         self._advance()
 
-    def finish(self) -> None:
+    def finish(self, *, patient: bool = True) -> None:
         """No more refreshes: what waits is written and measured, and the last refresh is looked at.
 
-        In real time it is not, where another was: whoever stops a run need not wait for that.
+        In real time it is not where another was, nor where somebody waits for the run to stop (not patient).
         """
         self.truth.end()
         self._advance()
         last = self.last
-        if self.moment is not None and not self._simulated:
+        if not self._simulated and (self.moment is not None or not patient):
             return
         if last is None or not self._measure or not _has_picture(last) or last.account.eyes_m is None:
             return

@@ -237,6 +237,14 @@ def test_the_moment_to_show_is_the_last_refresh_by_its_number_and_in_real_time_t
         np.testing.assert_array_equal(observer.moment.eye_views.eyes_m, aside(0.001 * shown))
 
 
+def test_who_stops_a_run_waits_for_no_measurement(content: ContentSource, solved: Solution) -> None:
+    solver = Drawing(content, at_once=False)  # busy
+    observer, _ = looking(content, solver=solver, simulated=False, measure=True, evaluate_every=50)
+    observer.refreshed(refresh(1, solved))
+    observer.finish(patient=False)
+    assert observer.moment is None and solver.tasks == []
+
+
 def test_in_real_time_one_measurement_is_under_way_at_a_time_and_no_refresh_waits_for_it(
     content: ContentSource, solved: Solution
 ) -> None:
