@@ -80,7 +80,7 @@ class Soak:
     def client(self, number: int) -> None:
         """Asks for anything, again and again."""
         choose = random.Random(number)
-        scenes, plain = [*SCENES, "nobody's"], ("next", "reload", "flat", "resume", "pause", "blackbox")
+        scenes = [*SCENES, "nobody's"]
         while time.monotonic() < self._end_s - 30.0:
             scene = {"command": "scene", "value": choose.choice(scenes)}
             model = {"command": "model", "value": choose.choice(["fast", "balanced"])}
