@@ -11,7 +11,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
 NIGHTLY := out/nightly
 
-.PHONY: demo test test-slow golden lint types secrets coverage nightly package bench fuzz soak install uninstall system eye-models models gallery hashes clean
+.PHONY: demo test test-slow golden lint types secrets coverage nightly package bench fuzz soak install uninstall system eye-models models gallery site hashes clean
 
 demo: $(VENV)/.runtime
 	$(BIN)/phasestack demo $(DEMO_ARGS)
@@ -82,6 +82,11 @@ models: $(VENV)/.test
 	for name in fast balanced best; do $(BIN)/phasestack export --arch $$name --out runtime/model/data/$$name.onnx || exit 1; done
 	cd runtime/model/data && sha256sum balanced.onnx best.onnx fast.onnx > SHA256SUMS
 
+# The pages and the API's reference as a site in out/site; docs/make_figures.py draws its diagrams.
+site: $(VENV)/.docs
+	$(BIN)/python -m sphinx -q -W --keep-going -b html -c docs/site . out/site
+	@echo "open out/site/docs/index.html"
+
 # docs/performance.md and the pages' pictures from the commands (minutes).
 gallery: $(VENV)/.test
 	$(BIN)/python -m docs.make_gallery
@@ -107,6 +112,10 @@ $(VENV)/.test: $(VENV)/.runtime requirements/test.lock requirements/torch.lock
 	@sh systemd/packages.sh test
 	$(BIN)/python -m pip install --quiet -r requirements/test.lock
 	$(BIN)/python -m pip install --quiet -r requirements/torch.lock
+	@touch $@
+
+$(VENV)/.docs: $(VENV)/.test requirements/docs.lock
+	$(BIN)/python -m pip install --quiet --no-deps -r requirements/docs.lock
 	@touch $@
 
 clean:

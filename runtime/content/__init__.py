@@ -1,1 +1,1 @@
-"""Sources of pictures: each draws what an eye should see into a raster that is asked for."""
+"""Content sources: the picture of a scene for one eye, in a given raster."""

@@ -1,7 +1,7 @@
-"""What every content source answers: what does an eye at this pose see, in these pixels?
+"""The interface of content sources: the picture of a scene for one eye, in a given raster.
 
 `ContentSource` is the base of scenes of a user's own, too: `scene = "mypackage.tunnel:Tunnel"`. Of its methods only
-`render` must be written; the others say what can be left out, and their defaults are right for any scene.
+`render` must be written; the others are optimisations, whose defaults are right for any scene.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class ContentInfo:
-    """What a source knows about itself; the plan leaves out what this says is not needed."""
+    """Static properties of a scene; the solver skips work that they make unnecessary."""
 
     name: str
     moving: bool = False
@@ -73,8 +73,7 @@ class ContentSource(ABC):
         """
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture | None:
-        """The same picture left in a texture, until the next of its side; None: there is none, `render` has to be
-        asked. Raises ContentFailure."""
+        """The same picture in a texture, valid until the next of its side; None: `render` it. Raises ContentFailure."""
         return None
 
     def expect(self, views: Sequence[View], *, time_ns: int) -> None:  # noqa: B027 - most have nothing to prepare
@@ -82,7 +81,7 @@ class ContentSource(ABC):
 
     @property
     def program(self) -> dict[str, Any] | None:
-        """Of a scene that another program draws: `address`, and `frame_ms` that it takes lately. None: it is none."""
+        """`address` and recent `frame_ms` of a scene that another program draws, else None."""
         return None
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect | None:
@@ -90,11 +89,11 @@ class ContentSource(ABC):
         return None
 
     def revision(self, *, time_ns: int) -> int:
-        """A number that changes when what `render` draws for the same view may have changed; 0 for ever if static."""
+        """A number that changes whenever `render` may draw the same view differently; constant for a static scene."""
         return time_ns if self.info.moving else 0
 
     def describe(self, *, time_ns: int) -> dict[str, Any] | None:
-        """Of a playlist: its entries, which one is shown, for how long still. None: it is none."""
+        """Entries of a playlist, the one that is shown and its remaining time; None for any other source."""
         return None
 
     def skip(self, *, time_ns: int) -> bool:
@@ -103,7 +102,7 @@ class ContentSource(ABC):
 
     @property
     def problem(self) -> str:
-        """What is wrong at present while the last good picture stays: one line; empty: nothing is."""
+        """The current fault while the last good picture stays, in one line; empty without one."""
         return ""
 
     def close(self) -> None:  # noqa: B027 - most sources hold nothing
@@ -116,8 +115,8 @@ class ForwardingSource(ContentSource):
     source: ContentSource  # that is shown at present
 
     @abstractmethod
-    def asked(self, view: View, time_ns: int) -> tuple[ContentSource, View, int]:
-        """Which one is asked, with which view, for which time."""
+    def forwarded(self, view: View, time_ns: int) -> tuple[ContentSource, View, int]:
+        """The source, view and time that a request is forwarded to."""
 
     @property
     def problem(self) -> str:
@@ -128,23 +127,23 @@ class ForwardingSource(ContentSource):
         return self.source.program
 
     def expect(self, views: Sequence[View], *, time_ns: int) -> None:
-        asked = [self.asked(view, time_ns) for view in views]
-        asked[0][0].expect([view for _, view, _ in asked], time_ns=asked[0][2])
+        requests = [self.forwarded(view, time_ns) for view in views]
+        requests[0][0].expect([view for _, view, _ in requests], time_ns=requests[0][2])
 
     @property
     def draws_in(self) -> object:  # type: ignore[override]
         return self.source.draws_in
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture | None:
-        source, view, time_ns = self.asked(view, time_ns)
+        source, view, time_ns = self.forwarded(view, time_ns)
         return source.draw(view, time_ns=time_ns)
 
     def render(self, view: View, *, time_ns: int) -> U8:
-        source, view, time_ns = self.asked(view, time_ns)
+        source, view, time_ns = self.forwarded(view, time_ns)
         return source.render(view, time_ns=time_ns)
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect | None:
-        source, view, time_ns = self.asked(view, time_ns)
+        source, view, time_ns = self.forwarded(view, time_ns)
         return source.extent(view, time_ns=time_ns)
 
     def close(self) -> None:

@@ -20,13 +20,13 @@ SIZES_KEPT = 8
 
 @dataclass(slots=True)
 class _Target:
-    smooth: Any  # framebuffer with several samples or half floats; None where neither is wanted
+    smooth: Any  # framebuffer with several samples or half floats; None where neither is needed
     plain: list[Any]  # one a side
     pictures: list[U8]  # one (h, w, 4) array a side, reused
 
 
 class CanvasSource(ContentSource):
-    """A source that draws with OpenGL, into framebuffers of the views' sizes: who wants the pixels reads them back.
+    """A source that draws with OpenGL, into framebuffers of the views' sizes: pixels are read back on request.
 
     Only the box that the content may touch is cleared, drawn and resolved with several samples a pixel: on a
     software rasteriser resolving is the dearest step.

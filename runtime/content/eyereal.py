@@ -50,8 +50,8 @@ def is_data_set(folder: Path) -> bool:
 def read_folder(folder: Path, preset: str) -> tuple[Pair, ...]:
     """Every pair, by number. Raises InputError: no pair, half a pair, coordinates that are no eye.
 
-    Names hold the eyes in the scene's digital units. Of `_0` and `_1` geometry tells which one is left; `_left` and
-    `_right`, of the set's newer data, say so, and geometry must agree. preset: the scene's name.
+    Names hold the eyes in the scene's digital units. Which of `_0` and `_1` is left follows from their positions;
+    `_left` and `_right`, of the set's newer data, must agree with them. preset: the scene's name.
     """
     stack_from_scene: F64 = np.linalg.inv(drawn_scene_from_stack(preset)).astype(np.float64)
     found: dict[int, list[tuple[str, Path, F64]]] = {}

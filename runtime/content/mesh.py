@@ -26,7 +26,7 @@ from runtime.support.untrusted_input import LIMITS
 
 log = logging.getLogger("phasestack.content")
 
-UNCOLOURED = (0.70, 0.74, 0.80)  # of a file that says nothing of colours
+UNCOLOURED = (0.70, 0.74, 0.80)  # of a file without colours
 WHITE = (1.0, 1.0, 1.0)
 GLTF = (".glb", ".gltf")
 STL_HEAD, STL_FACET = 84, 50  # bytes of a binary file's head and of each of its triangles
@@ -119,7 +119,7 @@ def _loaded(path: Path, data: bytes) -> list[tuple[Any, F64]]:
         return untrusted_input.read_bytes(place, most_bytes=LIMITS.file_bytes, source=path, field=field)
 
     class Beside(trimesh.resolvers.FilePathResolver):
-        """What a loader reads beside a file: it passes over what it does not get, so that this keeps why."""
+        """Reads files beside the mesh; keeps the reason of a refusal, since loaders skip what they do not get."""
 
         refused: InputError | None = None
         pixels = 0  # of all textures
@@ -183,7 +183,7 @@ def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8]) -> Part:
     elif kind == "face":
         colours, normals = np.repeat(visual.face_colors, 3, axis=0), np.repeat(mesh.face_normals, 3, axis=0)
         vertices, faces = vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3)
-    elif path.suffix.lower() not in GLTF:  # which is white where it says nothing
+    elif path.suffix.lower() not in GLTF:  # whose default is white
         colour = UNCOLOURED
     if picture is None or visual.uv is None:
         picture, uv = None, np.zeros((len(vertices), 2))
@@ -210,7 +210,7 @@ def _unit(colours: Any) -> F32:
 def _material(material: Any, pictures: dict[int, U8]) -> tuple[U8 | None, tuple[float, float, float]]:
     """Texture (RGBA) and colour of a trimesh material: they multiply, as in glTF.
 
-    A texture's colour is white where it says black: exporters write so who mean the texture alone.
+    A black factor beside a texture is taken for white: some exporters write it for the texture alone.
     """
     is_gltf = hasattr(material, "baseColorTexture")
     if is_gltf:

@@ -46,7 +46,7 @@ VIDEO_PROPERTIES = (
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How a picture holds its views."""
+    """Arrangement of the views in a picture."""
 
     kind: str  # mono, rgbd, quilt, side-by-side, top-bottom
     columns: int = 1
@@ -81,7 +81,7 @@ class Layout:
 
 
 def layout_of(path: Path, settings: ContentSettings) -> Layout:
-    """How a file holds its views: the setting, or what its name says. Raises InputError."""
+    """The arrangement of views in a file, by the setting or by a mark in its name. Raises InputError."""
     stem = path.stem.lower()
     named = settings.layout
     if named == "auto":
@@ -132,7 +132,7 @@ class Frames(ABC):
 
 
 class PictureFiles(Frames):
-    """One picture for ever, or those of a folder in the order of their names; turned as their EXIF says."""
+    """One still picture, or a folder's in the order of their names; rotated by their EXIF orientation."""
 
     def __init__(self, paths: Sequence[Path], *, rate_hz: float) -> None:
         size_of_file(paths[0])  # before it is unpacked

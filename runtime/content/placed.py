@@ -69,7 +69,7 @@ class PlacedSource(ForwardingSource):
         """The source's own, as far as it still holds here."""
         return _moved(self.source.info, self.placing)
 
-    def asked(self, view: View, time_ns: int) -> tuple[ContentSource, View, int]:
+    def forwarded(self, view: View, time_ns: int) -> tuple[ContentSource, View, int]:
         """The same pixels for the same eye, in the scene's frame."""
         matrix = self.placing.stack_from_scene(time_ns)
         turn = matrix[:3, :3] / self.placing.scale

@@ -62,7 +62,7 @@ class SceneFile:
 
 
 def guessed_axes(low: F64, high: F64) -> tuple[str, str]:
-    """The axis that is up, and the one that faces the viewer, of a file that does not say: y and +z, or z and -y.
+    """The up axis and the one towards the viewer, guessed from an extent: +y and +z, or +z and -y.
 
     What lies flat is shown from its flat side. Else the axis is up along which it stands on 0 or above, and not
     around it; else the longer one.

@@ -57,7 +57,7 @@ class Playlist:
 def read_playlist(path: Path, settings: ContentSettings) -> Playlist:
     """Raises InputError, naming file, entry and field.
 
-    settings: what holds where an entry says nothing; where the whole list is placed is not theirs.
+    settings: defaults of every entry, except for the placing, which is the whole list's.
     """
     file = validated(PlaylistFile, read_table(path), source=path)
     common = settings.model_dump(exclude={"scene", "file", *FIELDS})
@@ -76,7 +76,7 @@ def read_playlist(path: Path, settings: ContentSettings) -> Playlist:
 
 
 class PlaylistSource(ForwardingSource):
-    """The scenes of a list, one after another, from the first time that it is asked for."""
+    """The scenes of a list, one after another, counted from its first request."""
 
     def __init__(self, playlist: Playlist, openers: list[Callable[[Any], ContentSource]], *, context: Any) -> None:
         """Raises InputError where one of them can't be shown."""
@@ -122,7 +122,7 @@ class PlaylistSource(ForwardingSource):
         self._begin_ns = time_ns - rounds * self._ends_ns[-1] - self._ends_ns[within]
         return True
 
-    def asked(self, view: View, time_ns: int) -> tuple[ContentSource, View, int]:
+    def forwarded(self, view: View, time_ns: int) -> tuple[ContentSource, View, int]:
         since_ns = self._turn_to(time_ns)
         return self.source, view, since_ns
 

@@ -30,7 +30,7 @@ SPLAT_MARKS = {"f_dc_0", "scale_0", "rot_0"}
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """What a PLY file says of itself."""
+    """The header of a PLY file."""
 
     path: Path
     order: str  # a key of ORDERS

@@ -20,7 +20,7 @@ Triple = tuple[float, float, float]
 
 @cache
 def preset_file() -> dict[str, Any]:
-    """The data file, which says what its keys are."""
+    """The data file; its comments explain its keys."""
     return tomllib.loads(FILE.read_text(encoding="utf-8"))
 
 

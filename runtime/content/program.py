@@ -1,4 +1,4 @@
-"""A program that draws: a renderer, a game, a web page connects, is asked for both eyes' pictures and answers them.
+"""Scenes drawn by another program (a renderer, a game, a web page) that connects and answers requests for pictures.
 
 The protocol is in docs/programs.md. What comes late, or not at all, leaves the last pictures where they are.
 """
@@ -36,7 +36,7 @@ log = logging.getLogger("phasestack.content")
 
 HOST = "127.0.0.1"
 ANSWERED_S = 0.4  # both pictures; later they are late
-GIVEN_UP_S = 2.0  # a frame that is late is no more waited for: another may be asked for in its place
+GIVEN_UP_S = 2.0  # a late frame is abandoned after this, and another may be requested
 IN_FLIGHT_MAX = 2
 HELLO_S = 5.0
 NEAR_M, FAR_M = 0.05, 100.0
@@ -80,12 +80,12 @@ def camera_of(view: View) -> dict[str, Any]:
 
 @dataclass(slots=True)
 class _Frame:
-    """One that a program was asked for."""
+    """One request to a program."""
 
     views: Sequence[View]
     asked_s: float
     pictures: dict[int, U8] = field(default_factory=dict)  # by side
-    wanted: bool = True  # somebody waits for it
+    awaited: bool = True  # `answer` may still be called for it
 
     @property
     def complete(self) -> bool:
@@ -116,7 +116,7 @@ class Programs:
         log.info("a program may draw: its address is in `phasestack status` (program)")
 
     def ask(self, views: Sequence[View], *, time_ns: int) -> int:
-        """Ask for pictures of one size; answers the frame's number. Raises ContentFailure where nobody may be asked."""
+        """Request pictures of one size; returns the frame's number. Raises ContentFailure where none is ready."""
         view, now_s = views[0], time.monotonic()
         with self._changed:
             self._count += 1
@@ -153,7 +153,7 @@ class Programs:
         with self._changed:
             frame = self._frames.get(number)
             if frame is not None:
-                frame.wanted = False
+                frame.awaited = False
                 if frame.complete:
                     del self._frames[number]
 
@@ -168,7 +168,7 @@ class Programs:
         return None
 
     def _connected(self, connection: ServerConnection) -> None:
-        """One connection's thread: what it says first is what it does."""
+        """One connection's thread; its first message says whether it draws or listens."""
         why = "it is gone"
         try:
             hello = json.loads(connection.recv(timeout=HELLO_S))
@@ -221,7 +221,7 @@ class Programs:
             frame.pictures[side] = np.ascontiguousarray(picture[::-1]) if self._bottom_up else picture
             if frame.complete:
                 self.frame_ms = 1e3 * (time.monotonic() - frame.asked_s)
-                if not frame.wanted:
+                if not frame.awaited:
                     del self._frames[number]
             self._changed.notify_all()
 

@@ -1,7 +1,7 @@
 """A picture with depth: colour and a grey depth map side by side, drawn as two surfaces.
 
 The front one is the picture, split where its depth jumps. The other one is what lies behind its edges, made up from
-what is seen beside them: a viewer who looks past an edge sees neither a hole nor the near thing drawn out.
+the colours beside them, so that a viewer who looks past an edge sees neither a hole nor a stretched foreground.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ NOMINAL_DISTANCE_M = 0.6  # from here the surface looks like the picture
 TORN_RELATIVE = 0.12  # of the depth range: a larger step between neighbours is an edge, not a slope
 BLURRED_PX = 5  # so wide an edge of the depth map still is one
 MIXED_PX = 2  # to either side of an edge colours are of both sides
-BEHIND_SHARE = 0.1  # of the picture's width: so far behind an edge a surface is made up
+BEHIND_SHARE = 0.1  # of the picture's width: how far behind an edge the background is filled in
 SET_BACK = 0.004  # of the depth range: the made-up surface lies behind the true one where both are
 SAMPLES = 4  # a pixel: the split edges are its outlines
 

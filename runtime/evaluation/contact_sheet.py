@@ -1,4 +1,4 @@
-"""One picture that tells a person at a glance what a run did: layers, wanted, seen, error."""
+"""The contact sheet of a run: layers, and for each eye the target, what it sees, and the error."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, line
             error = np.where(seen.mask[..., None], np.abs(seen.image - target) * ERROR_GAIN, 0.94)
             rows.append(
                 [
-                    (f"{eye} eye: wanted", as_codes(target)),
+                    (f"{eye} eye: target", as_codes(target)),
                     (f"{eye} eye: seen through the layers", as_codes(shown)),
                     (f"{eye} eye: error x {ERROR_GAIN} (black is perfect)", as_codes(error)),
                 ]

@@ -1,4 +1,4 @@
-"""The one displayed quality of layers against pictures (docs/contracts.md)."""
+"""Displayed quality of layers against target pictures (docs/contracts.md)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """`phasestack record --motion`: one of the tracker benchmark's motions as a recording, with its true eyes.
 
-Noise, outliers and dropouts are the benchmark's; the truth is in the file, so a run's summary tells the displayed
-quality at the true eyes. The sensor stands where the demo's calibration, the default, says.
+The true eyes are in the file, so that a run's summary has the displayed quality at them. The sensor's pose is that of
+the demo's calibration, the default.
 """
 
 from __future__ import annotations

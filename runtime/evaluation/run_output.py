@@ -1,4 +1,4 @@
-"""The files of a run (contracts). They are for looking at afterwards: losing them must not stop what they tell of."""
+"""The files of a run (docs/contracts.md). A failure to write them does not stop the run."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class RunOutput:
     """Writes a run's files into a folder; they appear together when it is left without an error.
 
     A thread of its own writes, so that no refresh waits for a disk. Where the disk fails on the way (full, gone, not
-    ours any more), the files are abandoned: `problem` says why, one line of the log tells it, and the run goes on.
+    ours any more), the files are abandoned: `problem` holds the reason, one line is logged, and the run goes on.
     """
 
     def __init__(self, target: Path, *, every_one: bool = True) -> None:
@@ -116,7 +116,7 @@ class RunOutput:
             self.left_out += 1
 
     def _write(self) -> None:
-        """The writer's thread: work in its order, until told to stop."""
+        """The writer's thread: work in its order, until None."""
         while (work := self._work.get()) is not None:
             if not self.problem:
                 self._attempt(work)

@@ -1,4 +1,4 @@
-"""A still pair that was solved: what the eyes make of its layers, and the files that tell it."""
+"""A solved still pair: the retina images of its layers, their quality, and the files of a result."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ class PairQuality:
 
 @dataclass(frozen=True)
 class SolvedPair:
-    """Layers, what eyes see of them, and how good that is: worked out when it is first asked for.
+    """Layers, what eyes see of them, and the quality; computed on first access.
 
-    Asking raises ValueError where an eye sees nothing of the display.
+    Access raises ValueError where an eye sees nothing of the display.
     """
 
     layers: U8  # (N, h, w, 3 or 4), rear to front

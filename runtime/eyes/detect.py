@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 
 class EyeFinder:
-    """Eyes of one viewer. `choice` says who that is and why; `reason` why the last frame gave no eyes."""
+    """Eyes of one viewer. `choice`: how that viewer was chosen; `reason`: why the last frame gave no eyes."""
 
     def __init__(self, settings: Settings | None = None) -> None:
         """settings: of `calibration` the viewer's eye distance."""
@@ -43,7 +43,7 @@ class EyeFinder:
         return self._finder.choice
 
     def find(self, frame: SensorFrame) -> EyePoints | None:
-        """The viewer's eyes in the `sensor` frame, or None; then `reason` says why.
+        """The viewer's eyes in the `sensor` frame, or None with the reason in `reason`.
 
         Needs colour and intrinsics, and depth registered to them where the sensor has it.
         """

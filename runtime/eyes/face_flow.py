@@ -1,7 +1,7 @@
 """How a face moved from one picture to the next, to a fiftieth of a pixel: optical flow of what is rigid in it.
 
 The networks look at each picture anew and err anew. What a face's skin and hair did between two pictures is known far
-better, so pupils are carried along by it and only slowly pulled to what the networks say.
+better, so pupils follow the optical flow and are only slowly corrected by the networks.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ POINTS_MIN, INLIERS_MIN = 10, 8
 
 
 class FaceFlow:
-    """Remembers a face and says how it moved since."""
+    """The motion of a remembered face between pictures."""
 
     def __init__(self) -> None:
         self._grey: Any = None

@@ -134,13 +134,13 @@ def _positive(covariance: F64) -> F64:
 
 
 def ahead(belief: Belief, dt_s: float) -> F64:
-    """(3,) position so many seconds ahead: the models' mean by belief."""
+    """(3,) position predicted ahead: the mean over the models, weighted by their probability."""
     place: F64 = _transition(dt_s)[:3] @ (belief.weight @ belief.state)
     return place
 
 
 def spread(belief: Belief, dt_s: float, *, acceleration: Sequence[float], about: F64) -> F64:
-    """(3, 3) mean square, m², of how far the position is from a place (3,) so many seconds ahead."""
+    """(3, 3) mean square, m², of the predicted position's distance from a place (3,)."""
     step = _transition(dt_s)[:3]
     added = np.square(acceleration)[:, None, None] * _noise(dt_s)[:3, :3]
     apart = belief.state @ step.T - about

@@ -1,7 +1,7 @@
 """The three networks that see a face, and the square crops of a picture that they look at.
 
 Pixels are continuous, the centre of a picture's first pixel is (0.5, 0.5). *Left* is the viewer's own left, which is
-on the right of an unmirrored picture; it comes first. `docs/sensors.md` says where the models are from.
+on the right of an unmirrored picture; it comes first. The models' origin is in `docs/sensors.md`.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ def reason_against(eyes_m: F64, *, in_front_m: float = 0.0) -> str:
 
 
 class RefusalWatch:
-    """Counts samples that were refused, by reason; says so once where most can't be a viewer's for one reason."""
+    """Counts refused samples by reason, and warns once where one reason applies to most samples."""
 
     def __init__(self) -> None:
         self._last: deque[str] = deque(maxlen=WINDOW)

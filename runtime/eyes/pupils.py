@@ -36,7 +36,7 @@ IRIS_RATIO_MAX = 1.4  # of the larger to the smaller one
 TOO_LOW = 0.0093
 OPEN_MIN = 0.12  # height of an open eye in its widths: below, a blink hides the iris
 
-PULL = 0.1  # of the way to what the networks say that a pupil goes in each picture
+PULL = 0.1  # fraction of the way to the networks' estimate by which a pupil is corrected in each picture
 # Further from it than the first (eye distances) the eyes turned: they are followed by as much of the way at the second.
 GAZE_FROM, GAZE_FULL, GAZE_PULL = 0.02, 0.06, 0.6
 # Eyes turn together: where one alone seems to, by more eye distances, it is hidden (a hand, hair), and the network
@@ -71,7 +71,7 @@ class Pupils:
 
 @dataclass(frozen=True, slots=True)
 class _Look:
-    """What the networks say of one face in one picture."""
+    """The networks' estimates of one face in one picture."""
 
     mesh: F64  # (468, 3) px
     presence: float
@@ -111,7 +111,7 @@ class PupilFinder:
         self.reason, self.choice = "", "nobody yet"
 
     def find(self, picture: U8, *, time_ns: int = 0) -> Pupils | None:
-        """The viewer's pupils in an (h, w, 3) RGB picture, or None; then `reason` says why."""
+        """The viewer's pupils in an (h, w, 3) RGB picture, or None with the reason in `reason`."""
         if self._looks is not None and time_ns - self._seen_ns > self._lock_ns:
             self.forget()
             self.choice = "nobody: the viewer left"

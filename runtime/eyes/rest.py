@@ -30,10 +30,10 @@ NEAREST_M = 0.1  # from the display; nearer eyes count as so near
 
 
 class RestWatch:
-    """Takes every sample that is believed, and says where the head rests. One thread uses it; no clock."""
+    """Detects a head at rest from the accepted samples, and its resting place. One thread uses it; no clock."""
 
     def __init__(self, *, max_drift_m: float) -> None:
-        """max_drift_m: a resting head may drift so far, and by what noise leaves unsure, until it is renewed."""
+        """max_drift_m: drift of a resting head, beyond the uncertainty by noise, after which its place is updated."""
         self._max_drift_m = max_drift_m
         self._times = np.zeros(2 * KEPT, np.int64)
         self._eyes = np.zeros((2 * KEPT, 2, 3))
@@ -58,7 +58,7 @@ class RestWatch:
             if self._stands():
                 self._settle(capture_ns - REST_NS)
         elif self._left(self.place):
-            # What lies before the motion says nothing of where it will end.
+            # Samples from before the motion do not help to find its end.
             self._keep_last(2)
             self.place = None
         elif slow_checks and self._drifted(self.place):

@@ -1,4 +1,4 @@
-"""Where the eyes are at any instant: gates, filters, keeps a history, predicts, and says how it knows."""
+"""The eyes at any instant: gating, filtering, history and prediction, with a label for how an estimate was made."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ DECAY_S = 0.06  # time constant with which a lost head comes to rest
 REVIVE_S = 0.06  # in which the picture slides to eyes that were lost and found
 CLOCK_RESET_NS = NS_PER_S  # a capture this far in the past is a clock that was set back, not a late sample
 COMPLETED_NOISE = 2.0  # an eye that was filled in is this much less certain
-NOISE_FLOOR_M = 2e-5  # a driver that says less than this is not believed: nothing measures a pupil so well
+NOISE_FLOOR_M = 2e-5  # smaller covariances from a driver are raised to this: no sensor measures a pupil better
 ESTABLISHED = 3  # samples of a head; one of fewer may have been a mistake
 SIGMA_AHEAD_S = 1.0  # how sure a guess is, is not predicted further ahead
 NEAREST_M = 0.1  # from the display; nearer eyes count as so near, for what their depth matters
-PANEL_M = (0.5184, 0.2916)  # width and height, where nobody says
+PANEL_M = (0.5184, 0.2916)  # width and height by default
 NO_JUMP = np.zeros((2, 3))
 
 UNCERTAIN = "uncertain"
@@ -57,7 +57,7 @@ class _Head(NamedTuple):
         return (time_ns - self.capture_ns) / NS_PER_S
 
     def eyes_m(self, ahead_s: float) -> F64:
-        """(2, 3) left and right eye, so many seconds after the newest sample."""
+        """(2, 3) left and right eye, `ahead_s` seconds after the newest sample."""
         middle, half = imm.ahead(self.middle, ahead_s), imm.ahead(self.half, ahead_s)
         return np.array([middle - half, middle + half])
 
@@ -115,7 +115,7 @@ class _Shown:
     jump_ns: int
 
     def eyes_m(self, ahead_s: float, time_ns: int) -> F64:
-        """(2, 3) as they are served for an instant, predicted so far."""
+        """(2, 3) as served for an instant, predicted `ahead_s` seconds ahead."""
         eyes = self.head.eyes_m(ahead_s)
         if self.jump_m is not NO_JUMP:
             fraction = min(max((time_ns - self.jump_ns) / NS_PER_S / REVIVE_S, 0.0), 1.0)
@@ -134,7 +134,7 @@ class Tracker:
     """One viewer's eyes. `update` takes samples as they come; `at` answers for any instant.
 
     The first person seen is the viewer, for as long as they are seen. Eyes that return after a loss take over from
-    where `at` last said that they were, and fade to where they are; between two people nothing fades.
+    the last served position and are blended to the measured one; between two people nothing is blended.
     """
 
     def __init__(

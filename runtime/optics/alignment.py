@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8, PanelFrame, pixels_of
 
-EVEN_CODE = 128  # the middle of a panel's range: what lies beside the solution
+EVEN_CODE = 128  # mid-grey: what a panel shows beside the solution
 FARTHEST_M = 1e6  # of any coordinate: what is farther counts as not finite
 NEAREST_M = 0.01  # of an eye before the front panel: nearer, its rays graze the panels
 MOST_SHIFT = 0.5  # of a panel's width or height, that its middle may be moved: by then half of what is seen is even
@@ -58,7 +58,7 @@ def align(stack: PanelStack, *, solved_for_m: F64, eyes_m: F64) -> Alignment:
     old, new = _middle(solved_for_m), _middle(eyes_m)
     share, limited = 1.0, ""
     for most, least, why in _limits(stack, solved_for_m, eyes_m, old=old, new=new):
-        # Every limit says: share · most <= least.
+        # Every limit has the form share · most <= least.
         reach = 0.0 if least < 0.0 else 1.0 if most <= least else least / most
         if reach < share:
             share, limited = reach, why

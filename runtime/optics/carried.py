@@ -1,8 +1,8 @@
 """What eyes see that are not where the layers were solved for: carried, expected and light quality (docs/contracts.md).
 
 The picture that the layers were solved for is carried along on the centre panel: the ray of each of its pixels is
-replaced by the one from the true eye through the same point of that panel. So ghosts and colour fringes count, and
-the parallax that a late picture lacks does not.
+replaced by the one from the true eye through the same point of that panel. Ghosts and colour fringes
+count as errors; the parallax between nominal and true eye, which no shift of the layers can add, does not.
 """
 
 from __future__ import annotations
@@ -60,9 +60,9 @@ def expected_psnrs_db(
 
     For each standard deviation to the right and up, by five points: no error with weight 1/2, two standard deviations
     to either side with 1/8 each, which is exact for second moments. drawn: an (h, w, 3) picture for each of the eyes
-    (2, 3) that the layers were solved for; seen_from_m: (2, 3) where they really are, without: there. What moved eyes
-    see is told by a quarter of the rays, to 0.02 dB: of a picture of `PLENTY` by every second pixel of every second
-    row, else, of light, by two rays for four. The other arguments and errors are those of `carried_db`.
+    (2, 3) that the layers were solved for; seen_from_m: (2, 3) their true places, by default the same. Moved eyes are
+    sampled with a quarter of the rays, which is exact to 0.02 dB: every second pixel of every second row of a picture
+    of `PLENTY`, else, for light, two rays instead of four. The other arguments and errors are those of `carried_db`.
     """
     eyes = np.asarray(eyes_m, dtype=np.float64)
     true = eyes if seen_from_m is None else np.asarray(seen_from_m, dtype=np.float64)

@@ -1,10 +1,10 @@
 """What eyes see of displayed layers, in two ways, as one mean squared error (docs/contracts.md, Error).
 
-*Light*, the figure to quote: a panel's pixel is an even box, and an eye makes of a pixel of its picture the mean
-intensity over that pixel and over its pupil, which is focused on the centre panel. Two sets of rays at random places
-tell it, each with an error of its own: the mean of the product of both errors is the squared error without the rays'
-noise, which a square would count as the picture's. *One ray*, as published evaluations have it: through the pixel's
-centre and the pupil's, panels sampled bilinearly.
+*Light*, the figure to quote: a panel's pixel is a square of one colour, and an eye makes of a pixel of its picture the
+mean intensity over that pixel and over its pupil, which is focused on the centre panel. It is estimated by two
+independent sets of rays at random places; the mean of the product of both sets' errors is an unbiased estimate of the
+squared error, whereas the mean of one set's squares would contain the variance of its own rays. *One ray*, as published
+evaluations have it: through the pixel's centre and the pupil's, panels sampled bilinearly.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Sampling(NamedTuple):
 
     rays: int = 2  # of light, along and down a pixel, in each of its two sets; 0: one ray, bilinear
     pupil_mm: float = PUPIL_MM  # diameter, of light; 0: a point
-    step: int = 1  # only every so-manieth pixel of every so-manieth row
+    step: int = 1  # every `step`-th pixel of every `step`-th row
 
 
 LIGHT = Sampling()
@@ -209,8 +209,8 @@ def _kernel() -> Any:
                 if counts:
                     other = seen[sets - 1]
                     for channel in range(3):
-                        wanted = view.target[row, column, channel]
-                        total += (seen[0, channel] * share - wanted) * (other[channel] * share - wanted)
+                        target = view.target[row, column, channel]
+                        total += (seen[0, channel] * share - target) * (other[channel] * share - target)
                     counted += 3
         return total, counted
 

@@ -62,13 +62,13 @@ def squared_error(image: F32, target: F32, mask: Mask) -> tuple[float, int]:
     return total, counted
 
 
-def quality(seen: Sequence[F32], wanted: Sequence[F32], masks: Sequence[Mask], *, similarity: bool = True) -> Quality:
+def quality(seen: Sequence[F32], targets: Sequence[F32], masks: Sequence[Mask], *, similarity: bool = True) -> Quality:
     """Pooled displayed quality over eyes. Raises ValueError where no ray of an eye crosses every panel.
 
     similarity: SSIM as well; otherwise it is NaN.
     """
     errors, weights, per_eye, similarities = 0.0, 0, [], []
-    for image, target, mask in zip(seen, wanted, masks, strict=True):
+    for image, target, mask in zip(seen, targets, masks, strict=True):
         squared, counted = squared_error(image, target, mask)
         if counted == 0:
             raise ValueError("no ray of this eye crosses every panel")

@@ -88,7 +88,7 @@ class Rays:
 
     @classmethod
     def of_eye(cls, eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg: float) -> Rays:
-        """Of an eye (3,), frame `stack`, whose image is so many pixels large and `fov_deg` wide."""
+        """Of an eye (3,), frame `stack`, whose image has this size and the horizontal field of view `fov_deg`."""
         return cls(
             image_from_stack(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg),
             np.arange(width_px, dtype=np.float64) + 0.5,
@@ -145,7 +145,7 @@ def seen_by(
     """What a pinhole eye sees (EyeReal supplement, (6), (7)): panel values summed along each ray, then sin².
 
     layers: (N, H, W, 3 or 4), rear to front, uint8 code values or float in [0, 1]; a fourth channel is ignored.
-    The image has the layers' size unless told.
+    The image has the layers' size by default.
     Raises ValueError for an eye that is not before every panel.
     """
     eye = checked_eye(eye_m, stack)

@@ -61,7 +61,7 @@ class Page:
     """A whole page."""
 
     title: str
-    lead: str  # one sentence that says what the page found
+    lead: str  # one sentence: the main result
     sections: Sequence[Section]
     machine: Mapping[str, str] = field(default_factory=dict)
     command: str = ""  # that makes this page again; empty: nothing is said of it

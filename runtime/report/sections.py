@@ -115,7 +115,7 @@ def focal_section(stack: FocalStack) -> Section:
     text = [
         f"Three cards, 5 cm behind, in and 4.5 cm before the middle panel, seen from {DISTANCE_M:g} m by a pupil of "
         f"{1000 * PUPIL_M:g} mm. The layers ({stack.model}) are solved for two pinhole eyes only; what the rest of the "
-        "pupil sees nobody asked for. On a flat panel every card is sharpest in the panel's plane, wherever it seems "
+        "pupil sees was no target. On a flat panel every card is sharpest in the panel's plane, wherever it seems "
         "to stand.",
     ]
     caption = (

@@ -118,7 +118,7 @@ class SteppedSensor(Sensor):
         """The oldest unread sample, once it is available. Raises SensorTimeout, EndOfRecording, SensorLost."""
         following = self.peek()
         if following is None:
-            return self.next_sample()  # which says why
+            return self.next_sample()  # it raises the reason
         due_ns = self.available_ns(following)
         deadline_ns = self._clock.now_ns() + round(timeout_s * NS_PER_S)
         self._clock.sleep_until_ns(min(due_ns, deadline_ns))

@@ -15,7 +15,7 @@ from runtime.errors import SensorLost, SensorTimeout
 from runtime.records import EyePoints, Intrinsics, SensorFrame
 from runtime.sensor.base import Capabilities, DeviceClock, Sensor
 
-AGAIN_NS = NS_PER_S // 30  # a page says where the eyes are as they move: until then they are where they were
+AGAIN_NS = NS_PER_S // 30  # a page reports eyes when they move; between reports the last position is repeated
 SILENT_NS = 5 * NS_PER_S  # without a word from a page nobody is seen
 LEAST_SIGMA_M = 5e-5
 PICTURE_MAX_PX = 2048

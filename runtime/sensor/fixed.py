@@ -1,4 +1,4 @@
-"""Driver `fixed`: eyes that stand still where the configuration says. No sensor, no calibration."""
+"""Driver `fixed`: eyes at a configured position. No sensor, no calibration."""
 
 from __future__ import annotations
 

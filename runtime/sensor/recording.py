@@ -147,7 +147,7 @@ def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -
 
 
 class Recording:
-    """An opened recording. Samples are read as they are asked for: images do not pile up in memory."""
+    """An opened recording. Samples are read lazily: images do not pile up in memory."""
 
     def __init__(self, path: Path) -> None:
         """Reads the header and the first sample. Raises InputError, naming the file."""
@@ -243,7 +243,7 @@ def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[
 def _unpacked(chunk: Any, *, source: Path, max_bytes: int) -> bytes:
     """A chunk's records as bytes. Raises InputError over the limit, else what the unpacker raises."""
     says: int = chunk.uncompressed_size
-    room = min(says, max_bytes) + 1  # unpackers take the memory that they are allowed
+    room = min(says, max_bytes) + 1  # unpackers allocate up to their limit
     data: bytes = chunk.data
     if chunk.compression == "lz4":
         import lz4.frame

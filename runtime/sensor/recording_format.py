@@ -21,7 +21,7 @@ EYES_TOPIC, COLOUR_TOPIC, DEPTH_TOPIC, CALIBRATION_TOPIC = "/eyes", "/colour", "
 POSITION_DIGITS = 7  # a tenth of a micrometre: four digits below the best sensor's noise
 JPEG_QUALITY = 92
 NUMBER_MAX = 1 << 62  # as a time, 146 years: sums and differences of two still fit 64 bits
-COORDINATE_MAX_M = 1e6  # beyond what any sensor says, in any unit; the tracker judges what a viewer's eyes are
+COORDINATE_MAX_M = 1e6  # beyond any sensor's range in any unit; plausibility is the tracker's business
 IMAGE_SIDE_MAX_PX = 1 << 15
 
 Count = Annotated[int, Field(ge=0, le=NUMBER_MAX)]

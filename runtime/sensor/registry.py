@@ -1,4 +1,4 @@
-"""Drivers by name. A driver's module, and so its SDK, is imported only when it is asked for."""
+"""Drivers by name. A driver's module, and so its SDK, is imported only when it is used."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Driver `replay`: a recording as if it were a sensor, at its own pace or as fast as it is asked."""
+"""Driver `replay`: a recording as if it were a sensor, at its own pace or as fast as it is read."""
 
 from __future__ import annotations
 

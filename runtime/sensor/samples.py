@@ -44,7 +44,7 @@ def finder(sensor: Sensor, make_find: Callable[[], FindEyes] | None) -> FindEyes
 
 
 def searched(frame: SensorFrame, find: FindEyes | None, *, keep_images: bool = False) -> SensorFrame:
-    """A sample with the eyes in its pictures, which go then unless they are asked for."""
+    """A sample with the eyes found in its pictures, which are then dropped unless `keep_images`."""
     if find is not None:
         frame = replace(frame, eyes=find(frame))
     return frame if keep_images else replace(frame, colour=None, depth_mm=None)

@@ -25,8 +25,8 @@ HANG_MARGIN_S = 0.5
 ABANDONED_MAX = 8
 QUEUE_MAX = 1024  # samples that wait to be read: four seconds of the fastest sensor
 PICTURES_MAX = 8  # the same of samples that carry pictures
-AHEAD_NS = NS_PER_S // 1000  # a capture so far after its arrival is no time of this machine's clock
-BEHIND_NS = 60 * NS_PER_S  # nor is one so far before it
+AHEAD_NS = NS_PER_S // 1000  # a capture time later than its arrival by more than this is not of this machine's clock
+BEHIND_NS = 60 * NS_PER_S  # nor is one earlier by more than this
 FROZEN_NS = 2 * NS_PER_S  # a camera that is well never delivers the same picture for so long: it has noise
 LOOKED_AT = slice(None, None, 4)  # rows and columns of a picture
 
@@ -47,7 +47,7 @@ class SensorState(StrEnum):
 
 
 class _Attempt:
-    """One thread with one driver. Once `abandoned`, nothing it says counts any more."""
+    """One thread with one driver. Once `abandoned`, its results are ignored."""
 
     def __init__(self, number: int, run: Callable[[_Attempt], None], *, wait_s: float, deadline_ns: int) -> None:
         """Raises TransientError: no thread at present."""
@@ -104,7 +104,7 @@ class SensorWorker(Samples):
         return frames
 
     def arrived(self, now_ns: int) -> list[SensorFrame]:
-        state = self.state  # asked first: its last samples come before it says that it is over
+        state = self.state  # read first: the last samples arrive before the state changes to ended
         frames = self.take()
         if not frames and state is SensorState.ENDED:
             raise EndOfRecording(self.reason)
@@ -163,7 +163,7 @@ class SensorWorker(Samples):
             self._account(self._driver)
             self._hung.append(attempt)
         if len(self._hung) <= ABANDONED_MAX:
-            with suppress(TransientError):  # no thread at present: asked again when it is looked at next
+            with suppress(TransientError):  # no thread at present: tried again at the next look
                 self._begin(REOPEN_AFTER_S)
 
     def _set(self, attempt: _Attempt, state: SensorState, reason: str) -> None:
@@ -270,7 +270,7 @@ class SensorWorker(Samples):
                 self._set(attempt, SensorState.RUNNING, "")
 
     def _timely(self, frames: list[SensorFrame], now_ns: int) -> list[SensorFrame]:
-        """Those that can have been taken when they say. Raises FatalError where none ever was: no device does that."""
+        """Frames with a plausible capture time. Raises FatalError where no frame ever had one."""
         timely = [frame for frame in frames if -AHEAD_NS <= now_ns - frame.capture_ns <= BEHIND_NS]
         if len(timely) < len(frames):
             ahead_s = (frames[-1].capture_ns - now_ns) / NS_PER_S

@@ -113,7 +113,7 @@ def test_matrices_put_points_where_the_view_has_them(source: Any, placed: bool) 
     views = [*raster_views(EYES, STACK.panel(0)), retina_view(EYES[1], 1, width_px=64, height_px=36, fov_deg=40)]
     if placed:
         moved: Any = placed_source(source, Placing(2.0, (0.01, 0.02, 0.03)))
-        views = [moved.asked(view, 0)[1] for view in views]
+        views = [moved.forwarded(view, 0)[1] for view in views]
     for view in views:
         told = camera_of(view)
         look, projection = (np.reshape(told[name], (4, 4)).T for name in ("view", "projection"))

@@ -42,7 +42,7 @@ from runtime.sensor.recording import RecordingWriter
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.sensor.replay import ReplayDriver
 from runtime.support.untrusted_input import parsed_json
-from tests.content.test_hostile import PNG_URI, gltf, textured
+from tests.content.test_untrusted_files import PNG_URI, gltf, textured
 from tests.panels.edids import block
 from tests.sensor.taken import taken_until
 

@@ -81,8 +81,8 @@ def test_a_case_that_crashes_fails_by_its_name_and_the_others_go_on(
         raise ZeroDivisionError("somewhere deep inside")
 
     def trials(fits: object, full: bool) -> list[Trial]:
-        good = Trial("solve", "a good one", lambda: Answer(0.0, 1.0), measure="of the wanted")
-        bad = Trial("solve", "a bad one", crashes, measure="of the wanted", floor=0.0)
+        good = Trial("solve", "a good one", lambda: Answer(0.0, 1.0), measure="of the target")
+        bad = Trial("solve", "a bad one", crashes, measure="of the target", floor=0.0)
         return [bad, good]
 
     monkeypatch.setattr(suite, "every_trial", trials)

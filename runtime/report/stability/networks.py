@@ -58,7 +58,7 @@ def pictures(kind: str) -> list[U8]:
     return [left, right]
 
 
-# Each is seen from straight ahead, and from so many metres and degrees.
+# Each is seen from straight ahead, and from a distance (metres) and an off-axis angle (degrees).
 KINDS = {
     "all black": (0.7, 15.0), "all white": (0.9, -25.0), "lines one pixel wide": (1.5, -35.0),
     "black for one eye, white for the other": (0.7, 15.0), "noise, another for each eye": (0.9, -25.0),
@@ -67,7 +67,7 @@ KINDS = {
 
 
 def stressed(model: str, images: Sequence[U8], eyes_m: F64, stack: PanelStack = STACK) -> Answer:
-    """RMS displayed error; how much of it there must be is known for no picture: it is held to what was recorded."""
+    """RMS displayed error; no closed form exists, so it is held to the recorded error."""
     layers = predicted(model, images, eyes_m, stack)
     if layers.shape != (3, stack.height_px, stack.width_px, 3) or layers.dtype != np.uint8:
         return Answer(1.0, 0.0, note=f"layers of {layers.shape}, {layers.dtype}")

@@ -22,11 +22,11 @@ from runtime.records import F32, F64
 from runtime.report.stability.trial import Answer, Trial
 
 STAGE = "solve"
-AMPLITUDE = 0.1  # of the wanted difference between the eyes at its lowest frequency, in phase units of pi/2
+AMPLITUDE = 0.1  # of the target difference between the eyes at its lowest frequency, in phase units of pi/2
 FINER = ((5, 0.05), (11, 0.03))  # cycles across the panels, and amplitude, of more of the difference
 COMMON = ((3, 0.15), (7, 0.1))  # the same of what both eyes want
 WIDTH_M, HEIGHT_M, WIDTH_PX, HEIGHT_PX = 0.5184, 0.2916, 64, 4
-FLOOR = 0.002  # a grey level of 8 bits, on one of three panels, of the wanted
+FLOOR = 0.002  # a grey level of 8 bits, on one of three panels, relative to the target
 Method = Callable[["Problem"], F32]  # (N, height, width, C) panel values in [0, 1]
 
 
@@ -139,4 +139,4 @@ def trials(methods: Mapping[str, Method]) -> Iterator[Trial]:
         geometry = USUAL | change
         for method_name, method in methods.items():
             run = partial(converges, method, **geometry)
-            yield Trial(STAGE, f"{method_name}, {name}", run, measure="of the wanted", floor=FLOOR)
+            yield Trial(STAGE, f"{method_name}, {name}", run, measure="of the target", floor=FLOOR)

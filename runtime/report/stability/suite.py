@@ -1,7 +1,7 @@
 """All trials of all stages, run one after the other.
 
-Cases of what a model or a filter makes of a hard problem have no closed form for how good it can be: they are held to
-what was recorded, `limits.json`. `phasestack stability --full --record FILE` writes it anew; whoever changes a model or
+How good a model or a filter could be on a hard problem has no closed form: such cases are held to the recorded errors
+in `limits.json`. `phasestack stability --full --record FILE` writes it anew; whoever changes a model or
 the tracker does, and says in the commit what became worse.
 """
 

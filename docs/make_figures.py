@@ -1,0 +1,172 @@
+"""Draws docs/images/optics.png, architecture.png and clocks.png: `python -m docs.make_figures`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
+
+from runtime.config import ModelSettings, StackGeometry
+from runtime.model.predictor import load_predictor
+from runtime.model.still import solve_still
+from runtime.optics.retina import seen_by
+from runtime.report.pairs import Painter, eyes_at
+
+IMAGES = Path(__file__).resolve().parent / "images"
+LEFT, RIGHT, INK, SOFT = "#1f6fb4", "#d1661b", "#222222", "#8a8f98"
+FOV_DEG = 40.0
+
+
+def arrow(
+    axes: Any, start: tuple[float, float], end: tuple[float, float], colour: str = INK, bend: float = 0.0
+) -> None:
+    """An arrow in data coordinates."""
+    style = f"arc3,rad={bend}"
+    axes.add_patch(
+        FancyArrowPatch(start, end, arrowstyle="-|>", mutation_scale=12, lw=1.4, color=INK, connectionstyle=style)
+    )
+
+
+def box(axes: Any, x: float, y: float, width: float, height: float, text: str, colour: str) -> None:
+    """A box with centred text."""
+    shape = "round,pad=0.02,rounding_size=0.12"
+    axes.add_patch(FancyBboxPatch((x, y), width, height, boxstyle=shape, fc=colour, ec=INK, lw=1.0))
+    axes.text(x + width / 2, y + height / 2, text, ha="center", va="center", fontsize=9.5, color=INK)
+
+
+def blank(figure: Any, place: Any, x: tuple[float, float], y: tuple[float, float]) -> Any:
+    """Axes without ticks or frame."""
+    axes = figure.add_subplot(place)
+    axes.set(xlim=x, ylim=y, xticks=[], yticks=[])
+    axes.set_frame_on(False)
+    return axes
+
+
+def optics() -> Figure:
+    """The stack from above with both eyes' rays, the layers of the built-in scene, and what each eye sees of them."""
+    stack = StackGeometry().stack()
+    eyes = eyes_at(distance_m=0.6, height_m=0.05)
+    with Painter("demo", stack) as painter:
+        pair = painter.pair("demo", eyes, stack, off_mm=())
+    predictor = load_predictor("balanced", stack, ModelSettings())
+    layers = np.array(solve_still(*pair.images, eyes_m=eyes, fov_deg=FOV_DEG, predictor=predictor).layers[..., :3])
+    seen = [seen_by(eye, layers, stack, fov_deg=FOV_DEG).codes() for eye in eyes]
+
+    figure = Figure(figsize=(11, 8.2), layout="constrained")
+    grid = figure.add_gridspec(3, 6, height_ratios=(2.3, 1, 1.25))
+    axes = blank(figure, grid[0, :], (-22, 70), (-31, 31))
+    half = 100 * stack.width_m / 2
+    axes.fill_between([-20, -16], -half, half, color="#fff3c4")
+    axes.text(-18, 0, "backlight", rotation=90, ha="center", va="center", fontsize=9)
+    for x, name in ((-11, "polarizer"), (11, "crossed\npolarizer")):
+        axes.plot([x, x], [-half, half], color=SOFT, lw=2, ls=(0, (2, 2)))
+        axes.text(x, half + 1, name, ha="center", va="bottom", fontsize=8.5, color=SOFT)
+    for n, x_m in enumerate(stack.x_m):
+        axes.plot([100 * x_m] * 2, [-half, half], color=INK, lw=3)
+        axes.text(100 * x_m, -half - 1, f"panel {n}", ha="center", va="top", fontsize=9)
+    for eye, colour, name in ((eyes[0], LEFT, "left eye"), (eyes[1], RIGHT, "right eye")):
+        x, y = 100 * eye[0], -100 * eye[1]  # seen from above: the viewer's right is down
+        for place in (9.0, -7.0):
+            slope = (y - place) / x
+            axes.plot([x, -16], [y, place - 16 * slope], color=colour, lw=1.1, alpha=0.8)
+            crossings = [100 * x_m for x_m in stack.x_m]
+            axes.plot(crossings, [place + slope * c for c in crossings], "o", color=colour, ms=4)
+        axes.plot([x], [y], "o", ms=9, color=colour)
+        axes.text(x + 1.5, y, name, va="center", fontsize=9.5, color=colour)
+    axes.text(34, 22, "along a ray the panels' turns add up:", fontsize=9.5, ha="center")
+    axes.text(34, 18.5, r"intensity $= \sin^2\left(\frac{\pi}{2}\,(v_0 + v_1 + v_2)\right)$", fontsize=12, ha="center")
+    axes.text(34, -22, "both eyes look through the same pixel of the middle panel\nand through different ones of the"
+              " outer panels", fontsize=9.5, ha="center", va="center")  # fmt: skip
+    for n, layer in enumerate(layers):
+        own = figure.add_subplot(grid[1, 2 * n : 2 * n + 2])
+        own.imshow(layer)
+        own.set(xticks=[], yticks=[])
+        own.set_title(f"what panel {n} is given" + (" (rear)", "", " (front)")[n], fontsize=10)
+    for side, (picture, colour) in enumerate(zip(seen, (LEFT, RIGHT), strict=True)):
+        own = figure.add_subplot(grid[2, 3 * side : 3 * side + 3])
+        own.imshow(picture)
+        own.set(xticks=[], yticks=[])
+        own.set_title(f"what the {('left', 'right')[side]} eye sees through all three", fontsize=10, color=colour)
+    return figure
+
+
+def architecture() -> Figure:
+    """Who hands what to whom, on which thread."""
+    figure = Figure(figsize=(11, 5.6), layout="constrained")
+    axes = blank(figure, 111, (0, 22), (0, 11))
+    threads = (
+        (0.2, 7.3, 21.6, 3.1, "#eef4fb", "sensor thread"),
+        (0.2, 3.9, 21.6, 3.1, "#fdf1e7", "presenter: the display's clock, one refresh after another"),
+        (0.2, 0.5, 21.6, 3.1, "#eef8ee", "solver thread: as fast as the machine is"),
+    )
+    for x, y, width, height, colour, name in threads:
+        axes.add_patch(
+            FancyBboxPatch((x, y), width, height, boxstyle="round,pad=0,rounding_size=0.2", fc=colour, ec="none")
+        )
+        axes.text(x + width - 0.2, y + height - 0.15, name, fontsize=9, va="top", ha="right", color=SOFT)
+    white = "#ffffff"
+    box(axes, 1, 7.9, 4, 1.4, "sensor\ndriver or recording", white)
+    box(axes, 7, 7.9, 4, 1.4, "eyes\npupils in pictures", white)
+    box(axes, 13, 7.9, 4, 1.4, "calibration\nsensor to stack", white)
+    box(axes, 1, 4.5, 4, 1.4, "tracker\npredicts the eyes", white)
+    box(axes, 7, 4.5, 4, 1.4, "policy\nsolve, reuse or flat", white)
+    box(axes, 13, 4.5, 4, 1.4, "alignment\nscale and shift a panel", white)
+    box(axes, 18.4, 4.5, 3, 1.4, "panels\none refresh", white)
+    box(axes, 7, 1.1, 4, 1.4, "content\na picture for each eye", white)
+    box(axes, 13, 1.1, 4, 1.4, "model\ntwo pictures to layers", white)
+    for start, end in (
+        ((5.1, 8.6), (6.9, 8.6)), ((11.1, 8.6), (12.9, 8.6)), ((5.1, 5.2), (6.9, 5.2)), ((11.1, 5.2), (12.9, 5.2)),
+        ((17.1, 5.2), (18.3, 5.2)), ((11.1, 1.8), (12.9, 1.8)),
+    ):  # fmt: skip
+        arrow(axes, start, end)
+    arrow(axes, (15, 7.8), (3, 6.0), bend=0.12)
+    axes.text(10.6, 7.1, "samples", fontsize=9, ha="center", va="bottom", color=INK)
+    arrow(axes, (9, 4.4), (9, 2.6))
+    axes.text(9.15, 3.65, "eyes to solve for", fontsize=9, va="center")
+    arrow(axes, (15, 2.6), (15, 4.4))
+    axes.text(15.15, 3.65, "newest solution", fontsize=9, va="center")
+    return figure
+
+
+def clocks() -> Figure:
+    """Samples, solutions and refreshes of a third of a second."""
+    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    axes = blank(figure, 111, (-38, 205), (-0.7, 3.4))
+    refresh_ms, solve_ms, first_ms = 1e3 / 60, 42.0, 18.0
+    rows = {"sensor, 30 Hz": 2.6, "solver": 1.6, "refreshes, 60 Hz": 0.4}
+    for name, y in rows.items():
+        axes.text(-37, y, name, fontsize=9.5, va="center")
+        axes.plot([0, 203], [y, y], color="#dddddd", lw=1, zorder=0)
+    for k in range(6):
+        axes.plot([k * 33.3], [rows["sensor, 30 Hz"]], "v", color=INK, ms=8)
+    shades, solutions = ("#9ecae1", "#fdae6b", "#a1d99b", "#d4b9da"), []
+    for k in range(4):
+        start = first_ms + k * (solve_ms + 3)
+        solutions.append(start + solve_ms)
+        axes.barh(rows["solver"], solve_ms, left=start, height=0.5, color=shades[k], ec=INK, lw=0.8)
+        axes.text(start + solve_ms / 2, rows["solver"], f"solution {k + 1}", ha="center", va="center", fontsize=9)
+    shown = 0
+    for k in range(12):
+        time = k * refresh_ms
+        done = sum(end <= time for end in solutions)
+        colour = "#eeeeee" if done == 0 else shades[done - 1]
+        axes.barh(rows["refreshes, 60 Hz"], refresh_ms * 0.86, left=time, height=0.5, color=colour, ec=INK, lw=0.8)
+        if done > shown:
+            arrow(axes, (solutions[done - 1], rows["solver"] - 0.28), (time + 4, rows["refreshes, 60 Hz"] + 0.3))
+        shown = max(shown, done)
+    note = "every refresh shows the newest solution, each panel scaled and shifted to the eyes at its display time"
+    axes.text(0, -0.35, note, fontsize=9.5)
+    return figure
+
+
+def main() -> None:
+    """Write all three."""
+    for draw in (optics, architecture, clocks):
+        draw().savefig(IMAGES / f"{draw.__name__}.png", dpi=110, metadata={"Software": None})
+
+
+if __name__ == "__main__":
+    main()

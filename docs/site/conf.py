@@ -1,0 +1,34 @@
+"""Sphinx: `make site` builds README, the pages of docs/ and the API from docstrings into out/site."""
+
+project = "phasestack"
+author = "the phasestack authors"
+html_title = "phasestack"
+extensions = ["myst_parser", "sphinx.ext.autodoc"]
+include_patterns = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "THIRD_PARTY.md", "docs/*.md"]
+exclude_patterns = [
+    ".*",
+    "out",
+    "build",
+    "dist",
+    "runtime",
+    "tests",
+    "calib",
+    "model_export",
+    "requirements",
+    "systemd",
+]
+source_suffix = {".md": "markdown"}
+root_doc = "docs/index"
+html_theme = "furo"
+html_show_sphinx = html_show_copyright = False
+html_copy_source = False
+templates_path: list[str] = []
+myst_heading_anchors = 3
+myst_enable_extensions = ["deflist"]
+# Code without a language is a shell's or Python's: it is shown as it stands.
+highlight_language = "none"
+suppress_warnings = ["myst.xref_ambiguous"]
+autodoc_typehints = "description"
+autodoc_member_order = "bysource"
+autodoc_default_options = {"members": True}
+nitpicky = False
