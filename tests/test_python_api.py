@@ -227,29 +227,6 @@ def test_what_can_hardly_be_meant_is_warned_of_where_it_is_written(change: dict[
     assert caught[0].filename == __file__
 
 
-TYPED = """
-import numpy as np
-import phasestack
-
-picture = np.zeros((180, 320, 3), np.uint8)
-stack = phasestack.Stack(width_m=0.5, height_m=0.3, x_m=[-0.06, 0.0, 0.06], width_px=320, height_px=180)
-result = phasestack.solve(picture, picture, eyes_m=((0.7, -0.03, 0), (0.7, 0.03, 0)), stack=stack)
-quality = phasestack.evaluate(result.layers, picture, picture, stack=stack, cameras=np.zeros((2, 3, 4)))
-psnr_db: float = quality.psnr_db
-reveal_type(quality.light_db)
-reveal_type(stack.x_m)
-"""
-
-
-@pytest.mark.slow
-def test_types_lead_from_a_script_to_what_they_are(tmp_path: Path) -> None:
-    (tmp_path / "script.py").write_text(TYPED)
-    command = [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(tmp_path), "script.py"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=240)
-    assert 'Revealed type is "Any"' not in done.stdout and "import-untyped" not in done.stdout, done.stdout
-    assert done.returncode == 0, done.stdout
-
-
 def test_the_command_takes_the_cameras_that_pictures_were_taken_with(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

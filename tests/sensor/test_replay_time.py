@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from runtime.clock import NS_PER_S, MonotonicClock, SimulatedClock
 from runtime.config import SensorSettings
-from runtime.errors import EndOfRecording, InputError
+from runtime.errors import InputError
 from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
@@ -78,20 +78,6 @@ def test_fast_recordings_are_delivered_whole_and_in_order_to_a_slow_reader(tmp_p
     got, _, worker = play(path, busy_s=1 / 30)  # a reader that is slower than the recording
     assert [frame.sequence for frame, _ in got] == list(range(1, 1 + round(0.5 * RATE_HZ)))
     assert worker.stale_inputs == 0
-
-
-def test_in_simulated_time_a_sample_has_arrived_by_its_capture_and_latency(tmp_path: Path) -> None:
-    driver = ReplayDriver(
-        str(recorded(tmp_path / "a.mcap", [0.0, 0.01, 0.02, 3.02, 3.03])), SimulatedClock(7), latency_ms=15.0
-    )
-    driver.open()
-    assert driver.peek().sequence == 1 and driver.peek().sequence == 1
-    assert taken_until(driver, 7 + 14_999_999) == []
-    arrived = {t: [f.sequence for f in taken_until(driver, 7 + t)] for t in (25_000_000, 2 * NS_PER_S, 4 * NS_PER_S)}
-    assert arrived == {25_000_000: [1, 2], 2 * NS_PER_S: [3], 4 * NS_PER_S: [4, 5]}
-    assert driver.peek() is None and taken_until(driver, 9 * NS_PER_S) == []
-    with pytest.raises(EndOfRecording):
-        driver.next_sample()
 
 
 def test_samples_whose_time_goes_backwards_are_left_out_and_told_once(
