@@ -170,18 +170,12 @@ class RunObserver:
             self._take(measured, counts=not self.measured and last.account.state is State.TRACKING)
 
     @property
-    def _is_first(self) -> bool:
-        """In real time the first that can be is measured: there are stills soon, whenever the run is stopped."""
-        return self._measure and not self._simulated and self.moment is None
-
-    @property
     def _busy(self) -> bool:
         return bool(self._samples) or self._drawing or self._job is not None
 
     def _is_sample(self, account: RefreshAccount) -> bool:
         every, light = self._every, self._keep_light
         sampled = self._measure and every and account.frame % every == every - 1
-        sampled = sampled or (self._is_first and account.state is State.TRACKING)
         return bool(sampled or (light and account.frame % light == light - 1))
 
     def _advance(self) -> None:
@@ -249,7 +243,7 @@ class RunObserver:
             and account.state is State.TRACKING
             and _has_picture(refresh)
             and account.eyes_m is not None
-            and (every == 0 or account.frame % every == every - 1 or refresh is self.last or self._is_first)
+            and (every == 0 or account.frame % every == every - 1 or refresh is self.last)
         )
 
     def _compared(self, refresh: Refresh, true_m: F64 | None, drawn: Pictures) -> Measured | None:
