@@ -104,10 +104,7 @@ def spectral_file(net: SpectralSolver, recipe: Recipe) -> bytes:
         parameters=_parameters(net),
         cell_px=recipe.cell_px,
         reduction=recipe.reduction,
-        emphasis=recipe.emphasis,
-        interpolation=recipe.interpolation,
         steps=recipe.steps,
-        refining=recipe.refining,
     )
     return with_contract(spectral_bytes(net, cell_px=recipe.cell_px), contract)
 

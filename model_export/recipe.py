@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from runtime.config import Section, validated
-from runtime.model.contract import Refining, Steps, TrainedFor
+from runtime.model.contract import Steps, TrainedFor
 from runtime.support import untrusted_input
 
 RECIPES = Path(__file__).parent / "recipes"
@@ -27,13 +27,7 @@ class Recipe(Section):
     iterations: Annotated[int, Field(ge=0, le=32)] = Field(4, description="of the box, within the network")
     cell_px: Annotated[int, Field(ge=1, le=64)] = 4
     reduction: Literal[1, 2, 4] = 2
-    emphasis: Annotated[float, Field(ge=0, le=0.5)] = Field(
-        0.0,
-        description="strength of the sharpening that undoes the blur of interpolation, on the way in and in the eye",
-    )
-    interpolation: Literal["linear", "cubic"] = "linear"
-    steps: Annotated[Steps, Field(min_length=1)]
-    refining: Refining = ()
+    steps: Steps = ()
 
     def canonical(self) -> bytes:
         """The same bytes for the same recipe."""

@@ -18,7 +18,7 @@ from runtime.records import U8
 
 if TYPE_CHECKING:
     from runtime.model.gl.backend import GlBackend
-    from runtime.model.steps import SolverBackend
+    from runtime.model.solver import SolverBackend
     from runtime.support.gl_sharing import ShareGroup
 
 log = logging.getLogger("phasestack.model")

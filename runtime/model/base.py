@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from runtime.model.contract import Step
 from runtime.model.job import Job
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, U8, Layers, pixels_of
 
 if TYPE_CHECKING:
-    from runtime.model.steps import SolverBackend
+    from runtime.model.solver import SolverBackend
 
 
 STAGES = ("prepare", "inference", "finish")  # inference: the network alone
@@ -43,6 +42,8 @@ class Predictor(ABC):
     stack: PanelStack
     backend: str = "cpu"  # what does all that surrounds the network at present
     fell_back: tuple[str, ...] = ()  # nodes of the network that run on another provider than the wished one
+    needs_rasters: bool = True  # whether still pictures are warped for it; else it looks along their own rays
+    black_beside: bool = False  # whether those end in black, not in their repeated edge
     trims: bool = False  # whether it solves a part of the panels, or one channel (`trim`)
 
     def reads_textures_of(self, context: object) -> bool:
@@ -60,20 +61,6 @@ class Predictor(ABC):
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
         """The rasters that each eye's picture must be drawn on, for eyes (2, 3), frame `stack`."""
 
-    @property
-    def interpolation(self) -> str:
-        """How still pictures are to be warped for it: `linear` or `cubic` (`Contract.interpolation`)."""
-        return "linear"
-
-    @property
-    def black_beside(self) -> bool:
-        """Whether still pictures end in black, not in their repeated edge."""
-        return False
-
-    def windows(self, eyes_m: F64) -> tuple[tuple[slice, slice], ...]:
-        """Rows and columns of each raster that `solve` will look at: all of them, where it doesn't know better."""
-        return tuple((slice(0, raster.height_px), slice(0, raster.width_px)) for raster in self.rasters(eyes_m))
-
     @abstractmethod
     def solve(self, job: Job) -> Prediction:
         """The layers of a job.
@@ -81,11 +68,6 @@ class Predictor(ABC):
         Raises ModelFailure where inference fails or does not answer with finite numbers; of these EyesNotServed where
         the model has no picture for two eyes like these.
         """
-
-    @property
-    def refining(self) -> tuple[Step, ...]:
-        """Joint steps that a still picture's layers are to be changed by, along its own rays (`own_rays.refined`)."""
-        return ()
 
     def warm_up(self, eyes_m: F64) -> None:
         """Solve once for grey pictures, so that the first frame does not pay for allocation."""

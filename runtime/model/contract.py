@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field
 
 from runtime.config import Section, validated
 from runtime.errors import InputError
@@ -19,49 +19,23 @@ Places = Literal["middle", "rising", "falling"]
 
 
 class Step(Section):
-    """One step of a `chain` model."""
+    """One step of all panels (docs/mathematics.md, L5)."""
 
-    kind: Literal["chain", "front", "rear", "joint"] = Field(
-        description="the network along the eyes' line, a local correction of one outer panel, or a step of all panels"
-    )
-    size: Annotated[float, Field(gt=0, le=2)] = Field(1.0, description="of a correction (for two points) or joint step")
+    size: Annotated[float, Field(gt=0, le=3)] = 1.0
     momentum: Annotated[float, Field(ge=0, lt=1)] = Field(
-        0.0, description="of a joint step: so much of its change is gone again, ahead of the next one"
+        0.7, description="so much of the change is gone again, ahead of the next step"
     )
     floor: Annotated[float, Field(gt=0, le=1)] = Field(
-        0.1, description="a joint step takes the squared slope of what an eye sees for so much at least"
+        0.1, description="the squared slope of what an eye sees counts for so much at least"
     )
     places: Places = Field(
         "middle",
-        description="where a joint step takes unsure eyes to be: where they are, or a standard deviation to either "
-        "side, the right one higher or lower",
+        description="where unsure eyes are taken to be: where they are, or a standard deviation to either side, "
+        "the right one higher or lower",
     )
 
 
-def checked_steps(steps: tuple[Step, ...]) -> tuple[Step, ...]:
-    """Steps that can be carried out: one chain, first, no joint ones. Raises ValueError."""
-    if steps and [index for index, step in enumerate(steps) if step.kind == "chain"] != [0]:
-        raise ValueError("must begin with a chain step, the only one")
-    if any(step.kind == "joint" for step in steps):
-        raise ValueError("joint steps belong in refining")
-    return steps
-
-
-Steps = Annotated[tuple[Step, ...], AfterValidator(checked_steps)]
-
-
-def checked_refining(steps: tuple[Step, ...]) -> tuple[Step, ...]:
-    """Joint steps alone. Raises ValueError."""
-    if any(step.kind != "joint" for step in steps):
-        raise ValueError("must be joint steps")
-    return steps
-
-
-Refining = Annotated[
-    tuple[Step, ...],
-    AfterValidator(checked_refining),
-    Field(description="joint steps along a still picture's own rays, once it is solved"),
-]
+Steps = Annotated[tuple[Step, ...], Field(max_length=64, description="of all panels, after the network")]
 
 
 class TrainedFor(Section):
@@ -108,22 +82,10 @@ class Contract(Section):
         4, description="chain: parallax of the outer panels in columns of the network's raster"
     )
     reduction: Literal[1, 2, 4] = Field(2, description="chain: the network's raster is so much coarser than a panel")
-    emphasis: Annotated[float, Field(ge=0, le=0.5)] = Field(
-        0.0,
-        description="strength of the sharpening that undoes the blur of interpolation, on the way in and in the eye",
-    )
     picture_fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
         0.0, description="horizontal view of the pictures it was trained on, black beside them; 0: whatever is drawn"
     )
-    interpolation: Literal["linear", "cubic"] = Field("linear", description="how still pictures are warped")
     steps: Steps = ()
-    refining: Refining = ()
-
-    @model_validator(mode="after")
-    def _has_steps(self) -> Contract:
-        if self.input_frame == "chain" and not self.steps:
-            raise ValueError("steps: a chain model needs one at least")
-        return self
 
 
 def parse_contract(metadata: dict[str, str], *, source: str | Path) -> Contract:

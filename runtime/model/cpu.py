@@ -1,25 +1,27 @@
-"""What surrounds the network, on the processor: 16-bit integers, by compiled kernels, a few rows at a time."""
+"""The solver's panels on the processor: 16-bit integers, moved by the compiled loops of `runtime.kernels`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import replace
+from ctypes import byref, c_void_p
+from typing import Any
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from runtime.model.assembly import ArrayAssembly, fill_area
-from runtime.model.compiled.panels import Panels
-from runtime.model.contract import Contract
-from runtime.model.job import Picture
-from runtime.model.reprojection import CENTRE, NEUTRAL, OUTER, START, coarser
-from runtime.model.resample import buffer, resample
-from runtime.model.steps import Problem
-from runtime.model.targets import FULL, Pictures, fill_targets, phase_codes
+from runtime.kernels import MARGIN, Image, Panel, Problem, library
+from runtime.model.contract import Step
+from runtime.model.geometry import Geometry
+from runtime.model.job import Job
+from runtime.model.targets import FULL, SUBCODE, middle_codes, rest_of, target_table, without_alpha
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
-from runtime.records import F32, I16, U8
-from runtime.support.gl import DrawnPicture
+from runtime.records import F64, I16, U8
+from runtime.support.threads import at_once, on_rows
+
+SAFE = 4 * MARGIN  # elements around rows of panels that whole vectors touch
 
 
 class CpuBackend:
@@ -28,11 +30,8 @@ class CpuBackend:
     name = "cpu"
     context: object = None
 
-    def state(self, contract: Contract, stack: PanelStack, *, threads: int) -> CpuState:
-        return CpuState(contract, stack, threads=threads)
-
-    def assembly(self, stack: PanelStack) -> ArrayAssembly:
-        return ArrayAssembly(stack)
+    def state(self, stack: PanelStack, *, threads: int) -> CpuState:
+        return CpuState(stack, threads=threads)
 
     def close(self) -> None:
         """It holds nothing."""
@@ -41,96 +40,121 @@ class CpuBackend:
 class CpuState:
     """A `SolverState`."""
 
-    def __init__(self, contract: Contract, stack: PanelStack, *, threads: int) -> None:
-        self._contract, self._size, self._threads = contract, stack, max(1, threads)
-        self._by_kind: dict[tuple[int, int], Panels] = {}  # by channels and reduction
-        self._pairs: dict[str, tuple[I16, I16]] = {}  # of both eyes or outer panels; sizes follow the viewer
-        self._drawn: tuple[PixelRect, ...] = ()  # where the layers hold more than even panels
-        self._layers: U8 = np.full((3, stack.height_px, stack.width_px, 4), 255, np.uint8)
+    def __init__(self, stack: PanelStack, *, threads: int) -> None:
+        self._stack, self._threads = stack, max(1, threads)
+        self._rest = rest_of(stack.count)
+        self._buffers: dict[int, _Buffers] = {}  # by channels
+        self._layers = np.full((stack.count, stack.height_px, stack.width_px, 4), 255, np.uint8)
+        self._beside: object = None  # what the layers hold beside what was written last
 
-    def begin(self, pictures: Sequence[Picture], problem: Problem) -> AbstractContextManager[None]:
-        self._problem = problem
-        self._full = self._panels = self._panels_of(1)
-        if (reduction := problem.reduction) > 1:
-            self._panels = self._panels_of(reduction)
-        arrays = [picture.pixels() if isinstance(picture, DrawnPicture) else picture for picture in pictures]
-        contract, box = self._contract, problem.boxes[CENTRE]
-        self._pictures = Pictures(arrays, box, problem.channels, contract.emphasis, phase_codes(contract.branch))
-        coarse = self._panels is not self._full
-        self._reduced = self._panels.target if coarse else self._pair("reduced", *problem.reduced_size)
-        fill_targets(self._pictures, [self._full.target, self._reduced])
+    def begin(self, job: Job, geometry: Geometry) -> AbstractContextManager[None]:
+        self._geometry, self._channels, self._sigma_mm = geometry, job.channels, job.eye_sigma_mm
+        if job.channels not in self._buffers:
+            self._buffers[job.channels] = _Buffers(self._stack, job.channels)
+        self._held = self._buffers[job.channels]
+        box, rays = geometry.boxes[geometry.middle], geometry.rays
+        if job.own is not None:
+            pictures: Sequence[U8] = [picture[rays.slices] for picture in job.own.pictures]
+        elif job.part is not None and job.part.drawn:
+            within = PixelRect(rays.u0 - box.u0, rays.v0 - box.v0, rays.u1 - box.u0, rays.v1 - box.v0)
+            pictures = [images[0][within.slices] for images in job.arrays]
+        else:
+            pictures = [images[0][rays.slices] for images in job.arrays]
+        self._targets = at_once(lambda picture: without_alpha(picture, job.channels), pictures)
+        self._tapers = geometry.tapers()
+        for n, panel in enumerate(self._held.last):
+            box = geometry.boxes[n]
+            panel[: box.height_px, : box.width_px * job.channels] = self._rest
         return nullcontext()
 
-    def network_pictures(self) -> tuple[I16, I16]:
-        problem, frame = self._problem, self._problem.frame
-        left, right = self._reduced
-        half = (right - left) >> 1
-        residuals = self._pair("residuals", frame.width_px, frame.rows)
-        for side, residual in enumerate((-half, half)):
-            matrix = problem.reduced_from_frame(side)
-            resample(residual, image_from_result=matrix, out=residuals[side], result_columns=frame.columns)
-        return residuals
+    def set_panel(self, panel: int, codes: I16) -> None:
+        box, channels = self._geometry.boxes[panel], self._channels
+        whole = cv2.resize(codes, (box.width_px, box.height_px), interpolation=cv2.INTER_CUBIC)
+        np.clip(whole, 0, FULL, out=whole)
+        self._held.last[panel, : box.height_px, : box.width_px * channels] = whole.reshape(box.height_px, -1)
 
-    def set_panel(self, panel: int, codes: I16, *, shown: bool) -> None:
-        # By way of a raster as coarse as the answer: where columns are bent that is sampled linearly, whose kinks on
-        # every pixel no correction could undo.
-        problem, raster = self._problem, coarser(self._full.rasters[panel], self._contract.reduction)
-        coarse = self._pair("answer", raster.width_px, raster.height_px)[OUTER.index(panel)]
-        matrix, columns = problem.answer_from_raster(panel, raster), problem.answer_columns
-        resample(codes, image_from_result=matrix, out=coarse, outside=START, cubic=True, image_columns=columns)
-        self._panels.set_panel(panel, np.clip(coarse, 0, FULL, out=coarse), shown=shown)
+    def close_middle(self) -> None:
+        problem, _keep = self._problem(self._geometry.panels_from_rays("middle", 0.0))
+        self._in_parts(library().close_middle, problem)
 
-    def project(self, panels: Sequence[int]) -> None:
-        self._panels.project(panels)
+    def start(self) -> None:
+        np.copyto(self._held.ahead, self._held.last)
 
-    def correct(self, panel: int, *, size: float, shown: bool) -> None:
-        self._panels.step(panel, size=size, shown=shown, fading=self._fading())
+    def step(self, step: Step) -> None:
+        held, loops = self._held, library()
+        problem, _keep = self._problem(self._geometry.panels_from_rays(step.places, self._sigma_mm))
+        problem.size, problem.momentum, problem.floor = step.size, step.momentum, step.floor
+        for n, box in enumerate(self._geometry.boxes):
 
-    def finish(self) -> U8:
-        boxes = self._problem.boxes
-        if self._drawn != boxes:
-            for layer, box in zip(self._layers, boxes, strict=True):
-                for area in box.beside(width_px=self._size.width_px, height_px=self._size.height_px):
-                    fill_area(layer, area, (NEUTRAL, NEUTRAL, NEUTRAL))
-            self._drawn = boxes
-        self._whole().show(self._layers, boxes)
+            def convert(first: int, end: int, n: int = n) -> None:
+                at = [image.ctypes.data + first * image.strides[0] for image in (held.ahead[n], *held.phasors[n])]
+                loops.to_phasors(*at, (end - first) * held.ahead.shape[2])
+
+            on_rows(convert, box.height_px, threads=self._threads)
+        self._in_parts(loops.step, problem)
+        held.ahead, held.moved = held.moved, held.ahead
+
+    def write(self, beside: int | tuple[int, ...] | None) -> U8:
+        geometry, loops = self._geometry, library()
+        if beside is not None and self._beside != (beside, geometry.boxes):
+            self._fill(beside)
+            self._beside = beside, geometry.boxes
+        elif beside is None:
+            self._beside = None
+        for n, box in enumerate(geometry.boxes):
+            kept = geometry.kept if n == geometry.middle else box
+            if not kept.width_px or not kept.height_px:
+                continue
+            first = self._held.last[n, kept.v0 - box.v0 :, (kept.u0 - box.u0) * self._channels :]
+            image = Image.of(first, rows=kept.height_px, width=kept.width_px)
+            pixels = self._layers[n].view(np.uint32)[kept.v0 :, kept.u0 :, 0]
+
+            def show(first: int, end: int, image: Image = image, pixels: NDArray[Any] = pixels) -> None:
+                loops.show(byref(image), self._channels, pixels.ctypes.data, self._stack.width_px, first, end)
+
+            on_rows(show, kept.height_px, threads=self._threads)
         return self._layers
 
     def close(self) -> None:
-        self._by_kind = {}
+        self._buffers = {}
 
-    def _panels_of(self, reduction: int) -> Panels:
-        """The problem's panels on rasters so many times coarser than their own."""
-        problem, size = self._problem, self._size
-        if (key := (problem.channels, reduction)) not in self._by_kind:
-            width_px, height_px = (-(-px // reduction) for px in (size.width_px, size.height_px))
-            size = replace(size, width_px=width_px, height_px=height_px)
-            self._by_kind[key] = Panels(size, threads=self._threads, channels=problem.channels)
-        panels = self._by_kind[key]
-        panels.crop(problem.coarser_rasters(reduction), problem.stack, reduction)
-        panels.set_eyes(problem.eyes_m, eye_sigma_mm=problem.eye_sigma_mm)
-        return panels
+    def _fill(self, beside: int | tuple[int, ...]) -> None:
+        """All panels at rest, the middle one as if all eyes saw one colour; whole pixels at a time."""
+        rest = (self._rest + SUBCODE // 2) // SUBCODE
+        codes = middle_codes(self._stack.count)[list(beside)].tolist() if isinstance(beside, tuple) else [beside] * 3
+        for n, layer in enumerate(self._layers):
+            colour = codes if n == self._stack.count // 2 else [rest] * 3
+            layer.view(np.uint32)[..., 0] = np.array([*colour, 255], np.uint8).view(np.uint32)[0]
 
-    def _whole(self) -> Panels:
-        """The panels on their own pixels."""
-        if self._panels is not self._full:
-            self._full.take(self._panels)
-            self._panels = self._full
-        return self._full
+    def _in_parts(self, work: Any, problem: Problem) -> None:
+        at_once(lambda part: work(byref(problem), part, self._threads), range(self._threads))
 
-    def _pair(self, name: str, width_px: int, height_px: int) -> tuple[I16, I16]:
-        channels = self._problem.channels
-        shape = (height_px, width_px) if channels == 1 else (height_px, width_px, channels)
-        if name not in self._pairs or self._pairs[name][0].shape != shape:
-            self._pairs[name] = buffer(height_px, width_px, channels=channels), buffer(*shape[:2], channels=channels)
-        return self._pairs[name]
+    def _problem(self, panels_from_rays: F64) -> tuple[Problem, object]:
+        """What the loops are given; and arrays that must live as long."""
+        geometry, held, channels = self._geometry, self._held, self._channels
+        seen = np.ascontiguousarray(panels_from_rays)
+        back = np.linalg.inv(seen)
+        back = np.ascontiguousarray(back / np.abs(back[..., 2:, 2:]))
+        table = target_table(self._stack.count)
+        problem = Problem(
+            panels=self._stack.count, sets=len(seen), channels=channels,
+            height=geometry.rays.height_px, width=geometry.rays.width_px,
+            panels_from_rays=seen.ctypes.data, rays_from_panels=back.ctypes.data,
+            targets=(c_void_p * 2)(*(target.ctypes.data for target in self._targets)),
+            column_taper=self._tapers[0].ctypes.data, row_taper=self._tapers[1].ctypes.data,
+            table=table.ctypes.data, rest=self._rest,
+        )  # fmt: skip
+        for n, box in enumerate(geometry.boxes):
+            images = (held.ahead[n], held.moved[n], held.last[n], *held.phasors[n])
+            problem.panel[n] = Panel(*(Image.of(image, rows=box.height_px, width=box.width_px) for image in images))
+        return problem, (seen, back, table)
 
-    def _fading(self) -> tuple[F32, F32] | None:
-        """How residuals end within a part of larger panels, along the centre panel's columns and rows; None: not at
-        all."""
-        fade = self._problem.fade
-        if fade is None:
-            return None
-        matrix = self._problem.centre_from(self._panels.rasters[CENTRE].plane_from_raster())
-        width_px, height_px = self._panels.size
-        return fade.ray_weights(matrix, rows=height_px, columns=width_px)
+
+class _Buffers:
+    """Panels between steps, for pictures of so many channels; a box begins at the first row and element."""
+
+    def __init__(self, stack: PanelStack, channels: int) -> None:
+        shape = (stack.count, stack.height_px + 1, stack.width_px * channels + SAFE)
+        self.last, self.ahead, self.moved = (np.zeros(shape, np.int16) for _ in range(3))
+        self.phasors = np.zeros((shape[0], 2, *shape[1:]), np.int16)  # cosine and sine
+

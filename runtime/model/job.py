@@ -5,9 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
-from runtime.model.fade import Fade
 from runtime.optics.pupil import TRACKING_SIGMA_MM
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
@@ -19,44 +16,22 @@ Picture = U8 | DrawnPicture
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A rectangle of every panel that is solved by itself. Beside it the outer panels stand at the middle of their
-    range, from which the solver starts, and the centre panel carries what both eyes see."""
+    """A window of every panel that is solved. Beside it the outer panels stand at the middle of their range, from which
+    the solver starts, and the middle panel carries what both eyes see."""
 
     box: PixelRect  # panel pixels; empty: nothing is solved
-    kept: PixelRect  # of the centre panel, within the box: beside it that panel belongs to the rest
-    fade_px: tuple[float, float]  # right and down: how far inwards what drives the outer panels fades out
-    colour: tuple[int, ...] | None = None  # 8-bit codes beside the box; None: what the left eye's picture has there
-    drawn: bool = False  # the job's pictures are of the box alone, not of the whole centre panel
+    kept: PixelRect  # of the middle panel, within the box: beside it that panel belongs to the rest
+    taper_px: tuple[float, float]  # right and down: how far inwards what drives the outer panels fades out
+    colour: tuple[int, ...] | None = None  # 8-bit codes beside the box; None: what the pictures have there
+    drawn: bool = False  # the job's pictures are of the box alone, not of the whole middle panel
 
-    def stack(self, whole: PanelStack) -> PanelStack:
-        """The panels cut to the box and moved to its centre, as a stack of their own."""
-        box, (_, y_m, z_m) = self.box, self.shift_m(whole)
-        return PanelStack(
-            whole.width_m / whole.width_px * box.width_px,
-            whole.height_m / whole.height_px * box.height_px,
-            whole.x_m,
-            box.width_px,
-            box.height_px,
-            None if whole.tilt is None else whole.tilt.moved(float(y_m), float(z_m)),
-        )
 
-    def shift_m(self, whole: PanelStack) -> F64:
-        """(3,) where the box's centre is on the centre panel, metres; frame `stack` but for x, which is 0."""
-        y_px = (self.box.u0 + self.box.u1) / 2 - whole.width_px / 2
-        z_px = whole.height_px / 2 - (self.box.v0 + self.box.v1) / 2
-        return np.array([0.0, y_px * whole.width_m / whole.width_px, z_px * whole.height_m / whole.height_px])
+@dataclass(frozen=True, slots=True)
+class Own:
+    """Still pictures, along whose own pixels' rays panels are solved."""
 
-    def fade(self, whole: PanelStack) -> Fade:
-        """How the part ends: gently, but where the panels themselves do."""
-        box, kept = self.box, self.kept
-        return Fade(
-            PixelRect(kept.u0 - box.u0, kept.v0 - box.v0, kept.u1 - box.u0, kept.v1 - box.v0),
-            over_px=self.fade_px,
-            left=box.u0 > 0,
-            top=box.v0 > 0,
-            right=box.u1 < whole.width_px,
-            bottom=box.v1 < whole.height_px,
-        )
+    pictures: Sequence[U8]  # (h, w, 3) of the left and the right eye
+    projections: F64  # (2, 3, 4) their pixels from frame `stack`
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +40,9 @@ class Job:
 
     pictures: Sequence[Sequence[Picture]]  # [eye][raster] (h, w, 4) RGBA, left eye first, on `Predictor.rasters`
     eyes_m: F64  # (2, 3) left and right, frame `stack`
-    # Standard deviation, an axis, of where light enters the eyes, common to both, right and up; 0: two points.
+    # Standard deviation of the tracker's error, an axis, common to both eyes, right and up; 0: they are known.
     eye_sigma_mm: float = TRACKING_SIGMA_MM
+    own: Own | None = None  # None: the rays of `pictures`
     part: Part | None = None  # None: all of the panels
     channels: int = 3  # 1: the pictures are grey, and one channel is solved for all three
     deadline_ns: int | None = None  # of `time.perf_counter_ns`: no further step begins after it; None: none

@@ -7,7 +7,9 @@ from pathlib import Path
 
 from runtime.config import ModelSettings
 from runtime.errors import InputError
+from runtime.kernels import MAX_PANELS
 from runtime.model.base import Prediction, Predictor
+from runtime.model.contract import Step
 from runtime.optics.stack import PanelStack
 from runtime.support.memory import keep_freed_memory
 
@@ -41,30 +43,41 @@ def shipped_sha256(name: str) -> str:
         raise InputError(table, f"{name}.onnx", "is not listed: install phasestack again") from None
 
 
+def steps_from_even(steps: int) -> tuple[Step, ...]:
+    """What serves where panels begin even in place of so many steps from a network's proposal."""
+    return (Step(size=1.2),) * (5 * steps + 3) + (Step(size=0.8),) * (2 * steps + 1)
+
+
 def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None = None) -> Predictor:
     """The model `name` (shipped name, `sart` or an ONNX file) for a stack.
 
-    A stack that the network was not made for (not three panels, or none that are evenly spaced, to `UNEVEN_MOST`) is
-    served by `sart` where a shipped name was asked for; `Predictor.name` says so. Raises InputError, MissingPart.
+    A stack that a shipped network was not made for (not three panels, or none that are evenly spaced, to `UNEVEN_MOST`)
+    is served by its steps alone, from even panels; `Predictor.name` says so. Raises InputError, MissingPart.
     """
     keep_freed_memory()
     settings = settings or ModelSettings()
     path = model_path(name)
-    if path is None or (name in SHIPPED and not (stack.count == 3 and stack.is_evenly_spaced)):
+    if path is None:
         from runtime.model.sart import SartPredictor
 
-        return SartPredictor(stack, why="" if path is None else f"instead of {name}: needs three even panels")
+        return SartPredictor(stack)
+    from runtime.model.network import PictureProposal
+    from runtime.model.proposal import ChainProposal
     from runtime.model.session import ModelSession
+    from runtime.model.solver import Solver
 
     session = ModelSession(path, provider=settings.provider, threads=settings.threads, sha256=shipped_sha256(name))
-    if session.contract.panels != stack.count:
-        raise InputError(path, "contract.panels", f"{session.contract.panels}, but the stack has {stack.count}")
-    if session.contract.input_frame == "chain":
+    contract = session.contract
+    if name in SHIPPED and not (stack.count == 3 and stack.is_evenly_spaced):
+        if stack.count > MAX_PANELS:
+            raise InputError("model", "name", f"{name} serves up to {MAX_PANELS} panels; use the model sart")
+        title = f"{name} (without its network: needs three even panels)"
+        return Solver(stack, None, steps_from_even(len(contract.steps)), name=title, threads=settings.threads)
+    if contract.panels != stack.count:
+        raise InputError(path, "contract.panels", f"{contract.panels}, but the stack has {stack.count}")
+    if contract.input_frame == "chain":
         if not stack.is_evenly_spaced:
             raise InputError(path, "contract.panels", "needs evenly spaced panels; use the model sart")
-        from runtime.model.unrolled import UnrolledPredictor
-
-        return UnrolledPredictor(session, stack, threads=settings.threads)
-    from runtime.model.network import NetworkPredictor
-
-    return NetworkPredictor(session, stack, source=path)
+        return Solver(stack, ChainProposal(session), contract.steps, name=contract.name, threads=settings.threads)
+    pictures = PictureProposal(session, stack, source=path)
+    return Solver(stack, pictures, contract.steps, name=contract.name, threads=settings.threads)

@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import chain
 
 import cv2
 import numpy as np
 
-from runtime.model.base import Prediction, Predictor
-from runtime.model.job import Job
-from runtime.model.own_rays import refined
-from runtime.model.unseen import extrapolate_border, is_whole, shown_of
+from runtime.clock import Stopwatch
+from runtime.model.base import STAGES, Prediction, Predictor
+from runtime.model.job import Job, Own
+from runtime.model.proposal import resample, source_px
 from runtime.optics.pupil import TRACKING_SIGMA_MM
-from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PlaneRaster
 from runtime.optics.views import image_from_raster, image_from_stack
 from runtime.records import F64, U8
 from runtime.support.threads import at_once
 
-FINE_ENOUGH = 1.5  # pixels of a picture for one of the raster: finer ones are sampled as they are
-MIN_RAYS, MAX_RAYS = 0.5, 2.0  # pixels of a picture for one of the raster, between which its rays are looked along
-EDGE_PX = 2.0  # of a raster, beside a picture, that its outermost rays are interpolated from: its edge goes on there
+RAYS_PX = 0.6, 1.6  # pixels of a picture, along a side, for one of a panel: others are resized to one for one
 
 
 def solve_still(
@@ -36,142 +32,42 @@ def solve_still(
 ) -> Prediction:
     """Layers for two pictures (h, w, 3 or 4) that a left and a right eye (2, 3), frame `stack`, should see.
 
-    The pictures' horizontal field of view is `fov_deg`; each eye looks at the stack's origin. Warps each picture
-    to the rasters that the predictor wants (EyeReal supplement, (47)); where one ends within the panels, nothing is
-    driven for what it does not show (`unseen`). Where the predictor has steps for it, the layers are improved along the
-    pictures' own rays (`own_rays`). Its prepare time includes the warps. changed: the job that is solved instead, as
-    `trim` has it.
+    The pictures' horizontal field of view is `fov_deg`; each eye looks at the stack's origin. The solver looks along
+    their pixels' own rays; for a network of whole pictures each is warped to the rasters that it wants (EyeReal
+    supplement, (47)), which its prepare time includes. changed: the job that is solved instead, as `trim` has it.
     """
-    start = cv2.getTickCount()
-    rasters, windows = predictor.rasters(eyes_m), predictor.windows(eyes_m)
-    pictures = at_once(_with_alpha, (left, right))
-    projections = [
-        image_from_stack(eye_m, width_px=picture.shape[1], height_px=picture.shape[0], fov_deg=fov_deg)
-        for picture, eye_m in zip(pictures, eyes_m, strict=True)
-    ]
-    pairs = [
-        _drawn(pictures, projections, raster, rows=rows, columns=columns, predictor=predictor)
-        for raster, (rows, columns) in zip(rasters, windows, strict=True)
-    ]
-    images = [list(of_eye) for of_eye in zip(*pairs, strict=True)]
-    job = changed(Job(images, eyes_m, eye_sigma_mm=eye_sigma_mm))
-    warps_ms = (cv2.getTickCount() - start) / cv2.getTickFrequency() * 1e3
-    prediction = predictor.solve(job)
-    rows, columns = windows[0]
-    rays_px = [
-        _source_px(image_from_raster(projection, rasters[0]), rows=rows, columns=columns) for projection in projections
-    ]
-    box = PixelRect(0, 0, predictor.stack.width_px, predictor.stack.height_px) if job.part is None else job.part.box
-    steps, stage_ms, layers = predictor.refining, _added(prediction.stage_ms, {"prepare": warps_ms}), prediction.layers
-    if not steps or not box.width_px or min(rays_px) <= MIN_RAYS or max(rays_px) >= MAX_RAYS:
-        return Prediction(layers, stage_ms, prediction.steps)
-    start = cv2.getTickCount()
-    layers = refined(
-        layers,
-        pictures,
-        predictor.stack,
-        eyes_m=eyes_m,
-        projections=projections,
-        eye_sigma_mm=eye_sigma_mm,
-        steps=steps,
-        box=box,
-        channels=job.channels,
-        threads=max(1, cv2.getNumThreads()),
-    )
-    steps_ms = (cv2.getTickCount() - start) / cv2.getTickFrequency() * 1e3
-    return Prediction(layers, _added(stage_ms, {"finish": steps_ms}), prediction.steps + len(steps))
+    watch = Stopwatch(*STAGES)
+    rasters = predictor.rasters(eyes_m)
+    pictures = [np.ascontiguousarray(picture[..., :3]) for picture in (left, right)]
+    own = _own(pictures, eyes_m, rasters[len(rasters) // 2], fov_deg=fov_deg)
+    images: Sequence[list[U8]] = ([], [])
+    if predictor.needs_rasters:
+        for side in (0, 1):
+            images[side].extend(at_once(lambda raster, side=side: _warped(own, side, raster, predictor), rasters))  # type: ignore[misc]
+    job = changed(Job(images, eyes_m, eye_sigma_mm=eye_sigma_mm, own=own))
+    watch.lap("prepare")
+    made = predictor.solve(job)
+    stage_ms = {name: made.stage_ms.get(name, 0.0) + ms for name, ms in watch.stage_ms.items()}
+    return Prediction(made.made, stage_ms, made.steps)
 
 
-def _drawn(
-    pictures: Sequence[U8],
-    projections: Sequence[F64],
-    raster: PlaneRaster,
-    *,
-    rows: slice,
-    columns: slice,
-    predictor: Predictor,
-) -> list[U8]:
-    """Both eyes' pictures on a raster, for a predictor. On the centre panel's, what one does not show is made up."""
-    matrices = [image_from_raster(projection, raster) for projection in projections]
-    window = {"rows": rows, "columns": columns}
-    images = [
-        _warped(
-            picture,
-            matrix,
-            raster,
-            **window,
-            interpolation=predictor.interpolation,
-            black_beside=predictor.black_beside,
-        )
-        for picture, matrix in zip(pictures, matrices, strict=True)
-    ]
-    if predictor.black_beside or raster.x_m != predictor.stack.x_m[predictor.stack.count // 2]:
-        return images
-    shown = [
-        shown_of(
-            matrix,
-            size=(picture.shape[1], picture.shape[0]),
-            **window,
-            margin_px=EDGE_PX * _source_px(matrix, **window),
-        )
-        for picture, matrix in zip(pictures, matrices, strict=True)
-    ]
-    if not all(is_whole(one, columns) for one in shown):
-        extrapolate_border(images, shown, **window)
-    return images
+def _own(pictures: Sequence[U8], eyes_m: F64, middle: PlaneRaster, *, fov_deg: float) -> Own:
+    """The pictures and their rays, about as many as the panels have pixels."""
+    height, width = pictures[0].shape[:2]
+    at = [image_from_stack(eye_m, width_px=width, height_px=height, fov_deg=fov_deg) for eye_m in eyes_m]
+    scale = source_px(image_from_raster(at[0], middle), (middle.width_px, middle.height_px))
+    if not RAYS_PX[0] <= scale <= RAYS_PX[1]:
+        size = max(2, round(width / scale)), max(2, round(height / scale))
+        how = cv2.INTER_AREA if scale > 1 else cv2.INTER_CUBIC
+        pictures = [np.asarray(cv2.resize(picture, size, interpolation=how), np.uint8) for picture in pictures]
+        resized = np.diag([size[0] / width, size[1] / height, 1.0])
+        at = [resized @ projection for projection in at]
+    return Own(pictures, np.stack(at))
 
 
-def _with_alpha(picture: U8) -> U8:
-    return np.asarray(picture if picture.shape[2] == 4 else cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA), np.uint8)
-
-
-def _added(*stages: dict[str, float]) -> dict[str, float]:
-    return {name: sum(part.get(name, 0.0) for part in stages) for name in dict.fromkeys(chain(*stages))}
-
-
-def _warped(
-    rgba: U8,
-    image_from_raster: F64,
-    raster: PlaneRaster,
-    *,
-    rows: slice,
-    columns: slice,
-    interpolation: str,
-    black_beside: bool,
-) -> U8:
-    """A picture on a raster; only the given rows and columns are drawn."""
-    whole = (rows.stop - rows.start, columns.stop - columns.start) == (raster.height_px, raster.width_px)
-    out: U8 = (np.empty if whole else np.zeros)((raster.height_px, raster.width_px, 4), np.uint8)
-    source_px = _source_px(image_from_raster, rows=rows, columns=columns)
-    # OpenCV puts pixel centres at integers.
-    matrix = _shifted(-0.5, -0.5) @ image_from_raster @ _shifted(columns.start + 0.5, rows.start + 0.5)
-    cubic = interpolation == "cubic" and source_px < FINE_ENOUGH
-    if cubic and not black_beside:
-        from runtime.model.compiled.warp import is_level, warped  # noqa: PLC0415 - imports numba
-
-        place = matrix / matrix[2, 2]
-        if is_level(place, rows=rows, columns=columns, size=(rgba.shape[1], rgba.shape[0])):
-            warped(rgba, place, out=out, rows=rows, columns=columns)
-            return out
-    cv2.warpPerspective(
-        rgba,
-        matrix,
-        (columns.stop - columns.start, rows.stop - rows.start),
-        dst=out[rows, columns],
-        flags=(cv2.INTER_CUBIC if cubic else cv2.INTER_LINEAR) | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_CONSTANT if black_beside else cv2.BORDER_REPLICATE,
-    )
-    return out
-
-
-def _source_px(image_from_raster: F64, *, rows: slice, columns: slice) -> float:
-    """Pixels of the picture, along a side, for one of the raster, in the middle of what is drawn."""
-    u, v = (columns.start + columns.stop) / 2, (rows.start + rows.stop) / 2
-    x, y, w = image_from_raster @ (u, v, 1.0)
-    a = image_from_raster
-    jacobian = (a[:2, :2] - np.outer((x / w, y / w), a[2, :2])) / w
-    return float(np.sqrt(abs(np.linalg.det(jacobian))))
-
-
-def _shifted(right: float, down: float) -> F64:
-    return np.array([[1.0, 0.0, right], [0.0, 1.0, down], [0.0, 0.0, 1.0]])
+def _warped(own: Own, side: int, raster: PlaneRaster, predictor: Predictor) -> U8:
+    """An eye's picture on a raster, RGBA."""
+    rgba = np.asarray(cv2.cvtColor(own.pictures[side], cv2.COLOR_RGB2RGBA), np.uint8)
+    matrix, size = image_from_raster(own.projections[side], raster), (raster.height_px, raster.width_px)
+    edge = cv2.BORDER_CONSTANT if predictor.black_beside else cv2.BORDER_REPLICATE
+    return np.asarray(resample(rgba, matrix, size=size, edge=edge), np.uint8)

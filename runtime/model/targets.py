@@ -1,83 +1,82 @@
-"""What pictures ask of the panels: 8-bit codes to phase sums in fixed point, by tables; grey ones in one channel."""
+"""What pictures ask of the panels: 8-bit codes to sums of what panels show, in fixed point, by tables."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from runtime.optics.malus import Branch, phase_from_intensity
-from runtime.optics.rect import PixelRect
-from runtime.records import I16, U8
-from runtime.support.threads import at_once
+from runtime.optics.stack import PanelStack
+from runtime.records import F32, I16, U8
 
 SUBCODE = 16  # fixed point: sixteenths of an 8-bit panel code
 FULL = 255 * SUBCODE  # one panel's whole range, a quarter turn
 SLOPE_FLOOR = 0.25  # the least weight of a ray beside the slope of sin² where it is wanted
+# Where panels stand before anything is asked of them: so that their sum is in the middle of one of sin²'s slopes.
+REST = {2: 0.75, 3: 0.5, 4: 0.375, 5: 0.5}
 COARSE_STEP = 16  # a look at every so many pixels tells most coloured pictures for next to nothing
 
 
+def rest_of(panels: int) -> int:
+    """The same in sixteenths of a code, for any number of panels."""
+    return round(REST.get(panels, 1.5 / panels) * FULL)
+
+
+@lru_cache(maxsize=8)
+def target_table(panels: int) -> F32:
+    """(256, 2) for each code that an eye should see: the sum of so many panels, in sixteenths of a code, nearest to where
+    they rest; and how much a ray weighs that wants it, by the slope of sin² there, 1 at its steepest."""
+    intensities = np.arange(256) / 255.0
+    slope = int(REST.get(panels, 1.5 / panels) * panels)  # 1 falls from 1 to 2, 2 rises again
+    rise = 2 / np.pi * np.arcsin(np.sqrt(intensities))
+    sums = slope + (1 - rise if slope % 2 else rise)
+    share = rise * (1 - rise) * 4
+    return np.stack([sums * FULL, SLOPE_FLOOR + (1 - SLOPE_FLOOR) * share], axis=1).astype(np.float32)
+
+
+@lru_cache(maxsize=8)
+def middle_codes(panels: int) -> U8:
+    """(256,) the middle panel's code for each code that an eye should see, while the others rest."""
+    codes = (target_table(panels)[:, 0] - (panels - 1) * rest_of(panels)) / SUBCODE
+    return np.clip(np.rint(codes), 0, 255).astype(np.uint8)
+
+
 @lru_cache(maxsize=4)
-def phase_codes(branch: Branch = 2) -> NDArray[np.int16]:
+def phase_codes(branch: Branch = 2) -> I16:
     """(256,) phase sum, in sixteenths of a panel code, for each 8-bit code value an eye should see."""
     codes = np.arange(256) / 255.0
     return np.rint(phase_from_intensity(codes, branch) * FULL).astype(np.int16)
 
 
-def pre_emphasised(picture: U8, strength: float) -> U8:
-    """Sharpened by what interpolation will blur: on the way to the panels' pixels, and between them in the eye.
-
-    A separable [-a, 1 + 2a, -a] on every channel; 0 leaves the picture as it is.
-    """
-    if not strength:
-        return picture
-    kernel = np.array([-strength, 1 + 2 * strength, -strength], np.float32)
-    return np.asarray(cv2.sepFilter2D(picture, -1, kernel, kernel), np.uint8)
-
-
 def is_grey(picture: U8) -> bool:
-    """True where red, green and blue are equal in every pixel of an (h, w, 4) picture: no colour may be lost."""
+    """True where red, green and blue are equal in every pixel of an (h, w, 3 or 4) picture: no colour may be lost."""
     coarse = picture[::COARSE_STEP, ::COARSE_STEP]
     if (coarse[..., 0] != coarse[..., 1]).any() or (coarse[..., 1] != coarse[..., 2]).any():
         return False
-    red, green, blue, _ = cv2.split(picture)
+    red, green, blue = cv2.split(picture)[:3]
     return cv2.norm(red, green, cv2.NORM_INF) == 0.0 and cv2.norm(green, blue, cv2.NORM_INF) == 0.0
 
 
 def without_alpha(picture: U8, channels: int) -> U8:
-    """The (h, w, 4) picture as (h, w, 3), or as (h, w) where it is grey and one channel will do."""
+    """The (h, w, 3 or 4) picture as (h, w, 3), or as (h, w) where it is grey and one channel will do; contiguous."""
     if channels == 1:
         return np.asarray(cv2.extractChannel(picture, 0), np.uint8)
+    if picture.shape[2] == 3:
+        return np.ascontiguousarray(picture)
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGBA2RGB), np.uint8)
 
 
-@dataclass(frozen=True, slots=True)
-class Pictures:
-    """What is asked for: both eyes' pictures within a box of the centre panel."""
-
-    arrays: Sequence[U8]  # (h, w, 4) of the whole panel, left and right
-    box: PixelRect
-    channels: int  # 1 or 3
-    emphasis: float  # how strongly they are sharpened (`pre_emphasised`)
-    table: I16  # (256,) what is asked for each code: its phase sum
-
-
-def fill_targets(pictures: Pictures, pairs: Sequence[Sequence[I16]]) -> None:
-    """Phase sums at the size of pairs of images (h, w[, 3]), left and right, averaged as codes: into them."""
-
-    def sharpened(picture: U8) -> U8:
-        return pre_emphasised(without_alpha(picture[pictures.box.slices], pictures.channels), pictures.emphasis)
-
-    def fill(item: tuple[U8, I16]) -> None:
-        picture, image = item
-        size = image.shape[1::-1]
-        same = picture.shape[1::-1] == size
-        cv2.LUT(picture if same else cv2.resize(picture, size, interpolation=cv2.INTER_AREA), pictures.table, dst=image)
-
-    sharp = at_once(sharpened, pictures.arrays)
-    for pair in pairs:
-        at_once(fill, list(zip(sharp, pair, strict=True)))
+def flat_layers(image: U8, stack: PanelStack) -> U8:
+    """(N, h, w, 4) layers that show a picture (h, w, 4), drawn on the middle panel's raster, to every eye."""
+    middle = stack.count // 2
+    layers = np.full((stack.count, stack.height_px, stack.width_px, 4), 255, np.uint8)
+    # On the second branch the sum is at least one panel's range: the other panels share it, and the middle
+    # one carries the picture.
+    even = 255 // (stack.count - 1)
+    layers[..., :3] = even
+    phase = cv2.LUT(cv2.cvtColor(image, cv2.COLOR_RGBA2RGB), phase_codes(2))
+    rest = np.clip((phase + SUBCODE // 2) // SUBCODE - even * (stack.count - 1), 0, 255).astype(np.uint8)
+    layers[middle, ..., :3] = rest
+    return layers

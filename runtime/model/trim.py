@@ -2,7 +2,7 @@
 
 Panels that are cut to a window and moved to its centre are a smaller stack, seen by eyes moved the same way. Where the
 eyes agree, the outer panels stand at the middle of their range, and the centre panel carries the picture. What drives
-the outer panels fades out towards the window's edge (`model.fade`): there is no seam.
+the outer panels fades out towards the window's edge (`Geometry.tapers`): there is no seam.
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from runtime.model.geometry import geometry_of
 from runtime.model.job import Job, Part, Picture
+from runtime.model.proposal import coarse_pictures
 from runtime.model.targets import is_grey
 from runtime.optics.rect import PixelRect, union
 from runtime.optics.stack import PanelStack
@@ -33,6 +35,7 @@ WAVE_STEPS = (6.0, 14.0)
 PANEL_CROSSINGS = 2.0
 MARGIN_PX = 16
 EDGE_PX = 2
+COARSER = 2  # times fewer pixels, either way, on which still pictures are compared
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,32 +60,44 @@ def trim(job: Job, scene: Scene) -> tuple[Job, Savings]:
     """The same job for less work, and what that leaves out. Twice for one frame: before its pictures are drawn, where
     the content knows where it lies, and after that, for what the pictures show."""
     part = job.part
-    if part is None and job.pictures:
+    if part is None and (job.pictures or job.own):
         part = _differing_part(job, scene)
     elif part is None and scene.extent is not None and scene.extent.width_px:
         steep = max(steepness(np.array([code], np.uint8)) for code in scene.colour)
         part = _part_around(scene.extent, job.eyes_m, scene, steep=steep)
         part = part and replace(part, colour=scene.colour, drawn=True)
-    nothing = not job.pictures or (part is not None and not part.box.width_px)
-    grey = not nothing and all(_is_grey(images[0], part) for images in job.pictures)
+    grey = False
+    if job.own is not None:
+        grey = all(map(is_grey, job.own.pictures))
+    elif job.pictures and not (part is not None and not part.box.width_px):
+        grey = all(_is_grey(images[0], part) for images in job.pictures)
     trimmed = replace(job, part=part, channels=1 if grey else job.channels)
     return trimmed, Savings(trimmed.solved_share(scene.stack), trimmed.channels)
 
 
 def _differing_part(job: Job, scene: Scene) -> Part | None:
     """Where the pictures differ; None where that is too much, or they were left in textures."""
-    left, right = (images[0] for images in job.pictures)
-    if isinstance(left, DrawnPicture) or isinstance(right, DrawnPicture):
-        return None
+    if job.own is not None:
+        geometry = geometry_of(job, scene.stack)
+        left, right, _ = coarse_pictures(replace(job, channels=3), geometry, COARSER)
+        begin, scale = geometry.boxes[geometry.middle], COARSER
+    else:
+        left, right = (images[0] for images in job.pictures)  # type: ignore[assignment]
+        begin, scale = PixelRect(0, 0, 0, 0), 1
+        if isinstance(left, DrawnPicture) or isinstance(right, DrawnPicture):
+            return None
+
+    def part_of(box: PixelRect) -> Part | None:
+        grown = PixelRect(*(begin_px + scale * at for begin_px, at in zip((begin.u0, begin.v0) * 2, box.corners)))
+        return _part_around(grown, job.eyes_m, scene, steep=steepness_beside(left, box))
+
     # A coarse look tells for next to nothing what is too large; only the rest is worth a close one.
     box, part = coarse_box(left, right), None
     if box.width_px:
-        part = _part_around(box, job.eyes_m, scene, steep=steepness_beside(left, box))
+        part = part_of(box)
     if not box.width_px or part is not None:
         box = differing_box(left, right, known=box)
-        if not box.width_px:
-            return Part(NOWHERE, NOWHERE, (0.0, 0.0))
-        part = _part_around(box, job.eyes_m, scene, steep=steepness_beside(left, box))
+        part = part_of(box) if box.width_px else Part(NOWHERE, NOWHERE, (0.0, 0.0))
     return part
 
 
@@ -106,7 +121,7 @@ def _is_grey(picture: Picture, part: Part | None) -> bool:
 
 
 def differing_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES, known: PixelRect = NOWHERE) -> PixelRect:
-    """The smallest box of pixels in which two (h, w, 4) RGBA pictures differ; empty where they agree everywhere.
+    """The smallest box of pixels in which two (h, w, 3 or 4) pictures differ; empty where they agree everywhere.
 
     known: a box within it, as `coarse_box` finds one: only what is beside that is looked at.
     """

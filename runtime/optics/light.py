@@ -12,11 +12,12 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
-from typing import Any, NamedTuple
+from ctypes import byref
+from typing import NamedTuple
 
 import numpy as np
 
+from runtime import kernels
 from runtime.optics.malus import intensity_from_phase
 from runtime.optics.pupil import PUPIL_MM
 from runtime.optics.retina import Rays, checked_eye, pupil_points
@@ -69,7 +70,7 @@ def squared_error(
     nearly perfect it can be less than 0, by the rays' noise.
     Raises ValueError for an eye that is not before every panel, or where no pixel counts.
     """
-    of_rows, cores, step = _kernel(), len(os.sched_getaffinity(0)), sampling.step
+    cores, step = len(os.sched_getaffinity(0)), sampling.step
     codes = np.ascontiguousarray(layers)
     fine = 1 if sampling.rays else TABLE
     table = intensity_from_phase(np.arange(255 * fine * stack.count + 1, dtype=np.float32) / np.float32(255 * fine))
@@ -77,15 +78,36 @@ def squared_error(
     for side, (nominal, true, target) in enumerate(zip(solved_for_m, eyes_m, targets, strict=True)):
         view = view_of(side, nominal, true, target, stack, fov_deg=fov_deg, pupil_mm=sampling.pupil_mm)
         rows = range(0, len(target), step * -(-len(target) // (4 * cores * step)))
-        calls += [
-            (codes, view, table, sampling.rays, step, stack.tilt is not None, first, last)
-            for first, last in zip(rows, [*rows[1:], len(target)], strict=True)
-        ]
+        calls += [(view, first, last) for first, last in zip(rows, [*rows[1:], len(target)], strict=True)]
+
+    def error(call: tuple[View, int, int]) -> tuple[float, int]:
+        view, first, last = call
+        return _squared_error(codes, view, table, sampling, first, last)
+
     with ThreadPoolExecutor(cores) as pool:
-        total, counted = map(sum, zip(*pool.map(lambda call: of_rows(*call), calls), strict=True))
+        total, counted = map(sum, zip(*pool.map(error, calls), strict=True))
     if counted == 0:
         raise ValueError("no ray of these eyes crosses every panel")
     return float(total / counted)
+
+
+def _squared_error(
+    codes: U8, view: View, table: F32, sampling: Sampling, first: int, last: int
+) -> tuple[float, int]:
+    """Sum of the squared error over some rows of one eye's picture, and of how many numbers."""
+    count, height, width, components = codes.shape
+    target, table = np.ascontiguousarray(view.target, np.float32), np.ascontiguousarray(table, np.float32)
+    matrices = [np.ascontiguousarray(x, np.float64) for x in (view.centre_from_image, view.panels_from_centre, view.toward)]
+    given = kernels.View(
+        layers=codes.ctypes.data, panels=count, height=height, width=width, components=components,
+        target=target.ctypes.data, rows=target.shape[0], columns=target.shape[1],
+        centre_from_image=matrices[0].ctypes.data, panels_from_centre=matrices[1].ctypes.data,
+        toward=matrices[2].ctypes.data, table=table.ctypes.data, first_ray=view.first_ray,
+        points=len(view.panels_from_centre), rays=sampling.rays, step=sampling.step,
+    )  # fmt: skip
+    result = kernels.Result()
+    kernels.library().squared_error(byref(given), first, last, byref(result))
+    return result.total, result.counted
 
 
 def view_of(
@@ -120,98 +142,3 @@ def panels_from_centre(true_m: F64, stack: PanelStack) -> F64:
             moved = layer_from_seen(stack, place[-1], true_m[place[:-1]])
             matrices[place] = layer_pixels_from_seen(stack.panel(place[-1]), moved) @ matrices[place]
     return matrices
-
-
-def random_bits(ray: Any) -> Any:
-    """Of a ray, by its number (splitmix64): 24 for its place along the pixel, 24 down, 16 for the pupil's point."""
-    bits = np.uint64(ray) * np.uint64(0x9E3779B97F4A7C15)
-    bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return bits ^ (bits >> np.uint64(31))
-
-
-def ray_of(bits: Any, points: Any) -> Any:
-    """Where a ray crosses its part of a pixel, along and down in [0, 1), and at which point of the pupil it ends."""
-    part = np.uint64(0xFFFFFF)
-    along, down = (bits & part) * 2.0**-24, (bits >> np.uint64(24) & part) * 2.0**-24
-    return along, down, np.int64(bits >> np.uint64(48)) * points >> 16
-
-
-@cache
-def _kernel() -> Any:
-    """The compiled loop: sum of the squared error over some rows of one eye's picture, and of how many numbers."""
-    from numba import config, njit  # noqa: PLC0415 - half a second that only this needs
-
-    bits_of, place_of = njit(random_bits), njit(ray_of)
-
-    @njit(nogil=True, error_model="numpy", fastmath={"contract"}, cache=bool(config.CACHE_DIR))  # type: ignore
-    def of_rows(codes, view, table, rays, step, tilted, first, last):  # type: ignore
-        height, width = codes.shape[1:3]
-        centre, panels, toward = view.centre_from_image, view.panels_from_centre, view.toward
-        half, one = np.float32(0.5), np.float32(1)
-        a_set, sets = max(rays * rays, 1), 2 if rays else 1
-        share, seen = one / np.float32(a_set), np.empty((2, 3), np.float32)
-        part_px, columns, points = 1.0 / max(rays, 1), view.target.shape[1], len(panels)
-        total, counted = 0.0, 0
-        for row in range(first, last, step):
-            for column in range(0, columns, step):
-                seen[:], counts = 0, True
-                number = view.first_ray + (row * columns + column) * a_set * sets
-                part_u, part_v, own = 0, 0, 0  # of the pixel, and which of the sets
-                for ray in range(a_set * sets):
-                    u, v, point = column + 0.5, row + 0.5, 0
-                    if rays:
-                        along, down, point = place_of(bits_of(number + ray), points)
-                        u, v = column + (part_u + along) * part_px, row + (part_v + down) * part_px
-                    counts = counts and toward[0] * u + toward[1] * v + toward[2] < 0
-                    weight = 1 / (centre[2, 0] * u + centre[2, 1] * v + centre[2, 2])
-                    a = (centre[0, 0] * u + centre[0, 1] * v + centre[0, 2]) * weight
-                    b = (centre[1, 0] * u + centre[1, 1] * v + centre[1, 2]) * weight
-                    red, green, blue = half, half, half  # rounded, where the table is looked into
-                    for n in range(panels.shape[1]):
-                        x = panels[point, n, 0, 0] * a + panels[point, n, 0, 2]
-                        y = panels[point, n, 1, 1] * b + panels[point, n, 1, 2]
-                        if tilted:
-                            x, y = x + panels[point, n, 0, 1] * b, y + panels[point, n, 1, 0] * a
-                            weight = 1 / (
-                                panels[point, n, 2, 0] * a + panels[point, n, 2, 1] * b + panels[point, n, 2, 2]
-                            )
-                            x, y = x * weight, y * weight
-                        counts = counts and 0.5 < x < width - 0.5 and 0.5 < y < height - 0.5
-                        if not counts:
-                            break
-                        if rays:
-                            i, j = np.uint32(y), np.uint32(x)
-                            red += codes[n, i, j, 0]
-                            green += codes[n, i, j, 1]
-                            blue += codes[n, i, j, 2]
-                            continue
-                        i, j = np.uint32(y - 0.5), np.uint32(x - 0.5)
-                        down_share, right_share = np.float32(y - 0.5 - i), np.float32(x - 0.5 - j)
-                        for k in range(4):
-                            weight_y = down_share if k > 1 else one - down_share
-                            weight_x = right_share if k & 1 else one - right_share
-                            part = weight_y * weight_x * np.float32(TABLE)
-                            below, beside = i + np.uint32(k > 1), j + np.uint32(k & 1)
-                            red += part * codes[n, below, beside, 0]
-                            green += part * codes[n, below, beside, 1]
-                            blue += part * codes[n, below, beside, 2]
-                    if not counts:
-                        break
-                    seen[own, 0] += table[int(red)]
-                    seen[own, 1] += table[int(green)]
-                    seen[own, 2] += table[int(blue)]
-                    part_u += 1
-                    if part_u == rays:
-                        part_u, part_v = 0, part_v + 1
-                    if part_v == rays and rays:
-                        part_v, own = 0, own + 1
-                if counts:
-                    other = seen[sets - 1]
-                    for channel in range(3):
-                        target = view.target[row, column, channel]
-                        total += (seen[0, channel] * share - target) * (other[channel] * share - target)
-                    counted += 3
-        return total, counted
-
-    return of_rows

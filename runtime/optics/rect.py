@@ -26,6 +26,10 @@ class PixelRect:
         return max(self.v1 - self.v0, 0)
 
     @property
+    def corners(self) -> tuple[int, int, int, int]:
+        return self.u0, self.v0, self.u1, self.v1
+
+    @property
     def slices(self) -> tuple[slice, slice]:
         """Rows and columns, to index an image."""
         return slice(self.v0, self.v1), slice(self.u0, self.u1)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from runtime.model.assembly import flat_layers
-from runtime.model.targets import FULL, SUBCODE, phase_codes, pre_emphasised
+from runtime.model.targets import FULL, SUBCODE, flat_layers, phase_codes
 from runtime.optics.malus import intensity_from_phase
 from runtime.optics.stack import PanelStack
 
@@ -40,12 +39,3 @@ def test_phase_codes_are_the_phases_of_every_code_in_sixteenths_of_a_panel_code(
     assert np.abs(intensity_from_phase(table / FULL) * 255 - np.arange(256)).max() < 0.8 / SUBCODE
     low, high = (0, FULL) if branch == 1 else (FULL, 2 * FULL)
     assert table.min() == low and table.max() == high
-
-
-def test_pre_emphasis_sharpens_edges_and_keeps_even_parts() -> None:
-    picture = np.full((12, 12, 3), 100, np.uint8)
-    picture[:, 6:] = 140
-    assert np.array_equal(pre_emphasised(picture, 0.0), picture)
-    sharp = pre_emphasised(picture, 0.1)
-    assert sharp[6, 5].tolist() == [96] * 3 and sharp[6, 6].tolist() == [144] * 3  # a tenth of the step, either side
-    assert (sharp[:, :5] == 100).all() and (sharp[:, 7:] == 140).all()

@@ -10,7 +10,7 @@ import pytest
 
 from runtime.model.chain import chain_frame
 from runtime.model.predictor import load_predictor
-from runtime.model.resample import buffer, resample
+from runtime.model.proposal import resample
 from runtime.model.still import solve_still
 from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
@@ -53,9 +53,9 @@ def test_gaps_that_differ_a_little_are_served_by_the_network_as_well_as_even_one
     assert displayed_db(uneven, uneven) > displayed_db(STACK, STACK) - 0.5
 
 
-def test_gaps_that_differ_more_are_served_by_sart_and_the_name_says_so() -> None:
+def test_gaps_that_differ_more_are_served_from_even_panels_and_the_name_says_so() -> None:
     predictor = load_predictor("balanced", replace(STACK, x_m=(-0.06, 0.0, 0.03)))
-    assert predictor.name.startswith("sart")
+    assert predictor.name.startswith("balanced (without its network")
 
 
 @pytest.mark.parametrize("x_m", [(-0.06, 0.0, 0.06), (-0.058, 0.001, 0.065)])
@@ -85,6 +85,6 @@ def test_a_perspective_is_resampled_where_it_belongs() -> None:
     v, u = np.mgrid[0:60, 0:90].astype(np.float64) + 0.5
     image = np.rint(10 * u + 7 * v).astype(np.int16)
     matrix = np.array([[1.01, 0.02, 2.0], [-0.01, 0.99, 1.5], [1e-4, -2e-4, 1.0]])
-    found = resample(image, image_from_result=matrix, out=buffer(40, 70, channels=1))
+    found = resample(image, matrix, size=(40, 70))
     x, y, weight = np.einsum("ij,jhw->ihw", matrix, np.stack([u[:40, :70], v[:40, :70], np.ones((40, 70))]))
     assert np.abs(found - (10 * x / weight + 7 * y / weight))[2:-2, 2:-2].max() < 1.5

@@ -5,9 +5,6 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import Any
 
-from runtime.model.assembly import ArrayAssembly, Assembly
-from runtime.model.contract import Contract
-from runtime.model.gl.assembly import GlAssembly
 from runtime.model.gl.programs import Passes
 from runtime.model.gl.state import GlState, check_size
 from runtime.optics.stack import PanelStack
@@ -30,11 +27,8 @@ class GlBackend:
         self._pool = None if group is None else LayerPool(context, group)
         self.renderer = describe(context)["renderer"]
 
-    def state(self, contract: Contract, stack: PanelStack, *, threads: int) -> GlState:
-        return GlState(self.passes, contract, stack, pool=self._pool)
-
-    def assembly(self, stack: PanelStack) -> Assembly:
-        return ArrayAssembly(stack) if self._pool is None else GlAssembly(self.passes, self._pool, stack)
+    def state(self, stack: PanelStack, *, threads: int) -> GlState:
+        return GlState(self.passes, stack, pool=self._pool)
 
     def close(self) -> None:
         with suppress(Exception):  # of a context that is lost there is nothing to release

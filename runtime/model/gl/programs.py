@@ -71,9 +71,10 @@ class Passes:
         uniforms: Mapping[str, Any],
         *,
         defines: tuple[str, ...] = (),
+        at: tuple[int, int, int, int] | None = None,
     ) -> None:
         """Draw the first output's size into all of them. Inputs and uniforms are named as in the shader; what it
-        has no use for is left out. defines: of the shader (`source`)."""
+        has no use for is left out. defines: of the shader (`source`); at: first column and row, width and height."""
         program, array, held = self._program(name, defines)
         for unit, (key, image) in enumerate(inputs.items()):
             image.texture.use(unit)
@@ -81,7 +82,7 @@ class Passes:
         for key, value in uniforms.items():
             self._set(program, held, key, value)
         target = self.target(outputs)
-        target.viewport = (0, 0, *outputs[0].size)
+        target.viewport = at or (0, 0, *outputs[0].size)
         target.use()
         array.render(moderngl.TRIANGLES, vertices=3)
 

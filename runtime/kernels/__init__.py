@@ -1,0 +1,81 @@
+"""The compiled loops: C++ without Python in it, called by `ctypes`, which lets other threads run meanwhile.
+
+The structures below are those of `solver.cpp` and `light.cpp`, field by field.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+MAX_PANELS = 5
+MARGIN = 64  # elements behind an image's rows that loops may touch
+_pointer, _int, _long, _float = ctypes.c_void_p, ctypes.c_int32, ctypes.c_int64, ctypes.c_float
+
+
+class Image(ctypes.Structure):
+    """Rows of 16-bit elements, channels beside each other."""
+
+    _fields_ = (("data", _pointer), ("stride", _long), ("rows", _int), ("width", _int), ("ring", _int))
+
+    @classmethod
+    def of(cls, array: NDArray[Any], *, rows: int, width: int) -> Image:
+        """The first rows and pixels of an int16 array (rows, elements), which must live as long."""
+        return cls(array.ctypes.data, array.strides[0] // array.itemsize, rows, width, len(array))
+
+
+class Panel(ctypes.Structure):
+    """One panel between steps."""
+
+    _fields_ = (("ahead", Image), ("moved", Image), ("last", Image), ("cosine", Image), ("sine", Image))
+
+
+class Problem(ctypes.Structure):
+    """What a step is about."""
+
+    _fields_ = (
+        ("panels", _int), ("sets", _int), ("channels", _int), ("height", _int), ("width", _int),
+        ("panels_from_rays", _pointer), ("rays_from_panels", _pointer), ("targets", _pointer * 2),
+        ("column_taper", _pointer), ("row_taper", _pointer), ("table", _pointer), ("rest", _float),
+        ("panel", Panel * MAX_PANELS), ("size", _float), ("momentum", _float), ("floor", _float),
+    )  # fmt: skip
+
+
+class View(ctypes.Structure):
+    """One eye's view of displayed layers."""
+
+    _fields_ = (
+        ("layers", _pointer), ("panels", _int), ("height", _int), ("width", _int), ("components", _int),
+        ("target", _pointer), ("rows", _int), ("columns", _int), ("centre_from_image", _pointer),
+        ("panels_from_centre", _pointer), ("toward", _pointer), ("table", _pointer), ("first_ray", _long),
+        ("points", _int), ("rays", _int), ("step", _int),
+    )  # fmt: skip
+
+
+class Result(ctypes.Structure):
+    """Sum of a squared error, and of how many numbers."""
+
+    _fields_ = (("total", ctypes.c_double), ("counted", _long))
+
+
+@cache
+def library() -> Any:
+    """The loops. Raises ImportError where the package was not built for this machine."""
+    built = sorted(Path(__file__).parent.glob("compiled*.so"))
+    if not built:
+        raise ImportError("runtime.kernels is not compiled: install phasestack again (it needs g++)")
+    loops = ctypes.CDLL(str(built[0]))
+    for name, arguments in {
+        "step": (_pointer, _int, _int),
+        "close_middle": (_pointer, _int, _int),
+        "to_phasors": (_pointer, _pointer, _pointer, _long),
+        "show": (_pointer, _int, _pointer, _long, _int, _int),
+        "squared_error": (_pointer, _int, _int, _pointer),
+    }.items():
+        function = getattr(loops, name)
+        function.argtypes, function.restype = arguments, None
+    return loops

@@ -1,0 +1,99 @@
+// What one eye sees of displayed layers, ray by ray: the squared error of some rows (runtime/optics/light.py).
+#include <cstdint>
+
+#include "sampling.hpp"
+
+namespace {
+
+constexpr int TABLE_STEPS = 16;  // entries a code value, of the table that sums along bilinear rays are looked up in
+
+struct View {
+  const uint8_t *layers;  // (panels, height, width, components)
+  int32_t panels, height, width, components;
+  const float *target;  // (rows, columns, 3) intensities
+  int32_t rows, columns;
+  const double *centre_from_image;   // (3, 3)
+  const double *panels_from_centre;  // (points, panels, 3, 3)
+  const double *toward;              // (3) times (u, v, 1): negative for a ray that goes towards the panels
+  const float *table;                // intensities of summed codes, half of an entry added before it is cut off
+  int64_t first_ray;                 // its number
+  int32_t points, rays, step;        // of the pupil; a side of a pixel in each set, 0: one, bilinear; every such pixel
+};
+
+struct Result {
+  double total;
+  int64_t counted;
+};
+
+// Of a ray, by its number (splitmix64): 24 bits for its place along the pixel, 24 down, 16 for the pupil's point.
+INLINE uint64_t random_bits(uint64_t ray) {
+  uint64_t bits = ray * 0x9E3779B97F4A7C15u;
+  bits = (bits ^ (bits >> 30)) * 0xBF58476D1CE4E5B9u;
+  bits = (bits ^ (bits >> 27)) * 0x94D049BB133111EBu;
+  return bits ^ (bits >> 31);
+}
+
+// Adds what one ray sees, by colours; false where it misses a panel.
+INLINE bool see(const View &view, double u, double v, int point, float *seen) {
+  if (!(view.toward[0] * u + view.toward[1] * v + view.toward[2] < 0)) return false;
+  const double *c = view.centre_from_image, weight = 1 / (c[6] * u + c[7] * v + c[8]);
+  const double a = (c[0] * u + c[1] * v + c[2]) * weight, b = (c[3] * u + c[4] * v + c[5]) * weight;
+  float sums[3] = {0.5f, 0.5f, 0.5f};
+  const int64_t plane = int64_t(view.height) * view.width * view.components;
+  for (int n = 0; n < view.panels; ++n) {
+    const double *m = view.panels_from_centre + (int64_t(point) * view.panels + n) * 9;
+    const double w = 1 / (m[6] * a + m[7] * b + m[8]);
+    const double x = (m[0] * a + m[1] * b + m[2]) * w, y = (m[3] * a + m[4] * b + m[5]) * w;
+    if (!(0.5 < x && x < view.width - 0.5 && 0.5 < y && y < view.height - 0.5)) return false;
+    const uint8_t *layer = view.layers + n * plane;
+    if (view.rays) {
+      const uint8_t *pixel = layer + (int64_t(y) * view.width + int64_t(x)) * view.components;
+      for (int k = 0; k < 3; ++k) sums[k] += pixel[k];
+      continue;
+    }
+    const int64_t row = int64_t(y - 0.5), column = int64_t(x - 0.5);
+    const float down = float(y - 0.5 - double(row)), right = float(x - 0.5 - double(column));
+    for (int corner = 0; corner < 4; ++corner) {
+      const int below = corner > 1, beside = corner & 1;
+      const float part = (below ? down : 1 - down) * (beside ? right : 1 - right) * TABLE_STEPS;
+      const uint8_t *pixel = layer + ((row + below) * view.width + column + beside) * view.components;
+      for (int k = 0; k < 3; ++k) sums[k] += part * pixel[k];
+    }
+  }
+  for (int k = 0; k < 3; ++k) seen[k] += view.table[int(sums[k])];
+  return true;
+}
+
+}  // namespace
+
+// Of every step-th row from first to end: the sum of both sets' errors' products, and how many numbers it is of.
+FOR_EVERY_CPU void squared_error(const View *given, int first, int end, Result *result) {
+  const View &view = *given;
+  const int in_set = std::max(view.rays * view.rays, 1), sets = view.rays ? 2 : 1, side = std::max(view.rays, 1);
+  double total = 0;
+  int64_t counted = 0;
+  for (int row = first; row < end; row += view.step)
+    for (int column = 0; column < view.columns; column += view.step) {
+      float seen[2][3] = {};
+      bool counts = true;
+      const int64_t number = view.first_ray + (int64_t(row) * view.columns + column) * in_set * sets;
+      for (int ray = 0; ray < in_set * sets && counts; ++ray) {
+        double u = column + 0.5, v = row + 0.5;
+        int point = 0;
+        if (view.rays) {
+          const uint64_t bits = random_bits(uint64_t(number + ray));
+          const int stratum = ray % in_set;
+          u = column + (stratum % side + double(bits & 0xFFFFFF) * 0x1p-24) / side;
+          v = row + (stratum / side + double(bits >> 24 & 0xFFFFFF) * 0x1p-24) / side;
+          point = int((bits >> 48) * uint64_t(view.points) >> 16);
+        }
+        counts = see(view, u, v, point, seen[ray / in_set]);
+      }
+      if (!counts) continue;
+      const float *target = view.target + (int64_t(row) * view.columns + column) * 3;
+      for (int k = 0; k < 3; ++k)
+        total += (seen[0][k] / float(in_set) - target[k]) * (seen[sets - 1][k] / float(in_set) - target[k]);
+      counted += 3;
+    }
+  *result = {total, counted};
+}

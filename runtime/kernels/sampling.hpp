@@ -1,0 +1,183 @@
+// Bilinear samples of images along the rows of a raster that lies a homography away: the one sampler of all kernels.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+
+// Functions that the linker calls are compiled for each of three processors, and what they inline with them.
+#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
+#define FOR_EVERY_CPU extern "C" __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
+#else
+#define FOR_EVERY_CPU extern "C"
+#endif
+#define INLINE static inline __attribute__((always_inline))
+#define VECTORISED _Pragma("GCC ivdep")
+
+constexpr int LANES = 32;     // elements that loops work on together, whatever a processor makes of that
+constexpr int TILE_PX = 256;  // pixels of a row that are sampled at once: what they need stays in the first-level cache
+constexpr int PIECE_PX = 64;  // of a tile
+constexpr int RUN_PX = 32;    // of a row, along which a weight grows evenly
+constexpr int MAX_PANELS = 5;
+constexpr int MAX_CHANNELS = 3;
+constexpr int TILE = TILE_PX * MAX_CHANNELS + 2 * LANES;  // elements; what follows the last one may be written over
+constexpr int SOURCE = 2 * TILE;
+constexpr int FIELDS = 3;  // sampled together, at most
+constexpr float WEIGHT_UNIT = 16384;
+
+// An image of 16-bit elements, channels beside each other. Whole vectors are read behind a row's end.
+struct Image {
+  int16_t *data;
+  int64_t stride;  // elements
+  int32_t rows, width, ring;  // row r is the (r % ring)th in memory
+  const int16_t *row(int r) const { return data + int64_t(r % ring) * stride; }
+};
+
+struct Ramp {  // the pixel that an element belongs to
+  float one_channel[RUN_PX * MAX_CHANNELS + LANES] = {}, three_channels[RUN_PX * MAX_CHANNELS + LANES] = {};
+  constexpr Ramp() {
+    for (int e = 0; e < RUN_PX * MAX_CHANNELS + LANES; ++e) one_channel[e] = float(e), three_channels[e] = float(e / 3);
+  }
+};
+constexpr Ramp RAMP;
+
+// A row of a raster through a homography: where its pixel u lies in an image, whose pixels' centres are at integers.
+struct Line {
+  double x0, xu, y0, yu, w0, wu;
+  Line() = default;
+  Line(const double *homography, int row) {
+    const double *m = homography, v = row + 0.5;
+    xu = m[0], x0 = m[0] * 0.5 + m[1] * v + m[2];
+    yu = m[3], y0 = m[3] * 0.5 + m[4] * v + m[5];
+    wu = m[6], w0 = m[6] * 0.5 + m[7] * v + m[8];
+  }
+  double x(double u) const { return (x0 + xu * u) / (w0 + wu * u) - 0.5; }
+  double y(double u) const { return (y0 + yu * u) / (w0 + wu * u) - 0.5; }
+};
+
+struct Span {
+  int first, last;  // pixels, and beyond the last
+};
+
+INLINE Span common(Span a, Span b) {
+  const Span both{std::max(a.first, b.first), std::min(a.last, b.last)};
+  return both.first < both.last ? both : Span{0, 0};
+}
+
+INLINE void at_least_zero(double slope, double offset, double &low, double &high) {
+  if (slope > 0) low = std::max(low, -offset / slope);
+  else if (slope < 0) high = std::min(high, -offset / slope);
+  else if (offset < 0) high = -1;
+}
+
+// Pixels of a row of so many whose places are `near` of an image's pixels or more inside its edges.
+INLINE Span inside(const Line &line, int count, const Image &image, double near) {
+  constexpr double rounded = 1e-6;  // a place on an edge is inside, however it was worked out
+  const double right = image.width - near, below = image.rows - near;
+  double low = 0, high = count - 1;
+  at_least_zero(line.wu, line.w0 - 1e-9, low, high);
+  at_least_zero(line.xu - near * line.wu, line.x0 - near * line.w0, low, high);
+  at_least_zero(right * line.wu - line.xu, right * line.w0 - line.x0, low, high);
+  at_least_zero(line.yu - near * line.wu, line.y0 - near * line.w0, low, high);
+  at_least_zero(below * line.wu - line.yu, below * line.w0 - line.y0, low, high);
+  if (!(high >= low - rounded)) return {0, 0};
+  const Span span{int(std::ceil(low - rounded)), int(std::floor(high + rounded)) + 1};
+  return span.first < span.last ? span : Span{0, 0};
+}
+
+INLINE int16_t rounded(float x) { return int16_t(int(std::nearbyintf(x))); }
+
+// From a to b by a share in WEIGHT_UNIT. Both are 8191 at most, either way, so that twice their difference fits.
+INLINE int16_t mixed(int16_t a, int16_t b, int16_t share) {
+  const int16_t twice = int16_t(2 * (b - a));
+  return int16_t(a + int16_t((((int32_t(twice) * int32_t(share)) >> 14) + 1) >> 1));
+}
+
+struct Work {
+  int16_t source[FIELDS][SOURCE];
+  int16_t tile[2 * MAX_PANELS][TILE];
+  float sum[FIELDS][TILE];
+};
+
+// F images alike at pixels first to last of a line (TILE_PX at most, all of them `inside`), into out[f], from its first
+// element on. Two rows of the image are mixed first, for the pixels between which the line runs; then each two pixels of
+// that. Both go run by run: along a run the same two are mixed, with weights that grow evenly.
+template <int F, int C>
+INLINE void sample(const Image *images, const Line &line, int first, int last, Work &work, int16_t (*out)[TILE]) {
+  const Image &image = images[0];
+  const float *ramp = C == 1 ? RAMP.one_channel : RAMP.three_channels;
+  const double xs = line.x(first), xe = line.x(last - 1), ys = line.y(first), ye = line.y(last - 1);
+  const double slope = xe - xs > 0.5 ? (ye - ys) / (xe - xs) : 0, bottom = image.rows - 1;
+  const int s0 = std::clamp(int(std::floor(xs)) - 1, 0, image.width - 1);
+  const int s1 = std::clamp(int(std::floor(xe)) + 2, 0, image.width - 1);
+  const int elements = std::min((s1 - s0 + 1) * C, SOURCE - 4 * LANES);
+  for (int at = 0, length; at < elements; at += length) {
+    const double y = ys + (s0 + at / C - xs) * slope, within = std::clamp(y, 0.0, bottom);
+    const int row = std::min(int(within), std::max(image.rows - 2, 0));
+    double grows = y == within ? slope : 0, until = 1e6;  // pixels
+    if (std::abs(slope) > 1e-7) {
+      const double end = y < 0 ? (slope > 0 ? 0 : -1e9) : y > bottom ? (slope < 0 ? bottom : 1e9) : row + (slope > 0);
+      until = std::min((end - y) / slope, 1e6);
+    }
+    length = std::min(elements - at, (int(until) + 1) * C);
+    float share = float((within - row) * WEIGHT_UNIT);
+    const float growth = float(grows / C * WEIGHT_UNIT);
+    const int64_t from = int64_t(s0) * C + at;
+    for (int e = 0; e < length; e += LANES, share += growth * LANES) {
+      int16_t weights[LANES];
+      VECTORISED for (int k = 0; k < LANES; ++k) weights[k] = int16_t(int(share + growth * RAMP.one_channel[k]));
+      for (int f = 0; f < F; ++f) {
+        const int16_t *upper = images[f].row(row) + from + e;
+        const int16_t *lower = images[f].row(std::min(row + 1, image.rows - 1)) + from + e;
+        int16_t *to = work.source[f] + LANES + at + e;
+        VECTORISED for (int k = 0; k < LANES; ++k) to[k] = mixed(upper[k], lower[k], weights[k]);
+      }
+    }
+  }
+  for (int f = 0; f < F; ++f) {  // an image's edges go on
+    int16_t *source = work.source[f] + LANES;
+    for (int c = 0; c < C; ++c) {
+      source[c - C] = source[c];
+      source[elements + c] = source[elements + C + c] = source[elements - C + c];
+    }
+  }
+  const int steps = last - 1 - first;
+  const double half = 0.5 * steps, middle = steps > 1 ? line.x(first + half) : 0.5 * (xs + xe);
+  const double bend = steps > 1 ? (xs + xe - 2 * middle) / (half * half) * 0.5 : 0;  // along a tile: a parabola
+  const double scale = steps > 0 ? (xe - xs) / steps - bend * steps : 1;  // where it begins
+  const int piece = std::max(2, int(std::min(std::sqrt(0.5 / std::max(std::abs(bend), 1e-9)), double(PIECE_PX))));
+  for (int k = 0, next; k <= steps; k = next) {  // along a piece, its chord tells where runs end, to an eighth of a pixel
+    next = std::min(k + piece, steps + 1);
+    const double begin = xs - s0 + k * (scale + bend * k) - k;  // how much further to the right the source is
+    const double drift = scale - 1 + bend * (k + next - 1), per_run = std::abs(drift) > 1e-3 ? std::abs(1 / drift) : 1e3;
+    const int way = drift < 0 ? -1 : 1;
+    int beside = int(std::floor(begin));
+    double until = k + (way < 0 ? begin - beside : beside + 1 - begin) * per_run;
+    for (; k < next; until += per_run, beside += way)
+      for (int length, end = std::min(int(std::min(until, 1e6)) + 1, next); k < end; k += length) {
+        length = std::min(end - k, RUN_PX);
+        const float share = float((xs - s0 - beside - k + k * (scale + bend * k)) * WEIGHT_UNIT);
+        const float growth = float((scale + bend * (2 * k + length - 1) - 1) * WEIGHT_UNIT);
+        for (int e = 0; e < length * C; e += LANES) {
+          int16_t weights[LANES];
+          VECTORISED for (int i = 0; i < LANES; ++i) weights[i] = int16_t(int(share + growth * ramp[e + i]));
+          for (int f = 0; f < F; ++f) {
+            const int16_t *left = work.source[f] + LANES + (k + beside) * C + e;
+            int16_t *to = out[f] + k * C + e;
+            VECTORISED for (int i = 0; i < LANES; ++i) to[i] = mixed(left[i], left[i + C], weights[i]);
+          }
+        }
+      }
+  }
+}
+
+// How long a tile of a line may be: short enough that a parabola stands for it, and that its source has room.
+INLINE int tile_px(const Line &line, Span span) {
+  const double first = line.w0 + line.wu * span.first, last = line.w0 + line.wu * span.last;
+  const double nearest = std::min(std::abs(first), std::abs(last)), turn = std::abs(line.wu) * TILE_PX;
+  const double scale = std::max(std::abs(line.xu - line.wu * (line.x(span.first) + 0.5)),
+                                std::abs(line.xu - line.wu * (line.x(span.last) + 0.5))) / nearest;
+  const double bent = turn > 0.1 * nearest ? 0.1 * nearest / turn : 1, wide = scale > 1.8 ? 1.8 / scale : 1;
+  return std::max(4, int(TILE_PX * std::min(bent, wide)));
+}

@@ -1,0 +1,179 @@
+"""What a solution looks along: parts of panels, and for each eye the panels' pixels that its rays cross, by homographies.
+
+A ray belongs to a pixel of a raster: a still picture's own pixels, or the middle panel's where content is drawn there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from math import ceil, floor
+
+import numpy as np
+
+from runtime.model.contract import Places
+from runtime.model.job import Job, Own
+from runtime.optics.rect import PixelRect
+from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.optics.tilt import coarse_layer_from_seen, layer_pixels_from_seen
+from runtime.optics.views import image_from_raster, relative_scale_shift, stack_from_eye
+from runtime.records import F32, F64
+
+PAD_PX = 2  # of what is visible
+ALIGN_PX = 8  # boxes begin and end at multiples of this, so that a half or a quarter of them is whole
+LEAST_PX = 32
+MIN_WEIGHT = 0.05  # of a corner in a picture's homography, beside the middle's: nearer to the eye's plane it has no place
+TAPERED_SHARE = 1 / 6  # of a window's taper, over which its rays fade: they mend the error of the wave's own
+PLACES: dict[Places, tuple[tuple[float, float], ...]] = {  # right and up, standard deviations of the eyes' place
+    "middle": ((0.0, 0.0),),
+    "rising": ((1.0, 1.0), (-1.0, -1.0)),
+    "falling": ((1.0, -1.0), (-1.0, 1.0)),
+}
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Panels' boxes and the raster of rays of one solution."""
+
+    stack: PanelStack
+    eyes_m: F64  # (2, 3) left and right, frame `stack`
+    boxes: tuple[PixelRect, ...]  # of each panel, that is solved
+    kept: PixelRect  # of the middle panel's box, that rays look through
+    rays: PixelRect  # of a picture's pixels, or of the middle panel's
+    middle_from_rays: F64  # (2, 3, 3) the middle panel's pixels, from its box's first, for each eye
+    taper_px: tuple[float, float] = (0.0, 0.0)  # of the middle panel, right and down; over which a window's rays fade
+
+    @property
+    def middle(self) -> int:
+        return self.stack.count // 2
+
+    @cached_property
+    def rasters(self) -> tuple[PlaneRaster, ...]:
+        """The panels' pixels within their boxes."""
+        return tuple(box.cut(self.stack.panel(n)) for n, box in enumerate(self.boxes))
+
+    def panels_from_rays(self, places: Places, eye_sigma_mm: float) -> F64:
+        """(2P, N, 3, 3) each panel's pixels, from its box's first, for P places of the eyes; left and right in turn."""
+        right, up = stack_from_eye(self.eyes_m.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
+        centre = np.array([self.rays.width_px / 2, self.rays.height_px / 2, 1.0])
+        found = []
+        for across, down in PLACES[places] if eye_sigma_mm > 0 else PLACES["middle"]:
+            moved_m = eye_sigma_mm / 1e3 * (across * right + down * up)
+            for eye_m, from_rays in zip(self.eyes_m + moved_m, self.middle_from_rays, strict=True):
+                between = [
+                    panel_from_middle(self.stack, self.rasters, eye_m, n) if n != self.middle else np.eye(3)
+                    for n in range(self.stack.count)
+                ]
+                seen = np.stack(between) @ from_rays
+                found.append(seen / (seen[:, 2] @ centre)[:, None, None])
+        return np.array(found)
+
+    def tapers(self) -> tuple[F32, F32]:
+        """(width,) and (height,) what rays' errors are multiplied with: 0 at a window's edges to 1 inside."""
+        box, kept, matrix = self.boxes[self.middle], self.kept, self.middle_from_rays.mean(axis=0)
+        width_px, height_px = self.rays.width_px, self.rays.height_px
+        u = np.stack([np.arange(width_px) + 0.5, np.full(width_px, height_px / 2), np.ones(width_px)])
+        v = np.stack([np.full(height_px, width_px / 2), np.arange(height_px) + 0.5, np.ones(height_px)])
+        across, down = (matrix[axis] @ at / (matrix[2] @ at) for axis, at in ((0, u), (1, v)))
+        return (
+            taper(across + box.u0, kept.u0, kept.u1, self.stack.width_px, self.taper_px[0] * TAPERED_SHARE),
+            taper(down + box.v0, kept.v0, kept.v1, self.stack.height_px, self.taper_px[1] * TAPERED_SHARE),
+        )
+
+
+def geometry_of(job: Job, stack: PanelStack, *, whole: bool = False) -> Geometry:
+    """For a job's part of the panels, or for all of what its eyes see of them."""
+    part = None if whole else job.part
+    if part is None:
+        boxes = visible_boxes(job.eyes_m, stack)
+        kept, taper_px = boxes[stack.count // 2], (0.0, 0.0)
+    else:
+        boxes, kept, taper_px = (part.box,) * stack.count, part.kept, part.taper_px
+    box = boxes[stack.count // 2]
+    if job.own is None:
+        shift = np.array([[1.0, 0.0, kept.u0 - box.u0], [0.0, 1.0, kept.v0 - box.v0], [0.0, 0.0, 1.0]])
+        return Geometry(stack, job.eyes_m, boxes, kept, kept, np.stack([shift, shift]), taper_px)
+    raster = stack.panel(stack.count // 2)
+    pictures_from_middle = [image_from_raster(projection, raster) for projection in job.own.projections]
+    rays = _looked_through(pictures_from_middle, kept, job.own)
+    first = np.array([[1.0, 0.0, rays.u0], [0.0, 1.0, rays.v0], [0.0, 0.0, 1.0]])
+    to_box = np.array([[1.0, 0.0, -box.u0], [0.0, 1.0, -box.v0], [0.0, 0.0, 1.0]])
+    middle_from_rays = np.stack([to_box @ np.linalg.inv(matrix) @ first for matrix in pictures_from_middle])
+    return Geometry(stack, job.eyes_m, boxes, kept, rays, middle_from_rays, taper_px)
+
+
+def _looked_through(pictures_from_middle: Sequence[F64], box: PixelRect, own: Own) -> PixelRect:
+    """The pixels of either picture that look through a box of the middle panel."""
+    height, width = own.pictures[0].shape[:2]
+    corners = np.array([[box.u0, box.u1, box.u0, box.u1], [box.v0, box.v0, box.v1, box.v1], [1.0] * 4])
+    centre = np.array([(box.u0 + box.u1) / 2, (box.v0 + box.v1) / 2, 1.0])
+    ends = []
+    for matrix in pictures_from_middle:
+        x, y, w = (matrix / (matrix[2] @ centre)) @ corners
+        if w.min() < MIN_WEIGHT:
+            return PixelRect(0, 0, width, height)
+        ends.append((x / w, y / w))
+    low, high = np.floor(np.min(ends, axis=(0, 2))), np.ceil(np.max(ends, axis=(0, 2)))
+    u0, v0 = int(np.clip(low[0], 0, width - 1)), int(np.clip(low[1], 0, height - 1))
+    return PixelRect(u0, v0, int(np.clip(high[0], u0 + 1, width)), int(np.clip(high[1], v0 + 1, height)))
+
+
+def panel_from_middle(stack: PanelStack, rasters: Sequence[PlaneRaster], eye_m: F64, n: int) -> F64:
+    """3x3, last entry 1: panel n's pixels from the middle one's, as an eye (3,) sees them in line.
+
+    A scale and a shift, but where panels are tilted (`optics.tilt`).
+    """
+    source, target = rasters[stack.count // 2], rasters[n]
+    scale, shift_m = relative_scale_shift(eye_m, from_x_m=source.x_m, to_x_m=target.x_m)
+    across = np.array([[scale, 0.0, shift_m[0]], [0.0, scale, shift_m[1]], [0.0, 0.0, 1.0]])
+    matrix: F64 = target.raster_from_plane() @ across @ source.plane_from_raster()
+    if stack.tilt is not None:
+        matrix = layer_pixels_from_seen(target, coarse_layer_from_seen(stack, n, eye_m)) @ matrix
+    return np.asarray(matrix / matrix[2, 2], np.float64)
+
+
+def visible_boxes(eyes_m: F64, stack: PanelStack) -> tuple[PixelRect, ...]:
+    """For each panel the pixels on rays of either eye (2, 3) that cross every panel, a little padded.
+
+    Where an eye sees nothing through all panels, a small box in the middle: there is nothing to solve.
+    """
+    middle_x_m, half = stack.x_m[stack.count // 2], np.array([stack.width_m, stack.height_m]) / 2
+    lows, highs = [], []
+    for eye_m in eyes_m:
+        seen = [relative_scale_shift(eye_m, from_x_m=x_m, to_x_m=middle_x_m) for x_m in stack.x_m]
+        lows.append(np.max([shift - half * scale for scale, shift in seen], axis=0))
+        highs.append(np.min([shift + half * scale for scale, shift in seen], axis=0))
+    low, high = np.min(lows, axis=0), np.max(highs, axis=0)
+    boxes = []
+    for x_m in stack.x_m:
+        seen = [relative_scale_shift(eye_m, from_x_m=middle_x_m, to_x_m=x_m) for eye_m in eyes_m]
+        corners = [corner * scale + shift for scale, shift in seen for corner in (low, high)]
+        boxes.append(_box(np.min(corners, axis=0), np.max(corners, axis=0), stack))
+    return tuple(boxes)
+
+
+def _box(low_m: F64, high_m: F64, stack: PanelStack) -> PixelRect:
+    u0, u1 = _span(low_m[0] / stack.width_m + 0.5, high_m[0] / stack.width_m + 0.5, stack.width_px)
+    v0, v1 = _span(0.5 - high_m[1] / stack.height_m, 0.5 - low_m[1] / stack.height_m, stack.height_px)
+    return PixelRect(u0, v0, u1, v1)
+
+
+def _span(low: float, high: float, size: int) -> tuple[int, int]:
+    first, last = max(0, floor(low * size) - PAD_PX), min(size, ceil(high * size) + PAD_PX)
+    first, last = first // ALIGN_PX * ALIGN_PX, min(size, -(-last // ALIGN_PX) * ALIGN_PX)
+    least = min(LEAST_PX, size)
+    if last - first < least:
+        first = min(max(0, (first + last - least) // 2), size - least)
+        last = first + least
+    return first, last
+
+
+def taper(at_px: F64, first: int, last: int, size: int, over_px: float) -> F32:
+    """0 at pixels `first` and `last` to 1 so far inside of them, but at the edges of a panel of so many."""
+    weights = np.ones(len(at_px))
+    if over_px > 0 and first > 0:
+        weights = np.minimum(weights, (at_px - first) / over_px)
+    if over_px > 0 and last < size:
+        weights = np.minimum(weights, (last - at_px) / over_px)
+    return np.clip(weights, 0.0, 1.0).astype(np.float32)

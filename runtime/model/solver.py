@@ -1,0 +1,149 @@
+"""The solver: a network's proposal, the middle panel closed, and steps of all panels (docs/mathematics.md).
+
+A device (`cpu`, `gl`) does single steps; their order is here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from time import perf_counter_ns
+from typing import Protocol
+
+from runtime.clock import Stopwatch
+from runtime.model.base import STAGES, Prediction, Predictor
+from runtime.model.contract import Step
+from runtime.model.cpu import CpuBackend
+from runtime.model.geometry import Geometry, geometry_of
+from runtime.model.job import Job
+from runtime.model.network import PictureProposal
+from runtime.model.proposal import ChainProposal
+from runtime.model.targets import rest_of
+from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.records import F64, I16, Layers
+
+NEUTRAL = (rest_of(3) + 8) // 16  # code of a panel at rest, of three
+
+
+class SolverState(Protocol):
+    """The panels of one stack on one device, and what changes them. Lives from frame to frame; one thread uses it."""
+
+    def begin(self, job: Job, geometry: Geometry) -> AbstractContextManager[None]:
+        """Take what is wanted; all panels rest within their boxes. All else is done within what it answers."""
+
+    def set_panel(self, panel: int, codes: I16) -> None:
+        """What a panel shows within its box: (rows, columns[, 3]), sixteenths of a code, of any size."""
+
+    def close_middle(self) -> None:
+        """The middle panel as it is best for both eyes, while the others stay."""
+
+    def start(self) -> None:
+        """Begin steps where the panels are: without momentum."""
+
+    def step(self, step: Step) -> None:
+        """Move all panels."""
+
+    def write(self, beside: int | tuple[int, ...] | None) -> Layers:
+        """(N, h, w, 4) 8-bit codes of all panels; what is beside the boxes: rests, with a code or a colour (as eyes see
+        it) on the middle panel; None: stays what was written before. An array is the state's own until the next frame."""
+
+    def close(self) -> None:
+        """Release textures. May be called twice."""
+
+
+class SolverBackend(Protocol):
+    """A device that does the steps."""
+
+    name: str  # as `model.backend` calls it
+    context: object  # of OpenGL, whose textures it reads; None: it reads arrays
+
+    def state(self, stack: PanelStack, *, threads: int) -> SolverState:
+        """For a stack. Raises InputError where that does not fit."""
+
+    def close(self) -> None:
+        """Release what its states shared, once they are closed. May be called twice."""
+
+
+class Solver(Predictor):
+    """Steps from a network's proposal, or from even panels: any stack, any pose."""
+
+    def __init__(
+        self,
+        stack: PanelStack,
+        proposal: ChainProposal | PictureProposal | None,
+        steps: Sequence[Step],
+        *,
+        name: str,
+        threads: int = 2,
+        backend: SolverBackend | None = None,
+    ) -> None:
+        """proposal: None: panels begin even; backend: None: the processor."""
+        self.stack, self.name, self._proposal, self._steps = stack, name, proposal, tuple(steps)
+        self.provider, self.parameters, self._threads = "cpu", 0, threads
+        if proposal is not None:
+            session = proposal.session
+            self.provider, self.parameters = session.provider, session.contract.parameters
+            self.fell_back = session.fell_back
+        self.trims = isinstance(proposal, ChainProposal)
+        self.needs_rasters = isinstance(proposal, PictureProposal)
+        self.black_beside = isinstance(proposal, PictureProposal) and proposal.black_beside
+        self._backend: SolverBackend = backend or CpuBackend()
+        self._state: SolverState | None = None
+
+    @property
+    def backend(self) -> str:  # type: ignore[override]
+        return self._backend.name
+
+    def reads_textures_of(self, context: object) -> bool:
+        return context is not None and self._backend.context is context
+
+    def on_panels(self, stack: PanelStack) -> Solver | None:
+        if isinstance(self._proposal, PictureProposal) or stack.count != 3:
+            return None
+        return Solver(stack, self._proposal, self._steps, name=self.name, threads=self._threads)
+
+    def set_backend(self, backend: SolverBackend) -> None:
+        self.close()
+        self._backend = backend
+
+    def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
+        if isinstance(self._proposal, PictureProposal):
+            return self._proposal.rasters
+        return (self.stack.panel(self.stack.count // 2),)
+
+    def solve(self, job: Job) -> Prediction:
+        watch, part, beside = Stopwatch(*STAGES), job.part, (NEUTRAL if job.part is None else job.part.colour)
+        if self._state is None:
+            self._state = self._backend.state(self.stack, threads=self._threads)
+        state, steps, layers = self._state, 0, None
+        if part is not None and beside is None:  # beside the window both eyes see one picture
+            with state.begin(job, geometry_of(job, self.stack, whole=True)):
+                state.close_middle()
+                layers = state.write(NEUTRAL)
+        if part is None or part.box.width_px or layers is None:
+            geometry = geometry_of(job, self.stack)
+            with state.begin(job, geometry):
+                if part is None or part.box.width_px:
+                    steps = self._solve(job, geometry, state, watch)
+                layers = state.write(beside)
+        watch.lap("finish")
+        return Prediction(layers, watch.stage_ms, steps)
+
+    def _solve(self, job: Job, geometry: Geometry, state: SolverState, watch: Stopwatch) -> int:
+        """Steps done, the network counted."""
+        proposed = {} if self._proposal is None else self._proposal.panels(job, geometry, watch)
+        for n, codes in proposed.items():
+            state.set_panel(n, codes)
+        if geometry.middle not in proposed:
+            state.close_middle()
+        state.start()
+        for done, step in enumerate(self._steps, 1):
+            if job.deadline_ns is not None and perf_counter_ns() >= job.deadline_ns:
+                return done
+            state.step(step)
+        return 1 + len(self._steps)
+
+    def close(self) -> None:
+        if self._state is not None:
+            self._state.close()
+        self._state = None

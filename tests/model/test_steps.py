@@ -1,0 +1,180 @@
+"""The processor's steps: they are those of the reference in torch, and light gets better by them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from model_export.light import Views, step
+from runtime.config import ModelSettings
+from runtime.model.contract import Step
+from runtime.model.cpu import CpuState
+from runtime.model.geometry import geometry_of
+from runtime.model.job import Job, Own
+from runtime.model.predictor import load_predictor, steps_from_even
+from runtime.model.solver import Solver
+from runtime.model.still import solve_still
+from runtime.model.targets import FULL, SUBCODE, rest_of, target_table
+from runtime.optics.carried import light_psnrs_db
+from runtime.optics.stack import PanelStack, Tilt
+from runtime.optics.views import image_from_stack
+from runtime.records import F64, U8
+from tests.model.scenes import FOV_DEG, card_scene, eyes
+
+STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 480, 270)
+TILTED = replace(STACK, tilt=Tilt(((0.001, 0.012, -0.006), (0.0, 0.0, 0.0), (-0.002, 0.004, 0.015)), (1.0, 0.1, -0.05)))
+STACKS = {
+    "two": replace(STACK, x_m=(-0.03, 0.03)),
+    "three": STACK,
+    "tilted": TILTED,
+    "uneven": replace(STACK, x_m=(-0.05, 0.0, 0.02)),
+    "four": replace(STACK, x_m=(-0.06, -0.02, 0.02, 0.06)),
+    "five": replace(STACK, x_m=(-0.06, -0.03, 0.0, 0.03, 0.06)),
+}
+PAIRS = {
+    "in front": (eyes(0.6, 0.05, 0.1), False),
+    "own rays": (eyes(0.6, 0.05, 0.1), True),
+    "own rays, far aside": (eyes(0.4, 0.5, -0.2, roll_deg=20), True),
+}
+MANY = 0.93  # of all pixels; the rest lies where a ray just meets an edge, or hardly any slope is left
+torch.set_num_threads(1)  # its pool spins, beside the suite's other workers
+
+
+def smooth(seed: int, channels: int) -> U8:
+    """(270, 480, 3) random, smooth, over the whole range."""
+    image = cv2.GaussianBlur(np.random.default_rng(seed).random((270, 480, 3)), (0, 0), 2.0)
+    image = image if channels == 3 else image[..., :1].repeat(3, 2)
+    return np.rint(255 * np.clip(0.5 + 3 * (image - 0.5), 0, 1)).astype(np.uint8)
+
+
+def begun(stack: PanelStack, pair: F64, *, own: bool, channels: int = 3, threads: int = 2) -> tuple[CpuState, Job, Any]:
+    """A state with random panels, and what it was begun for."""
+    pictures = [smooth(seed, channels) for seed in (8, 9)]
+    job = Job([[cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA)] for picture in pictures], pair, channels=channels)  # type: ignore[list-item]
+    if own:
+        at = [image_from_stack(eye, width_px=480, height_px=270, fov_deg=FOV_DEG) for eye in pair]
+        job = replace(job, own=Own(pictures, np.stack(at)))
+    state, geometry = CpuState(stack, threads=threads), geometry_of(job, stack)
+    state.begin(job, geometry)
+    for n, box in enumerate(geometry.boxes):
+        panel = cv2.resize(smooth(n, channels), (box.width_px, box.height_px)).astype(np.int16) * SUBCODE
+        state.set_panel(n, panel if channels == 3 else panel[..., 0])
+    state.start()
+    return state, job, geometry
+
+
+def panels_of(state: CpuState, geometry: Any, channels: int) -> list[Any]:
+    return [
+        state._held.last[n, : box.height_px, : box.width_px * channels].reshape(box.height_px, box.width_px, channels)
+        for n, box in enumerate(geometry.boxes)
+    ]
+
+
+@pytest.mark.parametrize("stack", STACKS)
+@pytest.mark.parametrize("pair", PAIRS)
+@pytest.mark.parametrize("channels", [1, 3])
+def test_steps_are_the_references(stack: str, pair: str, channels: int) -> None:
+    (at, own), count = PAIRS[pair], STACKS[stack].count
+    state, job, geometry = begun(STACKS[stack], at, own=own, channels=channels)
+    boxes, rays = geometry.boxes, geometry.rays
+    seen = geometry.panels_from_rays("middle", 0.0)
+    # The reference has one size for all panels: each lies in the first corner of the largest.
+    height, width = (max(getattr(box, name) for box in boxes) for name in ("height_px", "width_px"))
+    last = torch.zeros(count, channels, height, width, dtype=torch.float64)
+    for n, panel in enumerate(panels_of(state, geometry, channels)):
+        last[n, :, : panel.shape[0], : panel.shape[1]] = torch.from_numpy(panel.astype(np.float64) / FULL).movedim(-1, 0)
+    pictures = job.own.pictures if job.own else [images[0] for images in job.pictures]
+    targets = torch.from_numpy(np.stack([p[rays.slices][..., :channels] for p in pictures]) / 255.0).movedim(-1, 1)
+    ahead, views = last, Views(torch.from_numpy(seen), rays.width_px, rays.height_px)
+    alike = len({(box.width_px, box.height_px) for box in boxes}) == 1
+    for size in (1.6, 1.2):
+        last, ahead = step(last, ahead, targets, views, size=size, momentum=0.5)
+        state.step(Step(size=size, momentum=0.5))
+    for n, panel in enumerate(panels_of(state, geometry, channels)):
+        edge = 0 if alike else 8  # beside a smaller panel the reference sees what is not there
+        rows, columns = slice(edge, panel.shape[0] - edge), slice(edge, panel.shape[1] - edge)
+        off = np.abs(panel / FULL - last[n, :, : panel.shape[0], : panel.shape[1]].movedim(0, -1).numpy())[rows, columns]
+        assert np.median(off) < 2e-3
+        assert (off < 2e-2).mean() > MANY, np.quantile(off, [0.9, 0.99, 0.999])
+
+
+def test_threads_share_a_step_without_a_trace() -> None:
+    found = []
+    for threads in (1, 3):
+        state, _, geometry = begun(TILTED, eyes(0.4, 0.3, roll_deg=20), own=True, threads=threads)
+        for places in ("rising", "falling"):
+            state.step(Step(size=1.6, places=places))  # type: ignore[arg-type]
+        state.close_middle()
+        found.append(panels_of(state, geometry, 3))
+    assert all((one == other).all() for one, other in zip(*found, strict=True))
+
+
+@pytest.mark.parametrize("stack", ["two", "three", "five"])
+def test_the_middle_panel_is_closed_to_what_one_eye_asks_of_even_ones(stack: str) -> None:
+    pair = eyes(0.6)[[0, 0]]
+    state, job, geometry = begun(STACKS[stack], pair, own=False)
+    middle, count = geometry.middle, STACKS[stack].count
+    for n, box in enumerate(geometry.boxes):
+        state.set_panel(n, np.full((box.height_px, box.width_px, 3), rest_of(count), np.int16))
+    same = replace(job, pictures=[job.pictures[0], job.pictures[0]])
+    state.begin(same, geometry)
+    state.close_middle()
+    wanted = target_table(count)[:, 0][job.arrays[0][0][geometry.rays.slices][..., :3]] - (count - 1) * rest_of(count)
+    assert np.abs(panels_of(state, geometry, 3)[middle] - np.clip(wanted, 0, FULL)).max() <= 3
+
+
+def test_many_steps_with_momentum_do_not_diverge() -> None:
+    state, _, geometry = begun(STACK, eyes(0.6), own=True)
+    changes = []
+    for _ in range(60):
+        before = [panel.copy() for panel in panels_of(state, geometry, 3)]
+        state.step(Step(size=1.3, momentum=0.6))
+        after = panels_of(state, geometry, 3)
+        changes.append(np.mean([np.abs(a.astype(int) - b).mean() for a, b in zip(after, before, strict=True)]))
+    assert changes[-1] < 0.05 * changes[0]
+
+
+@pytest.mark.parametrize("stack", [STACK, TILTED], ids=["even", "tilted"])
+@pytest.mark.parametrize("sigma_mm", [0.0, 1.0])
+def test_every_step_makes_light_better(stack: PanelStack, sigma_mm: float) -> None:
+    pair, found_db = eyes(0.6, 0.05, 0.1), []
+    pictures = [card_scene(eye) for eye in pair]
+    solver = load_predictor("best", stack, ModelSettings(threads=2))
+    assert isinstance(solver, Solver)
+    steps = solver._steps
+    for count in (0, 1, 3, len(steps)):
+        solver._steps = steps[:count]
+        how: Any = {"eyes_m": pair, "fov_deg": FOV_DEG}
+        layers = solve_still(*pictures, **how, predictor=solver, eye_sigma_mm=sigma_mm).layers
+        found_db.append(light_psnrs_db(layers, pictures, stack, **how, sigmas_mm=[sigma_mm])[sigma_mm])
+    assert found_db == sorted(found_db)
+    assert found_db[-1] > found_db[0] + 2
+
+
+@pytest.mark.parametrize("stack", [name for name in STACKS if name not in ("three", "tilted")])
+def test_panels_that_begin_even_show_both_eyes_a_picture(stack: str) -> None:
+    pair = eyes(0.6)
+    pictures = [card_scene(eye) for eye in pair]
+    solver = Solver(STACKS[stack], None, steps_from_even(3), name="even")
+    how: Any = {"eyes_m": pair, "fov_deg": FOV_DEG}
+    layers = solve_still(*pictures, **how, predictor=solver, eye_sigma_mm=0.0).layers
+    assert light_psnrs_db(layers, pictures, STACKS[stack], **how, sigmas_mm=[0.0])[0.0] > 22
+
+
+def test_equal_grey_pictures_and_panels_that_show_them_stay() -> None:
+    pair = eyes(0.6)
+    grey = np.full((270, 480, 4), 128, np.uint8)
+    state, geometry = CpuState(STACK, threads=1), geometry_of(Job([[grey], [grey]], pair), STACK)
+    state.begin(Job([[grey], [grey]], pair), geometry)
+    state.close_middle()
+    state.start()
+    before = [panel.copy() for panel in panels_of(state, geometry, 3)]
+    for _ in range(3):
+        state.step(Step(size=1.6))
+    for panel, old in zip(panels_of(state, geometry, 3), before, strict=True):
+        assert np.abs(panel.astype(int) - old).max() <= SUBCODE // 2
