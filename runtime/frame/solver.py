@@ -16,8 +16,8 @@ from runtime.content.base import View
 from runtime.errors import ContentFailure, ContextLost, ModelFailure
 from runtime.frame.policy import FramePolicy, SolutionKey
 from runtime.frame.run_state import RunCell, RunState
-from runtime.model.targets import flat_layers
 from runtime.model.job import Part
+from runtime.model.targets import flat_layers
 from runtime.model.trim import Savings
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import raster_from_stack

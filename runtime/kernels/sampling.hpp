@@ -17,6 +17,7 @@
 
 constexpr int LANES = 32;     // elements that loops work on together, whatever a processor makes of that
 constexpr int TILE_PX = 256;  // pixels of a row that are sampled at once: what they need stays in the first-level cache
+constexpr int EDGE_PX = 4;   // beyond an image, that may be looked at where a run ends a little late
 constexpr int PIECE_PX = 64;  // of a tile
 constexpr int RUN_PX = 32;    // of a row, along which a weight grows evenly
 constexpr int MAX_PANELS = 5;
@@ -137,10 +138,11 @@ INLINE void sample(const Image *images, const Line &line, int first, int last, W
   }
   for (int f = 0; f < F; ++f) {  // an image's edges go on
     int16_t *source = work.source[f] + LANES;
-    for (int c = 0; c < C; ++c) {
-      source[c - C] = source[c];
-      source[elements + c] = source[elements + C + c] = source[elements - C + c];
-    }
+    for (int beyond = 1; beyond <= EDGE_PX; ++beyond)
+      for (int c = 0; c < C; ++c) {
+        source[c - beyond * C] = source[c];
+        source[elements + (beyond - 1) * C + c] = source[elements - C + c];
+      }
   }
   const int steps = last - 1 - first;
   const double half = 0.5 * steps, middle = steps > 1 ? line.x(first + half) : 0.5 * (xs + xe);

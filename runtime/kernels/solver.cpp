@@ -66,7 +66,10 @@ Share share_of(const Problem &problem, int part, int parts, int fields) {
       double low = 1e9, high = -1e9;
       for (int set = 0; set < problem.sets; ++set) {
         const Line line(problem.rays_from_panels + (set * problem.panels + n) * 9, q);
-        for (double u : {-0.5, image.width - 0.5}) low = std::min(low, line.y(u)), high = std::max(high, line.y(u));
+        const double right = image.width - 0.5, top = line.y(-0.5), bottom = line.y(right);
+        const double run = std::abs(line.x(right) - line.x(-0.5));
+        const double beside = 2 * std::abs(bottom - top) / std::max(run, 1.0);  // two pixels further along the line
+        low = std::min({low, top - beside, bottom - beside}), high = std::max({high, top + beside, bottom + beside});
       }
       const int since = int(std::clamp(std::floor(low), 0.0, height - 1.0));
       until[q] = latest = std::max(latest, int(std::clamp(std::floor(high) + 1, 0.0, height - 1.0)));

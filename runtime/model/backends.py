@@ -17,9 +17,8 @@ from runtime.optics.stack import PanelStack
 from runtime.records import U8
 
 if TYPE_CHECKING:
+    from runtime.model.device import SolverBackend
     from runtime.model.gl.backend import GlBackend
-    from runtime.model.solver import SolverBackend
-    from runtime.support.gl_sharing import ShareGroup
 
 log = logging.getLogger("phasestack.model")
 
@@ -39,13 +38,10 @@ class Choice:
     why: str  # one line, with what was measured
 
 
-def choose(
-    wanted: Wanted, predictor: Predictor, context: Callable[[], Any], *, group: ShareGroup | None = None
-) -> Choice:
+def choose(wanted: Wanted, predictor: Predictor, context: Callable[[], Any]) -> Choice:
     """The backend for a model that is loaded. Tells the log what it found.
 
     context: an OpenGL context, current on this thread, asked for where one is needed; it may raise MissingPart.
-    group: the context's, where solutions are shown from its textures.
     auto: whichever is faster here, whatever it is called; the processor where OpenGL can't be had or used.
     Raises MissingPart (gl without OpenGL), InputError (a panel too large for the driver), ModelFailure.
     """
@@ -54,9 +50,9 @@ def choose(
     elif wanted == "cpu":
         choice = Choice(_cpu(), "as asked for")
     elif wanted == "gl":
-        choice = Choice(_gl(context(), predictor.stack, group), "as asked for")
+        choice = Choice(_gl(context(), predictor.stack), "as asked for")
     else:
-        choice = _faster(predictor, lambda: _gl(context(), predictor.stack, group))
+        choice = _faster(predictor, lambda: _gl(context(), predictor.stack))
     log.info("backend: %s (%s)", choice.backend.name, choice.why)
     return choice
 
@@ -67,10 +63,10 @@ def _cpu() -> SolverBackend:
     return CpuBackend()
 
 
-def _gl(context: Any, stack: PanelStack, group: ShareGroup | None) -> GlBackend:
+def _gl(context: Any, stack: PanelStack) -> GlBackend:
     from runtime.model.gl.backend import GlBackend
 
-    return GlBackend(context, stack, group=group)
+    return GlBackend(context, stack)
 
 
 def _faster(predictor: Predictor, made: Callable[[], GlBackend]) -> Choice:

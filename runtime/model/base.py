@@ -13,7 +13,7 @@ from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, U8, Layers, pixels_of
 
 if TYPE_CHECKING:
-    from runtime.model.solver import SolverBackend
+    from runtime.model.device import SolverBackend
 
 
 STAGES = ("prepare", "inference", "finish")  # inference: the network alone

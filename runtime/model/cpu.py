@@ -157,4 +157,3 @@ class _Buffers:
         shape = (stack.count, stack.height_px + 1, stack.width_px * channels + SAFE)
         self.last, self.ahead, self.moved = (np.zeros(shape, np.int16) for _ in range(3))
         self.phasors = np.zeros((shape[0], 2, *shape[1:]), np.int16)  # cosine and sine
-

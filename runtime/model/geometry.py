@@ -1,4 +1,4 @@
-"""What a solution looks along: parts of panels, and for each eye the panels' pixels that its rays cross, by homographies.
+"""What a solution looks along: parts of panels, and for each eye the homographies from its rays to the panels' pixels.
 
 A ray belongs to a pixel of a raster: a still picture's own pixels, or the middle panel's where content is drawn there.
 """
@@ -23,7 +23,9 @@ from runtime.records import F32, F64
 PAD_PX = 2  # of what is visible
 ALIGN_PX = 8  # boxes begin and end at multiples of this, so that a half or a quarter of them is whole
 LEAST_PX = 32
-MIN_WEIGHT = 0.05  # of a corner in a picture's homography, beside the middle's: nearer to the eye's plane it has no place
+MIN_WEIGHT = (
+    0.05  # of a corner in a picture's homography, beside the middle's: nearer to the eye's plane it has no place
+)
 TAPERED_SHARE = 1 / 6  # of a window's taper, over which its rays fade: they mend the error of the wave's own
 PLACES: dict[Places, tuple[tuple[float, float], ...]] = {  # right and up, standard deviations of the eyes' place
     "middle": ((0.0, 0.0),),
@@ -82,10 +84,13 @@ class Geometry:
         )
 
 
-def geometry_of(job: Job, stack: PanelStack, *, whole: bool = False) -> Geometry:
-    """For a job's part of the panels, or for all of what its eyes see of them."""
-    part = None if whole else job.part
-    if part is None:
+def geometry_of(job: Job, stack: PanelStack, *, whole: bool = False, unseen: bool = False) -> Geometry:
+    """For a job's part of the panels; whole: for all of what its eyes see of them; unseen: and all else."""
+    part = None if whole or unseen else job.part
+    if unseen:
+        boxes: tuple[PixelRect, ...] = (PixelRect(0, 0, stack.width_px, stack.height_px),) * stack.count
+        kept, taper_px = boxes[0], (0.0, 0.0)
+    elif part is None:
         boxes = visible_boxes(job.eyes_m, stack)
         kept, taper_px = boxes[stack.count // 2], (0.0, 0.0)
     else:

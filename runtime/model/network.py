@@ -1,4 +1,4 @@
-"""Whole-picture networks as a proposal: eye pictures on panel rasters in, panel values out (the published U-Net's kind)."""
+"""Whole-picture networks as a proposal: eye pictures on panel rasters in, panel values out (as the published U-Net)."""
 
 from __future__ import annotations
 

@@ -78,7 +78,9 @@ class ChainProposal:
             to_plane = local.plane_from_local @ frame.plane_from_frame(local.eyes_m[side], x_m=raster.x_m)
             half = lacked if (side == 1) == (local.order == (0, 1)) else -lacked
             size = frame.rows, frame.width_px
-            return resample(half, raster.raster_from_plane() @ to_plane, size=size, cubic=True, result_columns=frame.columns)
+            return resample(
+                half, raster.raster_from_plane() @ to_plane, size=size, cubic=True, result_columns=frame.columns
+            )
 
         left, right = at_once(seen, (0, 1))
         waves, shifted_waves, spectrum, modes_in = chain_modes(frame.cells)
@@ -105,7 +107,7 @@ class ChainProposal:
         """Half of what the right eye wants more than the left one, on a coarser raster of the middle panel's box."""
         left, right, unseen = coarse_pictures(job, geometry, self._reduction)
         phases = [cv2.LUT(picture, self._codes) for picture in (left, right)]
-        half: I16 = (phases[1] - phases[0]) >> 1
+        half: I16 = np.right_shift(phases[1].astype(np.int16) - phases[0].astype(np.int16), 1)
         if unseen is not None:
             half[unseen] = 0  # what one eye's picture does not show contradicts nothing
         kernel = np.array([-SHARPENED, 1 + 2 * SHARPENED, -SHARPENED])
@@ -120,7 +122,10 @@ class ChainProposal:
         # The answer begins one parallax before the first column.
         begin = np.array([[1.0, 0.0, frame.cell_px], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
         columns = ColumnLaw(frame.columns.bend, frame.columns.middle + frame.cell_px)
-        matrix, size = begin @ to_frame @ seen_from_layer @ raster.plane_from_raster(), (raster.height_px, raster.width_px)
+        matrix, size = (
+            begin @ to_frame @ seen_from_layer @ raster.plane_from_raster(),
+            (raster.height_px, raster.width_px),
+        )
         codes = resample(answer, matrix, size=size, cubic=True, edge=cv2.BORDER_REPLICATE, image_columns=columns)
         np.clip(codes, 0, FULL, out=codes)
         if max(geometry.taper_px) > 0:
@@ -181,9 +186,8 @@ def resample(
     image_columns: ColumnLaw = EVEN_COLUMNS,
     result_columns: ColumnLaw = EVEN_COLUMNS,
 ) -> NDArray[Any]:
-    """Samples of an image (h, w[, C]) on a raster of (rows, columns), through a homography between what the two laws make
-    of columns; pixel centres at half-integers. edge: OpenCV's name for what lies beside the image.
-    """
+    """Samples of an image (h, w[, C]) on a raster of (rows, columns), through a homography between what the two laws
+    make of columns; pixel centres at half-integers. edge: OpenCV's name for what lies beside the image."""
     flags = cv2.INTER_CUBIC if cubic else cv2.INTER_LINEAR
     if not (image_columns.bend or result_columns.bend):
         matrix, flags = _at_centres(image_from_result), flags | cv2.WARP_INVERSE_MAP
@@ -205,15 +209,15 @@ def _local(geometry: Geometry, *, whole: bool) -> _Local:
         pitch_m = np.array([stack.width_m / stack.width_px, stack.height_m / stack.height_px])
         y_m = ((box.u0 + box.u1 - stack.width_px) / 2) * pitch_m[0]
         z_m = ((stack.height_px - box.v0 - box.v1) / 2) * pitch_m[1]
-        size = {"width_px": box.width_px, "height_px": box.height_px}
-        extent = {"width_m": box.width_px * pitch_m[0], "height_m": box.height_px * pitch_m[1]}
-        stack, eyes_m = replace(stack, **size, **extent, tilt=None), eyes_m - np.array([0.0, y_m, z_m])
+        across_m, down_m = box.width_px * pitch_m[0], box.height_px * pitch_m[1]
+        stack = PanelStack(float(across_m), float(down_m), stack.x_m, box.width_px, box.height_px)
+        eyes_m = eyes_m - np.array([0.0, y_m, z_m])
         plane_from_local = np.array([[1.0, 0.0, y_m], [0.0, 1.0, z_m], [0.0, 0.0, 1.0]])
-    across_m = np.abs(eyes_m[1] - eyes_m[0])
-    if across_m[2] > across_m[1]:  # eyes above each other: what was down (-z) is to the right (+y)
+    apart_m = np.abs(eyes_m[1] - eyes_m[0])
+    if apart_m[2] > apart_m[1]:  # eyes above each other: what was down (-z) is to the right (+y)
         eyes_m = np.stack([eyes_m[:, 0], -eyes_m[:, 2], -eyes_m[:, 1]], axis=1)
         stack, plane_from_local = replace(stack, tilt=None).transposed(), plane_from_local @ _SWAPPED
-    elif not across_m.any():  # one eye that stands for both asks for no difference: any line will do
+    elif not apart_m.any():  # one eye that stands for both asks for no difference: any line will do
         eyes_m = eyes_m + HALF_IPD_M * np.array([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
     order = (0, 1) if eyes_m[1, 1] >= eyes_m[0, 1] else (1, 0)
     return _Local(stack, eyes_m[list(order)], order, plane_from_local)

@@ -54,7 +54,9 @@ class SartPredictor(Predictor):
                 for target, matrices in zip(targets, forward, strict=True)
             ]
             for n, panel in enumerate(panels):
-                panel += share * sum(_warp(residual, matrices[n]) for residual, matrices in zip(residuals, back, strict=True))
+                panel += share * sum(
+                    _warp(residual, matrices[n]) for residual, matrices in zip(residuals, back, strict=True)
+                )
                 np.clip(panel, 0, 1, out=panel)
         watch.lap("inference")
         layers = np.full((stack.count, stack.height_px, stack.width_px, 4), 255, np.uint8)

@@ -6,62 +6,22 @@ A device (`cpu`, `gl`) does single steps; their order is here.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from time import perf_counter_ns
-from typing import Protocol
 
 from runtime.clock import Stopwatch
 from runtime.model.base import STAGES, Prediction, Predictor
 from runtime.model.contract import Step
 from runtime.model.cpu import CpuBackend
+from runtime.model.device import SolverBackend, SolverState
 from runtime.model.geometry import Geometry, geometry_of
 from runtime.model.job import Job
 from runtime.model.network import PictureProposal
 from runtime.model.proposal import ChainProposal
 from runtime.model.targets import rest_of
 from runtime.optics.stack import PanelStack, PlaneRaster
-from runtime.records import F64, I16, Layers
+from runtime.records import F64
 
 NEUTRAL = (rest_of(3) + 8) // 16  # code of a panel at rest, of three
-
-
-class SolverState(Protocol):
-    """The panels of one stack on one device, and what changes them. Lives from frame to frame; one thread uses it."""
-
-    def begin(self, job: Job, geometry: Geometry) -> AbstractContextManager[None]:
-        """Take what is wanted; all panels rest within their boxes. All else is done within what it answers."""
-
-    def set_panel(self, panel: int, codes: I16) -> None:
-        """What a panel shows within its box: (rows, columns[, 3]), sixteenths of a code, of any size."""
-
-    def close_middle(self) -> None:
-        """The middle panel as it is best for both eyes, while the others stay."""
-
-    def start(self) -> None:
-        """Begin steps where the panels are: without momentum."""
-
-    def step(self, step: Step) -> None:
-        """Move all panels."""
-
-    def write(self, beside: int | tuple[int, ...] | None) -> Layers:
-        """(N, h, w, 4) 8-bit codes of all panels; what is beside the boxes: rests, with a code or a colour (as eyes see
-        it) on the middle panel; None: stays what was written before. An array is the state's own until the next frame."""
-
-    def close(self) -> None:
-        """Release textures. May be called twice."""
-
-
-class SolverBackend(Protocol):
-    """A device that does the steps."""
-
-    name: str  # as `model.backend` calls it
-    context: object  # of OpenGL, whose textures it reads; None: it reads arrays
-
-    def state(self, stack: PanelStack, *, threads: int) -> SolverState:
-        """For a stack. Raises InputError where that does not fit."""
-
-    def close(self) -> None:
-        """Release what its states shared, once they are closed. May be called twice."""
 
 
 class Solver(Predictor):
@@ -121,7 +81,8 @@ class Solver(Predictor):
                 state.close_middle()
                 layers = state.write(NEUTRAL)
         if part is None or part.box.width_px or layers is None:
-            geometry = geometry_of(job, self.stack)
+            # Of a network of whole pictures all that it answers is shown.
+            geometry = geometry_of(job, self.stack, unseen=self.needs_rasters)
             with state.begin(job, geometry):
                 if part is None or part.box.width_px:
                     steps = self._solve(job, geometry, state, watch)

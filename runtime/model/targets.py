@@ -26,8 +26,8 @@ def rest_of(panels: int) -> int:
 
 @lru_cache(maxsize=8)
 def target_table(panels: int) -> F32:
-    """(256, 2) for each code that an eye should see: the sum of so many panels, in sixteenths of a code, nearest to where
-    they rest; and how much a ray weighs that wants it, by the slope of sin² there, 1 at its steepest."""
+    """(256, 2) for each code that an eye should see: the sum of so many panels, in sixteenths of a code, nearest to
+    where they rest; and how much a ray weighs that wants it, by the slope of sin² there, 1 at its steepest."""
     intensities = np.arange(256) / 255.0
     slope = int(REST.get(panels, 1.5 / panels) * panels)  # 1 falls from 1 to 2, 2 rises again
     rise = 2 / np.pi * np.arcsin(np.sqrt(intensities))

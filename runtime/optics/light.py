@@ -91,13 +91,13 @@ def squared_error(
     return float(total / counted)
 
 
-def _squared_error(
-    codes: U8, view: View, table: F32, sampling: Sampling, first: int, last: int
-) -> tuple[float, int]:
+def _squared_error(codes: U8, view: View, table: F32, sampling: Sampling, first: int, last: int) -> tuple[float, int]:
     """Sum of the squared error over some rows of one eye's picture, and of how many numbers."""
     count, height, width, components = codes.shape
     target, table = np.ascontiguousarray(view.target, np.float32), np.ascontiguousarray(table, np.float32)
-    matrices = [np.ascontiguousarray(x, np.float64) for x in (view.centre_from_image, view.panels_from_centre, view.toward)]
+    matrices = [
+        np.ascontiguousarray(x, np.float64) for x in (view.centre_from_image, view.panels_from_centre, view.toward)
+    ]
     given = kernels.View(
         layers=codes.ctypes.data, panels=count, height=height, width=width, components=components,
         target=target.ctypes.data, rows=target.shape[0], columns=target.shape[1],

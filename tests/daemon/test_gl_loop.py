@@ -23,7 +23,6 @@ from runtime.records import SolveRequest
 from runtime.support.gl import offscreen_context
 from runtime.support.memory import give_back
 from tests.daemon.rig import Rig
-from tests.model.plain_panels import hold_exactly
 from tests.panels import xserver
 from tests.waiting import eventually
 
@@ -38,7 +37,6 @@ ON_WINDOWS: dict[str, Any] = {
 
 @pytest.mark.parametrize("scene", ["demo", "grey"])
 def test_pictures_in_textures_are_solved_as_pictures_in_arrays_are(scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    hold_exactly(monkeypatch)
     eyes_m = np.array([[0.6, -0.031, 0.05], [0.6, 0.031, 0.05]])
     request = SolveRequest(0, eyes_m, "predicted", 0.001, flat_wanted=False)
     layers = []

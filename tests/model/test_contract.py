@@ -38,13 +38,11 @@ def test_shipped_models_keep_their_contract_and_are_small(name: str) -> None:
         ({"surprise": 1}, "surprise"),
         ({"panels": "three"}, "panels"),
         ({"value_range": [0, "x"]}, "value_range"),
-        ({"steps": [{"kind": "front"}]}, "must begin with a chain step"),
-        ({"steps": [{"kind": "chain"}, {"kind": "chain"}]}, "the only one"),
-        ({"steps": []}, "needs one at least"),
+        ({"steps": [{"kind": "front"}]}, "kind"),
+        ({"steps": [{"size": -1}]}, "size"),
         ({"cell_px": -1}, "cell_px"),
         ({"cell_px": 1e9}, "cell_px"),
         ({"outputs": []}, "outputs"),
-        ({"refining": [{"kind": "rear"}]}, "refining: must be joint steps"),
     ],
 )
 def test_a_contract_that_does_not_fit_is_refused_by_field(change: dict[str, object], field: str) -> None:

@@ -7,9 +7,9 @@ import pytest
 
 from runtime.config import ModelSettings
 from runtime.errors import EyesNotServed, ModelFailure
+from runtime.model.geometry import visible_boxes
 from runtime.model.job import Job
 from runtime.model.predictor import load_predictor
-from runtime.model.geometry import visible_boxes
 from runtime.model.sart import SartPredictor
 from runtime.model.still import solve_still
 from runtime.optics.carried import expected_psnrs_db

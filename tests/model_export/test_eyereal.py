@@ -18,8 +18,9 @@ from model_export.eyereal import EyeRealNet  # noqa: E402
 from runtime.content.eyereal import Pair, read_folder  # noqa: E402
 from runtime.errors import InputError  # noqa: E402
 from runtime.model.contract import parse_contract  # noqa: E402
-from runtime.model.network import NetworkPredictor  # noqa: E402
+from runtime.model.network import PictureProposal  # noqa: E402
 from runtime.model.session import ModelSession  # noqa: E402
+from runtime.model.solver import Solver  # noqa: E402
 from runtime.model.still import solve_still  # noqa: E402
 from runtime.optics.stack import PanelStack  # noqa: E402
 from runtime.support.artifacts import read_image, write_png  # noqa: E402
@@ -162,12 +163,13 @@ def pair_of(folder: Path, place: str) -> Pair:
     return pair
 
 
-def predictor_of(official: Path, folder: Path) -> NetworkPredictor:
+def predictor_of(official: Path, folder: Path) -> Solver:
     path = folder / "eyereal.onnx"
     path.write_bytes(eyereal_file(official, width_px=SIZE[0], height_px=SIZE[1], eye_order="right-left"))
     # The published code's panels of lego_bulldozer: with square pixels, whatever their shape.
     stack = PanelStack(0.5184, 0.5184 * SIZE[1] / SIZE[0], (-0.06, 0.0, 0.06), *SIZE)
-    return NetworkPredictor(ModelSession(path, threads=1), stack, source=path)
+    session = ModelSession(path, threads=1)
+    return Solver(stack, PictureProposal(session, stack, source=path), (), name=session.contract.name)
 
 
 @pytest.mark.parametrize("place", EYES)
@@ -179,7 +181,7 @@ def test_what_the_network_is_fed_and_the_layers_that_are_shown_are_the_official_
     predictor = predictor_of(official, tmp_path)
     pictures = [read_image(path) for path in pair.paths]
     done = solve_still(*pictures, eyes_m=pair.eyes_m, fov_deg=40.0, predictor=predictor)
-    fed, wanted = predictor._input[0], golden(f"{place}_x")
+    fed, wanted = predictor._proposal._input[0], golden(f"{place}_x")
     if place == "near":
         assert (wanted == 0).mean() > 0.3, "the case must have black beside"
     codes = np.abs(fed - wanted) * 255
@@ -203,10 +205,12 @@ def test_pictures_of_another_view_are_black_beside_the_network_s_own_40_degrees(
     predictor = predictor_of(official, tmp_path)
     white = np.full((200, 320, 3), 255, np.uint8)
     solve_still(white, white, eyes_m=pair.eyes_m, fov_deg=70.0, predictor=predictor)
-    fed, beside = predictor._input[0], golden("near_x") == 0
+    fed, beside = predictor._proposal._input[0], golden("near_x") == 0
     assert (fed[beside] < 0.6).all() and fed[beside].mean() < 0.01
     solve_still(white, white, eyes_m=pair.eyes_m, fov_deg=20.0, predictor=predictor)
-    assert (predictor._input[0] == 0).mean() > 0.7, "a smaller picture ends in black too, not in its repeated edge"
+    assert (predictor._proposal._input[0] == 0).mean() > 0.7, (
+        "a smaller picture ends in black too, not in its repeated edge"
+    )
     predictor.close()
 
 

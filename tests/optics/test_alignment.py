@@ -11,7 +11,7 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from runtime.model.reprojection import NEUTRAL
+from runtime.model.solver import NEUTRAL
 from runtime.optics.alignment import (
     EVEN_CODE,
     FARTHEST_M,

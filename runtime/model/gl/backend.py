@@ -9,7 +9,6 @@ from runtime.model.gl.programs import Passes
 from runtime.model.gl.state import GlState, check_size
 from runtime.optics.stack import PanelStack
 from runtime.support.gl import describe
-from runtime.support.gl_sharing import LayerPool, ShareGroup
 
 
 class GlBackend:
@@ -17,21 +16,17 @@ class GlBackend:
 
     name = "gl"
 
-    def __init__(self, context: Any, stack: PanelStack, *, group: ShareGroup | None = None) -> None:
-        """context: the content's, or one of the backend's own; whoever made it releases it. group: of a context that
-        shows solutions from its textures: they are left there (`LayerTextures`). Raises InputError where a panel of
-        the stack is too large for the driver."""
+    def __init__(self, context: Any, stack: PanelStack) -> None:
+        """context: the content's, or one of the backend's own; whoever made it releases it. Raises InputError where a
+        panel of the stack is too large for the driver."""
         check_size(context, stack)
         self.context = context
         self.passes = Passes(context)
-        self._pool = None if group is None else LayerPool(context, group)
         self.renderer = describe(context)["renderer"]
 
     def state(self, stack: PanelStack, *, threads: int) -> GlState:
-        return GlState(self.passes, stack, pool=self._pool)
+        return GlState(self.passes, stack)
 
     def close(self) -> None:
         with suppress(Exception):  # of a context that is lost there is nothing to release
             self.passes.release()
-            if self._pool is not None:
-                self._pool.close()

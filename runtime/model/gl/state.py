@@ -21,26 +21,22 @@ from runtime.model.gl.programs import Image, Passes
 from runtime.model.job import Job
 from runtime.model.targets import FULL, SUBCODE, middle_codes, rest_of, target_table
 from runtime.optics.stack import PanelStack
-from runtime.records import F64, I16, Layers
+from runtime.records import F64, I16, U8
 from runtime.support.gl import DrawnPicture, finish
-from runtime.support.gl_sharing import LayerPool, LayerTextures, wait_until_drawn
 
 PANELS, MIDDLE = 3, 1
-HALVES = 32768 / 65535  # of 0, as numbers of either sign are held
 
 
 class GlState:
     """A `SolverState` of three panels. Used on the thread of its context, which is current whenever a job begins."""
 
-    def __init__(self, passes: Passes, stack: PanelStack, *, pool: LayerPool | None = None) -> None:
-        """passes: of a context that others may use too. pool: where solutions are left; None: they are read back.
-        Raises InputError where a panel is too large for the driver."""
+    def __init__(self, passes: Passes, stack: PanelStack) -> None:
+        """passes: of a context that others may use too. Raises InputError where a panel is too large for the driver."""
         check_size(passes.context, stack)
-        self._passes, self._stack, self._pool = passes, stack, pool
+        self._passes, self._stack = passes, stack
         self._textures: dict[tuple[Any, ...], Any] = {}
         self._names: dict[str, str] = {}  # which of two images is which
-        self._left: LayerTextures | None = None
-        self._layers = None if pool is not None else np.empty((PANELS, stack.height_px, stack.width_px, 4), np.uint8)
+        self._layers = np.empty((PANELS, stack.height_px, stack.width_px, 4), np.uint8)
         self._closed = False
 
     @contextmanager
@@ -70,18 +66,17 @@ class GlState:
         gathered: dict[str, Image] = {"last": self._panel("last", MIDDLE)}
         for side in (0, 1):
             weight, lacked = (self._rays(f"{name}{side}") for name in ("weight", "lacked"))
-            self._draw("lack", (weight, lacked), {**inputs, **self._wanted(side)}, {**self._through(seen[side]), "rest": 0.5})
+            self._draw(
+                "lack", (weight, lacked), {**inputs, **self._wanted(side)}, {**self._through(seen[side]), "rest": 0.5}
+            )
             gathered |= {f"weight{side}": weight, f"lacked{side}": lacked}
         self._draw("fill", (self._panel("spare", MIDDLE),), gathered, self._back(back[:, MIDDLE]))
         self._swap("last", "spare", MIDDLE)
 
     def start(self) -> None:
         for n in range(PANELS):
-            whole = self._geometry.boxes[n]
-            self._passes.context.copy_framebuffer(
-                self._passes.target((self._panel("ahead", n),)), self._passes.target((self._panel("last", n),))
-            )
-            del whole
+            ahead, last = (self._passes.target((self._panel(name, n),)) for name in ("ahead", "last"))
+            self._passes.context.copy_framebuffer(ahead, last)
 
     def step(self, step: Step) -> None:
         seen, back = self._homographies(self._geometry.panels_from_rays(step.places, self._sigma_mm))
@@ -109,14 +104,9 @@ class GlState:
             self._swap("ahead", "moved", n)
             self._swap("last", "spare", n)
 
-    def write(self, beside: int | tuple[int, ...] | None) -> Layers:
+    def write(self, beside: int | tuple[int, ...] | None) -> U8:
         width, height = self._stack.width_px, self._stack.height_px
-        if self._pool is None:
-            targets = [self._texture(("layer", n), (width, height), 4, dtype="f1") for n in range(PANELS)]
-        else:
-            if beside is not None or self._left is None:
-                self._left = left_in(self._pool, self._passes, self._stack)
-            targets = list(self._left.textures)
+        targets = [self._texture(("layer", n), (width, height), 4, dtype="f1") for n in range(PANELS)]
         for n, texture in enumerate(targets):
             image, box = Image(texture, width, height), self._geometry.boxes[n]
             kept = self._geometry.kept if n == MIDDLE else box
@@ -126,11 +116,7 @@ class GlState:
                 place = {"first": (kept.u0 - box.u0, kept.v0 - box.v0), "grey": self._channels == 1}
                 inputs = {"last": self._panel("last", n)}
                 self._draw("show", (image,), inputs, place, at=(kept.u0, kept.v0, kept.width_px, kept.height_px))
-        if self._left is not None:
-            wait_until_drawn()
-            return self._left
         finish()
-        assert self._layers is not None
         for texture, layer in zip(targets, self._layers, strict=True):
             self._passes.target((Image(texture, width, height),)).read_into(layer, components=4)
         return self._layers
@@ -204,7 +190,9 @@ class GlState:
 
     @property
     def _longest(self) -> int:
-        return max(self._stack.width_px, self._stack.height_px, self._geometry.rays.width_px, self._geometry.rays.height_px)
+        return max(
+            self._stack.width_px, self._stack.height_px, self._geometry.rays.width_px, self._geometry.rays.height_px
+        )
 
     def _panel(self, name: str, n: int) -> Image:
         """The box's part of an image as large as a whole panel: boxes follow the viewer, textures don't."""
@@ -241,15 +229,6 @@ class GlState:
             made.filter, made.repeat_x, made.repeat_y = (smooth, smooth), False, False
             self._textures[key] = made
         return self._textures[key]
-
-
-def left_in(pool: LayerPool, passes: Passes, stack: PanelStack) -> LayerTextures:
-    """Textures for a stack's layers to be left in; those of sizes that nobody asks for any more are released."""
-    left = pool.taken(stack.count, width_px=stack.width_px, height_px=stack.height_px)
-    for textures in pool.surplus():
-        for texture in textures:
-            passes.forget(texture)
-    return left
 
 
 def check_size(context: moderngl.Context, stack: PanelStack) -> None:
