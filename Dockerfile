@@ -24,6 +24,7 @@ ARG BASE=python:3.11.14-slim-bookworm@sha256:65a93d69fa75478d554f4ad27c85c1e69fa
 
 FROM ${BASE} AS build
 WORKDIR /src
+RUN apt-get update && apt-get install -y --no-install-recommends g++ && rm -rf /var/lib/apt/lists/*
 # Dependencies first: they change less often than the program.
 COPY requirements/runtime.lock requirements/
 RUN python -m venv /opt/phasestack \

@@ -95,7 +95,7 @@ gallery: $(VENV)/.test
 hashes:
 	sh requirements/make_hashes.sh
 
-# Debian's packages: OpenGL without a screen, the USB and OpenNI2 libraries. Only root can install them.
+# Debian's packages: g++, OpenGL without a screen, the USB and OpenNI2 libraries. Only root can install them.
 system:
 	@sh systemd/packages.sh
 
@@ -103,7 +103,7 @@ $(VENV)/.created:
 	$(PYTHON) -m venv $(VENV)
 	@touch $@
 
-$(VENV)/.runtime: $(VENV)/.created requirements/runtime.lock pyproject.toml | system
+$(VENV)/.runtime: $(VENV)/.created requirements/runtime.lock pyproject.toml $(wildcard runtime/kernels/*.?pp) | system
 	$(BIN)/python -m pip install --quiet -r requirements/runtime.lock
 	$(BIN)/python -m pip install --quiet --no-deps --editable .
 	@touch $@
@@ -119,4 +119,4 @@ $(VENV)/.docs: $(VENV)/.test requirements/docs.lock
 	@touch $@
 
 clean:
-	rm -rf $(VENV) build dist out *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) build dist out *.egg-info runtime/kernels/*.so .mypy_cache .ruff_cache .pytest_cache

@@ -63,7 +63,7 @@ class Result:
     layers: U8  # (panels, h, w, 3), rear to front
     model: str  # what solved: a stack that the networks do not serve is solved by `sart`
     eye_sigma_mm: float
-    total_ms: float  # of this one call, its first-time compiling included
+    total_ms: float  # of this one call
 
     def __init__(self, layers: U8, pair: _Pair, *, model: str, eye_sigma_mm: float, total_ms: float) -> None:
         self.layers, self.model, self.eye_sigma_mm, self.total_ms = layers, model, eye_sigma_mm, total_ms

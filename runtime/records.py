@@ -20,7 +20,7 @@ Inference = Literal["ran", "reused", "skipped"]
 
 
 class HeldLayers(Protocol):
-    """Layers (N, h, w, 4) that lie elsewhere than in memory: in textures (`support.gl_sharing`)."""
+    """Layers (N, h, w, 4) that lie elsewhere than in memory: in textures."""
 
     @property
     def shape(self) -> tuple[int, ...]:

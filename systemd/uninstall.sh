@@ -6,7 +6,7 @@ usage() {
 Removes what install.sh has put there: sh systemd/uninstall.sh (as root), or `make uninstall`.
 
   DESTDIR=/some/root  the tree that it was installed in
-  PURGE=yes           also the configuration, the state and the cache
+  PURGE=yes           also the configuration and the state
 
 Example: PURGE=yes sh systemd/uninstall.sh
 HELP
@@ -38,14 +38,14 @@ rm -f /run/phasestack.failures /run/phasestack-x.failures
 rm -rf "$DESTDIR/usr/lib/phasestack" "$DESTDIR/opt/phasestack" "$DESTDIR/usr/share/doc/phasestack" \
   "$DESTDIR/usr/lib/systemd/system/phasestack.service.d"
 if [ "${PURGE:-no}" = yes ]; then
-  rm -rf "$DESTDIR/etc/phasestack" "$DESTDIR/var/lib/phasestack" "$DESTDIR/var/cache/phasestack"
+  rm -rf "$DESTDIR/etc/phasestack" "$DESTDIR/var/lib/phasestack"
 fi
 if [ "$live" = yes ]; then
   systemctl daemon-reload
   udevadm control --reload 2>/dev/null || true
 fi
 echo "phasestack is removed${DESTDIR:+ from $DESTDIR}"
-for left in /etc/phasestack /var/lib/phasestack /var/cache/phasestack; do
+for left in /etc/phasestack /var/lib/phasestack; do
   [ ! -e "$DESTDIR$left" ] || echo "  left: $DESTDIR$left (PURGE=yes takes it)"
 done
 [ "$live" = no ] || ! id phasestack >/dev/null 2>&1 || echo "  left: the user and group phasestack (userdel phasestack)"

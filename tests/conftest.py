@@ -27,18 +27,12 @@ def pytest_configure(config: pytest.Config) -> None:
     if hasattr(config, "workerinput"):
         for name in THREADS:
             os.environ.setdefault(name, "1")
-    home = os.environ.get("XDG_CACHE_HOME", "")
-    compiled = (Path(home) if home else Path.home() / ".cache") / "phasestack" / "compiled"
     folder = Path(tempfile.mkdtemp(prefix="phasestack-tests-"))  # short: a socket's path has at most 107 bytes
     config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
     for name in ("STATE", "CACHE", "RUNTIME", "CONFIG", "DATA"):
         own = folder / name.lower()
         own.mkdir(mode=0o700)
         os.environ[f"XDG_{name}_{'DIR' if name == 'RUNTIME' else 'HOME'}"] = str(own)
-    # Compiled kernels alone are the user's: a folder's name says what they were compiled from, and it takes 20 seconds.
-    compiled.mkdir(mode=0o700, parents=True, exist_ok=True)
-    (folder / "cache" / "phasestack").mkdir(mode=0o700)
-    (folder / "cache" / "phasestack" / "compiled").symlink_to(compiled)
 
 
 @pytest.fixture(autouse=True)

@@ -144,33 +144,3 @@ def test_every_wrong_field_of_a_file_is_told_in_one_line(tmp_path: Path) -> None
     assert parts[0].startswith(f"{tmp_path}/phasestack.toml: stack.width_m: ")
     assert any(part.startswith("content.up: is no setting") for part in parts)
     assert any(part.startswith("loop.rate_hz: ") for part in parts) and "loop.zebra: is no setting" in parts
-
-
-def test_a_user_whom_the_system_does_not_know_and_who_has_no_home_is_served(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """`docker run --user 12345` ended with exit code 70."""
-    monkeypatch.setenv("XDG_CACHE_HOME", "")
-    monkeypatch.delenv("HOME")
-    monkeypatch.setattr(pwd, "getpwuid", {}.__getitem__)  # as for such a user
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    folders._root.cache_clear()
-    assert folders.user_cache("a").parent == tmp_path / f"phasestack-{os.geteuid()}"
-    folders._root.cache_clear()
-
-
-def test_a_cache_that_can_not_be_written_is_told_once_and_kept_elsewhere(tmp_path: Path, monkeypatch: Any) -> None:
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    told: list[str] = []
-    monkeypatch.setattr(folders.log, "warning", lambda text, *what: told.append(text % what))
-    assert [folders.user_cache(name).parent for name in "ab"] == [tmp_path / f"phasestack-{os.geteuid()}"] * 2
-    assert len(told) == 1 and "can't be written" in told[0]
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file" / "other"))
-    (tmp_path / f"phasestack-{os.geteuid()}").chmod(0o755)
-    assert folders.user_cache("a").parent == folders.NOWHERE, "what others may write is not loaded"
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "shared"))
-    (tmp_path / "shared" / "phasestack").mkdir(mode=0o777, parents=True)
-    (tmp_path / "shared" / "phasestack").chmod(0o777)
-    assert folders.user_cache("a").parent == folders.NOWHERE, "what others may write is not loaded"

@@ -8,6 +8,7 @@ import sys
 import tarfile
 import venv
 import zipfile
+from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
@@ -48,11 +49,12 @@ def test_the_wheel_holds_every_file_of_the_packages_and_the_sdist_too(packages: 
         str(path.relative_to(ROOT))
         for package in ("phasestack", "runtime", "calib", "model_export")
         for path in (ROOT / package).rglob("*")
-        if path.is_file() and "__pycache__" not in path.parts
+        if path.is_file() and "__pycache__" not in path.parts and path.suffix != ".so"
     }
     assert len(wanted) > 300
     assert wanted - in_wheel == set()
     assert wanted - in_sdist == set()
+    assert [name for name in in_wheel if fnmatch(name, "runtime/kernels/compiled*.so")]
     assert not [name for name in in_wheel if name.startswith(("tests/", "docs/"))]
 
 

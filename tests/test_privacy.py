@@ -11,8 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from runtime.support.folders import user_cache
-
 ROOT = Path(__file__).resolve().parents[1]
 CALLS = (
     "socket,connect,bind,sendto,sendmsg,open,openat,creat,mkdir,mkdirat,rename,renameat,renameat2,symlink,link,linkat"
@@ -20,7 +18,6 @@ CALLS = (
 LINE = re.compile(r"^\d+\s+(\w+)\((.*)\)\s+= (-?\d+)")
 QUOTED = re.compile(r'"((?:[^"\\]|\\.)*)"')
 WRITES = re.compile(r"O_WRONLY|O_RDWR|O_CREAT|O_TRUNC|O_APPEND")
-KEPT = Path(".cache/phasestack/compiled")  # in the home: inner loops, compiled once (docs/dependencies.md)
 NAME_SERVICE = "/var/run/nscd/socket"  # the C library asks it for users and groups
 
 
@@ -29,8 +26,6 @@ def run_traced(folder: Path, *arguments: str) -> tuple[list[str], list[str]]:
     home, scratch, trace = folder / "home", folder / "tmp", folder / "trace"
     for path in (home, scratch):
         path.mkdir()
-    (home / KEPT).parent.mkdir(parents=True)
-    (home / KEPT).symlink_to(user_cache("compiled"))  # what the tests' user has of them: to compile takes 20 seconds
     environment = {
         "PATH": os.environ["PATH"],
         "HOME": str(home),
@@ -43,11 +38,6 @@ def run_traced(folder: Path, *arguments: str) -> tuple[list[str], list[str]]:
     done = subprocess.run(traced, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     written, sockets = [], []
-    kept = {str(home / part) for part in (KEPT, *KEPT.parents)} - {str(home)}
-
-    def is_kept(name: str) -> bool:
-        return name in kept or name.startswith(f"{home / KEPT}/")
-
     for line in trace.read_text(errors="replace").splitlines():
         match = LINE.match(line)
         if match is None or int(match[3]) < 0:
@@ -59,9 +49,9 @@ def run_traced(folder: Path, *arguments: str) -> tuple[list[str], list[str]]:
                 sockets.append(line)
         elif call not in ("open", "openat") or WRITES.search(given):
             name = next(iter(reversed(QUOTED.findall(given))), "")
-            if not (name.startswith((f"{folder}/out", "/dev/", "/proc/")) or is_kept(name)):
+            if not name.startswith((f"{folder}/out", "/dev/", "/proc/")):
                 written.append(line)
-    left = [str(path) for place in (home, scratch) for path in place.rglob("*") if not is_kept(str(path))]
+    left = [str(path) for place in (home, scratch) for path in place.rglob("*")]
     return written + left, sockets
 
 

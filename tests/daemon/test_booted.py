@@ -281,19 +281,17 @@ def test_a_reboot_a_power_cut_a_full_disk_and_a_missing_panel_leave_nobody_waiti
     pc.reboot()
     assert eventually(lambda: pc.is_active(*UP) and pc.shows(), within_s=120)
     owner = pc.done("id -u phasestack")
-    for what in ("lib", "cache"):
-        pc.write(f"etc/systemd/system/var-{what}-phasestack.mount", small_disk(what, owner))
-    pc.done("systemctl enable var-lib-phasestack.mount var-cache-phasestack.mount; sync")
+    pc.write("etc/systemd/system/var-lib-phasestack.mount", small_disk(owner))
+    pc.done("systemctl enable var-lib-phasestack.mount; sync")
     pc.cut()
     pc.boot()
-    assert eventually(lambda: pc.is_active("var-lib-phasestack.mount", "var-cache-phasestack.mount"))
+    assert eventually(lambda: pc.is_active("var-lib-phasestack.mount"))
     assert eventually(lambda: pc.is_active(*UP) and pc.shows(), within_s=150)
-    for what in ("lib", "cache"):
-        assert pc.run(f"head -c 32M /dev/zero > /var/{what}/phasestack/full").returncode != 0
+    assert pc.run("head -c 32M /dev/zero > /var/lib/phasestack/full").returncode != 0
     before = pc.prop("MainPID")
     pc.done("systemctl restart phasestack phasestack-page")
     assert pc.comes_back(unlike=before) and pc.prop("NRestarts") == "0" and pc.is_active(*UP)
-    pc.done("systemctl disable var-lib-phasestack.mount var-cache-phasestack.mount")
+    pc.done("systemctl disable var-lib-phasestack.mount")
     pc.done("rm /etc/systemd/system/var-*.mount")
     pc.write("etc/phasestack/phasestack.toml", CONFIG.replace("DUMMY2", "HDMI-9"))
     pc.reboot()
@@ -301,9 +299,9 @@ def test_a_reboot_a_power_cut_a_full_disk_and_a_missing_panel_leave_nobody_waiti
     assert "HDMI-9" in pc.done("phasestack status")
 
 
-def small_disk(what: str, owner: str) -> str:
+def small_disk(owner: str) -> str:
     return (
-        f"[Mount]\nWhat=tmpfs\nType=tmpfs\nWhere=/var/{what}/phasestack\nOptions=size=16M,uid={owner}\n"
+        f"[Mount]\nWhat=tmpfs\nType=tmpfs\nWhere=/var/lib/phasestack\nOptions=size=16M,uid={owner}\n"
         "[Install]\nWantedBy=local-fs.target\n"
     )
 
@@ -313,5 +311,5 @@ def test_it_is_uninstalled_twice_and_says_what_it_leaves(pc: Pc) -> None:
     pc.done("systemctl stop systemd-udevd systemd-udevd-control.socket systemd-udevd-kernel.socket")
     assert "left: the user and group" in pc.done("cd /root/phasestack && PURGE=yes make uninstall")
     assert pc.run("systemctl is-active phasestack phasestack-page phasestack-x").stdout.count("active\n") == 3
-    left = pc.done("find /etc /usr /opt /run /var/lib /var/cache -xdev -name '*phasestack*' -not -path '*.service.d*'")
+    left = pc.done("find /etc /usr /opt /run /var/lib -xdev -name '*phasestack*' -not -path '*.service.d*'")
     assert left == ""
