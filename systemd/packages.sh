@@ -1,6 +1,6 @@
 #!/bin/sh
-# Debian's packages for the runtime, made from its source; with `test` for the test suite too, with `slow` for its slow tests too. Root: installed.
-# Others: asked for, in one line.
+# Debian's packages for the runtime, made from its source; with `test` for the test suite too, with `slow` for its slow
+# tests too. Root: installed. Others: asked for, in one line.
 set -u
 runtime="g++ libegl1 libgl1-mesa-dri libgles2 libgl1 libusb-1.0-0 libopenni2-0"
 testing="xvfb xserver-xorg-core xserver-xorg-video-dummy x11-xserver-utils x11-apps imagemagick chromium systemd udev"

@@ -33,7 +33,8 @@ def test_it_does_not_run_as_root() -> None:
 
 
 def apt_packages() -> list[str]:
-    (command,) = [part for value in of("RUN") for part in value.split("&&") if "apt-get install" in part]
+    """The final image's."""
+    *_, command = [part for value in of("RUN") for part in value.split("&&") if "apt-get install" in part]
     assert "--no-install-recommends" in command
     return [word for word in command.split()[2:] if not word.startswith("-")]
 
