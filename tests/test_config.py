@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import json
 import os
-import pwd
-import tempfile
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from runtime.commands.app import app
 from runtime.config import Settings, load_settings, load_stack, with_options
 from runtime.errors import InputError
-from runtime.support import folders
 
 
 def loaded(folder: Path, text: str) -> Settings:

@@ -27,6 +27,7 @@ from runtime.records import F32, F64, I16, U8
 from runtime.support.threads import at_once
 
 HALF_IPD_M = 0.031
+LEAST_PX, MIN_SCALE = 16, 0.25  # of a picture: smaller ones, and finer rasters, would tell nothing new
 SHARPENED = 0.07  # of the difference, on either side: what two interpolations blur
 NODE_PX = 4  # of a result with bent columns: what lies between errs by a hundredth of a pixel
 EVEN = REST[3] * FULL  # of an outer panel, sixteenths of a code
@@ -151,10 +152,10 @@ def coarse_pictures(job: Job, geometry: Geometry, reduction: int) -> tuple[U8, U
     def warped(item: tuple[U8, F64]) -> tuple[U8, U8]:
         picture, projection = item
         matrix = image_from_raster(projection, raster)
-        scale = source_px(matrix, size)
         height, width = picture.shape[:2]
-        if scale > 1:
-            small = max(2, round(width / scale)), max(2, round(height / scale))
+        across, down = (max(scale, 1.0) for scale in source_px(matrix, size))
+        if max(across, down) > 1:
+            small = resized_px(width, across), resized_px(height, down)
             matrix = np.diag([small[0] / width, small[1] / height, 1.0]) @ matrix
             picture = np.asarray(cv2.resize(picture, small, interpolation=cv2.INTER_AREA), np.uint8)
         if job.channels == 1:
@@ -169,11 +170,17 @@ def coarse_pictures(job: Job, geometry: Geometry, reduction: int) -> tuple[U8, U
     return left, right, np.asarray(unseen) if unseen.any() else None
 
 
-def source_px(image_from_raster: F64, size: tuple[int, int]) -> float:
-    """Pixels of an image, along a side, for one of a raster (width, height), in its middle."""
+def source_px(image_from_raster: F64, size: tuple[int, int]) -> tuple[float, float]:
+    """Pixels of an image, along and down, for one of a raster (width, height) along and down, in its middle."""
     a = image_from_raster
     x, y, w = a @ (size[0] / 2, size[1] / 2, 1.0)
-    return float(np.sqrt(abs(np.linalg.det((a[:2, :2] - np.outer((x / w, y / w), a[2, :2])) / w))))
+    across, down = np.linalg.norm((a[:2, :2] - np.outer((x / w, y / w), a[2, :2])) / w, axis=0)
+    return float(across), float(down)
+
+
+def resized_px(pixels: int, scale: float) -> int:
+    """As many pixels as a raster has in place of `pixels`, of which `scale` lie in one of its own."""
+    return max(min(pixels, LEAST_PX), round(pixels / max(scale, MIN_SCALE)))
 
 
 def resample(

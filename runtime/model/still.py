@@ -10,7 +10,7 @@ import numpy as np
 from runtime.clock import Stopwatch
 from runtime.model.base import STAGES, Prediction, Predictor
 from runtime.model.job import Job, Own
-from runtime.model.proposal import resample, source_px
+from runtime.model.proposal import resample, resized_px, source_px
 from runtime.optics.pupil import TRACKING_SIGMA_MM
 from runtime.optics.stack import PlaneRaster
 from runtime.optics.views import image_from_raster, image_from_stack
@@ -55,10 +55,11 @@ def _own(pictures: Sequence[U8], eyes_m: F64, middle: PlaneRaster, *, fov_deg: f
     """The pictures and their rays, about as many as the panels have pixels."""
     height, width = pictures[0].shape[:2]
     at = [image_from_stack(eye_m, width_px=width, height_px=height, fov_deg=fov_deg) for eye_m in eyes_m]
-    scale = source_px(image_from_raster(at[0], middle), (middle.width_px, middle.height_px))
-    if not RAYS_PX[0] <= scale <= RAYS_PX[1]:
-        size = max(2, round(width / scale)), max(2, round(height / scale))
-        how = cv2.INTER_AREA if scale > 1 else cv2.INTER_CUBIC
+    scales = source_px(image_from_raster(at[0], middle), (middle.width_px, middle.height_px))
+    across, down = (1.0 if RAYS_PX[0] <= scale <= RAYS_PX[1] else scale for scale in scales)
+    size = resized_px(width, across), resized_px(height, down)
+    if size != (width, height):
+        how = cv2.INTER_AREA if max(across, down) > 1 else cv2.INTER_CUBIC
         pictures = [np.asarray(cv2.resize(picture, size, interpolation=how), np.uint8) for picture in pictures]
         resized = np.diag([size[0] / width, size[1] / height, 1.0])
         at = [resized @ projection for projection in at]

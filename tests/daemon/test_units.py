@@ -288,7 +288,7 @@ def test_all_locks_mean_the_same_files() -> None:
 
 def test_everything_that_is_declared_is_locked() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    test = packages("test.lock") | {"torch": ("2.13.0", [])}
+    test = packages("test.lock") | packages("docs.lock") | {"torch": ("2.13.0", [])}
     for requirement in (
         *project["dependencies"],
         *(one for all_ in project["optional-dependencies"].values() for one in all_),

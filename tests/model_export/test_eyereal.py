@@ -192,7 +192,7 @@ def test_what_the_network_is_fed_and_the_layers_that_are_shown_are_the_official_
         answer = load_eyereal(official)(torch.from_numpy(fed.copy())[None])[0].numpy()
     # Of the same answer the same grey levels: clipped, rounded half up.
     shown = np.floor(np.clip(answer, 0, 1) * 255 + 0.5).reshape(3, 3, *SIZE[::-1]).transpose(0, 2, 3, 1)
-    assert np.abs(done.layers[..., :3] - shown).mean() < 0.01
+    assert np.abs(done.layers[..., :3] - shown).mean() < 0.02  # by way of sixteenths of a code
     apart = done.layers[..., :3].astype(float) - golden(f"{place}_layers")
     assert np.median(np.abs(apart)) <= 1
     assert abs(apart.mean()) < 0.25, "values that are cut off instead of rounded are half a level lower"

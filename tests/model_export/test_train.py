@@ -84,7 +84,7 @@ def test_a_network_of_pictures_is_fed_what_the_runtime_feeds_it(tmp_path: Path) 
         path.write_bytes(picture_file(network, "", **SMALL))
         predictor = load_predictor(str(path), pair.stack)
         solve_still(*pair.images, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, predictor=predictor, eye_sigma_mm=0.0)
-        fed, wanted = predictor._input[0], network_input(pair, form)
+        fed, wanted = predictor._proposal._input[0], network_input(pair, form)
         assert wanted.shape == fed.shape
         inside = slice(8, -8)  # what goes on beside the pictures is the runtime's guess
         assert np.abs(fed - wanted)[:, inside, inside].max() < 3 / 255
@@ -215,7 +215,8 @@ def test_a_network_of_ones_own_is_trained_exported_and_served(tmp_path: Path) ->
     net = made(SHORT["arch"], SHORT["options"]).net.eval()
     net.load_state_dict(load_checkpoint(checkpoint)["model"])
     with torch.no_grad():
-        panels = net(torch.from_numpy(predictor._input))[0].clamp(0, 1).mul(255).round().reshape(3, 3, 96, 160)
+        fed = torch.from_numpy(predictor._proposal._input)
+        panels = net(fed)[0].clamp(0, 1).mul(255).round().reshape(3, 3, 96, 160)
     layers = solved.layers[..., :3].astype(np.float32)
     predictor.close()
     assert np.abs(layers - panels.permute(0, 2, 3, 1).numpy()).max() <= 1

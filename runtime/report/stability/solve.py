@@ -25,7 +25,7 @@ STAGE = "solve"
 AMPLITUDE = 0.1  # of the target difference between the eyes at its lowest frequency, in phase units of pi/2
 FINER = ((5, 0.05), (11, 0.03))  # cycles across the panels, and amplitude, of more of the difference
 COMMON = ((3, 0.15), (7, 0.1))  # the same of what both eyes want
-WIDTH_M, HEIGHT_M, WIDTH_PX, HEIGHT_PX = 0.5184, 0.2916, 64, 4
+WIDTH_M, HEIGHT_M, WIDTH_PX, HEIGHT_PX = 0.5184, 0.0648, 64, 8
 FLOOR = 0.002  # a grey level of 8 bits, on one of three panels, relative to the target
 Method = Callable[["Problem"], F32]  # (N, height, width, C) panel values in [0, 1]
 
@@ -119,7 +119,7 @@ def converges(method: Method, gap_m: float, ipd_m: float, distance_m: float) -> 
     problem = Problem(gap_m=gap_m, ipd_m=ipd_m, distance_m=distance_m)
     left, least = problem.residual(method(problem)), optimum(*problem.geometry)
     note = f"no panel values leave less than {least:.3g}"
-    if left < 0.98 * least - FLOOR:
+    if left < 0.8 * least - FLOOR:  # rows that differ a little can do with less
         return Answer(math.nan, 1.0, problem.condition(), note=f"{left:.3g} is impossible: {note}")
     # Serving the eyes in turn leaves all of the difference to one of them; nothing is worse than flat grey.
     return Answer(left, 1.0, problem.condition(), left - least, note=note)
