@@ -50,7 +50,7 @@ class Camera:
 def photograph(
     phases: U8, panels: Sequence[PlacedPanel], stack: PanelStack, camera: Camera, pose: F64, random: np.random.Generator
 ) -> U8:
-    """(h, w) what a camera at `pose` (4, 4; camera_from_stack) sees of panels with phases (N, H, W) of 255ths."""
+    """(h, w) what a camera at `pose` (4, 4; camera_from_stack) sees of panels with 8-bit codes (N, H, W)."""
     size = (SAMPLES * camera.width_px, SAMPLES * camera.height_px)
     middle = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # a pixel's centre from its index
     fine = np.diag([SAMPLES, SAMPLES, 1.0])
