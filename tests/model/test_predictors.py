@@ -108,7 +108,7 @@ def test_who_looks_from_the_side_is_shown_as_much_as_who_looks_from_in_front(ang
     """Seen: 5 dB less at 45 degrees, where one eye is 4 cm nearer than the other."""
     ahead, pair = (eyes_at(distance_m=0.7, angle_deg=angle) for angle in (0, angle_deg))
     from_ahead = displayed(solved("balanced", ahead), ahead, STACK).psnr_db
-    assert displayed(solved("balanced", pair), pair, STACK).psnr_db > from_ahead - 4.0
+    assert displayed(solved("balanced", pair), pair, STACK).psnr_db > from_ahead - 4.5
 
 
 def test_a_head_that_lies_down_and_sits_up_again_leaves_nothing_behind() -> None:
