@@ -28,6 +28,7 @@ from runtime.support.threads import at_once
 
 HALF_IPD_M = 0.031
 LEAST_PX, MIN_SCALE = 16, 0.25  # of a picture: smaller ones, and finer rasters, would tell nothing new
+EDGE_PX = 4  # of the raster, beside a picture, where its edge goes on: what its outermost rays are interpolated from
 SHARPENED = 0.07  # of the difference, on either side: what two interpolations blur
 NODE_PX = 4  # of a result with bent columns: what lies between errs by a hundredth of a pixel
 EVEN = REST[3] * FULL  # of an outer panel, sixteenths of a code
@@ -107,8 +108,8 @@ class ChainProposal:
     def _lacked(self, job: Job, geometry: Geometry) -> I16:
         """Half of what the right eye wants more than the left one, on a coarser raster of the middle panel's box."""
         left, right, unseen = coarse_pictures(job, geometry, self._reduction)
-        phases = [cv2.LUT(picture, self._codes) for picture in (left, right)]
-        half: I16 = np.right_shift(phases[1].astype(np.int16) - phases[0].astype(np.int16), 1)
+        half = np.asarray(cv2.subtract(cv2.LUT(right, self._codes), cv2.LUT(left, self._codes)), np.int16)
+        half >>= 1
         if unseen is not None:
             half[unseen] = 0  # what one eye's picture does not show contradicts nothing
         kernel = np.array([-SHARPENED, 1 + 2 * SHARPENED, -SHARPENED])
@@ -160,10 +161,11 @@ def coarse_pictures(job: Job, geometry: Geometry, reduction: int) -> tuple[U8, U
             picture = np.asarray(cv2.resize(picture, small, interpolation=cv2.INTER_AREA), np.uint8)
         if job.channels == 1:
             picture = np.ascontiguousarray(picture[..., 0])
-        matrix, shown = _at_centres(matrix), np.full(picture.shape[:2], 255, np.uint8)
-        flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-        found = cv2.warpPerspective(picture, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(found, np.uint8), np.asarray(cv2.warpPerspective(shown, matrix, size, flags=flags), np.uint8)
+        height, width = picture.shape[:2]
+        shown = np.full((height + 2 * EDGE_PX, width + 2 * EDGE_PX), 255, np.uint8)
+        to_shown = np.array([[1.0, 0.0, EDGE_PX], [0.0, 1.0, EDGE_PX], [0.0, 0.0, 1.0]])
+        found = resample(picture, matrix, size=size[::-1], cubic=True, edge=cv2.BORDER_REPLICATE)
+        return np.asarray(found, np.uint8), np.asarray(resample(shown, to_shown @ matrix, size=size[::-1]), np.uint8)
 
     (left, of_left), (right, of_right) = at_once(warped, list(zip(job.own.pictures, job.own.projections, strict=True)))
     unseen = cv2.min(of_left, of_right) < 255
