@@ -28,7 +28,7 @@ from runtime.support.threads import at_once
 
 HALF_IPD_M = 0.031
 LEAST_PX, MIN_SCALE = 16, 0.25  # of a picture: smaller ones, and finer rasters, would tell nothing new
-EDGE_PX = 4  # of the raster, beside a picture, where its edge goes on: what its outermost rays are interpolated from
+EDGE_PX, EDGE_SHARE = 4, 1 / 40  # of the raster, at most, and of a picture: so far beside it its edge goes on
 SHARPENED = 0.07  # of the difference, on either side: what two interpolations blur
 NODE_PX = 4  # of a result with bent columns: what lies between errs by a hundredth of a pixel
 EVEN = REST[3] * FULL  # of an outer panel, sixteenths of a code
@@ -162,8 +162,9 @@ def coarse_pictures(job: Job, geometry: Geometry, reduction: int) -> tuple[U8, U
         if job.channels == 1:
             picture = np.ascontiguousarray(picture[..., 0])
         height, width = picture.shape[:2]
-        shown = np.full((height + 2 * EDGE_PX, width + 2 * EDGE_PX), 255, np.uint8)
-        to_shown = np.array([[1.0, 0.0, EDGE_PX], [0.0, 1.0, EDGE_PX], [0.0, 0.0, 1.0]])
+        right, down = (min(EDGE_PX, int(px * EDGE_SHARE)) for px in (width, height))
+        shown = np.full((height + 2 * down, width + 2 * right), 255, np.uint8)
+        to_shown = np.array([[1.0, 0.0, right], [0.0, 1.0, down], [0.0, 0.0, 1.0]])
         found = resample(picture, matrix, size=size[::-1], cubic=True, edge=cv2.BORDER_REPLICATE)
         return np.asarray(found, np.uint8), np.asarray(resample(shown, to_shown @ matrix, size=size[::-1]), np.uint8)
 
