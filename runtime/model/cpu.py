@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from runtime.kernels import MARGIN, Image, Panel, Problem, library
 from runtime.model.contract import Step
-from runtime.model.geometry import Geometry
+from runtime.model.geometry import Geometry, inverse
 from runtime.model.job import Job
-from runtime.model.targets import FULL, SUBCODE, middle_codes, rest_of, target_table, without_alpha
+from runtime.model.targets import FULL, beside_codes, rest_of, target_table, without_alpha
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, I16, U8
@@ -120,11 +120,9 @@ class CpuState:
 
     def _fill(self, beside: int | tuple[int, ...]) -> None:
         """All panels at rest, the middle one as if all eyes saw one colour; whole pixels at a time."""
-        rest = (self._rest + SUBCODE // 2) // SUBCODE
-        codes = middle_codes(self._stack.count)[list(beside)].tolist() if isinstance(beside, tuple) else [beside] * 3
         for n, layer in enumerate(self._layers):
-            colour = codes if n == self._stack.count // 2 else [rest] * 3
-            layer.view(np.uint32)[..., 0] = np.array([*colour, 255], np.uint8).view(np.uint32)[0]
+            pixel = np.array([*beside_codes(self._stack.count, n, beside), 255], np.uint8).view(np.uint32)[0]
+            layer.view(np.uint32)[..., 0] = pixel
 
     def _in_parts(self, work: Any, problem: Problem) -> None:
         at_once(lambda part: work(byref(problem), part, self._threads), range(self._threads))
@@ -132,9 +130,7 @@ class CpuState:
     def _problem(self, panels_from_rays: F64) -> tuple[Problem, object]:
         """What the loops are given; and arrays that must live as long."""
         geometry, held, channels = self._geometry, self._held, self._channels
-        seen = np.ascontiguousarray(panels_from_rays)
-        back = np.linalg.inv(seen)
-        back = np.ascontiguousarray(back / np.abs(back[..., 2:, 2:]))
+        seen, back = np.ascontiguousarray(panels_from_rays), np.ascontiguousarray(inverse(panels_from_rays))
         table = target_table(self._stack.count)
         problem = Problem(
             panels=self._stack.count, sets=len(seen), channels=channels,

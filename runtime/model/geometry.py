@@ -84,6 +84,12 @@ class Geometry:
         )
 
 
+def inverse(homographies: F64) -> F64:
+    """(..., 3, 3) the way back, of the same sign before the eye, last entries 1."""
+    back = np.linalg.inv(homographies)
+    return np.asarray(back / np.abs(back[..., 2:, 2:]), np.float64)
+
+
 def geometry_of(job: Job, stack: PanelStack, *, whole: bool = False, unseen: bool = False) -> Geometry:
     """For a job's part of the panels; whole: for all of what its eyes see of them; unseen: and all else."""
     part = None if whole or unseen else job.part

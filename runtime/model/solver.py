@@ -17,11 +17,11 @@ from runtime.model.geometry import Geometry, geometry_of
 from runtime.model.job import Job
 from runtime.model.network import PictureProposal
 from runtime.model.proposal import ChainProposal
-from runtime.model.targets import rest_of
+from runtime.model.targets import SUBCODE, rest_of
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64
 
-NEUTRAL = (rest_of(3) + 8) // 16  # code of a panel at rest, of three
+NEUTRAL = (rest_of(3) + SUBCODE // 2) // SUBCODE  # code of a panel at rest, of three
 
 
 class Solver(Predictor):

@@ -43,6 +43,14 @@ def middle_codes(panels: int) -> U8:
     return np.clip(np.rint(codes), 0, 255).astype(np.uint8)
 
 
+def beside_codes(panels: int, n: int, beside: int | tuple[int, ...]) -> list[int]:
+    """Red, green and blue code of panel n beside what is solved: at rest; the middle one has a code, or shows a
+    colour as eyes see it."""
+    if n != panels // 2:
+        return [(rest_of(panels) + SUBCODE // 2) // SUBCODE] * 3
+    return middle_codes(panels)[list(beside)].tolist() if isinstance(beside, tuple) else [beside] * 3
+
+
 @lru_cache(maxsize=4)
 def phase_codes(branch: Branch = 2) -> I16:
     """(256,) phase sum, in sixteenths of a panel code, for each 8-bit code value an eye should see."""

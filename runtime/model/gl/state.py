@@ -16,10 +16,10 @@ import numpy as np
 
 from runtime.errors import InputError
 from runtime.model.contract import Step
-from runtime.model.geometry import Geometry
+from runtime.model.geometry import Geometry, inverse
 from runtime.model.gl.programs import Image, Passes
 from runtime.model.job import Job
-from runtime.model.targets import FULL, SUBCODE, middle_codes, rest_of, target_table
+from runtime.model.targets import FULL, beside_codes, rest_of, target_table
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, I16, U8
 from runtime.support.gl import DrawnPicture, finish
@@ -60,7 +60,8 @@ class GlState:
         self._panel("last", panel).texture.write(held, viewport=(0, 0, box.width_px, box.height_px), alignment=1)
 
     def close_middle(self) -> None:
-        seen, back = self._homographies(self._geometry.panels_from_rays("middle", 0.0))
+        seen = self._geometry.panels_from_rays("middle", 0.0)
+        back = inverse(seen)
         table = self._texture("table", (256, 1), 2, dtype="f4", data=target_table(PANELS))
         inputs = {"last0": self._panel("last", 0), "last2": self._panel("last", 2), "table": Image(table, 256, 1)}
         gathered: dict[str, Image] = {"last": self._panel("last", MIDDLE)}
@@ -79,7 +80,8 @@ class GlState:
             self._passes.context.copy_framebuffer(ahead, last)
 
     def step(self, step: Step) -> None:
-        seen, back = self._homographies(self._geometry.panels_from_rays(step.places, self._sigma_mm))
+        seen = self._geometry.panels_from_rays(step.places, self._sigma_mm)
+        back = inverse(seen)
         phasors: dict[str, Image] = {}
         for n in range(PANELS):
             pair = {f"{name}{n}": self._panel(name, n) for name in ("cosine", "sine")}
@@ -111,7 +113,7 @@ class GlState:
             image, box = Image(texture, width, height), self._geometry.boxes[n]
             kept = self._geometry.kept if n == MIDDLE else box
             if beside is not None:
-                self._passes.target((image,)).clear(*self._beside(n, beside))
+                self._passes.target((image,)).clear(*(code / 255 for code in beside_codes(PANELS, n, beside)), 1.0)
             if kept.width_px and kept.height_px:
                 place = {"first": (kept.u0 - box.u0, kept.v0 - box.v0), "grey": self._channels == 1}
                 inputs = {"last": self._panel("last", n)}
@@ -150,10 +152,6 @@ class GlState:
         image, self._wanted_origin = self._targets[side]
         return {"wanted": image}
 
-    def _homographies(self, panels_from_rays: F64) -> tuple[F64, F64]:
-        back = np.linalg.inv(panels_from_rays)
-        return panels_from_rays, np.asarray(back / np.abs(back[..., 2:, 2:]), np.float64)
-
     def _through(self, matrices: F64) -> dict[str, Any]:
         found: dict[str, Any] = {"wanted_origin": self._wanted_origin}
         for n, (matrix, box) in enumerate(zip(matrices, self._geometry.boxes, strict=True)):
@@ -163,13 +161,6 @@ class GlState:
     def _back(self, matrices: F64) -> dict[str, Any]:
         rays = self._geometry.rays.width_px, self._geometry.rays.height_px
         return {"rays": rays, **{f"rays_from{number}": _mat3(matrix) for number, matrix in enumerate(matrices)}}
-
-    def _beside(self, n: int, beside: int | tuple[int, ...]) -> tuple[float, float, float, float]:
-        codes = [(rest_of(PANELS) + SUBCODE // 2) // SUBCODE] * 3
-        if n == MIDDLE:
-            codes = middle_codes(PANELS)[list(beside)].tolist() if isinstance(beside, tuple) else [beside] * 3
-        red, green, blue = (code / 255 for code in codes)
-        return red, green, blue, 1.0
 
     def _draw(
         self,
