@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import time
@@ -14,7 +15,7 @@ from typer.testing import CliRunner
 
 from calib.capture import Walk
 from calib.commands import app
-from calib.keys import Key
+from calib.keys import Key, TerminalKeys, parse
 from calib.pairs import PairsFile, read_pairs
 from calib.viewpoints import grid
 from runtime.clock import NS_PER_S
@@ -105,3 +106,29 @@ def test_a_person_at_the_terminal_takes_pairs_from_a_sensor(tmp_path: Path) -> N
     pairs = read_pairs(out)
     np.testing.assert_allclose(pairs.sensor_m[:1], [eyes_at(viewpoint.midpoint_m).eyes_m.mean(0)], atol=1e-6)
     assert pairs.sensor_serial == "A1"
+
+
+@pytest.mark.parametrize(
+    ("data", "keys"),
+    [
+        (b"\n", [Key.ACCEPT]),
+        (b"np q", [Key.NEXT, Key.PREVIOUS, Key.ACCEPT, Key.QUIT]),
+        (b"\x1b[C\x1b[D\x1b[A\x1b[B", [Key.RIGHT, Key.LEFT, Key.UP, Key.DOWN]),
+        (b"xyz", []),
+        (b"\x1b[Zn", [Key.NEXT]),
+    ],
+)
+def test_bytes_mean_keys(data: bytes, keys: list[Key]) -> None:
+    assert parse(data) == (keys, b"")
+
+
+def test_a_closed_input_quits_and_an_idle_one_says_nothing() -> None:
+    reading, writing = os.pipe()
+    keys = TerminalKeys(reading)
+    assert keys.poll() is None
+    os.write(writing, b"np344.2\n")
+    assert [keys.poll(), keys.poll(), keys.line(), keys.poll()] == [Key.NEXT, Key.PREVIOUS, "344.2", None]
+    os.close(writing)
+    assert (keys.poll(), keys.line()) == (Key.QUIT, "q")
+    keys.close()
+    os.close(reading)

@@ -1,4 +1,4 @@
-"""Charts: at its viewpoint an eye sees straight lines at the thirds, elsewhere it does not."""
+"""Viewpoints of calibration, and their charts: straight lines at the viewpoint, ghosts elsewhere."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from calib.charts import chart_fov_deg, line_picture, make_charts
-from calib.viewpoints import grid
-from runtime.config import load_settings
+from calib.viewpoints import Viewpoint, grid, viewing_place_m, viewing_volume_m
+from runtime.config import CalibrationSettings, load_settings
 from runtime.optics.quality import psnr_db
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
@@ -38,3 +39,21 @@ def test_a_solved_chart_shows_both_eyes_the_picture_from_its_viewpoint_alone(tmp
 
     assert seen_db(0.0) > 16
     assert seen_db(0.0) > 1.5 + max(seen_db(0.03), seen_db(-0.03))
+
+
+@pytest.mark.parametrize("viewpoint", grid(), ids=lambda v: v.name)
+def test_a_viewpoint_lies_where_its_polar_angles_say(viewpoint: Viewpoint) -> None:
+    x, y, z = viewpoint.midpoint_m
+    assert np.hypot(np.hypot(x, y), z) == pytest.approx(viewpoint.radius_cm / 100)
+    assert np.degrees(np.arccos(z * 100 / viewpoint.radius_cm)) == pytest.approx(viewpoint.phi_deg)
+    assert np.degrees(np.arctan2(x, y)) == pytest.approx(viewpoint.theta_deg)
+
+
+def test_the_grid_and_the_volume_follow_the_configured_viewing_range() -> None:
+    far = CalibrationSettings(viewing_m=(1.0, 2.0), viewing_side_deg=20, viewing_up_deg=(-10, 10))
+    assert {viewpoint.radius_cm for viewpoint in grid(far)} == {100, 150, 200}
+    assert {viewpoint.phi_deg for viewpoint in grid(far)} == {80, 90, 100}
+    assert {viewpoint.theta_deg for viewpoint in grid(far)} == {70, 90, 110}
+    distance = np.linalg.norm(viewing_volume_m(far), axis=1)
+    assert (distance.min(), distance.max()) == (pytest.approx(0.75), pytest.approx(3.0))
+    assert viewing_place_m(far)[0] == pytest.approx(1.5)

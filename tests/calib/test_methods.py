@@ -1,15 +1,18 @@
-"""The EyeReal's synthetic experiment: the error at the eye of every method, and of the one that is taken by default."""
+"""Methods of `calibrate solve`: their error at the eye, the error they predict, and gross errors they leave out."""
 
 from __future__ import annotations
 
 from functools import cache
+from itertools import product
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from calib.robust import fit_robust
 from calib.solution import METHODS, solve, solve_default
 from calib.viewpoints import grid, viewing_volume_m
+from tests.calib.camera import KNOWN_M, measured
 
 SIGMAS_M = (0.0, 0.001, 0.003, 0.010, 0.030)
 CAMERA_M = (0.05, 0.02, 0.22)
@@ -47,3 +50,49 @@ def test_the_default_is_within_two_percent_of_the_best_where_the_sensors_metre_i
     means = mean_error_m(sigma_m=sigma_m, scale=scale)
     assert means["default"] <= 1.02 * min(means[method] for method in METHODS)
     assert means["fixed-scale"] > 2 * means["default"]
+
+
+def spoiled(sensor: np.ndarray, wrong: list[int], *, by_m: float = 0.3) -> np.ndarray:
+    random = np.random.default_rng(1)
+    direction = random.normal(size=(len(wrong), 3))
+    sensor = sensor.copy()
+    sensor[wrong] += by_m * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    return sensor
+
+
+@pytest.mark.parametrize("sigma_m", [0.0, 0.001, 0.01])
+@pytest.mark.parametrize("wrong", [[], [0], [3, 9, 12, 20, 26], [0, 1, 2, 3, 4, 5, 6, 7]])
+def test_exactly_the_wrong_pairs_are_left_out(sigma_m: float, wrong: list[int]) -> None:
+    found = fit_robust(spoiled(measured(sigma_m=sigma_m), wrong), KNOWN_M)
+    assert np.flatnonzero(~found.inlier).tolist() == wrong
+
+
+def test_many_pairs_are_scored_by_a_sample_and_rejected_one_by_one() -> None:
+    volume = viewing_volume_m()
+    points = np.random.default_rng(0).uniform(volume.min(0), volume.max(0), size=(5000, 3))
+    wrong = list(range(0, 5000, 5))
+    found = fit_robust(spoiled(measured(points, sigma_m=0.003), wrong), points)
+    assert not found.inlier[wrong].any()
+    assert found.inlier.sum() >= 0.998 * 4000
+
+
+@pytest.mark.parametrize("method", ["inverse", "fixed-scale"])
+def test_the_predicted_error_at_the_eye_is_the_real_one(method: str) -> None:
+    """200 noise samples: the RMS over samples against the covariance's promise, at every point of the volume."""
+    volume = viewing_volume_m()
+    seen = measured(volume)
+    squares, promised = np.zeros(len(volume)), np.zeros(len(volume))
+    for seed in range(200):
+        found = solve(measured(sigma_m=0.003, seed=seed), KNOWN_M, method=method)
+        squares += ((found.similarity.points(seen) - volume) ** 2).sum(-1) / 200
+        promised += found.eye_error_m(volume) ** 2 / 200
+    ratio = np.sqrt(squares / promised)
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.06)
+    assert 0.8 < ratio.min() <= ratio.max() < 1.2
+
+
+def test_pairs_without_any_noise_leave_no_uncertainty() -> None:
+    corners = np.array(list(product((-1.0, 1.0), repeat=3)))
+    found = solve_default(corners, corners)
+    assert found.noise_m == 0.0
+    assert found.unit_covariance[6, 6] == 0.0

@@ -134,3 +134,29 @@ def test_photographs_that_cannot_be_used_are_named_and_nothing_is_written(
     assert "\n" not in text
     assert config.read_text() == CONFIG
     assert not (tmp_path / "r").exists()
+
+
+WRONG = [
+    "charts --out x --config no-such-file.toml",
+    "grey --out l.csv --photos none --panel 1",
+    "grey --photos . --panel 1",
+    "grey --panel 3 --show",
+    "grey --panel 1 --out c.png",
+    "grey --panel 1",
+    "panels",
+    "panels --photos .",
+    "panels --out r",
+    "panels --out r --photos . --show",
+    "panels --out r --photos none",
+    "panels --out r --photos .",
+    "panels --out r --photos . --write",
+]
+
+
+@pytest.mark.parametrize("request_line", WRONG)
+def test_wrong_requests_are_refused_and_leave_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request_line: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert isinstance(CliRunner().invoke(app, request_line.split()).exception, InputError)
+    assert list(tmp_path.iterdir()) == []

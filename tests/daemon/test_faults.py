@@ -21,6 +21,7 @@ from runtime.model.session import ModelSession
 from runtime.records import RefreshAccount
 from tests.daemon.rig import TRACKING, Rig
 from tests.daemon.test_notify import Supervisor
+from tests.soak import soak
 
 
 @pytest.fixture(scope="module")
@@ -259,3 +260,8 @@ def test_a_solver_that_hangs_does_not_starve_the_watchdog_and_a_refresh_that_tak
     panels.present = present  # type: ignore[method-assign]
     fed.refreshes_for(WATCHDOG_S)
     assert "WATCHDOG=1" in heard.heard()
+
+
+@pytest.mark.slow
+def test_nothing_piles_up_is_lost_or_gets_no_answer_while_parts_are_lost_and_changed() -> None:
+    soak(90.0, growth_mib=200)  # so early, everything still grows
