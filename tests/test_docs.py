@@ -19,6 +19,7 @@ import typer
 import phasestack
 from runtime.commands.app import app
 from runtime.config import Settings
+from runtime.daemon.commands import NAMES
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -134,6 +135,14 @@ def test_options_named_in_a_sentence_exist() -> None:
             name = max((path for path in known if tuple(words[: len(path)]) == path), key=len)
             options = {option for parameter in known[name].params for option in parameter.opts} | {"--help"}
             assert name and {word for word in words if word.startswith("--")} <= options, f"{page.name}: {line}"
+
+
+def test_the_table_of_operation_has_the_commands_of_ctl_that_the_daemon_takes() -> None:
+    typed = {path[-1] for path, _ in walk(typer.main.get_command(app)) if path[:1] == ("ctl",)} - {"ctl"}
+    page = (DOCS / "operation.md").read_text(encoding="utf-8")
+    table = page.partition("| `phasestack ctl` |")[2].partition("\n\n")[0]
+    listed = re.findall(r"`([a-z]+)[^`]*`", " ".join(row.split(" | ")[0] for row in table.splitlines()))
+    assert sorted(listed) == sorted(typed) == sorted(set(NAMES) - {"next"})  # `scene next`, as it is typed
 
 
 @pytest.mark.parametrize("line", CHEAP)
