@@ -26,8 +26,8 @@ LENS = 9  # fx fy cx cy k1 k2 p1 p2 k3
 POSE = 6  # turn, shift
 FOCAL_GUESSES = (0.6, 0.8, 1.1, 1.6, 2.4)  # of the longer side
 ROBUST_PX = 0.3  # residuals beyond this count by their size, not their square
-OUTLIER_SIGMAS = 4.0
-MIN_SIGMA_PX = 0.01
+OUTLIER_SIGMAS = 4.0  # beyond which a point is left out
+MIN_SIGMA_PX = 0.01  # of the points' noise: exact data reject nothing
 NO_FIT_PX = 5.0  # median distance of points beyond which nothing like the configuration was photographed
 MAX_STEPS, MAX_DAMPING = 60, 1e8
 # What is known of any camera before its first photograph, standard deviations: square pixels, a lens over the

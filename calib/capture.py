@@ -18,20 +18,20 @@ from calib.viewpoints import Viewpoint, grid
 from runtime.clock import NS_PER_S, SimulatedClock
 from runtime.config import Settings
 from runtime.errors import InputError
+from runtime.eyes.rest import MAD_TO_SIGMA
+from runtime.eyes.tracker import CONFIDENCE_MIN
 from runtime.records import F64, EyePoints
 from runtime.sensor.registry import open_sensor
 from runtime.sensor.samples import RecordedSamples
 
 WINDOW_NS = NS_PER_S // 2  # a pair is the median over so long
 MAX_SPREAD_M = 0.010  # eyes that moved or scattered by more meanwhile make no pair
-MIN_SAMPLES = 5
-MIN_CONFIDENCE = 0.3
-MAD_TO_SIGMA = 1.4826
+MIN_SAMPLES = 5  # in the window: of fewer the spread means nothing
 
 
 def midpoint(eyes: EyePoints | None) -> F64 | None:
     """(3,) middle of two measured eyes; None where one is missing, uncertain or filled in."""
-    if eyes is None or eyes.completed or eyes.confidence.min() < MIN_CONFIDENCE:
+    if eyes is None or eyes.completed or eyes.confidence.min() < CONFIDENCE_MIN:
         return None
     middle = eyes.eyes_m.mean(axis=0)
     return middle if np.isfinite(middle).all() else None

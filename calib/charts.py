@@ -22,7 +22,7 @@ from runtime.support.artifacts import OutputFolder, write_json, write_png
 from runtime.support.progress import tracked
 
 MODEL = "best"
-LINE_PX = 10.0
+LINE_PX = 10.0  # width of a line of the chart
 WIDEST_FOV_DEG = 40.0  # horizontal, of the eyes' images, as the published code has it
 
 

@@ -14,8 +14,8 @@ from runtime.records import F64
 
 RESIDUAL_LIMIT_M = 0.05  # the EyeReal supplement's (its figure S5)
 SENSOR_NOISE_FLOOR_M = 0.001  # no depth camera does better on a face
-REFUSE_EYE_ERROR_M = 0.05
-WARN_EYE_ERROR_M = 0.01
+REFUSE_EYE_ERROR_M = 0.05  # expected at the eye: such a calibration is useless
+WARN_EYE_ERROR_M = 0.01  # expected at the eye: ghosts are visible
 COPLANAR = 0.01  # third extent over the first
 MIRROR_GAIN = 0.5  # mirrored data fit a mirrored sensor this much better at least
 NAMED = 8  # pairs that a message lists

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from tomlkit import TOMLDocument
 
 
-KEPT_VERSIONS = 20
-KEPT_BYTES_MAX = 64 << 20
+KEPT_VERSIONS = 20  # of a configuration or a calibration that was replaced
+KEPT_BYTES_MAX = 64 << 20  # of a file of which versions are kept
 
 
 def save(path: Path, text: str) -> Path | None:

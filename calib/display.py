@@ -13,7 +13,7 @@ from runtime.panels.registry import open_panels, panel_settings
 from runtime.records import U8, PanelFrame
 from runtime.support.gl import offscreen_context
 
-POLL_NS = 50 * NS_PER_MS
+POLL_NS = 50 * NS_PER_MS  # between two looks for keys
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 

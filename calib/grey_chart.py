@@ -31,14 +31,14 @@ from runtime.support.artifacts import write_text
 
 GREYS = tuple(round(255 * step / 12) for step in range(13))
 SHARES = tuple(step / 16 for step in (1, 2, 4, 6, 8, 11, 14))  # of white pixels in a mixed patch
-PATCHES_ACROSS = 32
+PATCHES_ACROSS = 32  # a panel's width
 MARGIN = 0.15  # of a panel on each side: seen from nearby, its rim has no other panel behind it and no light
 INNER = 0.5  # share of a patch's side that is measured
 SAMPLES = 24  # by as many, of a patch
-MIN_MARKS = 4
+MIN_MARKS = 4  # of the panel, for the homography of its patches
 FALLS = 0.01  # of the range: a brighter grey that is darker by more is no grey curve
-CLIPPED = 0.02
-LUT_ROWS = 256
+CLIPPED = 0.02  # share of the white patches' pixels at the camera's limit, above which a photograph is overexposed
+LUT_ROWS = 256  # one for each 8-bit phase
 BAYER = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]])
 
 

@@ -26,7 +26,7 @@ Poll = Callable[[], Key | None]
 Say = Callable[[str], None]
 Named = tuple[str, U8]  # a photograph (h, w), and what to call it
 Sample = tuple[int, EyePoints | None, str]  # when it was taken, eyes in frame `sensor`, the sensor's serial
-POLL_NS = 20 * NS_PER_MS
+POLL_NS = 20 * NS_PER_MS  # between two looks for keys and samples
 CARD_CHARACTERS = 32  # of a line on a card
 
 

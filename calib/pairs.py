@@ -18,7 +18,7 @@ from runtime.records import F64
 from runtime.support import untrusted_input
 from runtime.support.artifacts import write_text
 
-MAX_PAIRS = 1_000_000
+MAX_PAIRS = 1_000_000  # of one file
 MAX_LISTED = 3  # mistakes that a refusal spells out
 MAX_MAGNITUDE = 1e9  # of a number, in whatever unit
 

@@ -29,7 +29,7 @@ from runtime.records import F64, U8
 from runtime.support.artifacts import write_json
 from runtime.support.progress import status_line
 
-MIN_PHOTOGRAPHS = 5
+MIN_PHOTOGRAPHS = 5  # that are usable
 MIN_SPAN_DEG = 15.0  # between the two directions that lie farthest apart
 DISAGREES = 0.4  # share of a photograph's points that do not fit
 MISFIT_PX = 1.5  # of a photograph: panels that move, or no rigid stack at all

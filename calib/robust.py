@@ -15,9 +15,9 @@ from scipy.stats import chi2
 from calib.similarity import Degenerate, ScaleRule, Similarity, fit, fit_batch
 from runtime.records import F64
 
-STARTS = 120
-START_PAIRS = 4
-STEPS = 4
+STARTS = 120  # random subsets that concentration begins from
+START_PAIRS = 4  # of each subset
+STEPS = 4  # concentration steps of each
 MAX_SCORED = 2000  # of more pairs than these a sample picks the start; the rejection sees them all
 REJECTION_PROBABILITY = 1e-4  # of a good pair, Gaussian noise
 RULE: ScaleRule = "inverse"

@@ -16,7 +16,7 @@ from runtime.errors import InputError, PhasestackError
 from runtime.support import untrusted_input
 from runtime.support.artifacts import write_json
 
-MAX_PROGRESS_BYTES = 4 << 20
+MAX_PROGRESS_BYTES = 4 << 20  # of setup.json
 
 
 def progress_path(config: Path) -> Path:

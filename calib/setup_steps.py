@@ -29,7 +29,7 @@ from runtime.support import untrusted_input
 from runtime.support.artifacts import OutputFolder, write_bytes, write_text
 
 Figures = dict[str, Any]
-MIN_PAIRS = 9
+MIN_PAIRS = 9  # of the 27 viewpoints, before the setup solves
 SERVICE_FOLDER = "/etc/phasestack"
 MAX_BYTES = 64 << 20  # of a file that the service reads
 ARROWS: dict[Key, Arrow] = {Key.UP: "up", Key.DOWN: "down", Key.LEFT: "left", Key.RIGHT: "right"}

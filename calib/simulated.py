@@ -18,7 +18,7 @@ from runtime.optics.stack import PanelStack
 from runtime.panels.monitors import Monitor
 from runtime.records import U8, EyePoints
 
-SENSOR_NOISE_M = 0.003
+SENSOR_NOISE_M = 0.003  # standard deviation of a coordinate, of a simulated depth camera
 STANDING_M = 0.002  # how exactly a person finds the place where the lines fuse, an axis
 SAMPLES_HERE = 16  # of the sensor, at 30 a second, while the person stands somewhere
 

@@ -12,7 +12,7 @@ from runtime.optics.views import stack_from_eye
 from runtime.records import F64
 
 USUAL = CalibrationSettings()  # R 40 to 60 cm, phi 70 to 90 degrees from the vertical, theta 80 to 100 round it
-IPD_M = 0.060
+IPD_M = 0.060  # the paper's, where the configuration names none
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from runtime.errors import InputError, one_line
 from runtime.support import untrusted_input
 from runtime.support.artifacts import write_bytes
 
-FILE_BYTES_MAX = 4 << 30
+FILE_BYTES_MAX = 4 << 30  # of a checkpoint
 WIDTH_KEY = "subnets.in_conv.0.weight"
 
 

@@ -13,8 +13,8 @@ from runtime.optics.views import image_from_stack, stack_from_eye
 from runtime.records import F64, U8
 
 PITCH_WIDTH_M = 0.5184  # of the prototype's panels
-CENTRE = 1
-WIDEST_DEG = 100.0
+CENTRE = 1  # index of the middle one of three panels
+WIDEST_DEG = 100.0  # horizontal field of view of a training picture
 LEAST_COMMON = 0.4  # of the centre panel's width that both eyes must see through all panels
 
 

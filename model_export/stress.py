@@ -14,7 +14,7 @@ from runtime.records import F32
 Feeds = dict[str, np.ndarray]
 ORDINARY = "ordinary pair"
 EXTRA = ("one eye black", "noise")
-LARGE_PX = 1_000_000
+LARGE_PX = 1_000_000  # of a picture: for larger ones the slow cases are left out
 
 
 def stress_pictures(height: int, width: int) -> dict[str, tuple[F32, F32]]:

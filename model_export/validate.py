@@ -22,7 +22,7 @@ from runtime.model.targets import FULL
 from runtime.support import untrusted_input
 from runtime.support.progress import tracked
 
-FILE_BYTES_MAX = 4 << 30
+FILE_BYTES_MAX = 4 << 30  # of a model
 LIMIT = 0.25 / 255  # largest difference in panel values: a quarter of a code
 SMALL = (96, 160)  # pictures for a model that takes any size
 

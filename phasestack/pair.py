@@ -33,9 +33,8 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
 from runtime.records import F64, U8
 from runtime.support.artifacts import OutputFolder, write_json
-from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG, refusal
+from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG, SEPARATION_MIN_M, refusal
 
-SEPARATION_MIN_M = 0.005
 SAME_PLACE_M = 0.001  # an eye and its camera
 _one_at_a_time = Lock()  # a loaded model has buffers of its own
 

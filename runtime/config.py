@@ -28,7 +28,7 @@ from runtime.support.plausible import check_text, nearest, within
 from runtime.support.plugins import located
 from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG
 
-TABLE_BYTES_MAX = 4 << 20
+TABLE_BYTES_MAX = 4 << 20  # of a TOML file
 
 
 class Section(BaseModel):
@@ -45,8 +45,8 @@ class Section(BaseModel):
 M = TypeVar("M", bound=BaseModel)
 
 MOST = 1e9  # of any number that has no narrower range
-PIXEL_ASPECT_TOLERANCE = 0.03
-LEAST_GAP_M = 1e-5
+PIXEL_ASPECT_TOLERANCE = 0.03  # relative: data sheets round the active area
+LEAST_GAP_M = 1e-5  # between panels: thinner than any panel
 PANELS_MOST = 8  # of a stack
 
 NonNegative = Annotated[float, Field(ge=0, le=MOST)]
@@ -398,7 +398,7 @@ def changed(settings: Settings, section: str, values: dict[str, Any], *, source:
     return settings.model_copy(update={section: new})
 
 
-KEY_PARTS_MAX = 16
+KEY_PARTS_MAX = 16  # of a dotted key: tomllib takes the square of their number in time and memory
 TEXTS = re.compile(
     r'''"""(?:[^\\]|\\.)*?"""|\'{3}.*?\'{3}|"(?:[^"\\\n]|\\.)*"|'[^'\n]*'|#[^\n]*''', re.DOTALL
 )  # TOML's strings and comments

@@ -16,9 +16,6 @@ app = typer.Typer(
     "Example: phasestack ctl scene demo",
 )
 
-HUNG_AFTER_S = 5.0
-ANSWERS_WITHIN_S = 70.0  # a scene or a model is loaded first: longer than the daemon itself waits for that
-
 Config = Annotated[Path | None, typer.Option(help="configuration of the daemon: says where its socket is")]
 
 
@@ -106,12 +103,12 @@ for _name, _meaning in PLAIN.items():
 
 def tell(request: dict[str, Any], config: Path | None) -> None:
     """Send one request; prints what holds now. Exits with 1 where no daemon answers, 2 where it refuses."""
-    from runtime.daemon.client import NotRunning, ask, sockets, unit_advice
+    from runtime.daemon.client import TOLD_WITHIN_S, NotRunning, ask, sockets, unit_advice
     from runtime.errors import InputError
     from runtime.support.figures import lines_of
 
     try:
-        answer = ask(sockets(config), request, timeout_s=ANSWERS_WITHIN_S)
+        answer = ask(sockets(config), request, timeout_s=TOLD_WITHIN_S)
     except NotRunning as error:
         typer.echo("; ".join(filter(None, (str(error), unit_advice()))), err=True)
         raise typer.Exit(1) from None
@@ -131,7 +128,7 @@ def status(
 
     Example: phasestack status --json
     """
-    from runtime.daemon.client import NotRunning, ask, sockets, unit_advice
+    from runtime.daemon.client import HUNG_AFTER_S, NotRunning, ask, sockets, unit_advice
     from runtime.support.figures import shown
 
     try:

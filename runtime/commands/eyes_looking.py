@@ -22,9 +22,8 @@ from runtime.records import U8, SensorFrame
 from runtime.sensor.recording import Recording
 from runtime.sensor.registry import open_sensor
 from runtime.support.artifacts import OutputFolder, held_back, png_bytes, read_image
-from runtime.support.film import open_film
+from runtime.support.film import VIDEOS, open_film
 
-FILMS = (".mp4", ".mkv", ".avi", ".mov", ".webm", ".m4v")
 RECORDING = ".mcap"
 OVERLAY_MIN_PX = 640  # longer side of an overlay, at least
 PRIVATE = 0o600  # a face is its owner's
@@ -69,7 +68,7 @@ def look_at_files(
     watcher, rows, follows = Watcher(settings), [], False
     with OutputFolder(out) if out is not None else nullcontext() as folder:
         for place, path in enumerate(files):
-            is_still = path.suffix.lower() not in (RECORDING, *FILMS)
+            is_still = path.suffix.lower() not in (RECORDING, *VIDEOS)
             if not (sequence and is_still and follows):
                 watcher.forget()
             follows = is_still
@@ -89,7 +88,7 @@ def _frames(path: Path, place: int, rate_hz: float) -> Iterator[SensorFrame]:
         for frame in Recording(path).samples():
             # What was found when it was recorded is not asked: the pictures are looked at anew.
             yield frame if frame.colour is None else replace(frame, eyes=None)
-    elif kind in FILMS:
+    elif kind in VIDEOS:
         yield from _filmed(path, rate_hz)
     else:
         yield SensorFrame(place, round(place * NS_PER_S / rate_hz), colour=read_image(path))

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from runtime.records import SensorFrame
     from runtime.sensor.worker import SensorWorker
 
-POLL_S = 0.004
-FIRST_SAMPLE_S = 15.0
+POLL_S = 0.004  # between two looks for samples: a quarter of a 60 Hz sensor's period
+FIRST_SAMPLE_S = 15.0  # that a sensor may take to its first sample
 SUFFIX = ".mcap"
 OVER = ("ended", "failed")
 

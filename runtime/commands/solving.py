@@ -29,8 +29,8 @@ from runtime.plan.savings import Measured, network_items
 from runtime.records import F64
 from runtime.support.artifacts import OutputFolder, read_image, write_json
 from runtime.support.gl import offscreen_context
+from runtime.support.ranges import SEPARATION_MIN_M
 
-SEPARATION_MIN_M = 0.005
 MEASURED_FROM = 10  # runs that are worth a look at which backend is faster
 
 

@@ -9,7 +9,7 @@ from runtime.content.base import View
 from runtime.optics.rect import PixelRect
 from runtime.records import F64
 
-NEAREST_M = 1e-3
+NEAREST_M = 1e-3  # before the eye: the near plane
 
 
 def clip_from_stack(view: View, corners_m: F64) -> F64:

@@ -16,7 +16,7 @@ from runtime.errors import InputError
 from runtime.records import F32, F64
 
 LOW_PASS_PX2 = 0.3  # added to each splat's covariance: none falls between the pixels
-ALPHA_MIN = 1 / 255
+ALPHA_MIN = 1 / 255  # of a splat at a pixel: less changes no code value
 LARGEST_RELATIVE_SCALE = 1000.0  # of a splat, in units of the scene's extent
 COEFFICIENTS = (0, 9, 24, 45)  # f_rest properties: of harmonics to degree 0, 1, 2, 3
 PACKED = [0, 1, 2, 4, 5, 8]  # of a 3x3 matrix, row by row

@@ -22,11 +22,10 @@ from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import U8
 from runtime.support import progress
 from runtime.support.artifacts import read_image
-from runtime.support.film import open_film
+from runtime.support.film import VIDEOS, open_film
 from runtime.support.picture_header import check_size, size_of_file
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
-VIDEOS = (".mp4", ".mkv", ".avi", ".mov", ".webm", ".m4v")
 QUILT = re.compile(r"qs([0-9]{1,6})x([0-9]{1,6})(?:a([0-9]+(?:\.[0-9]+)?))?(?![0-9])")
 ASPECT_MIN, ASPECT_MAX = 0.05, 20.0  # width over height of one view
 MARKS = (  # in a file's name, the longer ones first
@@ -34,8 +33,8 @@ MARKS = (  # in a file's name, the longer ones first
     ("_htb", "half-top-bottom"), ("_hou", "half-top-bottom"), ("_half_ou", "half-top-bottom"),
     ("_half_tb", "half-top-bottom"), ("_sbs", "side-by-side"), ("_tb", "top-bottom"), ("_ou", "top-bottom"),
 )  # fmt: skip
-TELL_EVERY = 64
-VIDEO_FRAMES_MAX = 1e8
+TELL_EVERY = 64  # pictures between two reports of progress
+VIDEO_FRAMES_MAX = 1e8  # that a header may claim: five weeks at 30 a second
 VIDEO_PROPERTIES = (
     cv2.CAP_PROP_FRAME_COUNT,
     cv2.CAP_PROP_FPS,

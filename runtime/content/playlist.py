@@ -21,7 +21,7 @@ from runtime.errors import InputError
 from runtime.support.plausible import within
 from runtime.support.plugins import located
 
-ENTRIES_MAX = 64
+ENTRIES_MAX = 64  # of a playlist: all of them are kept in memory
 
 
 class PlaylistFile(Section):

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from runtime.records import F64
 
 FILE = Path(__file__).with_name("presets.toml")
-CM = 0.01
+CM = 0.01  # metres
 
 Triple = tuple[float, float, float]
 

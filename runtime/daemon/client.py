@@ -19,8 +19,10 @@ from runtime.errors import TransientError
 DEFAULT_SOCKET = "/run/phasestack/status.sock"
 UNIT = "phasestack"
 LOOKED_UP_AGAIN_S = {"status": 0.2, "pictures": 0.3, "log": 0.5, "about": 2.0}
-LOOKED_UP_WITHIN_S = 3.0
-TOLD_WITHIN_S = 70.0  # a scene or a model is loaded first
+LOOKED_UP_WITHIN_S = 3.0  # an answer that needs no work of the loop: a page shows that the daemon hangs after it
+LOADED_WITHIN_S = 60.0  # the daemon waits so long for a scene or a model to load before it answers a command
+TOLD_WITHIN_S = LOADED_WITHIN_S + 10.0  # a client waits longer for the answer than the daemon does
+HUNG_AFTER_S = 5.0  # a loop that has completed no turn for so long hangs
 
 
 def user_socket() -> Path | None:

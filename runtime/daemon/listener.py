@@ -19,9 +19,9 @@ from runtime.support.background import BACKGROUND_NICENESS, begin, set_niceness
 
 log = logging.getLogger("phasestack.service")
 
-REQUEST_MAX_BYTES = 65536
-BACKLOG = 64
-CLIENTS_MAX = 64
+REQUEST_MAX_BYTES = 65536  # of one request, of a client or a page: bounds the memory that anybody can take
+BACKLOG = 64  # connections that wait to be accepted
+CLIENTS_MAX = 64  # connections at once; a newer one takes the place of the one that has waited longest
 REQUEST_S = 5.0  # for a whole request to come, and for its answer to be read
 
 LIMITED: Any = {"limit": REQUEST_MAX_BYTES, "backlog": BACKLOG}  # of asyncio's servers

@@ -22,7 +22,7 @@ from typing import Any
 
 from runtime.clock import NS_PER_S, Clock
 from runtime.config import ServiceSettings
-from runtime.daemon.client import DEFAULT_SOCKET, user_socket
+from runtime.daemon.client import DEFAULT_SOCKET, LOADED_WITHIN_S, user_socket
 from runtime.daemon.commands import Command, parse
 from runtime.daemon.listener import LIMITED, Listener, Refusal
 from runtime.errors import InputError, TransientError, without_secrets
@@ -31,10 +31,9 @@ from runtime.support.artifacts import to_json
 log = logging.getLogger("phasestack.service")
 
 GROUP = "phasestack"  # that may use the socket
-LOOP_ANSWERS_WITHIN_S = 5.0
-LOOKED_AGAIN_S = 0.1  # whether who asks is still there
-ALONE_WITHIN_S = 2.0
-LOADED_WITHIN_S = 60.0  # what has begun is waited for so long
+LOOP_ANSWERS_WITHIN_S = 5.0  # a command that the loop has not begun by then is refused
+LOOKED_AGAIN_S = 0.1  # between checks whether the client is still connected
+ALONE_WITHIN_S = 2.0  # the folder's lock is waited for: nobody holds it longer who takes a socket over
 
 
 class SocketInUse(TransientError):

@@ -140,8 +140,8 @@ def pictures(run: Run) -> dict[str, Any]:
     return {"frame": refresh.account.frame, "jpegs": {name: b64encode(jpeg).decode() for name, jpeg in jpegs.items()}}
 
 
-WIDTH_PX = 256
-JPEG_QUALITY = 80
+WIDTH_PX = 256  # of the page's small pictures
+JPEG_QUALITY = 80  # of the page's small pictures
 
 
 def pictures_of(refresh: Refresh, stack: PanelStack, *, fov_deg: float) -> dict[str, bytes]:

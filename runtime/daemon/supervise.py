@@ -32,7 +32,7 @@ from runtime.support.folders import state_folder
 
 log = logging.getLogger("phasestack.daemon")
 
-PANEL_RETRY_S = 1.0
+PANEL_RETRY_S = 1.0  # between two looks for a panel that is missing at the start
 NEEDS_RESTART = ("stack", "sensor", "output", "service", "model.backend")
 Chosen = dict[tuple[str, str], Any]  # section and key of a setting: what an operator chose while it runs
 

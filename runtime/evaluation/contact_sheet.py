@@ -14,10 +14,10 @@ from runtime.optics.pupil import PUPIL_MM, TRACKING_SIGMA_MM
 from runtime.optics.retina import as_codes
 from runtime.records import U8
 
-TILE_WIDTH = 640
-MARGIN = 12
+TILE_WIDTH = 640  # pixels
+MARGIN = 12  # pixels
 HEADLINE, TITLE = 52, 34
-ERROR_GAIN = 8
+ERROR_GAIN = 8  # that the difference is shown with
 INK = (40, 40, 40)
 PAPER = 246
 

@@ -20,7 +20,7 @@ from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
 
 SECONDS, RATE_HZ, NOISE_MM = 12.0, 30.0, 3.0
-SECONDS_MAX = 3600.0
+SECONDS_MAX = 3600.0  # of a recording that is made: it is held in memory
 
 
 def write_motion(

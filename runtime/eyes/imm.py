@@ -19,7 +19,7 @@ import numpy as np
 from runtime.records import F64
 
 FADE_S = 0.25  # time constant with which an acceleration fades
-WEIGHT_FLOOR = 1e-6
+WEIGHT_FLOOR = 1e-6  # of a filter's probability: a filter that is ruled out can come back
 _NODES, _SHARES = np.polynomial.legendre.leggauss(10)
 _AXES = np.eye(3)
 

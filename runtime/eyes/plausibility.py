@@ -22,10 +22,10 @@ EXCHANGED = "left and right exchanged"
 
 IPD_MIN_M, IPD_MAX_M = 0.050, 0.078  # how far apart a person's eyes are
 WINDOW = 30  # samples: a second of a common depth camera
-SAMPLES_MIN = 10
+SAMPLES_MIN = 10  # before any reason is reported
 TELL_SHARE = 0.5  # of the window, for one reason
 UNIT_SLACK = 1.25  # a separation of 40 to 94 units is one in millimetres: people's is 50 to 75 mm
-DISTANT_M = 20.0
+DISTANT_M = 20.0  # from the display: no sensor sees a face from there
 UPSIDE_DOWN_COSINE = -0.5  # a head rolled by more than 120 degrees is an exchange of its eyes
 
 MISTAKES = (NOT_NEWER, NOT_A_NUMBER, MILLIMETRES, TOO_CLOSE, TOO_FAR_APART, BEHIND, TOO_DISTANT, EXCHANGED)

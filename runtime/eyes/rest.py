@@ -16,14 +16,14 @@ LOST_NS = NS_PER_S  # after a longer gap nothing is known
 DRIFT_NS = 3 * NS_PER_S  # drift is measured by the median of so much
 EVERY = 8  # samples, noise and drift are looked at: neither changes quickly
 FEWEST = 8  # samples that anything is concluded from
-KEPT = 256
+KEPT = 256  # samples of a resting head
 GRACE_M = 0.0005  # of every test, for sensors without noise
 NOISE_MAX_M = 0.005  # what scatters by more is no resting head's, whatever the sensor: it could never be seen to leave
 # In standard deviations of one sample; each is exceeded by white noise once in hours at 60 samples a second.
 SINGLE = 4.5  # two samples in a row, the same way off
-MEDIAN_OF_FIVE = 2.6
+MEDIAN_OF_FIVE = 2.6  # of the newest five samples
 HALVES = 4.5  # of the difference of two halves' means, over the root of their length
-MAD_TO_SIGMA = 1.4826
+MAD_TO_SIGMA = 1.4826  # standard deviation of normal noise over its median absolute deviation
 MEDIAN_EFFICIENCY = 1.25  # a median is a quarter less sure than a mean
 LEVER_M = 0.15  # of a display of half a metre: root mean square of a point's distance from its middle
 NEAREST_M = 0.1  # from the display; nearer eyes count as so near

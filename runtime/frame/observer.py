@@ -49,7 +49,7 @@ Pictures = dict[str, tuple[U8, U8]]  # of both eyes: `solved`, `used`, `true`
 
 
 GAP_NS = NS_PER_S // 5  # a longer gap says nothing of what happened in it
-KEPT = 512
+KEPT = 512  # true positions: eight seconds at 60 Hz
 
 
 class TrueEyes:

@@ -14,7 +14,7 @@ from runtime.records import RefreshAccount, State
 
 WINDOW = 8192  # values at most that quantiles are taken over
 NOW_NS = NS_PER_S  # rates "now" are those of the last second
-NOW_KEPT = 1024
+NOW_KEPT = 1024  # refreshes that such a second may have
 STAGES = ("sensor", "track", *SOLVING_STAGES, "present", "wait")
 OVERHEAD_STAGES = ("sensor", "track")
 

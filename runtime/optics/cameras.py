@@ -16,7 +16,7 @@ from runtime.optics.views import stack_from_eye
 from runtime.records import F32, F64, U8
 
 BESIDE_MOST = 1 / 3  # of a picture, beside the panels, that passes without a word
-LEAST_PX = 16
+LEAST_PX = 16  # side of a resampled picture
 EXACT = 1e-6  # of a focal length: cameras that differ by less are the same
 DIGITS = 9  # of metres and degrees: what a camera was made from is found again
 NAMES = ("left", "right")

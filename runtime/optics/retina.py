@@ -19,7 +19,7 @@ from runtime.records import F32, F64, U8
 
 Mask = NDArray[np.bool_]
 
-STRIP_ROWS = 32
+STRIP_ROWS = 32  # of a picture that are worked on together: they fit the cache
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,13 +9,11 @@ from typing import Any
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from runtime.daemon.listener import REQUEST_MAX_BYTES, REQUEST_S
 from runtime.errors import InputError
 
 LOOPBACK = "127.0.0.1"
-MESSAGE_MAX_BYTES = 65536  # of a page
-
-CONNECTIONS_MAX = 64
-REQUEST_S = 5.0  # for a whole request to come
+CONNECTIONS_MAX = 64  # at once; a newer one takes the place of the one that has waited longest
 
 
 class LimitedConnection(H11Protocol):
@@ -64,7 +62,7 @@ def server_of(application: Any) -> uvicorn.Server:
             timeout_graceful_shutdown=2,
             http=LimitedConnection,
             ws="websockets-sansio",
-            ws_max_size=MESSAGE_MAX_BYTES,
+            ws_max_size=REQUEST_MAX_BYTES,
             ws_per_message_deflate=False,
         )
     )

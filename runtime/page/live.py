@@ -18,7 +18,7 @@ from runtime.optics.retina import as_codes
 from runtime.records import Layers, pixels_of
 from runtime.support.artifacts import to_json
 
-PAGES_MAX = 8
+PAGES_MAX = 8  # live pages at once: each is sent its own pictures
 RANGES = {"noise_mm": (0.0, 50.0), "latency_ms": (0.0, 1000.0), "camera_fov_deg": (20.0, 150.0)}
 RANGES |= {"gap_mm": (1.0, 500.0), "camera": (0.0, 1.0)}  # what needs a new start
 

@@ -25,14 +25,13 @@ from runtime.browser.link import BrowserLink
 from runtime.browser.still import asset as browser_asset
 from runtime.daemon.client import LOOKED_UP_AGAIN_S, Daemon
 from runtime.daemon.commands import NAMES
+from runtime.daemon.listener import REQUEST_MAX_BYTES, REQUEST_S
 from runtime.errors import InputError
-from runtime.page.connections import REQUEST_S
 from runtime.page.live import live
 from runtime.page.token import same
 from runtime.support.artifacts import to_json
 from runtime.support.untrusted_input import parsed_json
 
-BODY_MAX_BYTES = 65536
 SCRIPT, STYLE = "text/javascript", "text/css"
 PROTOCOL = "phasestack"  # of the WebSocket
 ASSETS = {"page.css": STYLE, "look.css": STYLE}
@@ -145,7 +144,7 @@ async def _body(request: Request) -> bytes:
         async with asyncio.timeout(REQUEST_S):
             async for piece in request.stream():
                 received += piece
-                if len(received) > BODY_MAX_BYTES:
+                if len(received) > REQUEST_MAX_BYTES:
                     raise TooLong
     except (ClientDisconnect, TimeoutError):
         raise ValueError from None

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from runtime.errors import InputError
 
-TOKEN_BYTES = 32
-LEAST_CHARACTERS = 16
-MOST_BYTES = 4096
+TOKEN_BYTES = 32  # random bytes of a new token
+LEAST_CHARACTERS = 16  # of a token that somebody wrote: a shorter one can be guessed
+MOST_BYTES = 4096  # that are read of its file
 
 
 def token_of(path: Path) -> str:

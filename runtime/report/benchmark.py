@@ -20,7 +20,7 @@ from runtime.report.pairs import FOV_DEG, Painter, eyes_at
 SIZES = ((960, 540), (1920, 1080))
 WORSE_DB = 0.1  # more than rounding and the order of threads can change
 SLOWER = 0.15  # at least; more where the runs themselves scatter more
-MORE_MEMORY = 0.15
+MORE_MEMORY = 0.15  # relative: a change that is reported
 UNSTEADY = 1.3  # times the least yardstick: the machine's speed changed by more than a difference that counts
 SCATTERS = 3.0  # of the medians' own scatter before a difference counts
 

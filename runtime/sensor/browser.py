@@ -17,8 +17,8 @@ from runtime.sensor.base import Capabilities, DeviceClock, Sensor
 
 AGAIN_NS = NS_PER_S // 30  # a page reports eyes when they move; between reports the last position is repeated
 SILENT_NS = 5 * NS_PER_S  # without a word from a page nobody is seen
-LEAST_SIGMA_M = 5e-5
-PICTURE_MAX_PX = 2048
+LEAST_SIGMA_M = 5e-5  # that a sample states; without simulated noise a covariance would be singular
+PICTURE_MAX_PX = 2048  # longer side of a page's camera picture
 
 
 class BrowserEyes(Sensor):

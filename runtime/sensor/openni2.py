@@ -21,10 +21,10 @@ from runtime.records import U8, U16, Intrinsics, SensorFrame
 from runtime.sensor.base import Capabilities, DeviceClock, Sensor
 from runtime.sensor.openni2_library import load
 
-SERIAL_PROPERTY = 3
+SERIAL_PROPERTY = 3  # ONI_DEVICE_PROPERTY_SERIAL_NUMBER
 DEPTH_1_MM, DEPTH_100_UM, RGB888, GRAY8 = 100, 101, 200, 202
 PAIR_APART_US = 40_000  # depth and colour of one instant are no further apart: a period of a camera without sync
-PAIR_WAIT_S = 0.02
+PAIR_WAIT_S = 0.02  # that a depth picture waits for its colour
 THREADS_STOP_S = 0.5  # fifteen periods of a file's threads: on a busy machine three were too few (crashes)
 DRAIN_MAX = 32  # frames that are passed over in one call: a queue can't keep us
 

@@ -29,7 +29,7 @@ SUMMARY_BYTES = 10_000  # with the schemas
 MAX_S, MAX_BYTES = 600.0, 2 << 30  # a recording ends before it is longer or larger
 MAGIC = b"\x89MCAP0\r\n"
 
-SYNCED_WITHIN_S = 30.0
+SYNCED_WITHIN_S = 30.0  # that closing a file waits for a slow disk
 SYNC_EVERY_NS = 2 * NS_PER_S  # what a power cut takes of a recording at most, on a disk that keeps up
 
 log = logging.getLogger(__name__)

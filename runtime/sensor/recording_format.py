@@ -19,10 +19,10 @@ SCHEMA_VERSION = 1
 METADATA_NAME = "phasestack.recording"
 EYES_TOPIC, COLOUR_TOPIC, DEPTH_TOPIC, CALIBRATION_TOPIC = "/eyes", "/colour", "/depth", "/camera"
 POSITION_DIGITS = 7  # a tenth of a micrometre: four digits below the best sensor's noise
-JPEG_QUALITY = 92
+JPEG_QUALITY = 92  # of recorded colour pictures
 NUMBER_MAX = 1 << 62  # as a time, 146 years: sums and differences of two still fit 64 bits
 COORDINATE_MAX_M = 1e6  # beyond any sensor's range in any unit; plausibility is the tracker's business
-IMAGE_SIDE_MAX_PX = 1 << 15
+IMAGE_SIDE_MAX_PX = 1 << 15  # of a recorded picture: beyond any camera's
 
 Count = Annotated[int, Field(ge=0, le=NUMBER_MAX)]
 Unit = Annotated[float, Field(ge=0, le=1)]

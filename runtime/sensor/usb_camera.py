@@ -18,7 +18,7 @@ from runtime.sensor.base import Capabilities, Sensor
 from runtime.support.film import open_film
 
 WAITED_NS = 3 * NS_PER_MS  # a picture that comes sooner lay in the driver's queue, and a newer one may
-QUEUE_MAX = 8
+QUEUE_MAX = 8  # pictures that one read takes out of the driver's queue at most
 STAMP_AGE_NS = NS_PER_S  # a picture's stamp that is older, or in the future, is none
 
 

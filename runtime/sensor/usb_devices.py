@@ -11,7 +11,7 @@ from runtime.errors import MissingPart, SensorLost
 UDEV_RULE = "70-phasestack-sensors.rules"
 SPEEDS = {1: "low speed (1.5 Mbit/s)", 2: "full speed (12 Mbit/s)", 3: "high speed, USB 2 (480 Mbit/s)"}
 SPEEDS |= {4: "SuperSpeed, USB 3 (5 Gbit/s)", 5: "SuperSpeed+, USB 3 (10 Gbit/s)"}
-SUPER_SPEED = 4
+SUPER_SPEED = 4  # libusb's number of USB 3's speed
 
 
 class KnownDevice(NamedTuple):

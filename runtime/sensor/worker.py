@@ -18,11 +18,11 @@ from runtime.sensor.base import Capabilities, Sensor
 from runtime.sensor.samples import FindEyes, Samples, finder, searched
 from runtime.support.background import begin
 
-TIMEOUTS_TO_REOPEN = 2
+TIMEOUTS_TO_REOPEN = 2  # in a row, without an error: then the sensor is reopened
 REOPEN_AFTER_S, REOPEN_AFTER_MAX_S = 0.25, 0.5  # the wait before a lost sensor is opened again doubles up to the second
 OPEN_TIMEOUT_S = 10.0  # an SDK that takes longer to open is given up and opened anew
-HANG_MARGIN_S = 0.5
-ABANDONED_MAX = 8
+HANG_MARGIN_S = 0.5  # beyond its time-out that a read may take before its thread counts as hung
+ABANDONED_MAX = 8  # hung threads that are left behind; with more, the sensor is given up
 QUEUE_MAX = 1024  # samples that wait to be read: four seconds of the fastest sensor
 PICTURES_MAX = 8  # the same of samples that carry pictures
 AHEAD_NS = NS_PER_S // 1000  # a capture time later than its arrival by more than this is not of this machine's clock

@@ -25,7 +25,7 @@ from runtime.support.picture_header import PNG, is_cut_off, read_coded
 
 STAGING = ".phasestack-staging-"
 JPEG = b"\xff\xd8\xff"
-ROWS_AT_ONCE = 64
+ROWS_AT_ONCE = 64  # of a picture that are converted together: bounds the memory
 TURNED = "a transparent picture that its EXIF entry turns can't be read"
 
 

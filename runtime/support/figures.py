@@ -8,7 +8,7 @@ from typing import Any
 
 from runtime.errors import one_line
 
-LINE_MAX = 2000
+LINE_MAX = 2000  # characters
 
 
 def shown(record: Mapping[str, Any], *, as_json: bool) -> str:

@@ -10,6 +10,7 @@ import cv2
 
 from runtime.support import untrusted_input
 
+VIDEOS = (".mp4", ".mkv", ".avi", ".mov", ".webm", ".m4v")
 CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
 OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 _alone = threading.Lock()

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import moderngl
 
 DEBIAN_PACKAGES = "libegl1 libgl1-mesa-dri libgles2 libgl1"
-MINIMUM_VERSION = 330
+MINIMUM_VERSION = 330  # of OpenGL, times 100: the shaders' version
 # Libraries by their sonames: the search that moderngl does otherwise starts a compiler and costs 60 ms.
 EGL: dict[str, Any] = {"backend": "egl", "libegl": "libEGL.so.1", "libgl": "libGL.so.1"}
 

@@ -30,9 +30,9 @@ PRIORITY = {
     logging.CRITICAL: "<2>",
 }
 ROOTS = ("phasestack", "runtime")  # named for what they report, or after their module
-BURST = 5
-REMEMBERED = 1000
-QUIET_NS = 30 * NS_PER_S
+BURST = 5  # equal messages that pass in `QUIET_NS`
+REMEMBERED = 1000  # different messages that are counted
+QUIET_NS = 30 * NS_PER_S  # after which a suppressed message passes again
 QUEUED_MAX = 4096  # lines that wait for a reader
 CLOSE_S = 1.0  # so long the last lines are waited for
 LINE_MAX = 4000  # characters

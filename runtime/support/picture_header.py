@@ -13,7 +13,7 @@ from runtime.support.untrusted_input import LIMITS
 
 PNG = b"\x89PNG\r\n\x1a\n"
 CHUNK_BYTES = 12  # of a PNG's part without what it holds: length, kind, checksum
-SIDE_MAX_PX = 1 << 16
+SIDE_MAX_PX = 1 << 16  # that a header may claim
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "PPM", "TGA")  # Pillow's; of EPS it would start Ghostscript
 ORIENTATION = 0x0112  # EXIF's tag
 TURNED = (5, 6, 7, 8)  # by a quarter: width and height are exchanged

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 EYE_MOST_M = 50.0  # a coordinate of an eye, either way
+SEPARATION_MIN_M = 0.005  # between two eyes: what is unusual for a person is the tracker's business
 FOV_RANGE_DEG = (0.1, 179.0)  # least and most of a picture's horizontal field of view
 RECORD_MOST_S = 604_800.0  # a week
 SCALE = (1e-6, 1e6)  # least and most of a frame's unit by another's: micrometres in metres, and the other way

@@ -16,8 +16,8 @@ from typing import IO, Any
 
 from runtime.errors import InputError
 
-JSON_DEPTH_MAX = 64
-JSON_BYTES_MAX = 64 << 20
+JSON_DEPTH_MAX = 64  # nested objects: Python's recursion bears more
+JSON_BYTES_MAX = 64 << 20  # of a JSON file
 DIGITS_MAX = 19  # of a 63-bit number
 MIB = 1 << 20
 
