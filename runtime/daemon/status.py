@@ -13,7 +13,7 @@ import numpy as np
 from runtime.browser.link import BrowserLink
 from runtime.clock import NS_PER_MS
 from runtime.config import ContentSettings, Settings
-from runtime.content.pictures import PICTURES, VIDEOS
+from runtime.content.pictures import PICTURES
 from runtime.content.presets import preset_names
 from runtime.content.registry import MESHES, PLAYLISTS
 from runtime.content.scenes import SCENES
@@ -24,6 +24,7 @@ from runtime.model.predictor import SHIPPED
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.records import U8, RefreshAccount, pixels_of
+from runtime.support.film import VIDEOS
 from runtime.support.version import version
 
 LIBRARY_MOST, LIBRARY_LOOKED_AT = 200, 2000
