@@ -53,7 +53,7 @@ class Mark:
 
     @property
     def saddles_px(self) -> F64:
-        """(4, 2) corners of the white square, pixels of the panel: top left, top right, bottom right, bottom left."""
+        """(4, 2) corners of the white square in panel pixels, clockwise from the top left."""
         u, v, side = self.left_px, self.top_px, self.side_px
         return np.array([[u, v], [u + side, v], [u + side, v + side], [u, v + side]], dtype=np.float64)
 

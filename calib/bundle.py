@@ -1,4 +1,4 @@
-"""Bundle adjustment: one camera, its places, and six degrees of freedom of every panel, from saddles in photographs.
+"""Bundle adjustment of one camera, its poses, and six degrees of freedom of every panel.
 
 The panels' own pixel pitch is the metre. The reference panel defines the stack's frame: it lies at its ideal place,
 and all else is relative to it. Robust first (soft L1), then what lies far off is left out and the rest is

@@ -1,4 +1,4 @@
-"""`calibrate capture`: a person's way through the viewpoints, when a pair is good enough to keep, the file of pairs."""
+"""`calibrate capture`: guides a person through the viewpoints and keeps the good pairs."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class EyeWindow:
             self._samples.popleft()
 
     def measure(self) -> tuple[F64, float] | None:
-        """Their median (3,), frame `sensor`, and robust RMS distance from it; None with fewer than `MIN_SAMPLES`."""
+        """Median (3,) of the window, frame `sensor`, and robust RMS distance; None: too few samples."""
         if len(self._samples) < MIN_SAMPLES:
             return None
         points = np.array([point for _, point in self._samples])

@@ -1,4 +1,4 @@
-"""Calibration charts: black lines on white at the thirds of each eye's image (EyeReal, 2.3, figure S4).
+"""Calibration charts: black lines at the thirds of each eye's image (EyeReal, 2.3, figure S4).
 
 Layers for both eyes at once: at the viewpoint the lines fuse, single and clean; off it they grow ghosts and stripes.
 """
@@ -27,7 +27,7 @@ WIDEST_FOV_DEG = 40.0  # horizontal, of the eyes' images, as the published code 
 
 
 def chart_fov_deg(viewpoint: Viewpoint, stack: PanelStack) -> float:
-    """Horizontal field of view of a viewpoint's eye images: the published one, or, from afar, the display's width.
+    """Horizontal field of view of a viewpoint's images: as published, or the display's from afar.
 
     The lines so stay on the panels wherever the viewer stands.
     """

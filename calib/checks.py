@@ -48,7 +48,7 @@ def check_pairs(pairs: Pairs) -> list[str]:
 
 
 def check_solution(pairs: Pairs, solution: Solution, volume_m: F64) -> list[str]:
-    """Warnings about a solution; `volume_m` (..., 3): where viewers are. Raises InputError: not to be used."""
+    """Warnings about a solution; `volume_m` (..., 3): the viewing volume. Raises InputError."""
     warnings = []
     check_similarity(solution.similarity.matrix, source=pairs.source)
     axis = "xyz"[int(np.argmax(solution.axis_rms_m))]

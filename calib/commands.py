@@ -1,4 +1,4 @@
-"""`phasestack calibrate`: where the sensor stands, where the panels are, how grey they are. Imports nothing heavy."""
+"""`phasestack calibrate`: panels, grey curves and the sensor's pose. Imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def panels(
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Find where every panel is from photographs of coded boards: distances, tilts, homographies, and how sure.
+    """Find where every panel is from photographs of coded boards, with standard errors.
 
     First --show: take 8 to 20 photographs by hand with one camera, without zooming between them, the display filling
     most of the picture, the room dim: from the middle, the left, the right, above and below, up to 40 degrees aside,
@@ -123,7 +123,7 @@ def capture(
     show: Annotated[bool, typer.Option("--show", help="show each chart on the panels")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Pair each chart's viewpoint with where the sensor sees the eyes. Every accepted pair is on disk at once.
+    """Pair each chart's viewpoint with the measured eyes; every accepted pair is saved at once.
 
     Live: at each chart move until the lines fuse, then press Enter (n: next, p: previous, whose pair Enter
     replaces, q: stop).

@@ -1,4 +1,4 @@
-"""Writing into a configuration: its comments stay, what it was is kept beside it, and only what is valid is written."""
+"""Writes to a configuration file: comments and past versions are kept; only valid ones are written."""
 
 from __future__ import annotations
 
@@ -25,8 +25,10 @@ KEPT_BYTES_MAX = 64 << 20  # of a file of which versions are kept
 
 
 def save(path: Path, text: str) -> Path | None:
-    """Write a file atomically, or the one that a link leads to; the one it replaces becomes the newest past version
-    beside it, which is returned, for no more readers than the file itself."""
+    """Write a file (or a link's target) atomically, and keep the one it replaces.
+
+    Answers the kept version's path, which is readable by no more users than the file.
+    """
     path, kept = path.resolve(), None
     if untrusted_input.is_there(path):
         pattern = re.compile(re.escape(path.stem) + r"\.(\d+)" + re.escape(path.suffix))
@@ -78,7 +80,7 @@ def put(document: TOMLDocument, section: str, values: Mapping[str, Any]) -> None
 
 
 def put_panels(document: TOMLDocument, key: str, values: Mapping[int, Any], *, panels: int) -> None:
-    """Set a key of some panels' tables (their homographies, a grey curve); the tables are made where there are none."""
+    """Set a key in some panels' tables (homography, grey curve), which are created if missing."""
     output: Any = document.setdefault("output", tomlkit.table())
     if "panels" not in output:
         output["panels"] = tomlkit.aot()

@@ -1,4 +1,4 @@
-"""The boards' saddles in a photograph, each to a few hundredths of a pixel; or what is wrong with the photograph."""
+"""Saddle points of the boards in a photograph to a few hundredths of a pixel, or its fault."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ class PanelDisplay:
         self._sink.present(PanelFrame(self._number, layers, self._number))
 
     def key(self) -> Key | None:
-        """The next key, or None. The same layers once more: it takes in the windows' events and keeps them alive.
+        """The next key, or None. Shows the layers again, which keeps the windows responsive.
 
         Raises PanelLost.
         """
@@ -47,7 +47,7 @@ class PanelDisplay:
 
 
 def open_display(settings: Settings, *, registered: bool = False, grey_curve: bool = True) -> PanelDisplay:
-    """The configured panels. registered, grey_curve: as configured; False: the bare panels, for what measures them.
+    """The configured panels. registered, grey_curve: False for bare panels, to measure them.
 
     Raises InputError, MissingPart, PanelLost.
     """

@@ -107,7 +107,7 @@ def grey_charts(stack: PanelStack, panel: int) -> U8:
 def lut_from_photographs(
     out: Path, pictures: Iterable[tuple[str, U8]], stack: PanelStack, *, panel: int, source: str
 ) -> dict[str, Any]:
-    """Write a panel's LUT from named photographs (h, w) of its chart; returns the summary. Raises InputError."""
+    """Write a panel's LUT from named photographs (h, w) of its chart. Raises InputError."""
     found = [histograms(picture, stack, panel, source=f"{source}, {name}") for name, picture in pictures]
     intensity, residual = measure(found, stack, panel, source=source)
     write_lut(out, intensity)
@@ -115,7 +115,7 @@ def lut_from_photographs(
 
 
 def write_lut(out: Path, intensity: F64) -> None:
-    """A panel's LUT, 256 rows of phase and grey from 0 to 1, from the intensities (13,) in [0, 1] of `GREYS`."""
+    """Write a panel's LUT (256 rows of phase and grey, 0 to 1) from intensities (13,) of `GREYS`."""
     # The root of the intensity is smooth at both ends, of a bare panel and of a monitor with a tone curve of its own.
     root = PchipInterpolator(np.array(GREYS) / 255, np.sqrt(np.maximum.accumulate(intensity)))
     fine, rows = np.linspace(0.0, 1.0, 4097), np.linspace(0.0, 1.0, LUT_ROWS)
@@ -154,8 +154,9 @@ def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F6
 
 
 def measure(pictures: list[F64], stack: PanelStack, panel: int, *, source: str) -> tuple[F64, float]:
-    """(13,) intensities of `GREYS`, from 0 to 1, from the histograms of one or more photographs with one exposure, and
-    how far a patch is off them, typically, as a share of its light.
+    """(13,) intensities of `GREYS`, 0 to 1, from histograms of photographs of one exposure.
+
+    Also the typical relative residual of a patch.
 
     Fitted together: the camera's tone curve, each photograph's uneven light (a quadratic of its logarithm), and the
     greys. Raises InputError where the greys do not ascend.

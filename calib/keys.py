@@ -1,4 +1,4 @@
-"""What a person types: lines in the terminal; keys, one at a time and without waiting, there or on a panel's window."""
+"""Keyboard input: lines and single keys in the terminal, single keys on a panel's window."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pairs of a measured sensor point and the known stack point: reading, checking, and keeping them safe."""
+"""Pairs of a measured sensor point and a known stack point: read, checked, stored."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class Pairs:
 
 
 def read_pairs(path: Path) -> Pairs:
-    """Pairs from CSV (a header with `COLUMNS`, others ignored) or JSON (a list of objects, or `{"pairs": [...]}`).
+    """Pairs from CSV (header `COLUMNS`) or JSON (a list of objects, or `{"pairs": [...]}`).
 
     Raises InputError, naming the file and every row and column that is wrong.
     """

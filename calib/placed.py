@@ -1,4 +1,4 @@
-"""Panels where they really are: six degrees of freedom each, and what an eye or a camera makes of that.
+"""Panels at their true poses, six degrees of freedom each, and how eyes and cameras see them.
 
 A panel's own frame has its origin at the panel's middle and the axes of `stack`: x out of the screen, y along the
 rows to the viewer's right, z up. Its pixel pitch is the stack's.
@@ -61,7 +61,7 @@ def stack_from_pixels(panel: PlacedPanel, stack: PanelStack) -> F64:
 
 
 def ideal_panel(stack: PanelStack, index: int) -> PlacedPanel:
-    """The panel where the geometry says that it is: parallel to the others, its middle on the stack's axis."""
+    """The panel at its nominal pose: parallel to the others, centred on the stack's axis."""
     return PlacedPanel(np.eye(3), np.array([stack.x_m[index], 0.0, 0.0]))
 
 

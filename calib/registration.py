@@ -1,4 +1,4 @@
-"""From photographs of the boards to what the runtime needs: distances, homographies, and how far to trust them.
+"""Registration from photographs of the boards: positions, homographies, standard errors.
 
 The stack's frame is the reference (middle) panel's: it stays where it is and its picture is not resampled. The other
 panels get their true distance, and a homography that puts each of their pixels where a panel parallel to the
@@ -69,7 +69,7 @@ def homographies(panels: Sequence[PlacedPanel], stack: PanelStack, eye_m: F64) -
 
 
 def geometry_of(panels: Sequence[PlacedPanel], stack: PanelStack, *, eye_m: F64) -> PanelStack:
-    """The geometry to configure for panels that stand so: distances, and tilts with homographies for an eye (3,).
+    """The configurable geometry of posed panels: positions, tilts and homographies for an eye (3,).
 
     Raises Undetermined where the panels do not stand in order.
     """
@@ -174,7 +174,7 @@ def _refuse_implausible(bundle: Bundle, stack: PanelStack) -> None:
 def register_photos(
     pictures: Iterable[tuple[str, U8]], source: str, out: Path, settings: Settings, *, config: Path | None
 ) -> dict[str, Any]:
-    """Register from named photographs (h, w) of the boards, report, and write into `config` where one is given.
+    """Register from named photographs (h, w), report, and optionally write into `config`.
 
     Raises InputError; nothing is written then.
     """

@@ -1,4 +1,4 @@
-"""`calibrate report`: the error of every point (seed's figure S5), and all other figures, on one page."""
+"""`calibrate report`: the error at every point (figure S5) and all other figures, on a page."""
 
 from __future__ import annotations
 

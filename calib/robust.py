@@ -1,4 +1,4 @@
-"""Similarities from pairs of which some are grossly wrong: least trimmed squares, then rejection and a refit.
+"""Robust similarities from pairs with gross errors: least trimmed squares, rejection, refit.
 
 Least trimmed squares (Rousseeuw 1984) with concentration steps (FAST-LTS, Rousseeuw & Van Driessen 1999) finds the
 half of the pairs that agree best; what lies outside the noise that this half and its neighbours show is rejected.

@@ -1,4 +1,4 @@
-"""The steps of setting up, each for itself: what it asks, what it writes into the configuration, what came of it."""
+"""The steps of `phasestack setup`: what each asks, writes into the configuration, and reports."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Step:
 
 
 def identify(setup: Setup) -> Figures:
-    """Which monitor is which panel, rear to front, and how each is mounted; one monitor at a time shows a card."""
+    """Step 1: which monitor is which panel, and how it is mounted, by a card on one at a time."""
     hardware, count = setup.hardware, setup.settings.stack.stack().count
     monitors = hardware.monitors()
     if len(monitors) < count:
@@ -161,7 +161,7 @@ def registration(setup: Setup) -> Figures:
 
 
 def grey(setup: Setup) -> Figures:
-    """What each panel makes of a grey, from photographs of its chart; a panel at a time, each kept at once."""
+    """Step 4: the grey curve of each panel from photographs of its chart, saved one by one."""
     stack = setup.settings.stack.stack()
     known = [bool(panel.lut) for panel in setup.settings.output.panels] or [False] * stack.count
     residuals = [0.0]
@@ -229,7 +229,7 @@ def calibration(setup: Setup) -> Figures:
 
 
 def service(setup: Setup) -> Figures:
-    """A folder with all that the service reads, and the commands that apply it, which are run where they may be."""
+    """Step 7: a folder with the service's files, and the commands that install it."""
     folder = (setup.out / "service").resolve()
     files = gather(setup.config, folder)
     sudo = "" if os.geteuid() == 0 else "sudo "

@@ -1,4 +1,4 @@
-"""Closed-form similarities from pairs of points (EyeReal supplement, (19)-(27), with its scale and two better ones).
+"""Closed-form similarities from pairs of points (supplement, (19)-(27)), with three scales.
 
 A similarity maps a sensor point c to the stack as  w = s·R·c + t.  Every rule finds the same rotation, the one that
 maximises the correlation of the centred points (Kabsch, Umeyama 1991), and differs in the scale:
@@ -95,7 +95,7 @@ def fit_batch(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
 
 
 def extents(points_m: F64) -> F64:
-    """(3,) singular values of K points about their mean, over the root of K: RMS extents along principal axes, m."""
+    """(3,) RMS extents, m, of K points along their principal axes."""
     centred, _ = _centred(points_m)
     size = float(np.abs(centred).max(initial=0.0))
     if size == 0.0:

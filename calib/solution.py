@@ -117,7 +117,7 @@ def solve(sensor_m: F64, stack_m: F64, *, method: Method, known_scale: float = 1
 
 
 def posterior_scale(fitted: F64 | float, *, sigma: float, freedom: int) -> tuple[F64, F64]:
-    """What is believed of the logarithm of a scale (...), and its standard deviation: two hypotheses, weighed (Bayes).
+    """Posterior mean and standard deviation of a log scale (...) under two hypotheses (Bayes).
 
     The pairs tell a fitted logarithm with an error estimated by so many degrees of freedom: Student's likelihood. The
     answer is the mean of both hypotheses' (0, and the fitted one) by their probabilities: no cliff between them, and a

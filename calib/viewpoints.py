@@ -1,4 +1,4 @@
-"""Where viewers stand: the calibration viewpoints (EyeReal, 2.3, for any distance), and the volume of errors."""
+"""Calibration viewpoints (EyeReal, 2.3, for any distance) and the viewing volume."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def viewing_place_m(viewing: CalibrationSettings) -> F64:
 
 
 def grid(viewing: CalibrationSettings = USUAL) -> tuple[Viewpoint, ...]:
-    """The 27 viewpoints of a configured viewing range, nearest first, row by row; the EyeReal's for the usual one."""
+    """The 27 viewpoints of a viewing range, nearest first; the EyeReal's for the default range."""
     low_deg, high_deg = viewing.viewing_up_deg
     radii_cm = np.rint(100 * np.linspace(*viewing.viewing_m, 3)).astype(int)
     phi_deg = np.rint(90 - np.linspace(high_deg, low_deg, 3)).astype(int)
@@ -60,8 +60,9 @@ def grid(viewing: CalibrationSettings = USUAL) -> tuple[Viewpoint, ...]:
 
 
 def viewing_volume_m(viewing: CalibrationSettings = USUAL) -> F64:
-    """(125, 3) points in `stack` that stand for where viewers are: beyond the grid by a quarter of its nearest
-    distance and half of its farthest, by 15 degrees to each side and 10 up and down.
+    """(125, 3) points in `stack` that span the viewing volume.
+
+    It exceeds the grid by a quarter of the nearest and half of the farthest distance, 15 degrees sideways, 10 up.
 
     For the usual range 0.3 to 0.9 m away, 25 degrees to each side.
     """

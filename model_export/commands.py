@@ -110,7 +110,7 @@ def export(
     option: Options = None,
     as_json: Annotated[bool, typer.Option("--json", help="the checks as one object on stdout")] = False,
 ) -> None:
-    """Write a model as ONNX with its contract, after checking it against torch; one that fails isn't written.
+    """Write a model as ONNX with its contract, if it agrees with torch.
 
     Without --checkpoint or --random-init, fast, balanced and best are made from the recipes that ship.
     Exits with 1 where a check fails.
@@ -140,7 +140,7 @@ def validate(
     file: Annotated[Path, typer.Argument(help="the ONNX file")],
     as_json: Annotated[bool, typer.Option("--json", help="the checks as one object on stdout")] = False,
 ) -> None:
-    """Check a model file: contract, names, shapes, and finite values on stress inputs, with and without optimisation.
+    """Check a model file: contract, names, shapes, and finite values on stress inputs.
 
     Exits with 1 where a check fails.
 

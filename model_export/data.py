@@ -1,4 +1,4 @@
-"""Endless procedural pairs: poses over the whole design range, scenes of planes, views from around the eyes."""
+"""Endless procedural training pairs: random poses, scenes of planes, views around the eyes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class TrainingPair:
 
 
 def random_stack(random: Random, *, width_px: int, height_px: int) -> PanelStack:
-    """Three even panels: the prototype's, whole at a coarser raster or a piece of them, or of another size."""
+    """Three even panels: the prototype's at a coarser raster, a part of them, or another size."""
     width_m = PITCH_WIDTH_M * math.exp(random.uniform(math.log(0.25), math.log(1.6)))
     gap_m = math.exp(random.uniform(math.log(0.005), math.log(0.5)))
     if random.random() < 0.6:  # what people build
@@ -88,7 +88,7 @@ def random_place(
 def random_pair(
     random: Random, *, width_px: int, height_px: int, stack: PanelStack | None = None, fov_deg: float = 0.0
 ) -> TrainingPair:
-    """One pair of the endless stream, of the panels given or random ones; fov_deg 0: what the panels fill."""
+    """One random training pair, for given or random panels; fov_deg 0: as wide as the panels."""
     stack, eyes = random_place(random, width_px=width_px, height_px=height_px, stack=stack)
     scene = random_scene(random, stack, eyes.mean(axis=0))
     fov_deg = fov_deg or filling_fov_deg(stack, eyes.mean(axis=0))

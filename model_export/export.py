@@ -112,7 +112,7 @@ def spectral_file(net: SpectralSolver, recipe: Recipe) -> bytes:
 def picture_network(
     arch: str, checkpoint: Path | None, random_init: int | None, options: dict[str, Any]
 ) -> tuple[Network, str]:
-    """A network of pictures with a checkpoint's weights, or untrained ones, and the digest of where they are from.
+    """A picture network with a checkpoint's weights or untrained, and its source's digest.
 
     A checkpoint of `phasestack train` knows the network's options, and it must be of that network.
     """

@@ -1,4 +1,4 @@
-"""Differentiable light: what eyes see of a stack of panels, and the step that improves the panels. In plain torch.
+"""Differentiable light in plain torch: what eyes see of the panels, and the step.
 
 This is the reference that the runtime's kernels are held to, and what networks are trained through. Equations are those
 of docs/mathematics.md, "A step".
@@ -65,7 +65,7 @@ class Views:
         fov_deg: float | None,
         places_m: ArrayLike = ((0.0, 0.0, 0.0),),
     ) -> Views:
-        """Rays of a picture's own pixels (`fov_deg` wide, horizontally), or, without one, of the centre panel's pixels.
+        """Rays of a picture's pixels (`fov_deg` wide), or without one of the centre panel's pixels.
 
         eyes_m: (2, 3) left, right, frame `stack`; places_m: what is added to both, a picture's rays then being those
         through the same points of the centre panel. Raises ValueError for an eye in the centre panel's plane.
@@ -82,7 +82,7 @@ class Views:
 
 
 def light(panels: Tensor, views: Views) -> tuple[Tensor, Tensor]:
-    """What every ray set sees of panels (N, C, H, W): intensities (E, C, h, w), and which rays count (E, 1, h, w).
+    """Intensities (E, C, h, w) of panels (N, C, H, W), and which rays count (E, 1, h, w).
 
     (L1) and (L2). Differentiable with respect to the panels; on their device, in their type.
     """
@@ -91,7 +91,7 @@ def light(panels: Tensor, views: Views) -> tuple[Tensor, Tensor]:
 
 
 def traced(panels: Tensor, views: Views, *, rays: int = 2, random: torch.Generator | None = None) -> Tensor:
-    """The same intensities (E, C, h, w) by rays by rays single ones a pixel, at random places of it: noisy, but exact.
+    """The same intensities by rays x rays random rays a pixel: without bias, but noisy.
 
     Two calls err independently of each other: the mean of the product of both errors is the squared error, unbiased.
     """
@@ -118,7 +118,7 @@ def step(
     momentum: float | Tensor = MOMENTUM,
     floor: float = FLOOR,
 ) -> tuple[Tensor, Tensor]:
-    """x' and y' of (L5) from panels x and what momentum makes of them, y (at first the same), both (N, C, H, W).
+    """One step (L5): x' and y' from panels x and their extrapolation y, both (N, C, H, W).
 
     targets: (2, C, h, w) what the left and the right eye should see, on the rays' raster.
     """

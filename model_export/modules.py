@@ -71,7 +71,7 @@ def check_known(arch: str, *others: str) -> None:
 
 
 def made(arch: str, options: dict[str, Any], *, seed: int = 0) -> Network:
-    """A network with the weights of a seed. Raises InputError: no such class, or one that says what none may."""
+    """A network initialised by a seed. Raises InputError: no such class, or bad attributes."""
     check_known(arch)
     kind = plugin_class(KNOWN.get(arch, arch), nn.Module, field="--arch")
     said = {name: getattr(kind, name) for name in Form.model_fields if hasattr(kind, name)}

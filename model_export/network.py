@@ -1,4 +1,4 @@
-"""The shipped network: the whole solving along the eyes' line, for eyes that are known so well and no better."""
+"""The shipped network: closed-form solving along the eyes' baseline for a given tracking error."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class SpectralSolver(nn.Module):
         self.relaxation = nn.Parameter(torch.tensor([1.3] * (iterations - 1) + [1.0] * min(1, iterations)))
 
     def gains(self, spectrum: Tensor, doubt: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(patterns, cells + 1) each: numerator and denominator of g, with what h takes over left out, and h's gain."""
+        """(patterns, cells + 1) each: numerator and denominator of g without h's share, and h's gain."""
         scale = torch.exp(self.log_doubt)
         # A mode of the chain in a pattern of the block is two waves, its frequency beside the pattern's either way.
         beside = 2 * torch.asin(torch.clamp(spectrum / 4, 0, 1))[None] / (2 * self.cell_px)
@@ -80,8 +80,9 @@ class SpectralSolver(nn.Module):
         return share * m * spectrum[None], share * alpha2 + cost_g, gain_h
 
     def forward(self, *feeds: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Rear and front panel (rows, cells + 1, 2K·C) in 16-bit codes, from one parallax before the first column, and
-        one number that is finite where all that was worked out is.
+        """Rear and front panel (rows, cells + 1, 2K·C) in 16-bit codes, from one parallax before column 0.
+
+        Also one number that is finite if every intermediate is.
 
         feeds: `INPUTS`. left, right (rows, cells, 2K·C), 16-bit codes: what each eye lacks along its rays through the
         raster; waves (cells + 1, cells + 1) V, shifted_waves Ũ, spectrum (cells + 1,) s and modes_in

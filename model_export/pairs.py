@@ -1,4 +1,4 @@
-"""Pairs as a network of pictures learns from them: its input, what the eyes should see, and where they really are."""
+"""Training pairs of a picture network: its input, the targets, and the true eyes."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Pairs(Dataset[dict[str, Tensor]]):
     scene: str = ""  # that the runtime draws, turned about the vertical, instead
 
     def __getitem__(self, number: int) -> dict[str, Tensor]:
-        """The network's input, what the eyes should see, and homographies of the rays where the head really is."""
+        """The network's input, the targets, and homographies of the rays at the true eyes."""
         pair = self.pair(number)
         random = np.random.default_rng([self.seed, number, 1])
         pose = stack_from_eye(pair.eyes_m.mean(axis=0))
@@ -102,7 +102,7 @@ def opened(scene: str, stack: PanelStack, _process: int) -> ContentSource:
 
 
 def folder_pairs(folder: Path) -> tuple[Pair, ...]:
-    """The pairs of a folder in the published data set's form, whose name holds the scene's. Raises InputError."""
+    """Pairs of a folder in the published data set's form, named after its scene. Raises InputError."""
     name = next((name for name in preset_names() if name in folder.resolve().name), "")
     if not name:
         raise InputError(folder, "name", f"holds none of {', '.join(preset_names())}")

@@ -90,7 +90,7 @@ def _shift(right: float, down: float) -> F64:
 
 
 def random_scene(random: Random, stack: PanelStack, middle_m: F64) -> Scene:
-    """A backdrop, and cards at many depths around the panels, many of them slanted, for a viewer about `middle_m`."""
+    """A backdrop, and cards at many depths around the panels, for a viewer about `middle_m`."""
     centre_m = stack.x_m[1]
     distance_m = middle_m[0] - centre_m
     deep_m = (stack.x_m[-1] - centre_m) * math.exp(random.uniform(math.log(0.3), math.log(6.0)))

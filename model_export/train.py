@@ -1,4 +1,4 @@
-"""`phasestack train`: a network of pictures by gradients, with the light that eyes get of its panels as the loss.
+"""`phasestack train`: gradient training of a picture network, with light as the loss.
 
 AdamW, the learning rate along a cosine. Pair number k and every random number of iteration k follow from (seed, k), so
 that a training that was stopped goes on as if it had not been.

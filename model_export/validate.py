@@ -69,7 +69,7 @@ def validate_file(path: Path) -> Report:
 
 
 def check_model(data: bytes, *, source: str, reference: Reference | None = None) -> Report:
-    """Checks of a model's bytes, against what it came from or, without a reference, against its graph as it stands.
+    """Check a model's bytes against what it was made from or, without that, against its own graph.
 
     Raises InputError where the bytes are no ONNX model or carry no contract that we know.
     """

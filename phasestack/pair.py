@@ -1,4 +1,4 @@
-"""Two pictures, two eyes and a stack of panels to layers, and anybody's layers to what the eyes make of them."""
+"""From two pictures, two eyes and a stack to layers, and the quality of any layers."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Result:
 
     @property
     def quality(self) -> PairQuality:
-        """How good what the eyes get is; measured when it is first asked for, which may take longer than solving."""
+        """Quality of what the eyes see; measured when first read, which may take longer than solving."""
         return self._pair.quality
 
     @property
@@ -185,8 +185,9 @@ def evaluate(
 
 
 def camera(eye_m: Sequence[float] | F64, *, width_px: int, height_px: int, fov_deg: float = 40.0) -> F64:
-    """(3, 4) the pinhole camera at an eye that pictures are taken with, where no other is told: from homogeneous metres
-    of the stack's frame to homogeneous pixels. It looks at the stack's origin, x parallel to the ground.
+    """(3, 4) pinhole camera at an eye, from homogeneous metres of `stack` to homogeneous pixels.
+
+    It looks at the stack's origin, x parallel to the ground; the default for pictures.
 
     The third coordinate is the distance along the gaze. Raises ValueError, naming the argument.
     """
@@ -202,7 +203,7 @@ def camera(eye_m: Sequence[float] | F64, *, width_px: int, height_px: int, fov_d
 def project(
     points_m: ArrayLike, *, eye_m: Sequence[float] | F64, width_px: int, height_px: int, fov_deg: float = 40.0
 ) -> F64:
-    """(..., 2) pixels at which an eye's picture shows points (..., 3) of the stack's frame, metres; NaN behind the eye.
+    """(..., 2) pixels of points (..., 3), frame `stack`, in an eye's picture; NaN behind the eye.
 
     Raises ValueError, naming the argument.
     """

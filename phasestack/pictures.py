@@ -58,7 +58,7 @@ def as_codes(picture: Picture) -> U8:
 
 
 def find_eyes(picture: ArrayLike) -> Pupils | None:
-    """The foremost viewer's pupils in an (h, w, 3|4) picture, uint8 or float in 0..1; None where nobody is.
+    """The foremost viewer's pupils in an (h, w, 3|4) picture, uint8 or float in 0..1; None: nobody.
 
     `eyes_px` is (2, 2): the viewer's left eye first, which is on the right of an unmirrored picture; continuous pixels,
     centres at half-integers. `sigma_px` says how sure they are. Raises ValueError for what is no picture.

@@ -11,7 +11,7 @@ from runtime.optics.stack import PanelStack, Tilt
 
 
 class Stack(PanelStack):
-    """Parallel panels of one size: rear (0, at the backlight) to front along `x_m`, metres, centred on the origin."""
+    """Parallel panels of one size, rear to front at `x_m` (metres), centred on the origin."""
 
     __slots__ = ()
 

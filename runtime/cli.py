@@ -1,4 +1,4 @@
-"""What the script `phasestack` imports first: from here on an interrupt (Ctrl-C) ends it with 130 and not a word.
+"""Entry point of the script `phasestack`: imported first, so that Ctrl-C exits silently with 130.
 
 Nothing is open or written while commands are imported, so an interrupt needs no unwinding; as an exception it would
 end in a traceback, or be lost where Python drops it. The guard takes over once it stands (`commands.guard`).

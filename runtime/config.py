@@ -427,7 +427,7 @@ def read_table(path: Path) -> dict[str, Any]:
 
 
 def validated(model: type[M], table: dict[str, Any], *, source: str | Path) -> M:
-    """A table as settings. Raises InputError with every wrong field's full name, and what may have been meant."""
+    """A table as validated settings. Raises InputError that names every wrong field."""
     try:
         return model.model_validate(table)
     except ValidationError as error:
@@ -494,7 +494,7 @@ def _seen_from(folder: Path, table: dict[str, Any]) -> dict[str, Any]:
 
 
 def load_settings(path: Path | None) -> Settings:
-    """Settings from a file, or the defaults without one; paths in it are relative to its folder. Raises InputError."""
+    """Settings from a file (paths relative to its folder), or the defaults. Raises InputError."""
     if path is None:
         return Settings()
     return validated(Settings, _seen_from(path.absolute().parent, read_table(path)), source=path)

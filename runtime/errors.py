@@ -27,8 +27,7 @@ def without_secrets(text: str) -> str:
 
 
 def one_line(text: str, *, most: int = PART_CHARACTERS_MAX) -> str:
-    r"""Text on one line, without secrets: what can't be printed (line breaks, escapes, NUL) becomes `?`, a long one's
-    middle `...`.
+    r"""Text on one printable line, without secrets; the middle of a long one becomes `...`.
 
     >>> one_line("a\nb"), one_line("x" * 9, most=7)
     ('a?b', 'xx...xx')
@@ -90,7 +89,7 @@ class ModelFailure(TransientError):
 
 
 class EyesNotServed(ModelFailure):
-    """Two eyes that this model has no picture for, wherever they come from: a viewer may move on, an option won't."""
+    """The model cannot serve these two eyes: a viewer may move on, an option is refused."""
 
 
 class ContextLost(TransientError):

@@ -101,7 +101,7 @@ class EyesEstimate:
 
 @dataclass(frozen=True, slots=True)
 class PanelFrame:
-    """What all panels show together at one refresh: a solution aligned to the eyes, the flat picture, or both mixed."""
+    """What all panels show at one refresh: an aligned solution, the flat picture, or a mix."""
 
     number: int  # of the refresh: all panels show the same
     solved: Layers | None  # (N, height_px, width_px, 4) RGBA, rear to front; layers solved for two eyes; None: none yet

@@ -1,1 +1,1 @@
-"""What a run was like, for who debugs it: kept for some minutes in memory, or written to a file all the way."""
+"""A record of a run for debugging: the last minutes in memory, or a journal on disk."""

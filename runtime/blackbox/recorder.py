@@ -1,4 +1,4 @@
-"""Keeps the last minutes of a run in memory, and writes them to an MCAP file when asked or at a fault.
+"""The last minutes of a run in memory, written to an MCAP file on request or at a fault.
 
 Every few seconds what is new goes to a journal on the disk, which a run that ends takes away: after a power cut or a
 kill the next run finds it, and it becomes a file of the kind `cut`.
@@ -167,7 +167,7 @@ class Recorder(logging.Handler):
         _sweep(folder)
 
     def watches(self, presenter: Presenter, *, in_stack_frame: bool) -> None:
-        """Begin. in_stack_frame: the sensor's points are in `stack`: they are written as a sensor would see them."""
+        """Begin recording. in_stack_frame: points arrive in `stack`; they are written in `sensor`."""
         self._presenter = presenter
         if in_stack_frame:
             self._sensor_from_stack = np.asarray(np.linalg.inv(presenter.run_cell.state.calibration.stack_from_sensor))
@@ -229,7 +229,7 @@ class Recorder(logging.Handler):
                 self._bytes -= len(self._kept.popleft().data) + OVERHEAD_BYTES
 
     def save(self, kind: str, saved: Saved = lambda problem, path: None) -> None:
-        """Write what is kept to a file as the run goes on; kind: `asked`, or of a fault. saved: called at its end."""
+        """Write what is kept to a file, in the background. kind: `asked` or a fault; saved: at its end."""
         if not self._most_ns or self._presenter is None:
             saved("nothing is kept in memory (service.blackbox_minutes is 0)", None)
             return
@@ -319,7 +319,7 @@ class Recorder(logging.Handler):
 
 
 def write_file(folder: Path, kind: str, kept: list[Message], header: RecordingHeader, settings: str) -> Path:
-    """A new file in a folder, whole or not there, for its owner alone: who was here is private. Raises OSError.
+    """Write a new file atomically, readable by its owner alone (it shows who was here). Raises OSError.
 
     Its number is above all others in the folder: the wall's clock may be set back.
     """
@@ -428,8 +428,7 @@ def _find_cut(folder: Path) -> None:
 
 
 def make_room(folder: Path) -> None:
-    """Of too many files the commonest kind makes way, all but its first: no kind's flood takes another kind's place.
-    The newest of all stays."""
+    """Delete surplus files, of the most frequent kind first, but never a kind's first or the newest file."""
     kinds: dict[str, list[Path]] = {}
     *earlier, _ = sorted(folder.glob(f"{PREFIX}*.mcap"), key=lambda path: (_number(path), path.name)) or [folder]
     for file in earlier:

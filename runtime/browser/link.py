@@ -1,4 +1,4 @@
-"""Between the loop and the pages that show it: the viewer's eyes go one way, what the panels show the other."""
+"""The link between the loop and the live pages: the viewer's eyes in, the panels' layers out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A solution as one HTML file that needs no other: its layers, and the script that traces what eyes see of them."""
+"""A solution as one self-contained HTML file: its layers and the script that traces what eyes see."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def viewer_html(
     lines: Sequence[str] = (),
     follows: bool = True,
 ) -> str:
-    """The page. layers: (N, h, w, 3 or 4), rear to front, as the panels show them to eyes (2, 3), frame `stack`.
+    """The viewer page. layers: (N, h, w, 3 or 4), rear to front, as shown to eyes (2, 3), frame `stack`.
 
     wanted: an (h, w, 3) picture for each eye, `fov_deg` wide; () where none is known; lines: what stands below.
     follows: outer panels follow the head until one says otherwise.

@@ -1,4 +1,4 @@
-"""Every command by its name. Only names and options are here; each command imports what it needs when it runs."""
+"""All commands by name. Each command imports what it needs only when it runs."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ def bench(
     out: Annotated[Path | None, typer.Option(help="write the regression file here (JSON)")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
-    """Measure time, light and memory of the shipped models, at 960x540 and 1920x1080, or compare two measurements.
+    """Measure time, light and memory of the shipped models at two sizes, or compare two measurements.
 
     Example: phasestack bench --out bench.json
 

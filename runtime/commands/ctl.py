@@ -1,4 +1,4 @@
-"""`phasestack ctl` tells the running daemon what to do between two of its turns; `status` asks what it does and why."""
+"""`phasestack ctl` and `status`: commands to the running daemon, and its state."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ def demo(
     frames: Annotated[int | None, typer.Option(min=1, help="refreshes; default: the whole recording")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="the summary as one JSON object on stdout")] = False,
 ) -> None:
-    """Replay a built-in recording of a moving head through the whole pipeline, on panels that need no screen.
+    """Replay a built-in recording of a moving head through the whole pipeline, without a screen.
 
     Example: phasestack demo --out out/demo
     """

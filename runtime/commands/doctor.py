@@ -1,4 +1,4 @@
-"""`phasestack doctor`: is everything there that the configuration asks for, and what to do where it is not?
+"""`phasestack doctor`: check everything that the configuration needs, with a remedy for each fault.
 
 Each check is a small function of the settings that answers rows and never raises.
 """
@@ -44,7 +44,7 @@ def doctor(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout")] = False,
 ) -> None:
-    """Check settings, sensor, permissions, OpenGL, monitors and their binding, scene, model, calibration, the service.
+    """Check settings, sensor, permissions, OpenGL, monitors, scene, model, calibration and service.
 
     What is only unusual is a warning. Exits with 1 where a check fails.
 

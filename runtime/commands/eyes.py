@@ -1,4 +1,4 @@
-"""`phasestack eyes`: where the viewer's pupils are in pictures, films and recordings, or before the sensor now."""
+"""`phasestack eyes`: the viewer's pupils in pictures, films, recordings, or before the sensor now."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `phasestack eyes` does: pictures from files or the sensor through the finder, to rows and overlays."""
+"""The body of `phasestack eyes`: from pictures to rows and overlays."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Watcher:
 def look_at_files(
     files: list[Path], settings: Settings, *, sequence: bool, rate_hz: float, out: Path | None
 ) -> list[Row]:
-    """Rows in the order of the files and their frames. Raises InputError, and then leaves nothing in `out`."""
+    """A row for each frame of each file, in order. Raises InputError; then `out` is left unchanged."""
     watcher, rows, follows = Watcher(settings), [], False
     with OutputFolder(out) if out is not None else nullcontext() as folder:
         for place, path in enumerate(files):

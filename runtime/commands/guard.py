@@ -19,7 +19,7 @@ INTERRUPTED, BAD_INPUT, OWN_ERROR, MAY_PASS, NOBODY_READS = 130, 2, 70, 75, 141
 
 
 def run_guarded(*, interrupts_leave: bool) -> None:
-    """Run the command that the arguments name; never returns. interrupts_leave: until now (`cli`); then they raise."""
+    """Run the command named by the arguments; never returns. interrupts_leave: Ctrl-C exited so far."""
     _fill_standard_descriptors()
     try:
         from runtime.commands.app import app

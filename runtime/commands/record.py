@@ -44,7 +44,7 @@ def record(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="what was recorded as one JSON object on stdout")] = False,
 ) -> None:
-    """Record eye positions with their times; pictures only with --images. Ctrl-C ends a recording properly.
+    """Record eye positions with their times; pictures only with --images. Ctrl-C ends it properly.
 
     With --motion a head moves as the tracker's benchmark has it: noise, outliers, dropouts, and the true eyes.
 
@@ -103,7 +103,7 @@ def _refuse_target(out: Path, *, motion: bool) -> None:
 
 
 def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | None) -> dict[str, Any]:
-    """Record until the time is up, a limit is reached, the source ends or Ctrl-C. Raises FatalError, InputError."""
+    """Record until time, a limit, the end of the source or Ctrl-C. Raises FatalError, InputError."""
     from runtime.clock import NS_PER_S, MonotonicClock
     from runtime.eyes.detect import EyeFinder
     from runtime.sensor.recording import MAX_S, recording_to

@@ -18,7 +18,7 @@ def setup(
     seed: Annotated[int, typer.Option(min=0, help="of the simulated display")] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout, at the end")] = False,
 ) -> None:
-    """Set a display up: which monitor is which panel, sizes, registration by photographs, sensor, calibration.
+    """Set a display up: monitors, sizes, registration by photographs, grey curves, sensor, calibration.
 
     It asks in the terminal; where panels show something, keys on their windows count too. Every step can be skipped
     and repeated; q stops, and the same command goes on there. At the end: the figures of each step, and a

@@ -131,7 +131,7 @@ def solve_pair(
 
 
 def taken(pictures: list[Any], eyes: Eyes, stack: PanelStack) -> tuple[list[Any], F64, float]:
-    """Pictures of eyes (2, 3) that look at the stack's origin, and their field of view. Raises InputError."""
+    """Pictures of eyes (2, 3) looking at the stack's origin, with the field of view. Raises InputError."""
     if eyes.cameras is None:
         if eyes.left is None or eyes.right is None:
             raise InputError("solve", "--left-eye, --right-eye", "are needed, metres; or --camera")

@@ -20,7 +20,7 @@ def try_(
     seconds: Annotated[float | None, number(1, 1e6, "s", help="end after so long")] = None,
     as_json: Annotated[bool, typer.Option("--json", help='{"url": ...} on a line once it is served')] = False,
 ) -> None:
-    """Look into a display that is not there: the daemon's own loop, with a browser as the viewer's head and the panels.
+    """Try the display without hardware: the daemon's own loop, with a browser as viewer and panels.
 
     Example: phasestack try
     """

@@ -1,4 +1,4 @@
-"""The body of `phasestack try`: the daemon, and beside it the web server that is its sensor and its panels."""
+"""The body of `phasestack try`: the daemon, and the web server that is its sensor and its panels."""
 
 from __future__ import annotations
 

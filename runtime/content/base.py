@@ -73,7 +73,7 @@ class ContentSource(ABC):
         """
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture | None:
-        """The same picture in a texture, valid until the next of its side; None: `render` it. Raises ContentFailure."""
+        """The picture in a texture, valid until the side's next; None: use `render`. Raises ContentFailure."""
         return None
 
     def expect(self, views: Sequence[View], *, time_ns: int) -> None:  # noqa: B027 - most have nothing to prepare
@@ -85,11 +85,11 @@ class ContentSource(ABC):
         return None
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect | None:
-        """A box of the view's pixels beside which only the background shows, without drawing it; None: not known."""
+        """A box of the view's pixels outside which only the background shows; None: unknown."""
         return None
 
     def revision(self, *, time_ns: int) -> int:
-        """A number that changes whenever `render` may draw the same view differently; constant for a static scene."""
+        """A number that changes whenever `render` may draw the same view differently."""
         return time_ns if self.info.moving else 0
 
     def describe(self, *, time_ns: int) -> dict[str, Any] | None:

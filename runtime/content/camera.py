@@ -13,8 +13,9 @@ NEAREST_M = 1e-3  # before the eye: the near plane
 
 
 def clip_from_stack(view: View, corners_m: F64) -> F64:
-    """4x4 OpenGL clip matrix of a view, of whose depths (8n, 3) corners are the limits; row 0 of the raster is row 0
-    of what GL reads back.
+    """4x4 OpenGL clip matrix of a view, with near and far planes around (8n, 3) corners.
+
+    Row 0 of the raster is row 0 of what GL reads back.
 
     GL's first row in memory is its lowest, so the raster's v runs along GL's +y and nothing need be flipped.
     Raises ValueError where none of the corners is before the eye.
@@ -35,15 +36,14 @@ def box_corners(low_m: ArrayLike, high_m: ArrayLike) -> F64:
 
 
 def project(pixels_from_stack: F64, points_m: F64) -> tuple[F64, F64]:
-    """(n, 2) pixels and (n,) depths in metres of (n, 3) `stack` points. Pixels of points behind are meaningless."""
+    """(n, 2) pixels and (n,) depths in metres of (n, 3) `stack` points; behind the eye undefined."""
     homogeneous = points_m @ pixels_from_stack[:, :3].T + pixels_from_stack[:, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
         return homogeneous[:, :2] / homogeneous[:, 2:], homogeneous[:, 2]
 
 
 def covered_box(view: View, corners_m: F64, *, align_px: int = 32) -> PixelRect:
-    """The part of the raster that a convex hull of corners may touch, grown to multiples of `align_px`; empty where
-    all of it is behind the eye."""
+    """The pixels that a convex hull of corners may cover, grown to `align_px`; empty behind the eye."""
     pixels, depths = project(view.pixels_from_stack, corners_m)
     if _depth_bounds(view, corners_m)[1] <= 2 * NEAREST_M:
         return PixelRect(0, 0, 0, 0)

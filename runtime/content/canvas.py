@@ -26,7 +26,7 @@ class _Target:
 
 
 class CanvasSource(ContentSource):
-    """A source that draws with OpenGL, into framebuffers of the views' sizes: pixels are read back on request.
+    """A source that draws with OpenGL into a framebuffer per view size, read back on request.
 
     Only the box that the content may touch is cleared, drawn and resolved with several samples a pixel: on a
     software rasteriser resolving is the dearest step.
@@ -49,7 +49,7 @@ class CanvasSource(ContentSource):
         return self.draw(view, time_ns=time_ns).pixels()
 
     def drawn(self, view: View, box: PixelRect, paint: Callable[[], None]) -> DrawnPicture:
-        """Clear, let `paint` issue its draw calls inside `box`; the picture of the view's side, until its next one."""
+        """Clear, let `paint` draw inside `box`; the picture of the view's side, valid until its next one."""
         target = self._target(view.width_px, view.height_px)
         plain = target.plain[view.side]
         plain.use()

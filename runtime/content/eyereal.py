@@ -93,7 +93,7 @@ def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
 
 
 class EyeRealSource(ContentSource):
-    """The pair that was taken nearest to the viewer, warped by way of the display's centre for the rest of the way."""
+    """The pair taken nearest to the viewer, warped to the view through the display's centre plane."""
 
     def __init__(
         self, pairs: tuple[Pair, ...], *, fov_deg: float, background: tuple[float, float, float], name: str

@@ -71,7 +71,7 @@ def silhouette(edges: Edges, eye: F64) -> tuple[I32, I32]:
 
 
 def ramps(clip: F64, ends: I32, apex: I32, *, width_px: int, height_px: int) -> tuple[F32, I32]:
-    """Two triangles along each outline edge, from the edge (coverage 1) to a pixel outside it (coverage 0).
+    """Two triangles along each outline edge: coverage 1 at the edge, 0 one pixel outside.
 
     clip: (v, 4) clip coordinates of the shape's vertices.
     Returns (k, 6, 5) clip coordinates and coverage, and (k, 6) the vertex whose colour each corner has, of the edges

@@ -90,7 +90,7 @@ def load_gaussians(header: Header) -> Gaussians:
 
 
 def covariances_of(scales: F32, quaternions: F32) -> F32:
-    """(n, 6) R diag(s²) R^T of (n, 3) standard deviations and (n, 4) quaternions w, x, y, z of any length but 0."""
+    """(n, 6) R diag(s²) R^T of (n, 3) standard deviations and (n, 4) quaternions w, x, y, z."""
     rotation = Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
     spread = rotation * scales.astype(np.float64)[:, None]
     full = spread @ spread.transpose(0, 2, 1)
@@ -108,7 +108,7 @@ def moved(gaussians: Gaussians, target_from_source: F64) -> Gaussians:
 
 
 def seen_splats(gaussians: Gaussians, view: View, *, nearest_m: float = 1e-3) -> Splats:
-    """Project to first order about each centre (EWA, Zwicker et al. 2001), leave out what can't be seen, sort.
+    """Visible splats, sorted, projected to first order about each centre (EWA, Zwicker et al. 2001).
 
     A 3x4 projection of any kind will do: the Jacobian is (P_i - u_i P_3)/w, so a panel's own pixels are as good
     as an eye's image.
@@ -153,7 +153,7 @@ def seen_splats(gaussians: Gaussians, view: View, *, nearest_m: float = 1e-3) ->
 
 
 def harmonic_basis(directions: F32, count: int) -> F32:
-    """(n, count) real spherical harmonics, in the order and with the signs of the reference implementation."""
+    """(n, count) real spherical harmonics, order and signs as in the reference implementation."""
     x, y, z = directions.T
     basis = [np.full_like(x, 0.28209479177387814)]
     if count > 1:
@@ -178,7 +178,7 @@ def harmonic_basis(directions: F32, count: int) -> F32:
 
 
 def colours_towards(harmonics: F32, directions: F32) -> F32:
-    """(n, 3) colours, not below 0, of (n, k, 3) coefficients seen along (n, 3) unit directions from the eye."""
+    """(n, 3) colours >= 0 of (n, k, 3) coefficients along (n, 3) unit directions from the eye."""
     if harmonics.shape[1] == 1:
         return np.asarray(np.maximum(harmonics[:, 0] * np.float32(0.28209479177387814) + np.float32(0.5), 0))
     basis = harmonic_basis(directions, harmonics.shape[1])

@@ -1,4 +1,4 @@
-"""What a glTF file promises, held to the limits before trimesh takes memory for it, and its textures looked at.
+"""Checks of a glTF file's declared sizes and textures against the limits, before trimesh loads it.
 
 trimesh passes over a texture that it cannot read; here that is an error that names it.
 """
@@ -140,7 +140,7 @@ def _of_uri(uri: str, read: Read) -> bytes:
 
 
 def cut_alpha(rgba: U8, material: Any) -> None:
-    """Alpha of a trimesh material's texture (h, w, 4), rescaled in place so that a half is where the material cuts."""
+    """Rescale a trimesh material's alpha (h, w, 4) in place so that its cut-off is one half."""
     cut = {"MASK": 0.5 if material.alphaCutoff is None else material.alphaCutoff, "BLEND": 0.5}
     cutoff = cut.get(str(material.alphaMode), 0.0)
     opacity = 1.0 if material.baseColorFactor is None else float(material.baseColorFactor[3]) / 255

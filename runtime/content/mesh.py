@@ -56,7 +56,7 @@ def prepare(file: SceneFile) -> Callable[[Any], TriangleSource]:
 
 
 def load_mesh(path: Path) -> MeshData:
-    """Read a file. Raises InputError: unreadable, over a limit, no faces, NaN vertices, a texture missing."""
+    """Read a mesh. Raises InputError: unreadable, over a limit, no faces, NaN, a missing texture."""
     progress.tell(f"reading {path.name}", 0)
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
     _check_counts(path, data)

@@ -100,7 +100,7 @@ def layout_of(path: Path, settings: ContentSettings) -> Layout:
 
 
 def screen(stack: PanelStack, *, width_px: int, height_px: int, pixel_aspect: float = 1.0) -> PlaneRaster:
-    """A picture's pixels on the plane through the stack's centre: as large as the display lets its shape be.
+    """A picture's pixel grid on the stack's centre plane, as large as the display allows.
 
     pixel_aspect: width of a pixel over its height.
     """

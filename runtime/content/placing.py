@@ -1,4 +1,4 @@
-"""A file that is to be shown, and where its coordinates lie in the stack frame: a preset's way, or fitted."""
+"""A scene file and the placement of its coordinates in the stack frame: a preset's, or fitted."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def guessed_axes(low: F64, high: F64) -> tuple[str, str]:
 
 
 def fitted(low: F64, high: F64, *, axes: F64, stack: PanelStack, depth_m: tuple[float, float]) -> F64:
-    """4x4 stack_from_scene that centres a box and scales it until the display is full, or the depth that it can show.
+    """4x4 stack_from_scene that centres a box and scales it to the display's size and depth.
 
     What is deeper than `depth_m` (rear, front) begins at its front and reaches behind its rear, where most is hidden.
     low, high: (3,) corners in the scene's coordinates; axes: 3x3 scene_from_stack rotation.

@@ -83,7 +83,7 @@ def read_header(path: Path) -> Header:
 
 
 def read_vertices(header: Header) -> Table:
-    """A structured array with a field for each property. Raises InputError: truncated, text, lists among them."""
+    """The vertices as a structured array. Raises InputError: truncated, text, or list properties."""
     path, count = header.path, header.counts["vertex"]
     if next(iter(header.counts)) != "vertex" or "list" in {kind for _, kind in header.fields}:
         raise InputError(path, "vertex", "must stand first, with one number a property")

@@ -1,4 +1,4 @@
-"""The paper's 17 scenes: scale, pose and depth of each, in the EyeReal's reading and in the published code's."""
+"""The paper's 17 scenes: scale, pose and depth, by its supplement and by the published code."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def preset_names() -> tuple[str, ...]:
 
 
 def stack_from_preset(name: str) -> F64:
-    """4x4 metres of the stack frame from a scene's digital units, as the supplement prints: R·scene/(100 r_p2d) + t."""
+    """4x4 stack metres from scene units as the supplement prints it: R·scene/(100 r_p2d) + t."""
     table, matrix = preset_file()["scene"][name], np.eye(4)
     rotation = rotation_matrix(table["rotation_deg"], preset_file()["rotation_order"])
     matrix[:3, :3] = rotation / (table["scale_per_cm"] / CM)
@@ -39,8 +39,10 @@ def stack_from_preset(name: str) -> F64:
 
 
 def drawn_scene_from_stack(name: str) -> F64:
-    """4x4 the scene's digital units from metres of the stack frame, as the published code drew the data set: its scale,
-    the scene's own axes, and the panels where it evaluates."""
+    """4x4 scene units from stack metres, as the published code drew the data set.
+
+    It uses its own scale, the scene's axes, and the panels where that code evaluates.
+    """
     code, matrix = preset_file()["scene"][name]["published"], np.eye(4)
     axes = axes_matrix(out=code["out"], up=code["up"])
     gap = code["thickness_cm"] * code["scale_per_cm"]
@@ -52,7 +54,7 @@ def drawn_scene_from_stack(name: str) -> F64:
 
 
 def rotation_matrix(angles_deg: Triple, order: str) -> F64:
-    """3x3 of three angles about x, y, z, applied in `order` (lower case: fixed axes, upper case: turning ones)."""
+    """3x3 rotation by three angles about x, y, z in `order` (lower case: fixed axes, else moving ones)."""
     angles = [angles_deg["xyz".index(letter)] for letter in order.lower()]
     return np.asarray(Rotation.from_euler(order, angles, degrees=True).as_matrix())
 

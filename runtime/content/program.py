@@ -1,4 +1,4 @@
-"""Scenes drawn by another program (a renderer, a game, a web page) that connects and answers requests for pictures.
+"""Scenes drawn by another program (renderer, game, web page) that answers requests for pictures.
 
 The protocol is in docs/programs.md. What comes late, or not at all, leaves the last pictures where they are.
 """
@@ -59,7 +59,7 @@ def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
 
 
 def camera_of(view: View) -> dict[str, Any]:
-    """View and projection matrix of a view as OpenGL wants them: column after column, depth -1 to 1, metres."""
+    """View and projection matrices of a view for OpenGL: column-major, depth -1 to 1, metres."""
     pixels = view.pixels_from_stack
     forward = pixels[2, :3] / np.linalg.norm(pixels[2, :3])
     right, down = (row[:3] - (row[:3] @ forward) * forward for row in pixels[:2])
@@ -116,7 +116,7 @@ class Programs:
         log.info("a program may draw: its address is in `phasestack status` (program)")
 
     def ask(self, views: Sequence[View], *, time_ns: int) -> int:
-        """Request pictures of one size; returns the frame's number. Raises ContentFailure where none is ready."""
+        """Request a frame's pictures and return its number. Raises ContentFailure without a program."""
         view, now_s = views[0], time.monotonic()
         with self._changed:
             self._count += 1

@@ -40,7 +40,7 @@ def open_content(settings: ContentSettings, stack: PanelStack, context: Any) -> 
 
 
 def prepare_content(settings: ContentSettings, stack: PanelStack) -> Opener:
-    """Read and check what `settings.scene` names; the answer makes the source on the thread that has the context.
+    """Read and check `settings.scene`; the result makes the source on the thread with the context.
 
     This is the slow part and needs no GL: it may run on any thread. How far it is goes to `support.progress`.
     Raises InputError, naming file and field.

@@ -40,7 +40,7 @@ Mask = NDArray[np.bool_]
 
 
 def split_rgbd(rgb: U8, path: Path) -> tuple[U8, F32]:
-    """(h, w, 3) colour and (h, w) depth in [0, 1], 1 nearest: the left and right halves. Raises InputError."""
+    """(h, w, 3) colour and (h, w) depth in [0, 1], 1 nearest, of the two halves. Raises InputError."""
     width = rgb.shape[1] // 2
     if width < 2 or rgb.shape[0] < 2:
         raise InputError(path, "layout", "the picture is too small for colour and depth side by side")
@@ -51,7 +51,7 @@ def split_rgbd(rgb: U8, path: Path) -> tuple[U8, F32]:
 
 
 def surfaces(colour: U8, depth: F32, *, stack: PanelStack, depth_m: tuple[float, float]) -> list[Part]:
-    """The picture as triangles, each point on its ray from the nominal eye, at its depth: in front, and behind edges.
+    """The picture as triangles, each point on its ray at its depth: front surface, and background.
 
     colour: (h, w, 3); depth: (h, w), 1 nearest.
     """
@@ -77,7 +77,7 @@ def surfaces(colour: U8, depth: F32, *, stack: PanelStack, depth_m: tuple[float,
 
 
 def sharpened(depth: F32) -> F32:
-    """(h, w) depth whose edges are one step wide: what a blur left between two sides goes to the nearer one."""
+    """(h, w) depth with blurred edges sharpened to one step: pixels between go to the nearer side."""
     kernel = np.ones((BLURRED_PX, BLURRED_PX), np.uint8)
     high, low = cv2.dilate(depth, kernel), cv2.erode(depth, kernel)
     snapped = np.where(high - depth < depth - low, high, low)
@@ -85,7 +85,7 @@ def sharpened(depth: F32) -> F32:
 
 
 def unmixed(colour: U8, depth: F32) -> U8:
-    """(h, w, 3) colours; those beside an edge of the depth are the nearest ones farther inside their own side."""
+    """(h, w, 3) colours whose pixels beside a depth edge are replaced from farther inside their side."""
     side = 2 * MIXED_PX + 1
     kernel = np.ones((side, side), np.uint8)
     mixed = cv2.dilate(depth, kernel) - cv2.erode(depth, kernel) > TORN_RELATIVE

@@ -1,4 +1,4 @@
-"""The built-in scenes: what stands where, in fractions of the display so that every stack shows all of it."""
+"""The built-in scenes, in fractions of the display, so that every stack shows all of them."""
 
 from __future__ import annotations
 

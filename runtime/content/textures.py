@@ -1,4 +1,4 @@
-"""The built-in scene's textures: (256, 256, 4) RGBA pictures made from arithmetic, the same on every machine."""
+"""Procedural textures of the built-in scenes, (256, 256, 4) RGBA, identical on every machine."""
 
 from __future__ import annotations
 

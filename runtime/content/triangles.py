@@ -112,8 +112,7 @@ class Part:
 
 
 class DrawnPart:
-    """A part with all that drawing it takes. Made without a GL context, on any thread, which is the slow half; then
-    uploaded by the source that draws it."""
+    """A part with its prepared buffers: made on any thread without GL, then uploaded by its source."""
 
     def __init__(self, part: Part, *, outlined: bool = True) -> None:
         """outlined: with what ramps along its outline need."""
@@ -172,8 +171,10 @@ class TriangleSource(CanvasSource):
         info: ContentInfo,
         samples: int = 0,
     ) -> None:
-        """stack_from_parts: 4x4 each, a similarity; samples: per pixel, for outlines; 0: ramps along the outlines,
-        which a software rasteriser draws faster."""
+        """stack_from_parts: 4x4 similarities; samples: per pixel for outlines; 0: ramps along the outlines.
+
+        A software rasteriser draws ramps faster.
+        """
         super().__init__(context, info=info, samples=samples)
         self.parts, self.stack_from_parts = list(parts), list(stack_from_parts)
         self._with_ramps = samples == 0

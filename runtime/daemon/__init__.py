@@ -1,1 +1,1 @@
-"""What makes a run a daemon: building, supervising, reconfiguring, the socket, signals, notifications."""
+"""The daemon: building, supervising and reconfiguring a run; socket, signals, notifications."""

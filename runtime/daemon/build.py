@@ -110,7 +110,7 @@ def scaled_stack(settings: Settings, scale: float) -> PanelStack:
 
 
 class Host(Supervisor):
-    """Who a run is for: asked before its first refresh, its supervisor from then on. This one asks for nothing."""
+    """The owner of a run, asked before its first refresh; then its supervisor. Base: asks for nothing."""
 
     recorder: Any = None  # another observer, whose `watches` is called before the first refresh
 

@@ -53,7 +53,7 @@ class NotRunning(TransientError):
 
 
 def ask(paths: Iterable[Path], request: dict[str, Any], *, timeout_s: float = 10.0) -> dict[str, Any]:
-    """The daemon's answer. Raises NotRunning where none answers at any of the paths; timeout_s: of each step."""
+    """The daemon's answer. Raises NotRunning without one at any path; timeout_s: per step."""
     problems, hangs = [], False
     for path in paths:
         try:
@@ -95,7 +95,7 @@ def _advice(error: Exception) -> str:
 
 
 def unit_advice() -> str:
-    """How systemd's service is, in the words of its last error, and what to do; empty where there is none."""
+    """The systemd service's condition in its last error's words, with a remedy; empty without one."""
     wanted = ("LoadState", "ActiveState", "Result", "ExecMainStatus", "StatusText")
     try:
         shown = subprocess.run(
@@ -120,7 +120,7 @@ def unit_advice() -> str:
 
 
 class Daemon:
-    """The daemon as the page asks it: however many look, it is asked as often as news is wanted. Any thread may."""
+    """The daemon as seen by the page: answers are cached for all browsers. Thread-safe."""
 
     def __init__(self, sockets: tuple[Path, ...]) -> None:
         """sockets: where it may listen."""
@@ -129,7 +129,7 @@ class Daemon:
         self._answers: dict[str, tuple[float, dict[str, Any]]] = {}
 
     def look_up(self, name: str) -> dict[str, Any]:
-        """`status`, `pictures`, `log` or `about`; where no daemon answers, `ok` is False and `error` says why."""
+        """The answer to `status`, `pictures`, `log` or `about`; without a daemon `ok` is False."""
         with self._locks[name]:
             asked_s, answer = self._answers.get(name, (float("-inf"), {}))
             if time.monotonic() - asked_s < LOOKED_UP_AGAIN_S[name]:

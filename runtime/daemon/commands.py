@@ -15,7 +15,7 @@ PLACING = ("scale", "offset_m", "rotation_deg", "turntable_per_min")  # of `plac
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """One command of an operator. The loop runs it between two refreshes, or begins to, and answers exactly once.
+    """An operator's command. The loop begins it between two refreshes and answers it exactly once.
 
     Whoever runs it takes it first, and leaves it where `take` is False: what was given up is never done.
     `flat` holds the 2D picture until `resume`; `pause` freezes the picture until `resume`.

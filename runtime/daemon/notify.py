@@ -38,7 +38,7 @@ class Notifier:
         return self._channel is not None and self._channel.socket is not None
 
     def ready(self) -> None:
-        """The first frame is on the panels, or it waits for them, answering meanwhile. Later calls do nothing."""
+        """Report ready: the first frame is shown, or panels are waited for. Later calls do nothing."""
         if not self._ready:
             self._ready = True
             self._send("READY=1")
@@ -51,7 +51,7 @@ class Notifier:
             self._send(f"STATUS={line}")
 
     def starting(self) -> None:
-        """Progress before the first frame: START_STEP_S more, of the start or, once it is ready, of the watchdog."""
+        """Report progress before the first frame: extends the start's or the watchdog's time-out."""
         step_us = round(START_STEP_S * 1e6)
         if not self._ready:
             self._send(f"EXTEND_TIMEOUT_USEC={step_us}")

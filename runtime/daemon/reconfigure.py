@@ -1,4 +1,4 @@
-"""Other settings while it runs: what they need is made ready alongside the solver, and taken over between two steps."""
+"""A change of settings during a run: loaded beside the solver, taken over between two steps."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Ready = tuple[Opener | None, Predictor | None]  # None: stays as it is
 
 
 class Reconfiguration:
-    """One change of settings. Nothing changes until all that it needs is ready; where any of it fails, nothing does.
+    """One change of settings, all or nothing: it takes effect once everything it needs is loaded.
 
     Begun by whoever asks; `advance` is a task of the solver's thread, until it answers True; then `finished` is
     set, and `problem` says whether it was refused.
@@ -78,8 +78,7 @@ class Reconfiguration:
 
     @property
     def finished(self) -> bool:
-        """Taken over or refused; also where the solver hangs in it and has been left behind, or nobody wants it and it
-        does not end."""
+        """True once taken over or refused; also where the solver hangs in it, or it was abandoned."""
         if not self._finished and self._taker is not None and not self._taker.is_newest:
             self.problem, self._finished = LEFT_BEHIND, True
         is_stuck = self.abandoned and time.monotonic() - self._begun_s > LIMITS.load_s

@@ -1,4 +1,4 @@
-"""The status and control socket: JSON lines over a local socket of mode 0660, answered alongside the loop."""
+"""The status and control socket: JSON lines over a local socket of mode 0660, on its own thread."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class StatusServer(Listener):
                 self.path.unlink()
 
     def answer(self, line: bytes) -> dict[str, Any] | Command:
-        """One request to one answer (`ok` says whether it was done, `error` why not), or to a command for the loop."""
+        """The answer to a request (`ok`; `error` says why not), or a command for the loop."""
         try:
             request = json.loads(line)
         except (ValueError, RecursionError):
@@ -215,7 +215,7 @@ def _check_dead(path: Path) -> None:
 
 
 def open_status_server(settings: ServiceSettings, *, clock: Clock, supervised: bool) -> StatusServer | None:
-    """The socket that the settings name; in a person's session, where its default can't be made, their own.
+    """The socket that the settings name; in a user's session, where that fails, the user's own.
 
     Under a supervisor it is the socket or nothing: raises SocketInUse where another phasestack has it, InputError
     where it can't be made. A run by hand then goes on without one, and the log says why.

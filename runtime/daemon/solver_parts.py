@@ -83,7 +83,7 @@ class RunningSolver:
 
 
 class SolverMaker:
-    """Makes a solver on the thread that calls; again, with the settings of then, where the one before it hung."""
+    """Makes a solver on the calling thread, and again with the present settings after a hang."""
 
     def __init__(
         self,
@@ -102,8 +102,7 @@ class SolverMaker:
         self._prepared: tuple[ContentSettings, Opener] | None = None  # read, and not made into a source yet
 
     def __call__(self, *, context: Any = None, simulated: bool = False) -> RunningSolver:
-        """context: one to use together with the panels; None: one of this thread's own. Raises FatalError; leaves
-        nothing open then."""
+        """context: shared with the panels; None: the thread's own. Raises FatalError, leaving nothing open."""
         own = context is None
         generation = self.run.begin() if self.run is not None else 0
         settings = self.run.state.settings if self.run is not None else self._settings

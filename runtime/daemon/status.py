@@ -146,7 +146,7 @@ JPEG_QUALITY = 80  # of the page's small pictures
 
 
 def pictures_of(refresh: Refresh, stack: PanelStack, *, fov_deg: float) -> dict[str, bytes]:
-    """JPEGs of a refresh: `layer-0`, ... rear to front, `seen-left`, `seen-right`; none where nothing was shown yet.
+    """JPEGs of a refresh: `layer-0` (rear) onwards, `seen-left`, `seen-right`; none before the first.
 
     Layers are as they were solved, made small, and seen from the eyes that they were solved for: what is exact would
     cost more than a refresh.

@@ -1,5 +1,7 @@
-"""Files of nobody knows whom are tried in a process of their own first: one that may take so much memory and time, and
-that is killed. What the display shows goes on meanwhile, and only what came through is loaded into it."""
+"""Trial loading of untrusted files in a process with limited memory and time.
+
+The display goes on meanwhile, and only what came through is loaded into it.
+"""
 
 from __future__ import annotations
 

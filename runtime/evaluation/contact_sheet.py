@@ -33,7 +33,7 @@ class Moment:
 
 
 def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, lines: Sequence[str] = ()) -> U8:
-    """(h, w, 3) RGB: a row of layers, and for each eye a row of what it should see, sees, and the difference.
+    """(h, w, 3) RGB: a row of layers; for each eye a row of target, what it sees, and the difference.
 
     headline: the one figure to quote; lines: what stands below it.
     """

@@ -75,7 +75,7 @@ def displayed(
 def expected_db(
     eye_views: EyeViews, layers: U8, *, light: bool = False, sigmas_mm: Sequence[float] = SIGMAS_MM
 ) -> dict[str, float | None]:
-    """Expected PSNR (docs/contracts.md, Error) of layers, by the tracking's error in millimetres: "0", "1", "2".
+    """Expected PSNR (docs/contracts.md, Error) by tracking error in millimetres: "0", "1", "2".
 
     light: of what pupils get of the panels' pixels, else of one ray a pixel. None where such an error would take an eye
     to where it sees nothing.
@@ -89,7 +89,7 @@ def expected_db(
 
 
 def on_panels_raster(picture: Picture, stack: PanelStack) -> Picture:
-    """A picture in the panels' pixels where it has their aspect, as a judge of the layers compares it; else as it is.
+    """A picture resampled to the panels' pixels where their aspect agrees, else unchanged.
 
     A picture of another aspect would be stretched, and then no eye is meant to see it.
     """

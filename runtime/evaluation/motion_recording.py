@@ -1,4 +1,4 @@
-"""`phasestack record --motion`: one of the tracker benchmark's motions as a recording, with its true eyes.
+"""`phasestack record --motion`: a benchmark motion as a recording, with its true eyes.
 
 The true eyes are in the file, so that a run's summary has the displayed quality at them. The sensor's pose is that of
 the demo's calibration, the default.

@@ -27,7 +27,7 @@ class RunOutput:
     """
 
     def __init__(self, target: Path, *, every_one: bool = True) -> None:
-        """every_one: wait for a disk that is slower than the run; otherwise what it can't take in time is left out."""
+        """every_one: wait for a slow disk; otherwise leave out what it cannot take in time."""
         self._folder = OutputFolder(target)
         self._target, self._every_one = target, every_one
         self._lines: TextIO | None = None
@@ -62,7 +62,7 @@ class RunOutput:
         self._later(lambda: self._line(line))
 
     def light(self, frame: int, *, layers: U8, drawn: tuple[U8, U8] | None, info: Mapping[str, Any]) -> None:
-        """`light/<frame>/`: what the panels show at one refresh, and what the eyes that it was solved for should see.
+        """Write `light/<frame>/`: the panels at one refresh, and what the solution's eyes should see.
 
         layers: (N, h, w, 3 or 4), aligned; drawn: (h, w, 3) retina pictures, None where there were none; info: what
         light.json holds. None of these arrays may be written to afterwards.
@@ -81,7 +81,7 @@ class RunOutput:
     def finish(
         self, summary: dict[str, Any], layers: U8 | None, moment: Moment | None = None, *, unseen: str = ""
     ) -> None:
-        """The last frame, the summary; stills, contact sheet and viewer of the newest refresh that was measured.
+        """Write the last frame, the summary, and the stills, sheet and viewer of the newest measured refresh.
 
         unseen: the viewer's page where no two eyes saw anything.
         """

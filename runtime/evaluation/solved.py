@@ -74,7 +74,7 @@ class SolvedPair:
         return self.eye_views.viewer(self.layers, title=headline(self.quality.light_db["1"]), lines=lines)
 
     def write(self, folder: Path, *, lines: Sequence[str]) -> None:
-        """Layers, what each eye sees and should see; contact sheet and viewer with `lines` below their headline."""
+        """Write layers, eye views, contact sheet and viewer, with `lines` below their headline."""
         for n, layer in enumerate(self.layers):
             write_png(folder / f"layer-{n}.png", layer)
         self.eye_views.write(folder)

@@ -35,7 +35,7 @@ def timed(
     enough_s: float = 0.0,
     slow_s: float = float("inf"),
 ) -> Timed[T]:
-    """A run that doesn't count, then at least `runs`; then more until they add up to `enough_s` or are `most`.
+    """Time a warm function: `runs` at least, then more up to `enough_s` or `most` runs.
 
     slow_s: where the first takes longer, it counts and is the only run.
     """

@@ -1,4 +1,4 @@
-"""The calibration that takes eyes from the sensor's frame to the stack's: load, check, apply, and its error.
+"""The calibration from the sensor's frame to the stack's: load, check, apply, and its error.
 
 Parameters of a calibration, about a pivot w0 (the pairs' centre, in `stack`) where they are nearly uncorrelated:
 rotation vector (3, rad, about the axes of `stack`), shift (3, m) and log scale (1). A small change d of them moves
@@ -93,7 +93,7 @@ class Calibration:
         )
 
     def position_error_m(self, stack_m: ArrayLike) -> F64 | None:
-        """(...) expected (RMS) distance, m, by which points (..., 3) in `stack` are off due to the calibration alone.
+        """(...) RMS error, m, of points (..., 3) in `stack` that the calibration alone causes.
 
         None where that is not known.
         """
@@ -126,7 +126,7 @@ def position_jacobian(stack_m: ArrayLike, *, pivot_m: ArrayLike) -> F64:
 
 
 def similarity_defect(matrix: ArrayLike) -> float:
-    """How far the upper left 3x3 is from a scaled rotation: max of |A^T A / s² - I|, s² the mean square of columns.
+    """Distance of the upper left 3x3 from a scaled rotation: max |A^T A / s² - I|.
 
     0: exactly a similarity (or a reflection of one); infinite for a zero matrix.
     """
@@ -139,7 +139,7 @@ def similarity_defect(matrix: ArrayLike) -> float:
 
 
 def check_similarity(matrix: F64, *, source: str | Path) -> None:
-    """Raise InputError, naming the field, where a finite 4x4 matrix is no similarity that a display can have.
+    """Raise InputError, naming the field, for a 4x4 that is no similarity a display can have.
 
     Its determinant must be positive, its scale within `SCALE`, and the sensor within `MAX_DISTANCE_M`.
     """
@@ -198,7 +198,7 @@ def load_calibration(path: Path | None) -> Calibration:
 
 
 def demo_stack_from_sensor() -> F64:
-    """4x4 rigid transform of the demo's sensor, which looks at the viewer along +x, tilted down by 10 degrees."""
+    """4x4 rigid transform of the demo's sensor, which looks along +x, tilted down by 10 degrees."""
     return load_calibration(None).stack_from_sensor
 
 

@@ -1,4 +1,4 @@
-"""Two eyes in a sensor's pictures: a viewer's pupils, how far away they are, and how sure all of it is."""
+"""Eyes from a sensor's pictures: the viewer's pupils, their distance, and the covariance."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 
 class EyeFinder:
-    """Eyes of one viewer. `choice`: how that viewer was chosen; `reason`: why the last frame gave no eyes."""
+    """Finder of one viewer's eyes. `choice`: how the viewer was chosen; `reason`: why there are none."""
 
     def __init__(self, settings: Settings | None = None) -> None:
         """settings: of `calibration` the viewer's eye distance."""

@@ -1,5 +1,6 @@
-"""How far away a viewer's eyes are: what the camera measures on the rigid face, fused over time, and without a
-measurement what the distance between this viewer's eyes says.
+"""The distance of a viewer's eyes: measured on the rigid face and fused over time.
+
+Without depth it follows from the separation of this viewer's eyes.
 
 One number is followed: the viewer's eye distance in metres, as the depth measurements show it. A distance is that
 number times the focal length over the eyes' distance in pixels (along the line between them in space, which the mesh

@@ -1,4 +1,4 @@
-"""How a face moved from one picture to the next, to a fiftieth of a pixel: optical flow of what is rigid in it.
+"""Motion of a face between pictures to 1/50 pixel: optical flow of its rigid parts.
 
 The networks look at each picture anew and err anew. What a face's skin and hair did between two pictures is known far
 better, so pupils follow the optical flow and are only slowly corrected by the networks.
@@ -44,7 +44,7 @@ class FaceFlow:
         self._grey, self._mesh = self._crop(picture), mesh[RIGID, :2].copy()
 
     def moved(self, picture: U8, mesh: F64) -> F64 | None:
-        """(2, 3) similarity: where the remembered picture's pixels of the face are now; None: that is not known."""
+        """(2, 3) similarity from the remembered face's pixels to the new picture's; None: unknown."""
         grey = self._crop(picture)
         matrix = self._crop_from_picture
         start = (transformed(matrix, self._mesh) - 0.5).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Interacting multiple models (Blom and Bar-Shalom 1988): Kalman filters of one point's motion that differ in haste.
+"""Interacting multiple models (Blom and Bar-Shalom 1988): Kalman filters of different agility.
 
 Each model has Singer's acceleration (1970): it fades with a time constant and is renewed by noise of its own strength.
 A still head wants a heavy filter, a hasty one a light filter, and which it is changes in a tenth of a second. The noise
@@ -96,7 +96,7 @@ def predicted(belief: Belief, dt_s: float, *, acceleration: Sequence[float], sta
 
 
 def surprise(belief: Belief, measured: F64, *, noise: F64) -> float:
-    """Least squared distance of a measurement from any model, in units of its variance (chi² of three axes)."""
+    """Least squared Mahalanobis distance of a measurement from any model (chi² of three axes)."""
     return float(_chi2(measured - belief.state[:, :3], belief.covariance[:, :3, :3] + noise).min())
 
 

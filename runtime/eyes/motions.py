@@ -1,4 +1,4 @@
-"""Heads that move as viewers do, and what a depth camera makes of them: for the benchmark and the tests."""
+"""Simulated head motions and a depth camera's samples of them, for the benchmark and tests."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ MOTIONS: dict[str, Motion] = {
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """How one viewer makes a motion: where in it they begin, how fast and how far they go, and to which side first."""
+    """One viewer's variation of a motion: phase, speed, extent and first direction."""
 
     start_s: float = 0.0
     pace: float = 1.0

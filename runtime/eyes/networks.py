@@ -24,7 +24,7 @@ CROP_BLUR = 0.45  # standard deviation, in the crop's pixels, that keeps a shrun
 
 
 def load_network(name: str) -> Any:
-    """An onnxruntime session on one thread, which the display's loop never waits for. name: a file in `models`.
+    """An onnxruntime session on one thread, outside the display's loop. name: a file in `models`.
 
     It has run once, as the first run is several times as slow as the others.
     """
@@ -51,7 +51,7 @@ def inverse(matrix: F64) -> F64:
 
 
 def resampled(picture: U8, size: tuple[int, int], crop_from_picture: F64) -> U8:
-    """A picture warped by an affine (2, 3) matrix of continuous pixels, without aliasing; edges are repeated."""
+    """A picture warped by an affine (2, 3) of continuous pixels, antialiased, edges repeated."""
     ratio = 1 / np.sqrt(abs(np.linalg.det(crop_from_picture[:, :2])))  # picture's pixels a crop's
     corners = np.array([[0, 0], [size[0], 0], [0, size[1]], [size[0], size[1]]], np.float64)
     seen = transformed(inverse(crop_from_picture), corners)
@@ -166,7 +166,7 @@ class MeshNetwork:
 
 
 class IrisNetwork:
-    """The iris in a square around an eye. It knows the eye on the left of a picture; the other one is mirrored."""
+    """The iris in a square around an eye: trained for the eye on a picture's left, the other is mirrored."""
 
     SIZE = 64
 

@@ -1,4 +1,4 @@
-"""What can't be a viewer's two eyes, and why: left and right exchanged, millimetres, behind the display.
+"""Reasons why two points cannot be a viewer's eyes: exchanged, millimetres, behind the display.
 
 Pure of time and of clocks; eyes are in frame `stack` (+x out of the screen, +y the viewer's right, +z up), metres.
 """
@@ -39,7 +39,7 @@ _HINTS = {
 
 
 def reason_against(eyes_m: F64, *, in_front_m: float = 0.0) -> str:
-    """Why (2, 3) left and right eye can't be a viewer's, or an empty text. in_front_m: an eye's x must be larger.
+    """Why (2, 3) points can't be a viewer's eyes; empty: they can. in_front_m: least x of an eye.
 
     An exchange shows in the line from left to right: across the line of sight, level, it points to the viewer's right.
     """
@@ -75,7 +75,7 @@ class RefusalWatch:
         return self._counts
 
     def update(self, reason: str) -> str:
-        """Take in what became of a sample, empty where it was taken. Answers a line to log when the state changes."""
+        """Count a sample's refusal (empty: accepted). Answers a line to log when the state changes."""
         self._last.append(reason if reason in MISTAKES else "")
         if reason:
             self._counts[reason] += 1

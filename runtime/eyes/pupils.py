@@ -1,4 +1,4 @@
-"""One viewer's pupils in pictures: found, followed from picture to picture, and not mixed up with anybody else's."""
+"""One viewer's pupils in pictures: found, followed, and kept apart from other people's."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class _Look:
 
 
 class PupilFinder:
-    """Finds a viewer and keeps to that viewer. `reason`: why the last picture gave nothing; `choice`: who it is."""
+    """Finds and keeps one viewer. `reason`: why the last picture gave nothing; `choice`: who it is."""
 
     def __init__(self, *, lock_ns: int = 0) -> None:
         """lock_ns: a viewer not seen for this long makes way for another."""

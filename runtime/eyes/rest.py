@@ -1,4 +1,4 @@
-"""Does the head stand still? Told from the samples that the tracker took, whose noise a prediction would only enlarge.
+"""Detection of a head at rest, from the accepted samples.
 
 What the tracker predicts jitters by several times the sensor's noise, since the noise of the speed is multiplied by
 the horizon. A head at rest has no speed: the median of its samples is where it is, and the picture need not follow.
@@ -30,10 +30,10 @@ NEAREST_M = 0.1  # from the display; nearer eyes count as so near
 
 
 class RestWatch:
-    """Detects a head at rest from the accepted samples, and its resting place. One thread uses it; no clock."""
+    """Detects a resting head and its position from accepted samples. Single thread, no clock."""
 
     def __init__(self, *, max_drift_m: float) -> None:
-        """max_drift_m: drift of a resting head, beyond the uncertainty by noise, after which its place is updated."""
+        """max_drift_m: drift of a resting head, beyond the noise, that updates its position."""
         self._max_drift_m = max_drift_m
         self._times = np.zeros(2 * KEPT, np.int64)
         self._eyes = np.zeros((2 * KEPT, 2, 3))

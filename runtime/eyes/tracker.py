@@ -1,4 +1,4 @@
-"""The eyes at any instant: gating, filtering, history and prediction, with a label for how an estimate was made."""
+"""The tracker: gating, filtering, history and prediction of the eyes, each estimate labelled."""
 
 from __future__ import annotations
 
@@ -289,7 +289,7 @@ class Tracker:
 
 
 def sideways_sigma_m(error_m2: F64, eye_m: F64, *, panel_m: tuple[float, float]) -> float:
-    """Standard deviation of an axis, right or up, that does as much harm as an eye's error (3, 3) covariance, `stack`.
+    """The sideways standard deviation that does as much harm as an eye's (3, 3) covariance.
 
     An eye that is d nearer than it is believed sees a point of the display through the other panels as one that is
     d·u/x farther from the point's foot, u: the distance from there, x: the eye's. The mean square over the display.

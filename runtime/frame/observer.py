@@ -1,4 +1,4 @@
-"""Looks at a run's refreshes: the account's lines, sampled quality, kept light. Off the refreshes' own time.
+"""Observes refreshes outside their own time: lines of frames.jsonl, sampled quality, kept light.
 
 Lines wait until the recording has said where the eyes really were; so do measurements. In simulated time they are
 made at once; in real time the solver's thread draws what is compared and a thread of its own compares, and while one

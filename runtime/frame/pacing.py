@@ -1,4 +1,4 @@
-"""When refreshes wake, are presented and send their light: predicted from the display's own vertical blanks.
+"""Pacing: wake, present and display times of refreshes, predicted from vertical blanks.
 
 Pure: it is given the time and what happened, and never reads a clock. The manner is that of Monado's compositor
 pacing: predict, report what happened, learn the phase of the blanks and the time that a refresh needs before one.

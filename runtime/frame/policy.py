@@ -54,7 +54,7 @@ class FramePolicy:
         solved: SolutionKey | None,
         flat: SolutionKey | None,
     ) -> Decision:
-        """plan: what may be left out; solved, flat: what there is; revision: of the content at `request.time_ns`."""
+        """plan: allowed savings; solved, flat: what there is; revision: the content's at `request.time_ns`."""
         if request.flat_wanted and not self._flat_wanted:
             self.episode += 1
         self._flat_wanted = request.flat_wanted

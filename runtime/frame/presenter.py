@@ -1,4 +1,4 @@
-"""One refresh after the other: receive, map, predict, align, present, account. It waits for nothing but its time.
+"""The presenter's loop: receive, map, predict, align, present, account; waits only for its time.
 
 The solver works alongside it (`solver_host`) and hands over complete solutions; every refresh shows the newest one,
 aligned to where the eyes will be at its display time.
@@ -46,7 +46,7 @@ log = logging.getLogger("phasestack.presenter")
 
 
 class Supervisor:
-    """What the presenter reports to the outside, and asks it, once a refresh, never waiting. This one does nothing."""
+    """The presenter's connection to the outside, called once a refresh, never waiting. Base: nothing."""
 
     def stop_reason(self) -> str:
         """Why to stop; empty: go on."""
@@ -79,7 +79,7 @@ class Observer(Protocol):
 
 
 class RefreshTimes:
-    """Laps of one refresh. On a simulated clock each stage takes what the configuration says, and time passes."""
+    """Stage times of a refresh; on a simulated clock each stage takes its configured time."""
 
     def __init__(self, clock: Clock, simulated_ms: Mapping[str, float]) -> None:
         self._simulated = clock if isinstance(clock, SimulatedClock) else None
@@ -147,7 +147,7 @@ class Presenter:
         self._aligned: tuple[int, bytes, tuple[F64, ...], str] | None = None
 
     def run(self, *, frames: int | None = None) -> str:
-        """Refreshes until the recording ends, `frames` are done, or the supervisor says so. Answers why it stopped."""
+        """Refresh until the recording ends, `frames` are done, or it is told to stop; answers why."""
         reason = ""
         while not reason:
             try:
@@ -355,7 +355,7 @@ class Presenter:
             observer.refreshed(self.last)
 
     def summary(self, *, simulated: bool = False) -> dict[str, Any]:
-        """The part of summary.json that is counted (contract 5.2); simulated: every time is the run's clock's."""
+        """The counted part of summary.json (contract 5.2); simulated: all times are the run's clock's."""
         predictor = self.run_cell.state.predictor
         return {
             **self.stats.summary(stale_inputs=self.samples.stale_inputs, simulated=simulated),

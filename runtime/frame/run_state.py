@@ -1,4 +1,4 @@
-"""What a run is made with at one moment: one immutable value, replaced as a whole by whoever reconfigures."""
+"""The immutable state of a run at one moment, replaced as a whole on reconfiguration."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LEFT_BEHIND = "content or model took so long to be made that the solver was made
 
 @dataclass(frozen=True, slots=True)
 class RunState:
-    """Settings, calibration, content and model that belong together. Content and model are the solver's alone."""
+    """Settings, calibration, content and model that belong together; the solver owns the last two."""
 
     version: int  # another number for each value
     settings: Settings

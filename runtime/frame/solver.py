@@ -1,4 +1,4 @@
-"""Draws content and predicts layers for where the eyes will be; one thread uses it, the one with its GL context."""
+"""Draws content and predicts layers for the future eyes, on the one thread with its GL context."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ FLAT_EYE_M = (0.7, 0.0, 0.0)  # where the flat picture is drawn from before any 
 
 @dataclass(frozen=True, slots=True)
 class SolverStep:
-    """What became of one request; or the newest of what all requests so far came to, one value, replaced as a whole."""
+    """The result of one request; as news, the newest of all results so far."""
 
     solution: Solution | None = None  # a new one for two eyes
     flat: Solution | None = None  # a new flat picture
@@ -187,7 +187,7 @@ class Solver:
 
 
 class LayerBuffers:
-    """As many buffers as are held at once, which is three: being written, newest, shown. One thread takes."""
+    """A pool of as many buffers as are held at once: one written, one newest, one shown."""
 
     def __init__(self) -> None:
         self._buffers: list[tuple[U8, Callable[[], U8 | None]]] = []

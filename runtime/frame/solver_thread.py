@@ -1,4 +1,4 @@
-"""The solver's own thread: hands over complete solutions, and is left behind where a call does not return."""
+"""The solver's thread: hands over complete solutions; abandoned when a call does not return."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The daemon's state, a pure function of what is there, each transition reported once; and what came late."""
+"""The daemon's state as a pure function of its conditions, and detection of late refreshes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Conditions:
 
 
 def judge(conditions: Conditions) -> tuple[State, str]:
-    """The state that the conditions call for, and why. Stopping, starting and what is missing come before the eyes."""
+    """The state and its reason. Priority: stopping, starting, missing parts, then the eyes."""
     if conditions.stopping:
         return State.STOPPING, conditions.stopping
     missing = [part for part in PARTS if part in conditions.missing]
@@ -66,7 +66,7 @@ class StateMachine:
         return f"{self.state}: {', '.join(self.missing)}" if self.state is State.DEGRADED else str(self.state)
 
     def update(self, conditions: Conditions, *, now_ns: int) -> bool:
-        """Take in one turn; True where the state, or what is missing, is another: log it. Stopping is never left."""
+        """Take in one turn; True if the state or what is missing changed. Stopping is final."""
         self._held_ns[self.state] += now_ns - self._counted_ns
         self._counted_ns = now_ns
         if self.state is State.STOPPING:

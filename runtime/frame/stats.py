@@ -1,4 +1,4 @@
-"""What a run came to: bounded memory however long it lasts. All times are the run's clock's, but for `overhead_ms`."""
+"""Statistics of a run in bounded memory; on the run's clock, except for `overhead_ms`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ OVERHEAD_STAGES = ("sensor", "track")
 
 
 class Quantiles:
-    """Of all values of a run: of every one, of every second, fourth, ... once there are many; the largest exactly."""
+    """Quantiles of all values of a run, thinned evenly when there are many; the maximum is exact."""
 
     def __init__(self, size: int = WINDOW) -> None:
         self._values = np.zeros(size)

@@ -1,4 +1,4 @@
-"""From a sensor's samples to the eyes at any instant: map, track, find rest; with the settings of the moment."""
+"""From sensor samples to the eyes at any instant: calibrate, track, detect rest."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The display's optics: pure functions of arrays. Frames, units and equation numbers are in each docstring."""
+"""The display's optics: pure functions of arrays, with frames, units and equation numbers."""

@@ -40,7 +40,7 @@ class Alignment:
 
 
 def reference_x_m(stack: PanelStack) -> float:
-    """The plane whose points stay where they are: the centre panel, or midway between the two in the middle."""
+    """x of the reference plane: the centre panel, or halfway between the two middle ones."""
     half = stack.count // 2
     return stack.x_m[half] if stack.count % 2 else (stack.x_m[half - 1] + stack.x_m[half]) / 2
 
@@ -69,7 +69,7 @@ def align(stack: PanelStack, *, solved_for_m: F64, eyes_m: F64) -> Alignment:
 
 
 def scale_and_shift(matrix: F64) -> tuple[float, float, float, float]:
-    """(scale_u, scale_v, shift_u, shift_v) of a 3x3. Raises ValueError where it is anything more than that."""
+    """(scale_u, scale_v, shift_u, shift_v) of a 3x3. Raises ValueError for any other matrix."""
     (su, a, tu), (b, sv, tv), last = matrix.tolist()
     if a or b or last != [0.0, 0.0, 1.0]:
         raise ValueError("an alignment is a scale and a shift")

@@ -1,4 +1,4 @@
-"""Pictures that other cameras took from the eyes' places, turned to those of eyes that look at the stack's origin."""
+"""Pictures of cameras at the eyes' places, resampled as if they looked at the stack's origin."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Picture = U8 | F32  # (h, w, 3)
 
 
 def as_cameras(given: Any) -> tuple[F64, F64]:
-    """(2, 3, 4) projections from the `stack` frame to a picture's pixels, right-handed, and (2, 3) where they stand.
+    """(2, 3, 4) right-handed projections from `stack` to pixels, and the (2, 3) camera positions.
 
     Raises ValueError.
     """
@@ -45,8 +45,9 @@ def as_cameras(given: Any) -> tuple[F64, F64]:
 def looking_at_origin(
     pictures: Sequence[Picture], cameras: F64, eyes_m: F64, stack: PanelStack
 ) -> tuple[list[Picture], float]:
-    """Pictures (h, w, 3) of pinhole eyes (2, 3) that look at the stack's origin, and their horizontal field of view in
-    degrees, from those that cameras (2, 3, 4) took at the same places.
+    """Resample cameras' (2, 3, 4) pictures as if their eyes (2, 3) looked at the stack's origin.
+
+    Answers the (h, w, 3) pictures and their horizontal field of view in degrees.
 
     They are as wide and as high as the panels are seen, where both given pictures show that; sampled cubically, unless
     the cameras look at the origin already. Raises ValueError where a picture does not show the stack's middle.
@@ -118,7 +119,7 @@ def _slope(matrix: F64) -> F64:
 
 
 def doubts(eyes_m: ArrayLike, stack: PanelStack, *, fov_deg: float, size: tuple[int, int]) -> list[str]:
-    """What of eyes and pictures (width, height) can hardly be meant, a line each, with the argument's name."""
+    """Probable mistakes in eyes and picture sizes (width, height), one line each, naming the argument."""
     eyes, told = np.asarray(eyes_m, np.float64), []
     if fov_deg <= math.pi:
         told.append(f"fov_deg: {fov_deg:g} degrees looks like radians (of {math.degrees(fov_deg):.1f} degrees)")

@@ -1,4 +1,4 @@
-"""What eyes see that are not where the layers were solved for: carried, expected and light quality (docs/contracts.md).
+"""Quality at eyes other than those solved for: carried, expected and light (docs/contracts.md).
 
 The picture that the layers were solved for is carried along on the centre panel: the ray of each of its pixels is
 replaced by the one from the true eye through the same point of that panel. Ghosts and colour fringes
@@ -31,7 +31,7 @@ def carried_db(
     eyes_m: ArrayLike,
     fov_deg: float,
 ) -> float:
-    """PSNR, of one ray a pixel, at eyes (2, 3) of layers that were solved for others (2, 3), against their pictures.
+    """PSNR, one ray a pixel, at eyes (2, 3) of layers solved for other eyes (2, 3).
 
     layers: (N, H, W, 3 or 4) code values, exactly what the panels show; drawn: an (h, w, 3) picture for each eye of
     `solved_for_m`, as retina pictures of horizontal field of view `fov_deg`, code values or float in [0, 1].
@@ -56,7 +56,7 @@ def expected_psnrs_db(
     seen_from_m: ArrayLike | None = None,
     sampling: Sampling = ONE_RAY,
 ) -> dict[float, float]:
-    """PSNR of the carried squared error expected over normal errors of the eyes' common place (docs/contracts.md).
+    """PSNR of the carried squared error, expected over normal tracking errors (docs/contracts.md).
 
     For each standard deviation to the right and up, by five points: no error with weight 1/2, two standard deviations
     to either side with 1/8 each, which is exact for second moments. drawn: an (h, w, 3) picture for each of the eyes

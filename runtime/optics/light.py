@@ -1,4 +1,4 @@
-"""What eyes see of displayed layers, in two ways, as one mean squared error (docs/contracts.md, Error).
+"""What eyes see of displayed layers as a mean squared error (docs/contracts.md, Error).
 
 *Light*, the figure to quote: a panel's pixel is a square of one colour, and an eye makes of a pixel of its picture the
 mean intensity over that pixel and over its pupil, which is focused on the centre panel. It is estimated by two
@@ -63,7 +63,7 @@ def squared_error(
     fov_deg: float,
     sampling: Sampling,
 ) -> float:
-    """Mean squared error of what eyes (2, 3) see against what those solved for (2, 3) should: carried, as `carried`.
+    """Mean squared error at eyes (2, 3) against the pictures of the eyes solved for, carried.
 
     layers: (N, H, W, 3 or 4) code values, rear to front; targets: (h, w, 3) intensities for each eye solved for, of
     pictures `fov_deg` wide. A pixel counts whose rays all cross every panel half a pixel inside. Of light that is
@@ -128,7 +128,7 @@ def first_ray(side: int) -> int:
 
 
 def panels_from_centre(true_m: F64, stack: PanelStack) -> F64:
-    """(..., N, 3, 3) where the lines from eyes (..., 3) through the centre panel's pixels cross each panel's layer."""
+    """(..., N, 3, 3) homographies from the centre panel's pixels to each layer, for eyes (..., 3)."""
     centre = stack.panel(stack.count // 2)
     x, y, z = np.moveaxis(true_m[..., None], -2, 0)
     share = (np.array(stack.x_m) - x) / (centre.x_m - x)

@@ -1,4 +1,4 @@
-"""Malus' law and Jones calculus of N rotators between crossed polarizers (EyeReal supplement, (1)-(7))."""
+"""Malus' law and Jones calculus of N rotators between crossed polarizers (supplement, (1)-(7))."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ T = TypeVar("T", bound=np.floating[Any])
 
 
 def jones_rotator(angle_rad: float) -> F64:
-    """2x2 Jones matrix R(-phi) of a panel that turns the polarization counter-clockwise (equations (2), (3))."""
+    """2x2 Jones matrix R(-phi) of a panel that turns the polarization counter-clockwise ((2), (3))."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([[c, -s], [s, c]])
 
 
 def jones_intensity(angles_rad: ArrayLike) -> float:
-    """Transmitted intensity of panels between crossed polarizers by the Jones product (equations (5), (7)), I_0 = 1."""
+    """Intensity transmitted through panels between crossed polarizers, by Jones matrices ((5), (7))."""
     field = np.array([1.0, 0.0])
     for angle in np.atleast_1d(np.asarray(angles_rad, dtype=np.float64)):
         field = jones_rotator(float(angle)) @ field
@@ -29,7 +29,7 @@ def jones_intensity(angles_rad: ArrayLike) -> float:
 
 
 def intensity_from_phase(phase: NDArray[T]) -> NDArray[T]:
-    """What an eye sees where the panel values along its ray add up to `phase` (units of pi/2): sin² (equation (7)).
+    """Intensity sin²(π/2·phase) for the sum of the panel values along a ray (equation (7)).
 
     Single precision stays single.
     """

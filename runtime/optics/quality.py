@@ -54,7 +54,7 @@ def ssim(a: F32, b: F32, mask: Mask) -> float:
 
 
 def squared_error(image: F32, target: F32, mask: Mask) -> tuple[float, int]:
-    """Sum of the squared difference over the rays that count and all channels, and how many numbers that is."""
+    """Sum of squared differences over the counted rays and channels, and the number of terms."""
     total, counted = 0.0, 0
     for rows in strips(len(mask)):
         difference = (image[rows] - target[rows])[mask[rows]].astype(np.float64).ravel()

@@ -10,7 +10,7 @@ from runtime.optics.stack import PlaneRaster
 
 @dataclass(frozen=True, slots=True)
 class PixelRect:
-    """Pixels [u0, u1) x [v0, v1) of a raster; u right, v down. Empty where an end is not beyond its beginning."""
+    """Pixels [u0, u1) x [v0, v1) of a raster, u right, v down; empty if an end is not past its start."""
 
     u0: int
     v0: int

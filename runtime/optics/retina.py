@@ -1,4 +1,4 @@
-"""Simulated retinas: what an eye sees through the layers (contracts), pinhole and with a pupil of finite size."""
+"""Simulated retinas: what an eye sees through the layers, as a pinhole or with a finite pupil."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class Rays:
 
     @classmethod
     def of_eye(cls, eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg: float) -> Rays:
-        """Of an eye (3,), frame `stack`, whose image has this size and the horizontal field of view `fov_deg`."""
+        """Rays of an eye (3,), frame `stack`, for an image of this size and horizontal field of view."""
         return cls(
             image_from_stack(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg),
             np.arange(width_px, dtype=np.float64) + 0.5,
@@ -119,7 +119,7 @@ class Rays:
         return result
 
     def toward(self) -> F64:
-        """(3,) what gives a ray's x when multiplied by (u, v, 1): negative for one that goes towards the panels."""
+        """(3,) coefficients of a ray's x for (u, v, 1): negative towards the panels."""
         # A ray's direction is the inverse of the projection's left part times (u, v, 1).
         return np.asarray(np.linalg.inv(self.from_stack[:, :3])[0])
 
@@ -142,7 +142,7 @@ def seen_by(
     width_px: int | None = None,
     height_px: int | None = None,
 ) -> Retina:
-    """What a pinhole eye sees (EyeReal supplement, (6), (7)): panel values summed along each ray, then sin².
+    """What a pinhole eye sees: sin² of the panel values summed along each ray (supplement, (6), (7)).
 
     layers: (N, H, W, 3 or 4), rear to front, uint8 code values or float in [0, 1]; a fourth channel is ignored.
     The image has the layers' size by default.
@@ -211,7 +211,7 @@ def pupil_points(diameter_m: float, rings: int = 2) -> F64:
 
 
 def average(images: Iterable[F32]) -> F32:
-    """(h, w, C) mean of equally sized images: a finite pupil sees the average of what its points see (section 1.4)."""
+    """(h, w, C) mean of images: a finite pupil averages what its points see (section 1.4)."""
     total: F32 | None = None
     count = 0
     for image in images:

@@ -1,4 +1,4 @@
-"""Reverse perspective uniform: panel pixels from an eye's image pixels (EyeReal supplement, 3.2, (40)-(47)).
+"""Reverse perspective uniform: panel pixels from an eye's image pixels (supplement, (40)-(47)).
 
 Its misprints are listed and mended in docs/mathematics.md.
 """
@@ -13,7 +13,7 @@ from runtime.records import F64
 
 
 def panel_from_image(image_from_stack: F64, raster: PlaneRaster) -> F64:
-    """M_RPU (equation (47)): 3x3 panel pixels from an eye's image pixels; the inverse of the plane-induced homography.
+    """M_RPU (equation (47)): 3x3 panel pixels from image pixels, the inverse homography.
 
     Built without a numerical inverse: the ray of an image pixel is cut with the panel's plane, so that it
     stays exact at grazing angles. Scaled so that its largest entry is 1.

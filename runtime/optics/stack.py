@@ -48,7 +48,7 @@ class PlaneRaster:
 
 @dataclass(frozen=True, slots=True)
 class Tilt:
-    """How panels that are not quite parallel stand, and the place from which their layers look as if they were."""
+    """Slopes of panels that are not quite parallel, and the eye position they are registered from."""
 
     depth: tuple[tuple[float, float, float], ...]  # per panel (d, r, u): it stands d + r·y + u·z before its x_m, metres
     seen_from_m: tuple[float, float, float]  # frame `stack`
@@ -62,7 +62,7 @@ class Tilt:
 
 @dataclass(frozen=True, slots=True)
 class PanelStack:
-    """Geometry of the display: parallel panels of one size, rear (0) to front (N-1), or nearly parallel ones."""
+    """Geometry of the display: (nearly) parallel panels of one size, rear (0) to front (N-1)."""
 
     width_m: float
     height_m: float
@@ -77,7 +77,7 @@ class PanelStack:
 
     @property
     def is_evenly_spaced(self) -> bool:
-        """True where neighbours are equally far apart, as nearly as the shipped networks serve as well as even ones."""
+        """True if the gaps are even enough for the shipped networks."""
         gaps = np.diff(self.x_m)
         return bool(gaps.size == 0 or np.ptp(gaps) <= UNEVEN_MOST * gaps.mean())
 

@@ -1,4 +1,4 @@
-"""Panels that are not quite parallel: where on a layer an eye sees what it would see on an ideal panel.
+"""Tilted panels: where on a layer an eye sees what it would see on the ideal panel.
 
 Registration by photographs puts every pixel of a layer where an eye at `seen_from_m` sees it on the ideal panel
 (parallel, at its x_m). Another eye, also the other one of the same head, sees a tilted panel's pixels elsewhere: its
@@ -21,7 +21,7 @@ UNSEEN_PX = 0.05  # of a panel's pixels: what moves less is left out
 
 
 def layer_from_seen(stack: PanelStack, index: int, eye_m: F64) -> F64:
-    """3x3: where the layer of a panel has what an eye (3,) sees at (y, z, 1) of the ideal panel; same coordinates.
+    """3x3 from (y, z, 1) of the ideal panel to the layer's, as seen by an eye (3,).
 
     The identity where the stack has no tilt.
     """

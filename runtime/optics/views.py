@@ -37,13 +37,13 @@ def stack_from_eye(eye_m: ArrayLike) -> F64:
 
 
 def image_from_camera(*, width_px: int, height_px: int, fov_deg: float) -> F64:
-    """3x3 intrinsic matrix of square pixels and centred principal point (equation (36)); fov is horizontal."""
+    """3x3 intrinsic matrix: square pixels, centred principal point, horizontal fov (equation (36))."""
     focal_px = width_px / 2 / math.tan(math.radians(fov_deg) / 2)
     return np.array([[focal_px, 0.0, width_px / 2], [0.0, focal_px, height_px / 2], [0.0, 0.0, 1.0]])
 
 
 def image_from_stack(eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg: float) -> F64:
-    """3x4 projection of `stack` points to an eye's image: K · diag(1, -1, -1) · R_e^T · [I | -e] (equations (31)-(39)).
+    """3x4 projection of `stack` points to an eye's image: K·diag(1, -1, -1)·R_e^T·[I | -e] ((31)-(39)).
 
     The third homogeneous coordinate is the distance along the gaze in metres, positive before the eye.
     """
@@ -75,7 +75,7 @@ def raster_from_stack(eye_m: ArrayLike, raster: PlaneRaster) -> F64:
 
 
 def image_from_raster(image_from_stack: F64, raster: PlaneRaster) -> F64:
-    """3x3 plane-induced homography: an eye's image pixels from a plane's pixels (H of equations (40)-(42))."""
+    """3x3 plane-induced homography from a plane's pixels to an eye's image pixels (H of (40)-(42))."""
     return image_from_stack[:, :3] @ raster.stack_from_raster() + np.outer(image_from_stack[:, 3], [0.0, 0.0, 1.0])
 
 

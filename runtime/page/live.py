@@ -1,4 +1,4 @@
-"""The live page's connection: the viewer's eyes come in, layers and refreshes go out. On the web server's loop."""
+"""The live page's connection: the viewer's eyes in, layers and refreshes out."""
 
 from __future__ import annotations
 

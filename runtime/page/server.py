@@ -1,4 +1,4 @@
-"""The page's web application: its own files for everybody, and nothing of the daemon without the token.
+"""The page's web application; everything of the daemon needs the token.
 
 The token comes with every request: the page's script keeps it (`session.js`), where the browser gives it to no other
 site nor port. There is no cookie, so that no other site's request carries what it needs.

@@ -15,7 +15,7 @@ class PanelSink(ABC):
 
     @property
     def period_ns(self) -> int | None:
-        """Between two vertical blanks, as the monitor that sets the pace says; None: there is none, or unknown."""
+        """Period between vertical blanks of the monitor that sets the pace; None: none, or unknown."""
         return None
 
     @abstractmethod

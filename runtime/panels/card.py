@@ -1,4 +1,4 @@
-"""What `identify` shows on a panel: which one it is, which way is up, whether its colours and edges are right."""
+"""The card that `identify` shows on a panel: index, orientation, colours and edges."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def identity_card(width_px: int, height_px: int, *, title: str, lines: Sequence[str]) -> U8:
-    """(height_px, width_px, 4) RGBA, upright for the viewer: title, lines, an arrow up, colour bars, grey steps.
+    """(height_px, width_px, 4) upright card: title, lines, an arrow up, colour bars, grey steps.
 
     A line of one pixel runs along every edge: where one is missing, the panel is cropped or misaligned. Words keep
     off the edges: before a front panel's rim, seen from nearby, no panel behind it lets light through.

@@ -90,7 +90,7 @@ DIRECTIONS: dict[Arrow, tuple[int, int]] = {"up": (0, -1), "down": (0, 1), "left
 
 
 def mounting_of(arrow: Arrow, *, mirrored: bool) -> tuple[int, str]:
-    """`rotation_deg` and `mirror` of a panel on whose card the arrow that should point up points elsewhere.
+    """`rotation_deg` and `mirror` of a panel, from where its card's arrow points.
 
     mirrored: its writing reads the wrong way round.
     """

@@ -1,4 +1,4 @@
-"""Phase to grey: what a panel must be sent so that it turns the light by the angle that was asked for."""
+"""Grey curves: the grey level that makes a panel turn the light by a given angle."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def measured_curve(path: Path) -> F32:
 
 
 def curve(*, lut: str, gamma: float) -> F32:
-    """(256, 3) grey in [0, 1] for each 8-bit phase and channel: a panel's measured curve, or else its gamma's.
+    """(256, 3) grey in [0, 1] for each 8-bit phase and channel: measured, or by gamma.
 
     A panel's phase is then grey^gamma. Raises InputError.
     """

@@ -117,7 +117,7 @@ def check_modes(panels: Sequence[PanelSettings], monitors: Sequence[Monitor], *,
 
 
 def refresh_difference(monitors: Sequence[Monitor]) -> str:
-    """One line where the panels' monitors refresh at different rates, else an empty text; unknown rates (0) pass."""
+    """One line if the panels' monitors refresh at different rates, else empty; rate 0 is unknown."""
     known = [monitor for monitor in monitors if monitor.refresh_hz > 0]
     rates = [monitor.refresh_hz for monitor in known]
     if not rates or max(rates) - min(rates) <= REFRESH_TOLERANCE_HZ:

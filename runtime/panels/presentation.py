@@ -1,4 +1,4 @@
-"""The presentation shader: one layer of the uploaded frame, aligned and mixed, on to one panel's framebuffer."""
+"""The presentation shader: an aligned and mixed layer drawn to a panel's framebuffer."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def shows_flat(frame: PanelFrame) -> bool:
 
 
 class Painter:
-    """The presentation shader in one context; vertex arrays and framebuffers are not shared between contexts."""
+    """The presentation shader in one context; vertex arrays and framebuffers belong to it."""
 
     def __init__(
         self,

@@ -52,7 +52,7 @@ def panel_settings(settings: OutputSettings, count: int) -> tuple[PanelSettings,
 
 
 def open_panels(settings: OutputSettings, stack: PanelStack, clock: Clock, context: moderngl.Context) -> PanelSink:
-    """The sink that `[output]` asks for; `context` is current again whenever one of its methods has returned.
+    """The sink of `[output]`; `context` is current again after each of its methods.
 
     Raises InputError (settings that don't fit), PanelLost (a monitor is not there yet: wait and retry).
     """

@@ -1,4 +1,4 @@
-"""Whether windows and monitors are still what was bound: asked of the X server once a second, a question at a time.
+"""Watches whether windows and monitors are still as bound, by one question to X at a time.
 
 GLFW reports monitors that come and go and of windows that are asked to close or become another size. It doesn't
 report a window that somebody destroyed, unmapped or moved, nor a monitor that got another place or mode: what is shown
@@ -26,7 +26,7 @@ class PlacementWatch:
     """
 
     def __init__(self, display: Display, monitors: Sequence[Monitor], windows: Sequence[Window], clock: Clock) -> None:
-        """monitors: as they were bound, with their windows, one a panel. Nothing is asked in the first EVERY_NS."""
+        """monitors: as bound, with their windows, one per panel. Nothing is asked in the first EVERY_NS."""
         self._display, self._clock = display, clock
         # Against what was there when it was bound; what came between binding and here differs from the monitor.
         self._states = [display.output_state(monitor.connector) for monitor in monitors]

@@ -1,4 +1,4 @@
-"""Panels on monitors: one fullscreen window a panel, a frame on all or none; or cards on every monitor there is."""
+"""Panels on monitors: one fullscreen window per panel, or an identity card on every monitor."""
 
 from __future__ import annotations
 

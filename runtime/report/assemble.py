@@ -22,7 +22,7 @@ Progress = Callable[[str], None]
 
 
 class GrowingPage:
-    """index.html, report.json and the plots: written anew as there is more, so that a stopped report is a page too."""
+    """index.html, report.json and plots, rewritten as results come, so that a stopped report is complete."""
 
     def __init__(self, out: Path, command: str, progress: Progress) -> None:
         self.out, self._command, self._progress = out, command, progress
@@ -65,7 +65,7 @@ def whole_report(
     command: str = "phasestack report",
     progress: Progress = lambda name: None,
 ) -> dict[str, Any]:
-    """Measure everything into a folder; answers report.json's object. `quick`: quarter-size panels, fewer references.
+    """Measure everything into a folder; answers report.json. `quick`: quarter size, fewer references.
 
     Raises InputError for case files and models with mistakes, before anything is measured.
     """

@@ -1,4 +1,4 @@
-"""The frontier's regression file: time, light and memory of the shipped models, beside a yardstick of the machine."""
+"""Regression file of the shipped models' time, light and memory, with a yardstick of the machine."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ class Change:
 
 
 def compare(old: RegressionFile, new: RegressionFile) -> list[Change]:
-    """What got slower, faster, worse or better. Times are compared as multiples of each file's own yardstick.
+    """Changes between two regression files, with times relative to each file's yardstick.
 
     Where the machine was too busy in either (`too_busy`) they are not compared at all.
     """

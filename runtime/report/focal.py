@@ -1,4 +1,4 @@
-"""Focal parallax (EyeReal supplement, 1.4): an eye with a pupil of finite size focuses through the solved layers.
+"""Focal parallax (supplement, 1.4): an eye with a finite pupil focuses through the layers.
 
 A pupil sees the mean of what its points see, and focusing at a distance means that those pictures are laid on each
 other so that they agree there. From a point of the pupil (right, up) the picture is that of a pinhole, shifted by
@@ -63,7 +63,7 @@ class FocalStack:
 
 
 def projection(eye_m: F64, point: F64, *, focus_m: float) -> F64:
-    """3x4 projection of `stack` points through a point (right, up) of the pupil, laid on the plane in focus.
+    """3x4 projection of `stack` points through a pupil's point (right, up), focused on a plane.
 
     Its third coordinate is the distance from the eye along the gaze.
     """

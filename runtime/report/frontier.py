@@ -1,4 +1,4 @@
-"""Error against run time: every method on every pair, in one run, each method in a process of its own."""
+"""Error against run time: every method on every pair, each method in its own process."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class PairResult:
 
 @dataclass(frozen=True, slots=True)
 class MethodResult:
-    """One method over all pairs of one resolution so far: an entry of `methods` in report.json. Means over pairs."""
+    """A method's means over the pairs of one resolution: an entry of `methods` in report.json."""
 
     name: str
     kind: Kind
@@ -127,7 +127,7 @@ class MethodResult:
 def measure(
     methods: Sequence[Method], pairs: Iterable[StillPair], *, threads: int = 2, viewers: Path | None = None
 ) -> Iterator[tuple[str, MethodResult]]:
-    """Every method on every pair, pair by pair. Pairs share a resolution. viewers: folder for the first one's layers.
+    """Results of every method, pair by pair, at one resolution. viewers: folder for the first layers.
 
     Yields what was measured last, and its method's result so far. Raises FatalError where one fails.
     """
@@ -141,7 +141,7 @@ def measure(
 
 
 def apart(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-    """Call an importable function in a fresh process: its memory and threads are its own. Raises FatalError."""
+    """Call an importable function in a fresh process with its own memory. Raises FatalError."""
     # What it prints goes to stderr: stdout may be somebody's JSON.
     with ProcessPoolExecutor(1, get_context("spawn"), initializer=os.dup2, initargs=(2, 1)) as pool:
         try:
@@ -191,7 +191,7 @@ def _peak_mib() -> float:
 
 
 def pair_result(pair: StillPair, run: MethodRun, *, viewer: Path | None = None) -> PairResult:
-    """Displayed quality (docs/contracts.md, Error) at the eyes, expected of unsure ones, and at places beside them.
+    """Displayed quality (docs/contracts.md, Error): at the eyes, expected, and off the eyes.
 
     viewer: folder that a page is left in, to look into the layers.
     """

@@ -1,4 +1,4 @@
-"""Others' figures beside ours, by their measure: 640x360, one ray a pixel, layers as they are displayed (8 bits)."""
+"""Published figures beside ours by their measure: 640x360, one ray a pixel, 8-bit layers."""
 
 from __future__ import annotations
 

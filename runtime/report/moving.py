@@ -1,4 +1,4 @@
-"""What a viewer who moves sees: the product's own runs in simulated time, for every motion, over the solver's time."""
+"""What a moving viewer sees: simulated runs for every motion and several solver times."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Watched:
 
 
 def simulated_run(settings: Settings, *, scale: float, keep_light: int) -> Watched:
-    """The daemon's own loop on a recording, on the simulated clock, to its end; keep_light: refreshes between lights.
+    """Run the daemon's loop on a recording on the simulated clock; keep_light: every so many refreshes.
 
     Raises FatalError.
     """
@@ -82,7 +82,7 @@ def settings_for(recording: Path, *, solver_ms: float) -> Settings:
 
 
 def moving_run(motion: str, solver_ms: float, *, seconds: float = SECONDS, scale: float = 0.5, seed: int = 1) -> Moving:
-    """One motion with one solver. Meant for a process of its own. Raises FatalError where it shows nothing."""
+    """Results of one motion with one solver, for its own process. Raises FatalError without any."""
     with tempfile.TemporaryDirectory(prefix="phasestack-") as folder:
         recording = Path(folder) / "motion.mcap"
         write_motion(recording, motion, seconds=seconds, seed=seed)

@@ -1,4 +1,4 @@
-"""What the reports share: self-contained HTML pages of sections, how plots look, and what they were measured on."""
+"""Shared by the reports: self-contained HTML pages, the plots' style, the machine's description."""
 
 from __future__ import annotations
 
@@ -80,8 +80,10 @@ class Page:
         return [figure for section in self.sections for figure in section.figures]
 
     def write(self, out: Path, *, record: str, data: Any) -> None:
-        """index.html, its pictures as PNGs and `data` as JSON under the name `record`, in the folder `out`: all of
-        them or none. Raises InputError."""
+        """Write index.html, its PNGs and `data` as JSON (`record`) into `out`, all or none.
+
+        Raises InputError.
+        """
         with OutputFolder(out) as folder:
             write_json(folder.staging / record, data)
             write_text(folder.staging / "index.html", self.html())

@@ -1,4 +1,4 @@
-"""Stereo pairs with their geometry and the truth away from the eyes: case files, and the built-in scenes."""
+"""Stereo pairs with geometry and pictures off the eyes: case files and built-in scenes."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class CaseFile(BaseModel):
 
 
 def read_pairs(folder: Path) -> list[StillPair]:
-    """Every case file in a folder, by name. Other JSON files are passed over; a case with a mistake is not.
+    """Every case file in a folder, by name; other JSON is ignored, a case with a mistake is refused.
 
     Raises InputError, naming file and field; also where the folder holds no case at all.
     """
@@ -105,7 +105,7 @@ def _case(path: Path, table: dict[str, Any]) -> StillPair:
 
 
 def eyes_at(*, distance_m: float, angle_deg: float = 0.0, height_m: float = 0.0, ipd_m: float = 0.063) -> F64:
-    """(2, 3) eyes whose middle is at a distance from the origin and an angle off +x towards +y, head turned to it."""
+    """(2, 3) eyes at a distance from the origin and an angle from +x towards +y, facing the origin."""
     angle = math.radians(angle_deg)
     level = math.sqrt(max(distance_m**2 - height_m**2, 0.0))
     middle = np.array([level * math.cos(angle), level * math.sin(angle), height_m])
@@ -173,7 +173,7 @@ PROCEDURAL = (
 
 
 def procedural_pairs(stack: PanelStack) -> Iterator[StillPair]:
-    """The report's own pairs, one after the other: built-in scenes from three places, with views beside the eyes."""
+    """The report's own pairs: built-in scenes from three places, with views off the eyes."""
     for scene, name, place in PROCEDURAL:
         with Painter(scene, stack) as painter:
             pair = painter.pair(name, eyes_at(**place), stack)

@@ -1,4 +1,4 @@
-"""The driver contract: open, capabilities, read the newest, close; and a device's time on the host's clock."""
+"""The driver contract: open, capabilities, read the newest, close; and a device's clock."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Driver `browser`: a page's pointer is the head, with a sensor's noise and latency; or its camera sees one."""
+"""Driver `browser`: a page's pointer as the head, with noise and latency; or its camera."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings in MCAP: small chunks, so that a crash loses at most one; opened up to the break where there is one."""
+"""Recordings in MCAP with small chunks: a crash loses one at most, and the rest can be opened."""
 
 from __future__ import annotations
 
@@ -202,7 +202,7 @@ class Recording:
             self.is_whole = False
 
     def samples(self) -> Iterator[SensorFrame]:
-        """All whole samples in the order of recording. Raises InputError for a sample that is not one of ours.
+        """All complete samples in recorded order. Raises InputError for a foreign one.
 
         A message of eye points completes a sample.
         """

@@ -1,4 +1,4 @@
-"""What stands in a recording: topics, the messages in each with their schemas, and messages as bytes and back."""
+"""The format of a recording: topics, messages and their schemas, encoded and decoded."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Stamp(Message):
 
 
 class Stamped(Message):
-    """What all messages of pictures have: they follow Foxglove's schemas, so that its viewer and others show them."""
+    """Common fields of picture messages, after Foxglove's schemas."""
 
     timestamp: Annotated[Stamp, WithJsonSchema({"type": "object"})]
     frame_id: str = "sensor"
@@ -230,7 +230,7 @@ def depth_from_message(data: bytes) -> U16:
 
 
 def calibration_message(intrinsics: Intrinsics, *, capture_ns: int) -> bytes:
-    """Intrinsics as a pinhole without distortion. Foxglove's pixel centres are integers, ours half-integers."""
+    """Pinhole intrinsics without distortion; Foxglove's pixel centres are integers, ours half-integers."""
     i = intrinsics
     matrix = [i.fx_px, 0.0, i.cx_px - 0.5, 0.0, i.fy_px, i.cy_px - 0.5, 0.0, 0.0, 1.0]
     projection = [*matrix[:3], 0.0, *matrix[3:6], 0.0, *matrix[6:], 0.0]

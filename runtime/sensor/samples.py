@@ -1,4 +1,4 @@
-"""Where a run's samples come from: a sensor thread in real time (`worker`), or a recording on the simulated clock."""
+"""The source of samples: a sensor thread in real time, or a recording on the simulated clock."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Samples(ABC):
         return ""
 
     def recorded_ahead(self) -> list[SensorFrame]:
-        """Samples of the next moment that a recording holds already; [] of a sensor. For what was known afterwards."""
+        """Samples of the next moment that a recording already holds, for what is known afterwards; else []."""
         return []
 
     @abstractmethod

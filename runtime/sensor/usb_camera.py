@@ -1,4 +1,4 @@
-"""Driver `usb-camera`: a plain webcam by V4L2. It has no depth: how far away eyes are follows from their distance."""
+"""Driver `usb-camera`: a webcam by V4L2, without depth: distance from the eyes' separation."""
 
 from __future__ import annotations
 

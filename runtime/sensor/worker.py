@@ -1,4 +1,4 @@
-"""The thread that a sensor lives in: samples wait in a bounded queue, and a hanging SDK is left behind."""
+"""The sensor's thread: samples wait in a bounded queue, and a hanging SDK is abandoned."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class SensorWorker(Samples):
         *,
         keep_images: bool = False,
     ) -> None:
-        """make_driver: an unopened driver, a fresh one at each call; make_find: what finds eyes, where it has none."""
+        """make_driver: a new unopened driver at each call; make_find: an eye finder, for drivers without."""
         self._make, self._settings, self._clock = make_driver, settings, clock
         self._make_find, self._keep_images = make_find, keep_images
         self._lock, self._watching = threading.Lock(), threading.Lock()

@@ -1,4 +1,4 @@
-"""Files that are whole and on the disk, or not there, written under a temporary name and renamed; pictures quietly."""
+"""Files written atomically: under a temporary name, synced and renamed; and pictures."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ TURNED = "a transparent picture that its EXIF entry turns can't be read"
 
 
 def sync(path: Path) -> None:
-    """Have a file's data, or a folder's names, on the disk: until then a power cut undoes them. Raises OSError."""
+    """Sync a file's data or a folder's names to disk, against power cuts. Raises OSError."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -46,7 +46,7 @@ def put_in_place(part: Path, path: Path) -> None:
 
 
 def write_bytes(path: Path, data: bytes, *, like: Path | None = None) -> None:
-    """Write a file atomically, making its parents. Raises InputError where it can't be written, or is a folder.
+    """Write a file atomically, creating its parents. Raises InputError.
 
     like: the file whose owner and readers it has; None: the one that it replaces, where there is one.
     """
@@ -129,7 +129,7 @@ def write_png(path: Path, image: U8) -> None:
 
 
 def read_image(path: Path) -> U8:
-    """(h, w, 3) RGB of any common picture file, of 16 bits the upper 8; where it is transparent, white shows through.
+    """(h, w, 3) 8-bit RGB of any common picture file, composed over white. Raises InputError.
 
     Raises InputError, naming the file: also for one that would take too much memory, before it is unpacked.
     """

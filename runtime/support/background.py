@@ -1,5 +1,4 @@
-"""Work on a thread of its own, asked about between two steps of whoever wants it; and whose turn comes first where
-threads compete for too few cores: the presenter's, then the solver's, then the rest."""
+"""Jobs on background threads, and thread priorities: presenter, solver, then the rest."""
 
 from __future__ import annotations
 

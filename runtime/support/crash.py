@@ -50,7 +50,7 @@ def written(error: BaseException) -> str:
 
 
 def watch_threads() -> None:
-    """Exceptions that end a thread, and those that Python can't raise, are told like others: never a traceback."""
+    """Report exceptions that end a thread, or that Python can't raise, in one line."""
     threading.excepthook = lambda hook: _say(hook.exc_value, hook.exc_type)
     sys.unraisablehook = lambda hook: _say(hook.exc_value, hook.exc_type)
 

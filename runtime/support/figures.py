@@ -17,7 +17,7 @@ def shown(record: Mapping[str, Any], *, as_json: bool) -> str:
 
 
 def lines_of(record: Mapping[str, Any]) -> Iterator[str]:
-    """A line a field, or one for each object of a list. What was not measured, is off or empty is left out.
+    """A line per field, or per object of a list; unmeasured, disabled and empty ones are left out.
 
     What it holds can't break a line.
     """

@@ -1,4 +1,4 @@
-"""The OpenGL context without a screen: EGL, on whichever driver the machine has (Mesa's llvmpipe at the least)."""
+"""The offscreen OpenGL context: EGL with any driver (Mesa's llvmpipe at least)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ EGL: dict[str, Any] = {"backend": "egl", "libegl": "libEGL.so.1", "libgl": "libG
 
 
 def offscreen_context() -> moderngl.Context:
-    """A context that needs no screen, current on the calling thread; content and offscreen panels share it.
+    """An offscreen context, current on this thread, shared by content and offscreen panels.
 
     Use it on one thread only. Raises MissingPart, naming Debian's packages, where EGL can't give OpenGL 3.3.
     """
@@ -39,7 +39,7 @@ def offscreen_context() -> moderngl.Context:
 
 
 def leave_context() -> None:
-    """Have no context current on this thread: one that is released while it is current stays as long as the process."""
+    """Make no context current on this thread: a current one that is released would leak."""
     egl, pointer = ctypes.CDLL(EGL["libegl"]), ctypes.c_void_p
     egl.eglGetCurrentDisplay.restype, egl.eglMakeCurrent.argtypes = pointer, [pointer] * 4
     egl.eglMakeCurrent(egl.eglGetCurrentDisplay(), None, None, None)
@@ -51,7 +51,7 @@ def _gl_finish() -> Any:
 
 
 def finish() -> None:
-    """Wait until what was drawn in this thread's context is complete, letting other Python threads run meanwhile.
+    """Wait until this thread's GL commands are complete, without holding Python's lock.
 
     moderngl's own calls keep the interpreter's lock: reading a picture that a software rasteriser still draws would
     hold every other thread up for tens of milliseconds.

@@ -56,7 +56,7 @@ class TextFormat(logging.Formatter):
 
 
 class RateLimit(logging.Filter):
-    """Lets five lines of one message through in any half minute; the next that passes says how many did not.
+    """Passes five equal messages in half a minute; the next one says how many were suppressed.
 
     A record with `extra={"always": True}` (a transition of state) always passes.
     """
@@ -102,7 +102,7 @@ class _Lines(logging.Handler):
 
 
 class QueuedLines(QueueHandler):
-    """Puts records into a bounded queue, whose listener formats and writes them. Where it is full, lines are lost."""
+    """Puts records into a bounded queue for a writer thread; when it is full, lines are dropped."""
 
     def __init__(self, descriptor: int, form: logging.Formatter) -> None:
         self.queue: queue.Queue[Any] = queue.Queue(QUEUED_MAX)

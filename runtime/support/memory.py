@@ -13,7 +13,7 @@ MOST_KEPT = 1 << 30  # bytes free at the heap's end before any go back
 
 
 def give_back() -> None:
-    """Give freed memory back to the system; the C library keeps what lies between pieces that are still in use.
+    """Return freed memory to the system, as far as the C library can.
 
     Takes milliseconds. Does nothing where the C library has no such call.
     """

@@ -9,7 +9,7 @@ from typing import Any
 
 @cache
 def onnxruntime() -> Any:
-    """The module, its telemetry switched off before its import by environment and after it by its own switch."""
+    """The onnxruntime module, with telemetry off by environment and by its own switch."""
     os.environ["ORT_DISABLE_TELEMETRY"] = "1"
     import onnxruntime as ort
 

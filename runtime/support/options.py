@@ -1,4 +1,4 @@
-"""Options and arguments that are numbers: each within a range, so that what no display has is told by its option."""
+"""Numeric options with ranges: a value out of range is refused by the option's name."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def place(*, help: str) -> Any:
 
 @contextmanager
 def blame_option(command: str, **given: Any) -> Iterator[None]:
-    """An InputError about a setting that the command line gave names the option: `scene`, `model`; None: not given."""
+    """An InputError about a setting, renamed to the command-line option that gave it."""
     try:
         yield
     except InputError as error:

@@ -1,4 +1,4 @@
-"""How large a picture is, by its header alone, and whether that is within the limits: nothing is unpacked before."""
+"""A picture's size from its header, checked against the limits before it is decoded."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TURNED = (5, 6, 7, 8)  # by a quarter: width and height are exchanged
 
 
 def picture_size(coded: bytes | IO[bytes], *, turned: bool = False) -> tuple[int, int]:
-    """Width and height of a coded picture or an open file; turned: after its EXIF orientation. Raises ValueError."""
+    """Width and height of a coded picture; turned: after its EXIF orientation. Raises ValueError."""
     from PIL import Image
 
     with warnings.catch_warnings():
@@ -67,7 +67,7 @@ def _orientation(image: Any) -> int:
 
 
 def check_size(width_px: int, height_px: int, *, source: str | Path, field: str = "", name: str = "") -> None:
-    """Raises InputError for more pixels than the limit, with both figures. name: of a picture within `source`."""
+    """Raise InputError for more pixels than the limit. name: of a picture within `source`."""
     if max(width_px, height_px) > SIDE_MAX_PX or width_px * height_px > LIMITS.pixels:
         problem = f"has {width_px} x {height_px} pixels; at most {LIMITS.pixels:,}"
         raise InputError(source, field, f"{name} {problem}".strip())
@@ -90,7 +90,7 @@ def decoded_picture(coded: bytes, *, source: str | Path, field: str, name: str) 
 
 
 def read_coded(path: Path) -> bytes:
-    """A picture file's bytes, undecoded; refused by its header where it has too many pixels. Raises InputError."""
+    """A picture file's undecoded bytes, checked by its header. Raises InputError."""
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
     try:
         width, height = picture_size(data)

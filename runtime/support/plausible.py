@@ -1,4 +1,4 @@
-"""What a setting can be: ranges that tell a wrong unit, texts that a path can hold, and names that were misspelt."""
+"""Plausible settings: ranges that reveal a wrong unit, possible paths, misspelt names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Classes of a user's own, named by a dotted path: `mypackage.tunnel:Tunnel` is the class `Tunnel` of that module."""
+"""User-defined classes, named `module:Class`, as in `mypackage.tunnel:Tunnel`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def is_plugin(name: str) -> bool:
 
 
 def located(name: str, folder: Path) -> str:
-    """A name as it is; a path that is relative, seen from a folder. A bare word without a suffix is a name.
+    """A relative path resolved against a folder; a bare word without a suffix is a name and stays.
 
     What has a scheme (`rtsp://...`) is no path, nor is a class (`module:Class`).
     """
@@ -32,7 +32,7 @@ def located(name: str, folder: Path) -> str:
 
 
 def plugin_class(name: str, base: type, *, field: str) -> Any:
-    """The class that `name` stands for. Raises InputError: no such module or class, or one that is no `base`.
+    """The class named `module:Class`. Raises InputError if missing, or not derived from `base`.
 
     field: the setting that names it.
     """
@@ -49,7 +49,7 @@ def plugin_class(name: str, base: type, *, field: str) -> Any:
 
 
 def strict(options: type[BaseModel]) -> type[BaseModel]:
-    """A class's options, where a mistyped key is refused, unless the class itself says what becomes of such."""
+    """A class's options with unknown keys refused, unless the class itself allows them."""
     if "extra" in options.model_config:
         return options
     return type(options.__name__, (options,), {"__module__": __name__, "model_config": {"extra": "forbid"}})

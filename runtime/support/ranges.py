@@ -1,4 +1,4 @@
-"""What numbers can be, wherever they come from: settings, options and files. Nothing heavy: every command loads it."""
+"""Ranges of numbers in settings, options and files. Imports nothing heavy."""
 
 from __future__ import annotations
 

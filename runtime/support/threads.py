@@ -1,4 +1,4 @@
-"""Work on a few threads at once that release the interpreter's lock, as numpy's, OpenCV's and compiled loops do."""
+"""Work on several threads, for loops that release the interpreter's lock (numpy, OpenCV, C++)."""
 
 from __future__ import annotations
 

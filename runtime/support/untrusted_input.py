@@ -69,7 +69,7 @@ def is_there(path: str | Path, *, folder: bool = False) -> bool:
 def open_regular(
     path: str | Path, *, most_bytes: int | None = None, source: str | Path = "", field: str = ""
 ) -> IO[bytes]:
-    """An open regular file, for reading. Raises InputError for a folder, a FIFO, a device, or too large a file.
+    """An open regular file, for reading. Raises InputError: a folder, FIFO, device, or too large.
 
     Opening never waits (a FIFO without a writer would), and what was opened is what is checked.
     """
@@ -127,7 +127,7 @@ def read_json(path: str | Path, *, most_bytes: int = JSON_BYTES_MAX, most_depth:
 
 
 def parsed_json(text: str | bytes, *, source: str | Path, field: str = "", most_depth: int = JSON_DEPTH_MAX) -> Any:
-    """JSON, nested no deeper than `most_depth`, without NaN and Infinity, which are not JSON. Raises InputError."""
+    """Strict JSON (no NaN or Infinity) of limited depth. Raises InputError."""
     data = text if isinstance(text, bytes) else text.encode(errors="surrogatepass")
     try:
         value = json.loads(decoded(data, source=source, field=field), parse_constant=_no_constant, parse_int=_whole)

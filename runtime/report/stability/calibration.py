@@ -1,5 +1,7 @@
-"""The similarity from the sensor's frame to the stack's (EyeReal supplement, (15)-(28)), from pairs that hardly
-determine it: the pairs are made by a known similarity, which every rule must find."""
+"""Calibration (supplement, (15)-(28)) from pairs that hardly determine it.
+
+The pairs are made by a known similarity, which every rule must find.
+"""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ def unit(a: Any) -> Any:
 
 
 def axes(eye: Any) -> tuple[Any, Any, Any]:
-    """Right, up and back of an eye that looks at the origin ((10)-(13)); on the vertical axis the limit from +x."""
+    """Right, up and back axes of an eye ((10)-(13)); on the vertical axis the limit from +x."""
     back = unit(eye)
     right = vector([0, 1, 0]) if eye[0] == 0 and eye[1] == 0 else unit(np.array([-eye[1], eye[0], mpf(0)]))
     return right, np.cross(back, right), back

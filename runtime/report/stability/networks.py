@@ -1,4 +1,4 @@
-"""The shipped networks on pictures, poses and sizes that break solvers: what comes out is a picture, or a refusal."""
+"""The shipped networks on extreme pictures, poses and sizes: the result is a picture or a refusal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Eye poses, projections to panels and Malus' law at their singularities (EyeReal supplement, (1)-(14), (40)-(47))."""
+"""Poses, projections and Malus' law at their singularities (supplement, (1)-(14), (40)-(47))."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ INTENSITIES = {
 
 
 def pose(eye: Sequence[float]) -> Answer:
-    """The rotation against 50 digits. Its condition is how fast the head turns as the eye nears the vertical axis."""
+    """The rotation against 50 digits; its condition grows as the eye nears the vertical axis."""
     truth = np.array(exact.axes(exact.vector(eye)), dtype=object).T
     rotation = stack_from_eye(eye)[:3, :3]
     error = max(map(exact.distance, rotation.flat, truth.flat))
@@ -95,7 +95,7 @@ def followed(eye: Sequence[float], *, index: int, stack: PanelStack = STACK) -> 
 
 
 def of_intensity(intensity: float, branch: Literal[1, 2]) -> Answer:
-    """The phase of an intensity. Towards 1 the slope of the arcsine, and the condition with it, goes to infinity."""
+    """The phase of an intensity; its condition goes to infinity towards 1."""
     root = exact.mp.asin(exact.mp.sqrt(exact.mpf(intensity))) * 2 / exact.mp.pi
     truth = root if branch == 1 else 2 - root
     found = phase_from_intensity(np.array(intensity), branch)

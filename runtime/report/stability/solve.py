@@ -73,7 +73,7 @@ class Problem:
 
 @lru_cache(maxsize=64)
 def traced(gap_m: float, ipd_m: float, distance_m: float) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
-    """Each eye's rays that cross every panel: (rays, N·h·w) bilinear weights, and the columns of its picture."""
+    """Rays of each eye that cross every panel: (rays, N·h·w) bilinear weights, and picture columns."""
     focal, found = WIDTH_PX * distance_m / WIDTH_M, []
     v, u = np.mgrid[0:HEIGHT_PX, 0:WIDTH_PX] + 0.5
     for sign in (-1, 1):

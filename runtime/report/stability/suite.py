@@ -34,7 +34,7 @@ def every_trial(fits: Mapping[str, Fit], *, full: bool) -> Iterator[Trial]:
 def run(
     trials: list[Trial], *, record: Path | None = None, progress: Callable[[int, int], None] = lambda done, of: None
 ) -> list[Case]:
-    """Settle every trial, telling how far it is. record: a file for limits; those of what isn't tried stay."""
+    """Run every trial with progress. record: the file of limits to update."""
     limits: dict[str, float] = json.loads(LIMITS.read_text(encoding="utf-8"))
     cases = []
     for index, trial in enumerate(trials):

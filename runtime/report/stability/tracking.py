@@ -1,4 +1,4 @@
-"""The tracker at extreme time steps, against a head that moves evenly: where its eyes are is known at every instant."""
+"""The tracker at extreme time steps, against a head whose positions are known exactly."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FLOOR_M = 1e-6
 
 
 def head_m(time_ns: int, *, span_ns: int) -> F64:
-    """(2, 3) left and right eye, frame `stack`, of a head that goes TRAVEL_M in a span, at FASTEST at most."""
+    """(2, 3) left and right eye, frame `stack`, of a head that moves TRAVEL_M in a span."""
     share = min(1.0, FASTEST * span_ns / NS_PER_S / float(np.linalg.norm(TRAVEL_M)))
     return EYES_M + TRAVEL_M * share * (time_ns / max(span_ns, 1))
 

@@ -70,7 +70,7 @@ def refusal(stage: str, name: str, call: Callable[[], object]) -> Trial:
 
 
 def settle(trial: Trial, *, limit: float | None = None) -> Case:
-    """Run a trial. Nothing that the code under trial raises escapes; only its own errors count as a refusal.
+    """Run a trial. Only the project's own errors count as a refusal; nothing escapes.
 
     limit: the forward error that was recorded of it; a trial that is held to one fails without it.
     """
