@@ -55,7 +55,7 @@ class Patch:
 
 @lru_cache(maxsize=8)
 def patches(stack: PanelStack, panel: int) -> tuple[Patch, ...]:
-    """Where which patch lies: between the board's marks, kinds scattered, always the same."""
+    """The chart's patches between the board's marks: kinds scattered, always the same."""
     pitch = stack.width_px // PATCHES_ACROSS
     side = pitch * 5 // 6 // 8 * 8  # half of it, what is measured, holds the mixing pattern whole
     free = [

@@ -55,7 +55,7 @@ class SetupHardware:
         return key
 
     def wait(self) -> None:
-        """A moment."""
+        """Sleep until the next poll."""
         self._clock.sleep_until_ns(self._clock.now_ns() + POLL_NS)
 
     def monitors(self) -> tuple[Monitor, ...]:

@@ -20,7 +20,7 @@ MAX_PROGRESS_BYTES = 4 << 20  # of setup.json
 
 
 def progress_path(config: Path) -> Path:
-    """Where it is kept how far a configuration's setting up has come: beside it."""
+    """The file beside a configuration that records the setup's progress."""
     return config.with_name(f"{config.stem}.setup.json")
 
 

@@ -1,4 +1,4 @@
-"""A display that is not there, for `setup --simulate`."""
+"""Simulated hardware for `setup --simulate`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SAMPLES_HERE = 16  # of the sensor, at 30 a second, while the person stands some
 
 
 class SimulatedHardware(SetupHardware):
-    """Its monitors are mixed up, a person stands where asked to; the terminal says what one would see.
+    """Simulated hardware: shuffled monitors, and a person who goes where asked.
 
     The depth sensor stands where the built-in recording's does, so that `run` can replay that afterwards.
     """

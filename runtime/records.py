@@ -20,7 +20,7 @@ Inference = Literal["ran", "reused", "skipped"]
 
 
 class HeldLayers(Protocol):
-    """Layers (N, h, w, 4) that lie elsewhere than in memory: in textures."""
+    """Layers (N, h, w, 4) in GL textures."""
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -28,7 +28,7 @@ class HeldLayers(Protocol):
 
     @property
     def lost(self) -> bool:
-        """Whether they are no more."""
+        """Whether their GL context is gone."""
 
     def pixels(self) -> U8:
         """The same as an array, brought here when it is first asked for. Raises ContextLost."""
@@ -114,7 +114,7 @@ class PanelFrame:
 
 @dataclass(frozen=True, slots=True)
 class PresentReport:
-    """What presenting a PanelFrame came to."""
+    """Outcome of presenting a PanelFrame."""
 
     number: int
     present_ns: int  # when the last panel's light left, as well as it is known

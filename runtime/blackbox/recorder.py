@@ -114,7 +114,7 @@ def text_of(record: logging.LogRecord) -> str:
 
 
 class Message(NamedTuple):
-    """What happened, as it will stand in a file."""
+    """An event as it will be written to a file."""
 
     at_ns: int  # on the run's clock: the wall's may be set
     wall_ns: int  # since 1970
@@ -280,7 +280,7 @@ class Recorder(logging.Handler):
         return {"lines": list(self._lines), "states": list(self._passed)}
 
     def describe(self) -> dict[str, Any]:
-        """For the status."""
+        """The black box's entry in the status."""
         with self._kept_lock:
             kept_ns = self._kept[-1].at_ns - self._kept[0].at_ns if self._kept else 0
             held_bytes = self._bytes
@@ -303,7 +303,7 @@ class Recorder(logging.Handler):
         self.close()
 
     def close(self) -> None:
-        """No more; what waits to be written is. May be called twice."""
+        """Stop recording and finish pending files. May be called twice."""
         for name in ROOTS:
             logging.getLogger(name).removeHandler(self)
         if self._fault is not None:

@@ -30,7 +30,7 @@ class SeenEyes:
 
 @dataclass(eq=False)
 class BrowserLink:
-    """Any thread may use it. Of several pages one is the viewer; the others look on."""
+    """Thread-safe link to the pages. One page is the viewer; the others look on."""
 
     stack: PanelStack  # whose panels are shown at present
     fov_deg: float
@@ -51,7 +51,7 @@ class BrowserLink:
     _captures: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=CAPTURES_MAX))
 
     def is_viewer(self, page: object) -> bool:
-        """Whether a page's eyes count: those of the one that is there for longest."""
+        """Whether this page is the viewer: the one connected longest."""
         return next(iter(self.news), None) is page
 
     def see(self, eyes_m: Any, page_ms: float) -> None:

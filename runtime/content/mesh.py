@@ -44,7 +44,7 @@ class MeshData:
 
 
 def prepare(file: SceneFile) -> Callable[[Any], TriangleSource]:
-    """Read it and make its outlines ready; the answer uploads them. Raises InputError."""
+    """Read the file and find its outlines; the result uploads them to GL. Raises InputError."""
     data = load_mesh(file.path)
     parts = []
     for number, part in enumerate(data.parts):

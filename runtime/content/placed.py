@@ -46,7 +46,7 @@ class Placing:
 
 
 def placing_of(settings: ContentSettings) -> Placing:
-    """As the settings have it."""
+    """The placing that the settings describe."""
     return Placing(settings.scale, settings.offset_m, settings.rotation_deg, settings.turntable_per_min)
 
 

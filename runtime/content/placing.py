@@ -33,7 +33,7 @@ class SceneFile:
 
     @property
     def background(self) -> tuple[float, float, float]:
-        """Behind it."""
+        """Background colour."""
         return self.settings.background or DARK
 
     def placed(self, low: F64, high: F64) -> F64:

@@ -93,7 +93,7 @@ class _Frame:
 
 
 class Programs:
-    """Who is connected, and what they have answered. Any thread may use it."""
+    """Connections of drawing programs, and their answers. Thread-safe."""
 
     def __init__(self, port: int, *, most_bytes: int) -> None:
         """Raises InputError where the port is taken."""
@@ -149,7 +149,7 @@ class Programs:
         raise ContentFailure(self.problem or f"the program has not answered within {1e3 * ANSWERED_S:.0f} ms")
 
     def done(self, number: int) -> None:
-        """A frame is not waited for any more: it is in flight until it is answered."""
+        """Stop waiting for a frame; it counts as in flight until it is answered."""
         with self._changed:
             frame = self._frames.get(number)
             if frame is not None:
@@ -158,7 +158,7 @@ class Programs:
                     del self._frames[number]
 
     def close(self) -> None:
-        """Nobody may connect any more."""
+        """Close the port and all connections."""
         begin("programs", self._server.shutdown)
 
     def _refused(self, connection: ServerConnection, request: Any) -> Any:

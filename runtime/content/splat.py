@@ -47,7 +47,7 @@ void main() {
 
 
 def prepare(file: SceneFile) -> Callable[[Any], SplatSource]:
-    """Read it; the answer uploads it. Raises InputError."""
+    """Read the file; the result uploads it to GL. Raises InputError."""
     gaussians = load_gaussians(read_header(file.path))
     low, high = np.percentile(gaussians.centres.astype(np.float64), [STRAY, 100 - STRAY], axis=0)
     matrix = file.placed(low, high)

@@ -198,7 +198,7 @@ class TriangleSource(CanvasSource):
         return union(boxes)
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
-        """The same bytes for the same view and time."""
+        """Draw the view; the same view and time give the same bytes."""
         placed = list(zip(self.parts, self.places(time_ns), strict=True))
         corners = np.stack([part.corners_m @ matrix[:3, :3].T + matrix[:3, 3] for part, matrix in placed])
         area = union([camera.covered_box(view, part) for part in corners])

@@ -139,7 +139,7 @@ class Daemon:
         return answer
 
     def tell(self, command: str, value: Any) -> dict[str, Any]:
-        """One wish; what became of it."""
+        """Send a command; answers its outcome."""
         return self._asked({"command": command, "value": value}, timeout_s=TOLD_WITHIN_S)
 
     def _asked(self, request: dict[str, Any], *, timeout_s: float) -> dict[str, Any]:

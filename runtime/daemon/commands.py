@@ -26,15 +26,15 @@ class Command:
     answer: Future[dict[str, Any]] = field(default_factory=Future)
 
     def take(self) -> bool:
-        """It runs from now on. False: who asked has given it up; it must not be done."""
+        """Claim the command for execution. False: its client has given up; do not run it."""
         return self.answer.set_running_or_notify_cancel()
 
     def done(self, **what: Any) -> None:
-        """It was carried out; what: holds now."""
+        """Answer success. what: the new state."""
         self.answer.set_result({"ok": True, **what})
 
     def refuse(self, why: str) -> None:
-        """It could not be carried out; nothing has changed."""
+        """Answer a refusal; nothing has changed."""
         self.answer.set_result({"ok": False, "error": why or "refused"})
 
 

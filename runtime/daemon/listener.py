@@ -1,4 +1,4 @@
-"""A small server on a thread of its own: whoever trickles, hangs or comes in crowds holds up nobody.
+"""A small server on its own thread that slow, hanging or numerous clients cannot block.
 
 A request has so long to arrive, an answer so long to be read, and where all places are taken the client that has
 waited longest for a whole request goes. No client costs a thread.
@@ -29,7 +29,7 @@ Opened = Callable[[Callable[[StreamReader, StreamWriter], Any]], Coroutine[Any, 
 
 
 class Refusal(Exception):
-    """Why a client is sent away."""
+    """Reason for disconnecting a client."""
 
 
 class Listener(ABC):
@@ -68,7 +68,7 @@ class Listener(ABC):
 
     @abstractmethod
     def refuse(self, writer: StreamWriter, why: str) -> None:
-        """The last answer to a client that is sent away."""
+        """Send a last answer to a client before disconnecting it."""
 
     async def request(self, reader: StreamReader, end: bytes) -> bytes:
         """The next request, with its end; what there is of it where nothing more will come. Raises Refusal."""

@@ -37,7 +37,7 @@ def placing_in(settings: Settings) -> dict[str, Any]:
 
 
 def holds(presenter: Presenter) -> dict[str, Any]:
-    """What an operator chooses, as it is now: the answer to every command."""
+    """The operator's present choices: the answer to every command."""
     state = presenter.run_cell.state
     return {
         "scene": state.settings.content.scene,

@@ -144,7 +144,7 @@ class Daemon(Host):
             self._server.lookups |= {"log": self.recorder.look_at_log} if self.recorder is not None else {}
 
     def wait_for_panel(self, why: str) -> bool:
-        """Under a supervisor wait for it, as a state that others need not wait for; by hand refuse."""
+        """As a service, report that a panel is missing and retry; by hand, refuse."""
         if not self._notifier.supervised or self._signals.stop:
             return False
         if why != self._waits_for:

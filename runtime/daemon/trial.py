@@ -69,7 +69,7 @@ def _outcome(child: subprocess.Popen[bytes], given: bytes, seconds: float, wante
 
 
 def main(part: str, memory: int) -> int:
-    """In the child."""
+    """Entry point of the child process."""
     resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
     settings = Settings.model_validate_json(sys.stdin.read())
     try:

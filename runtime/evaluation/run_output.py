@@ -146,7 +146,7 @@ class RunOutput:
 
 
 def in_one_line(summary: dict[str, Any]) -> str:
-    """The whole run, of which a sheet shows one moment."""
+    """A run's summary in one line, for its contact sheet."""
     line = f"The run: {summary['presented']} of {summary['frames']} refreshes presented, model {summary['model']}"
     if summary.get("light_db") is not None:
         line += f"; light {summary['light_db']:.1f} dB, mean of {summary['quality_frames']} refreshes looked at"

@@ -19,7 +19,7 @@ BySigma = Mapping[str, float | None]
 
 @dataclass(frozen=True, slots=True)
 class PairQuality:
-    """How good what the eyes get is (docs/contracts.md, Error); by "0", "1", "2" mm of tracking error."""
+    """Quality of what the eyes see (docs/contracts.md, Error), by "0", "1", "2" mm of tracking error."""
 
     light_db: BySigma  # of real pixels and pupils; "1", a good tracker's, is the figure to quote
     expected_db: BySigma  # one ray a pixel
@@ -58,7 +58,7 @@ class SolvedPair:
 
     @cached_property
     def quality(self) -> PairQuality:
-        """The judgement: seconds of work for a large picture."""
+        """The measured quality; takes seconds for a large picture."""
         views = self.eye_views
         light, expected = (expected_db(views, self.layers, light=light) for light in (True, False))
         at_eyes = views.quality
@@ -70,7 +70,7 @@ class SolvedPair:
         return tuple(retina.codes() for retina in self.eye_views.seen)
 
     def viewer(self, lines: Sequence[str]) -> str:
-        """The page to look into the layers."""
+        """The viewer page of the layers."""
         return self.eye_views.viewer(self.layers, title=headline(self.quality.light_db["1"]), lines=lines)
 
     def write(self, folder: Path, *, lines: Sequence[str]) -> None:

@@ -25,7 +25,7 @@ _AXES = np.eye(3)
 
 
 class Belief(NamedTuple):
-    """What is known of the motion, by every model."""
+    """Belief of every motion model: states, covariances, probabilities."""
 
     state: F64  # (models, 9)
     covariance: F64  # (models, 9, 9)
@@ -64,7 +64,7 @@ def _noise(dt_s: float) -> F64:
 
 
 def started(place: F64, *, noise: F64, speed: float, acceleration: Sequence[float]) -> Belief:
-    """At a first measurement (3,) with its covariance (3, 3): at rest, as far as is known.
+    """Belief after a first measurement (3,) with covariance (3, 3): at rest.
 
     speed: m/s; acceleration: m/s², one for each model: standard deviations of an axis.
     """
@@ -78,7 +78,7 @@ def started(place: F64, *, noise: F64, speed: float, acceleration: Sequence[floa
 
 
 def predicted(belief: Belief, dt_s: float, *, acceleration: Sequence[float], stay_s: float) -> Belief:
-    """After dt_s >= 0: the models mix, then each moves on. stay_s: mean time in one model."""
+    """Belief predicted dt_s >= 0 ahead: models mix, then move. stay_s: mean time in one model."""
     count = len(belief.weight)
     leave = -math.expm1(-dt_s / stay_s) / count  # evenly, to stay among them
     change = np.full((count, count), leave) + (1 - count * leave) * np.eye(count)
@@ -107,7 +107,7 @@ def _chi2(off: F64, covariance: F64) -> F64:
 
 
 def corrected(belief: Belief, measured: F64, *, noise: F64) -> Belief:
-    """With a measurement (3,) of that covariance (3, 3) taken in."""
+    """Belief updated with a measurement (3,) of covariance (3, 3)."""
     total = belief.covariance[:, :3, :3] + noise
     gain = np.linalg.solve(total, belief.covariance[:, :3, :]).transpose(0, 2, 1)
     off = measured - belief.state[:, :3]

@@ -46,7 +46,7 @@ def transformed(matrix: F64, points: F64) -> F64:
 
 
 def inverse(matrix: F64) -> F64:
-    """Of an affine (2, 3) matrix."""
+    """Inverse of an affine (2, 3) matrix."""
     return np.asarray(cv2.invertAffineTransform(matrix), np.float64)
 
 
@@ -102,7 +102,7 @@ class FoundFace:
         return float(np.sqrt(self.box[2] * self.box[3]))
 
     def square(self) -> Square:
-        """What the mesh looks at."""
+        """The square that the mesh network is given."""
         eyes, mouth = self.points[:2].mean(axis=0), self.points[3:].mean(axis=0)
         line = self.points[1] - self.points[0]
         size = max(np.linalg.norm(line), 0.95 * np.linalg.norm(mouth - eyes))

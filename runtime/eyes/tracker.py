@@ -176,7 +176,7 @@ class Tracker:
         return self._take(_Sample(capture_ns, (left + right) / 2, (right - left) / 2, self._noise(points)))
 
     def forget(self) -> None:
-        """As if nothing had ever been seen."""
+        """Reset to the initial state."""
         self._history.clear()
         self._other = self._lost_ns = None
         self._newest_ns, self._asked_ns = -1, 0

@@ -69,7 +69,7 @@ class TrueEyes:
         self._ended = True
 
     def may_come(self, time_ns: int) -> bool:
-        """Whether the truth of an instant is not known yet, and may be once later samples have come."""
+        """Whether the truth of an instant is still unknown but may come with later samples."""
         return bool(self._known) and time_ns > self._known[-1][0] and not self._ended
 
     def at(self, time_ns: int) -> F64 | None:

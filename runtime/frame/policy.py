@@ -1,4 +1,4 @@
-"""What is to be made and shown: flat or solved, anew or as it is. Decisions alone; no clock, no I/O.
+"""Decisions on what to solve and show (flat, solved, reuse): pure, without clock or I/O.
 
 Stillness is decided in one place, by the rest watch on the sensor's samples (`eyes.rest`): here, eyes labelled
 `rested` are solved for once. Whatever else moves them is solved for anew.
@@ -20,7 +20,7 @@ Kind = Literal["solve", "flat", "nothing"]
 
 @dataclass(frozen=True, slots=True)
 class SolutionKey:
-    """What the newest solution, or the newest flat picture, was made of."""
+    """Inputs that the newest solution, or flat picture, was made from."""
 
     state_version: int
     revision: int  # of the content
@@ -91,7 +91,7 @@ def wants_flat(eyes: EyesEstimate, *, flat_asked: bool, flatness: float) -> bool
 
 @dataclass(slots=True)
 class Flatness:
-    """How far the picture has gone over to the flat one, 0 to 1; moves at a constant rate."""
+    """Mixing weight of the flat picture, 0 to 1, which moves at a constant rate."""
 
     value: float = 1.0
     since_ns: int = -1

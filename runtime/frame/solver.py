@@ -193,7 +193,7 @@ class LayerBuffers:
         self._buffers: list[tuple[U8, Callable[[], U8 | None]]] = []
 
     def copy_of(self, layers: U8) -> U8:
-        """(...) the same values in a buffer that is nobody else's as long as the answer lives."""
+        """A copy (...) in a pooled buffer, which is the caller's as long as the result lives."""
         held = [holder() is not None for _, holder in self._buffers]
         index = held.index(False) if False in held else len(held)
         if index == len(held):

@@ -55,7 +55,7 @@ class SolverHost(ABC):
 
 
 def taken_in(news: SolverStep, step: SolverStep) -> SolverStep:
-    """The news with what a step made; the newest wins, and what failed is as the last step found it."""
+    """The news updated by a step: its results, where it has any, and its failures."""
     return SolverStep(step.solution or news.solution, step.flat or news.flat, step.missing)
 
 

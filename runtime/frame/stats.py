@@ -94,7 +94,7 @@ class RunStats:
         return (self._last_ns - self._first_ns) / NS_PER_S if self.frames else 0.0
 
     def reuse_saves_ms(self) -> float | None:
-        """What a refresh that shows a solution again does without; None before there was a solution."""
+        """Solver time that a refresh saves by reusing a solution; None before the first one."""
         medians = [self._stages[stage].of("p50") for stage in SOLVING_STAGES]
         known = [median["p50"] for median in medians if median is not None]
         return sum(known) if known and self.presented > self.solutions > 0 else None

@@ -37,7 +37,7 @@ class Viewer:
         self._captures_ns: deque[int] = deque(maxlen=64)
 
     def adopt(self, settings: Settings, calibration: Calibration) -> None:
-        """Other settings hold from now on. The tracker forgets only where its own have changed."""
+        """Adopt new settings; the tracker is reset only if its own have changed."""
         before, self._settings, self._calibration = self._settings, settings, calibration
         if settings.tracker != before.tracker:
             self._tracker = self._new_tracker()
@@ -51,7 +51,7 @@ class Viewer:
 
     @property
     def warning(self) -> str:
-        """What most samples of late can't be (exchanged, in millimetres, ...); empty: all is well."""
+        """Why most recent samples are implausible (exchanged eyes, millimetres, ...); else empty."""
         return self._refusals.warning
 
     @property
@@ -67,7 +67,7 @@ class Viewer:
         return round((len(self._captures_ns) - 1) * NS_PER_S / (self._captures_ns[-1] - self._captures_ns[0]), 2)
 
     def take(self, frame: SensorFrame, *, serial: str) -> None:
-        """One sample, as it came. What the tracker refuses is counted, and seen by nobody else."""
+        """Take in a sample; one that the tracker rejects is counted and goes no further."""
         self._captures_ns.append(frame.capture_ns)
         points = frame.eyes
         if points is not None and not self._in_stack_frame:

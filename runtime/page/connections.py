@@ -1,4 +1,4 @@
-"""uvicorn's connections, of which those that wait for a request hold up nobody."""
+"""uvicorn connections with limits, so that idle ones block nobody."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CONNECTIONS_MAX = 64  # at once; a newer one takes the place of the one that has
 
 
 class LimitedConnection(H11Protocol):
-    """One that asks nothing is let go; where all places are taken, the one that has waited longest goes."""
+    """A connection that is closed when idle; if there are too many, the longest-idle one is closed."""
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
@@ -33,7 +33,7 @@ class LimitedConnection(H11Protocol):
 
     @property
     def waits(self) -> bool:
-        """For a request."""
+        """Whether it is waiting for a request."""
         cycle: Any = self.cycle  # None before the first request
         return cycle is None or bool(cycle.response_complete)
 
@@ -51,7 +51,7 @@ def listening(command: str, port: int) -> sockets.socket:
 
 
 def server_of(application: Any) -> uvicorn.Server:
-    """What serves an application, as all pages are."""
+    """A uvicorn server for an application, with the limits of all pages."""
     return uvicorn.Server(
         uvicorn.Config(
             application,

@@ -57,5 +57,5 @@ def _read(path: Path) -> str:
 
 
 def same(given: str, token: str) -> bool:
-    """Whether they are the same, in a time that does not tell how much of them is."""
+    """Constant-time comparison of two tokens."""
     return hmac.compare_digest(given.encode(), token.encode())

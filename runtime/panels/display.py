@@ -175,7 +175,7 @@ class Display:
         return window
 
     def output_state(self, connector: str) -> xlib.OutputState | None:
-        """What an output sends now, and to which monitor; None: nothing, or it has gone."""
+        """The mode and monitor of an output now; None: it is off or gone."""
         output = self._outputs.get(connector)
         return xlib.output_state(_pointer(), output) if output else None
 

@@ -105,14 +105,14 @@ class FrameTextures:
         self._flat_version: int | None = None
 
     def lacks(self, frame: PanelFrame) -> tuple[bool, bool]:
-        """Whether its solution, and its flat picture, are seen and not here yet."""
+        """Whether the frame's solution, and its flat picture, are visible but not uploaded."""
         return (
             shows_solved(frame) and frame.solved_version != self._solved_version,
             shows_flat(frame) and frame.flat_version != self._flat_version,
         )
 
     def upload(self, frame: PanelFrame) -> None:
-        """Take in what the frame shows and is not here yet."""
+        """Upload the frame's visible pictures that are not here yet."""
         lacks_solved, lacks_flat = self.lacks(frame)
         if lacks_solved and frame.solved is not None:
             self._solved_version = None  # until it is here as a whole

@@ -1,1 +1,1 @@
-"""What every part may use: files that are whole or not there, background jobs, GL contexts, logs."""
+"""Shared tools: atomic files, untrusted input, background jobs, GL contexts, logs."""

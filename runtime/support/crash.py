@@ -21,7 +21,7 @@ KEPT = 20  # files in a folder; older ones make way: a service that fails again 
 
 
 def written(error: BaseException) -> str:
-    """Write the exception down, and answer the line that tells it with the file's name. Never raises."""
+    """Write an exception's report and answer one line that names the file. Never raises."""
     from runtime.support.version import version
 
     what = one_line(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__)

@@ -1,4 +1,4 @@
-"""How far a long piece of work is: the work tells, whoever started it listens, and may stop it.
+"""Progress of long work: reported by the work to a listener, which may stop it.
 
 Readers call `tell` as they go. Nobody need listen; who wants to does so with `listening`, and an exception that the
 listener raises ends the work: so a signal is heard within one step.
