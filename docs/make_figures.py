@@ -108,26 +108,24 @@ def architecture() -> Figure:
         )
         axes.text(x + width - 0.2, y + height - 0.15, name, fontsize=9, va="top", ha="right", color=SOFT)
     white = "#ffffff"
-    box(axes, 1, 7.9, 4, 1.4, "sensor\ndriver or recording", white)
-    box(axes, 7, 7.9, 4, 1.4, "eyes\npupils in pictures", white)
-    box(axes, 13, 7.9, 4, 1.4, "calibration\nsensor to stack", white)
-    box(axes, 1, 4.5, 4, 1.4, "tracker\npredicts the eyes", white)
-    box(axes, 7, 4.5, 4, 1.4, "policy\nsolve, reuse or flat", white)
-    box(axes, 13, 4.5, 4, 1.4, "alignment\nscale and shift a panel", white)
-    box(axes, 18.4, 4.5, 3, 1.4, "panels\none refresh", white)
-    box(axes, 7, 1.1, 4, 1.4, "content\na picture for each eye", white)
-    box(axes, 13, 1.1, 4, 1.4, "model\ntwo pictures to layers", white)
+    box(axes, 0.6, 7.8, 4.2, 1.6, "sensor: driver or recording\nsensor/worker.py", white)
+    box(axes, 5.7, 7.8, 4.2, 1.6, "eyes: pupils in pictures\neyes/detect.py", white)
+    box(axes, 0.6, 4.4, 4.2, 1.6, "calibration: sensor to stack\neyes/calibration.py", white)
+    box(axes, 5.7, 4.4, 4.2, 1.6, "tracker: predicts the eyes\neyes/tracker.py", white)
+    box(axes, 12.2, 4.4, 4.4, 1.6, "alignment: scale and shift\noptics/alignment.py", white)
+    box(axes, 17.4, 4.4, 4.2, 1.6, "panels: one refresh\npanels/presentation.py", white)
+    box(axes, 5.7, 1.0, 4.2, 1.6, "policy: solve, reuse or flat\nframe/policy.py", white)
+    box(axes, 10.8, 1.0, 4.2, 1.6, "content: a picture per eye\nplan/drawing.py", white)
+    box(axes, 15.9, 1.0, 4.2, 1.6, "model: pictures to layers\nmodel/solver.py", white)
     for start, end in (
-        ((5.1, 8.6), (6.9, 8.6)), ((11.1, 8.6), (12.9, 8.6)), ((5.1, 5.2), (6.9, 5.2)), ((11.1, 5.2), (12.9, 5.2)),
-        ((17.1, 5.2), (18.3, 5.2)), ((11.1, 1.8), (12.9, 1.8)),
+        ((4.9, 8.6), (5.6, 8.6)), ((4.9, 5.2), (5.6, 5.2)), ((10.0, 5.2), (12.1, 5.2)), ((16.7, 5.2), (17.3, 5.2)),
+        ((10.0, 1.8), (10.7, 1.8)), ((15.1, 1.8), (15.8, 1.8)), ((7.0, 7.7), (3.4, 6.1)), ((7.8, 4.3), (7.8, 2.7)),
+        ((16.3, 2.7), (16.3, 4.3)),
     ):  # fmt: skip
         arrow(axes, start, end)
-    arrow(axes, (15, 7.8), (3, 6.0), bend=0.12)
-    axes.text(10.6, 7.1, "samples", fontsize=9, ha="center", va="bottom", color=INK)
-    arrow(axes, (9, 4.4), (9, 2.6))
-    axes.text(9.15, 3.65, "eyes to solve for", fontsize=9, va="center")
-    arrow(axes, (15, 2.6), (15, 4.4))
-    axes.text(15.15, 3.65, "newest solution", fontsize=9, va="center")
+    axes.text(6.4, 7.15, "samples", fontsize=9, va="center")
+    axes.text(7.95, 3.6, "eyes to solve for", fontsize=9, va="center")
+    axes.text(16.15, 3.6, "newest solution", fontsize=9, va="center", ha="right")
     return figure
 
 
