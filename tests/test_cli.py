@@ -96,7 +96,7 @@ def test_eyes_in_line_with_the_displays_depth_are_served_by_sart(pair: Path) -> 
     assert (pair / "out" / "solve.json").exists()
 
 
-def test_what_a_decoder_says_of_a_damaged_picture_stands_in_the_one_line(pair: Path) -> None:
+def test_a_decoder_s_complaint_about_a_damaged_picture_is_in_the_line(pair: Path) -> None:
     data = bytearray((pair / "left.png").read_bytes())
     data[len(data) // 2] ^= 0x5A
     (pair / "damaged.png").write_bytes(data)
@@ -106,7 +106,7 @@ def test_what_a_decoder_says_of_a_damaged_picture_stands_in_the_one_line(pair: P
     assert "damaged.png: is not an image that can be decoded (libpng error: " in line
 
 
-def test_a_folder_in_the_place_of_a_layer_is_named_and_nothing_is_replaced(pair: Path) -> None:
+def test_a_folder_in_a_layer_s_place_is_named_and_nothing_replaced(pair: Path) -> None:
     (pair / "out" / "layer-1.png").mkdir(parents=True)
     (pair / "out" / "layer-0.png").write_text("the old one")
     assert "layer-1.png: is a folder" in refusal(*solve_arguments(pair, model="fast"))

@@ -46,9 +46,7 @@ PANEL = '[[output.panels]]\nconnector = "DP-{}"\n'
         ("[loop]\nzebra = 1", "loop.zebra", "is no setting"),
     ],
 )
-def test_what_makes_no_sense_is_told_with_its_field_and_what_may_have_been_meant(
-    tmp_path: Path, text: str, field: str, said: str
-) -> None:
+def test_nonsense_is_refused_with_its_field_and_a_suggestion(tmp_path: Path, text: str, field: str, said: str) -> None:
     with pytest.raises(InputError) as told:
         loaded(tmp_path, text)
     assert str(told.value).startswith(f"{tmp_path}/phasestack.toml: {field}: ")

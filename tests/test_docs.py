@@ -137,7 +137,7 @@ def test_options_named_in_a_sentence_exist() -> None:
             assert name and {word for word in words if word.startswith("--")} <= options, f"{page.name}: {line}"
 
 
-def test_the_table_of_operation_has_the_commands_of_ctl_that_the_daemon_takes() -> None:
+def test_operation_s_table_has_the_commands_of_ctl() -> None:
     typed = {path[-1] for path, _ in walk(typer.main.get_command(app)) if path[:1] == ("ctl",)} - {"ctl"}
     page = (DOCS / "operation.md").read_text(encoding="utf-8")
     table = page.partition("| `phasestack ctl` |")[2].partition("\n\n")[0]
@@ -213,3 +213,25 @@ def test_every_page_can_be_reached_from_the_readme() -> None:
         places = ((page.parent / link).resolve() for link in links if link.endswith(".md") and ":" not in link)
         waiting += [place for place in places if place not in reached]
     assert [page.name for page in PAGES if page not in reached] == []
+
+
+def test_names_of_tests_have_at_most_twelve_words() -> None:
+    names = [name for path in (ROOT / "tests").rglob("test_*.py") if path.parent.name not in ("model", "plan")
+             for name in re.findall(r"^\s*def test_(\w+)", path.read_text(encoding="utf-8"), re.MULTILINE)]  # fmt: skip
+    assert len(names) > 800 and [name for name in names if len(name.strip("_").split("_")) > 12] == []
+
+
+def public_docstrings() -> Iterator[tuple[str, str]]:
+    """The docstring of every module, and of every public class and function in it, by file."""
+    for package in ("calib", "model_export", "phasestack", "runtime"):
+        for path in (ROOT / package).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                named = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef)
+                if isinstance(node, ast.Module) or (named and not node.name.startswith("_")):
+                    yield str(path.relative_to(ROOT)), ast.get_docstring(node) or ""
+
+
+def test_the_first_line_of_a_public_docstring_is_short() -> None:
+    open_rooms = ("runtime/kernels/", "runtime/model/", "runtime/plan/")
+    lines = [(path, text.partition("\n")[0]) for path, text in public_docstrings() if not path.startswith(open_rooms)]
+    assert len(lines) > 1200 and [(path, line) for path, line in lines if len(line) >= 100] == []

@@ -30,7 +30,7 @@ def listed() -> dict[str, list[str]]:
     return {plain(name): rest for name, *rest in rows}
 
 
-def test_the_page_lists_every_package_of_the_runtime_s_lock_and_no_other() -> None:
+def test_the_page_lists_exactly_the_packages_of_the_runtime_s_lock() -> None:
     locked = {plain(name): version for name, version in script().locked().items()}
     assert {name: rest[0] for name, rest in listed().items()} == locked
 

@@ -70,9 +70,7 @@ print(numpy.__version__, runtime.__file__)
 """
 
 
-def test_a_clean_environment_with_the_wheel_and_an_older_numpy_runs_a_program_and_the_demo(
-    packages: Path, tmp_path: Path
-) -> None:
+def test_the_wheel_runs_a_program_and_the_demo_in_a_clean_environment(packages: Path, tmp_path: Path) -> None:
     """Of everything else the newest that the ranges allow: what `pip install` gives to anybody."""
     venv.create(tmp_path / "clean", with_pip=True)
     python = tmp_path / "clean" / "bin" / "python"

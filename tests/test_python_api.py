@@ -29,7 +29,7 @@ def picture(shift_px: int = 0) -> np.ndarray:
     return np.roll(cv2.resize(coarse, (320, 180), interpolation=cv2.INTER_CUBIC), shift_px, axis=1)
 
 
-def test_a_pair_becomes_layers_with_what_each_eye_sees_and_how_good_that_is(tmp_path: Path) -> None:
+def test_a_pair_becomes_layers_eye_views_and_quality(tmp_path: Path) -> None:
     result = phasestack.solve(picture(), picture(3), eyes_m=EYES, stack=STACK, fov_deg=40, model="fast")
     assert result.layers.shape == (3, 180, 320, 3) and result.layers.dtype == np.uint8
     assert result.seen.shape == (2, 180, 320, 3) and result.seen.dtype == np.uint8
@@ -135,7 +135,7 @@ def test_a_stack_that_can_t_be_is_refused_when_it_is_made(given: dict[str, Any],
         phasestack.Stack(**well | given)
 
 
-def test_a_result_says_itself_in_a_line_and_measures_its_quality_when_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_result_prints_in_a_line_and_measures_quality_when_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
     real = solved.displayed
     monkeypatch.setattr(solved, "displayed", lambda *given, **how: calls.append(1) or real(*given, **how))

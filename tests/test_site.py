@@ -35,7 +35,7 @@ def test_the_python_that_a_page_shows_runs(page: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_site_is_built_without_a_warning_and_has_every_page_and_the_api(tmp_path: Path) -> None:
+def test_the_site_builds_without_warnings_with_every_page_and_the_api(tmp_path: Path) -> None:
     pytest.importorskip("furo")
     command = [
         sys.executable,

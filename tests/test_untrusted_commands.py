@@ -74,7 +74,7 @@ def parameters(kind: str) -> list[tuple[tuple[str, ...], Any]]:
 
 @pytest.mark.parametrize("text", ["nan", "inf", "1e308"])
 @pytest.mark.parametrize(("words", "parameter"), parameters("float"), ids=lambda x: " ".join(getattr(x, "opts", x)))
-def test_every_number_has_a_range_and_what_is_outside_is_told_by_its_option(
+def test_every_number_is_refused_outside_its_range_by_its_option(
     words: tuple[str, ...], parameter: Any, text: str
 ) -> None:
     count = str(parameter.type_descriptor.annotation).count("float")

@@ -119,7 +119,7 @@ def _loaded(path: Path, data: bytes) -> list[tuple[Any, F64]]:
         return untrusted_input.read_bytes(place, most_bytes=LIMITS.file_bytes, source=path, field=field)
 
     class Beside(trimesh.resolvers.FilePathResolver):
-        """Reads files beside the mesh; keeps the reason of a refusal, since loaders skip what they do not get."""
+        """Reads files beside the mesh and keeps the reason of a refusal, which loaders would skip."""
 
         refused: InputError | None = None
         pixels = 0  # of all textures

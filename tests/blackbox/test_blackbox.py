@@ -105,9 +105,7 @@ def the_file(folder: Path) -> Path:
     return found
 
 
-def test_it_holds_every_refresh_sample_and_state_and_a_replay_gives_the_same_states(
-    stalled: Path, tmp_path: Path
-) -> None:
+def test_it_holds_every_refresh_and_sample_and_replays_to_the_same_states(stalled: Path, tmp_path: Path) -> None:
     recorder = Recorder(tmp_path, minutes=2.0)
     accounts = run_of(stalled, recorder=recorder)
     path = the_file(tmp_path)
@@ -137,9 +135,7 @@ def test_it_keeps_no_more_than_its_minutes_and_its_bytes(tmp_path: Path, monkeyp
         recorder.close()
 
 
-def test_a_fault_writes_what_was_before_it_and_what_followed_for_its_owner_alone(
-    tmp_path: Path, monkeypatch: Any
-) -> None:
+def test_a_fault_writes_what_preceded_and_followed_it_for_its_owner_alone(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr(recording, "AFTER_FAULT_NS", NS_PER_S // 2)
     recorder = Recorder(tmp_path, minutes=2.0)
     with Rig(recorder=recorder) as rig:
@@ -174,7 +170,7 @@ def test_a_start_without_a_sensor_is_no_fault(tmp_path: Path, monkeypatch: Any) 
     assert not list(tmp_path.iterdir())
 
 
-def test_it_is_written_when_asked_and_the_samples_in_it_are_a_recording(tmp_path: Path) -> None:
+def test_a_requested_file_is_written_and_its_samples_are_a_recording(tmp_path: Path) -> None:
     answers: list[tuple[str, Path | None]] = []
     recorder = Recorder(tmp_path, minutes=2.0)
     with Rig(recorder=recorder) as rig:
@@ -217,7 +213,7 @@ def test_a_folder_that_cant_be_written_is_reported_to_who_asks(tmp_path: Path) -
     assert "cannot be written" in answers[0]
 
 
-def test_a_flood_of_one_kind_keeps_its_first_and_last_and_takes_no_other_kinds_place(tmp_path: Path) -> None:
+def test_a_flood_of_one_kind_displaces_no_other_kind(tmp_path: Path) -> None:
     earlier = tmp_path / "blackbox-20200101T000000Z-fault-sensor.mcap"
     earlier.write_bytes(b"an earlier run's")
     (tmp_path / "mine.mcap").write_bytes(b"kept")
@@ -233,7 +229,7 @@ def test_a_flood_of_one_kind_keeps_its_first_and_last_and_takes_no_other_kinds_p
     assert "blackbox-20200103T000000Z-fault-panel.mcap" in kept and kept[-1] == file.name
 
 
-def test_many_who_ask_in_one_second_get_whole_files_and_each_an_answer(tmp_path: Path) -> None:
+def test_many_requests_in_one_second_all_get_whole_files(tmp_path: Path) -> None:
     """Of a hundred 73 were refused, and 3 were told of a file that nothing could read."""
     answers: list[tuple[str, Path | None]] = []
     with Rig(recorder=(recorder := Recorder(tmp_path, minutes=1))) as rig:
@@ -253,9 +249,7 @@ def test_many_who_ask_in_one_second_get_whole_files_and_each_an_answer(tmp_path:
     assert not [path for path in tmp_path.iterdir() if path not in there and recording.JOURNAL not in path.name]
 
 
-def test_a_clock_that_was_set_back_does_not_make_the_newest_the_oldest(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_setting_the_clock_back_does_not_age_the_newest_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class SetBack(datetime):
         year_now = 2026
 
@@ -290,7 +284,7 @@ write_file(Path(sys.argv[1]), "asked", kept(), RecordingHeader("replay", ""), "{
 """
 
 
-def test_what_a_killed_writer_left_is_swept_by_the_next_and_what_is_being_written_is_not(tmp_path: Path) -> None:
+def test_leftovers_of_a_killed_writer_are_swept_but_not_files_being_written(tmp_path: Path) -> None:
     def writer() -> subprocess.Popen[str]:
         command = [sys.executable, "-c", WRITES, str(tmp_path)]
         begun = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
@@ -308,7 +302,7 @@ def test_what_a_killed_writer_left_is_swept_by_the_next_and_what_is_being_writte
     assert busy.returncode == 0 and len(read(whole)) == 1
 
 
-def test_of_a_run_that_was_killed_the_next_finds_all_but_its_last_seconds(tmp_path: Path) -> None:
+def test_after_a_kill_the_next_run_finds_all_but_the_last_seconds(tmp_path: Path) -> None:
     config = tmp_path / "a.toml"
     config.write_text(f'[stack]\nwidth_px = 64\nheight_px = 36\n[model]\nname = "fast"\nthreads = 1\nbackend = "cpu"\n'
                       f'[service]\nsocket = "{tmp_path}/s.sock"\n')  # fmt: skip

@@ -130,7 +130,7 @@ def judged(tmp_path: Path, panels: Panels, eyes: np.ndarray, layers: np.ndarray,
 
 
 @pytest.mark.slow
-def test_a_solution_s_viewer_shows_the_light_that_a_tracer_finds_at_rest_and_moved(tmp_path: Path) -> None:
+def test_the_viewer_shows_the_light_that_a_tracer_finds(tmp_path: Path) -> None:
     eyes, pictures = pair(STACK)
     result = phasestack.solve(*pictures, eyes_m=eyes, stack=STACK, model="fast")
     result.save(tmp_path)

@@ -76,7 +76,7 @@ def half_covered(picture: np.ndarray) -> np.ndarray:
         PanelStack(0.3, 0.2, (-0.04, 0.0, 0.02, 0.05), 1280, 800),
     ],
 )
-def test_a_camera_square_to_a_bare_panel_reads_every_mark_where_it_was_drawn(stack: PanelStack) -> None:
+def test_a_camera_square_to_a_bare_panel_reads_every_mark_exactly(stack: PanelStack) -> None:
     for index in range(stack.count):
         picture = cv2.copyMakeBorder(board(stack, index), 40, 40, 40, 40, cv2.BORDER_CONSTANT)
         seen = find_marks(cv2.GaussianBlur(picture, (0, 0), 0.8), stack, name="")

@@ -30,7 +30,7 @@ def register(seen: Any, *, stack: PanelStack = STACK) -> Any:
 
 
 @pytest.mark.slow
-def test_a_dozen_stacks_are_found_within_a_tenth_of_a_pixel_and_the_intervals_hold_the_truth() -> None:
+def test_a_dozen_stacks_are_found_to_a_tenth_of_a_pixel() -> None:
     errors, inside = [], []
     for seed in range(12):
         truth, random = hands(seed)
@@ -88,7 +88,7 @@ def test_panels_in_the_reverse_order_are_told(seed: int) -> None:
         register(seen)
 
 
-def test_a_parallel_panel_has_one_homography_and_a_tilted_one_has_one_for_each_eye() -> None:
+def test_a_tilted_panel_s_homography_depends_on_the_eye() -> None:
     turned = Rotation.from_rotvec([0.01, 0.0, 0.0]).as_matrix()
     parallel = PlacedPanel(turned, np.array([STACK.x_m[2], 0.001, -0.002]))
     eyes = ([0.6, 0.0, 0.0], [0.4, 0.2, 0.1])

@@ -108,7 +108,7 @@ def scripted(tmp_path: Path, lines: list[str], keys: Sequence[Key] = (), kind: t
     return Setup(tmp_path / "c.toml", tmp_path / "out", hardware, said.append, lambda: next(typed, "q"))
 
 
-def test_as_root_the_last_step_applies_what_was_made_and_keeps_the_files_before(
+def test_as_root_the_last_step_installs_files_and_keeps_the_old_ones(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     setup, installed = scripted(tmp_path, []), tmp_path / "etc"
@@ -175,7 +175,7 @@ class FourMonitors(SimulatedHardware):
         self.shown = (*self.shown, number)
 
 
-def test_a_monitor_is_named_by_a_serial_of_its_own_and_keeps_what_is_known_of_it(tmp_path: Path) -> None:
+def test_a_monitor_is_named_by_its_serial_and_keeps_its_settings(tmp_path: Path) -> None:
     taken = [Key.ACCEPT, Key.UP, Key.ACCEPT]
     keys = [Key.ACCEPT, Key.DOWN, Key.NEXT, *taken, Key.NEXT, *taken]
     setup = scripted(tmp_path, [], keys, FourMonitors)
@@ -203,7 +203,7 @@ def test_nothing_is_asked_of_a_terminal_that_is_closed(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_rewritten_configuration_and_its_past_are_read_by_no_more_and_a_link_stays_one(tmp_path: Path) -> None:
+def test_rewriting_a_configuration_widens_no_permission_and_keeps_links(tmp_path: Path) -> None:
     """A camera's password in it: setup made 0600 to 0644, and the link a file of its own."""
     (tmp_path / "kept").mkdir()
     config, link = tmp_path / "kept" / "display.toml", tmp_path / "phasestack.toml"

@@ -127,9 +127,7 @@ def test_a_folder_without_pairs_and_a_truncated_picture_are_told(tmp_path: Path)
         EyeRealSource(read_folder(tmp_path, LEGO), fov_deg=40, background=(1, 1, 1), name="lego")
 
 
-def test_a_folder_is_read_as_the_preset_that_its_name_holds_or_told_what_to_set(
-    tmp_path: Path, context: Any, stack: PanelStack
-) -> None:
+def test_a_folder_is_read_as_the_preset_in_its_name(tmp_path: Path, context: Any, stack: PanelStack) -> None:
     named, other = tmp_path / "lego_bulldozer-test", tmp_path / "from-the-net"
     named.mkdir()
     write_pair(named, context, stack)

@@ -9,7 +9,7 @@ from runtime.content import shapes
 from runtime.content.fringe import edges_of, ramps, silhouette
 
 
-def test_a_box_has_twelve_edges_and_two_diagonals_a_face_none_of_which_is_an_outline() -> None:
+def test_the_diagonals_of_a_box_s_faces_are_no_outlines() -> None:
     box = shapes.box((1.0, 2.0, 3.0))
     edges = edges_of(box)
     assert len(edges.faces) == 12 + 6

@@ -211,7 +211,7 @@ def test_a_broken_file_is_one_line_that_names_the_field(
     assert "\n" not in str(refused.value)
 
 
-def test_an_obj_in_another_encoding_and_a_texture_with_a_space_in_its_name_are_read(tmp_path: Path) -> None:
+def test_an_obj_in_another_encoding_and_a_texture_with_spaces_are_read(tmp_path: Path) -> None:
     Image.new("RGB", (4, 4), (255, 0, 0)).save(tmp_path / "my skin.png")
     (tmp_path / "a.mtl").write_text("newmtl a\nmap_Kd my skin.png\n")
     corners = TRIANGLE + "vt 0 0\nvt 1 0\nvt 0 1\nusemtl a\nf 1/1 2/2 3/3\n"

@@ -45,7 +45,7 @@ def test_each_eye_gets_its_half(tmp_path: Path, context: Any, stack: PanelStack,
     assert not source.info.moving
 
 
-def test_a_plain_picture_lies_in_the_middle_plane_and_both_eyes_see_the_same(
+def test_a_plain_picture_lies_in_the_middle_plane_for_both_eyes(
     tmp_path: Path, context: Any, stack: PanelStack
 ) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (90, 160, 3), np.uint8)
@@ -137,7 +137,7 @@ def test_a_picture_too_small_for_its_views_is_one_line(
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.mp4", "a.avi"])
-def test_a_file_that_was_cut_off_is_one_line_and_the_decoders_are_silent(
+def test_a_truncated_file_gives_one_line_and_silent_decoders(
     tmp_path: Path, context: Any, stack: PanelStack, name: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / name
@@ -211,7 +211,7 @@ def test_halves_and_quilts_have_the_shape_that_their_name_tells(
 
 @pytest.mark.parametrize("blur", [0, 3])
 @pytest.mark.parametrize("eye", [(0.6, -0.12, 0.05), (0.6, 0.12, -0.05)])
-def test_beside_an_edge_there_is_neither_a_hole_nor_the_near_thing_drawn_out(
+def test_beside_an_edge_there_is_no_hole_and_no_stretched_foreground(
     tmp_path: Path, context: Any, stack: PanelStack, blur: int, eye: tuple[float, float, float]
 ) -> None:
     """A green square before a blue ground, its edges mixed in colour and depth: only these two colours are seen."""
@@ -231,7 +231,7 @@ def test_beside_an_edge_there_is_neither_a_hole_nor_the_near_thing_drawn_out(
     assert green.sum() == pytest.approx(expected, rel=0.08)
 
 
-def test_a_picture_much_larger_than_the_raster_is_averaged_and_not_picked_from(stack: PanelStack) -> None:
+def test_a_picture_much_larger_than_the_raster_is_averaged(stack: PanelStack) -> None:
     lines = np.zeros((1080, 1920, 3), np.uint8)
     lines[:, ::2] = 255
     view = panel_view((0.7, -0.03, 0.1), stack.panel(1))

@@ -74,9 +74,7 @@ def test_the_next_one_can_be_asked_for(folder: Path, context: Any, stack: PanelS
     assert colour_at(source, stack, 53.4) == "green" and colour_at(source, stack, 53.6) == "blue"
 
 
-def test_an_entry_has_settings_and_a_place_of_its_own_within_the_lists(
-    folder: Path, context: Any, stack: PanelStack
-) -> None:
+def test_an_entry_has_its_own_settings_and_place(folder: Path, context: Any, stack: PanelStack) -> None:
     shows = ("scene = 'red.png'\nseconds = 1\nscale = 0.5", "scene = 'sparse'\nseconds = 1\nturntable_per_min = 6")
     source = opened(written(folder, *shows), context, stack, offset_m=(0.0, 0.05, 0.0))
     picture = source.render(panel_view(EYE, stack.panel(1)), time_ns=0)

@@ -19,7 +19,7 @@ SHIFTS = {"matrixcity": (0, 1.5, 0), "room_floor": (0, 0.35, 0.15)}
 
 
 @pytest.mark.parametrize("name", PLACES)
-def test_the_published_reading_puts_the_panels_where_that_code_does_in_the_scene(name: str) -> None:
+def test_the_published_reading_places_the_panels_as_that_code_does(name: str) -> None:
     """That code spans three panels evenly from half a thickness below `ground` to half a thickness above its end."""
     scale, thickness_cm, out, up, ground, coefficient = PLACES[name]
     z_min = ground if coefficient is None else thickness_cm * scale * coefficient

@@ -72,7 +72,7 @@ def test_the_nearer_of_two_surfaces_hides_the_other(context: Any, stack: PanelSt
         source.close()
 
 
-def test_the_same_view_and_time_give_the_same_bytes_in_another_context_too(context: Any, stack: PanelStack) -> None:
+def test_the_same_view_and_time_give_the_same_bytes_in_any_context(context: Any, stack: PanelStack) -> None:
     from runtime.support.gl import offscreen_context
 
     view = panel_view(EYES["ahead"], stack.panel(1))

@@ -132,7 +132,7 @@ def test_without_a_program_the_state_says_where_one_may_connect(source: Any) -> 
         drawn(source)
 
 
-def test_a_silent_program_is_late_and_is_not_asked_for_more_than_two_frames(source: Any) -> None:
+def test_a_silent_program_is_late_and_gets_at_most_two_requests(source: Any) -> None:
     program = Program(source, lambda asked, eye: None)
     for _ in range(2):
         with pytest.raises(ContentFailure, match="not answered within 400 ms"):
@@ -164,7 +164,7 @@ def _draws(source: Any) -> bool:
         return False
 
 
-def test_who_answers_with_the_wrong_size_is_sent_away_with_the_reason_and_may_come_back(source: Any) -> None:
+def test_a_program_with_the_wrong_size_is_told_why_and_may_return(source: Any) -> None:
     program = Program(source, lambda asked, eye: b"x" * 100)
     with pytest.raises(ContentFailure, match="100 bytes for 64x36"):
         drawn(source)

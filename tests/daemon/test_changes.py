@@ -142,7 +142,7 @@ def broken_content(folder: Path, broken: str) -> Path:
 BROKEN = {"NaN": "vertices: 1 of 3", "missing": "neither a file", "a list": "show[1]: content: scene: "}
 
 
-def test_content_that_can_t_be_loaded_is_refused_and_the_last_good_stays(
+def test_content_that_can_t_be_loaded_is_refused_and_the_old_stays(
     served: Served, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     content = served.rig.content
@@ -211,7 +211,7 @@ def configuration(scene: str = "demo", **model: Any) -> str:
     )
 
 
-def test_a_reload_keeps_the_scene_model_and_place_that_were_chosen_until_the_file_says_something_new(
+def test_a_reload_keeps_what_was_chosen_unless_the_file_changed_it(
     served: Served,
 ) -> None:
     served.config.write_text(configuration())
@@ -231,7 +231,7 @@ def test_a_reload_keeps_the_scene_model_and_place_that_were_chosen_until_the_fil
     assert served.status()["scene"] == "flat"
 
 
-def test_a_command_that_fails_in_a_way_that_nobody_expected_is_refused_and_the_run_goes_on(
+def test_a_command_that_fails_unexpectedly_is_refused_and_the_run_continues(
     served: Served, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def broken(*_: Any) -> None:
@@ -278,7 +278,7 @@ def slow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     del sys.modules["slow_scene"]
 
 
-def test_a_scene_whose_making_never_ends_is_refused_and_what_it_makes_after_all_is_shown_nowhere(
+def test_a_scene_that_never_loads_is_refused_and_never_shown(
     served: Served, slow: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its thread is left behind; when it goes on, it neither publishes its scene nor closes the new solver's."""
@@ -302,7 +302,7 @@ def test_a_scene_whose_making_never_ends_is_refused_and_what_it_makes_after_all_
     assert served.asked("scene", "sparse")["scene"] == "sparse"
 
 
-def test_a_scene_whose_making_takes_longer_than_a_step_may_is_shown_when_it_is_there(served: Served, slow: Any) -> None:
+def test_a_scene_that_loads_slower_than_a_step_is_shown_when_ready(served: Served, slow: Any) -> None:
     solver = served.rig.presenter.solver
     before = len(served.rig.accounts)
 
@@ -317,7 +317,7 @@ def test_a_scene_whose_making_takes_longer_than_a_step_may_is_shown_when_it_is_t
 
 
 @pytest.mark.parametrize("where", ["imported", "made", "drawn"])
-def test_a_scene_that_ends_the_process_is_refused_or_a_fault_and_later_changes_are_made(
+def test_a_scene_that_ends_the_process_does_not_block_later_changes(
     served: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:
     """`sys.exit()`, as vendors' kits do: ctl said ok, and ok to all that came later, and did nothing."""
@@ -347,9 +347,7 @@ def test_a_scene_that_ends_the_process_is_refused_or_a_fault_and_later_changes_a
     served.rig.refresh_until(TRACKING)
 
 
-def test_of_many_changes_one_is_loaded_at_a_time_and_only_the_newest_waits(
-    served: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_changes_load_one_at_a_time_and_only_the_newest_waits(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     """Twenty models were loaded side by side: 4 GB."""
     real, at_once, begun = reconfigure.ready_predictor, [0, 0], []
 
@@ -404,7 +402,7 @@ def test_a_configuration_that_takes_long_to_read_takes_no_refresh(
     assert max(after - before for before, after in pairwise(instants)) < 0.7 * NS_PER_S
 
 
-def test_an_address_s_password_is_in_no_answer_no_log_and_no_black_box(
+def test_an_address_s_password_appears_in_no_answer_log_or_black_box(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO", "phasestack")

@@ -91,7 +91,7 @@ def test_without_a_daemon_status_fails_with_one_line(tmp_path: Path) -> None:
         ("activating", "success", "journalctl -u phasestack"),
     ],
 )
-def test_where_the_service_does_not_run_status_says_how_it_is_and_what_to_do(
+def test_without_the_service_status_says_how_it_is_and_what_to_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, state: str, result: str, told: str
 ) -> None:
     """What systemd 252 prints; the booted system's test asks it itself."""

@@ -116,7 +116,7 @@ def started(tmp_path: Path) -> Iterator[Callable[..., Any]]:
     ("number", "after_s"),
     [(signal.SIGTERM, 0.05), (signal.SIGTERM, 1.6), (signal.SIGINT, 1.0)],
 )
-def test_a_signal_at_any_stage_of_the_start_ends_it_without_a_traceback(
+def test_a_signal_at_any_stage_of_the_start_ends_it_cleanly(
     started: Callable[..., Any], number: Signals, after_s: float
 ) -> None:
     daemon = started()
@@ -128,7 +128,7 @@ def test_a_signal_at_any_stage_of_the_start_ends_it_without_a_traceback(
     assert "Traceback" not in errors
 
 
-def test_it_is_ready_once_it_presents_an_operator_steers_it_and_it_ends_in_order(started: Callable[..., Any]) -> None:
+def test_it_becomes_ready_by_presenting_is_steered_and_ends_in_order(started: Callable[..., Any]) -> None:
     daemon = started(watchdog_s=2.0)
     assert daemon.hears("READY=1")
     assert daemon.status()["presented"] >= 1
@@ -164,7 +164,7 @@ PANEL = '[[output.panels]]\nconnector = "HDMI-%d"\n'
 NO_SCREEN = CONFIG + '[output]\nkind = "windows"\n' + "".join(PANEL % n for n in range(3))
 
 
-def test_a_panel_that_is_missing_at_the_start_is_waited_for_as_a_state_and_it_stops_at_once(
+def test_a_panel_missing_at_the_start_is_waited_for_as_a_state(
     started: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
@@ -205,9 +205,7 @@ def test_by_hand_a_missing_panel_is_refused_in_one_line(tmp_path: Path, monkeypa
 
 
 @pytest.mark.parametrize("reader", ["never reads", "was never there"])
-def test_where_nobody_reads_its_log_the_display_goes_on_and_it_can_be_ended(
-    started: Callable[..., Any], reader: str
-) -> None:
+def test_without_a_reader_of_its_log_the_display_goes_on_and_ends(started: Callable[..., Any], reader: str) -> None:
     out, descriptor = os.pipe()
     if reader == "never reads":
         os.set_blocking(descriptor, False)

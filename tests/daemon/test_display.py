@@ -66,7 +66,7 @@ def shows_something_on(x: list[xserver.XServer]) -> bool:
     return all(int(np.ptp(x[-1].panel(index))) > 0 for index in range(3))
 
 
-def test_it_shows_a_scene_takes_another_loses_a_monitor_and_stops_in_order(daemon: Any, x: XServer) -> None:
+def test_it_shows_scenes_survives_a_lost_monitor_and_stops_in_order(daemon: Any, x: XServer) -> None:
     assert eventually(lambda: shows_something_on(x))
     status = daemon.status()
     assert (status["panels"], status["scene"]) == ("windows", "demo")
@@ -92,9 +92,7 @@ def test_it_shows_a_scene_takes_another_loses_a_monitor_and_stops_in_order(daemo
     assert code == 0, errors
 
 
-def test_the_x_server_dies_and_the_daemon_that_is_started_again_waits_for_it(
-    daemon: Any, x: XServer, tmp_path: Path
-) -> None:
+def test_after_the_x_server_dies_a_restarted_daemon_waits_for_it(daemon: Any, x: XServer, tmp_path: Path) -> None:
     x[0].stop()
     code, errors = daemon.ends()
     assert code == SERVER_DIED

@@ -120,9 +120,7 @@ class Own(Sensor):
 """
 
 
-def test_a_sensor_of_ones_own_in_the_stacks_frame_needs_no_usb_and_no_calibration(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sensor_in_the_stack_s_frame_needs_no_calibration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "own_eyes.py").write_text(OWN)
     monkeypatch.syspath_prepend(tmp_path)
     code, checks = examined(tmp_path, '[sensor]\ndriver = "own_eyes:Own"')

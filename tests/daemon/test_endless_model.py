@@ -69,7 +69,7 @@ def test_a_stop_while_it_starts_is_heard_and_no_abort(endless: Path, tmp_path: P
     assert "stopped" in told and "terminate called" not in told
 
 
-def test_while_it_runs_an_endless_model_is_refused_and_no_thread_of_the_daemon_hangs(
+def test_an_endless_model_is_refused_and_hangs_no_thread_of_the_daemon(
     endless: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It held a thread for two minutes, and at the end of the daemon for good."""
@@ -81,7 +81,7 @@ def test_while_it_runs_an_endless_model_is_refused_and_no_thread_of_the_daemon_h
         served.rig.refresh_until_solved()
 
 
-def test_a_scene_that_takes_too_much_memory_ends_another_process_and_the_display_goes_on(
+def test_a_scene_that_takes_all_memory_ends_only_its_trial_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import trimesh

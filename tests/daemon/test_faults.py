@@ -170,7 +170,7 @@ def asleep(rig: Rig, solver: Any) -> list[RefreshAccount]:
     return accounts
 
 
-def test_a_model_that_never_returns_is_left_behind_the_solver_made_anew_and_what_it_held_released(
+def test_a_model_that_never_returns_is_abandoned_and_its_resources_freed(
     steady: Rig,
 ) -> None:
     held = weakref.ref(steady.run.parts)
@@ -233,9 +233,7 @@ def fed(heard: Supervisor) -> Iterator[Rig]:
     notifier.close()
 
 
-def test_a_solver_that_hangs_does_not_starve_the_watchdog_and_a_refresh_that_takes_for_ever_does(
-    fed: Rig, heard: Supervisor
-) -> None:
+def test_the_watchdog_outlives_a_hung_solver_but_not_an_endless_refresh(fed: Rig, heard: Supervisor) -> None:
     """The presenter's clock alone feeds it: there is a picture, it follows the eyes, and the solver is made anew."""
     gate = threading.Event()
     predictor = fed.break_predictor()
@@ -263,5 +261,5 @@ def test_a_solver_that_hangs_does_not_starve_the_watchdog_and_a_refresh_that_tak
 
 
 @pytest.mark.slow
-def test_nothing_piles_up_is_lost_or_gets_no_answer_while_parts_are_lost_and_changed() -> None:
+def test_faults_and_changes_pile_nothing_up_and_all_requests_are_answered() -> None:
     soak(90.0, growth_mib=200)  # so early, everything still grows

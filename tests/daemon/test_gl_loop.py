@@ -63,7 +63,7 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[xserver.
     made.stop()
 
 
-def test_panels_show_what_opengl_solved_and_a_monitor_that_comes_and_goes_is_no_new_solver(
+def test_panels_show_opengl_s_solution_and_a_returning_monitor_keeps_the_solver(
     server: xserver.XServer,
 ) -> None:
     with Rig(**ON_WINDOWS) as rig:
@@ -85,7 +85,7 @@ def test_panels_show_what_opengl_solved_and_a_monitor_that_comes_and_goes_is_no_
 
 
 @pytest.mark.parametrize("losses", [3, pytest.param(300, marks=[pytest.mark.slow, pytest.mark.timeout(3600)])])
-def test_contexts_that_the_panels_lose_are_made_anew_with_the_solver_and_leave_nothing(
+def test_contexts_lost_by_the_panels_are_remade_with_the_solver_without_leaks(
     server: xserver.XServer, monkeypatch: pytest.MonkeyPatch, losses: int
 ) -> None:
     with Rig(**ON_WINDOWS, abandon_s=0.2) as rig:

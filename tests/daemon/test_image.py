@@ -55,7 +55,7 @@ def buildah(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Buildah]:
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def test_the_images_default_command_its_page_and_its_doctor_run_as_its_user(buildah: Buildah) -> None:
+def test_the_image_s_command_page_and_doctor_run_as_its_user(buildah: Buildah) -> None:
     config = json.loads(buildah("inspect", "--type", "image", IMAGE).stdout)["OCIv1"]["config"]
     assert config["User"] == "phasestack"
     container = buildah("from", IMAGE).stdout.strip()

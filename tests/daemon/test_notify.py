@@ -75,7 +75,7 @@ def test_the_start_can_be_extended_until_it_is_over(
     assert supervisor.heard() == ["EXTEND_TIMEOUT_USEC=60000000", "READY=1"]
 
 
-def test_a_start_that_goes_on_once_it_is_ready_has_the_watchdogs_patience_until_the_first_frame(
+def test_a_start_that_continues_after_ready_keeps_the_watchdog_patient(
     supervisor: Supervisor, notifier_of: Callable[..., Notifier]
 ) -> None:
     notifier = notifier_of(environment=WATCHED)

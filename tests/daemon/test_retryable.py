@@ -49,9 +49,7 @@ def test_a_run_that_the_machine_ended_may_be_started_again(monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("error", [read_by_a_reader(errno.ENOENT), InputError("a.toml", "x", "bad"), ValueError("x")])
-def test_a_run_that_its_input_or_a_mistake_of_ours_ended_tells_just_that(
-    monkeypatch: pytest.MonkeyPatch, error: Exception
-) -> None:
+def test_a_run_ended_by_its_input_or_a_bug_reports_just_that(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
     monkeypatch.setattr(supervise, "drive", raising(error))
     with pytest.raises(type(error)) as caught:
         lived()
@@ -107,7 +105,7 @@ class Refusing:
 
 
 @pytest.mark.parametrize(("number", "opened"), [(errno.EMFILE, True), (errno.ENOMEM, True), (errno.ENOENT, False)])
-def test_a_sensor_that_can_not_be_reopened_for_want_of_descriptors_is_tried_again(number: int, opened: bool) -> None:
+def test_a_sensor_that_lacks_descriptors_to_reopen_is_tried_again(number: int, opened: bool) -> None:
     errors: list[Exception] = [read_by_a_reader(number), read_by_a_reader(number)]
     worker = SensorWorker(lambda: Refusing(errors), SensorSettings(), MonotonicClock())
     worker.start()

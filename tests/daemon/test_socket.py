@@ -142,7 +142,7 @@ def test_somebody_elses_file_is_neither_removed_nor_followed(
     assert precious.read_text() == "precious" and path.is_symlink() == is_link
 
 
-def test_by_hand_a_run_goes_on_without_its_socket_and_under_a_supervisor_it_does_not(
+def test_without_its_socket_a_run_goes_on_unless_supervised(
     server: StatusServer, path: Path, clock: SimulatedClock
 ) -> None:
     settings = ServiceSettings(socket=str(path))
@@ -185,7 +185,7 @@ def test_a_command_that_was_refused_as_too_late_is_never_done(
     assert not server.commands.get(timeout=60).take()
 
 
-def test_when_the_daemon_stops_who_waits_is_told_and_nothing_is_done_later(server: StatusServer, path: Path) -> None:
+def test_when_the_daemon_stops_waiting_clients_are_told_and_nothing_follows(server: StatusServer, path: Path) -> None:
     with ThreadPoolExecutor(1) as pool:
         asked = pool.submit(ask, [path], {"command": "pause"})
         command = server.commands.get(timeout=60)

@@ -86,7 +86,7 @@ def test_the_library_is_offered_with_the_scenes(tmp_path: Path) -> None:
         assert about(served.run)["models"][:2] == ("fast", "balanced")
 
 
-def test_the_page_gets_small_pictures_of_the_layers_and_of_what_each_eye_sees(tmp_path: Path) -> None:
+def test_the_page_gets_small_pictures_of_layers_and_eye_views(tmp_path: Path) -> None:
     with Served(tmp_path, content={"scene": "sparse"}) as served:
         layers_of(served)
         told = served.asked("pictures")

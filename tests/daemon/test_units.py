@@ -90,7 +90,7 @@ def test_the_daemon_is_watched_and_restarted_with_limits(unit: str) -> None:
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root writes in /run")
-def test_after_each_failure_in_a_row_a_start_waits_longer_and_after_a_stop_on_purpose_not_at_all(
+def test_repeated_failures_delay_the_next_start_and_a_deliberate_stop_does_not(
     tmp_path: Path,
 ) -> None:
     sleep = tmp_path / "sleep"
@@ -204,7 +204,7 @@ def test_the_installer_refuses_an_old_or_missing_python(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(shutil.which("Xvfb") is None or os.getuid() != 0, reason="needs Xvfb, and root to be another user")
-def test_a_fresh_authority_lets_the_daemons_user_in_to_the_x_server_and_nobody_else() -> None:
+def test_an_x_authority_admits_the_daemon_s_user_and_nobody_else() -> None:
     """65534 (nobody): in the group or not, as the daemon's user is to root, who makes the file and runs the server."""
     with tempfile.TemporaryDirectory() as folder:
         Path(folder).chmod(0o755)

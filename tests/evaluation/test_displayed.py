@@ -114,7 +114,7 @@ def test_solve_tells_what_the_eyes_see_of_pictures_of_another_aspect(tmp_path: P
     assert told["eye_sigma_mm"] == 1
 
 
-def test_of_a_16_bit_file_the_upper_byte_is_read_as_the_judge_of_layers_does(tmp_path: Path) -> None:
+def test_of_a_16_bit_file_the_upper_byte_is_used(tmp_path: Path) -> None:
     codes = np.arange(0, 65536, 7, dtype=np.uint16)[: 90 * 100].reshape(90, 100)
     cv2.imwrite(str(tmp_path / "a.png"), codes)
     np.testing.assert_array_equal(read_image(tmp_path / "a.png"), np.repeat(codes[..., None] >> 8, 3, axis=2))

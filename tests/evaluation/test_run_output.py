@@ -87,9 +87,7 @@ def test_a_full_disk_abandons_the_files_once_and_the_run_goes_on(
     assert list(tmp_path.iterdir()) == [], "nothing half-written is left"
 
 
-def test_where_not_every_line_must_be_kept_a_slow_disk_makes_nobody_wait(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_where_lines_may_be_dropped_a_slow_disk_delays_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import threading
 
     go_on, layers = threading.Event(), pictures()[0]

@@ -179,7 +179,7 @@ def test_millimetres_in_metres_are_only_warned_of(tmp_path: Path, scale: float) 
     assert "far from 1" in warning and "millimetres" in warning
 
 
-def test_a_sensor_far_from_the_display_is_warned_of_and_a_kilometre_refused(tmp_path: Path) -> None:
+def test_a_far_sensor_is_warned_of_and_a_kilometre_refused(tmp_path: Path) -> None:
     def away(distance_m: float) -> str:
         matrix = np.eye(4)
         matrix[0, 3] = distance_m

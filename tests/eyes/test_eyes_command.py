@@ -74,7 +74,7 @@ def test_pictures_in_sequence_are_followed(folder: Path) -> None:
     assert [row["seen"] for row in json.loads(done.stdout)["pictures"]] == ["found", "followed"]
 
 
-def test_what_can_not_be_read_is_told_in_one_line_and_leaves_nothing(folder: Path, tmp_path: Path) -> None:
+def test_an_unreadable_file_gives_one_line_and_leaves_nothing(folder: Path, tmp_path: Path) -> None:
     for name in ("text.png", "text.mp4", "text.mcap", "missing.png", "missing.mp4"):
         if name.startswith("text"):
             (tmp_path / name).write_text("no picture")

@@ -44,7 +44,7 @@ def faulty(depth: np.ndarray, seed: int, *, holes: float, flying: float, noise_m
     return noisy
 
 
-def test_noise_holes_and_flying_pixels_neither_pull_the_eyes_nor_shake_them_and_sigma_is_true() -> None:
+def test_noise_holes_and_flying_pixels_hardly_move_the_eyes() -> None:
     colour, depth, (truth,) = scene(PLACE, intrinsics=CAMERA)
     finder, errors, sigmas = EyeFinder(), [], []
     for number in range(30):
@@ -80,7 +80,7 @@ def test_depth_that_stops_is_bridged_by_this_viewers_eye_distance() -> None:
 
 @pytest.mark.parametrize("has_depth", [False, True])
 @pytest.mark.parametrize("place", [(0.3, 0.05, 0.6), (-0.2, -0.25, 0.6), (0.0, 0.0, 0.6)])
-def test_the_eyes_of_a_head_beside_the_picture_s_middle_are_across_its_line_of_sight(
+def test_an_off_centre_head_s_eyes_lie_across_its_line_of_sight(
     place: tuple[float, float, float], has_depth: bool
 ) -> None:
     """A head that looks into the camera: one eye is nearer to the picture's plane than the other."""
@@ -109,14 +109,14 @@ def seen(points_m: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("depth_mm", [0, 90, 9000], ids=["nothing", "too near", "the wall"])
-def test_depth_that_makes_no_person_of_a_face_gives_no_eyes_and_says_so(depth_mm: int) -> None:
+def test_depth_that_fits_no_person_gives_no_eyes_and_a_reason(depth_mm: int) -> None:
     colour, depth, _ = scene(PLACE, intrinsics=CAMERA)
     finder = EyeFinder()
     assert finder.find(frame(colour, np.full_like(depth, depth_mm), CAMERA)) is None
     assert finder.reason == "no depth of a person's size on the face"
 
 
-def test_a_camera_without_depth_knows_the_distance_as_well_as_people_s_eyes_are_alike() -> None:
+def test_without_depth_the_distance_is_as_good_as_eye_separations_are_alike() -> None:
     colour, _, (truth,) = scene(PLACE, intrinsics=CAMERA)
     learnt, known = EyeFinder(), EyeFinder(with_settings(calibration={"ipd_m": IPD_M}))
     for number in range(20):

@@ -30,7 +30,7 @@ def test_each_mistake_is_told_by_its_name(reason: str) -> None:
 
 @pytest.mark.parametrize("motion", MOTIONS)
 @pytest.mark.parametrize("seed", range(4))
-def test_no_viewer_who_moves_is_suspected_but_an_exchange_of_their_eyes_is(motion: str, seed: int) -> None:
+def test_no_moving_viewer_is_suspected_but_exchanged_eyes_are(motion: str, seed: int) -> None:
     for eyes in true_eyes(motion, np.arange(0, 20, 0.05), path=path_of(seed)):
         assert p.reason_against(eyes) == ""
         assert p.reason_against(eyes[::-1]) == p.EXCHANGED
@@ -68,7 +68,7 @@ def test_the_watch_tells_once_counts_by_reason_and_takes_it_back() -> None:
 @pytest.mark.parametrize(
     "reasons", [(p.MILLIMETRES, "", "", "", ""), ("uncertain",), ("elsewhere than the viewer", "")]
 )
-def test_a_few_bad_samples_blinks_and_other_people_are_counted_and_no_fault(reasons: tuple[str, ...]) -> None:
+def test_a_few_bad_samples_are_counted_and_are_no_fault(reasons: tuple[str, ...]) -> None:
     watch = p.RefusalWatch()
     assert not any([watch.update(reasons[k % len(reasons)]) for k in range(200)])
     assert watch.counts == {reasons[0]: 200 // len(reasons)} and watch.warning == ""

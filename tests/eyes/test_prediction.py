@@ -56,7 +56,7 @@ def constant_velocity(measured: F64, *, q: float, ahead_s: float) -> F64:
 
 
 @pytest.mark.parametrize("motion", [name for name in MOTIONS if name != "still"])
-def test_at_60_ms_it_is_as_good_as_the_best_plain_filter_tuned_for_the_motion(motion: str) -> None:
+def test_at_60_ms_it_matches_the_best_plain_filter(motion: str) -> None:
     observed = observe(motion, seconds=20.0, rate_hz=RATE_HZ, outliers=0.0, dropout_every_s=0.0)
     measured = np.array([o.points.eyes_m.mean(0) for o in observed])
     ours, ahead_s = p95_mm(tracked(observed), motion, observed), AHEAD_NS / NS_PER_S

@@ -30,9 +30,7 @@ def test_the_models_are_those_that_were_shipped() -> None:
 @pytest.mark.parametrize("portrait", [eileen(), grace()], ids=["eileen", "grace"])
 @pytest.mark.parametrize("distance_m", [0.5, 0.75, 1.0, 1.5])
 @pytest.mark.parametrize("light", [1.0, 0.25])
-def test_both_pupils_are_found_to_a_millimetre_and_a_half_and_sigma_is_true(
-    portrait: Portrait, distance_m: float, light: float
-) -> None:
+def test_pupils_are_found_to_1_5_mm_and_sigma_is_true(portrait: Portrait, distance_m: float, light: float) -> None:
     place = np.array([0.05, -0.02, distance_m])
     colour, _, (truth,) = scene(place, intrinsics=CAMERA, portraits=(portrait,), noise=2)
     found = find_eyes((colour * light).astype(np.uint8))
@@ -96,7 +94,7 @@ def test_another_person_who_passes_in_front_is_not_the_viewer() -> None:
     assert not all(seen[10:18]) and all(seen[-2:]) and finder.viewer == 1
 
 
-def test_another_viewer_is_taken_once_the_first_is_gone_for_as_long_as_it_says() -> None:
+def test_another_viewer_is_taken_once_the_first_is_gone_long_enough() -> None:
     finder = PupilFinder(lock_ns=300_000_000)
     here = np.array([0.0, 0.0, 0.7])
     for number in range(14):

@@ -42,7 +42,7 @@ def watched(
 
 @pytest.mark.parametrize("noise_mm", [0.0, 0.5, 1.0, 2.0, 3.0])
 @pytest.mark.parametrize(("rate_hz", "seed"), [(30, 0), (30, 1), (60, 2), (3, 3)])
-def test_a_still_head_is_found_at_rest_once_and_near_where_it_is(noise_mm: float, rate_hz: float, seed: int) -> None:
+def test_a_still_head_is_found_at_rest_once_near_its_place(noise_mm: float, rate_hz: float, seed: int) -> None:
     told = watched(60, noise_m=noise_mm / 1000, rate_hz=rate_hz, seed=seed)
     rests_from_s = 1.1 if rate_hz > 8 else 3.0
     places = [place for time_s, _, place in told if time_s > rests_from_s]

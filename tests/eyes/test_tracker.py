@@ -48,7 +48,7 @@ def fed(count: int = 30, motion: Callable[..., Any] = lambda k: STILL, **noise: 
 # --- what an answer is called
 
 
-def test_at_a_sample_the_answer_is_exact_between_two_interpolated_and_after_the_last_predicted() -> None:
+def test_answers_are_exact_at_samples_interpolated_between_and_predicted_after() -> None:
     tracker, last = fed(motion=moving)
     exact, between, after = tracker.at(last - PERIOD), tracker.at(last - PERIOD // 2), tracker.at(last + 60 * MS)
     assert (exact.label, between.label, after.label) == ("exact", "interpolated", "predicted")
@@ -88,7 +88,7 @@ def test_a_stalled_stream_is_held_even_without_word_of_a_loss() -> None:
 
 
 @given(ms=st.integers(-2000, 2000))
-def test_every_answer_is_for_the_instant_asked_and_eyes_are_there_unless_none(ms: int) -> None:
+def test_every_answer_is_for_the_instant_asked_with_eyes_unless_none(ms: int) -> None:
     assert Tracker().at(ms) == EyesEstimate(ms, 0, None, "none")
     tracker, last = fed()
     answer = tracker.at(last + ms * MS)
@@ -136,7 +136,7 @@ def test_a_single_bad_sample_changes_nothing_and_is_refused_with_its_reason(bad:
     assert tracker.update(points(), capture_ns=last + PERIOD) == NOT_NEWER
 
 
-def test_a_hasty_head_is_believed_at_its_second_sample_and_another_person_once_the_viewer_is_gone() -> None:
+def test_a_hasty_head_is_followed_at_its_second_sample() -> None:
     tracker, last = fed()
     hasty, far = STILL + np.array([0.0, 0.017, 0.0]), STILL + np.array([0.0, 0.4, 0.0])
     told = [tracker.update(points(hasty), capture_ns=last + k * PERIOD) for k in (1, 2)]
@@ -163,7 +163,7 @@ def drawn(covariance_m2: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDAr
     return np.array(off)[60:], np.array(told)[60:]
 
 
-def test_right_up_and_depth_are_believed_by_their_own_noise_and_sigma_is_what_it_does_to_the_picture() -> None:
+def test_each_axis_is_weighted_by_its_own_noise() -> None:
     fine = np.diag([0.002, 0.0001, 0.0001]) ** 2
     off, told = drawn(fine)
     coarse, _ = drawn(np.eye(3) * 0.002**2)
@@ -254,7 +254,7 @@ def test_an_eye_that_was_filled_in_pulls_less() -> None:
 
 
 @pytest.mark.parametrize("since_ms", [40, 60, 90, 119])
-def test_lost_eyes_go_on_until_the_loss_and_then_come_to_rest_with_the_time_constant(since_ms: int) -> None:
+def test_lost_eyes_move_on_until_the_loss_and_then_come_to_rest(since_ms: int) -> None:
     tracker, last = fed(60, moving)
     tracker.update(None, capture_ns=last + PERIOD)
     held = tracker.at(last + since_ms * MS)

@@ -19,7 +19,7 @@ def layers(value: int) -> np.ndarray:
 
 
 @given(st.lists(st.sets(st.integers(0, 5)), max_size=30))
-def test_whatever_is_held_stays_as_it_was_and_no_more_buffers_are_made_than_are_held_at_once(story: Any) -> None:
+def test_held_buffers_never_change_and_no_more_are_made_than_held(story: Any) -> None:
     """story: which of the copies that are held are let go before each next one."""
     buffers, held, most = LayerBuffers(), [], 0
     for value, letting_go in enumerate(story):

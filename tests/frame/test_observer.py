@@ -100,7 +100,7 @@ def looking(
 # --- lines -------------------------------------------------------------------------------------------------------
 
 
-def test_a_line_waits_until_the_recording_has_told_where_the_eyes_were_at_its_light_and_tells_it(
+def test_a_line_waits_for_the_recorded_truth_at_its_display_time(
     content: ContentSource,
 ) -> None:
     observer, kept = looking(content)
@@ -164,9 +164,7 @@ def test_nothing_measured_is_null(content: ContentSource, solved: Solution) -> N
     assert observer.moment is None
 
 
-def test_quality_is_of_what_the_panels_show_at_the_eyes_used_and_at_the_true_ones(
-    content: ContentSource, solved: Solution
-) -> None:
+def test_quality_is_measured_at_the_eyes_used_and_at_the_true_ones(content: ContentSource, solved: Solution) -> None:
     observer, _ = looking(content, measure=True, evaluate_every=1)
     used, true = aside(0.015), aside(0.012)
     seen = refresh(1, solved, eyes_m=used)
@@ -200,7 +198,7 @@ def test_every_so_many_refreshes_are_sampled_while_tracking_and_no_others(
 
 
 @pytest.mark.parametrize("change", [{"presented": False}, {"eyes_m": None}, {"flatness": 0.5}])
-def test_what_no_eye_saw_and_a_mixture_with_the_flat_picture_are_not_measured(
+def test_unseen_pictures_and_mixtures_with_the_flat_one_are_not_measured(
     content: ContentSource, solved: Solution, change: dict[str, Any]
 ) -> None:
     observer, _ = looking(content, measure=True, evaluate_every=1)
@@ -222,9 +220,7 @@ def test_a_short_run_measures_its_last_refresh(content: ContentSource, solved: S
     assert observer.moment is not None
 
 
-def test_the_moment_to_show_is_the_last_refresh_by_its_number_and_in_real_time_the_newest_measured(
-    content: ContentSource, solved: Solution
-) -> None:
+def test_the_moment_shown_is_the_last_or_in_real_time_newest_measured(content: ContentSource, solved: Solution) -> None:
     for simulated, shown in ((True, 3), (False, 0)):
         observer, _ = looking(content, simulated=simulated, measure=True, evaluate_every=1)
         for number in range(4):
@@ -245,7 +241,7 @@ def test_who_stops_a_run_waits_for_no_measurement(content: ContentSource, solved
     assert observer.moment is None and solver.tasks == []
 
 
-def test_in_real_time_one_measurement_is_under_way_at_a_time_and_no_refresh_waits_for_it(
+def test_in_real_time_one_measurement_runs_at_a_time_and_delays_nothing(
     content: ContentSource, solved: Solution
 ) -> None:
     solver = Drawing(content, at_once=False)
@@ -278,9 +274,7 @@ def test_comparing_is_not_the_presenter_s_nor_the_solver_s_work(
 # --- kept light --------------------------------------------------------------------------------------------------
 
 
-def test_every_nth_refresh_leaves_what_the_panels_show_and_what_the_judge_needs(
-    content: ContentSource, solved: Solution
-) -> None:
+def test_every_nth_refresh_leaves_what_a_judge_needs(content: ContentSource, solved: Solution) -> None:
     observer, kept = looking(content, keep_light=4)
     shown = {}
     for number in range(12):

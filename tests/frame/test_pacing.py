@@ -42,15 +42,13 @@ def refresh(pacer: Pacer, display: Display, now_ns: int, *, work_ns: int) -> tup
     return timing, blank_ns
 
 
-def test_the_first_refresh_comes_at_once_and_its_light_after_the_scan_out() -> None:
+def test_the_first_refresh_comes_at_once_with_light_after_the_scan_out() -> None:
     timing = pacer(work_ns=2 * NS_PER_MS).predict(1000)
     assert timing == FrameTiming(0, 1000, 1000 + 2 * NS_PER_MS, 1000 + 2 * NS_PER_MS + PHOTON_NS)
 
 
 @pytest.mark.parametrize(("late_periods", "skipped"), [(0.4, 0), (0.6, 1), (1.4, 1), (1.6, 2), (10.6, 11)])
-def test_who_comes_too_late_for_a_slot_takes_a_later_one_and_every_slot_between_is_missed(
-    late_periods: float, skipped: int
-) -> None:
+def test_a_late_refresh_takes_a_later_slot_and_skipped_ones_are_missed(late_periods: float, skipped: int) -> None:
     paced = pacer()
     first = paced.predict(0)
     now_ns = first.wake_ns + PERIOD_NS + round(late_periods * PERIOD_NS)
@@ -61,7 +59,7 @@ def test_who_comes_too_late_for_a_slot_takes_a_later_one_and_every_slot_between_
 
 
 @given(st.lists(st.tuples(SHORT_NS, st.integers(0, 3 * PERIOD_NS)), max_size=60), st.integers(0, PERIOD_NS))
-def test_whatever_happens_slots_ascend_on_one_grid_none_is_lost_and_none_begins_far_too_late(
+def test_slots_always_ascend_on_one_grid_and_none_starts_far_too_late(
     story: list[tuple[int, int]], work_ns: int
 ) -> None:
     """story: for each refresh, how long it worked, and what else held it up."""
@@ -90,7 +88,7 @@ def test_without_blanks_the_light_is_told_from_when_presenting_was_done() -> Non
     assert paced.presented(timing, woke_ns=0, done_ns=5 * NS_PER_MS) == 5 * NS_PER_MS + PHOTON_NS
 
 
-def test_the_time_that_a_refresh_works_is_learnt_and_it_wakes_so_much_earlier() -> None:
+def test_the_working_time_of_a_refresh_is_learnt_for_its_wake_up() -> None:
     paced, now_ns = pacer(), 0
     for _ in range(40):
         timing = paced.predict(now_ns)
@@ -101,9 +99,7 @@ def test_the_time_that_a_refresh_works_is_learnt_and_it_wakes_so_much_earlier() 
 
 
 @given(st.floats(0, 1), st.floats(0.998, 1.002))
-def test_refreshes_follow_the_display_s_own_blanks_wherever_they_lie_and_as_they_drift(
-    phase: float, pace: float
-) -> None:
+def test_refreshes_follow_the_display_s_own_drifting_blanks(phase: float, pace: float) -> None:
     """The configured period is a nominal one; a monitor's own differs, and its phase is anything."""
     display = Display(period_ns=pace * PERIOD_NS, phase_ns=phase * PERIOD_NS)
     paced, now_ns = pacer(), 0
@@ -115,7 +111,7 @@ def test_refreshes_follow_the_display_s_own_blanks_wherever_they_lie_and_as_they
     assert np.abs(errors[200:]).max() <= 0.025 * PERIOD_NS
 
 
-def test_a_blank_that_was_missed_is_counted_once_and_the_next_refresh_keeps_off_it() -> None:
+def test_a_missed_blank_is_counted_once_and_the_next_refresh_avoids_it() -> None:
     display, paced = Display(PERIOD_NS), pacer(work_ns=NS_PER_MS)
     now_ns, blanks = 0, []
     for number in range(60):
@@ -135,7 +131,7 @@ def lead(paced: Pacer) -> int:
 
 
 @pytest.mark.parametrize("work_ms", [0.5, 3.0, 6.0])
-def test_a_display_that_is_drawn_for_long_before_its_blank_misses_next_to_none_once_it_is_known(work_ms: float) -> None:
+def test_a_slow_display_misses_next_to_no_blank_once_it_is_known(work_ms: float) -> None:
     display, paced, now_ns = Display(PERIOD_NS, phase_ns=5 * NS_PER_MS), pacer(), 0
     blanks = []
     for _ in range(4000):
@@ -145,7 +141,7 @@ def test_a_display_that_is_drawn_for_long_before_its_blank_misses_next_to_none_o
     assert np.mean(intervals > 1.5) <= 0.004
 
 
-def test_a_refresh_that_was_left_out_on_purpose_keeps_its_slot_and_is_no_missed_blank() -> None:
+def test_a_deliberately_skipped_refresh_keeps_its_slot_and_is_not_missed() -> None:
     display, paced, now_ns = Display(PERIOD_NS), pacer(), 0
     for _ in range(20):
         _, now_ns = refresh(paced, display, now_ns, work_ns=NS_PER_MS // 4)

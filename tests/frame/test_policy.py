@@ -54,11 +54,11 @@ def test_the_flat_picture_comes_first_since_something_must_be_shown_to_nobody() 
     assert Told().kinds(wish(None, flat=True), wish(None, flat=True)) == ["flat", "nothing"]
 
 
-def test_the_flat_picture_is_there_before_it_is_needed_and_then_eyes_are_solved_for() -> None:
+def test_the_flat_picture_is_made_before_it_is_needed() -> None:
     assert Told().kinds(wish(), wish(), wish()) == ["flat", "solve", "nothing"]
 
 
-def test_eyes_that_are_where_they_were_are_solved_for_once_and_any_others_anew() -> None:
+def test_unmoved_eyes_are_solved_for_once_and_others_anew() -> None:
     told = Told()
     assert told.kinds(wish(), wish(), wish(EYES.copy()), wish(aside(1e-9)), wish(aside(1e-9))) == [
         "flat", "solve", "nothing", "solve", "nothing",
@@ -83,7 +83,7 @@ def test_paused_makes_nothing_new_whatever_changes_but_the_first_picture() -> No
     assert told.asked(wish(aside(0.1))).kind == "solve"
 
 
-def test_the_flat_picture_is_drawn_anew_each_time_that_it_comes_to_be_wanted_and_keeps_its_place_until_then() -> None:
+def test_the_flat_picture_is_redrawn_whenever_it_is_wanted_again() -> None:
     told = Told()
     told.kinds(wish(), wish())
     assert told.kinds(wish(None, flat=True), wish(None, flat=True), wish(None, flat=True)) == [
@@ -93,7 +93,7 @@ def test_the_flat_picture_is_drawn_anew_each_time_that_it_comes_to_be_wanted_and
     assert told.kinds(wish(None, flat=True), wish(None, flat=True)) == ["flat", "nothing"]
 
 
-def test_while_both_are_wanted_solutions_and_flat_pictures_of_moving_content_take_turns() -> None:
+def test_with_moving_content_solutions_and_flat_pictures_take_turns() -> None:
     told, kinds = Told(), []
     for revision in range(12):
         told.revision = revision
@@ -108,7 +108,7 @@ def test_while_both_are_wanted_solutions_and_flat_pictures_of_moving_content_tak
         max_size=40,
     )
 )
-def test_what_is_asked_for_again_and_again_is_there_soon_and_then_nothing_is_done(
+def test_a_repeated_request_is_soon_satisfied_and_then_nothing_is_done(
     story: list[tuple[float | None, bool, bool, int]],
 ) -> None:
     told = Told()

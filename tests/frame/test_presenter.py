@@ -46,7 +46,7 @@ def test_every_refresh_is_aligned_to_the_eyes_of_its_own_light(stage: Stage) -> 
     assert not np.array_equal(done.frame.solved_from_shown[0], np.eye(3))
 
 
-def test_the_alignment_of_a_refresh_is_from_the_eyes_of_the_solution_that_it_shows(stage: Stage) -> None:
+def test_a_refresh_is_aligned_from_the_eyes_of_the_solution_it_shows(stage: Stage) -> None:
     stage.eyes = moves
     stage.refresh(30)
     solved_for = aside(0.05)
@@ -67,7 +67,7 @@ def test_alignment_can_be_switched_off_while_it_runs(stage: Stage) -> None:
     assert len(stage.refresh()[0].frame.solved_from_shown) == STACK.count
 
 
-def test_eyes_that_are_too_far_from_the_solution_s_are_met_as_far_as_possible_and_that_is_told(stage: Stage) -> None:
+def test_eyes_too_far_off_are_aligned_as_far_as_possible(stage: Stage) -> None:
     stage.eyes = lambda _: aside(3.0)
     stage.refresh(30)
     machine = stage.presenter.machine
@@ -97,7 +97,7 @@ def test_an_eye_that_the_solution_was_not_made_for_moves_nothing(stage: Stage) -
     assert all(np.array_equal(a, b) for a, b in zip(done.frame.solved_from_shown, wanted, strict=True))
 
 
-def test_codes_never_change_at_rest_under_noise_and_do_when_the_same_head_moves() -> None:
+def test_at_rest_codes_ignore_noise_and_with_movement_they_change() -> None:
     """A 60 Hz head with 3 mm of noise: nothing shimmers."""
     from runtime.optics.alignment import shown_layers
 
@@ -122,7 +122,7 @@ def test_codes_never_change_at_rest_under_noise_and_do_when_the_same_head_moves(
 # --- the flat picture --------------------------------------------------------------------------------------------
 
 
-def test_before_the_first_solution_the_flat_picture_is_shown_whole_and_the_first_picture_is_not_faded_in() -> None:
+def test_before_the_first_solution_the_flat_picture_is_shown_without_fading() -> None:
     stage = Stage()
     stage.solver.hand_over(flat=solution(1, None))
     (done,) = stage.refresh()
@@ -134,7 +134,7 @@ def test_before_the_first_solution_the_flat_picture_is_shown_whole_and_the_first
     assert (done.frame.flatness, done.account.inference) == (0.0, "ran")
 
 
-def test_a_lost_viewer_is_held_then_the_picture_goes_flat_evenly_and_comes_back_evenly(stage: Stage) -> None:
+def test_a_lost_viewer_is_held_then_fades_to_flat_and_back(stage: Stage) -> None:
     stage.eyes = lambda s: EYES if s < 1.0 or s > 3.0 else None
     states, flatness = [], []
     for done in stage.refresh(5 * HZ):
@@ -224,7 +224,7 @@ def test_a_picture_is_vouched_to_be_unchanged_only_where_nothing_differs() -> No
 # --- faults ------------------------------------------------------------------------------------------------------
 
 
-def test_a_lost_panel_drops_refreshes_says_so_and_comes_back_with_the_newest(stage: Stage) -> None:
+def test_a_lost_panel_drops_refreshes_and_comes_back_with_the_newest(stage: Stage) -> None:
     stage.change(align=False)
     stage.refresh(2)
     assert stage.panels.unchanged
@@ -246,9 +246,7 @@ def test_a_lost_panel_drops_refreshes_says_so_and_comes_back_with_the_newest(sta
 
 
 @pytest.mark.parametrize("part", ["content", "model"])
-def test_what_the_solver_lacks_is_named_once_as_a_fault_and_the_last_solution_stays_aligned(
-    stage: Stage, part: str
-) -> None:
+def test_a_solver_fault_is_reported_once_and_the_last_solution_stays_aligned(stage: Stage, part: str) -> None:
     stage.solver.hand_over(**{part: "out of memory"})
     stage.eyes = moves
     done = stage.refresh(30)
@@ -289,7 +287,7 @@ def test_no_refresh_waits_for_the_solver() -> None:
 # --- what the solver is asked ------------------------------------------------------------------------------------
 
 
-def test_the_solver_is_asked_for_the_eyes_in_the_middle_of_the_time_that_its_solution_will_be_shown(
+def test_eyes_are_requested_for_the_middle_of_the_solution_s_showing(
     stage: Stage,
 ) -> None:
     stage.eyes = moves
@@ -307,7 +305,7 @@ def test_the_solver_is_asked_for_the_eyes_in_the_middle_of_the_time_that_its_sol
 # --- accounts ----------------------------------------------------------------------------------------------------
 
 
-def test_a_solution_ran_with_the_refresh_that_first_shows_it_and_is_reused_after_that(stage: Stage) -> None:
+def test_a_solution_ran_at_its_first_refresh_and_is_reused_later(stage: Stage) -> None:
     stage.solver.hand_over(solved=solution(3, stage_ms={"render": 8.0, "inference": 3.0}))
     told = [done.account for done in stage.refresh(3)]
     assert [account.inference for account in told] == ["ran", "reused", "reused"]

@@ -21,7 +21,7 @@ def cell() -> RunCell:
     return RunCell(Settings(), calibration=load_calibration(None), content=Part(), predictor=Part())
 
 
-def test_changes_from_many_threads_are_all_made_and_each_part_is_handed_back_once(cell: RunCell) -> None:
+def test_concurrent_changes_are_all_made_and_each_part_handed_back_once(cell: RunCell) -> None:
     handed_back = []
     mine = [[Part() for _ in range(50)] for _ in range(4)]
 

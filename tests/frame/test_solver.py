@@ -40,14 +40,14 @@ def solver(cell: RunCell) -> Solver:
     return made
 
 
-def test_the_flat_picture_is_for_eyes_anywhere_and_the_same_on_every_pixel_s_way(cell: RunCell) -> None:
+def test_the_flat_picture_is_for_eyes_anywhere_and_equal_along_every_ray(cell: RunCell) -> None:
     flat = Solver(cell, SMALL).step(wish(None, flat=True)).flat
     assert flat.solved_for_m is None
     assert flat.layers.shape == (3, 108, 192, 4)
     assert set(flat.stage_ms) == {"render"}
 
 
-def test_a_solution_is_what_the_model_makes_of_what_the_content_shows_these_eyes(solver: Solver, cell: RunCell) -> None:
+def test_a_solution_is_the_model_s_answer_to_the_content_s_pictures(solver: Solver, cell: RunCell) -> None:
     state = cell.state
     solution = solver.step(wish(time_ns=77)).solution
     job = drawn_for(state.predictor, state.content, EYES, time_ns=77, trimmed=True, eye_sigma_mm=solution.eye_sigma_mm)
@@ -101,7 +101,7 @@ def test_content_that_moves_is_solved_for_at_its_instant(solver: Solver, cell: R
     moving.close()
 
 
-def test_the_less_sure_the_eyes_the_more_the_solution_is_made_to_hold(solver: Solver) -> None:
+def test_less_certain_eyes_get_a_more_tolerant_solution(solver: Solver) -> None:
     sigmas = [solver.step(wish(aside(k / 100), sigma_m=k / 1000)).solution.eye_sigma_mm for k in range(4)]
     assert sigmas == pytest.approx([0.0, 1.0, 2.0, 3.0]), "the tracker's alone"
 
@@ -119,7 +119,7 @@ def test_after_its_budget_no_further_step_begins_but_on_a_simulated_clock(cell: 
 OFF_M = np.array([[0.123, 0.43, 0.0], [0.078, 0.47, 0.0]])  # the right eye is 80.6 degrees off the axis
 
 
-def test_an_eye_that_can_t_see_the_display_gives_way_to_the_other(solver: Solver, cell: RunCell) -> None:
+def test_an_eye_beside_the_display_gets_the_other_s_picture(solver: Solver, cell: RunCell) -> None:
     solution = solver.step(wish(OFF_M)).solution
     assert solution.seeing == (True, False)
     assert np.array_equal(solution.solved_for_m, OFF_M[[0, 0]])
@@ -167,7 +167,7 @@ def test_a_model_that_fails_is_named_and_tried_again(
     assert solver.step(wish()).missing == {}
 
 
-def test_where_not_even_the_flat_picture_can_be_drawn_there_is_an_even_one(
+def test_where_even_the_flat_picture_fails_a_uniform_one_is_shown(
     cell: RunCell, content: ContentSource, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
@@ -181,7 +181,7 @@ def test_where_not_even_the_flat_picture_can_be_drawn_there_is_an_even_one(
     assert step.flat.layers.std() > 1
 
 
-def test_a_fault_that_is_over_is_told_no_more_though_nothing_is_to_be_made(
+def test_a_fault_that_is_over_is_cleared_without_new_work(
     solver: Solver, content: ContentSource, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A revision that could not be asked for once, while the head rests."""

@@ -50,7 +50,7 @@ def host(parts: FakeParts, clock: SimulatedClock) -> SimulatedSolver:
     return SimulatedSolver(parts, clock)
 
 
-def test_a_solution_is_handed_over_when_its_cost_has_passed_and_not_before(
+def test_a_solution_is_handed_over_exactly_when_its_cost_has_passed(
     host: SimulatedSolver, clock: SimulatedClock
 ) -> None:
     host.post(wish(5))
@@ -62,7 +62,7 @@ def test_a_solution_is_handed_over_when_its_cost_has_passed_and_not_before(
     assert made.stage_ms == {"render": 8.0, "prepare": 4.0, "inference": 3.0, "finish": 8.0}
 
 
-def test_of_several_wishes_while_it_is_busy_the_newest_is_solved_next_and_begins_where_the_last_one_ended(
+def test_a_busy_solver_takes_the_newest_request_next(
     host: SimulatedSolver, parts: FakeParts, clock: SimulatedClock
 ) -> None:
     begun_ns = clock.now_ns()
@@ -131,9 +131,7 @@ def test_what_failed_is_told_and_the_last_solution_stays(
     assert host.news().missing == {}
 
 
-def test_a_task_is_done_at_once_and_where_it_is_not_done_again_at_every_step(
-    host: SimulatedSolver, parts: FakeParts
-) -> None:
+def test_a_task_is_done_at_once_or_retried_at_every_step(host: SimulatedSolver, parts: FakeParts) -> None:
     seen: list[Any] = []
 
     def task(given: Any) -> bool:

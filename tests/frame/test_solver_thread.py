@@ -129,7 +129,7 @@ def shop() -> Iterator[Workshop]:
     made.close()
 
 
-def test_parts_are_made_used_and_closed_on_one_thread_that_is_not_the_presenter_s(shop: Workshop) -> None:
+def test_parts_live_on_one_thread_that_is_not_the_presenter_s(shop: Workshop) -> None:
     threads = []
     shop.behave = lambda request: (threads.append(threading.current_thread().name), solves(request))[1]
     shop.solve(1)
@@ -150,7 +150,7 @@ def test_what_can_t_be_made_is_raised_to_who_waits_for_it() -> None:
     host.close(PATIENCE_S)
 
 
-def test_who_waits_for_one_that_is_never_ready_gives_up_or_stops_waiting() -> None:
+def test_waiting_for_a_solver_that_is_never_ready_can_be_ended() -> None:
     gate = threading.Event()
     host = SolverThread(lambda: FakeParts(lambda _: SolverStep()) if gate.wait(PATIENCE_S) else None, MonotonicClock())
     with pytest.raises(FatalError, match=r"not ready after 0\.2 s"):
@@ -197,7 +197,7 @@ def test_what_is_late_is_reported_in_milliseconds_while_the_last_solution_stays(
     assert shop.host.news().solution.solved_for_ns == 1
 
 
-def test_one_late_step_is_no_fault_and_late_ones_in_a_row_are_until_as_many_are_in_time(shop: Workshop) -> None:
+def test_one_late_step_is_no_fault_and_several_in_a_row_are(shop: Workshop) -> None:
     def slow(request: SolveRequest) -> SolverStep:
         shop.clock.advance_ns(round(1.5 * LATE_S * NS_PER_S))
         return solves(request)
@@ -213,7 +213,7 @@ def test_one_late_step_is_no_fault_and_late_ones_in_a_row_are_until_as_many_are_
     assert shop.host.news().missing == {}
 
 
-def test_a_step_that_does_not_return_is_left_behind_and_the_solver_made_anew_serves(shop: Workshop) -> None:
+def test_a_step_that_never_returns_is_abandoned_for_a_new_solver(shop: Workshop) -> None:
     shop.solve(1)
     shop.behave = shop.hang
     shop.post(2)
@@ -227,7 +227,7 @@ def test_a_step_that_does_not_return_is_left_behind_and_the_solver_made_anew_ser
     assert shop.host.news().missing == {}
 
 
-def test_what_a_step_that_was_left_behind_makes_after_all_counts_no_more(shop: Workshop) -> None:
+def test_what_an_abandoned_step_makes_is_ignored(shop: Workshop) -> None:
     shop.behave = shop.hang
     shop.post(1)
     shop.left()
@@ -238,7 +238,7 @@ def test_what_a_step_that_was_left_behind_makes_after_all_counts_no_more(shop: W
     assert shop.host.news().solution.solved_for_ns == 2
 
 
-def test_a_solver_that_hangs_again_and_again_leaves_no_more_than_a_few_threads(shop: Workshop) -> None:
+def test_a_solver_that_hangs_repeatedly_leaves_few_threads(shop: Workshop) -> None:
     shop.behave = shop.hang
     for number in range(1, ABANDONED_MAX + 1):
         shop.post(number)
@@ -256,7 +256,7 @@ def test_a_solver_that_hangs_again_and_again_leaves_no_more_than_a_few_threads(s
     assert shop.host.news().solution.solved_for_ns == 50
 
 
-def test_a_step_that_raises_is_told_at_once_and_the_solver_made_anew(shop: Workshop) -> None:
+def test_a_step_that_raises_is_reported_and_the_solver_remade(shop: Workshop) -> None:
     """`Solver.step` answers with what is missing; what is raised beside it must not end solving silently."""
     shop.solve(1)
 
@@ -275,7 +275,7 @@ def test_a_step_that_raises_is_told_at_once_and_the_solver_made_anew(shop: Works
     assert shop.host.news().missing == {}
 
 
-def test_where_it_can_t_be_made_anew_that_is_told_and_tried_again(shop: Workshop) -> None:
+def test_a_failure_to_remake_the_solver_is_reported_and_retried(shop: Workshop) -> None:
     shop.behave = shop.hang
     shop.post(1)
     shop.refuse = RuntimeError("no memory")
@@ -306,7 +306,7 @@ def test_a_task_is_asked_again_after_every_step_until_it_is_done(shop: Workshop)
     assert asked == [shop.all[0]] * 3
 
 
-def test_tasks_that_wait_behind_a_hung_step_are_done_by_the_solver_made_anew(shop: Workshop) -> None:
+def test_tasks_behind_a_hung_step_are_done_by_the_new_solver(shop: Workshop) -> None:
     shop.behave = shop.hang
     shop.post(1)
     done: queue.Queue[Any] = queue.Queue()

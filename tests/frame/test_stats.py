@@ -61,14 +61,14 @@ def test_what_was_not_measured_is_none() -> None:
     assert (alone["fps"], alone["photon_ms"], alone["solution_age_ms"], alone["eye_sigma_mm"]) == (None,) * 4
 
 
-def test_a_refresh_that_should_have_shown_a_picture_and_did_not_is_dropped_and_parts_two_intervals() -> None:
+def test_a_refresh_without_its_picture_is_dropped_and_splits_the_interval() -> None:
     stats = told([account(k, presented=k != 5) for k in range(11)])
     summary = stats.summary(stale_inputs=0)
     assert (summary["presented"], summary["dropped"]) == (10, 1)
     assert summary["interval_ms"]["p99"] == 20.0  # none of 40 ms is made up
 
 
-def test_overhead_leaves_out_the_first_refresh_which_pays_for_what_is_made_once() -> None:
+def test_overhead_leaves_out_the_first_refresh() -> None:
     stats = RunStats()
     stats.add(account(0), overhead_ms=500.0)
     assert stats.summary(stale_inputs=0)["overhead_ms"] is None
@@ -81,7 +81,7 @@ def test_in_simulated_time_every_figure_is_the_run_s_clock_s() -> None:
     assert stats.summary(stale_inputs=0, simulated=True)["overhead_ms"]["p50"] == pytest.approx(0.3)
 
 
-def test_rates_now_are_of_the_last_second_and_those_of_the_run_are_not() -> None:
+def test_rates_now_cover_the_last_second_alone() -> None:
     slow = [account(k, present_ns=k * NS_PER_S // 5) for k in range(100)]
     fast = [account(k, present_ns=20 * NS_PER_S + k * PERIOD_NS, inference="ran") for k in range(200)]
     stats = told(slow + fast)
@@ -89,7 +89,7 @@ def test_rates_now_are_of_the_last_second_and_those_of_the_run_are_not() -> None
     assert stats.summary(stale_inputs=0)["fps"] < 15
 
 
-def test_quantiles_are_of_the_whole_run_and_a_stall_early_on_is_not_forgotten() -> None:
+def test_quantiles_cover_the_whole_run_and_remember_an_early_stall() -> None:
     """After 8,192 refreshes it was."""
     figures = Quantiles(64)
     for number in range(10_000):

@@ -49,7 +49,7 @@ def watched(
 
 
 @pytest.mark.parametrize("noise_mm", [0.0, 1.0, 3.0])
-def test_a_head_at_rest_is_rested_and_its_eyes_stay_to_the_last_bit_whatever_the_noise(noise_mm: float) -> None:
+def test_a_resting_head_s_eyes_stay_identical_whatever_the_noise(noise_mm: float) -> None:
     told = watched(viewer(), 6.0, noise_m=noise_mm / 1000)[2 * DISPLAY_HZ :]
     assert {estimate.label for estimate in told} == {"rested"}
     assert len({estimate.eyes_m.tobytes() for estimate in told}) == 1
@@ -57,19 +57,19 @@ def test_a_head_at_rest_is_rested_and_its_eyes_stay_to_the_last_bit_whatever_the
     assert all(0.0 < estimate.sigma_m < 0.003 for estimate in told)
 
 
-def test_a_moving_head_is_predicted_and_its_eyes_differ_from_refresh_to_refresh() -> None:
+def test_a_moving_head_is_predicted_differently_at_every_refresh() -> None:
     told = watched(viewer(), 3.0, noise_m=0.003, y_m=lambda s: 0.1 * np.sin(2 * s))[DISPLAY_HZ:]
     assert {estimate.label for estimate in told} == {"predicted"}
     assert all((a.eyes_m != b.eyes_m).any() for a, b in pairwise(told))
 
 
-def test_where_the_plan_may_not_let_it_rest_every_refresh_is_predicted_anew() -> None:
+def test_where_the_plan_forbids_rest_every_refresh_is_predicted() -> None:
     told = watched(viewer(plan={"enabled": False}), 3.0, noise_m=0.003)[2 * DISPLAY_HZ :]
     assert {estimate.label for estimate in told} == {"predicted"}
     assert len({estimate.eyes_m.tobytes() for estimate in told}) == len(told)
 
 
-def test_eyes_that_are_lost_while_they_rest_are_held_where_they_rested_and_then_none() -> None:
+def test_eyes_lost_at_rest_are_held_there_and_then_none() -> None:
     seen = viewer(tracker={"hold_s": 0.4})
     told = watched(seen, 3.0, noise_m=0.003, lost=lambda s: s > 2.0)
     held = [estimate for estimate in told if estimate.label == "held"]
@@ -102,7 +102,7 @@ def test_looking_ahead_for_the_solver_changes_nothing_of_what_is_shown() -> None
         assert one.eyes_m is None or (one.eyes_m == other.eyes_m).all()
 
 
-def test_other_settings_of_the_plan_keep_what_the_tracker_knows_and_other_ones_of_its_own_do_not() -> None:
+def test_the_tracker_is_reset_only_by_its_own_settings() -> None:
     seen = viewer()
     watched(seen, 1.0, noise_m=0.001)
     calibration = load_calibration(None)

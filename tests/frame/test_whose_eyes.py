@@ -120,7 +120,7 @@ PATTERNS = ("AB", "AAB", "ABB", "AABB", "AAABBB", "ABBB")  # the viewer is away 
 @pytest.mark.parametrize("motion", MOTIONS)
 @pytest.mark.parametrize("kind", [uncertain, outliers, another_person])
 @pytest.mark.parametrize("share", SHARES)
-def test_whatever_share_is_refused_the_viewer_s_eyes_are_served_and_sigma_is_no_less_than_half_the_error(
+def test_whatever_is_refused_sigma_is_at_least_half_the_error(
     share: float, kind: Callable[[float], Tamper], motion: str
 ) -> None:
     served = serve(motion, kind(share))
@@ -130,7 +130,7 @@ def test_whatever_share_is_refused_the_viewer_s_eyes_are_served_and_sigma_is_no_
 
 @pytest.mark.parametrize("motion", MOTIONS)
 @pytest.mark.parametrize("pattern", PATTERNS)
-def test_two_people_in_turn_never_make_a_third_and_the_first_is_kept(pattern: str, motion: str) -> None:
+def test_two_people_in_turn_never_make_a_third_and_the_first_stays(pattern: str, motion: str) -> None:
     served = serve(motion, in_turn(pattern))
     assert served.p95_mm() <= 15.0
     assert served.error_mm.max() < 100.0  # the other is 370 mm away

@@ -59,7 +59,7 @@ def test_a_difference_is_told_with_run_refresh_field_and_both_values() -> None:
     assert told([[0.5]], None) == ["walk: refresh 0 eyes_m: stored [[0.5]], now None"]
 
 
-def test_within_its_tolerance_a_value_has_not_moved_and_a_nan_always_has() -> None:
+def test_a_value_within_its_tolerance_has_not_moved_and_nan_always_has() -> None:
     assert told([0.1], [0.1 + 9e-7]) == []
     assert told([0.1], [float("nan")]) != []
 
@@ -74,7 +74,7 @@ def test_a_run_of_another_length_has_moved() -> None:
     assert [moved.field for moved in compare_text([{}, {}], [{}])] == ["refreshes"]
 
 
-def test_many_differences_of_a_field_are_one_line_with_the_first_and_the_largest() -> None:
+def test_many_differences_of_a_field_give_one_line() -> None:
     stored = [{}, *({"psnr_db": 20.0} for _ in range(5))]
     now = [{}, *({"psnr_db": 20.0 + 0.1 * n} for n in range(5))]
     (line,) = as_lines("walk", compare_text(stored, now))
@@ -82,7 +82,7 @@ def test_many_differences_of_a_field_are_one_line_with_the_first_and_the_largest
     assert "4 values in 4 refreshes, most at refresh 4 by 0.4" in line
 
 
-def test_a_picture_has_moved_where_its_mean_has_or_where_a_few_pixels_have_by_much() -> None:
+def test_a_picture_has_moved_by_its_mean_or_by_a_few_pixels() -> None:
     stored = np.full((3, 54, 96, 3), 100, np.uint8)
     assert compare_picture(stored, stored, number=1, what="panels") == []
     far = stored.copy()

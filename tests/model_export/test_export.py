@@ -80,7 +80,7 @@ def test_the_eye_that_the_data_had_first_gets_the_first_channels(tmp_path: Path)
     assert not np.array_equal(layers["left-right"], layers["right-left"])
 
 
-def test_a_file_whose_weights_were_changed_differs_from_the_torch_it_came_from(tmp_path: Path) -> None:
+def test_a_file_with_changed_weights_differs_from_its_torch_source(tmp_path: Path) -> None:
     checkpoint = narrow_eyereal(tmp_path)
     model = onnx.load(exported(checkpoint))
     kernel = model.graph.initializer[0]

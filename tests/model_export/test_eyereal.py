@@ -173,7 +173,7 @@ def predictor_of(official: Path, folder: Path) -> Solver:
 
 
 @pytest.mark.parametrize("place", EYES)
-def test_what_the_network_is_fed_and_the_layers_that_are_shown_are_the_official_codes(
+def test_the_network_s_input_and_output_layers_are_the_official_code_s(
     official: Path, tmp_path: Path, place: str
 ) -> None:
     """All 18 channels of one pair: panel by panel, `_0` before `_1`, red before green before blue, black beside."""
@@ -199,7 +199,7 @@ def test_what_the_network_is_fed_and_the_layers_that_are_shown_are_the_official_
     predictor.close()
 
 
-def test_pictures_of_another_view_are_black_beside_the_network_s_own_40_degrees(official: Path, tmp_path: Path) -> None:
+def test_pictures_of_another_view_are_black_outside_the_network_s_40_degrees(official: Path, tmp_path: Path) -> None:
     """`--fov 70` shows the network what it was trained on: the 40 degrees in the middle."""
     pair = pair_of(tmp_path, "near")
     predictor = predictor_of(official, tmp_path)
@@ -214,7 +214,7 @@ def test_pictures_of_another_view_are_black_beside_the_network_s_own_40_degrees(
     predictor.close()
 
 
-def test_an_export_says_what_it_was_trained_for_only_where_that_is_known(official: Path) -> None:
+def test_an_export_states_its_training_only_where_it_is_known(official: Path) -> None:
     def trained_for(data: bytes) -> object:
         import onnx
 

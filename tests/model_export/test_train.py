@@ -64,7 +64,7 @@ def test_a_plane_is_drawn_where_the_projection_puts_it() -> None:
         assert (v_px * picture).sum() / picture.sum() == pytest.approx(v / w, abs=0.12)
 
 
-def test_pairs_of_a_scene_are_what_the_runtime_draws_of_it_from_anywhere() -> None:
+def test_pairs_of_a_scene_are_the_runtime_s_own_pictures_of_it() -> None:
     first, again, other = (Pairs(Form(), 3, 96, 54, 1.0, scene="demo").pair(number) for number in (0, 0, 1))
     assert np.array_equal(first.images, again.images) and np.array_equal(first.eyes_m, again.eyes_m)
     assert not np.array_equal(first.images[0], first.images[1]) and np.std(first.images) > 20
@@ -130,7 +130,7 @@ def test_training_raises_the_light_that_eyes_get_and_leaves_its_files(tmp_path: 
     assert _held_out_db(after, [batch], torch.device("cpu")) > _held_out_db(before, [batch], torch.device("cpu")) + 0.5
 
 
-def test_a_training_that_was_killed_goes_on_as_if_it_had_not_been(tmp_path: Path) -> None:
+def test_a_killed_training_continues_as_if_uninterrupted(tmp_path: Path) -> None:
     """kill -9 between two checkpoints; then --resume: the same curve and weights as without."""
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     run_training(whole, Training(**SHORT))

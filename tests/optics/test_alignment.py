@@ -58,7 +58,7 @@ def moved_px(matrix: np.ndarray, px: np.ndarray) -> np.ndarray:
 
 
 @given(stack=ANY_STACK, old=heads(), new=heads(), y=floats(-0.5, 0.5), z=floats(-0.5, 0.5))
-def test_the_ray_from_the_new_middle_through_any_reference_point_meets_what_the_old_one_met(
+def test_the_ray_from_the_new_midpoint_meets_what_the_old_one_met(
     stack: PanelStack, old: NDArray[np.float64], new: NDArray[np.float64], y: float, z: float
 ) -> None:
     aligned = align(stack, solved_for_m=old, eyes_m=new)
@@ -73,7 +73,7 @@ def test_the_ray_from_the_new_middle_through_any_reference_point_meets_what_the_
 @given(
     stack=ANY_STACK, middle=eyes(), half_m=floats(0.0, 0.04), step=st.tuples(floats(-0.05, 0.05), floats(-0.05, 0.05))
 )
-def test_a_head_that_moves_parallel_to_the_panels_is_aligned_exactly_for_each_of_its_eyes(
+def test_a_head_moving_parallel_to_the_panels_is_aligned_exactly(
     stack: PanelStack, middle: NDArray[np.float64], half_m: float, step: tuple[float, float]
 ) -> None:
     old = middle + np.array([[0.0, -half_m, 0.0], [0.0, half_m, 0.0]])
@@ -105,7 +105,7 @@ def test_a_panel_in_the_reference_plane_never_moves(
     assert matrices[stack.count // 2].tobytes() == np.eye(3).tobytes()
 
 
-def test_an_even_number_of_panels_meets_midway_between_the_two_in_the_middle() -> None:
+def test_an_even_number_of_panels_meets_between_the_middle_two() -> None:
     assert reference_x_m(PanelStack(0.5, 0.3, (0.01, 0.02, 0.04, 0.09), 64, 36)) == pytest.approx(0.03)
     assert reference_x_m(PanelStack(0.5, 0.3, (0.01, 0.02, 0.09), 64, 36)) == 0.02
 
@@ -162,7 +162,7 @@ def test_eyes_that_are_nowhere_leave_the_layers_as_they_are(bad: float) -> None:
 
 
 @pytest.mark.parametrize("x_m", [-1.0, 0.0, 0.06, 0.06 + 0.9 * NEAREST_M])
-def test_an_eye_at_or_behind_the_front_panel_holds_the_nearest_place_on_its_way(x_m: float) -> None:
+def test_an_eye_at_the_front_panel_is_held_at_the_nearest_place(x_m: float) -> None:
     new = HEAD.copy()
     new[0, 0] = x_m
     aligned = align(STACK, solved_for_m=HEAD, eyes_m=new)
@@ -173,7 +173,7 @@ def test_an_eye_at_or_behind_the_front_panel_holds_the_nearest_place_on_its_way(
     assert same(aligned, nearest)
 
 
-def test_eyes_far_from_those_solved_for_hold_where_an_outer_panel_would_leave_the_line() -> None:
+def test_eyes_too_far_off_are_held_where_an_outer_panel_would_leave() -> None:
     beyond = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.0, 4.0, 0.0]))
     assert "panel 0 is no longer in line" in beyond.limited and "4 m from where" in beyond.limited
     assert beyond.solved_from_shown[0][0, 2] == pytest.approx(MOST_SHIFT * 1920)
@@ -236,9 +236,7 @@ def slow_sample(layer: np.ndarray, m: np.ndarray, row: int, column: int) -> np.n
         matrix(shift_v=500.0),
     ],
 )
-def test_a_shown_pixel_is_the_bilinear_sample_of_the_solution_and_even_beside_it(
-    layers: np.ndarray, m: NDArray[np.float64]
-) -> None:
+def test_a_shown_pixel_is_a_bilinear_sample_and_mid_grey_outside(layers: np.ndarray, m: NDArray[np.float64]) -> None:
     shown = shown_layers(PanelFrame(1, layers, 1, (np.eye(3), np.eye(3), m)))
     assert np.array_equal(shown[:2], layers[:2])
     expected = np.array([[slow_sample(layers[2], m, row, column) for column in range(70)] for row in range(90)])
@@ -268,7 +266,7 @@ def test_the_aligned_solution_is_mixed_with_the_flat_picture_that_never_moves(la
     assert np.abs(shown - (0.75 * aligned + 0.25 * flat))[..., :3].max() <= 0.5 + 0.75 * 0.5
 
 
-def test_a_frame_that_has_nothing_to_show_or_more_than_scale_and_shift_is_refused(layers: np.ndarray) -> None:
+def test_a_frame_without_pictures_or_with_a_general_matrix_is_refused(layers: np.ndarray) -> None:
     with pytest.raises(ValueError, match="flat"):
         shown_layers(PanelFrame(1, None, 0))
     with pytest.raises(ValueError, match="flat"):

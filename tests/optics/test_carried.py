@@ -125,7 +125,7 @@ def test_light_of_tilted_panels_takes_the_rays_that_a_retina_takes() -> None:
     assert abs(untilted - expected.psnr_db) > 0.01, "this test must be able to fail"
 
 
-def test_eyes_that_are_where_the_layers_were_solved_for_see_the_exact_quality() -> None:
+def test_at_the_eyes_solved_for_carried_quality_is_the_exact_one() -> None:
     layers, pictures, eyes = case(STACKS[0], 1)
     exact = [seen_by(eye, layers, STACKS[0], fov_deg=30, width_px=SIZE[0], height_px=SIZE[1]) for eye in eyes]
     wanted = [picture.astype(np.float32) / np.float32(255) for picture in pictures]

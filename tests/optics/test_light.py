@@ -113,7 +113,7 @@ def test_a_pupil_is_a_disc_and_one_of_no_width_a_point() -> None:
         assert 3 * as_seen < as_not, "seen, but for the tracer's own noise"
 
 
-def test_few_rays_and_many_tell_the_same_error_of_which_their_own_noise_is_no_part() -> None:
+def test_few_rays_and_many_estimate_the_same_error_without_bias() -> None:
     layers, pictures = case(THREE, 4)
     seen = seen_by_both(layers, pupil_mm=4.0, rays=20)
     one_set = seen_by_both(layers, pupil_mm=4.0, rays=2)

@@ -24,7 +24,7 @@ def test_what_an_eye_sees_is_the_jones_product_between_crossed_polarizers(values
     assert float(intensity_from_phase(np.array(sum(values)))) == pytest.approx(by_hand, abs=1e-12)
 
 
-def test_crossed_polarizers_are_dark_without_a_rotation_and_bright_with_a_quarter_turn() -> None:
+def test_crossed_polarizers_are_dark_and_a_quarter_turn_is_bright() -> None:
     assert jones_intensity([0.0]) == 0.0
     assert jones_intensity([math.pi / 2]) == pytest.approx(1.0, abs=1e-15)
     # The erratum to (1): with the angle from the transmission axis it would be cos², bright without a rotation.

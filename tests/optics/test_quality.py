@@ -56,7 +56,7 @@ def test_ssim_is_that_of_scikit_image(seed: int, noise: float) -> None:
 
 
 @given(seeds, seeds)
-def test_two_eyes_are_pooled_by_their_squared_errors_and_not_by_their_decibels(first: int, second: int) -> None:
+def test_two_eyes_are_pooled_by_their_squared_errors(first: int, second: int) -> None:
     left, right = pictures(first, 0.02), pictures(second, 0.2)
     masks = [np.ones(left[0].shape[:2], bool), inner(right[0].shape)]
     pooled = quality([left[0], right[0]], [left[1], right[1]], masks)

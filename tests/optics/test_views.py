@@ -24,7 +24,7 @@ from tests.optics.strategies import eyes, floats, stacks
 
 
 @given(eyes(nearest_m=1e-6, farthest_m=1e6, off_axis_deg=180.0))
-def test_a_pose_is_a_rotation_that_looks_at_the_origin_with_its_head_upright(eye: np.ndarray) -> None:
+def test_a_pose_is_an_upright_rotation_that_looks_at_the_origin(eye: np.ndarray) -> None:
     pose = stack_from_eye(eye)
     rotation = pose[:3, :3]
     np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-15)
@@ -55,9 +55,7 @@ def test_on_the_vertical_axis_the_limit_from_the_front_is_taken(height: float) -
 
 
 @given(st.sampled_from([5e-324, 1e-310, 1e-300, 1e-200, 1e-100, 1e-12]), floats(-math.pi, math.pi), floats(0.1, 1e3))
-def test_beside_the_vertical_axis_the_head_is_turned_towards_the_axis_however_near(
-    off_m: float, turn: float, height: float
-) -> None:
+def test_beside_the_vertical_axis_the_head_turns_towards_it(off_m: float, turn: float, height: float) -> None:
     eye = np.array([off_m * math.cos(turn), off_m * math.sin(turn), height])
     assume(eye[0] != 0.0 or eye[1] != 0.0)
     rotation = stack_from_eye(eye)[:3, :3]

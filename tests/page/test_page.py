@@ -92,7 +92,7 @@ def test_without_the_token_nothing_is_told_or_done(page: Page, loop: Loop, path:
     assert code == 401 and b"secret" not in body and loop.told == []
 
 
-def test_no_answer_sets_a_cookie_which_a_page_on_another_port_would_be_sent(page: Page, loop: Loop) -> None:
+def test_no_answer_sets_a_cookie_that_another_port_would_get(page: Page, loop: Loop) -> None:
     for path in ("/", "/page.js", "/session.js", "/operator", f"/?token={page.token}", "/now/status"):
         assert "set-cookie" not in page.ask("GET", path, **page.bearer)[1]
 
@@ -157,7 +157,7 @@ def test_a_daemon_that_hangs_is_not_taken_for_none(page: Page, folder: Path) -> 
     assert eventually(lambda: page.look_up("status")["hangs"] is False)
 
 
-def test_without_a_daemon_it_says_so_and_when_one_is_back_it_goes_on(page: Page, folder: Path) -> None:
+def test_without_a_daemon_the_page_says_so_and_recovers_later(page: Page, folder: Path) -> None:
     assert eventually(lambda: "no daemon" in page.look_up("status").get("error", ""))
     assert page.ask("GET", "/now/status", **page.bearer)[0] == 503
     assert page.tell("pause")[0] == 503

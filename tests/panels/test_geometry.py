@@ -32,7 +32,7 @@ def test_without_registration_pixels_are_only_permuted(size: Any, rotation_deg: 
 
 
 @given(size=SIZES, rotation_deg=MOUNTED, mirror=MIRRORED, dx=st.floats(-20, 20), tilt=st.floats(-1e-5, 1e-5))
-def test_what_should_be_at_an_ideal_pixel_is_drawn_where_registration_found_it(
+def test_an_ideal_pixel_is_drawn_where_registration_found_it(
     size: Any, rotation_deg: Any, mirror: Any, dx: Any, tilt: Any
 ) -> None:
     width, height = size
@@ -55,7 +55,7 @@ def test_layers_of_half_the_resolution_fill_the_panel() -> None:
     assert not permutes_pixels(matrix)
 
 
-def test_a_shift_by_half_a_pixel_is_no_permutation_and_one_by_a_pixel_is() -> None:
+def test_a_shift_by_a_whole_pixel_is_a_permutation_by_half_not() -> None:
     assert not permutes_pixels(np.array([[1, 0, 0.5], [0, 1, 0], [0, 0, 1.0]]))
     assert permutes_pixels(np.array([[1, 0, 1.0], [0, 1, 0], [0, 0, 1.0]]))
 

@@ -95,9 +95,7 @@ def lit(x: XServer) -> list[bool]:
 
 
 @pytest.mark.windows
-def test_with_a_configuration_panels_are_shown_as_they_will_be_and_keys_go_from_one_to_the_next(
-    x: XServer, config: Path
-) -> None:
+def test_configured_panels_are_shown_as_mounted_and_keys_step_through_them(x: XServer, config: Path) -> None:
     bars = round(HEIGHT_PX * 0.85)
 
     def turned() -> bool:

@@ -70,14 +70,14 @@ def test_a_mode_of_the_stacks_shape_but_not_its_pixels_is_refused() -> None:
         check(PanelSettings(), small)
 
 
-def test_a_mode_of_another_shape_is_refused_and_a_panel_on_its_side_is_compared_as_it_is_seen() -> None:
+def test_a_wrong_mode_is_refused_and_a_rotated_panel_compared_as_seen() -> None:
     upright = replace(FULL, width_px=1080, height_px=1920)
     check(PanelSettings(rotation_deg=90), upright)
     with pytest.raises(PanelLost, match="panel 1: DP-1 shows 1080x1920"):
         check(PanelSettings(), upright)
 
 
-def test_rates_that_drift_apart_are_told_and_unknown_ones_are_not_guessed_at() -> None:
+def test_drifting_rates_are_reported_and_unknown_ones_not_guessed() -> None:
     assert refresh_difference([FULL, replace(FULL, connector="DP-2", refresh_hz=59.98)]) == ""
     assert refresh_difference([FULL, replace(FULL, refresh_hz=0.0)]) == ""
     told = refresh_difference([FULL, replace(FULL, connector="DP-2", refresh_hz=59.94)])

@@ -41,7 +41,7 @@ def shown(context: moderngl.Context, layers: NDArray[np.uint8], *panels: PanelSe
 
 @pytest.mark.parametrize(("rotation_deg", "clockwise_quarters"), [(0, 0), (90, 1), (180, 2), (270, 3)])
 @pytest.mark.parametrize(("mirror", "axis"), [("none", None), ("horizontal", 1), ("vertical", 0)])
-def test_a_mounted_panel_is_sent_its_picture_mirrored_then_turned_against_the_mounting(
+def test_a_mounted_panel_s_picture_is_mirrored_then_turned(
     context: moderngl.Context,
     layers: NDArray[np.uint8],
     rotation_deg: int,
@@ -137,14 +137,14 @@ def test_the_shader_shows_what_its_reference_says(
     assert (difference <= 1).mean() >= 0.999
 
 
-def test_a_panel_that_needs_no_alignment_is_fetched_to_the_bit_beside_those_that_do(sink: DrawnPanels) -> None:
+def test_an_unaligned_panel_is_exact_to_the_bit_beside_aligned_ones(sink: DrawnPanels) -> None:
     frame = PanelFrame(1, smooth(1), 1, align(STACK, solved_for_m=HEAD, eyes_m=HEAD * 1.01).solved_from_shown)
     sink.present(frame)
     assert np.array_equal(codes(sink.read_back())[1], codes(frame.solved)[1])
     assert not np.array_equal(codes(sink.read_back())[0], codes(frame.solved)[0])
 
 
-def test_a_registered_panel_is_aligned_first_and_then_sent_where_registration_found_it(
+def test_a_registered_panel_is_aligned_first_then_warped_by_its_registration(
     context: moderngl.Context,
 ) -> None:
     shift = PanelSettings(homography=((1.0, 0.0, 5.0), (0.0, 1.0, -3.0), (0.0, 0.0, 1.0)))
@@ -194,7 +194,7 @@ def test_a_solution_is_uploaded_once_however_often_it_is_aligned_and_shown(
     assert [id(layers) for layers in written[2:]] == [id(other)]
 
 
-def test_a_new_solution_is_shown_where_only_its_version_tells_it_from_the_old(sink: DrawnPanels) -> None:
+def test_a_new_solution_is_recognised_by_its_version_alone(sink: DrawnPanels) -> None:
     for version in (1, 2):
         sink.present(PanelFrame(version, smooth(version), version))
         assert np.array_equal(codes(sink.read_back()), codes(smooth(version)))

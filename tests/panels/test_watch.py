@@ -89,9 +89,7 @@ def test_layers_follow_monitors_that_change_places(x: XServer, opened: Callable[
     assert [monitor.connector for monitor in sink.monitors] == ["DUMMY2", "DUMMY0", "DUMMY1"]
 
 
-def test_a_monitor_in_a_mode_that_does_not_fit_is_held_and_named_until_it_is_put_right(
-    x: XServer, opened: Callable[..., Any]
-) -> None:
+def test_a_monitor_in_a_wrong_mode_is_held_and_named(x: XServer, opened: Callable[..., Any]) -> None:
     sink = opened(*BY_CONNECTOR)
     assert presents(sink, 0)
     x.set_mode(0, "tall")

@@ -45,9 +45,7 @@ def shows(x: XServer, monitor: int, expected: np.ndarray) -> bool:
     return eventually(lambda: np.array_equal(x.panel(monitor), expected[..., :3]))
 
 
-def test_a_panel_mounted_upside_down_and_one_mirrored_are_sent_what_sets_it_right(
-    x: XServer, opened: Callable[..., Any]
-) -> None:
+def test_upside_down_and_mirrored_panels_are_sent_corrected_pictures(x: XServer, opened: Callable[..., Any]) -> None:
     sink = opened(
         PanelSettings(connector="DUMMY0", rotation_deg=180),
         PanelSettings(connector="DUMMY1", mirror="horizontal"),
@@ -77,9 +75,7 @@ def presents(sink: WindowPanels, number: int) -> bool:
         return False
 
 
-def test_a_monitor_that_goes_is_named_and_one_that_returns_is_used_again(
-    x: XServer, opened: Callable[..., Any]
-) -> None:
+def test_a_lost_monitor_is_named_and_a_returning_one_used_again(x: XServer, opened: Callable[..., Any]) -> None:
     sink = opened(*BY_CONNECTOR)
     assert presents(sink, 0)
     x.unplug(1)
@@ -133,7 +129,7 @@ def test_the_aligned_picture_is_on_all_panels_in_the_same_frame(x: XServer, open
         assert (difference() <= 1).mean() >= 0.999
 
 
-def test_the_pacer_is_told_when_the_blank_was_and_how_often_one_comes(opened: Callable[..., Any]) -> None:
+def test_the_pacer_gets_the_time_and_period_of_vertical_blanks(opened: Callable[..., Any]) -> None:
     sink = opened(*BY_CONNECTOR)
     assert sink.period_ns == pytest.approx(1e9 / 60, rel=1e-3)
     first, second = sink.present(moved(0)), sink.present(moved(1))
@@ -156,9 +152,7 @@ def test_a_fault_while_drawing_leaves_the_new_frame_on_no_panel(
     assert eventually(lambda: presents(sink, 2))
 
 
-def test_an_unchanged_frame_stays_and_is_drawn_anew_where_the_windows_were_lost(
-    x: XServer, opened: Callable[..., Any]
-) -> None:
+def test_an_unchanged_frame_is_redrawn_only_if_windows_were_lost(x: XServer, opened: Callable[..., Any]) -> None:
     sink = opened(*BY_CONNECTOR)
     sink.present(frame(0))
     assert sink.present(frame(1), unchanged=True).number == 1

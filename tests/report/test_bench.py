@@ -51,7 +51,7 @@ def texts(old: dict[str, Any], new: dict[str, Any]) -> list[tuple[bool, str]]:
         ({}, {"ms": 100, "yardstick": 5}, "worse 2.00 times"),
     ],
 )
-def test_slower_than_the_noise_and_the_machine_is_worse_and_faster_is_better(old: Any, new: Any, found: str) -> None:
+def test_a_change_beyond_noise_is_worse_if_slower_and_better_if_faster(old: Any, new: Any, found: str) -> None:
     told = texts(regression_file(**old), regression_file(**new))
     assert len(told) == bool(found)
     assert " ".join(f"{'worse' if worse else 'better'} {text}" for worse, text in told).startswith(found)

@@ -22,9 +22,7 @@ def pixel(matrix: np.ndarray, point: np.ndarray) -> np.ndarray:
 
 
 @given(st.floats(0.2, 2.0), st.floats(-0.05, 0.05), st.floats(-0.05, 0.05), st.integers(0, 18))
-def test_every_point_of_the_pupil_sees_a_point_in_focus_at_the_same_pixel(
-    focus_m: float, right: float, up: float, index: int
-) -> None:
+def test_all_points_of_the_pupil_see_a_focused_point_alike(focus_m: float, right: float, up: float, index: int) -> None:
     pose = stack_from_eye(EYE)
     point = EYE - focus_m * pose[:3, 2] + right * pose[:3, 0] + up * pose[:3, 1]
     beside = focal.projection(EYE, pupil_points(focal.PUPIL_M)[index], focus_m=focus_m)
@@ -37,7 +35,7 @@ def test_the_middle_of_the_pupil_is_the_pinhole_eye() -> None:
     np.testing.assert_allclose(focal.projection(EYE, np.zeros(2), focus_m=0.3), plain, atol=1e-9)
 
 
-def test_out_of_focus_the_pupil_sees_a_disc_of_the_size_that_optics_gives() -> None:
+def test_out_of_focus_the_pupil_sees_a_disc_of_the_optical_size() -> None:
     """Blur = aperture·|1/f - 1/z|·focal length, from similar triangles."""
     pose = stack_from_eye(EYE)
     point = EYE - 0.5 * pose[:3, 2]

@@ -80,7 +80,7 @@ def die() -> None:
     os._exit(3)
 
 
-def test_a_measurement_in_a_process_of_its_own_answers_refuses_or_is_told_to_have_died() -> None:
+def test_a_measurement_process_answers_refuses_or_is_reported_dead() -> None:
     assert apart(echo, 7) == 7
     with pytest.raises(FatalError, match="file: field: is wrong"):
         apart(refuse)

@@ -45,7 +45,7 @@ def test_a_case_file_is_read_whole(tmp_path: Path) -> None:
     assert [view.mm for view in pair.off] == [2.0]
 
 
-def test_other_json_files_are_passed_over_and_views_beside_the_eyes_are_optional(tmp_path: Path) -> None:
+def test_other_json_files_are_ignored_and_views_off_the_eyes_optional(tmp_path: Path) -> None:
     case_folder(tmp_path, off=None)
     (tmp_path / "panels.json").write_text('{"width_m": 0.5, "height_m": 0.3, "x_m": [0.0, 0.1]}')
     (pair,) = read_pairs(tmp_path)

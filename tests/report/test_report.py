@@ -44,7 +44,7 @@ def test_mistakes_are_told_before_anything_is_measured_and_nothing_is_written(tm
         assert not (tmp_path / "out").exists()
 
 
-def test_a_model_that_does_not_fit_one_of_the_cases_is_refused_before_anything_is_measured(tmp_path: Path) -> None:
+def test_a_model_that_fits_not_every_case_is_refused_before_measuring(tmp_path: Path) -> None:
     """It was, after minutes, when its turn came."""
     (tmp_path / "cases").mkdir()
     case_folder(tmp_path / "cases", panels={"width_m": 0.5, "height_m": 0.3, "x_m": [-0.05, 0.05]}, off=None)
@@ -138,7 +138,7 @@ def test_texts_are_escaped() -> None:
 SCALE = 0.15
 
 
-def test_a_moving_head_sees_less_of_a_slow_solver_and_a_resting_one_as_much() -> None:
+def test_only_a_moving_head_sees_less_of_a_slow_solver() -> None:
     quick, slow, rests = (
         moving_run(motion, solver_ms, seconds=2.5, scale=SCALE)
         for motion, solver_ms in (("lean", 20.0), ("lean", 200.0), ("still", 200.0))

@@ -39,7 +39,7 @@ def driver_for(source: Any, **more: Any) -> Any:
     return OpenNI2Driver(SensorSettings(driver="openni2", source=str(source), **more), MonotonicClock())
 
 
-def test_a_recording_delivers_depth_in_mm_colour_of_the_same_instant_intrinsics_and_its_own_pace(oni: Any) -> None:
+def test_a_recording_delivers_depth_colour_and_intrinsics_at_its_own_pace(oni: Any) -> None:
     clock, frames = MonotonicClock(), []
     with driver_for(oni) as driver:
         for _ in range(6):
@@ -58,7 +58,7 @@ def test_a_recording_delivers_depth_in_mm_colour_of_the_same_instant_intrinsics_
     assert np.median(steps) == pytest.approx(1e9 / 30, rel=0.1)
 
 
-def test_a_recording_ends_unless_it_is_looped_and_can_be_opened_again_and_closed_twice(oni: Any) -> None:
+def test_a_recording_ends_unless_looped_and_can_be_reopened(oni: Any) -> None:
     driver = driver_for(oni)
     with driver, pytest.raises(EndOfRecording):
         for _ in range(20):
@@ -151,7 +151,7 @@ BUSY = "while True: pass"
 
 
 @pytest.mark.slow
-def test_recordings_that_are_closed_at_their_end_on_a_busy_machine_end_well(oni: Any) -> None:
+def test_recordings_closed_at_their_end_on_a_busy_machine_end_well(oni: Any) -> None:
     """Seen in CI: the library's own thread of a file outlives its device."""
     busy = [subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(3)]
     try:

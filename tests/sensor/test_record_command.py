@@ -93,7 +93,7 @@ def test_pictures_are_kept_only_with_images(tmp_path: Path) -> None:
         assert np.median(found) == pytest.approx(IPD_M, abs=0.004)
 
 
-def test_a_motion_replaces_a_motion_and_no_viewer_and_a_sensor_replaces_nothing(tmp_path: Path) -> None:
+def test_a_motion_replaces_only_a_motion_and_a_sensor_replaces_nothing(tmp_path: Path) -> None:
     """Seen: a sensor's recording was gone after `record --motion` to the same name, without a word."""
     out = tmp_path / "a.mcap"
     motion, sensor = ["--motion", "still", "--seconds", "1"], ["--seconds", "0.5"]
@@ -117,7 +117,7 @@ def test_a_motion_replaces_a_motion_and_no_viewer_and_a_sensor_replaces_nothing(
 
 
 @pytest.mark.parametrize("name", ["a.txt", "a", "a.mcap.bak", "x" * 5000 + ".mcap"])
-def test_a_name_that_is_not_a_recordings_is_refused_before_anything_is_recorded(tmp_path: Path, name: str) -> None:
+def test_a_name_without_the_recording_suffix_is_refused_at_once(tmp_path: Path, name: str) -> None:
     answer = CliRunner().invoke(app, ["--motion", "still", "--out", f"{tmp_path}/{name}"])
     assert isinstance(answer.exception, InputError)
     assert list(tmp_path.iterdir()) == []

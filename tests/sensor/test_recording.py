@@ -115,9 +115,7 @@ def test_images_do_not_pile_up_in_memory(tmp_path: Path) -> None:
     assert count == 30 and peak < 15 * depth.nbytes
 
 
-def test_a_truncated_file_opens_up_to_its_last_whole_chunk_and_says_so(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_truncated_file_opens_up_to_its_last_whole_chunk(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     whole, path, counts = DEMO_BYTES, tmp_path / "cut.mcap", []
     for size in range(3000, len(whole), 4801):
         path.write_bytes(whole[:size])
@@ -168,7 +166,7 @@ def test_a_recording_of_another_program_or_version_is_refused(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("limit", [30_000, 200_000])
-def test_it_ends_before_it_is_too_long_and_its_file_is_never_larger_than_allowed(
+def test_a_recording_stays_within_its_limits_of_length_and_size(
     tmp_path: Path, limit: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     done = write(tmp_path / "a.mcap", [sample(k) for k in range(100)], max_s=1.0)
@@ -220,7 +218,7 @@ def test_a_killed_recorder_leaves_all_but_its_last_chunk(tmp_path: Path) -> None
     assert not recording.is_whole and 170 <= count <= 200
 
 
-def test_a_full_disk_is_told_by_name_and_what_is_there_can_be_read(tmp_path: Path) -> None:
+def test_a_full_disk_is_named_and_what_was_written_can_be_read(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     # A measurement of coverage would write a file of its own.
     environment = {name: value for name, value in os.environ.items() if not name.startswith("COVERAGE_")}

@@ -41,7 +41,7 @@ def test_every_sample_is_delivered_once_in_order_and_without_waiting() -> None:
     assert driver.available_ns(frames[5]) == frames[5].capture_ns + 15_000_000
 
 
-def test_recorded_timing_is_kept_and_who_comes_late_gets_the_newest_and_the_others_are_counted() -> None:
+def test_replay_keeps_the_timing_and_counts_overtaken_samples() -> None:
     clock = SimulatedClock(NS_PER_S)
     driver = opened(clock, latency_ms=20.0)
     for k in range(20):
@@ -84,7 +84,7 @@ FRAMES = list(Recording(demo_recording_path()).samples())
 TRUTH = np.array([f.true_eyes_m for f in FRAMES])
 
 
-def test_the_viewers_left_is_at_the_left_of_the_stack_and_on_the_right_of_the_sensors_picture() -> None:
+def test_the_viewer_s_left_eye_is_on_the_right_of_the_picture() -> None:
     assert (TRUTH[:, 0, 1] < TRUTH[:, 1, 1]).all()
     seen = np.array([f.eyes.eyes_m for f in FRAMES if f.eyes is not None])
     assert (seen[:100, 0, 0] > seen[:100, 1, 0]).all() and (seen[:, :, 2] > 0).all()

@@ -63,7 +63,7 @@ def play(
     return got, states, worker
 
 
-def test_a_gap_longer_than_the_time_out_is_waited_for_once_and_nothing_is_reopened(tmp_path: Path) -> None:
+def test_a_gap_longer_than_the_time_out_reopens_nothing(tmp_path: Path) -> None:
     times = [*evenly(30, 0.5), *evenly(30, 0.5, start_s=2.3)]
     got, states, _ = play(recorded(tmp_path / "gap.mcap", times), latency_ms=20.0)
     assert [frame.sequence for frame, _ in got] == list(range(1, 31))

@@ -34,7 +34,7 @@ def settings(source: str) -> SensorSettings:
     return SensorSettings(driver="usb-camera", source=source, fov_deg=65.0)
 
 
-def test_eyes_before_a_camera_without_depth_are_in_their_direction_with_a_sigma_along_it(film: str) -> None:
+def test_without_depth_the_eyes_direction_is_right_with_sigma_along_it(film: str) -> None:
     sensor = settings(film)
     driver = open_sensor(sensor, MonotonicClock())
     find = EyeFinder(Settings(sensor=sensor)).find

@@ -159,7 +159,7 @@ def test_a_fatal_error_is_not_tried_again(started: Callable[..., Any]) -> None:
         worker.arrived(0)
 
 
-def test_the_end_of_a_recording_is_told_and_its_last_sample_is_not_lost(started: Callable[..., Any]) -> None:
+def test_the_end_of_a_recording_is_reported_after_its_last_sample(started: Callable[..., Any]) -> None:
     calls = []
 
     def act() -> None:
@@ -207,7 +207,7 @@ def test_an_sdk_that_hangs_is_left_behind_and_never_blocks_the_loop(
     assert log.count("close") == closed + 1 and worker.state == "running"
 
 
-def test_stopping_takes_no_longer_than_its_time_out_even_when_an_sdk_hangs(started: Callable[..., Any]) -> None:
+def test_stopping_keeps_its_time_out_even_when_an_sdk_hangs(started: Callable[..., Any]) -> None:
     release = threading.Event()
     worker, _ = started(lambda: release.wait(20))
     time.sleep(0.05)
@@ -252,7 +252,7 @@ def test_stamps_that_are_not_of_this_machine_s_clock_are_refused(ahead_s: float)
         worker.close()
 
 
-def test_a_kit_that_ends_the_process_or_fails_to_close_is_lost_and_opened_again(started: Callable[..., Any]) -> None:
+def test_an_sdk_that_exits_or_fails_to_close_is_reopened(started: Callable[..., Any]) -> None:
     """Its thread died of `sys.exit()`, and the status stayed well."""
     calls: list[int] = []
 
@@ -293,7 +293,7 @@ def camera(monkeypatch: pytest.MonkeyPatch) -> Any:
     worker.close()
 
 
-def test_stamps_of_the_future_are_never_believed_and_a_sensor_that_goes_on_so_is_lost(
+def test_future_stamps_are_rejected_and_a_persistent_sensor_counts_as_lost(
     camera: SensorWorker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """After the first sample nobody looked: 105 mm off, and sure to 2 mm."""

@@ -50,7 +50,7 @@ def test_what_the_disk_does_not_take_is_one_line_and_leaves_nothing(tmp_path: Pa
 
 
 @pytest.mark.usefixtures("tiny")
-def test_a_folder_that_does_not_fit_is_told_by_the_name_that_was_given(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_named_as_given(tmp_path: Path) -> None:
     target = tmp_path / "new" / "out"
     with pytest.raises(InputError) as caught, OutputFolder(target) as folder:
         write_bytes(folder.staging / "small", b"x")
@@ -62,7 +62,7 @@ def test_a_folder_that_does_not_fit_is_told_by_the_name_that_was_given(tmp_path:
 
 
 @pytest.mark.parametrize(("in_the_way", "told"), [("b/c/x", "b/c: is a folder"), ("b", "b: is no folder")])
-def test_what_is_in_the_way_of_one_file_keeps_all_others_from_being_replaced(
+def test_an_obstacle_to_one_file_keeps_all_others_from_being_replaced(
     tmp_path: Path, in_the_way: str, told: str
 ) -> None:
     write_bytes(tmp_path / "a", b"old")
@@ -117,7 +117,7 @@ with OutputFolder(Path(sys.argv[1])) as folder:
 """
 
 
-def test_of_what_is_staged_only_what_a_killed_process_left_is_cleared_away(tmp_path: Path) -> None:
+def test_of_staged_files_only_a_killed_process_s_are_removed(tmp_path: Path) -> None:
     """A folder of somebody's, and what a container was at, went with it."""
 
     def writer() -> subprocess.Popen[str]:

@@ -93,7 +93,7 @@ def say(text: str) -> None:
     log.info("%s", text, extra={"always": True})
 
 
-def test_a_reader_that_never_reads_holds_up_nobody_and_hears_the_rest_when_it_reads(pipe: Pipe) -> None:
+def test_a_reader_that_never_reads_blocks_nobody(pipe: Pipe) -> None:
     configured(pipe.stream)
     count = 2 * QUEUED_MAX
     longest_s = 0.0
@@ -168,7 +168,7 @@ def test_a_traceback_is_in_a_file_that_the_line_names(
     assert "Traceback" in report.read_text() and report.stat().st_mode & 0o777 == 0o600
 
 
-def test_a_message_that_repeats_is_cut_off_and_counted_but_transitions_and_others_pass(file: File) -> None:
+def test_a_repeated_message_is_suppressed_and_counted_and_others_pass(file: File) -> None:
     clock = SimulatedClock()
     configured(file.stream, clock)
     for number in range(100):
