@@ -23,6 +23,7 @@ from runtime.daemon.commands import NAMES
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
+CLI: Any = typer.main.get_command(app)
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md")])
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 IN_A_SENTENCE = re.compile(r"`phasestack ([^`]* --[^`]+)`")
@@ -85,7 +86,7 @@ def shown_commands() -> list[tuple[str, list[str]]]:
 
 def parse(words: list[str]) -> None:
     """Have the command's own parser take the words, as if they were typed; nothing is run."""
-    command, left, name = typer.main.get_command(app), list(words), "phasestack"
+    command, left, name = CLI, list(words), "phasestack"
     while hasattr(command, "commands") and left and left[0] in command.commands:
         name = f"{name} {left[0]}"
         command = command.commands[left.pop(0)]
@@ -102,7 +103,7 @@ def alternatives(name: str) -> list[str]:
 
 
 def test_every_command_has_an_example_and_says_what_its_options_are() -> None:
-    for path, command in walk(typer.main.get_command(app)):
+    for path, command in walk(CLI):
         name = " ".join(("phasestack", *path))
         assert f"Example: {name}" in command.help, name
         assert [parameter.name for parameter in command.params if not parameter.help] == [], name
@@ -128,7 +129,7 @@ def test_a_command_that_a_page_had_wrong_would_be_found(wrong: str) -> None:
 
 
 def test_options_named_in_a_sentence_exist() -> None:
-    known = dict(walk(typer.main.get_command(app)))
+    known = dict(walk(CLI))
     for page in PAGES:
         for line in IN_A_SENTENCE.findall(page.read_text(encoding="utf-8")):
             words = line.split()
@@ -138,7 +139,7 @@ def test_options_named_in_a_sentence_exist() -> None:
 
 
 def test_operation_s_table_has_the_commands_of_ctl() -> None:
-    typed = {path[-1] for path, _ in walk(typer.main.get_command(app)) if path[:1] == ("ctl",)} - {"ctl"}
+    typed = {path[-1] for path, _ in walk(CLI) if path[:1] == ("ctl",)} - {"ctl"}
     page = (DOCS / "operation.md").read_text(encoding="utf-8")
     table = page.partition("| `phasestack ctl` |")[2].partition("\n\n")[0]
     listed = re.findall(r"`([a-z]+)[^`]*`", " ".join(row.split(" | ")[0] for row in table.splitlines()))
