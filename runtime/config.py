@@ -134,13 +134,14 @@ class SensorSettings(Section):
         "", description="driver `openni2`: folder of libOpenNI2.so and OpenNI2/Drivers; empty: the system's"
     )
     fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
-        0.0, description="horizontal field of view of a camera that does not tell (usb-camera never does); 0: unknown"
+        0.0,
+        description="horizontal field of view of a camera that does not report it (usb-camera never does); 0: unknown",
     )
     fixed_eyes_m: tuple[tuple[Place, Place, Place], tuple[Place, Place, Place]] | None = Field(
         None, description="driver `fixed`: left and right eye in the stack frame; no sensor is opened"
     )
     options: dict[str, Any] = Field(
-        default_factory=dict, description="what a class of your own is made with; its own model checks it"
+        default_factory=dict, description="options of a driver of your own, checked by its own model"
     )
 
 
@@ -151,7 +152,7 @@ class TrackerSettings(Section):
         0.5, description="hold the last eyes for this long after a loss, then go flat"
     )
     noise_m: Annotated[float, within(1e-6, 0.2, "m")] = Field(
-        0.003, description="noise on an eye of a sensor that does not say its own, standard deviation of an axis"
+        0.003, description="standard deviation per axis of an eye, for a sensor that does not report its own"
     )
 
 
@@ -218,7 +219,7 @@ class ContentSettings(Section):
     )
     library: str = Field("", description="folder whose pictures, films, models and playlists the page offers")
     scale: Annotated[float, within(0.001, 1000.0, "")] = Field(
-        1.0, description="the scene's size, times its own, about the display's middle"
+        1.0, description="scale factor of the scene, about the display's middle"
     )
     offset_m: tuple[Offset, Offset, Offset] = Field(
         (0.0, 0.0, 0.0), description="where the scene is moved: out of the screen, to the right, up; metres"
@@ -228,7 +229,7 @@ class ContentSettings(Section):
         description="the scene's turns about the axes out of the screen, to the right and up, in this order",
     )
     turntable_per_min: Annotated[float, within(-600.0, 600.0, "turns a minute")] = Field(
-        0.0, description="the scene turns about the vertical so often a minute; negative: the other way; 0: it stands"
+        0.0, description="turns of the scene a minute about the vertical; negative: the other way; 0: none"
     )
 
     @model_validator(mode="after")
@@ -252,14 +253,14 @@ class ModelSettings(Section):
     provider: Literal["cpu", "cuda", "tensorrt", "openvino"] = Field("cpu", description="execution provider")
     backend: Annotated[Literal["auto", "cpu", "gl"], BeforeValidator(_today)] = Field(
         "auto",
-        description="what does all that surrounds the network: the processor, or OpenGL's shaders; "
-        "auto: both are measured at the start, and the faster one is taken",
+        description="what runs everything but the network: the processor, or OpenGL's shaders; "
+        "auto: whichever is faster when both are measured at the start",
     )
     threads: Annotated[int, Field(ge=0, le=256)] = Field(2, description="inference threads; 0: all cores")
     eye_sigma_mm: Literal["auto"] | NonNegative = Field(
         "auto",
-        description="standard deviation of the eyes' common place, millimetres an axis: a picture for eyes that are "
-        "known (0) or a forgiving one; auto: the tracker's own covariance",
+        description="tracking error that solutions allow for: standard deviation of the eyes' common place, "
+        "millimetres an axis; 0: eyes known exactly; auto: the tracker's own",
     )
     budget_ms: NonNegative = Field(
         0.0, description="time for one solution, drawing included, after which no further step begins; 0: none"
@@ -296,7 +297,7 @@ class LoopSettings(Section):
     """Pacing, and the stage costs of simulated time."""
 
     rate_hz: Annotated[float, within(1.0, 1000.0, "Hz")] = Field(
-        60.0, description="refreshes a second, where the display does not tell its own"
+        60.0, description="refreshes a second, where the display does not report its own"
     )
     sensor_latency_ms: Annotated[float, within(0.0, 10_000.0, "ms")] = Field(
         15.0, description="from capture to arrival of a replayed sample"
@@ -318,7 +319,7 @@ class LoopSettings(Section):
         description="what each stage costs on the simulated clock of --max-speed",
     )
     evaluate_every: Annotated[int, Field(ge=0)] = Field(
-        20, description="with --out: every so many refreshes, measure what the eyes see; 0: the last only"
+        20, description="with --out: measure what the eyes see every so many refreshes; 0: only at the last"
     )
 
 
@@ -326,7 +327,7 @@ class PlanSettings(Section):
     """What may be left out."""
 
     enabled: bool = Field(
-        True, description="leave out what the scene and a resting head do not need; false: draw and solve all of it"
+        True, description="skip what the scene and a resting head do not need; false: draw and solve everything"
     )
     align: bool = Field(True, description="shift and scale the panels at every refresh to where the eyes are then")
 
@@ -336,7 +337,7 @@ class ServiceSettings(Section):
 
     socket: str = Field("/run/phasestack/status.sock", description="status and control socket")
     blackbox_minutes: Annotated[float, within(0.0, 60.0, "min")] = Field(
-        2.0, description="what the black box keeps in memory, to be written at a fault or by `ctl blackbox`; 0: none"
+        2.0, description="minutes that the black box keeps in memory; 0: none"
     )
 
 

@@ -38,7 +38,7 @@ def scene(
 
 @app.command()
 def place(
-    scale: Annotated[float | None, number(0.001, 1000, help="the scene's size, times its own")] = None,
+    scale: Annotated[float | None, number(0.001, 1000, help="scale factor of the scene")] = None,
     offset: Annotated[
         tuple[float, float, float] | None, number(-10, 10, "m", help="where it is moved: out, right, up; metres")
     ] = None,
