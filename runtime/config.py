@@ -135,7 +135,7 @@ class SensorSettings(Section):
     )
     fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
         0.0,
-        description="horizontal field of view of a camera that does not report it (usb-camera never does); 0: unknown",
+        description="horizontal field of view of a camera that does not report it (as usb-camera); 0: unknown",
     )
     fixed_eyes_m: tuple[tuple[Place, Place, Place], tuple[Place, Place, Place]] | None = Field(
         None, description="driver `fixed`: left and right eye in the stack frame; no sensor is opened"
