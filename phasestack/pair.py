@@ -179,7 +179,10 @@ def evaluate(
     if given.ndim != 4 or given.shape[:3] != wanted or given.shape[3] not in (3, 4):
         last = given.ndim == 4 and given.shape[1] in (3, 4) and given.shape[3] not in (3, 4)
         advice = ": channels come last, np.moveaxis(layers, 1, -1)" if last else ""
+        advice = ": grey ones are np.stack([layers] * 3, -1)" if given.shape == wanted else advice
         raise ValueError(f"layers: have the shape {given.shape}, the stack's are {(*wanted, 3)}{advice}")
+    if np.issubdtype(given.dtype, np.floating) and 1 < given.max() <= np.pi / 2:
+        raise ValueError(f"layers: hold up to {given.max():g}: angles in radians? divide by pi/2")
     codes = [as_codes(as_picture(f"layers[{n}]", layer[..., :3])) for n, layer in enumerate(given)]
     return pair.judged(np.stack(codes)).quality
 

@@ -37,7 +37,8 @@ def as_picture(name: str, given: ArrayLike) -> Picture:
         )
     if picture.dtype != np.uint8:
         if not np.issubdtype(picture.dtype, np.floating):
-            raise ValueError(f"{name}: is of {picture.dtype}, neither uint8 (0..255) nor floating point (0..1)")
+            advice = f": codes are {name}.astype(np.uint8)" if np.issubdtype(picture.dtype, np.integer) else ""
+            raise ValueError(f"{name}: is of {picture.dtype}, neither uint8 (0..255) nor floating point (0..1){advice}")
         low, high = (float(bound) for bound in (picture.min(), picture.max()))
         if not (low >= 0 and high <= 1):  # nor NaN
             advice = f": divide by 255, or {name}.astype(np.uint8)" if low >= 0 and 1 < high <= 255 else ""

@@ -65,7 +65,7 @@ def test_pictures_are_codes_or_intensities_with_or_without_transparency() -> Non
     [
         ({"left": np.zeros((180, 320))}, "left"),
         ({"right": picture()[:90]}, "right"),
-        ({"right": picture().astype(np.int32)}, "right"),
+        ({"right": picture().astype(np.int32)}, r"right: .*right\.astype\(np\.uint8\)"),
         ({"left": picture().astype(np.float64)}, "left"),
         ({"eyes_m": (0.7, 0.0, 0.0)}, "eyes_m"),
         ({"eyes_m": ((0.05, -0.03, 0.0), (0.05, 0.03, 0.0))}, "eyes_m"),
@@ -206,6 +206,10 @@ def test_anybody_s_layers_are_evaluated_as_ours_are() -> None:
         phasestack.evaluate(np.moveaxis(result.layers, 3, 1), picture(), picture(3), **how)
     with pytest.raises(ValueError, match=r"layers: have the shape \(2, "):
         phasestack.evaluate(result.layers[:2], picture(), picture(3), **how)
+    with pytest.raises(ValueError, match=r"layers: have the shape .*grey ones are np.stack"):
+        phasestack.evaluate(result.layers[..., 0], picture(), picture(3), **how)
+    with pytest.raises(ValueError, match=r"layers: hold up to .*: angles in radians"):
+        phasestack.evaluate(result.layers / 255 * np.pi / 2, picture(), picture(3), **how)
 
 
 @pytest.mark.parametrize(

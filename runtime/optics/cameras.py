@@ -135,6 +135,6 @@ def doubts(eyes_m: ArrayLike, stack: PanelStack, *, fov_deg: float, size: tuple[
     if 1 - min(shares) > BESIDE_MOST:
         told.append(
             f"fov_deg: {1 - min(shares):.0%} of a picture {fov_deg:g} degrees wide that looks at the stack's origin "
-            "lies beside the panels: was it taken so?"
+            "lies beside the panels: was it taken so, or is there a camera to be given with it?"
         )
     return told

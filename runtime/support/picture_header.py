@@ -12,6 +12,7 @@ from runtime.support import untrusted_input
 from runtime.support.untrusted_input import LIMITS
 
 PNG = b"\x89PNG\r\n\x1a\n"
+PNG_DEPTH = slice(24, 25)  # where a PNG has its bits a channel
 CHUNK_BYTES = 12  # of a PNG's part without what it holds: length, kind, checksum
 SIDE_MAX_PX = 1 << 16  # that a header may claim
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "PPM", "TGA")  # Pillow's; of EPS it would start Ghostscript
@@ -66,10 +67,17 @@ def _orientation(image: Any) -> int:
     return found if isinstance(found, int) else 1
 
 
-def check_size(width_px: int, height_px: int, *, source: str | Path, field: str = "", name: str = "") -> None:
-    """Raise InputError for more pixels than the limit. name: of a picture within `source`."""
-    if max(width_px, height_px) > SIDE_MAX_PX or width_px * height_px > LIMITS.pixels:
-        problem = f"has {width_px} x {height_px} pixels; at most {LIMITS.pixels:,}"
+def check_size(
+    width_px: int, height_px: int, *, source: str | Path, field: str = "", name: str = "", head: bytes = b""
+) -> None:
+    """Raise InputError for more pixels than the limit; of a PNG with 16 bits a channel half of it, for its memory.
+
+    name: of a picture within `source`. head: the coded picture's beginning, where it is known.
+    """
+    is_deep = head.startswith(PNG) and head[PNG_DEPTH] == b"\x10"
+    most = LIMITS.pixels // (2 if is_deep else 1)
+    if max(width_px, height_px) > SIDE_MAX_PX or width_px * height_px > most:
+        problem = f"has {width_px} x {height_px} pixels{' of 16 bits a channel' * is_deep}; at most {most:,}"
         raise InputError(source, field, f"{name} {problem}".strip())
 
 
@@ -79,7 +87,7 @@ def decoded_picture(coded: bytes, *, source: str | Path, field: str, name: str) 
 
     try:
         width, height = picture_size(coded)
-        check_size(width, height, source=source, field=field, name=name)
+        check_size(width, height, source=source, field=field, name=name, head=coded)
         image = Image.open(io.BytesIO(coded), formats=FORMATS)
         image.load()
         return image
@@ -96,7 +104,7 @@ def read_coded(path: Path) -> bytes:
         width, height = picture_size(data)
     except ValueError:
         raise InputError(path, "", "is not an image that can be decoded") from None
-    check_size(width, height, source=path)
+    check_size(width, height, source=path, head=data)
     return data
 
 

@@ -44,10 +44,10 @@ def png(width: int, height: int) -> bytes:
     return file.getvalue()
 
 
-def png_header(width: int, height: int) -> bytes:
+def png_header(width: int, height: int, *, bits: int = 8) -> bytes:
     """As much of it as says the size."""
     small = png(1, 1)
-    body = b"IHDR" + struct.pack(">II", width, height) + small[24:29]
+    body = b"IHDR" + struct.pack(">IIB", width, height, bits) + small[25:29]
     return small[:12] + body + struct.pack(">I", zlib.crc32(body)) + small[33:]
 
 
@@ -75,6 +75,13 @@ def test_a_large_picture_is_refused_by_its_header_with_figure_and_limit(
     with pytest.raises(InputError) as caught:
         read_image(path)
     assert str(caught.value) == told
+
+
+def test_a_picture_of_sixteen_bits_a_channel_may_have_half_the_pixels(tmp_path: Path) -> None:
+    """One megabyte of file took 2.5 GB."""
+    path = tmp_path / "deep.png"
+    path.write_bytes(png_header(16_384, 8192, bits=16))
+    assert refused(path) == f"{path}: has 16384 x 8192 pixels of 16 bits a channel; at most 67,108,864"
 
 
 @pytest.mark.parametrize("suffix", [".png", ".mp4", ".glb", ".obj", ".ply"])
