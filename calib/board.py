@@ -1,4 +1,4 @@
-"""Coded boards for the panels: small marks that tell a camera which panel it sees, and where on it.
+"""Coded calibration boards: marks that identify the panel and the place on it.
 
 A mark is a white square with an ArUco marker inside and a smaller white square at each of its corners: where the
 two touch there is a saddle, which is found to a few hundredths of a pixel whatever the blur and the camera's tone

@@ -10,7 +10,7 @@ from typing import Any
 
 
 class Key(Enum):
-    """What a key means here."""
+    """Keys and their meaning."""
 
     ACCEPT = auto()
     NEXT = auto()

@@ -39,7 +39,7 @@ Number = Annotated[float, BeforeValidator(_no_truth_value), AfterValidator(_boun
 
 
 class PairRow(BaseModel):
-    """One pair as a row of the file, metres; `capture` adds what a person wants to know of it."""
+    """One pair as a row of the file, metres, with the columns that `capture` adds for people."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", coerce_numbers_to_str=True)
 

@@ -19,7 +19,7 @@ HOMOGENEOUS = np.array([0.0, 0.0, 1.0])  # picks the homogeneous one of a pixel 
 
 @dataclass(frozen=True, slots=True)
 class PlacedPanel:
-    """Where one panel is."""
+    """Pose of one panel."""
 
     rotation: F64  # (3, 3) stack_from_panel
     centre_m: F64  # (3,) its middle, frame `stack`

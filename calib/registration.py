@@ -39,7 +39,7 @@ DOUBTFUL_PX = 0.3  # a corner that is not known better is not worth writing
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """Where the panels are, and how that is known."""
+    """Registered panels, with their uncertainty."""
 
     bundle: Bundle
     stack: PanelStack  # the geometry to configure: true distances, and tilts

@@ -37,12 +37,12 @@ YES_NO = {Key.ACCEPT: True, Key.NEXT: False}
 
 
 class Stopped(Exception):
-    """The person wants to go on another time."""
+    """The person stops here, to continue another time."""
 
 
 @dataclass
 class Setup:
-    """What every step works with."""
+    """The state shared by all steps."""
 
     config: Path
     out: Path  # folder of reports, and of what the configuration names

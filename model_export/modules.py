@@ -52,7 +52,7 @@ class Network:
 
 @contextmanager
 def blamed(arch: str, field: str) -> Iterator[None]:
-    """Whatever a module of a user's own does is told as an InputError, in one line."""
+    """Turn any exception of a user's module into a one-line InputError."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

@@ -149,7 +149,7 @@ def _held_out_db(network: Network, batches: list[Batch], device: torch.device) -
 
 
 def _data(training: Training, form: Form) -> tuple[Pairs, Pairs]:
-    """What is learned from, and what is not. Raises InputError."""
+    """Training and held-out pairs. Raises InputError."""
     how: dict[str, Any] = {"width_px": training.width_px, "height_px": training.height_px}
     stack = load_stack(Path(training.panels), **how) if training.panels else None
     if stack is not None:

@@ -32,7 +32,7 @@ class MonotonicClock:
 
 
 class SimulatedClock:
-    """Time that passes only when it is told to: replay as fast as it can, and tests."""
+    """A clock that is advanced by hand, for fast replay and tests."""
 
     def __init__(self, start_ns: int = 0) -> None:
         self._now_ns = start_ns

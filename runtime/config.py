@@ -114,7 +114,7 @@ class StackGeometry(Section):
             )
 
     def stack(self) -> PanelStack:
-        """The geometry as optics wants it."""
+        """The geometry as a `PanelStack`."""
         tilt = None
         if any(any(slopes) for slopes in self.tilt):
             tilt = Tilt(tuple((0.0, right, up) for right, up in self.tilt), self.registered_from_m)
@@ -122,7 +122,7 @@ class StackGeometry(Section):
 
 
 class SensorSettings(Section):
-    """Which depth sensor delivers eye positions or images."""
+    """The sensor that delivers eye positions or images."""
 
     driver: str = Field("replay", description="replay, openni2, usb-camera, fixed, or a class of yours: `module:Class`")
     source: str = Field("demo", description="what to open: a recording, `demo`, a serial number, a device URI")
@@ -146,7 +146,7 @@ class SensorSettings(Section):
 
 
 class TrackerSettings(Section):
-    """Following of the two eyes."""
+    """The tracker of the two eyes."""
 
     hold_s: Annotated[float, within(0.0, 60.0, "s")] = Field(
         0.5, description="hold the last eyes for this long after a loss, then go flat"
@@ -185,7 +185,7 @@ LAYOUT = r"^(auto|mono|(half-)?side-by-side|(half-)?top-bottom|rgbd|qs\d{1,6}x\d
 
 
 class ContentSettings(Section):
-    """What is shown."""
+    """The content."""
 
     scene: str = Field("demo", description="a built-in scene, a preset, a file or folder, or a class: `module:Class`")
     options: dict[str, Any] = Field(
@@ -285,7 +285,7 @@ class PanelSettings(Section):
 
 
 class OutputSettings(Section):
-    """How layers leave the machine."""
+    """Output of the layers to panels."""
 
     kind: Literal["offscreen", "windows"] = Field("offscreen", description="EGL, or one fullscreen window a panel")
     panels: tuple[PanelSettings, ...] = Field(
@@ -324,7 +324,7 @@ class LoopSettings(Section):
 
 
 class PlanSettings(Section):
-    """What may be left out."""
+    """Savings that are allowed."""
 
     enabled: bool = Field(
         True, description="skip what the scene and a resting head do not need; false: draw and solve everything"
@@ -342,7 +342,7 @@ class ServiceSettings(Section):
 
 
 class Settings(Section):
-    """Everything. `phasestack config` prints it."""
+    """All settings. `phasestack config` prints them."""
 
     stack: StackGeometry = Field(default_factory=StackGeometry, description="geometry of the panels")
     sensor: SensorSettings = Field(default_factory=SensorSettings, description="depth sensor")

@@ -18,7 +18,7 @@ PASSING = frozenset(
 
 
 def without_secrets(text: str) -> str:
-    """Text in which the name and password of an address (before its `@`) are left out.
+    """Text without the name and password of addresses (before an `@`).
 
     >>> without_secrets("rtsp://user:a@b@host/door")
     'rtsp://host/door'

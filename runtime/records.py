@@ -77,7 +77,7 @@ class EyePoints:
 
 @dataclass(frozen=True, slots=True)
 class SensorFrame:
-    """What a driver delivers: one instant, with whichever streams the sensor has."""
+    """A driver's sample: one instant, with the streams that the sensor has."""
 
     sequence: int  # counts up by one for each frame of the device; gaps are losses
     capture_ns: int  # monotonic clock, when the light was integrated
@@ -90,7 +90,7 @@ class SensorFrame:
 
 @dataclass(frozen=True, slots=True)
 class EyesEstimate:
-    """Where the eyes are (or will be) at one instant, and how that is known."""
+    """Estimated eyes at one instant, with a label for how they are known."""
 
     time_ns: int  # the instant asked for
     capture_ns: int  # of the newest sample that went into it; 0 with label none
@@ -124,7 +124,7 @@ class PresentReport:
 
 @dataclass(frozen=True, slots=True)
 class PlanItem:
-    """One thing that is left out, why, what it saves and what it costs."""
+    """A saving: what is left out, why, the time saved and the quality lost."""
 
     what: str
     why: str
@@ -134,7 +134,7 @@ class PlanItem:
 
 @dataclass(frozen=True, slots=True)
 class FrameTiming:
-    """When one refresh wakes, is presented and sends its light: a prediction, on the run's clock."""
+    """Predicted wake, present and display times of one refresh, on the run's clock."""
 
     id: int  # number of the refresh
     wake_ns: int
@@ -144,7 +144,7 @@ class FrameTiming:
 
 @dataclass(frozen=True, slots=True)
 class SolveRequest:
-    """What the presenter asks of the solver; a newer one takes the place of one that has not begun."""
+    """A request of the presenter to the solver; a newer one replaces one that has not begun."""
 
     time_ns: int  # the instant to solve for: the middle of the time that the solution will be shown
     eyes_m: F64 | None  # (2, 3) left, right; frame `stack`; where they will be then; None: no viewer
@@ -156,7 +156,7 @@ class SolveRequest:
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """Layers for one pair of eyes, or the flat picture; whoever holds it reads values that never change."""
+    """Immutable layers for one pair of eyes, or the flat picture."""
 
     number: int  # counts up from 1, flat pictures and solutions together
     made: Layers  # (N, height_px, width_px, 4) RGBA, rear to front
@@ -174,7 +174,7 @@ class Solution:
 
 @dataclass(frozen=True, slots=True)
 class RefreshAccount:
-    """One refresh, as frames.jsonl tells it (contract 5.2)."""
+    """One refresh: a line of frames.jsonl (contract 5.2)."""
 
     frame: int
     capture_ns: int  # of the newest sample that the eyes are known from; 0: none

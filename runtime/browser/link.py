@@ -89,7 +89,7 @@ class BrowserLink:
         return taken
 
     def looked_at(self, finder: Any) -> Callable[[SensorFrame], EyePoints | None]:
-        """What finds eyes in a camera's pictures, while pages are told of what is found."""
+        """An eye finder for a page's camera whose results are also sent to the pages."""
 
         def find(frame: SensorFrame) -> EyePoints | None:
             eyes: EyePoints | None = finder.find(frame)

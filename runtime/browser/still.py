@@ -50,7 +50,7 @@ def viewer_html(
 
 
 def stack_table(stack: PanelStack) -> dict[str, Any]:
-    """The panels, as the script wants them."""
+    """The stack's geometry as a table for the script."""
     fields = ("width_m", "height_m", "x_m", "width_px", "height_px")
     table: dict[str, Any] = {name: getattr(stack, name) for name in fields}
     if stack.tilt is not None:

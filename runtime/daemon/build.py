@@ -1,4 +1,4 @@
-"""Puts a run together from its settings: the composition root below the command line."""
+"""The composition root: builds a run from its settings."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ SIMULATED_FIGURES = (
 
 @dataclass(frozen=True, slots=True)
 class RunOptions:
-    """What the command line says in addition to the configuration."""
+    """Options of a run that the command line adds to the configuration."""
 
     max_speed: bool = False
     measure: bool = False
@@ -67,7 +67,7 @@ class RunOptions:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """What was put together."""
+    """A run put together from its settings."""
 
     presenter: Presenter
     observer: RunObserver

@@ -1,4 +1,4 @@
-"""Asking the running daemon: where its socket is; one JSON line there, one back."""
+"""Client of the running daemon: finds its socket, sends a JSON line, reads one back."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def sockets(config: Path | None) -> tuple[Path, ...]:
 
 
 class NotRunning(TransientError):
-    """No daemon answers at the socket; the text says why, and what to do."""
+    """No daemon answers at the socket; the text says why and names a remedy."""
 
     hangs = False  # there is one, and it has not answered in time
 

@@ -1,4 +1,4 @@
-"""What can be asked of the running daemon, checked before it reaches the loop."""
+"""Commands to the running daemon, checked before they reach the loop."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `demo` and `run` share: drive a loop, show progress, leave the files, print the summary."""
+"""The common part of `demo` and `run`: drive a loop, show progress, write files and summary."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What systemd is told (sd_notify, watchdog). Without a supervisor every call does nothing."""
+"""Notifications to systemd (sd_notify, watchdog). Without a supervisor every call does nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the socket answers of a run: its status, what does not change, and what is shown now."""
+"""Answers of the socket about a run: status, constant facts, and pictures."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def holds(presenter: Presenter) -> dict[str, Any]:
 
 
 def shown(presenter: Presenter, account: RefreshAccount, link: BrowserLink) -> dict[str, Any]:
-    """What a page that shows the panels is told of each refresh."""
+    """Figures of each refresh for a page that shows the panels."""
     assert presenter.last is not None
     frame, solution = presenter.last.frame, presenter.last.solution
     return {
@@ -102,7 +102,7 @@ def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
 
 
 def about(run: Run) -> dict[str, Any]:
-    """What does not change while it runs, and which scenes there are: for the page."""
+    """Facts that do not change during a run, and the available scenes, for the page."""
     settings, stack = run.presenter.run_cell.state.settings, run.presenter.stack
     return {
         "version": version(),
@@ -116,7 +116,7 @@ def about(run: Run) -> dict[str, Any]:
 
 
 def library_scenes(settings: ContentSettings) -> tuple[str, ...]:
-    """What can be shown of the library's folder, by its whole path; as many as a page can offer.
+    """Full paths of the library folder's scenes, up to the page's limit.
 
     A name that is not UTF-8 (no setting can hold it) or that can't be printed is left out.
     """
@@ -132,7 +132,7 @@ def library_scenes(settings: ContentSettings) -> tuple[str, ...]:
 
 
 def pictures(run: Run) -> dict[str, Any]:
-    """What is shown now, as JPEGs in base64: for the page."""
+    """The pictures shown now, as JPEGs in base64, for the page."""
     refresh = run.presenter.last
     if refresh is None:
         return {"frame": None, "jpegs": {}}

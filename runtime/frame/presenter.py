@@ -61,7 +61,7 @@ class Supervisor:
 
 @dataclass(frozen=True, slots=True)
 class Refresh:
-    """All of one refresh, for those who look at it closely."""
+    """All data of one refresh, for observers."""
 
     account: RefreshAccount
     frame: PanelFrame
@@ -69,7 +69,7 @@ class Refresh:
 
 
 class Observer(Protocol):
-    """Who looks at refreshes: files, sampled quality. Quick: it runs between two refreshes."""
+    """An observer of refreshes (files, sampled quality); it must be quick."""
 
     def sampled(self, sample: SensorFrame) -> None:
         """A sample arrived."""

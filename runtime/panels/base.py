@@ -1,4 +1,4 @@
-"""Where layers go: one interface for windows and for offscreen panels."""
+"""The interface of panel sinks: windows, offscreen, browser."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from runtime.records import PanelFrame, PresentReport
 
 
 class PanelSink(ABC):
-    """All panels of the stack. One frame is on all of them or on none."""
+    """A sink for all panels of the stack; a frame is shown on all of them or on none."""
 
     name: str
     contexts_lost = 0  # so far: with the panels' GL context others on the same GPU are gone, too

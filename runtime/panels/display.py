@@ -49,7 +49,7 @@ class WindowContext:
         glfw.make_context_current(self._window)
 
     def __exit__(self, *exception: object) -> None:
-        """Leaves it current: whoever needs another makes that current."""
+        """Leave the context current."""
 
     def release(self) -> None:
         """The window owns its context."""

@@ -12,7 +12,7 @@ SERIAL_TAG, NAME_TAG = 0xFF, 0xFC
 
 @dataclass(frozen=True, slots=True)
 class Edid:
-    """Who made a monitor and which one it is. Serials are empty where the maker gave none."""
+    """Maker, model and serials of a monitor; a serial is empty if the maker gave none."""
 
     maker: str  # three letters
     serial: str  # the serial as text, or else the number of the header; unique only together with the model

@@ -41,12 +41,12 @@ class Monitor:
 
     @property
     def place(self) -> Rectangle:
-        """What it shows of the X screen."""
+        """The part of the X screen that it shows."""
         return Rectangle(self.x_px, self.y_px, self.width_px, self.height_px)
 
     @property
     def setting(self) -> str:
-        """How a table of `[[output.panels]]` names it."""
+        """The settings in `[[output.panels]]` that identify it."""
         return f'edid_serial = "{self.serial}"' if self.serial else f'connector = "{self.connector}"'
 
     def __str__(self) -> str:
@@ -56,7 +56,7 @@ class Monitor:
 
 
 def in_order(monitors: Sequence[Monitor]) -> tuple[Monitor, ...]:
-    """From left to right, then from top to bottom."""
+    """Monitors sorted from left to right, then from top to bottom."""
     return tuple(sorted(monitors, key=lambda monitor: (monitor.x_px, monitor.y_px, monitor.connector)))
 
 

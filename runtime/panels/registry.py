@@ -1,4 +1,4 @@
-"""Which panels the settings ask for, and those without a screen: for replay, tests and `demo`."""
+"""The panels that the settings name, and panels without a screen for replay and tests."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class OffscreenPanels(PanelSink):
-    """Panels that nobody looks at: a frame is taken and not drawn."""
+    """Panels without a screen: frames are accepted and not drawn."""
 
     name = "offscreen"
 

@@ -51,7 +51,7 @@ def task(what: str, *, seconds: float, too_slow: Exception) -> Iterator[None]:
 
 @contextmanager
 def listening(listener: Listener) -> Iterator[None]:
-    """Within this block, in this thread, the listener hears every `tell`."""
+    """Send this thread's reports of progress to a listener within the block."""
     token = _LISTENER.set(listener)
     try:
         yield
@@ -61,7 +61,7 @@ def listening(listener: Listener) -> Iterator[None]:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar that is told (done, of)."""
+    """A progress bar that is called with (done, of)."""
     try:
         yield lambda done, of: tell(title, done, of)
     finally:
