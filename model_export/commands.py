@@ -21,10 +21,16 @@ def require(*modules: str) -> None:
             raise MissingPart(f"{module} is needed here and is not installed: pip install {what}")
 
 
-Arch = Annotated[str, typer.Option(help="a name, or module:Class, a torch.nn.Module of your own on Python's path")]
+Arch = Annotated[
+    str, typer.Option(help="eyereal, unrolled, or module:Class, a torch.nn.Module of your own on Python's path")
+]
 Options = Annotated[
     list[str] | None,
-    typer.Option("--option", metavar="NAME=VALUE", help="of the network's own Options; may be repeated"),
+    typer.Option(
+        "--option",
+        metavar="NAME=VALUE",
+        help="of the network's own Options, or steps=N, of the solver after it; repeatable",
+    ),
 ]
 
 
@@ -96,7 +102,7 @@ def options_of(given: list[str] | None) -> dict[str, Any]:
 
 
 def export(
-    arch: Annotated[str, typer.Option(help="fast, balanced, best, eyereal, or module:Class")],
+    arch: Annotated[str, typer.Option(help="fast, balanced, best, eyereal, unrolled, or module:Class")],
     out: Annotated[Path, typer.Option(help="the ONNX file")],
     checkpoint: Annotated[
         Path | None, typer.Option(help="weights: of `phasestack train`, or a published one for eyereal")

@@ -21,7 +21,7 @@ from model_export.recipe import DESIGN_RANGE, Recipe, read_recipe
 from model_export.stress import Feeds
 from model_export.validate import Reference, Report, check_model
 from runtime.errors import InputError
-from runtime.model.contract import Contract
+from runtime.model.contract import Contract, Step
 from runtime.model.predictor import SHIPPED
 from runtime.support import untrusted_input
 from runtime.support.artifacts import write_bytes
@@ -144,6 +144,8 @@ def picture_file(
     check_static(network, **size)
     with blamed(network.arch, "export"):
         data = picture_bytes(net, channels=form.channels, **size)
+    with torch.no_grad():
+        steps = tuple(Step(size=float(a), momentum=float(b)) for a, b in zip(*network.steps(), strict=True))
     least = -OFFSET if network.arch == "eyereal" else 0.0
     contract = Contract(
         version=2,
@@ -156,7 +158,8 @@ def picture_file(
         value_range=(least, 1 + least),
         trained_for=None,  # a checkpoint does not tell what it was trained on
         recipe_sha256=origin,
-        **form.model_dump(),
+        **form.model_dump(exclude={"steps"}),
+        steps=steps,
         **size,
         inputs=ports((eyereal.INPUT,)),
         outputs=ports((eyereal.OUTPUT,)),

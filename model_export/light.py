@@ -42,7 +42,7 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
 
 NEAR_PX = 0.5  # a ray counts that is at least so far inside every panel
-SIZES = (2.0, 1.6, 1.2, 0.8, 0.8, 0.8)  # of steps from the network's panels, the best that was measured
+SIZE = 0.8  # of a few steps from panels that a learned network proposes; larger ones overshoot from poor ones
 MOMENTUM, FLOOR = 0.7, 0.1
 
 
@@ -138,6 +138,14 @@ def step(
     moved = size * gradient / (1.5 * torch.pi * bound.clamp(min=floor * sets)) * (3 / count)
     new = (y - moved).clamp(0, 1)
     return new, new + momentum * (new - x)
+
+
+def improved(panels: Tensor, targets: Tensor, views: Views, sizes: Sequence[Any], momenta: Sequence[Any]) -> Tensor:
+    """Panels after one step of each size."""
+    x = y = panels
+    for size, momentum in zip(sizes, momenta, strict=True):
+        x, y = step(x, y, targets, views, size=size, momentum=momentum)
+    return x
 
 
 def _phasors(panels: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -13,12 +13,14 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
+from model_export.light import MOMENTUM, SIZE
 from runtime.config import Section, validated
 from runtime.errors import InputError, PhasestackError
 from runtime.support.plugins import is_plugin, plugin_class, strict
 
-KNOWN = {"eyereal": "model_export.eyereal:EyeRealNet"}
+KNOWN = {"eyereal": "model_export.eyereal:EyeRealNet", "unrolled": "model_export.unrolled:Unrolled"}
 PANELS, COLOURS = 3, 3
+STEPS_MOST = 64  # that a contract may have
 
 
 class Form(Section):
@@ -32,6 +34,10 @@ class Form(Section):
     branch: Literal[1, 2] = Field(1, description="of phases: their sums lie in [0, 1] or in [1, 2]")
     picture_fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
         0.0, description="it sees pictures so wide, black beside them; 0: whatever is drawn"
+    )
+
+    steps: Annotated[int, Field(ge=0, le=STEPS_MOST)] = Field(
+        0, description="of the solver after it, in training and when it is served"
     )
 
     @property
@@ -48,6 +54,13 @@ class Network:
     net: nn.Module
     form: Form
     options: dict[str, Any]
+
+    def steps(self) -> tuple[Sequence[Any], Sequence[Any]]:
+        """Sizes and momenta of the solver's steps after it: those that the module learned, or one size."""
+        learned = [getattr(self.net, name, None) for name in ("step_sizes", "step_momenta")]
+        if isinstance(learned[0], Tensor) and isinstance(learned[1], Tensor):
+            return list(learned[0].clamp(1e-3, 3)), list(learned[1].clamp(0, 0.99))
+        return [SIZE] * self.form.steps, [MOMENTUM] * self.form.steps
 
 
 @contextmanager
@@ -75,8 +88,11 @@ def made(arch: str, options: dict[str, Any], *, seed: int = 0) -> Network:
     check_known(arch)
     kind = plugin_class(KNOWN.get(arch, arch), nn.Module, field="--arch")
     said = {name: getattr(kind, name) for name in Form.model_fields if hasattr(kind, name)}
+    own = strict(getattr(kind, "Options", Section))
+    said |= {name: options[name] for name in {"steps"} & set(options)}
     form = validated(Form, said, source=arch)
-    options = validated(strict(getattr(kind, "Options", Section)), options, source=f"{arch}: --option").model_dump()
+    options = {name: value for name, value in options.items() if name != "steps" or name in own.model_fields}
+    options = validated(own, options, source=f"{arch}: --option").model_dump()
     torch.manual_seed(seed)
     with blamed(arch, "__init__"):
         net = kind(**options)

@@ -48,17 +48,19 @@ class Pairs(Dataset[dict[str, Tensor]]):
     scene: str = ""  # that the runtime draws, turned about the vertical, instead
 
     def __getitem__(self, number: int) -> dict[str, Tensor]:
-        """The network's input, the targets, and homographies of the rays at the true eyes."""
+        """The network's input, the targets, and homographies of the rays: of the eyes believed, of the true ones."""
         pair = self.pair(number)
         random = np.random.default_rng([self.seed, number, 1])
         pose = stack_from_eye(pair.eyes_m.mean(axis=0))
         place = pose[:3, :2] @ random.normal(0.0, self.eye_sigma_mm * 1e-3, 2)
-        views = Views.of(pair.stack, pair.eyes_m, **self._size, fov_deg=pair.fov_deg, places_m=place[None])
+        places = np.stack([np.zeros(3), place])
+        views = Views.of(pair.stack, pair.eyes_m, **self._size, fov_deg=pair.fov_deg, places_m=places)
         images = np.stack(pair.images).transpose(0, 3, 1, 2)
         return {
             "input": torch.from_numpy(network_input(pair, self.form)),
             "targets": torch.from_numpy(images.astype(np.float32) / np.float32(255)),
-            "views": views.panels_from_rays,
+            "believed": views.panels_from_rays[:2],
+            "views": views.panels_from_rays[2:],
         }
 
     @property

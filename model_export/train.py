@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from model_export.checkpoint import fill, load_checkpoint, save_checkpoint
-from model_export.light import Views, light, traced
+from model_export.light import Views, improved, light, traced
 from model_export.modules import COLOURS, PANELS, Form, Network, blamed, made, probe
 from model_export.pairs import Pairs, folder_pairs
 from runtime.config import Section, load_stack
@@ -122,12 +122,20 @@ def _loss(network: Network, batch: Batch) -> Tensor:
     with torch.autocast(batch["input"].device.type, torch.bfloat16, enabled=batch["input"].is_cuda):
         answer = network.net.train()(batch["input"])
     losses = []
-    for panels, targets, matrices in zip(displayed(answer.float()), batch["targets"], batch["views"], strict=True):
+    for panels, targets, matrices in zip(_shown(network, answer, batch), batch["targets"], batch["views"], strict=True):
         views = Views(matrices, targets.shape[-1], targets.shape[-2])
-        seen, counts = light(panels.reshape(PANELS, COLOURS, *panels.shape[1:]), views)
+        seen, counts = light(panels, views)
         error = ((seen - targets) * counts).square().sum() / (counts.sum() * COLOURS)
         losses.append(10 * torch.log10(error + LEAST_ERROR))
     return torch.stack(losses).mean()
+
+
+def _shown(network: Network, answer: Tensor, batch: Batch) -> Iterator[Tensor]:
+    """What the panels show of each pair: the network's answer, and the solver's steps for the eyes believed."""
+    for panels, targets, matrices in zip(displayed(answer.float()), batch["targets"], batch["believed"], strict=True):
+        views = Views(matrices, targets.shape[-1], targets.shape[-2])
+        x = panels.reshape(PANELS, COLOURS, *panels.shape[1:])
+        yield displayed(improved(x, targets, views, *network.steps()))
 
 
 @torch.no_grad()
@@ -137,7 +145,7 @@ def _held_out_db(network: Network, batches: list[Batch], device: torch.device) -
     for number, batch in enumerate(_on(batch, device) for batch in batches):
         with blamed(network.arch, "validation"):
             answer = network.net.eval()(batch["input"])
-        panels = displayed(answer.float()).reshape(PANELS, COLOURS, *answer.shape[2:])
+        panels = next(_shown(network, answer, batch))
         targets = batch["targets"][0]
         views = Views(batch["views"][0], targets.shape[-1], targets.shape[-2])
         counts = light(panels, views)[1]

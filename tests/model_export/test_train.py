@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import os
 import re
@@ -14,12 +15,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+onnx = pytest.importorskip("onnx")
 torch = pytest.importorskip("torch")
 from typer.testing import CliRunner  # noqa: E402
 
 from model_export.checkpoint import load_checkpoint  # noqa: E402
 from model_export.data import TrainingPair, random_pair  # noqa: E402
 from model_export.export import export_model, picture_file  # noqa: E402
+from model_export.light import Views, improved, light, traced  # noqa: E402
 from model_export.modules import Form, made  # noqa: E402
 from model_export.pairs import Pairs, network_input  # noqa: E402
 from model_export.scene import Plane, Scene, draw  # noqa: E402
@@ -27,6 +30,7 @@ from model_export.train import Training, _held_out_db, displayed, run_training  
 from model_export.validate import validate_file  # noqa: E402
 from runtime.commands.app import app  # noqa: E402
 from runtime.errors import InputError  # noqa: E402
+from runtime.model.base import Prediction  # noqa: E402
 from runtime.model.predictor import load_predictor  # noqa: E402
 from runtime.model.still import solve_still  # noqa: E402
 from runtime.optics.stack import PanelStack  # noqa: E402
@@ -170,11 +174,12 @@ def test_the_published_network_learns_from_a_folder_of_its_pictures(tmp_path: Pa
 @pytest.mark.parametrize(
     ("changes", "problem"),
     [
+        ({"options": {"steps": 65}}, "my_network:MyNetwork: steps"),
         ({"data": "/nowhere/lego_bulldozer"}, "is no folder"),
         ({"data": "/nowhere/unnamed"}, "holds none of"),
         ({"arch": "tests.model_export.unservable:NotFinite", "options": {}}, "not finite"),
         ({"options": {"width": 8, "depth": 3}}, "--option: depth"),
-        ({"arch": "balanced", "options": {}}, "'balanced' is neither eyereal nor module:Class"),
+        ({"arch": "balanced", "options": {}}, "'balanced' is neither eyereal, unrolled nor module:Class"),
     ],
 )
 def test_what_cannot_be_trained_is_refused_before_anything_is_written(
@@ -219,6 +224,67 @@ def test_a_network_of_ones_own_is_trained_exported_and_served(tmp_path: Path) ->
         panels = net(fed)[0].clamp(0, 1).mul(255).round().reshape(3, 3, 96, 160)
     layers = solved.layers[..., :3].astype(np.float32)
     predictor.close()
+    assert solved.steps == 1
     assert np.abs(layers - panels.permute(0, 2, 3, 1).numpy()).max() <= 1
     with pytest.raises(InputError, match="is a checkpoint of my_network:MyNetwork, not of"):
         export_model("tests.model_export.unservable:Even", path, checkpoint=checkpoint)
+
+
+def served(path: Path, number: int) -> tuple[Prediction, float]:
+    """A pair's solution by a model's file, and its light by rays for the eyes that it was solved for."""
+    pair = random_pair(np.random.default_rng([4, number]), **SMALL)
+    predictor = load_predictor(str(path), pair.stack)
+    solved = solve_still(*pair.images, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, predictor=predictor, eye_sigma_mm=0.0)
+    panels = torch.from_numpy(solved.layers[..., :3].transpose(0, 3, 1, 2).copy()) / 255
+    predictor.close()
+    return solved, light_db(panels, pair)
+
+
+def light_db(panels: Any, pair: TrainingPair) -> float:
+    views = Views.of(pair.stack, pair.eyes_m, **SMALL, fov_deg=pair.fov_deg)
+    targets = torch.from_numpy(np.stack(pair.images).transpose(0, 3, 1, 2).copy()) / 255
+    counts, random = light(panels, views)[1], torch.Generator().manual_seed(1)
+    a, b = ((traced(panels, views, rays=3, random=random) - targets) * counts for _ in range(2))
+    return -10 * math.log10(float((a * b).sum() / (counts.sum() * 3)))
+
+
+def test_steps_after_a_learned_proposal_are_trained_through_exported_and_raise_its_light(tmp_path: Path) -> None:
+    run_training(tmp_path, Training(**SHORT | {"iterations": 8, "options": {**SHORT["options"], "steps": 2}}))
+    found = {}
+    for steps in (0, 2):
+        path = tmp_path / f"{steps}.onnx"
+        options = {"steps": steps} if steps == 0 else {}  # the checkpoint says that there are two
+        size = {"width_px": SMALL["width_px"], "height_px": SMALL["height_px"]}
+        report = export_model(SHORT["arch"], path, checkpoint=tmp_path / "checkpoint.pth", options=options, **size)
+        assert report.passed and validate_file(path).passed
+        found[steps] = [served(path, number) for number in (1, 2, 3)]
+    assert [solved.steps for solved, _ in found[0] + found[2]] == [1] * 3 + [3] * 3
+    gains = [after - before for (_, before), (_, after) in zip(found[0], found[2], strict=True)]
+    assert min(gains) > 1.0, gains
+
+
+def test_the_solver_s_steps_unrolled_learn_their_sizes_and_are_served_with_them(tmp_path: Path) -> None:
+    result = run_training(
+        tmp_path,
+        Training(
+            **SHORT
+            | {"arch": "unrolled", "options": {"steps": 3, "size": 0.2}, "iterations": 24, "learning_rate": 0.05}
+        ),
+    )
+    assert result["held_out_db"] > result["start_db"] + 1
+    path, checkpoint = tmp_path / "unrolled.onnx", tmp_path / "checkpoint.pth"
+    assert export_model("unrolled", path, checkpoint=checkpoint, width_px=160, height_px=96).passed
+    learned = load_checkpoint(checkpoint)["model"]["step_sizes"]
+    steps = json.loads(onnx.load(path).metadata_props[0].value)["steps"]
+    assert [step["size"] for step in steps] == pytest.approx(learned.tolist()) and learned.std() > 0.01
+    network = made("unrolled", {"steps": 3, "size": 0.2})
+    network.net.load_state_dict(load_checkpoint(checkpoint)["model"])
+    pair = random_pair(np.random.default_rng([4, 1]), **SMALL)
+    with torch.no_grad():
+        batch = torch.utils.data.default_collate([{"input": torch.from_numpy(network_input(pair, Form()))}])
+        views = Views.of(pair.stack, pair.eyes_m, **SMALL, fov_deg=pair.fov_deg)
+        targets = torch.from_numpy(np.stack(pair.images).transpose(0, 3, 1, 2).copy()) / 255
+        x = network.net(batch["input"])[0].reshape(3, 3, 96, 160)
+        in_torch = light_db(displayed(improved(x, targets, views, *network.steps())), pair)
+    solved, db = served(path, 1)
+    assert solved.steps == 4 and db == pytest.approx(in_torch, abs=0.5)

@@ -1,0 +1,33 @@
+"""The solver's steps as a network that one can train: their sizes and momenta are its weights."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from model_export.light import MOMENTUM, SIZE
+from runtime.config import Section
+
+
+class Unrolled(nn.Module):
+    """Panels that share the mean of both pictures evenly; training goes through the steps after them."""
+
+    class Options(Section):
+        """How deep it is."""
+
+        steps: Annotated[int, Field(ge=1, le=64)] = 4
+        size: Annotated[float, Field(gt=0, le=3)] = Field(SIZE, description="of every step, before training")
+
+    def __init__(self, steps: int, size: float) -> None:
+        super().__init__()
+        self.step_sizes = nn.Parameter(torch.full((steps,), size))
+        self.step_momenta = nn.Parameter(torch.full((steps,), MOMENTUM))
+
+    def forward(self, eyes: Tensor) -> Tensor:
+        """(n, 6, h, w) intensities -> (n, 9, h, w): a third each of the sum in [1, 2] that gives their mean."""
+        mean = (eyes[:, :3] + eyes[:, 3:]) / 2
+        phase = torch.asin(mean.clamp(0, 1).sqrt()) * (2 / torch.pi)
+        return ((2 - phase) / 3).repeat(1, 3, 1, 1)
