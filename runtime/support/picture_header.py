@@ -70,7 +70,7 @@ def _orientation(image: Any) -> int:
 def check_size(
     width_px: int, height_px: int, *, source: str | Path, field: str = "", name: str = "", head: bytes = b""
 ) -> None:
-    """Raise InputError for more pixels than the limit; of a PNG with 16 bits a channel half of it, for its memory.
+    """Raise InputError for more pixels than the limit, or half of it for a PNG with 16 bits a channel.
 
     name: of a picture within `source`. head: the coded picture's beginning, where it is known.
     """

@@ -248,7 +248,7 @@ def light_db(panels: Any, pair: TrainingPair) -> float:
     return -10 * math.log10(float((a * b).sum() / (counts.sum() * 3)))
 
 
-def test_steps_after_a_learned_proposal_are_trained_through_exported_and_raise_its_light(tmp_path: Path) -> None:
+def test_steps_after_a_learned_proposal_are_trained_and_raise_its_light(tmp_path: Path) -> None:
     run_training(tmp_path, Training(**SHORT | {"iterations": 8, "options": {**SHORT["options"], "steps": 2}}))
     found = {}
     for steps in (0, 2):
@@ -263,7 +263,7 @@ def test_steps_after_a_learned_proposal_are_trained_through_exported_and_raise_i
     assert min(gains) > 1.0, gains
 
 
-def test_the_solver_s_steps_unrolled_learn_their_sizes_and_are_served_with_them(tmp_path: Path) -> None:
+def test_unrolled_steps_learn_their_sizes_and_are_served_with_them(tmp_path: Path) -> None:
     result = run_training(
         tmp_path,
         Training(
