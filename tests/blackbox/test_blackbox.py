@@ -254,7 +254,7 @@ def test_setting_the_clock_back_does_not_age_the_newest_file(tmp_path: Path, mon
         year_now = 2026
 
         @classmethod
-        def now(cls, tz: Any = None) -> datetime:
+        def now(cls, tz: Any = None) -> Any:
             return datetime(cls.year_now, 11, 20, tzinfo=tz)
 
     monkeypatch.setattr(recording, "datetime", SetBack)

@@ -36,7 +36,7 @@ def panels(*options: str) -> dict:
 
 
 @pytest.fixture(scope="module")
-def truth() -> tuple[PlacedPanel, PlacedPanel, PlacedPanel]:
+def truth() -> tuple[PlacedPanel, ...]:
     return misplaced(STACK, shift_m=0.002, turn_deg=1.0, gap_m=0.002, random=np.random.default_rng(2))
 
 

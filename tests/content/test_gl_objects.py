@@ -23,7 +23,8 @@ class Counting:
     """A context that remembers every object that it made."""
 
     def __init__(self, context: Any) -> None:
-        self._context, self.made = context, []
+        self._context = context
+        self.made: list[Any] = []
 
     def __getattr__(self, name: str) -> Any:
         found = getattr(self._context, name)

@@ -99,7 +99,7 @@ class Daemon:
 
 @pytest.fixture
 def started(tmp_path: Path) -> Iterator[Callable[..., Any]]:
-    made = []
+    made: list[Daemon] = []
 
     def start(*extra: str, **keywords: float | str) -> Daemon:
         folder = tmp_path / str(len(made))

@@ -8,7 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 
@@ -87,7 +87,8 @@ def test_without_descriptors_the_exit_code_is_never_that_of_bad_configuration(tm
 class Refusing:
     """A sensor that the system has no descriptor for, so often as it is told."""
 
-    name, serial, skipped, missed, refused = "refusing", "", 0, 0, {}
+    name, serial, skipped, missed = "refusing", "", 0, 0
+    refused: ClassVar[dict[str, int]] = {}
     capabilities = Capabilities(eye_points=True)
 
     def __init__(self, errors: list[Exception]) -> None:
@@ -107,7 +108,8 @@ class Refusing:
 @pytest.mark.parametrize(("number", "opened"), [(errno.EMFILE, True), (errno.ENOMEM, True), (errno.ENOENT, False)])
 def test_a_sensor_that_lacks_descriptors_to_reopen_is_tried_again(number: int, opened: bool) -> None:
     errors: list[Exception] = [read_by_a_reader(number), read_by_a_reader(number)]
-    worker = SensorWorker(lambda: Refusing(errors), SensorSettings(), MonotonicClock())
+    sensor: Any = Refusing
+    worker = SensorWorker(lambda: sensor(errors), SensorSettings(), MonotonicClock())
     worker.start()
     try:
         if opened:

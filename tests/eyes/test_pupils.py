@@ -23,7 +23,8 @@ def pixels(eyes_m: np.ndarray) -> np.ndarray:
 
 
 def test_the_models_are_those_that_were_shipped() -> None:
-    sums = dict(reversed(line.split()) for line in (MODELS / "SHA256SUMS").read_text().splitlines())
+    lines = (MODELS / "SHA256SUMS").read_text().splitlines()
+    sums = {name: digest for digest, name in map(str.split, lines)}
     assert sums == {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in MODELS.glob("*.onnx")}
 
 

@@ -21,7 +21,8 @@ def layers(value: int) -> np.ndarray:
 @given(st.lists(st.sets(st.integers(0, 5)), max_size=30))
 def test_held_buffers_never_change_and_no_more_are_made_than_held(story: Any) -> None:
     """story: which of the copies that are held are let go before each next one."""
-    buffers, held, most = LayerBuffers(), [], 0
+    held: list[Any] = []
+    buffers, most = LayerBuffers(), 0
     for value, letting_go in enumerate(story):
         held = [entry for index, entry in enumerate(held) if index not in letting_go]
         held.append((value % 256, buffers.copy_of(layers(value % 256))))

@@ -22,7 +22,7 @@ def cell() -> RunCell:
 
 
 def test_concurrent_changes_are_all_made_and_each_part_handed_back_once(cell: RunCell) -> None:
-    handed_back = []
+    handed_back: list[Any] = []
     mine = [[Part() for _ in range(50)] for _ in range(4)]
 
     def change(parts: Any) -> None:

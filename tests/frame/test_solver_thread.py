@@ -152,7 +152,8 @@ def test_what_can_t_be_made_is_raised_to_who_waits_for_it() -> None:
 
 def test_waiting_for_a_solver_that_is_never_ready_can_be_ended() -> None:
     gate = threading.Event()
-    host = SolverThread(lambda: FakeParts(lambda _: SolverStep()) if gate.wait(PATIENCE_S) else None, MonotonicClock())
+    made: Any = lambda: FakeParts(lambda _: SolverStep()) if gate.wait(PATIENCE_S) else None  # noqa: E731
+    host = SolverThread(made, MonotonicClock())
     with pytest.raises(FatalError, match=r"not ready after 0\.2 s"):
         host.wait_ready(max_s=0.2)
     told: list[None] = []

@@ -27,7 +27,7 @@ from runtime.support.artifacts import read_image, write_png  # noqa: E402
 from tests.model_export.golden import EYES, SIZE, WIDTH, golden, picture, weights  # noqa: E402
 
 
-def load_eyereal(path: Path) -> EyeRealNet:
+def load_eyereal(path: Path) -> Any:
     return picture_network("eyereal", path, None, {})[0].net.eval()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -53,7 +54,7 @@ def test_intensities_outside_the_range_are_clipped_and_never_nan() -> None:
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_single_precision_stays_single(dtype: type) -> None:
-    value = np.linspace(0, 1, 1001, dtype=dtype)
+    value: Any = np.linspace(0, 1, 1001, dtype=dtype)
     phase = phase_from_intensity(value)
     assert phase.dtype == dtype
     assert intensity_from_phase(phase).dtype == dtype

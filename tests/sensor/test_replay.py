@@ -23,7 +23,7 @@ def opened(clock: MonotonicClock | SimulatedClock, **options: float) -> ReplayDr
 
 
 def everything(driver: ReplayDriver, most: int = 10_000) -> list[SensorFrame]:
-    frames = []
+    frames: list[SensorFrame] = []
     try:
         while len(frames) < most:
             frames.append(driver.next_sample())

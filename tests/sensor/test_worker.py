@@ -39,7 +39,7 @@ class Scripted(Sensor):
             self._on_open()
         self.serial = self.serial or "S7"
 
-    def read_newest(self, timeout_s: float) -> SensorFrame | None:
+    def read_newest(self, timeout_s: float) -> SensorFrame:
         self._count += 1
         self._act()
         return SensorFrame(self._count, time.monotonic_ns())
@@ -54,7 +54,7 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Any:
     workers = []
 
     def start(act: Any, *, on_open: Any = None, settings: Any = SETTINGS) -> Any:
-        log = []
+        log: list[Any] = []
         worker = SensorWorker(lambda: Scripted(act, log, on_open=on_open), settings, MonotonicClock())
         worker.start()
         workers.append(worker)
@@ -179,7 +179,8 @@ def test_an_sdk_that_hangs_is_left_behind_and_never_blocks_the_loop(
     started: Callable[..., Any], where: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("runtime.sensor.worker.HANG_MARGIN_S", 0.1)
-    hung, release = [], threading.Event()
+    hung: list[Any] = []
+    release = threading.Event()
 
     def hang_once() -> None:
         time.sleep(0.002)
