@@ -59,7 +59,7 @@ if [ "$live" = yes ]; then
   for unit in phasestack-page phasestack phasestack-x; do
     case $(systemctl show --property=ActiveState --value "$unit") in
       inactive | failed) ;;
-      *) running="$unit $running" ;;
+      *) running="$running $unit" ;;
     esac
   done
   # shellcheck disable=SC2086
