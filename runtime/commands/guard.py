@@ -6,6 +6,7 @@ names), 75 what may pass, 130 Ctrl-C, 141 nobody reads what is printed.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import errno
 import os
@@ -36,12 +37,14 @@ def run_guarded(*, interrupts_leave: bool) -> None:
     if interrupts_leave:  # a second interrupt finds nothing to unwind
         signal.signal(signal.SIGINT, lambda number, frame: os._exit(INTERRUPTED))
     code = _flushed(code)
-    if _has_hung_thread():  # taking down what a library's own thread still runs in would end in an abort
+    if _has_hung_thread():
         from runtime.support import logs
 
         logs.flush()
-        os._exit(code)
-    sys.exit(code)
+    else:
+        atexit._run_exitfuncs()
+    # Modules are not taken down: that takes time, and in what a library's own thread still runs it would end in an abort.
+    os._exit(code)
 
 
 def _interrupted(number: int, frame: FrameType | None) -> None:

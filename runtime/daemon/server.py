@@ -138,7 +138,7 @@ class StatusServer(Listener):
         if isinstance(answer, Command):
             if _is_gone(writer):
                 raise Refusal("nothing was done")
-            log.info("asked for: %s %s", answer.name, "" if answer.value is None else answer.value)
+            log.info("asked for: %s", answer.name if answer.value is None else f"{answer.name} {answer.value}")
             self.commands.put(answer)
             answer = await _outcome(answer, writer)
         return _line(answer)

@@ -15,7 +15,7 @@ from runtime.content.base import ContentSource
 from runtime.content.registry import Opener, prepare_content
 from runtime.errors import ContextLost, Stopped
 from runtime.eyes.calibration import Calibration
-from runtime.frame.run_state import LEFT_BEHIND, RunCell, RunState
+from runtime.frame.run_state import RunCell, RunState
 from runtime.frame.solver import Solver, SolverStep
 from runtime.model.backends import Choice, Wanted, choose
 from runtime.model.predictor import Predictor, load_predictor
@@ -65,7 +65,7 @@ class RunningSolver:
             raise ContextLost("the panels have lost their OpenGL context")
         state = self.run.state  # before looking whether it is another solver's
         if not self.is_newest:
-            raise Stopped(LEFT_BEHIND)
+            raise Stopped("it had been left behind")
         self._held = state
         return self.solver.step(request, state)
 

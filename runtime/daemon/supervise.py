@@ -121,7 +121,7 @@ class Daemon(Host):
         except PhasestackError as error:
             self._answer(presenter, command, str(error))
         except (Exception, SystemExit) as error:
-            log.exception("%s: unexpected error", command.name)
+            log.exception("%s", command.name)
             self._answer(presenter, command, f"unexpected error ({type(error).__name__}): see the log")
 
     def refreshed(self, presenter: Presenter, account: RefreshAccount) -> None:

@@ -182,7 +182,7 @@ class Solver:
         if isinstance(error, expected):
             log.warning("%s: %s", part, error)
         else:
-            log.exception("%s: unexpected error", part)
+            log.exception("%s", part)
         return dict(self._missing)
 
 

@@ -165,7 +165,7 @@ class SolverThread(SolverHost):
             log.error("solver: %s", _line(error))  # a record that held the error would hold what it held
             attempt.error, attempt.busy_since_ns = error.with_traceback(None), self._clock.now_ns()
         except BaseException as error:  # what no step answers with: a bug of ours, or a library's
-            log.exception("solver: unexpected error")
+            log.exception("solver")
             attempt.error, attempt.busy_since_ns = error.with_traceback(None), self._clock.now_ns()
         finally:
             parts.close()

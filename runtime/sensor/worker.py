@@ -208,7 +208,7 @@ class SensorWorker(Samples):
                 self._set(attempt, SensorState.LOST, str(error))
             except BaseException as error:
                 # An SDK's own exception, or its `sys.exit()`, must not end the daemon: what is broken may come back.
-                log.exception("sensor: unexpected error")
+                log.exception("sensor")
                 self._set(attempt, SensorState.LOST, f"{type(error).__name__}: {error}")
             finally:
                 if driver is not None:

@@ -74,7 +74,7 @@ class Job(Generic[T]):
             self.problem = str(error)
         except BaseException as error:  # whatever a library raises, or a vendor's `sys.exit()`
             self.problem = one_line(f"{self._name}: {type(error).__name__}: {error}")
-            log.exception("%s: unexpected error", self._name)
+            log.exception("%s", self._name)
         finally:
             self.done = True
             _running.discard(threading.current_thread())

@@ -266,8 +266,11 @@ def test_it_stops_within_two_seconds(pc: Pc, after_s: float) -> None:
 def test_an_upgrade_swaps_the_program_and_goes_back_if_it_cannot_start(pc: Pc) -> None:
     pc.done("systemctl start phasestack")
     before, program = pc.prop("MainPID"), pc.root / "root/phasestack/runtime/commands/run.py"
+    told = "journalctl -b -u phasestack -o cat | grep -c 'the X server died\\|the run before was cut' || true"
+    faults = pc.done(told)
     pc.done("cd /root/phasestack && make install")
     assert pc.comes_back(unlike=before)
+    assert pc.done(told) == faults
     good = program.read_text()
     program.write_text(good + "\n\nraise RuntimeError('a bad release')\n")
     failed = pc.run("cd /root/phasestack && make install")
