@@ -43,7 +43,7 @@ def run_guarded(*, interrupts_leave: bool) -> None:
         logs.flush()
     else:
         atexit._run_exitfuncs()
-    # Modules are not taken down: that takes time, and in what a library's own thread still runs it would end in an abort.
+    # Modules are not taken down: that takes time, and where a library's own thread still runs it would end in an abort.
     os._exit(code)
 
 
