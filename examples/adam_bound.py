@@ -19,9 +19,9 @@ from runtime.config import load_stack
 def decibels(panels: torch.Tensor, targets: torch.Tensor, views: Views) -> float:
     """Light of displayed panels by two sets of random rays, without bias: each errs independently of the other."""
     codes = (panels * 255).round() / 255
-    counts = light(codes, views)[1]
-    a, b = ((traced(codes, views, rays=3) - targets) * counts for _ in range(2))
-    return float(-10 * torch.log10((a * b).sum() / (counts.sum() * 3)))
+    (a, in_a), (b, in_b) = (traced(codes, views, rays=3) for _ in range(2))
+    counts = in_a & in_b
+    return float(-10 * torch.log10(((a - targets) * (b - targets) * counts).sum() / (counts.sum() * 3)))
 
 
 def main() -> None:

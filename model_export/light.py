@@ -90,22 +90,23 @@ def light(panels: Tensor, views: Views) -> tuple[Tensor, Tensor]:
     return torch.stack([(1 - reduce(torch.mul, z).real) / 2 for z in bundles]), counts
 
 
-def traced(panels: Tensor, views: Views, *, rays: int = 2, random: torch.Generator | None = None) -> Tensor:
-    """The same intensities by rays x rays random rays a pixel: without bias, but noisy.
+def traced(
+    panels: Tensor, views: Views, *, rays: int = 2, random: torch.Generator | None = None
+) -> tuple[Tensor, Tensor]:
+    """Intensities by rays x rays random rays a pixel, noisy but unbiased; and where all of them count.
 
     Two calls err independently of each other: the mean of the product of both errors is the squared error, unbiased.
     """
     size, angle = (views.height_px, views.width_px), torch.pi * panels
-    total = torch.zeros((), dtype=panels.dtype, device=panels.device)
+    total, counts = torch.zeros((), dtype=panels.dtype, device=panels.device), torch.tensor(True, device=panels.device)
     for stratum in range(rays * rays):
         at = torch.tensor([stratum % rays, stratum // rays])[:, None, None]
         within = (torch.rand(2, *size, generator=random, dtype=torch.float64) + at) / rays
-        sums = [
-            _sample(angle, matrices, size, near_px=NEAR_PX, within=within)[0].sum(dim=0)
-            for matrices in views.panels_from_rays
-        ]
-        total = total + (1 - torch.cos(torch.stack(sums))) / (2 * rays * rays)
-    return total
+        found = [_sample(angle, matrices, size, near_px=NEAR_PX, within=within) for matrices in views.panels_from_rays]
+        sums = torch.stack([values.sum(dim=0) for values, _ in found])
+        total = total + (1 - torch.cos(sums)) / (2 * rays * rays)
+        counts = counts & torch.stack([inside.all(dim=0) for _, inside in found])
+    return total, counts
 
 
 def step(

@@ -48,7 +48,7 @@ class Pairs(Dataset[dict[str, Tensor]]):
     scene: str = ""  # that the runtime draws, turned about the vertical, instead
 
     def __getitem__(self, number: int) -> dict[str, Tensor]:
-        """The network's input, the targets, and homographies of the rays: of the eyes believed, of the true ones."""
+        """The network's input, the targets, and the rays of the eyes believed and of the true ones."""
         pair = self.pair(number)
         random = np.random.default_rng([self.seed, number, 1])
         pose = stack_from_eye(pair.eyes_m.mean(axis=0))

@@ -148,10 +148,10 @@ def _held_out_db(network: Network, batches: list[Batch], device: torch.device) -
         panels = next(_shown(network, answer, batch))
         targets = batch["targets"][0]
         views = Views(batch["views"][0], targets.shape[-1], targets.shape[-2])
-        counts = light(panels, views)[1]
         random = torch.Generator().manual_seed(number)
-        a, b = ((traced(panels, views, rays=1, random=random) - targets) * counts for _ in range(2))
-        error = float((a * b).sum() / (counts.sum() * COLOURS))
+        (a, in_a), (b, in_b) = (traced(panels, views, rays=1, random=random) for _ in range(2))
+        counts = in_a & in_b
+        error = float(((a - targets) * (b - targets) * counts).sum() / (counts.sum() * COLOURS))
         found.append(-10 * math.log10(max(error, LEAST_ERROR)))
     return sum(found) / len(found)
 

@@ -116,11 +116,18 @@ def test_steps_raise_the_light_of_real_pixels_and_say_how_much(still: tuple[Pane
     boxes = np.stack([plain_light(codes.permute(0, 2, 3, 1).numpy(), stack, eye, (54, 96), 16) for eye in EYES])
     boxes = boxes.transpose(0, 3, 1, 2)
     true = decibels((boxes - targets.numpy()) ** 2)
-    a, b = (traced(codes, views, rays=4, random=random) - targets for _ in range(2))
+    a, b = (traced(codes, views, rays=4, random=random)[0] - targets for _ in range(2))
     unbiased = decibels(np.where(np.isnan(boxes), np.nan, a * b))
     assert all(after > before for before, after in pairwise(reached)) and reached[-1] > reached[0] + 15
     assert unbiased == pytest.approx(true, abs=0.1)
     assert reached[-1] == pytest.approx(true, abs=0.25)
+
+
+def test_a_pixel_counts_only_where_all_its_rays_cross_every_panel() -> None:
+    even, views = torch.full((3, 1, 8, 12), 0.2, dtype=torch.float64), views_of(STACK)
+    seen, counts = traced(even, views, rays=2, random=torch.Generator().manual_seed(1))
+    assert seen[counts].numpy() == pytest.approx(np.sin(np.pi / 2 * 0.6) ** 2)
+    assert 0 < counts.sum() < light(even, views)[1].sum()
 
 
 @pytest.mark.parametrize("stack", STACKS.values(), ids=STACKS)

@@ -22,7 +22,7 @@ from typer.testing import CliRunner  # noqa: E402
 from model_export.checkpoint import load_checkpoint  # noqa: E402
 from model_export.data import TrainingPair, random_pair  # noqa: E402
 from model_export.export import export_model, picture_file  # noqa: E402
-from model_export.light import Views, improved, light, traced  # noqa: E402
+from model_export.light import Views, improved, traced  # noqa: E402
 from model_export.modules import Form, made  # noqa: E402
 from model_export.pairs import Pairs, network_input  # noqa: E402
 from model_export.scene import Plane, Scene, draw  # noqa: E402
@@ -243,9 +243,10 @@ def served(path: Path, number: int) -> tuple[Prediction, float]:
 def light_db(panels: Any, pair: TrainingPair) -> float:
     views = Views.of(pair.stack, pair.eyes_m, **SMALL, fov_deg=pair.fov_deg)
     targets = torch.from_numpy(np.stack(pair.images).transpose(0, 3, 1, 2).copy()) / 255
-    counts, random = light(panels, views)[1], torch.Generator().manual_seed(1)
-    a, b = ((traced(panels, views, rays=3, random=random) - targets) * counts for _ in range(2))
-    return -10 * math.log10(float((a * b).sum() / (counts.sum() * 3)))
+    random = torch.Generator().manual_seed(1)
+    (a, in_a), (b, in_b) = (traced(panels, views, rays=3, random=random) for _ in range(2))
+    counts = in_a & in_b
+    return -10 * math.log10(float(((a - targets) * (b - targets) * counts).sum() / (counts.sum() * 3)))
 
 
 def test_steps_after_a_learned_proposal_are_trained_and_raise_its_light(tmp_path: Path) -> None:

@@ -150,7 +150,7 @@ function painted() {
 function take({ refresh, viewer: mine }) {
   const before = newest;
   [newest, viewer] = [refresh, mine];
-  if (!look) return;
+  if (!look || !refresh.state) return;
   look.used = refresh.eyes_m ?? look.used;
   look.sigma_m = (refresh.eye_sigma_mm ?? 0) / 1000;
   const flatness = checks ? 0 : layersSeen.solved ? (layersSeen.flat ? refresh.flatness : 0) : 1;
