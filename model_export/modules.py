@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass
+from io import StringIO
 from typing import Annotated, Any, Literal
 
 import torch
@@ -123,7 +124,7 @@ def check_static(network: Network, *, width_px: int, height_px: int) -> None:
     """Raises InputError where values decide what the module does: no graph holds that."""
     example = torch.zeros(1, network.form.channels, height_px, width_px)
     try:
-        with quiet(), torch.no_grad():
+        with quiet(), redirect_stderr(StringIO()), torch.no_grad():  # it prints the graph of what it can't follow
             torch.export.export(network.net.eval(), (example,), strict=False)
     except Exception as error:  # what it can't follow it tells in many ways: the exporter itself will tell of the rest
         if "data-dependent" in str(error).lower():

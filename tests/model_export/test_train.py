@@ -203,7 +203,7 @@ def test_a_module_that_cannot_be_served_is_refused_in_one_line(tmp_path: Path, a
     command = ["export", "--arch", arch, "--random-init", "1", "--width", "64", "--height", "48", "--out", str(out)]
     result = CliRunner().invoke(app, [*command, *(["--option", "width=2"] if arch.endswith("Narrow") else [])])
     assert isinstance(result.exception, InputError) and problem in str(result.exception), result.exception
-    assert "\n" not in str(result.exception)
+    assert "\n" not in str(result.exception) and result.output == ""
     assert not out.parent.exists()
 
 
