@@ -1,6 +1,6 @@
 """The compiled loops: C++ without Python in it, called by `ctypes`, which lets other threads run meanwhile.
 
-The structures below are those of `solver.cpp` and `light.cpp`, field by field.
+The structures below are those of `solver.cpp`, `warp.cpp` and `light.cpp`, field by field.
 """
 
 from __future__ import annotations
@@ -13,8 +13,11 @@ from typing import Any
 from numpy.typing import NDArray
 
 MAX_PANELS = 5
+REACH_PX = 4
 MARGIN = 64  # elements behind an image's rows that loops may touch
-_pointer, _int, _long, _float = ctypes.c_void_p, ctypes.c_int32, ctypes.c_int64, ctypes.c_float
+_pointer, _int, _long, _float, _double = (
+    ctypes.c_void_p, ctypes.c_int32, ctypes.c_int64, ctypes.c_float, ctypes.c_double
+)  # fmt: skip
 
 
 class Image(ctypes.Structure):
@@ -45,6 +48,15 @@ class Problem(ctypes.Structure):
     )  # fmt: skip
 
 
+class Warp(ctypes.Structure):
+    """Where a raster's pixels lie in an image, and how far beside it (less than `REACH_PX`) its edge goes on."""
+
+    _fields_ = (
+        ("image_from_raster", _double * 9), ("image_bend", _double), ("image_middle", _double),
+        ("raster_bend", _double), ("raster_middle", _double), ("reach", _double),
+    )  # fmt: skip
+
+
 class View(ctypes.Structure):
     """One eye's view of displayed layers."""
 
@@ -59,7 +71,7 @@ class View(ctypes.Structure):
 class Result(ctypes.Structure):
     """Sum of a squared error, and of how many numbers."""
 
-    _fields_ = (("total", ctypes.c_double), ("counted", _long))
+    _fields_ = (("total", _double), ("counted", _long))
 
 
 @cache
@@ -74,6 +86,7 @@ def library() -> Any:
         "close_middle": (_pointer, _int, _int),
         "to_phasors": (_pointer, _pointer, _pointer, _long),
         "show": (_pointer, _int, _pointer, _long, _int, _int),
+        "warp": (_pointer, _pointer, _pointer, _int, _int, _int, _int),
         "squared_error": (_pointer, _int, _int, _pointer),
     }.items():
         function = getattr(loops, name)

@@ -104,8 +104,8 @@ struct Work {
 // F images alike at pixels first to last of a line (TILE_PX at most, all of them `inside`), into out[f], from its first
 // element on. Two rows of the image are mixed first, for the pixels between which the line runs; then each two pixels of
 // that. Both go run by run: along a run the same two are mixed, with weights that grow evenly.
-template <int F, int C>
-INLINE void sample(const Image *images, const Line &line, int first, int last, Work &work, int16_t (*out)[TILE]) {
+template <int F, int C, typename AnyLine>
+INLINE void sample(const Image *images, const AnyLine &line, int first, int last, Work &work, int16_t (*out)[TILE]) {
   const Image &image = images[0];
   const float *ramp = C == 1 ? RAMP.one_channel : RAMP.three_channels;
   const double xs = line.x(first), xe = line.x(last - 1), ys = line.y(first), ye = line.y(last - 1);

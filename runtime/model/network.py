@@ -11,9 +11,9 @@ from runtime.clock import Stopwatch
 from runtime.errors import InputError, ModelFailure
 from runtime.model.geometry import Geometry
 from runtime.model.job import Job
-from runtime.model.proposal import resample
 from runtime.model.session import ModelSession
 from runtime.model.targets import FULL
+from runtime.model.warp import resample
 from runtime.optics.malus import phase_from_intensity
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import image_from_raster, image_from_stack

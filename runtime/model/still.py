@@ -10,7 +10,7 @@ import numpy as np
 from runtime.clock import Stopwatch
 from runtime.model.base import STAGES, Prediction, Predictor
 from runtime.model.job import Job, Own
-from runtime.model.proposal import resample, resized_px, source_px
+from runtime.model.warp import resample, resized_px, source_px
 from runtime.optics.pupil import TRACKING_SIGMA_MM
 from runtime.optics.stack import PlaneRaster
 from runtime.optics.views import image_from_raster, image_from_stack

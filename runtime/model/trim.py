@@ -14,8 +14,8 @@ import numpy as np
 
 from runtime.model.geometry import geometry_of
 from runtime.model.job import Job, Part, Picture
-from runtime.model.proposal import coarse_pictures
 from runtime.model.targets import is_grey
+from runtime.model.warp import coarser, reduced_pictures, resample
 from runtime.optics.rect import PixelRect, union
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
@@ -79,7 +79,18 @@ def _differing_part(job: Job, scene: Scene) -> Part | None:
     """Where the pictures differ; None where that is too much, or they were left in textures."""
     if job.own is not None:
         geometry = geometry_of(job, scene.stack)
-        left, right, _ = coarse_pictures(replace(job, channels=3), geometry, COARSER)
+        raster = coarser(geometry.rasters[geometry.middle], COARSER)
+        left, right = (
+            np.asarray(
+                resample(
+                    picture,
+                    from_plane @ raster.plane_from_raster(),
+                    size=(raster.height_px, raster.width_px),
+                    edge=cv2.BORDER_REPLICATE,
+                )
+            )
+            for picture, from_plane in reduced_pictures(replace(job, channels=3), geometry, COARSER)
+        )
         begin, scale = geometry.boxes[geometry.middle], COARSER
     else:
         left, right = (images[0] for images in job.pictures)  # type: ignore[assignment]

@@ -1,0 +1,71 @@
+// An image on another raster, through a homography between what laws of columns make of both (model/chain.py).
+#include "sampling.hpp"
+
+namespace {
+
+constexpr int BENT_TILE_PX = 64;   // a parabola stands for a law's curve
+constexpr double BEYOND = 1e-9;    // where a law has no column
+
+struct Columns {  // column u of a raster is t = middle + (1 - exp(-bend (u - middle))) / bend to a homography
+  double bend, middle;
+  double to(double u) const { return bend == 0 ? u : middle - std::expm1(-bend * (u - middle)) / bend; }
+  double from(double t) const { return bend == 0 ? t : middle - std::log(std::max(1 - bend * (t - middle), BEYOND)) / bend; }
+};
+
+struct Warp {
+  double image_from_raster[9];
+  Columns image, raster;
+  double reach;  // pixels beside the image, to which its edge goes on: less than EDGE_PX
+};
+
+struct WarpedLine {
+  Line line;  // between what the laws make of columns
+  Columns image, raster;
+  double t(double u) const { return raster.to(u + 0.5) - 0.5; }
+  double x(double u) const { return image.from(line.x(t(u)) + 0.5) - 0.5; }
+  double y(double u) const { return line.y(t(u)); }
+};
+
+// Pixels of a line that lie in an image, or beside it by no more than so much: there its edge goes on.
+INLINE Span reaches(const WarpedLine &at, int count, const Image &image, double reach) {
+  const Line &line = at.line;
+  const double left = at.image.to(-reach), right = at.image.to(image.width + reach), below = image.rows + reach;
+  double low = at.t(0), high = at.t(count - 1);
+  at_least_zero(line.wu, line.w0 - BEYOND, low, high);
+  at_least_zero(line.xu - left * line.wu, line.x0 - left * line.w0, low, high);
+  at_least_zero(right * line.wu - line.xu, right * line.w0 - line.x0, low, high);
+  at_least_zero(line.yu + reach * line.wu, line.y0 + reach * line.w0, low, high);
+  at_least_zero(below * line.wu - line.yu, below * line.w0 - line.y0, low, high);
+  if (!(high >= low)) return {0, 0};
+  const double first = at.raster.from(low + 0.5) - 0.5, last = at.raster.from(high + 0.5) - 0.5;
+  const Span span{std::max(int(std::ceil(first - 1e-6)), 0), std::min(int(std::floor(last + 1e-6)) + 1, count)};
+  return span.first < span.last ? span : Span{0, 0};
+}
+
+template <int C>
+INLINE void warp_rows(const Image &image, const Image &result, const Warp &warp, int beside, int begin, int end_row) {
+  Work work{};
+  const bool bent = warp.image.bend != 0 || warp.raster.bend != 0;
+  for (int r = begin; r < end_row; ++r) {
+    const WarpedLine line{Line(warp.image_from_raster, r), warp.image, warp.raster};
+    const Span span = reaches(line, result.width, image, warp.reach);
+    int16_t *row = result.data + int64_t(r) * result.stride;
+    std::fill(row, row + int64_t(span.first) * C, int16_t(beside));
+    std::fill(row + int64_t(span.last) * C, row + int64_t(result.width) * C, int16_t(beside));
+    if (span.first == span.last) continue;
+    const int length = std::min(tile_px(line.line, span), bent ? BENT_TILE_PX : TILE_PX);
+    for (int u = span.first; u < span.last; u += length) {
+      const int end = std::min(u + length, span.last);
+      sample<1, C>(&image, line, u, end, work, work.tile);
+      std::memcpy(row + int64_t(u) * C, work.tile[0], size_t(end - u) * C * sizeof(int16_t));
+    }
+  }
+}
+
+}  // namespace
+
+// Rows of a result: bilinear samples of an image whose elements are 8191 at most, either way; `beside` where it has none.
+FOR_EVERY_CPU void warp(const Image *image, const Image *result, const Warp *by, int channels, int beside, int first, int end) {
+  if (channels == 3) warp_rows<3>(*image, *result, *by, beside, first, end);
+  else warp_rows<1>(*image, *result, *by, beside, first, end);
+}

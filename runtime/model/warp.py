@@ -1,0 +1,132 @@
+"""Pictures and panels on other rasters."""
+
+from __future__ import annotations
+
+from ctypes import byref, c_double
+from dataclasses import replace
+from math import prod
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.kernels import MARGIN, Image, Warp, library
+from runtime.model.chain import EVEN_COLUMNS, ColumnLaw
+from runtime.model.geometry import Geometry
+from runtime.model.job import Job
+from runtime.model.targets import without_alpha
+from runtime.optics.stack import PlaneRaster
+from runtime.optics.views import image_from_raster
+from runtime.records import F64, I16, U8
+from runtime.support.threads import at_once, on_rows
+
+LEAST_PX, MIN_SCALE = 16, 0.25  # of a picture: smaller ones, and finer rasters, would tell nothing new
+REACH_PX = 3.0  # beside an image, to which its edge goes on
+LARGEST = 8191  # of an element that the compiled loop samples, either way
+_TRANSPOSED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def coarser(raster: PlaneRaster, reduction: int) -> PlaneRaster:
+    """The same rectangle in fewer pixels."""
+    width, height = max(1, raster.width_px // reduction), max(1, raster.height_px // reduction)
+    pitch_u_m, pitch_v_m = raster.pitch_u_m * raster.width_px / width, raster.pitch_v_m * raster.height_px / height
+    return replace(raster, pitch_u_m=pitch_u_m, pitch_v_m=pitch_v_m, width_px=width, height_px=height)
+
+
+def source_px(image_from_raster: F64, size: tuple[int, int]) -> tuple[float, float]:
+    """Pixels of an image, along and down, for one of a raster (width, height) along and down, in its middle."""
+    a = image_from_raster
+    x, y, w = a @ (size[0] / 2, size[1] / 2, 1.0)
+    across, down = np.linalg.norm((a[:2, :2] - np.outer((x / w, y / w), a[2, :2])) / w, axis=0)
+    return float(across), float(down)
+
+
+def resized_px(pixels: int, scale: float) -> int:
+    """As many pixels as a raster has in place of `pixels`, of which `scale` lie in one of its own."""
+    return max(min(pixels, LEAST_PX), round(pixels / max(scale, MIN_SCALE)))
+
+
+def reduced_pictures(job: Job, geometry: Geometry, reduction: int) -> list[tuple[U8, F64]]:
+    """For each eye its picture (h, w[, 3]), with so many times fewer pixels than the panels have, and the homography of
+    its pixels from (y, z, 1) on the middle panel."""
+    raster = geometry.rasters[geometry.middle]
+    pictures: list[tuple[U8, F64]] = []
+    if job.own is None:
+        box = geometry.boxes[geometry.middle]
+        rows, columns = (slice(None), slice(None)) if job.part and job.part.drawn else box.slices
+        pictures = [(images[0][rows, columns], np.eye(3)) for images in job.arrays]
+    else:
+        pictures = [
+            (picture, image_from_raster(projection, raster))
+            for picture, projection in zip(job.own.pictures, job.own.projections, strict=True)
+        ]
+
+    def reduced(item: tuple[U8, F64]) -> tuple[U8, F64]:
+        picture, from_raster = item
+        scales = source_px(from_raster, (raster.width_px, raster.height_px))
+        height, width = picture.shape[:2]
+        by_u, by_v = (
+            max(1, min(round(scale * reduction), px // LEAST_PX))
+            for scale, px in zip(scales, (width, height), strict=True)
+        )
+        picture = picture[
+            : height // by_v * by_v, : width // by_u * by_u
+        ]  # whole ones, for which OpenCV is ten times as fast
+        if (by_u, by_v) != (1, 1):
+            size = width // by_u, height // by_v
+            picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+        image_from_plane = np.diag([1 / by_u, 1 / by_v, 1.0]) @ from_raster @ raster.raster_from_plane()
+        return without_alpha(picture, job.channels), image_from_plane
+
+    return at_once(reduced, pictures)
+
+
+def resample(
+    image: NDArray[Any], image_from_result: F64, *, size: tuple[int, int], edge: int = cv2.BORDER_CONSTANT
+) -> NDArray[Any]:
+    """Bilinear samples of an image (h, w[, C]) on a raster of (rows, columns); pixel centres at half-integers.
+    edge: OpenCV's name for what lies beside the image."""
+    to_corners = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+    at_centres = np.linalg.inv(to_corners) @ image_from_result @ to_corners
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpPerspective(image, at_centres, size[::-1], flags=flags, borderMode=edge))
+
+
+def warp(
+    image: I16,
+    image_from_result: F64,
+    *,
+    size: tuple[int, int],
+    beside: int,
+    reach_px: float = REACH_PX,
+    image_columns: ColumnLaw = EVEN_COLUMNS,
+    result_columns: ColumnLaw = EVEN_COLUMNS,
+) -> I16:
+    """`resample` of an image (h, w[, 3]) of LARGEST at most either way, several times as fast, through a homography
+    between what the two laws make of columns. One of them is even.
+
+    beside: what lies farther beside the image than reach_px (REACH_PX at most), to which its edge goes on.
+    """
+    x, y, w = image_from_result @ (result_columns.middle or size[1] / 2, size[0] / 2, 1.0)
+    right, down = image_from_result[:2, 0] - np.array([x, y]) / w * image_from_result[2, 0]
+    turned = abs(down) > abs(right)  # the loop wants a result's rows along the image's
+    if turned and result_columns.bend:
+        image, image_from_result, turned = np.swapaxes(image, 0, 1), _TRANSPOSED @ image_from_result, False
+    elif turned:
+        image_from_result, size = image_from_result @ _TRANSPOSED, size[::-1]
+    source = _with_margin(image.shape)
+    np.clip(image, -LARGEST, LARGEST, out=source)
+    result = np.empty((*size, *image.shape[2:]), np.int16)
+    channels = result.shape[2] if result.ndim == 3 else 1
+    laws = image_columns.bend, image_columns.middle, result_columns.bend, result_columns.middle
+    by = Warp((c_double * 9)(*image_from_result.ravel()), *laws, reach_px)
+    images = [Image.of(x.reshape(len(x), -1), rows=x.shape[0], width=x.shape[1]) for x in (source, result)]
+    loops = library()
+    on_rows(lambda first, end: loops.warp(*map(byref, (*images, by)), channels, beside, first, end), size[0])
+    return np.ascontiguousarray(np.swapaxes(result, 0, 1)) if turned else result
+
+
+def _with_margin(shape: tuple[int, ...]) -> I16:
+    """An empty array, behind whose end compiled loops may look."""
+    return np.empty(prod(shape) + MARGIN, np.int16)[: prod(shape)].reshape(shape)
