@@ -34,7 +34,7 @@ class Image(ctypes.Structure):
 class Panel(ctypes.Structure):
     """One panel between steps."""
 
-    _fields_ = (("ahead", Image), ("moved", Image), ("last", Image), ("cosine", Image), ("sine", Image))
+    _fields_ = (("ahead", Image), ("moved", Image), ("last", Image))
 
 
 class Problem(ctypes.Structure):
@@ -84,7 +84,6 @@ def library() -> Any:
     for name, arguments in {
         "step": (_pointer, _int, _int),
         "close_middle": (_pointer, _int, _int),
-        "to_phasors": (_pointer, _pointer, _pointer, _long),
         "show": (_pointer, _int, _pointer, _long, _int, _int),
         "warp": (_pointer, _pointer, _pointer, _int, _int, _int, _int),
         "squared_error": (_pointer, _int, _int, _pointer),

@@ -98,7 +98,7 @@ INLINE int16_t mixed(int16_t a, int16_t b, int16_t share) {
 struct Work {
   int16_t source[FIELDS][SOURCE];
   int16_t tile[2 * MAX_PANELS][TILE];
-  float sum[FIELDS][TILE];
+  int16_t sum[FIELDS][TILE];
 };
 
 // F images alike at pixels first to last of a line (TILE_PX at most, all of them `inside`), into out[f], from its first

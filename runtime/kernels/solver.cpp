@@ -1,7 +1,8 @@
 // The solver's steps on the processor (docs/mathematics.md, L1 to L5; model_export/light.py is the reference).
 //
 // Rays are compared row by row, and what they see wrong waits in a ring of rows until all rays through a row of a panel
-// have been compared: then that row moves. Nothing but the panels leaves a core's own cache.
+// have been compared: then that row moves. Its phasors live in a ring as well, from the first of its rays to the last:
+// memory that is read and written holds nothing but the panels.
 #include <vector>
 
 #include "sampling.hpp"
@@ -14,10 +15,9 @@ constexpr float PI = 3.14159265f;
 constexpr double NEAR_PX = 0.5;   // a ray counts that crosses every panel so far inside its edges
 
 struct Panel {
-  Image ahead;         // what the rays see: with momentum
-  Image moved;         // the same after the step
-  Image last;          // without momentum, read and written
-  Image cosine, sine;  // of pi times what the rays see
+  Image ahead;  // what the rays see: with momentum
+  Image moved;  // the same after the step
+  Image last;   // without momentum, read and written
 };
 
 struct Problem {
@@ -26,7 +26,7 @@ struct Problem {
   const double *panels_from_rays;  // (sets, panels, 3, 3)
   const double *rays_from_panels;  // their inverses
   const uint8_t *targets[2];       // left and right eye's, (height, width, channels)
-  const float *column_taper;       // (width) what the rays' errors are multiplied with
+  const float *column_taper;       // (width, channels) what the rays' errors are multiplied with
   const float *row_taper;          // (height)
   const float *table;              // (256, 2): of a target's code, the sum of all panels that shows it, and its weight
   float rest;                      // what lies beside a panel counts for, where the middle one is closed
@@ -37,11 +37,12 @@ struct Problem {
 // What one thread does: rows of rays, and those of panels that are complete by then.
 struct Share {
   int first, end;
-  std::vector<int> until[MAX_PANELS];  // the last row of rays that each row of a panel is seen through
+  std::vector<int> since[MAX_PANELS], until[MAX_PANELS];  // first and last row of rays that see each row of a panel
   int panel_first[MAX_PANELS], panel_end[MAX_PANELS];
   int16_t *ring;
   int64_t stride, plane;  // of a row, of one field
   int rows, fields;
+  Image cosine[MAX_PANELS], sine[MAX_PANELS];  // of pi times what the rays see
 
   int16_t *field(int set, int f) const { return ring + (int64_t(set) * fields + f) * plane; }
   int16_t *row(int set, int f, int r) const { return field(set, f) + int64_t(r % rows) * stride; }
@@ -50,17 +51,18 @@ struct Share {
   }
 };
 
-Share share_of(const Problem &problem, int part, int parts, int fields) {
+Share share_of(const Problem &problem, int part, int parts, int fields, bool phasors) {
   static thread_local std::vector<int16_t> memory;
   const int height = problem.height;
   Share share;
   share.first = int(int64_t(height) * part / parts), share.end = int(int64_t(height) * (part + 1) / parts);
   share.rows = 1, share.fields = fields;
   int begin = share.first;
+  int64_t held[MAX_PANELS], total = 0;
   for (int n = 0; n < problem.panels; ++n) {
     const Image &image = problem.panel[n].ahead;
-    std::vector<int> &until = share.until[n];
-    until.resize(image.rows);
+    std::vector<int> &since = share.since[n], &until = share.until[n];
+    since.resize(image.rows), until.resize(image.rows);
     int &first = share.panel_first[n] = image.rows, &end = share.panel_end[n] = 0, latest = 0;
     for (int q = 0; q < image.rows; ++q) {
       double low = 1e9, high = -1e9;
@@ -71,19 +73,46 @@ Share share_of(const Problem &problem, int part, int parts, int fields) {
         const double beside = 2 * std::abs(bottom - top) / std::max(run, 1.0);  // two pixels further along the line
         low = std::min({low, top - beside, bottom - beside}), high = std::max({high, top + beside, bottom + beside});
       }
-      const int since = int(std::clamp(std::floor(low), 0.0, height - 1.0));
+      since[q] = int(std::clamp(std::floor(low), 0.0, height - 1.0));
       until[q] = latest = std::max(latest, int(std::clamp(std::floor(high) + 1, 0.0, height - 1.0)));
-      share.rows = std::max(share.rows, latest - since + 2);
+      share.rows = std::max(share.rows, latest - since[q] + 2);
       const bool mine = (latest >= share.first || part == 0) && (latest < share.end || part == parts - 1);
-      if (mine) first = std::min(first, q), end = q + 1, begin = std::min(begin, since);
+      if (mine) first = std::min(first, q), end = q + 1, begin = std::min(begin, since[q]);
     }
+    for (int q = image.rows - 2; q >= 0; --q) since[q] = std::min(since[q], since[q + 1]);
+    held[n] = 2;
+    for (int q = 0, oldest = 0; q < image.rows; held[n] = std::max(held[n], int64_t(++q - oldest) + 2))
+      while (oldest < q && until[oldest] < since[q]) ++oldest;
+    total += phasors ? 2 * held[n] * (image.width * problem.channels + LANES) : 0;
   }
   share.first = begin;
   share.stride = int64_t(problem.width) * problem.channels + 2 * LANES;
   share.plane = share.stride * share.rows;
-  memory.resize(size_t(problem.sets * fields * share.plane + 2 * LANES));
+  const int64_t rings = problem.sets * fields * share.plane + 2 * LANES;
+  memory.resize(size_t(rings + total + 2 * LANES));
   share.ring = memory.data();
+  int16_t *at = share.ring + rings;
+  for (int n = 0; phasors && n < problem.panels; ++n)
+    for (Image *image : {share.cosine + n, share.sine + n}) {
+      const Image &like = problem.panel[n].ahead;
+      *image = {at, int64_t(like.width) * problem.channels + LANES, like.rows, like.width, int32_t(held[n])};
+      at += image->stride * held[n];
+    }
   return share;
+}
+
+// Row q of a panel as cosine and sine of pi times what it shows.
+INLINE void to_phasors(const Problem &problem, const Share &share, int n, int q) {
+  const int16_t *row = problem.panel[n].ahead.row(q);
+  int16_t *cosine = const_cast<int16_t *>(share.cosine[n].row(q)), *sine = const_cast<int16_t *>(share.sine[n].row(q));
+  const int count = problem.panel[n].ahead.width * problem.channels;
+  VECTORISED for (int k = 0; k < count; ++k) {
+    const float t = (float(row[k]) - FULL / 2) * (PI / FULL), y = t * t;  // series about the middle of the range
+    const float s = ((((-1.0f / 39916800 * y + 1.0f / 362880) * y - 1.0f / 5040) * y + 1.0f / 120) * y - 1.0f / 6) * y + 1;
+    const float c = (((1.0f / 479001600 * y - 1.0f / 3628800) * y + 1.0f / 40320) * y - 1.0f / 720) * y + 1.0f / 24;
+    cosine[k] = rounded(UNIT * std::clamp(-s * t, -1.0f, 1.0f));
+    sine[k] = rounded(UNIT * std::clamp((c * y - 0.5f) * y + 1, -1.0f, 1.0f));
+  }
 }
 
 INLINE void clear_beside(const Problem &problem, const Share &share, int set, int r, Span span) {
@@ -102,7 +131,7 @@ INLINE void compare(const Problem &problem, const Share &share, int set, int r, 
   Span span{0, problem.width};
   for (int n = 0; n < N; ++n) {
     lines[n] = Line(problem.panels_from_rays + (set * N + n) * 9, r);
-    span = common(span, inside(lines[n], problem.width, problem.panel[n].cosine, NEAR_PX));
+    span = common(span, inside(lines[n], problem.width, problem.panel[n].ahead, NEAR_PX));
   }
   const float row_taper = problem.row_taper[r] * UNIT;
   int tile = TILE_PX;
@@ -110,12 +139,12 @@ INLINE void compare(const Problem &problem, const Share &share, int set, int r, 
   for (int u = span.first; u < span.last; u += tile) {
     const int end = std::min(u + tile, span.last), count = (end - u) * C;
     for (int n = 0; n < N; ++n) {
-      const Image phasor[2] = {problem.panel[n].cosine, problem.panel[n].sine};
+      const Image phasor[2] = {share.cosine[n], share.sine[n]};
       sample<2, C>(phasor, lines[n], u, end, work, work.tile + 2 * n);
     }
     const int64_t at = int64_t(u) * C;
     const uint8_t *target = problem.targets[set % 2] + int64_t(r) * problem.width * C + at;
-    for (int e = 0; e < count; ++e) work.sum[0][e] = problem.column_taper[u + e / C] * row_taper;
+    const float *taper = problem.column_taper + at;
     int16_t *out[1 + 2 * N];
     for (int f = 0; f < 1 + 2 * N; ++f) out[f] = share.row(set, f, r) + at;
     for (int e = 0; e < count; e += LANES)
@@ -132,7 +161,7 @@ INLINE void compare(const Problem &problem, const Share &share, int set, int r, 
           after_im[n] = after_re[n + 1] * im[n] + after_im[n + 1] * re[n];
         }
         const float seen = 0.5f - 0.5f * before_re[N], slope = before_im[N];
-        const float error = (seen - float(target[k]) * (1.0f / 255)) * work.sum[0][k];
+        const float error = (seen - float(target[k]) * (1.0f / 255)) * (taper[k] * row_taper);
         out[0][k] = rounded(slope * slope * UNIT);
         for (int n = 0; n < N; ++n) {
           out[1 + 2 * n][k] = rounded(error * (before_re[n] * after_re[n + 1] - before_im[n] * after_im[n + 1]));
@@ -143,7 +172,7 @@ INLINE void compare(const Problem &problem, const Share &share, int set, int r, 
   clear_beside(problem, share, set, r, span);
 }
 
-// What F fields of all sets come to at pixels u to end of a panel's row, into work.sum.
+// What F fields of all sets (four at most, whose sum fits) come to at pixels of a panel's row, into work.sum.
 template <int F, int C>
 INLINE void gather(const Problem &problem, const Share &share, const int *fields, int n, int q, Span tile, Work &work) {
   const int width = problem.panel[n].ahead.width;
@@ -159,9 +188,9 @@ INLINE void gather(const Problem &problem, const Share &share, const int *fields
       sample<F, C>(images, line, u, end, work, work.tile);
       for (int f = 0; f < F; ++f) {
         std::memset(work.tile[f] + count, 0, LANES * sizeof *work.tile[f]);
-        float *sum = work.sum[f] + (u - tile.first) * C;
+        int16_t *sum = work.sum[f] + (u - tile.first) * C;
         for (int e = 0; e < count; e += LANES)
-          VECTORISED for (int k = e; k < e + LANES; ++k) sum[k] += float(work.tile[f][k]);
+          VECTORISED for (int k = e; k < e + LANES; ++k) sum[k] = int16_t(sum[k] + work.tile[f][k]);
       }
     }
   }
@@ -177,12 +206,12 @@ INLINE void move(const Problem &problem, const Share &share, int n, int q, Work 
     const Span tile{u, std::min(u + TILE_PX, panel.ahead.width)};
     gather<3, C>(problem, share, fields, n, q, tile, work);
     const int64_t at = int64_t(u) * C, count = int64_t(tile.last - u) * C;
-    const int16_t *cosine = panel.cosine.row(q) + at, *sine = panel.sine.row(q) + at, *ahead = panel.ahead.row(q) + at;
+    const int16_t *cosine = share.cosine[n].row(q) + at, *sine = share.sine[n].row(q) + at, *ahead = panel.ahead.row(q) + at;
     int16_t *last = const_cast<int16_t *>(panel.last.row(q)) + at, *moved = const_cast<int16_t *>(panel.moved.row(q)) + at;
     for (int e = 0; e < count; e += LANES)
       VECTORISED for (int k = e; k < e + LANES; ++k) {
-        const float gradient = float(sine[k]) * work.sum[1][k] + float(cosine[k]) * work.sum[2][k];
-        const float change = size * gradient / std::max(work.sum[0][k], least);
+        const float gradient = float(sine[k]) * float(work.sum[1][k]) + float(cosine[k]) * float(work.sum[2][k]);
+        const float change = size * gradient / std::max(float(work.sum[0][k]), least);
         const float now = std::min(std::max(float(ahead[k]) - change, 0.0f), FULL);
         moved[k] = rounded(now + problem.momentum * (now - float(last[k])));
         last[k] = rounded(now);
@@ -199,8 +228,7 @@ INLINE void lack(const Problem &problem, const Share &share, int set, int r, Wor
   for (int u = span.first; u < span.last; u += TILE_PX) {
     const Span tile{u, std::min(u + TILE_PX, span.last)};
     const int count = (tile.last - u) * C;
-    float *sum = work.sum[0];
-    std::fill(sum, sum + TILE, 0.0f);
+    float sum[TILE] = {};
     for (int n = 0; n < problem.panels; ++n) {
       if (n == middle) continue;
       const Line line(homographies + n * 9, r);
@@ -235,16 +263,21 @@ INLINE void fill(const Problem &problem, const Share &share, int q, Work &work) 
     gather<2, C>(problem, share, fields, middle, q, tile, work);
     int16_t *out = const_cast<int16_t *>(image.row(q)) + int64_t(u) * C;
     for (int k = 0; k < (tile.last - u) * C; ++k)
-      if (work.sum[0][k] > 0) out[k] = rounded(std::clamp(2 * UNIT * work.sum[1][k] / work.sum[0][k], 0.0f, FULL));
+      if (work.sum[0][k] > 0) out[k] = rounded(std::clamp(2 * UNIT * float(work.sum[1][k]) / float(work.sum[0][k]), 0.0f, FULL));
   }
 }
 
 template <int C, int N>
 INLINE void step_rows(const Problem &problem, const Share &share) {
   Work work{};
-  int at[N];
+  int at[N], ready[N];  // the next row of a panel that moves, and that becomes phasors
   std::copy(share.panel_first, share.panel_first + N, at);
+  for (int n = 0; n < N; ++n)
+    ready[n] = int(std::lower_bound(share.until[n].begin(), share.until[n].end(), share.first) - share.until[n].begin());
   for (int r = share.first; r < share.end; ++r) {
+    for (int n = 0; n < N; ++n)
+      for (const int rows = problem.panel[n].ahead.rows; ready[n] < rows && share.since[n][ready[n]] <= r; ++ready[n])
+        to_phasors(problem, share, n, ready[n]);
     for (int set = 0; set < problem.sets; ++set) compare<C, N>(problem, share, set, r, work);
     for (int n = 0; n < N; ++n)
       while (at[n] < share.panel_end[n] && share.until[n][at[n]] <= r) move<C, N>(problem, share, n, at[n]++, work);
@@ -266,7 +299,7 @@ INLINE void close_rows(const Problem &problem, const Share &share) {
 
 // One of so many parts of a step, all of which may run at once; a panel's phasors are `ahead`'s.
 FOR_EVERY_CPU void step(const Problem *problem, int part, int parts) {
-  const Share share = share_of(*problem, part, parts, 1 + 2 * problem->panels);
+  const Share share = share_of(*problem, part, parts, 1 + 2 * problem->panels, true);
   switch (problem->channels * 10 + problem->panels) {
     case 12: return step_rows<1, 2>(*problem, share);
     case 13: return step_rows<1, 3>(*problem, share);
@@ -281,20 +314,9 @@ FOR_EVERY_CPU void step(const Problem *problem, int part, int parts) {
 
 // One of so many parts of the middle panel's `last`: the best for the other panels' as they stand.
 FOR_EVERY_CPU void close_middle(const Problem *problem, int part, int parts) {
-  const Share share = share_of(*problem, part, parts, 2);
+  const Share share = share_of(*problem, part, parts, 2, false);
   if (problem->channels == 3) close_rows<3>(*problem, share);
   else close_rows<1>(*problem, share);
-}
-
-// Elements of a panel as cosine and sine of pi times what it shows.
-FOR_EVERY_CPU void to_phasors(const int16_t *panel, int16_t *cosine, int16_t *sine, int64_t count) {
-  VECTORISED for (int64_t k = 0; k < count; ++k) {
-    const float t = (float(panel[k]) - FULL / 2) * (PI / FULL), y = t * t;  // series about the middle of the range
-    const float s = ((((-1.0f / 39916800 * y + 1.0f / 362880) * y - 1.0f / 5040) * y + 1.0f / 120) * y - 1.0f / 6) * y + 1;
-    const float c = (((1.0f / 479001600 * y - 1.0f / 3628800) * y + 1.0f / 40320) * y - 1.0f / 720) * y + 1.0f / 24;
-    cosine[k] = rounded(UNIT * std::clamp(-s * t, -1.0f, 1.0f));
-    sine[k] = rounded(UNIT * std::clamp((c * y - 0.5f) * y + 1, -1.0f, 1.0f));
-  }
 }
 
 // Rows of a panel in 8-bit codes, opaque, into (rows, width) RGBA pixels.

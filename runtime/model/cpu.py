@@ -61,7 +61,8 @@ class CpuState:
         else:
             pictures = [images[0][rays.slices] for images in job.arrays]
         self._targets = at_once(lambda picture: without_alpha(picture, job.channels), pictures)
-        self._tapers = geometry.tapers()
+        across, down = geometry.tapers()
+        self._tapers = np.repeat(across, job.channels), down
         for n, panel in enumerate(self._held.last):
             box = geometry.boxes[n]
             panel[: box.height_px, : box.width_px * job.channels] = self._rest
@@ -81,17 +82,10 @@ class CpuState:
         np.copyto(self._held.ahead, self._held.last)
 
     def step(self, step: Step) -> None:
-        held, loops = self._held, library()
+        held = self._held
         problem, _keep = self._problem(self._geometry.panels_from_rays(step.places, self._sigma_mm))
         problem.size, problem.momentum, problem.floor = step.size, step.momentum, step.floor
-        for n, box in enumerate(self._geometry.boxes):
-
-            def convert(first: int, end: int, n: int = n) -> None:
-                at = [image.ctypes.data + first * image.strides[0] for image in (held.ahead[n], *held.phasors[n])]
-                loops.to_phasors(*at, (end - first) * held.ahead.shape[2])
-
-            on_rows(convert, box.height_px, threads=self._threads)
-        self._in_parts(loops.step, problem)
+        self._in_parts(library().step, problem)
         held.ahead, held.moved = held.moved, held.ahead
 
     def write(self, beside: int | tuple[int, ...] | None) -> U8:
@@ -141,7 +135,7 @@ class CpuState:
             table=table.ctypes.data, rest=self._rest,
         )  # fmt: skip
         for n, box in enumerate(geometry.boxes):
-            images = (held.ahead[n], held.moved[n], held.last[n], *held.phasors[n])
+            images = (held.ahead[n], held.moved[n], held.last[n])
             problem.panel[n] = Panel(*(Image.of(image, rows=box.height_px, width=box.width_px) for image in images))
         return problem, (seen, back, table)
 
@@ -152,4 +146,3 @@ class _Buffers:
     def __init__(self, stack: PanelStack, channels: int) -> None:
         shape = (stack.count, stack.height_px + 1, stack.width_px * channels + SAFE)
         self.last, self.ahead, self.moved = (np.zeros(shape, np.int16) for _ in range(3))
-        self.phasors = np.zeros((shape[0], 2, *shape[1:]), np.int16)  # cosine and sine
