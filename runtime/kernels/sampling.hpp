@@ -36,9 +36,9 @@ struct Image {
 };
 
 struct Ramp {  // the pixel that an element belongs to
-  float one_channel[RUN_PX * MAX_CHANNELS + LANES] = {}, three_channels[RUN_PX * MAX_CHANNELS + LANES] = {};
+  int16_t one_channel[RUN_PX * MAX_CHANNELS + LANES] = {}, three_channels[RUN_PX * MAX_CHANNELS + LANES] = {};
   constexpr Ramp() {
-    for (int e = 0; e < RUN_PX * MAX_CHANNELS + LANES; ++e) one_channel[e] = float(e), three_channels[e] = float(e / 3);
+    for (int e = 0; e < RUN_PX * MAX_CHANNELS + LANES; ++e) one_channel[e] = int16_t(e), three_channels[e] = int16_t(e / 3);
   }
 };
 constexpr Ramp RAMP;
@@ -107,7 +107,7 @@ struct Work {
 template <int F, int C, typename AnyLine>
 INLINE void sample(const Image *images, const AnyLine &line, int first, int last, Work &work, int16_t (*out)[TILE]) {
   const Image &image = images[0];
-  const float *ramp = C == 1 ? RAMP.one_channel : RAMP.three_channels;
+  const int16_t *ramp = C == 1 ? RAMP.one_channel : RAMP.three_channels;
   const double xs = line.x(first), xe = line.x(last - 1), ys = line.y(first), ye = line.y(last - 1);
   const double slope = xe - xs > 0.5 ? (ye - ys) / (xe - xs) : 0, bottom = image.rows - 1;
   const int s0 = std::clamp(int(std::floor(xs)) - 1, 0, image.width - 1);
@@ -124,10 +124,12 @@ INLINE void sample(const Image *images, const AnyLine &line, int first, int last
     length = std::min(elements - at, (int(until) + 1) * C);
     float share = float((within - row) * WEIGHT_UNIT);
     const float growth = float(grows / C * WEIGHT_UNIT);
+    const int16_t step = rounded(growth);
     const int64_t from = int64_t(s0) * C + at;
     for (int e = 0; e < length; e += LANES, share += growth * LANES) {
       int16_t weights[LANES];
-      VECTORISED for (int k = 0; k < LANES; ++k) weights[k] = int16_t(int(share + growth * RAMP.one_channel[k]));
+      const int16_t begin = rounded(share);
+      VECTORISED for (int k = 0; k < LANES; ++k) weights[k] = int16_t(begin + step * RAMP.one_channel[k]);
       for (int f = 0; f < F; ++f) {
         const int16_t *upper = images[f].row(row) + from + e;
         const int16_t *lower = images[f].row(std::min(row + 1, image.rows - 1)) + from + e;
@@ -159,11 +161,11 @@ INLINE void sample(const Image *images, const AnyLine &line, int first, int last
     for (; k < next; until += per_run, beside += way)
       for (int length, end = std::min(int(std::min(until, 1e6)) + 1, next); k < end; k += length) {
         length = std::min(end - k, RUN_PX);
-        const float share = float((xs - s0 - beside - k + k * (scale + bend * k)) * WEIGHT_UNIT);
-        const float growth = float((scale + bend * (2 * k + length - 1) - 1) * WEIGHT_UNIT);
+        const int16_t share = rounded(float((xs - s0 - beside - k + k * (scale + bend * k)) * WEIGHT_UNIT));
+        const int16_t growth = rounded(float((scale + bend * (2 * k + length - 1) - 1) * WEIGHT_UNIT));
         for (int e = 0; e < length * C; e += LANES) {
           int16_t weights[LANES];
-          VECTORISED for (int i = 0; i < LANES; ++i) weights[i] = int16_t(int(share + growth * ramp[e + i]));
+          VECTORISED for (int i = 0; i < LANES; ++i) weights[i] = int16_t(share + growth * ramp[e + i]);
           for (int f = 0; f < F; ++f) {
             const int16_t *left = work.source[f] + LANES + (k + beside) * C + e;
             int16_t *to = out[f] + k * C + e;
