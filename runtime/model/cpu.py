@@ -7,7 +7,6 @@ from contextlib import AbstractContextManager, nullcontext
 from ctypes import byref, c_void_p
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,7 +14,7 @@ from runtime.kernels import MARGIN, Image, Panel, Problem, library
 from runtime.model.contract import Step
 from runtime.model.geometry import Geometry, inverse
 from runtime.model.job import Job
-from runtime.model.targets import FULL, beside_codes, rest_of, target_table, without_alpha
+from runtime.model.targets import beside_codes, rest_of, target_table, without_alpha
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, I16, U8
@@ -70,9 +69,7 @@ class CpuState:
 
     def set_panel(self, panel: int, codes: I16) -> None:
         box, channels = self._geometry.boxes[panel], self._channels
-        whole = cv2.resize(codes, (box.width_px, box.height_px), interpolation=cv2.INTER_CUBIC)
-        np.clip(whole, 0, FULL, out=whole)
-        self._held.last[panel, : box.height_px, : box.width_px * channels] = whole.reshape(box.height_px, -1)
+        self._held.last[panel, : box.height_px, : box.width_px * channels] = codes.reshape(box.height_px, -1)
 
     def close_middle(self) -> None:
         problem, _keep = self._problem(self._geometry.panels_from_rays("middle", 0.0))

@@ -19,7 +19,7 @@ class SolverState(Protocol):
         """Take what is wanted; all panels rest within their boxes. All else is done within what it answers."""
 
     def set_panel(self, panel: int, codes: I16) -> None:
-        """What a panel shows within its box: (rows, columns[, 3]), sixteenths of a code, of any size."""
+        """What a panel shows within its box: (rows, columns[, 3]), sixteenths of a code."""
 
     def close_middle(self) -> None:
         """The middle panel as it is best for both eyes, while the others stay."""

@@ -20,7 +20,7 @@ from runtime.model.geometry import Geometry, taper
 from runtime.model.job import Job
 from runtime.model.session import ModelSession
 from runtime.model.targets import FULL, REST, phase_codes
-from runtime.model.warp import REACH_PX, coarser, reduced_pictures, warp
+from runtime.model.warp import REACH_PX, reduced_pictures, warp
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.tilt import coarse_layer_from_seen
 from runtime.records import F32, F64, I16, U8
@@ -39,7 +39,7 @@ class Proposal(Protocol):
     """Where the steps begin."""
 
     def panels(self, job: Job, geometry: Geometry, watch: Stopwatch) -> dict[int, I16]:
-        """Panels' boxes, at any size, (rows, columns[, 3]), sixteenths of a code; those that are missing rest.
+        """Panels within their boxes, (rows, columns[, 3]), sixteenths of a code; those that are missing rest.
 
         Raises ModelFailure, and of these EyesNotServed."""
 
@@ -118,20 +118,17 @@ class ChainProposal:
         return np.asarray(cv2.LUT(picture[0], self._codes), np.int16), picture[1]
 
     def _on_panel(self, n: int, answer: I16, geometry: Geometry, local: _Local, frame: ChainFrame) -> I16:
-        """The network's answer for an outer panel on a coarser raster of its box."""
-        raster = coarser(geometry.rasters[n], self._reduction)
+        """The network's answer for an outer panel, within its box."""
+        raster = geometry.rasters[n]
         middle_m = local.in_stack(frame.middle_m)
         seen_from_layer = np.linalg.inv(coarse_layer_from_seen(geometry.stack, n, middle_m))
         to_frame = frame.frame_from_plane(x_m=raster.x_m) @ np.linalg.inv(local.plane_from_local)
         # The answer begins one parallax before the first column.
         begin = np.array([[1.0, 0.0, frame.cell_px], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
         columns = ColumnLaw(frame.columns.bend, frame.columns.middle + frame.cell_px)
-        matrix, size = (
-            begin @ to_frame @ seen_from_layer @ raster.plane_from_raster(),
-            (raster.height_px, raster.width_px),
-        )
-        codes = warp(answer, matrix, size=size, beside=EVEN, image_columns=columns)
-        np.clip(codes, 0, FULL, out=codes)
+        matrix = begin @ to_frame @ seen_from_layer @ raster.plane_from_raster()
+        size = raster.height_px, raster.width_px
+        codes = warp(np.clip(answer, 0, FULL), matrix, size=size, beside=EVEN, image_columns=columns)
         if max(geometry.taper_px) > 0:
             weights = _wave_taper(geometry, raster, middle_m)
             weights = weights[..., None] if codes.ndim == 3 else weights

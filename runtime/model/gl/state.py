@@ -53,8 +53,7 @@ class GlState:
 
     def set_panel(self, panel: int, codes: I16) -> None:
         box = self._geometry.boxes[panel]
-        whole = np.clip(cv2.resize(codes, (box.width_px, box.height_px), interpolation=cv2.INTER_CUBIC), 0, FULL)
-        held = np.rint((whole + FULL) * (65535 / (3 * FULL))).astype(np.uint16)
+        held = np.rint((codes + FULL) * (65535 / (3 * FULL))).astype(np.uint16)
         if held.ndim == 3:
             held = np.dstack([held, held[..., :1]])
         self._panel("last", panel).texture.write(held, viewport=(0, 0, box.width_px, box.height_px), alignment=1)
