@@ -244,11 +244,13 @@ INLINE void lack(const Problem &problem, const Share &share, int set, int r, Wor
     const int64_t at = int64_t(u) * C;
     const uint8_t *target = problem.targets[set % 2] + int64_t(r) * problem.width * C + at;
     int16_t *weights = share.row(set, 0, r) + at, *wanted = share.row(set, 1, r) + at;
-    for (int k = 0; k < count; ++k) {
-      const float *entry = problem.table + 2 * target[k];
-      weights[k] = rounded(entry[1] * UNIT);
-      wanted[k] = rounded(std::clamp(entry[0] - sum[k], -FULL, 2 * FULL) * entry[1] * 0.5f);
-    }
+    float asked[TILE], weight[TILE];
+    for (int k = 0; k < count; ++k) asked[k] = problem.table[2 * target[k]], weight[k] = problem.table[2 * target[k] + 1];
+    for (int e = 0; e < count; e += LANES)
+      VECTORISED for (int k = e; k < e + LANES; ++k) {
+        weights[k] = rounded(weight[k] * UNIT);
+        wanted[k] = rounded(std::min(std::max(asked[k] - sum[k], -FULL), 2 * FULL) * weight[k] * 0.5f);
+      }
   }
   clear_beside(problem, share, set, r, span);
 }
