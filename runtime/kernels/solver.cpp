@@ -80,9 +80,10 @@ Share share_of(const Problem &problem, int part, int parts, int fields, bool pha
       if (mine) first = std::min(first, q), end = q + 1, begin = std::min(begin, since[q]);
     }
     for (int q = image.rows - 2; q >= 0; --q) since[q] = std::min(since[q], since[q + 1]);
+    // Rays between two rows see both: phasors are there from the row before's first ray to the next one's last.
     held[n] = 2;
     for (int q = 0, oldest = 0; q < image.rows; held[n] = std::max(held[n], int64_t(++q - oldest) + 2))
-      while (oldest < q && until[oldest] < since[q]) ++oldest;
+      while (oldest < q && until[oldest + 1] < since[std::max(q - 1, 0)]) ++oldest;
     total += phasors ? 2 * held[n] * (image.width * problem.channels + LANES) : 0;
   }
   share.first = begin;
@@ -275,10 +276,10 @@ INLINE void step_rows(const Problem &problem, const Share &share) {
   int at[N], ready[N];  // the next row of a panel that moves, and that becomes phasors
   std::copy(share.panel_first, share.panel_first + N, at);
   for (int n = 0; n < N; ++n)
-    ready[n] = int(std::lower_bound(share.until[n].begin(), share.until[n].end(), share.first) - share.until[n].begin());
+    ready[n] = std::max(0, int(std::lower_bound(share.until[n].begin(), share.until[n].end(), share.first) - share.until[n].begin()) - 1);
   for (int r = share.first; r < share.end; ++r) {
     for (int n = 0; n < N; ++n)
-      for (const int rows = problem.panel[n].ahead.rows; ready[n] < rows && share.since[n][ready[n]] <= r; ++ready[n])
+      for (const int rows = problem.panel[n].ahead.rows; ready[n] < rows && share.since[n][std::max(ready[n] - 1, 0)] <= r; ++ready[n])
         to_phasors(problem, share, n, ready[n]);
     for (int set = 0; set < problem.sets; ++set) compare<C, N>(problem, share, set, r, work);
     for (int n = 0; n < N; ++n)

@@ -4,6 +4,7 @@
 namespace {
 
 constexpr int BENT_TILE_PX = 64;   // a parabola stands for a law's curve
+constexpr int SOURCE_PX = 480;     // that a tile's source has room for; near a law's end columns are wide
 constexpr double BEYOND = 1e-9;    // where a law has no column
 
 struct Columns {  // column u of a raster is t = middle + (1 - exp(-bend (u - middle))) / bend to a homography
@@ -54,8 +55,10 @@ INLINE void warp_rows(const Image &image, const Image &result, const Warp &warp,
     std::fill(row + int64_t(span.last) * C, row + int64_t(result.width) * C, int16_t(beside));
     if (span.first == span.last) continue;
     const int length = std::min(tile_px(line.line, span), bent ? BENT_TILE_PX : TILE_PX);
-    for (int u = span.first; u < span.last; u += length) {
-      const int end = std::min(u + length, span.last);
+    for (int u = span.first, end; u < span.last; u = end) {
+      end = std::min(u + length, span.last);
+      const double x = line.x(u);
+      for (double across; end - u > 1 && !((across = line.x(end - 1) - x) >= 0 && across < SOURCE_PX);) end -= (end - u) / 2;
       sample<1, C>(&image, line, u, end, work, work.tile);
       std::memcpy(row + int64_t(u) * C, work.tile[0], size_t(end - u) * C * sizeof(int16_t));
     }

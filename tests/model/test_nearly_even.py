@@ -10,7 +10,7 @@ import pytest
 
 from runtime.model.chain import chain_frame
 from runtime.model.predictor import load_predictor
-from runtime.model.proposal import resample
+from runtime.model.warp import resample
 from runtime.model.still import solve_still
 from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
