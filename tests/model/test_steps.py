@@ -109,10 +109,16 @@ def test_steps_are_the_references(stack: str, pair: str, channels: int) -> None:
         assert (off < 2e-2).mean() > MANY[pair], np.quantile(off, [0.9, 0.99, 0.999])
 
 
-def test_threads_share_a_step_without_a_trace() -> None:
+@pytest.mark.parametrize(
+    ("pair", "own"), [(eyes(0.4, 0.3, roll_deg=20), True), (eyes(0.2), False), (eyes(0.25, 0.1, -0.1), False)]
+)
+def test_threads_share_a_step_without_a_trace(pair: F64, own: bool) -> None:
+    """Nor does what the threads' memory held before."""
     found = []
     for threads in (1, 3):
-        state, _, geometry = begun(TILTED, eyes(0.4, 0.3, roll_deg=20), own=True, threads=threads)
+        before, _, _ = begun(STACK, eyes(0.9, 0.2 * threads), own=True, threads=threads)
+        before.step(Step(size=1.0, places="rising"))
+        state, _, geometry = begun(TILTED, pair, own=own, threads=threads)
         for places in ("rising", "falling"):
             state.step(Step(size=1.6, places=places))  # type: ignore[arg-type]
         state.close_middle()
