@@ -10,8 +10,8 @@ import pytest
 
 from runtime.model.chain import chain_frame
 from runtime.model.predictor import load_predictor
-from runtime.model.warp import resample
 from runtime.model.still import solve_still
+from runtime.model.warp import resample
 from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack, Tilt
