@@ -53,7 +53,8 @@ class GlState:
 
     def set_panel(self, panel: int, codes: I16) -> None:
         box = self._geometry.boxes[panel]
-        held = np.rint((codes + FULL) * (65535 / (3 * FULL))).astype(np.uint16)
+        unit = 65535 / (3 * FULL)
+        held = np.asarray(cv2.addWeighted(codes, unit, codes, 0.0, FULL * unit, dtype=cv2.CV_16U))
         if held.ndim == 3:
             held = np.dstack([held, held[..., :1]])
         self._panel("last", panel).texture.write(held, viewport=(0, 0, box.width_px, box.height_px), alignment=1)
