@@ -19,6 +19,7 @@ import numpy as np
 from runtime.records import F64
 
 FADE_S = 0.25  # time constant with which an acceleration fades
+ROUNDING = 1e-12  # of a covariance's trace: (10 nm)² of a head's (1 cm)²
 WEIGHT_FLOOR = 1e-6  # of a filter's probability: a filter that is ruled out can come back
 _NODES, _SHARES = np.polynomial.legendre.leggauss(10)
 _AXES = np.eye(3)
@@ -97,7 +98,14 @@ def predicted(belief: Belief, dt_s: float, *, acceleration: Sequence[float], sta
 
 def surprise(belief: Belief, measured: F64, *, noise: F64) -> float:
     """Least squared Mahalanobis distance of a measurement from any model (chi² of three axes)."""
-    return float(_chi2(measured - belief.state[:, :3], belief.covariance[:, :3, :3] + noise).min())
+    return float(_chi2(measured - belief.state[:, :3], _total(belief, noise)).min())
+
+
+def _total(belief: Belief, noise: F64) -> F64:
+    """(n, 3, 3) a measurement's covariance; not singular where jumps of metres leave it to rounding."""
+    total = belief.covariance[:, :3, :3] + noise
+    spread: F64 = np.trace(total, axis1=1, axis2=2)[:, None, None] * ROUNDING
+    return np.asarray(total + spread * np.eye(3), np.float64)
 
 
 def _chi2(off: F64, covariance: F64) -> F64:
@@ -108,7 +116,7 @@ def _chi2(off: F64, covariance: F64) -> F64:
 
 def corrected(belief: Belief, measured: F64, *, noise: F64) -> Belief:
     """Belief updated with a measurement (3,) of covariance (3, 3)."""
-    total = belief.covariance[:, :3, :3] + noise
+    total = _total(belief, noise)
     gain = np.linalg.solve(total, belief.covariance[:, :3, :]).transpose(0, 2, 1)
     off = measured - belief.state[:, :3]
     likely = -0.5 * (_chi2(off, total) + np.linalg.slogdet(total)[1])

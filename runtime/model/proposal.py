@@ -29,7 +29,7 @@ from runtime.support.threads import at_once
 HALF_IPD_M = 0.031
 EDGE_SHARE = 1 / 40  # of a picture: so far beside it at most its edge goes on
 UNSEEN = -1  # what pictures ask for is positive
-SHARPENED = 0.33  # of the difference, on either side: what two interpolations blur
+SHARPENED = 0.2  # of the difference, on either side: what two interpolations blur
 SHARPENING = np.array([-SHARPENED, 1 + 2 * SHARPENED, -SHARPENED])
 EVEN = round(REST[3] * FULL)  # of an outer panel, sixteenths of a code
 _SWAPPED = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # (y, z, 1) from (-z, -y, 1), and back
@@ -126,8 +126,10 @@ class ChainProposal:
         # The answer begins one parallax before the first column.
         begin = np.array([[1.0, 0.0, frame.cell_px], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
         columns = ColumnLaw(frame.columns.bend, frame.columns.middle + frame.cell_px)
-        matrix = begin @ to_frame @ seen_from_layer @ raster.plane_from_raster()
-        size = raster.height_px, raster.width_px
+        matrix, size = (
+            begin @ to_frame @ seen_from_layer @ raster.plane_from_raster(),
+            (raster.height_px, raster.width_px),
+        )
         codes = warp(np.clip(answer, 0, FULL), matrix, size=size, beside=EVEN, image_columns=columns)
         if max(geometry.taper_px) > 0:
             weights = _wave_taper(geometry, raster, middle_m)

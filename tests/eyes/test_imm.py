@@ -77,6 +77,22 @@ def test_mixing_matches_the_published_equations() -> None:
     steps=[0.5, 0.03125, 0.25, 6e-8, 0.5],
     sigmas=(1.0, 0.125, 2e-5),
 )
+@example(
+    places=[
+        (0, 0, 0),
+        (0, 1, 0),
+        (8, 4, 3),
+        (0, 0, 0),
+        (0, 0, 0),
+        (0, 0, 0),
+        (14, 0, 0),
+        (1, 0, 0),
+        (0, -14, -2),
+        (0, 0, 0),
+    ],
+    steps=[0, 0, 0.5, 0, 0, 0.001953125, 0.5, 1.192092896e-07, 0.375],
+    sigmas=(2e-5, 2e-5, 2e-5),
+)
 def test_covariances_stay_positive_and_everything_finite(places: Any, steps: Any, sigmas: Any) -> None:
     noise = np.diag(np.square(sigmas))
     belief = imm.started(np.array(places[0]), noise=noise, speed=0.3, acceleration=ACCELERATION)
