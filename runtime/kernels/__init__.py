@@ -1,4 +1,4 @@
-"""The compiled loops: C++ without Python in it, called by `ctypes`, which lets other threads run meanwhile.
+"""The compiled C++ loops, called by `ctypes`, which lets other threads run meanwhile.
 
 The structures below are those of `solver.cpp`, `warp.cpp` and `light.cpp`, field by field.
 """

@@ -51,11 +51,11 @@ class Predictor(ABC):
         return False
 
     def on_panels(self, stack: PanelStack) -> Predictor | None:
-        """The same model for other panels of the same kind, to measure backends with; None: it has one backend."""
+        """The same model for other panels of its kind, to measure backends; None: it has one backend."""
         return None
 
     def set_backend(self, backend: SolverBackend) -> None:  # noqa: B027 - most have one
-        """Have what surrounds the network done by another backend from the next call on. On the thread that solves."""
+        """Run everything but the network on another backend from the next call on (solver's thread)."""
 
     @abstractmethod
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:

@@ -36,8 +36,10 @@ Columns = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True, slots=True)
 class ColumnLaw:
-    """How a raster's columns u are spaced: t = middle + (1 - exp(-bend·(u - middle)))/bend is what a homography takes
-    for u; evenly where bend is 0."""
+    """Spacing of a raster's columns: t = middle + (1 - exp(-bend·(u - middle)))/bend.
+
+    t is what a homography takes for u; bend 0: even columns.
+    """
 
     bend: float = 0.0  # per column
     middle: float = 0.0  # column where both are the same
@@ -82,13 +84,15 @@ class ChainFrame:
         return across @ self.plane_from_raster
 
     def frame_from_plane(self, *, x_m: float) -> F64:
-        """3x3: this raster's (t, v, 1) from (y, z, 1) on a parallel plane, in line as seen from between the eyes."""
+        """3x3 this raster's (t, v, 1) from (y, z, 1) on a parallel plane, rectified between the eyes."""
         found = np.linalg.inv(self.plane_from_frame(self.middle_m, x_m=x_m))
         return np.asarray(found / found[2, 2], np.float64)
 
     def eye_sigma_px(self, stack: PanelStack, *, eye_sigma_mm: float) -> F32:
-        """(3,): how far the outer panels' pictures move, columns and rows, for eyes off by one standard deviation to
-        the right and up; and the centre panel's own parallax beside this raster's plane, in columns."""
+        """(3,) movement of the outer panels' pictures, columns and rows, for one sigma of the eyes.
+
+        The third is the centre panel's own parallax against this raster's plane, in columns.
+        """
         reach = (stack.x_m[-1] - self.x_m) / (self.middle_m[0] - stack.x_m[-1])
         centre = (self.x_m - stack.x_m[1]) / (self.middle_m[0] - stack.x_m[1])
         moved_m = eye_sigma_mm / 1e3 * reach

@@ -89,7 +89,7 @@ class Contract(Section):
 
 
 def parse_contract(metadata: dict[str, str], *, source: str | Path) -> Contract:
-    """The contract in an ONNX file's metadata. Raises InputError where it is missing, unknown or does not fit."""
+    """The contract in an ONNX file's metadata. Raises InputError: missing, unknown, or not fitting."""
     text = metadata.get(METADATA_KEY)
     if text is None:
         raise InputError(source, METADATA_KEY, "the model carries no contract: it is not one of phasestack's")

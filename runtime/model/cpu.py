@@ -1,4 +1,4 @@
-"""The solver's panels on the processor: 16-bit integers, moved by the compiled loops of `runtime.kernels`."""
+"""The solver's panels on the processor: 16-bit integers, moved by `runtime.kernels`."""
 
 from __future__ import annotations
 

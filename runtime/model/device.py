@@ -13,7 +13,7 @@ from runtime.records import I16, Layers
 
 
 class SolverState(Protocol):
-    """The panels of one stack on one device, and what changes them. Lives from frame to frame; one thread uses it."""
+    """The panels of one stack on one device, kept from frame to frame. One thread uses it."""
 
     def begin(self, job: Job, geometry: Geometry) -> AbstractContextManager[None]:
         """Take what is wanted; all panels rest within their boxes. All else is done within what it answers."""
@@ -31,9 +31,10 @@ class SolverState(Protocol):
         """Move all panels."""
 
     def write(self, beside: int | tuple[int, ...] | None) -> Layers:
-        """(N, h, w, 4) 8-bit codes of all panels. What is beside the boxes rests, with a code or a colour (as eyes see
-        it) on the middle panel; None: it stays what was written before. An array is the state's own until the next
-        frame."""
+        """(N, h, w, 4) 8-bit codes of all panels, valid until the next frame.
+
+        Outside the boxes panels rest; the middle one has a code or a colour, or with None keeps its pixels.
+        """
 
     def close(self) -> None:
         """Release textures. May be called twice."""

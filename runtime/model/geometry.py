@@ -1,4 +1,4 @@
-"""What a solution looks along: parts of panels, and for each eye the homographies from its rays to the panels' pixels.
+"""The rays of a solution: windows, and homographies from each eye's rays to panel pixels.
 
 A ray belongs to a pixel of a raster: a still picture's own pixels, or the middle panel's where content is drawn there.
 """
@@ -56,7 +56,7 @@ class Geometry:
         return tuple(box.cut(self.stack.panel(n)) for n, box in enumerate(self.boxes))
 
     def panels_from_rays(self, places: Places, eye_sigma_mm: float) -> F64:
-        """(2P, N, 3, 3) each panel's pixels, from its box's first, for P places of the eyes; left and right in turn."""
+        """(2P, N, 3, 3) panel pixels (from the box's first) for P eye places, left and right in turn."""
         right, up = stack_from_eye(self.eyes_m.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
         centre = np.array([self.rays.width_px / 2, self.rays.height_px / 2, 1.0])
         found = []

@@ -1,4 +1,4 @@
-"""What one solution is asked for: pictures, eyes, the part of the panels that is solved, channels, a deadline."""
+"""The input of one solution: pictures, eyes, window of the panels, channels, deadline."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ Picture = U8 | DrawnPicture
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A window of every panel that is solved. Beside it the outer panels stand at the middle of their range, from which
-    the solver starts, and the middle panel carries what both eyes see."""
+    """The window of every panel that is solved.
+
+    Outside it the outer panels stay at mid-range, where the solver starts; the middle panel carries the common picture.
+    """
 
     box: PixelRect  # panel pixels; empty: nothing is solved
     kept: PixelRect  # of the middle panel, within the box: beside it that panel belongs to the rest
@@ -36,7 +38,7 @@ class Own:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One solution's task. Everything that a cheaper solution differs in is a field of it (`runtime.model.trim`)."""
+    """The task of one solution; what a cheaper solution changes is a field (`runtime.model.trim`)."""
 
     pictures: Sequence[Sequence[Picture]]  # [eye][raster] (h, w, 4) RGBA, left eye first, on `Predictor.rasters`
     eyes_m: F64  # (2, 3) left and right, frame `stack`

@@ -1,4 +1,4 @@
-"""Whole-picture networks as a proposal: eye pictures on panel rasters in, panel values out (as the published U-Net)."""
+"""Whole-picture networks as proposals: eye pictures on panel rasters to panel values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What can be told of an ONNX file from its bytes alone: who made it, and whether it asks for other files.
+"""Facts of an ONNX file from its bytes alone: its producer, and references to other files.
 
 Protocol buffers are rows of (tag, value); field numbers are those of onnx.proto.
 """

@@ -1,4 +1,4 @@
-"""Which model a name means, and its loading; what models are is told in `base`."""
+"""The model that a name stands for, and its loading; the interface is in `base`."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def model_path(name: str) -> Path | None:
 
 
 def shipped_sha256(name: str) -> str:
-    """What a shipped model's file must be, from the table beside it; empty for another. Raises InputError."""
+    """The SHA-256 that a shipped model's file must have; empty for others. Raises InputError."""
     if name not in SHIPPED:
         return ""
     table = Path(str(resources.files("runtime.model") / "data" / SUMS))

@@ -1,4 +1,4 @@
-"""What the solver's steps begin with: the outer panels as a network proposes them along the line of the eyes.
+"""Initial outer panels, proposed by a network along the eyes' baseline.
 
 The network sees the difference of both eyes' pictures on a raster of its own (`chain`), on which an eye's parallax is a
 whole number of columns, and answers with both outer panels there.
@@ -39,7 +39,7 @@ class Proposal(Protocol):
     """Where the steps begin."""
 
     def panels(self, job: Job, geometry: Geometry, watch: Stopwatch) -> dict[int, I16]:
-        """Panels within their boxes, (rows, columns[, 3]), sixteenths of a code; those that are missing rest.
+        """Boxes of the proposed panels, any size, (rows, columns[, 3]), in sixteenths of a code.
 
         Raises ModelFailure, and of these EyesNotServed."""
 

@@ -1,4 +1,4 @@
-"""The literature's solver, kept to compare with: simultaneous reconstruction on one branch of Malus' law.
+"""SART on one branch of Malus' law: the literature's solver, for comparison.
 
 Any stack of 2 to 8 panels. Every turn corrects all panels at once by equal shares of both eyes' residual phases
 (Andersen and Kak 1984; on polarization fields Lanman et al. 2011), with the relaxation that serves it best.

@@ -126,7 +126,7 @@ class ModelSession:
 
 
 def nodes_elsewhere(session: Any, provider: str) -> tuple[str, ...]:
-    """Names (or kinds, where they have none) of a graph's nodes that run on another provider than the wished one.
+    """Names (or kinds) of the graph's nodes that run on another provider than the requested one.
 
     session: made with RECORD_NODES. As onnxruntime assigned them after its basic optimizations.
     """

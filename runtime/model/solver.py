@@ -1,4 +1,4 @@
-"""The solver: a network's proposal, the middle panel closed, and steps of all panels (docs/mathematics.md).
+"""The solver: a network's proposal, the middle panel closed, steps (docs/mathematics.md).
 
 A device (`cpu`, `gl`) does single steps; their order is here.
 """

@@ -30,7 +30,7 @@ def solve_still(
     eye_sigma_mm: float = TRACKING_SIGMA_MM,
     changed: Callable[[Job], Job] = lambda job: job,
 ) -> Prediction:
-    """Layers for two pictures (h, w, 3 or 4) that a left and a right eye (2, 3), frame `stack`, should see.
+    """Layers for pictures (h, w, 3 or 4) of a left and a right eye (2, 3), frame `stack`.
 
     The pictures' horizontal field of view is `fov_deg`; each eye looks at the stack's origin. The solver looks along
     their pixels' own rays; for a network of whole pictures each is warped to the rasters that it wants (EyeReal

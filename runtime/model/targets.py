@@ -1,4 +1,4 @@
-"""What pictures ask of the panels: 8-bit codes to sums of what panels show, in fixed point, by tables."""
+"""Targets of pictures: tables from 8-bit codes to sums of panel values, in fixed point."""
 
 from __future__ import annotations
 
@@ -26,8 +26,10 @@ def rest_of(panels: int) -> int:
 
 @lru_cache(maxsize=8)
 def target_table(panels: int) -> F32:
-    """(256, 2) for each code that an eye should see: the sum of so many panels, in sixteenths of a code, nearest to
-    where they rest; and how much a ray weighs that wants it, by the slope of sin² there, 1 at its steepest."""
+    """(256, 2) target sum of the panels, in sixteenths of a code, and its weight, for each code.
+
+    The sum is the one nearest to rest; the weight is the slope of sin² there, 1 at its steepest.
+    """
     intensities = np.arange(256) / 255.0
     slope = int(REST.get(panels, 1.5 / panels) * panels)  # 1 falls from 1 to 2, 2 rises again
     rise = 2 / np.pi * np.arcsin(np.sqrt(intensities))
@@ -44,8 +46,7 @@ def middle_codes(panels: int) -> U8:
 
 
 def beside_codes(panels: int, n: int, beside: int | tuple[int, ...]) -> list[int]:
-    """Red, green and blue code of panel n beside what is solved: at rest; the middle one has a code, or shows a
-    colour as eyes see it."""
+    """RGB code of panel n outside the window: at rest; the middle one a code, or a colour."""
     if n != panels // 2:
         return [(rest_of(panels) + SUBCODE // 2) // SUBCODE] * 3
     return middle_codes(panels)[list(beside)].tolist() if isinstance(beside, tuple) else [beside] * 3
@@ -59,7 +60,7 @@ def phase_codes(branch: Branch = 2) -> I16:
 
 
 def is_grey(picture: U8) -> bool:
-    """True where red, green and blue are equal in every pixel of an (h, w, 3 or 4) picture: no colour may be lost."""
+    """True if red, green and blue are equal in every pixel of an (h, w, 3 or 4) picture."""
     coarse = picture[::COARSE_STEP, ::COARSE_STEP]
     if (coarse[..., 0] != coarse[..., 1]).any() or (coarse[..., 1] != coarse[..., 2]).any():
         return False
@@ -68,7 +69,7 @@ def is_grey(picture: U8) -> bool:
 
 
 def without_alpha(picture: U8, channels: int) -> U8:
-    """The (h, w, 3 or 4) picture as (h, w, 3), or as (h, w) where it is grey and one channel will do; contiguous."""
+    """The picture as contiguous (h, w, 3), or (h, w) where it is grey and one channel suffices."""
     if channels == 1:
         return np.asarray(cv2.extractChannel(picture, 0), np.uint8)
     if picture.shape[2] == 3:
@@ -77,7 +78,7 @@ def without_alpha(picture: U8, channels: int) -> U8:
 
 
 def flat_layers(image: U8, stack: PanelStack) -> U8:
-    """(N, h, w, 4) layers that show a picture (h, w, 4), drawn on the middle panel's raster, to every eye."""
+    """(N, h, w, 4) layers that show every eye a picture (h, w, 4) on the middle panel's raster."""
     middle = stack.count // 2
     layers = np.full((stack.count, stack.height_px, stack.width_px, 4), 255, np.uint8)
     # On the second branch the sum is at least one panel's range: the other panels share it, and the middle

@@ -1,4 +1,4 @@
-"""Leaves out of a job what its pictures do not need: all but the place where the eyes' pictures differ, and colour.
+"""Reduces a job to the window where the eyes' pictures differ, and to one channel if grey.
 
 Panels that are cut to a window and moved to its centre are a smaller stack, seen by eyes moved the same way. Where the
 eyes agree, the outer panels stand at the middle of their range, and the centre panel carries the picture. What drives
@@ -57,8 +57,10 @@ class Savings:
 
 
 def trim(job: Job, scene: Scene) -> tuple[Job, Savings]:
-    """The same job for less work, and what that leaves out. Twice for one frame: before its pictures are drawn, where
-    the content knows where it lies, and after that, for what the pictures show."""
+    """The job with less work, and what that leaves out.
+
+    Called twice a frame: before its pictures are drawn, if the content knows its extent, and after.
+    """
     part = job.part
     if part is None and (job.pictures or job.own):
         part = _differing_part(job, scene)
@@ -132,7 +134,7 @@ def _is_grey(picture: Picture, part: Part | None) -> bool:
 
 
 def differing_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES, known: PixelRect = NOWHERE) -> PixelRect:
-    """The smallest box of pixels in which two (h, w, 3 or 4) pictures differ; empty where they agree everywhere.
+    """The smallest box in which two (h, w, 3 or 4) pictures differ; empty where they agree.
 
     known: a box within it, as `coarse_box` finds one: only what is beside that is looked at.
     """
@@ -147,8 +149,10 @@ def differing_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES, know
 
 
 def coarse_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES) -> PixelRect:
-    """A box within `differing_box`, from a look at a few pixels, for a hundredth of the time: what is too much of the
-    panel to be cut out is told by it."""
+    """A box within `differing_box` from a few pixels, at a hundredth of the time.
+
+    It decides whether the window would be too much of the panel to be worth cutting out.
+    """
     few = [np.ascontiguousarray(picture[::COARSE_STEP, ::COARSE_STEP]) for picture in (left, right)]
     box = _box(few[0], few[1], tolerance)
     if not box.width_px:
@@ -169,7 +173,7 @@ def _box(left: U8, right: U8, tolerance: int) -> PixelRect:
 
 
 def parallax_margin_px(eyes_m: F64, stack: PanelStack) -> F64:
-    """(2, N, 2) how far rays through a centre-panel pixel stray on each panel: columns right and rows down.
+    """(2, N, 2) stray on each panel of rays through a centre-panel pixel: columns right, rows down.
 
     To first order, as at the window's centre. eyes_m: (2, 3) left, right; frame `stack`.
     """
@@ -181,7 +185,7 @@ def parallax_margin_px(eyes_m: F64, stack: PanelStack) -> F64:
 
 
 def steepness(codes: U8) -> float:
-    """How visible an error of phase is before these 8-bit codes: 0 before black or white to 1 before mid-grey.
+    """Visibility of a phase error before these 8-bit codes: 0 at black or white, 1 at mid-grey.
 
     The slope of sin² in its own terms, 2·sqrt(I·(1 - I)), root mean square.
     """
@@ -197,7 +201,7 @@ def steepness_beside(picture: U8, box: PixelRect) -> float:
 
 
 def wave_steps(steep: float) -> float:
-    """How many parallaxes the outer panels are driven beside a difference, before a background so steep (0 to 1)."""
+    """Parallaxes that outer panels are driven beside a difference, by the background's steepness."""
     least, most = WAVE_STEPS
     return least + (most - least) * steep
 
@@ -210,7 +214,7 @@ def wave_px(eyes_m: F64, stack: PanelStack, *, steps: float) -> tuple[float, flo
 
 
 def room_px(low: float, high: float, parallax: F64, *, eyes_px: F64, weights: F64, steps: float) -> tuple[float, float]:
-    """Along one axis: how far before and after a difference from `low` to `high` the panels take part in it.
+    """Along one axis: margins before and after a difference from `low` to `high`.
 
     Pixels from the centre of the panel. parallax: (2, N), one axis of `parallax_margin_px`; eyes_px: (2,) the eyes'
     places on this axis; weights: (2, N) how far along its ray from the centre panel to the eye each panel lies; steps:
@@ -255,7 +259,7 @@ def _eyes_px(eyes_m: F64, stack: PanelStack) -> F64:
 
 
 def window_around(box: PixelRect, eyes_m: F64, stack: PanelStack, *, steps: float) -> PixelRect | None:
-    """The window that a difference is solved in: grown by its room, rounded up to whole sixteenths of the panel.
+    """The window of a difference: grown by its margins, rounded up to sixteenths of the panel.
 
     steps: as `wave_steps` has it. None where it would be most of the panel: then the whole is as fast.
     """

@@ -37,7 +37,7 @@ def retina_view(eye_m: F64, side: int, *, width_px: int, height_px: int, fov_deg
 def retina_pictures(
     content: ContentSource, eyes_m: F64, stack: PanelStack, *, fov_deg: float, time_ns: int
 ) -> tuple[U8, U8]:
-    """What content shows to eyes (2, 3), frame `stack`: (h, w, 3) each, of the panels' size, as retina pictures."""
+    """What content shows to eyes (2, 3), frame `stack`: (h, w, 3) retina pictures, panel size."""
     size = {"width_px": stack.width_px, "height_px": stack.height_px}
     views = [retina_view(eye, side, **size, fov_deg=fov_deg) for side, eye in enumerate(eyes_m)]
     content.expect(views, time_ns=time_ns)

@@ -1,4 +1,4 @@
-"""What a scene, its display and its viewer allow to be left out: decisions alone, from what was measured."""
+"""Savings that a scene, display and viewer allow: pure decisions from measurements."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Plan:
 
 
 def eyes_in_range(eyes_m: F64, *, range_deg: float = VISIBLE_DEG) -> tuple[bool, bool]:
-    """Which of two eyes (2, 3) can see the display: before it, and not farther off its axis than `range_deg`."""
+    """Which of two eyes (2, 3) can see the display: in front, within `range_deg` of its axis."""
     off_axis = np.degrees(np.arctan2(np.linalg.norm(eyes_m[:, 1:], axis=1), eyes_m[:, 0]))
     left, right = (off_axis <= range_deg).tolist()
     return left, right
@@ -70,7 +70,7 @@ def seeing_eyes(eyes_m: F64, before: tuple[bool, bool]) -> tuple[bool, bool]:
 
 
 def selected_eyes(eyes_m: F64, seeing: tuple[bool, bool]) -> F64:
-    """Eyes (2, 3) as they are drawn and solved for: one that can't see gives way to the other, and costs nothing."""
+    """Eyes (2, 3) to draw and solve for: an eye that can't see is replaced by the other."""
     if seeing == (True, False):
         return eyes_m[[0, 0]]
     if seeing == (False, True):

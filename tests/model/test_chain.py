@@ -31,7 +31,7 @@ def test_modes_are_the_singular_value_decomposition_of_the_chain_operator(cells:
     assert np.allclose(ut.T @ np.diag(np.sqrt(1 - s**2 / 16)) @ shifted.T, mean, atol=1e-4)
 
 
-def test_doubt_is_how_far_the_outer_panels_move_for_an_eye_that_is_off() -> None:
+def test_sigma_moves_the_outer_panels_as_a_displaced_eye_does() -> None:
     pair = eyes(0.6, 0.1, 0.05, roll_deg=10)
     frame = chain_frame(pair, STACK, cell_px=4, reduction=2)
     raster_from_plane = np.linalg.inv(frame.plane_from_raster)
@@ -109,7 +109,7 @@ def test_one_eye_may_be_nearer_than_the_other(
                 assert rows == pytest.approx([0.0, 0.0], abs=1e-6)
 
 
-def test_a_raster_s_column_law_goes_back_and_forth_and_is_even_where_nothing_bends() -> None:
+def test_a_column_law_inverts_and_without_bend_is_even() -> None:
     u = np.linspace(0.0, 400.0, 9)
     for bend in (-2e-3, 1e-9, 2e-3):
         law = ColumnLaw(bend, 200.0)
@@ -118,7 +118,7 @@ def test_a_raster_s_column_law_goes_back_and_forth_and_is_even_where_nothing_ben
     assert ColumnLaw().homography_from_column(u) is u
 
 
-def test_the_raster_covers_what_is_seen_of_all_panels_from_the_side_too() -> None:
+def test_the_raster_covers_all_panels_from_the_side_too() -> None:
     for angle_deg in (-50, -20, 20, 50):
         frame = chain_frame(eyes_at(distance_m=0.7, angle_deg=angle_deg), STACK, cell_px=4, reduction=2)
         scale, shift = relative_scale_shift(frame.middle_m, from_x_m=STACK.x_m[1], to_x_m=frame.x_m)
@@ -149,7 +149,7 @@ def test_eyes_above_each_other_have_no_row_to_solve_along() -> None:
         chain_frame(upright, STACK, cell_px=4, reduction=2)
 
 
-def test_a_far_viewer_of_a_thin_stack_meets_the_limit_of_cells_not_of_memory() -> None:
+def test_a_far_viewer_of_a_thin_stack_is_limited_in_cells() -> None:
     thin = PanelStack(0.5184, 0.2916, (-0.0005, 0.0, 0.0005), 1920, 1080)
     frame = chain_frame(eyes(10.0), thin, cell_px=4, reduction=2)
     assert frame.cells <= 1024
@@ -160,7 +160,7 @@ TILTED, UPRIGHT = eyes(0.55, 0.12, 0.09, roll_deg=15), eyes(0.7, -0.1, 0.05)
 
 @pytest.mark.parametrize("pair", [TILTED, UPRIGHT], ids=["tilted", "upright"])
 @pytest.mark.parametrize("x_m", [-0.06, 0.0, 0.06])
-def test_a_pixel_is_met_where_the_eye_s_ray_through_it_crosses_a_panel(pair: np.ndarray, x_m: float) -> None:
+def test_a_pixel_maps_to_where_the_eye_s_ray_crosses_a_panel(pair: np.ndarray, x_m: float) -> None:
     frame = chain_frame(pair, STACK, cell_px=4, reduction=2)
     for pixel in ([0.0, 0.0], [100.0, 30.0], [frame.width_px - 1.0, frame.rows / 2]):
         y_m, z_m, _ = frame.plane_from_raster @ [*pixel, 1.0]
@@ -172,7 +172,7 @@ def test_a_pixel_is_met_where_the_eye_s_ray_through_it_crosses_a_panel(pair: np.
 
 @pytest.mark.parametrize("pair", [TILTED, UPRIGHT], ids=["tilted", "upright"])
 @pytest.mark.parametrize("x_m", [-0.06, 0.0, 0.06])
-def test_the_way_from_a_panel_back_to_the_raster_is_the_inverse_from_between_the_eyes(
+def test_back_projection_is_the_inverse_as_seen_between_the_eyes(
     pair: np.ndarray, x_m: float
 ) -> None:
     frame = chain_frame(pair, STACK, cell_px=4, reduction=2)

@@ -33,7 +33,7 @@ def test_colours_stay_in_their_channels() -> None:
 
 
 @pytest.mark.parametrize("branch", [1, 2])
-def test_phase_codes_are_the_phases_of_every_code_in_sixteenths_of_a_panel_code(branch: int) -> None:
+def test_phase_codes_are_phases_in_sixteenths_of_a_code(branch: int) -> None:
     table = phase_codes(branch)  # type: ignore[arg-type]
     assert table.shape == (256,) and table.dtype == np.int16
     assert np.abs(intensity_from_phase(table / FULL) * 255 - np.arange(256)).max() < 0.8 / SUBCODE

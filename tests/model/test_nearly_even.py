@@ -53,7 +53,7 @@ def test_gaps_that_differ_a_little_are_served_by_the_network(share: float) -> No
     assert displayed_db(uneven, uneven) > displayed_db(STACK, STACK) - 1.0
 
 
-def test_gaps_that_differ_more_are_served_from_even_panels_and_the_name_says_so() -> None:
+def test_uneven_gaps_are_served_without_the_network_and_named_so() -> None:
     predictor = load_predictor("balanced", replace(STACK, x_m=(-0.06, 0.0, 0.03)))
     assert predictor.name.startswith("balanced (without its network")
 

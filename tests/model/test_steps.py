@@ -127,7 +127,7 @@ def test_threads_share_a_step_without_a_trace(pair: F64, own: bool) -> None:
 
 
 @pytest.mark.parametrize("stack", ["two", "three", "five"])
-def test_the_middle_panel_is_closed_to_what_one_eye_asks_of_even_ones(stack: str) -> None:
+def test_the_middle_panel_closes_on_one_eye_s_target(stack: str) -> None:
     pair = eyes(0.6)[[0, 0]]
     state, job, geometry = begun(STACKS[stack], pair, own=False)
     middle, count = geometry.middle, STACKS[stack].count

@@ -73,8 +73,10 @@ class Passes:
         defines: tuple[str, ...] = (),
         at: tuple[int, int, int, int] | None = None,
     ) -> None:
-        """Draw the first output's size into all of them. Inputs and uniforms are named as in the shader; what it
-        has no use for is left out. defines: of the shader (`source`); at: first column and row, width and height."""
+        """Draw a pass into all its outputs at the first one's size; unused inputs are ignored.
+
+        Inputs and uniforms are named as in the shader. defines: of the shader; at: first column and row, width, height.
+        """
         program, array, held = self._program(name, defines)
         for unit, (key, image) in enumerate(inputs.items()):
             image.texture.use(unit)

@@ -28,7 +28,7 @@ PANELS, MIDDLE = 3, 1
 
 
 class GlState:
-    """A `SolverState` of three panels. Used on the thread of its context, which is current whenever a job begins."""
+    """A `SolverState` of three panels, on the thread of its context."""
 
     def __init__(self, passes: Passes, stack: PanelStack) -> None:
         """passes: of a context that others may use too. Raises InputError where a panel is too large for the driver."""
