@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 MAX_PANELS = 5
 REACH_PX = 4
 MARGIN = 64  # elements behind an image's rows that loops may touch
+_AGAIN = "install phasestack again (it needs g++)"
 _pointer, _int, _long, _float, _double = (
     ctypes.c_void_p, ctypes.c_int32, ctypes.c_int64, ctypes.c_float, ctypes.c_double
 )  # fmt: skip
@@ -79,7 +80,7 @@ def library() -> Any:
     """The loops. Raises ImportError where the package was not built for this machine."""
     built = sorted(Path(__file__).parent.glob("compiled*.so"))
     if not built:
-        raise ImportError("runtime.kernels is not compiled: install phasestack again (it needs g++)")
+        raise ImportError(f"runtime.kernels is not compiled: {_AGAIN}")
     loops = ctypes.CDLL(str(built[0]))
     for name, arguments in {
         "step": (_pointer, _int, _int),
@@ -88,6 +89,8 @@ def library() -> Any:
         "warp": (_pointer, _pointer, _pointer, _int, _int, _int, _int),
         "squared_error": (_pointer, _int, _int, _pointer),
     }.items():
-        function = getattr(loops, name)
+        function = getattr(loops, name, None)
+        if function is None:
+            raise ImportError(f"{built[0]} is of another version: {_AGAIN}")
         function.argtypes, function.restype = arguments, None
     return loops
