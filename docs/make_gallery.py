@@ -221,8 +221,6 @@ def main() -> None:
     files = {name: smaller(arguments.work / source, name) for name, source in PICTURES.items()}
     files |= {name: (arguments.work / "look" / name).read_bytes() for name in ("looked-into.webp", "viewer.html")}
     text = page(json.loads((arguments.work / "report" / "report.json").read_text(encoding="utf-8")))
-    for old in IMAGES.iterdir():
-        old.unlink()
     for name, data in files.items():
         (IMAGES / name).write_bytes(data)
     (DOCS / "performance.md").write_text(text, encoding="utf-8")
