@@ -172,9 +172,7 @@ def test_a_pixel_maps_to_where_the_eye_s_ray_crosses_a_panel(pair: np.ndarray, x
 
 @pytest.mark.parametrize("pair", [TILTED, UPRIGHT], ids=["tilted", "upright"])
 @pytest.mark.parametrize("x_m", [-0.06, 0.0, 0.06])
-def test_back_projection_is_the_inverse_as_seen_between_the_eyes(
-    pair: np.ndarray, x_m: float
-) -> None:
+def test_back_projection_is_the_inverse_as_seen_between_the_eyes(pair: np.ndarray, x_m: float) -> None:
     frame = chain_frame(pair, STACK, cell_px=4, reduction=2)
     there_and_back = frame.frame_from_plane(x_m=x_m) @ frame.plane_from_frame(frame.middle_m, x_m=x_m)
     np.testing.assert_allclose(there_and_back / there_and_back[2, 2], np.eye(3), atol=1e-9)
