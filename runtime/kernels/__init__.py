@@ -13,7 +13,6 @@ from typing import Any
 from numpy.typing import NDArray
 
 MAX_PANELS = 5
-REACH_PX = 4
 MARGIN = 64  # elements behind an image's rows that loops may touch
 _AGAIN = "install phasestack again (it needs g++)"
 _pointer, _int, _long, _float, _double = (
@@ -50,11 +49,11 @@ class Problem(ctypes.Structure):
 
 
 class Warp(ctypes.Structure):
-    """Where a raster's pixels lie in an image, and how far beside it (less than `REACH_PX`) its edge goes on."""
+    """Where a raster's pixels lie in an image, and how far beside it (less than `EDGE_PX` there) its edge goes on."""
 
     _fields_ = (
         ("image_from_raster", _double * 9), ("image_bend", _double), ("image_middle", _double),
-        ("raster_bend", _double), ("raster_middle", _double), ("reach", _double),
+        ("raster_bend", _double), ("raster_middle", _double), ("reach_px", _double),
     )  # fmt: skip
 
 

@@ -16,7 +16,7 @@ struct Columns {  // column u of a raster is t = middle + (1 - exp(-bend (u - mi
 struct Warp {
   double image_from_raster[9];
   Columns image, raster;
-  double reach;  // pixels beside the image, to which its edge goes on: less than EDGE_PX
+  double reach_px;  // beside the image, to which its edge goes on: less than EDGE_PX
 };
 
 struct WarpedLine {
@@ -28,14 +28,14 @@ struct WarpedLine {
 };
 
 // Pixels of a line that lie in an image, or beside it by no more than so much: there its edge goes on.
-INLINE Span reaches(const WarpedLine &at, int count, const Image &image, double reach) {
+INLINE Span reaches(const WarpedLine &at, int count, const Image &image, double reach_px) {
   const Line &line = at.line;
-  const double left = at.image.to(-reach), right = at.image.to(image.width + reach), below = image.rows + reach;
+  const double left = at.image.to(-reach_px), right = at.image.to(image.width + reach_px), below = image.rows + reach_px;
   double low = at.t(0), high = at.t(count - 1);
   at_least_zero(line.wu, line.w0 - BEYOND, low, high);
   at_least_zero(line.xu - left * line.wu, line.x0 - left * line.w0, low, high);
   at_least_zero(right * line.wu - line.xu, right * line.w0 - line.x0, low, high);
-  at_least_zero(line.yu + reach * line.wu, line.y0 + reach * line.w0, low, high);
+  at_least_zero(line.yu + reach_px * line.wu, line.y0 + reach_px * line.w0, low, high);
   at_least_zero(below * line.wu - line.yu, below * line.w0 - line.y0, low, high);
   if (!(high >= low)) return {0, 0};
   const double first = at.raster.from(low + 0.5) - 0.5, last = at.raster.from(high + 0.5) - 0.5;
@@ -49,7 +49,7 @@ INLINE void warp_rows(const Image &image, const Image &result, const Warp &warp,
   const bool bent = warp.image.bend != 0 || warp.raster.bend != 0;
   for (int r = begin; r < end_row; ++r) {
     const WarpedLine line{Line(warp.image_from_raster, r), warp.image, warp.raster};
-    const Span span = reaches(line, result.width, image, warp.reach);
+    const Span span = reaches(line, result.width, image, warp.reach_px);
     int16_t *row = result.data + int64_t(r) * result.stride;
     std::fill(row, row + int64_t(span.first) * C, int16_t(beside));
     std::fill(row + int64_t(span.last) * C, row + int64_t(result.width) * C, int16_t(beside));

@@ -39,7 +39,7 @@ class Proposal(Protocol):
     """Where the steps begin."""
 
     def panels(self, job: Job, geometry: Geometry, watch: Stopwatch) -> dict[int, I16]:
-        """Boxes of the proposed panels, any size, (rows, columns[, 3]), in sixteenths of a code.
+        """Boxes of the proposed panels, (rows, columns[, 3]), in sixteenths of a code; the others rest.
 
         Raises ModelFailure, and of these EyesNotServed."""
 
@@ -88,9 +88,8 @@ class ChainProposal:
                 for codes, from_plane in (pictures[local.order[side]], pictures[local.order[1 - side]])
             )  # fmt: skip
             half = np.asarray(cv2.subtract(own, other), np.int16) >> 1
-            np.copyto(
-                half, 0, where=cv2.min(own, other) < 0
-            )  # what one eye's picture does not show contradicts nothing
+            # What one eye's picture does not show contradicts nothing.
+            np.copyto(half, 0, where=cv2.min(own, other) < 0)
             return np.asarray(cv2.sepFilter2D(half, cv2.CV_16S, SHARPENING, SHARPENING), np.int16)
 
         left, right = map(lacked, (0, 1))
@@ -126,10 +125,8 @@ class ChainProposal:
         # The answer begins one parallax before the first column.
         begin = np.array([[1.0, 0.0, frame.cell_px], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
         columns = ColumnLaw(frame.columns.bend, frame.columns.middle + frame.cell_px)
-        matrix, size = (
-            begin @ to_frame @ seen_from_layer @ raster.plane_from_raster(),
-            (raster.height_px, raster.width_px),
-        )
+        matrix = begin @ to_frame @ seen_from_layer @ raster.plane_from_raster()
+        size = raster.height_px, raster.width_px
         codes = warp(np.clip(answer, 0, FULL), matrix, size=size, beside=EVEN, image_columns=columns)
         if max(geometry.taper_px) > 0:
             weights = _wave_taper(geometry, raster, middle_m)

@@ -22,7 +22,7 @@ from runtime.records import F64, I16, U8
 from runtime.support.threads import at_once, on_rows
 
 LEAST_PX, MIN_SCALE = 16, 0.25  # of a picture: smaller ones, and finer rasters, would tell nothing new
-REACH_PX = 3.0  # beside an image, to which its edge goes on
+REACH_PX = 3.0  # beside an image, to which its edge goes on at most: less than the loop's EDGE_PX
 LARGEST = 8191  # of an element that the compiled loop samples, either way
 _TRANSPOSED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
@@ -70,9 +70,8 @@ def reduced_pictures(job: Job, geometry: Geometry, reduction: int) -> list[tuple
             max(1, min(round(scale * reduction), px // LEAST_PX))
             for scale, px in zip(scales, (width, height), strict=True)
         )
-        picture = picture[
-            : height // by_v * by_v, : width // by_u * by_u
-        ]  # whole ones, for which OpenCV is ten times as fast
+        # Whole multiples, which OpenCV shrinks ten times as fast.
+        picture = picture[: height // by_v * by_v, : width // by_u * by_u]
         if (by_u, by_v) != (1, 1):
             size = width // by_u, height // by_v
             picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
