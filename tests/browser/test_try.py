@@ -30,7 +30,7 @@ SMALL = '[stack]\nwidth_px = 320\nheight_px = 180\n[model]\nname = "fast"\nbacke
 TRIED = (
     "the token is not in the address", "the pointer moved the head", "status has the eyes there to 1 mm",
     "another solution", "and the page shows it", "the picture is one", "figures are told",
-    "what was asked for is shown", "and the newest again", "the solver is held",
+    "what was asked for is shown", "and the newest again", "the solver is held", "an old status does not undo it",
     "while alignment goes on", "eyes lost: flat", "and back", "a scene that is not there", "another scene",
     "another page looks on", "and takes over", "nobody: held, then flat", "back: tracking", "another gap",
     "its camera is the sensor", "and the pointer again", "and the scene stays",

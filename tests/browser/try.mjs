@@ -41,8 +41,27 @@ const solved = (await status()).solution;
 await page.mouse.move(220, 160);
 say("and the newest again", await until(async () => (await status()).solution > solved && await page.evaluate(() => document.querySelector(".light").textContent === "")));
 
+// A status from before the click that comes after it does not undo it.
+let asked, release;
+const old = new Promise((done) => { asked = done; }), clicked = new Promise((done) => { release = done; });
+await page.route("**/now/status", async (route) => {
+  const response = await route.fetch();
+  asked();
+  await clicked;
+  await route.fulfill({ response });
+}, { times: 1 });
+await old;
 await page.check("[name=held]");
 say("the solver is held", await until(async () => (await status()).paused));
+await page.evaluate(() => {
+  window.stayed = true;
+  const watch = () => { window.stayed &&= document.querySelector("[name=held]").checked; if (window.watched !== "enough") requestAnimationFrame(watch); };
+  watch();
+});
+release();
+await page.waitForResponse("**/now/status");
+await page.waitForTimeout(300);
+say("an old status does not undo it", await page.evaluate(() => { window.watched = "enough"; return window.stayed; }));
 const held = (await status()).solution;
 await page.mouse.move(420, 300);
 await until(async () => off((await status()).eyes_m, await page.evaluate(() => window.phasestack.eyes())) < 0.001);

@@ -22,7 +22,7 @@ const CONTROLS = `
 
 let look = null, socket = null, viewer = false, sensor = true, lastSent = 0, follows = null, ipd_m = 0.063, newest = null, pending = null;
 let checks = false, camera = null, lookedAt = null;
-let layersSeen = { solved: false, flat: false }, first = null;
+let layersSeen = { solved: false, flat: false }, first = null, wishes = 0, answered_ms = 0; // commands under way; when the last one ended
 const latencies = [], drawn = [];
 const main = document.querySelector("main");
 
@@ -49,12 +49,15 @@ const told = (text) => (main.querySelector(".told").textContent = text);
 
 async function wish(command, value = null) {
   told(`${command} …`);
+  wishes += 1;
   try {
     const answer = await (await ask("/do", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ command, value }) })).json();
     told(answer.ok ? "" : answer.error);
   } catch {
     told("phasestack try has ended.");
   }
+  wishes -= 1;
+  answered_ms = performance.now();
 }
 
 function build({ stack, fov_deg }) {
@@ -218,7 +221,8 @@ async function about() {
   }
 }
 
-function figures(now) {
+// asked_ms: when it was asked for. What is older than a command says nothing of what that set.
+function figures(now, asked_ms) {
   const at = (share) => [...latencies].sort((a, b) => a - b)[Math.floor(share * (latencies.length - 1))];
   const rows = {
     "this page draws": `${drawn.length} pictures in the last second`,
@@ -232,6 +236,7 @@ function figures(now) {
   };
   main.querySelector(".figures")?.replaceChildren(...Object.entries(rows).flatMap(([name, text]) =>
     [["dt", name], ["dd", text]].map(([kind, textContent]) => Object.assign(document.createElement(kind), { textContent }))));
+  if (wishes || asked_ms < answered_ms) return;
   for (const [name, value] of [["scene", now.scene], ["model", now.model_asked]]) {
     if (form(name) && document.activeElement !== form(name)) form(name).value = value ?? "";
   }
@@ -240,10 +245,10 @@ function figures(now) {
 
 async function report() {
   try {
-    const now = await status();
+    const asked_ms = performance.now(), now = await status();
     const starting = main.querySelector(".starting");
     if (starting && now.reason) starting.textContent = `Starting: ${now.reason}. The first time on a machine takes some ten seconds longer.`;
-    if (look && now.ok) figures(now);
+    if (look && now.ok) figures(now, asked_ms);
   } catch {
     // told by the connection
   }
