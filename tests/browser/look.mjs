@@ -14,6 +14,13 @@ for (const [name, head, aligned] of [["rest", [0, 0, 0], true], ["aligned", JSON
     writeFileSync(`${folder}/${name}-${eye}.png`, Buffer.from(url.split(",")[1], "base64"));
   }
 }
+for (const [n, url] of (await page.evaluate(async () => Promise.all(JSON.parse(document.getElementById("layers").textContent).map(async (layer) => {
+  const image = Object.assign(new Image(), { src: layer });
+  await image.decode();
+  const canvas = Object.assign(document.createElement("canvas"), { width: image.naturalWidth, height: image.naturalHeight });
+  canvas.getContext("2d").drawImage(image, 0, 0);
+  return canvas.toDataURL();
+})))).entries()) writeFileSync(`${folder}/decoded-${n}.png`, Buffer.from(url.split(",")[1], "base64"));
 await page.evaluate(() => window.phasestack.setHead([0, 0, 0]));
 if (await page.$("[data-mode=target]")) say("told", await page.waitForFunction(() => /\d dB/.test(document.querySelector(".light").textContent), null, { timeout: 120000 })
   .then(() => page.textContent(".light")));

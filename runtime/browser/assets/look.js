@@ -280,7 +280,7 @@ export class Look {
       }
     }
     if (!counted) return void (this.$(".light").textContent = "From here nothing is seen through all panels.");
-    this.light_db = -10 * Math.log10(Math.max(error / counted, 1e-9));
+    this.light_db = -10 * Math.log10(Math.max(error / counted - (scene.target_error ?? 0), 1e-9)); // less what storing targets changes
     const words = this.light_db > 33 ? "hard to tell from what was asked for" : this.light_db > 27 ? "a good picture with faint traces of the other layers" :
       this.light_db > 21 ? "ghosts and coloured edges are plain to see" : "the layers fall apart";
     this.$(".light").textContent = `Light that reaches both eyes here: ${this.light_db.toFixed(1)} dB against what was asked for: ${words}.`;

@@ -10,7 +10,11 @@ const image = async (url) => {
 };
 
 async function begin() {
-  const scene = read("scene"), [layers, wanted] = await Promise.all(["layers", "wanted"].map((id) => Promise.all(read(id).map(image))));
+  const scene = read("scene"), layers = await Promise.all(read("layers").map(image));
+  const wanted = await Promise.all(read("wanted").map(image)).catch(() => {
+    scene.lines.push("This browser can't read AVIF, in which the page has what was asked for.");
+    return [];
+  });
   if (wanted.length) scene.picture = { width: wanted[0].naturalWidth, height: wanted[0].naturalHeight };
   const look = new Look(document.querySelector("main"), scene, { title: scene.title });
   look.display.load("solved", layers);
