@@ -32,7 +32,6 @@ from runtime.daemon.client import ask
 from runtime.errors import SensorLost
 from runtime.frame import solver_thread
 from runtime.sensor.replay import ReplayDriver
-from runtime.support.memory import give_back
 
 LOST_EVERY_S = 30.0
 WARM_UP = 0.4  # of the time
@@ -96,7 +95,6 @@ class Soak:
             time.sleep(min(10.0, max(0.1, left_s - 20.0)))
             if left_s < self._end_s - self._warm_s:
                 gc.collect()
-                give_back()
                 now = process.memory_info().rss >> 20, process.num_fds(), threading.active_count()
                 self.usage.append(now)
                 print(f"{left_s:6.0f} s left: {now[0]} MiB, {now[1]} files, {now[2]} threads", flush=True)

@@ -135,8 +135,13 @@ class SolverThread(SolverHost):
     def _begin(self, number: int) -> _Attempt:
         attempt = _Attempt(number)
         attempt.busy_since_ns = self._clock.now_ns() if number > 1 else 0
-        attempt.thread = begin(f"solver-{number}", self._run, attempt)
+        attempt.thread = begin(f"solver-{number}", self._live, attempt)
         return attempt
+
+    def _live(self, attempt: _Attempt) -> None:
+        self._run(attempt)
+        if not self._closing.is_set():  # hundreds of MiB, which the next solver's thread would not find
+            give_back()
 
     def _run(self, attempt: _Attempt) -> None:
         set_niceness(SOLVER_NICENESS)
@@ -169,9 +174,8 @@ class SolverThread(SolverHost):
             attempt.error, attempt.busy_since_ns = error.with_traceback(None), self._clock.now_ns()
         finally:
             parts.close()
-            if attempt.abandoned.is_set():  # what it held is hundreds of MiB
-                attempt.error = parts = None
-                give_back()
+            if attempt.abandoned.is_set():  # nobody asks any more, and its frames hold what it held
+                attempt.error = None
 
     def _next_request(self) -> SolveRequest | None:
         with self._lock:

@@ -21,7 +21,6 @@ from runtime.optics.stack import PanelStack
 from runtime.panels.display import glfw
 from runtime.records import SolveRequest
 from runtime.support.gl import offscreen_context
-from runtime.support.memory import give_back
 from tests.daemon.rig import Rig
 from tests.panels import xserver
 from tests.waiting import eventually
@@ -115,7 +114,6 @@ def connection() -> int:
 
 
 def resident_mib() -> float:
-    give_back()
     lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
     (resident,) = (line for line in lines if line.startswith("VmRSS:"))
     return int(resident.split()[1]) / 1024

@@ -7,13 +7,16 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import numpy as np
+import psutil
 import pytest
 
 from runtime.clock import NS_PER_S, MonotonicClock, SimulatedClock
-from runtime.errors import FatalError, InputError
+from runtime.errors import ContextLost, FatalError, InputError
 from runtime.frame.solver import SolverStep
 from runtime.frame.solver_thread import ABANDON_S, ABANDONED_MAX, LATE_S, SolverThread
 from runtime.records import SolveRequest
+from runtime.support.memory import keep_freed_memory
 from runtime.support.untrusted_input import LIMITS
 from tests.frame.fakes import FakeParts, aside, solution
 from tests.waiting import eventually
@@ -274,6 +277,23 @@ def test_a_step_that_raises_is_reported_and_the_solver_remade(shop: Workshop) ->
     shop.solve(3)
     assert shop.host.news().solution.solved_for_ns == 3
     assert shop.host.news().missing == {}
+
+
+def test_memory_of_a_solver_that_ended_goes_back_to_the_system(shop: Workshop) -> None:
+    keep_freed_memory()
+
+    def fail(request: SolveRequest) -> SolverStep:
+        blocks = [np.ones(1 << 20) for _ in range(48)]  # of 8 MiB, as pictures are; malloc keeps what was freed
+        held.append(blocks.pop())
+        raise ContextLost("the panels have lost their OpenGL context")
+
+    held: list[Any] = []
+    shop.solve(1)
+    shop.behave = fail
+    before = psutil.Process().memory_info().rss
+    shop.post(2)
+    shop.closed.get(timeout=PATIENCE_S)
+    assert eventually(lambda: psutil.Process().memory_info().rss - before < 64 << 20, within_s=PATIENCE_S)
 
 
 def test_a_failure_to_remake_the_solver_is_reported_and_retried(shop: Workshop) -> None:
