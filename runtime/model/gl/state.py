@@ -75,28 +75,22 @@ class GlState:
         self._swap("last", "spare", MIDDLE)
 
     def start(self) -> None:
-        for n in range(PANELS):
-            ahead, last = (self._passes.target((self._panel(name, n),)) for name in ("ahead", "last"))
-            self._passes.context.copy_framebuffer(ahead, last)
+        self._ahead = "last"  # until the first step
 
     def step(self, step: Step) -> None:
         seen = self._geometry.panels_from_rays(step.places, self._sigma_mm)
         back = inverse(seen)
-        phasors: dict[str, Image] = {}
-        for n in range(PANELS):
-            pair = {f"{name}{n}": self._panel(name, n) for name in ("cosine", "sine")}
-            self._draw("phasors", tuple(pair.values()), {"ahead": self._panel("ahead", n)}, {})
-            phasors |= pair
+        ahead = {f"ahead{n}": self._panel(self._ahead, n) for n in range(PANELS)}
         names = ("curvature", *(f"{part}{n}" for n in range(PANELS) for part in ("real", "imaginary")))
         for number, matrices in enumerate(seen):
             fields = tuple(self._rays(f"{name} {number}") for name in names)
             tapers = {name: self._taper(name) for name in ("column_taper", "row_taper")}
-            self._draw("compare", fields, {**phasors, **self._wanted(number % 2), **tapers}, self._through(matrices))
+            self._draw("compare", fields, {**ahead, **self._wanted(number % 2), **tapers}, self._through(matrices))
         how = {
             "size": step.size / (PANELS * np.pi / 2), "momentum": step.momentum, "least": step.floor * len(seen),
         }  # fmt: skip
         for n in range(PANELS):
-            inputs = {name: self._panel(name, n) for name in ("ahead", "last")}
+            inputs = {"ahead": ahead[f"ahead{n}"], "last": self._panel("last", n)}
             for number in range(len(seen)):
                 for name in ("curvature", f"real{n}", f"imaginary{n}"):
                     inputs[f"{name.rstrip('012')}{number}"] = self._rays(f"{name} {number}")
@@ -105,6 +99,7 @@ class GlState:
             self._draw("move", outputs, inputs, {**self._back(back[:, n]), **how}, defines=defines)
             self._swap("ahead", "moved", n)
             self._swap("last", "spare", n)
+        self._ahead = "ahead"
 
     def write(self, beside: int | tuple[int, ...] | None) -> U8:
         width, height = self._stack.width_px, self._stack.height_px
