@@ -81,6 +81,7 @@ def library() -> Any:
     if not built:
         raise ImportError(f"runtime.kernels is not compiled: {_AGAIN}")
     loops = ctypes.CDLL(str(built[0]))
+    other = ImportError(f"{built[0]} is of another version: {_AGAIN}")
     for name, arguments in {
         "step": (_pointer, _int, _int),
         "close_middle": (_pointer, _int, _int),
@@ -90,6 +91,13 @@ def library() -> Any:
     }.items():
         function = getattr(loops, name, None)
         if function is None:
-            raise ImportError(f"{built[0]} is of another version: {_AGAIN}")
+            raise other
         function.argtypes, function.restype = arguments, None
+    for name, structure in {"problem_bytes": Problem, "warp_bytes": Warp, "view_bytes": View}.items():
+        try:
+            size = _int.in_dll(loops, name).value
+        except ValueError:
+            raise other from None
+        if size != ctypes.sizeof(structure):
+            raise other
     return loops

@@ -97,3 +97,5 @@ FOR_EVERY_CPU void squared_error(const View *given, int first, int end, Result *
     }
   *result = {total, counted};
 }
+
+extern "C" { extern const int32_t view_bytes = sizeof(View); }

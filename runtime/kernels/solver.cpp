@@ -337,3 +337,5 @@ FOR_EVERY_CPU void show(const Image *panel, int channels, uint32_t *pixels, int6
     }
   }
 }
+
+extern "C" { extern const int32_t problem_bytes = sizeof(Problem); }

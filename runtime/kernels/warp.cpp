@@ -72,3 +72,5 @@ FOR_EVERY_CPU void warp(const Image *image, const Image *result, const Warp *by,
   if (channels == 3) warp_rows<3>(*image, *result, *by, beside, first, end);
   else warp_rows<1>(*image, *result, *by, beside, first, end);
 }
+
+extern "C" { extern const int32_t warp_bytes = sizeof(Warp); }

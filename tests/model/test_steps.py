@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 import torch
 
 from model_export.light import Views, step
+from runtime import kernels
 from runtime.config import ModelSettings
 from runtime.model.contract import Step
 from runtime.model.cpu import CpuState
@@ -190,3 +192,12 @@ def test_equal_grey_pictures_and_panels_that_show_them_stay() -> None:
         state.step(Step(size=1.6))
     for panel, old in zip(panels_of(state, geometry, 3), before, strict=True):
         assert np.abs(panel.astype(int) - old).max() <= SUBCODE // 2
+
+
+def test_kernels_of_another_layout_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Longer(kernels.View):
+        _fields_ = (("more", ctypes.c_double),)
+
+    monkeypatch.setattr(kernels, "View", Longer)
+    with pytest.raises(ImportError, match="is of another version"):
+        kernels.library.__wrapped__()
