@@ -43,7 +43,7 @@ class Problem(ctypes.Structure):
     _fields_ = (
         ("panels", _int), ("sets", _int), ("channels", _int), ("height", _int), ("width", _int),
         ("panels_from_rays", _pointer), ("rays_from_panels", _pointer), ("targets", _pointer * 2),
-        ("column_taper", _pointer), ("row_taper", _pointer), ("table", _pointer), ("rest", _float),
+        ("column_taper", _pointer), ("row_taper", _pointer), ("table", _pointer), ("rest", _float), ("missing", _float),
         ("panel", Panel * MAX_PANELS), ("size", _float), ("momentum", _float), ("floor", _float),
     )  # fmt: skip
 

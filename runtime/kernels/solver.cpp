@@ -29,7 +29,7 @@ struct Problem {
   const float *column_taper;       // (width, channels) what the rays' errors are multiplied with
   const float *row_taper;          // (height)
   const float *table;              // (256, 2): of a target's code, the sum of all panels that shows it, and its weight
-  float rest;                      // what lies beside a panel counts for, where the middle one is closed
+  float rest, missing;             // closing: what lies beside a panel counts for; weight of a ray that misses one
   Panel panel[MAX_PANELS];
   float size, momentum, floor;
 };
@@ -226,6 +226,9 @@ INLINE void lack(const Problem &problem, const Share &share, int set, int r, Wor
   const int middle = problem.panels / 2;
   const double *homographies = problem.panels_from_rays + set * problem.panels * 9;
   const Span span = inside(Line(homographies + middle * 9, r), problem.width, problem.panel[middle].last, 0);
+  Span whole = span;  // rays that cross every panel
+  for (int n = 0; n < problem.panels; ++n)
+    whole = common(whole, inside(Line(homographies + n * 9, r), problem.width, problem.panel[n].last, 0));
   for (int u = span.first; u < span.last; u += TILE_PX) {
     const Span tile{u, std::min(u + TILE_PX, span.last)};
     const int count = (tile.last - u) * C;
@@ -247,6 +250,7 @@ INLINE void lack(const Problem &problem, const Share &share, int set, int r, Wor
     int16_t *weights = share.row(set, 0, r) + at, *wanted = share.row(set, 1, r) + at;
     float asked[TILE], weight[TILE];
     for (int k = 0; k < count; ++k) asked[k] = problem.table[2 * target[k]], weight[k] = problem.table[2 * target[k] + 1];
+    for (int k = 0; k < count; ++k) weight[k] *= u * C + k < whole.first * C || u * C + k >= whole.last * C ? problem.missing : 1;
     for (int e = 0; e < count; e += LANES)
       VECTORISED for (int k = e; k < e + LANES; ++k) {
         weights[k] = rounded(weight[k] * UNIT);

@@ -129,7 +129,7 @@ class CpuState:
             panels_from_rays=seen.ctypes.data, rays_from_panels=back.ctypes.data,
             targets=(c_void_p * 2)(*(target.ctypes.data for target in self._targets)),
             column_taper=self._tapers[0].ctypes.data, row_taper=self._tapers[1].ctypes.data,
-            table=table.ctypes.data, rest=self._rest,
+            table=table.ctypes.data, rest=self._rest, missing=geometry.missing_weight,
         )  # fmt: skip
         for n, box in enumerate(geometry.boxes):
             images = (held.ahead[n], held.moved[n], held.last[n])

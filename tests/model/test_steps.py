@@ -139,7 +139,32 @@ def test_the_middle_panel_closes_on_one_eye_s_target(stack: str) -> None:
     state.begin(same, geometry)
     state.close_middle()
     wanted = target_table(count)[:, 0][job.arrays[0][0][geometry.rays.slices][..., :3]] - (count - 1) * rest_of(count)
-    assert np.abs(panels_of(state, geometry, 3)[middle] - np.clip(wanted, 0, FULL)).max() <= 3
+    off = np.abs(panels_of(state, geometry, 3)[middle] - np.clip(wanted, 0, FULL))
+    assert np.median(off) <= 3
+    assert off.max() <= 32  # of rays that miss a panel, which weigh little in 16 bits
+
+
+def test_a_ray_that_misses_a_panel_leaves_a_pixel_to_the_other_eye() -> None:
+    state, job, geometry = begun(STACK, eyes(0.3), own=False)
+    for n, box in enumerate(geometry.boxes):
+        state.set_panel(n, np.full((box.height_px, box.width_px, 3), rest_of(3), np.int16))
+    codes = 90, 160
+    plain = [[np.full_like(images[0], code)] for images, code in zip(job.pictures, codes, strict=True)]
+    state.begin(replace(job, pictures=plain), geometry)
+    state.close_middle()
+    rays, found = geometry.rays, panels_of(state, geometry, 3)[geometry.middle][..., 0]
+    at = np.stack([*np.meshgrid(np.arange(rays.width_px) + 0.5, np.arange(rays.height_px) + 0.5), np.ones(found.shape)])
+    crosses = []
+    for matrices in geometry.panels_from_rays("middle", 0.0):
+        ends = [np.tensordot(matrix, at, 1) for matrix in matrices]
+        boxes = zip(ends, geometry.boxes, strict=True)
+        within = [(x > 0) & (x < b.width_px * w) & (y > 0) & (y < b.height_px * w) for (x, y, w), b in boxes]
+        crosses.append(np.all(within, axis=0))
+    wanted = [target_table(3)[code, 0] - 2 * rest_of(3) for code in codes]
+    for side in (0, 1):
+        alone = crosses[side] & ~crosses[1 - side]
+        assert alone.sum() > 1000
+        assert np.abs(found[alone] - wanted[side]).max() < 0.1 * abs(wanted[1] - wanted[0])
 
 
 def test_many_steps_with_momentum_do_not_diverge() -> None:

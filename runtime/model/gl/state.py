@@ -67,9 +67,8 @@ class GlState:
         gathered: dict[str, Image] = {"last": self._panel("last", MIDDLE)}
         for side in (0, 1):
             weight, lacked = (self._rays(f"{name}{side}") for name in ("weight", "lacked"))
-            self._draw(
-                "lack", (weight, lacked), {**inputs, **self._wanted(side)}, {**self._through(seen[side]), "rest": 0.5}
-            )
+            how = {"rest": 0.5, "missing": self._geometry.missing_weight}
+            self._draw("lack", (weight, lacked), {**inputs, **self._wanted(side)}, {**self._through(seen[side]), **how})
             gathered |= {f"weight{side}": weight, f"lacked{side}": lacked}
         self._draw("fill", (self._panel("spare", MIDDLE),), gathered, self._back(back[:, MIDDLE]))
         self._swap("last", "spare", MIDDLE)

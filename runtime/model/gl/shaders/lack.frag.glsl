@@ -6,7 +6,7 @@ uniform sampler2D last0, last2, wanted, table;
 uniform mat3 from_rays0, from_rays1, from_rays2;
 uniform vec2 size0, size1, size2;
 uniform ivec2 wanted_origin;
-uniform float rest;
+uniform float rest, missing;
 layout(location = 0) out vec4 weight;
 layout(location = 1) out vec4 lacked;
 
@@ -18,11 +18,13 @@ void main() {
     weight = vec4(0.0);
     lacked = held_number(vec4(0.0));
     if (!inside(place(from_rays1), size1, 0.0)) return;
-    vec4 seen = outer(last0, place(from_rays0), size0) + outer(last2, place(from_rays2), size2);
+    vec2 at0 = place(from_rays0), at2 = place(from_rays2);
+    vec4 seen = outer(last0, at0, size0) + outer(last2, at2, size2);
+    float counts = inside(at0, size0, 0.0) && inside(at2, size2, 0.0) ? 1.0 : missing;
     vec4 codes = texelFetch(wanted, ivec2(gl_FragCoord.xy) + wanted_origin, 0) * 255.0 + 0.5;
     for (int k = 0; k < 3; ++k) {
         vec2 entry = texelFetch(table, ivec2(int(codes[k]), 0), 0).rg;
-        weight[k] = entry.g;
-        lacked[k] = entry.g * clamp(entry.r / FULL - seen[k], -1.0, 2.0) * 0.25 + 0.5;
+        weight[k] = counts * entry.g;
+        lacked[k] = weight[k] * clamp(entry.r / FULL - seen[k], -1.0, 2.0) * 0.25 + 0.5;
     }
 }
