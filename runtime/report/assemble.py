@@ -17,6 +17,7 @@ from runtime.report.page import Page, Section, describe
 from runtime.report.pairs import StillPair, procedural_pairs, read_pairs
 from runtime.report.sections import focal_section, frontier_section, moving_section
 
+LIKE_PUBLISHED = "{}x{}".format(*SIZE_PX)
 QUOTE = "light_db at a tracking error of 1 mm: what both eyes' pupils make of the panels' pixels"
 Progress = Callable[[str], None]
 
@@ -61,38 +62,44 @@ def whole_report(
     pairs: Path | None = None,
     with_focal: bool = False,
     models: Sequence[str] = (),
+    published: str = "",
     quick: bool = False,
     command: str = "phasestack report",
     progress: Progress = lambda name: None,
 ) -> dict[str, Any]:
     """Measure everything into a folder; answers report.json. `quick`: quarter size, fewer references.
 
+    published: an ONNX file of SIZE_PX, measured beside published figures.
     Raises InputError for case files and models with mistakes, before anything is measured.
     """
     cases = read_pairs(pairs) if pairs is not None else []
     stack = StackGeometry().stack()
     if quick:
         stack = replace(stack, width_px=960, height_px=540)
-    for name in models:
-        for each in dict.fromkeys([*(pair.stack for pair in cases), stack]):  # minutes later is too late to refuse it
+    small = replace(stack, width_px=SIZE_PX[0], height_px=SIZE_PX[1])
+    like_published = _by_size(cases).get(LIKE_PUBLISHED, [])
+    served = [(name, [*(pair.stack for pair in cases), stack]) for name in models]
+    served += [(published, [pair.stack for pair in like_published] or [small])] if published else []
+    for name, stacks in served:
+        for each in dict.fromkeys(stacks):  # minutes later is too late to refuse it
             load_predictor(name, each, ModelSettings(threads=1)).close()
     page = GrowingPage(out, command, progress)
     methods = shipped_and_references(models, quick=quick)
-    published = "{}x{}".format(*SIZE_PX)
-    like_published: list[MethodResult] = []
+    beside: list[MethodResult] = []
     for size, own in _by_size(cases).items():
         title = f"{len(own)} case file{'s' if len(own) > 1 else ''}, {size}"
         results = _frontier(page, methods, own, title=title, name=f"cases-{size}", key="methods")
-        like_published += results if size == published else []
+        beside += results if size == LIKE_PUBLISHED else []
 
     key = "methods_on_built_in_scenes" if cases else "methods"
     _frontier(page, methods, procedural_pairs(stack), title="built-in scenes", name="scenes", key=key)
-    page.doing(f"beside published figures, {published}")
-    if not like_published:
-        small = replace(stack, width_px=SIZE_PX[0], height_px=SIZE_PX[1])
-        found = measure(shipped_and_references(quick=True)[: len(SHIPPED)], islice(procedural_pairs(small), 1))
-        like_published = list({result.name: result for _, result in found}.values())
-    page.put("literature", literature_section(like_published))
+    page.doing(f"beside published figures, {LIKE_PUBLISHED}")
+    missing = [] if beside else shipped_and_references(quick=True)[: len(SHIPPED)]
+    missing += [Method(Path(published).stem, "network", published)] if published else []
+    found = measure(missing, like_published or islice(procedural_pairs(small), 1))
+    beside += {result.name: result for _, result in found}.values()
+    page.record["methods_beside_published_figures"] = [result.record() for result in beside]
+    page.put("literature", literature_section(beside))
     _moving(page, quick=quick)
     if with_focal:
         _focal(page)

@@ -150,7 +150,7 @@ export class Look {
     if (checks) {
       g.clear(g.COLOR_BUFFER_BIT);
       if (!display.targets[0]) return; // a moment is being measured
-      const { width: pw, height: ph } = this.scene.picture, fit = Math.min(w / pw, h / ph), pic = { width: Math.floor(pw * fit), height: Math.floor(ph * fit) };
+      const { width: pw, height: ph } = this.scene.picture, fit = 0.97 * Math.min(w / pw, h / ph), pic = { width: Math.floor(pw * fit), height: Math.floor(ph * fit) };
       sides.forEach((side, k) => {
         const left = (k % across) * w + ((w - pic.width) >> 1), below = height - (Math.floor(k / across) + 1) * h + ((h - pic.height) >> 1);
         display.see({ eye: this.scene.eyes_m[side], picture: { ...pic, fov_deg: this.scene.fov_deg }, part: [left, below, pic.width, pic.height],

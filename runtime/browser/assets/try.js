@@ -227,7 +227,7 @@ function figures(now, asked_ms) {
   const rows = {
     "this page draws": `${drawn.length} pictures in the last second`,
     "the panels are given": `${number(now.fps_now)} refreshes a second`,
-    "the solver makes": `${number(now.solutions_per_s_now)} solutions a second, ${now.model ?? ""}`,
+    "the solver makes": `${now.solutions_per_s_now === 0 ? "nothing new now" : `${number(now.solutions_per_s_now)} solutions a second`}, ${now.model ?? ""}`,
     "the newest is": `${number(now.solution_age_now_ms, 0)} ms old`,
     "the eyes are known to": `${number(now.eye_sigma_now_mm, 2)} mm (${now.eyes_label ?? "–"})`,
     "pointer to aligned picture": `${number(at(0.5), 0)} ms, 99 of 100 within ${number(at(0.99), 0)} ms`,
