@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import logging
+import os
+import sys
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass
 from io import StringIO
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
@@ -134,8 +137,11 @@ def check_static(network: Network, *, width_px: int, height_px: int) -> None:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """The exporters advise developers of models, not users of this command."""
-    level = logging.root.manager.disable
+    """The exporters advise developers of models, not users of this command, and print graphs, from C++ too."""
+    sys.stdout.flush()
+    level, output = logging.root.manager.disable, os.dup(1)
+    with Path(os.devnull).open("wb") as nothing:
+        os.dup2(nothing.fileno(), 1)
     logging.disable(logging.WARNING)
     try:
         with warnings.catch_warnings():
@@ -143,3 +149,5 @@ def quiet() -> Iterator[None]:
             yield
     finally:
         logging.disable(level)
+        os.dup2(output, 1)
+        os.close(output)

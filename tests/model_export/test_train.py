@@ -198,12 +198,14 @@ def test_more_memory_than_there_is_is_told_before_it_is_taken(tmp_path: Path, mo
 
 
 @pytest.mark.parametrize(("arch", "problem"), FAULTS.items())
-def test_a_module_that_cannot_be_served_is_refused_in_one_line(tmp_path: Path, arch: str, problem: str) -> None:
+def test_a_module_that_cannot_be_served_is_refused_in_one_line(
+    tmp_path: Path, arch: str, problem: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "new" / "model.onnx"
     command = ["export", "--arch", arch, "--random-init", "1", "--width", "64", "--height", "48", "--out", str(out)]
     result = CliRunner().invoke(app, [*command, *(["--option", "width=2"] if arch.endswith("Narrow") else [])])
     assert isinstance(result.exception, InputError) and problem in str(result.exception), result.exception
-    assert "\n" not in str(result.exception) and result.output == ""
+    assert "\n" not in str(result.exception) and result.output == "" and capfd.readouterr() == ("", "")
     assert not out.parent.exists()
 
 
