@@ -10,6 +10,7 @@ from pydantic import Field
 
 from runtime.config import Section, validated
 from runtime.errors import InputError
+from runtime.kernels import MAX_PANELS
 
 METADATA_KEY = "phasestack.contract"
 VERSION = 2
@@ -60,7 +61,7 @@ class Contract(Section):
     version: Literal[2]
     arch: str
     name: str
-    panels: Annotated[int, Field(ge=2, le=8)]
+    panels: Annotated[int, Field(ge=2, le=MAX_PANELS)]
     eyes: Literal[2]
     input_frame: Literal["panel", "centre", "chain"]
     input_value: Literal["intensity", "phase"]

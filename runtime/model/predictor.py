@@ -66,11 +66,11 @@ def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None 
     from runtime.model.session import ModelSession
     from runtime.model.solver import Solver
 
+    if stack.count > MAX_PANELS:
+        raise InputError("model", "name", f"{name} serves up to {MAX_PANELS} panels; use the model sart")
     session = ModelSession(path, provider=settings.provider, threads=settings.threads, sha256=shipped_sha256(name))
     contract = session.contract
     if name in SHIPPED and not (stack.count == 3 and stack.is_evenly_spaced):
-        if stack.count > MAX_PANELS:
-            raise InputError("model", "name", f"{name} serves up to {MAX_PANELS} panels; use the model sart")
         title = f"{name} (without its network: needs three even panels)"
         return Solver(stack, None, steps_from_even(len(contract.steps)), name=title, threads=settings.threads)
     if contract.panels != stack.count:

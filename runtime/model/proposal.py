@@ -19,7 +19,7 @@ from runtime.model.chain import ChainFrame, ColumnLaw, chain_frame, chain_modes
 from runtime.model.geometry import Geometry, taper
 from runtime.model.job import Job
 from runtime.model.session import ModelSession
-from runtime.model.targets import FULL, REST, phase_codes
+from runtime.model.targets import FULL, phase_codes, rest_of
 from runtime.model.warp import REACH_PX, reduced_pictures, warp
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.tilt import coarse_layer_from_seen
@@ -31,7 +31,7 @@ EDGE_SHARE = 1 / 40  # of a picture: so far beside it at most its edge goes on
 UNSEEN = -1  # what pictures ask for is positive
 SHARPENED = 0.2  # of the difference, on either side: what two interpolations blur
 SHARPENING = np.array([-SHARPENED, 1 + 2 * SHARPENED, -SHARPENED])
-EVEN = round(REST[3] * FULL)  # of an outer panel, sixteenths of a code
+EVEN = rest_of(3)  # of an outer panel, sixteenths of a code
 _SWAPPED = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # (y, z, 1) from (-z, -y, 1), and back
 
 

@@ -17,7 +17,8 @@ from runtime.errors import ModelFailure
 from runtime.model.base import STAGES, Prediction, Predictor
 from runtime.model.geometry import panel_from_middle
 from runtime.model.job import Job
-from runtime.model.targets import FULL, REST, target_table
+from runtime.model.targets import FULL, target_table
+from runtime.optics.malus import rest_value
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F32, F64
 
@@ -42,7 +43,7 @@ class SartPredictor(Predictor):
         watch, stack = Stopwatch(*STAGES), self.stack
         table = np.ascontiguousarray(target_table(stack.count)[:, 0] / np.float32(FULL))
         targets = [cv2.LUT(np.ascontiguousarray(image[0][..., :3]), table) for image in job.arrays]
-        shape, rest = (stack.height_px, stack.width_px, 3), REST.get(stack.count, 1.5 / stack.count)
+        shape, rest = (stack.height_px, stack.width_px, 3), rest_value(stack.count)
         panels: list[NDArray[np.float32]] = [np.full(shape, rest, np.float32) for _ in range(stack.count)]
         forward = [[self._panel_from_middle(eye, n) for n in range(stack.count)] for eye in job.eyes_m]
         back = [[np.linalg.inv(matrix) for matrix in matrices] for matrices in forward]

@@ -17,11 +17,9 @@ from runtime.model.geometry import Geometry, geometry_of
 from runtime.model.job import Job
 from runtime.model.network import PictureProposal
 from runtime.model.proposal import ChainProposal
-from runtime.model.targets import SUBCODE, rest_of
+from runtime.optics.malus import rest_code
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64
-
-NEUTRAL = (rest_of(3) + SUBCODE // 2) // SUBCODE  # code of a panel at rest, of three
 
 
 class Solver(Predictor):
@@ -72,14 +70,15 @@ class Solver(Predictor):
         return (self.stack.panel(self.stack.count // 2),)
 
     def solve(self, job: Job) -> Prediction:
-        watch, part, beside = Stopwatch(*STAGES), job.part, (NEUTRAL if job.part is None else job.part.colour)
+        rest = rest_code(self.stack.count)
+        watch, part, beside = Stopwatch(*STAGES), job.part, (rest if job.part is None else job.part.colour)
         if self._state is None:
             self._state = self._backend.state(self.stack, threads=self._threads)
         state, steps, layers = self._state, 0, None
         if part is not None and beside is None:  # beside the window both eyes see one picture
             with state.begin(job, geometry_of(job, self.stack, whole=True)):
                 state.close_middle()
-                layers = state.write(NEUTRAL)
+                layers = state.write(rest)
         if part is None or part.box.width_px or layers is None:
             # Of a network of whole pictures all that it answers is shown.
             geometry = geometry_of(job, self.stack, unseen=self.needs_rasters)

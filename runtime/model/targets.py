@@ -7,21 +7,24 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from runtime.optics.malus import Branch, phase_from_intensity
+from runtime.optics.malus import Branch, phase_from_intensity, rest_code, rest_value
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, I16, U8
 
 SUBCODE = 16  # fixed point: sixteenths of an 8-bit panel code
 FULL = 255 * SUBCODE  # one panel's whole range, a quarter turn
 SLOPE_FLOOR = 0.25  # the least weight of a ray beside the slope of sin² where it is wanted
-# Where panels stand before anything is asked of them: so that their sum is in the middle of one of sin²'s slopes.
-REST = {2: 0.75, 3: 0.5, 4: 0.375, 5: 0.5}
 COARSE_STEP = 16  # a look at every so many pixels tells most coloured pictures for next to nothing
 
 
 def rest_of(panels: int) -> int:
-    """The same in sixteenths of a code, for any number of panels."""
-    return round(REST.get(panels, 1.5 / panels) * FULL)
+    """What a panel shows at rest, in sixteenths of a code."""
+    return round(rest_value(panels) * FULL)
+
+
+def slope_of(panels: int) -> int:
+    """Which of sin²'s slopes sums are on: 1 falls from 1 to 2, 2 rises from there."""
+    return int(rest_value(panels) * panels)
 
 
 @lru_cache(maxsize=8)
@@ -31,7 +34,7 @@ def target_table(panels: int) -> F32:
     The sum is the one nearest to rest; the weight is the slope of sin² there, 1 at its steepest.
     """
     intensities = np.arange(256) / 255.0
-    slope = int(REST.get(panels, 1.5 / panels) * panels)  # 1 falls from 1 to 2, 2 rises again
+    slope = slope_of(panels)
     rise = 2 / np.pi * np.arcsin(np.sqrt(intensities))
     sums = slope + (1 - rise if slope % 2 else rise)
     share = rise * (1 - rise) * 4
@@ -48,7 +51,7 @@ def middle_codes(panels: int) -> U8:
 def beside_codes(panels: int, n: int, beside: int | tuple[int, ...]) -> list[int]:
     """RGB code of panel n outside the window: at rest; the middle one a code, or a colour."""
     if n != panels // 2:
-        return [(rest_of(panels) + SUBCODE // 2) // SUBCODE] * 3
+        return [rest_code(panels)] * 3
     return middle_codes(panels)[list(beside)].tolist() if isinstance(beside, tuple) else [beside] * 3
 
 
@@ -81,11 +84,11 @@ def flat_layers(image: U8, stack: PanelStack) -> U8:
     """(N, h, w, 4) layers that show every eye a picture (h, w, 4) on the middle panel's raster."""
     middle = stack.count // 2
     layers = np.full((stack.count, stack.height_px, stack.width_px, 4), 255, np.uint8)
-    # On the second branch the sum is at least one panel's range: the other panels share it, and the middle
-    # one carries the picture.
-    even = 255 // (stack.count - 1)
+    # The sum is at least the slope's beginning: the other panels share that, and the middle one carries the picture.
+    even = slope_of(stack.count) * 255 // (stack.count - 1)
     layers[..., :3] = even
-    phase = cv2.LUT(cv2.cvtColor(image, cv2.COLOR_RGBA2RGB), phase_codes(2))
-    rest = np.clip((phase + SUBCODE // 2) // SUBCODE - even * (stack.count - 1), 0, 255).astype(np.uint8)
+    sums = np.rint(target_table(stack.count)[:, 0] / SUBCODE)
+    codes = np.clip(sums - even * (stack.count - 1), 0, 255).astype(np.uint8)
+    rest = cv2.LUT(cv2.cvtColor(image, cv2.COLOR_RGBA2RGB), codes)
     layers[middle, ..., :3] = rest
     return layers

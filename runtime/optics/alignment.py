@@ -20,10 +20,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.optics.malus import rest_code
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8, PanelFrame, pixels_of
 
-EVEN_CODE = 128  # mid-grey: what a panel shows beside the solution
 FARTHEST_M = 1e6  # of any coordinate: what is farther counts as not finite
 NEAREST_M = 0.01  # of an eye before the front panel: nearer, its rays graze the panels
 MOST_SHIFT = 0.5  # of a panel's width or height, that its middle may be moved: by then half of what is seen is even
@@ -85,8 +85,8 @@ def shown_layers(frame: PanelFrame) -> U8:
     """(N, h, w, 4): exactly what the panels show, before a panel's own curve, rotation and mirroring.
 
     The reference for the presentation shader: bilinear with exact weights (for moved eyes bicubic was never better by
-    more than 0.05 dB: docs/mathematics.md), `EVEN_CODE` beside the solution, mixed with the flat picture before it is
-    rounded. Where nothing is to be done the frame's own array is answered.
+    more than 0.05 dB: docs/mathematics.md), panels at rest beside the solution, mixed with the flat picture before it
+    is rounded. Where nothing is to be done the frame's own array is answered.
     Raises ValueError for a frame that has nothing to show, ContextLost where its layers' textures are no more.
     """
     flatness = 1.0 if frame.solved is None else frame.flatness
@@ -106,7 +106,7 @@ def shown_layers(frame: PanelFrame) -> U8:
         if mixed is None and is_identity(matrix):
             out[n] = solved[n]
             continue
-        for rows, codes in _resampled(solved[n], matrix):
+        for rows, codes in _resampled(solved[n], matrix, rest_code(len(solved))):
             if mixed is not None:
                 codes += (mixed[rows] - codes) * np.float32(flatness)
             codes += np.float32(0.5)
@@ -171,7 +171,7 @@ def _places(count: int, *, scale: float, shift: float) -> tuple[NDArray[np.intp]
     return first.astype(np.intp) + 1, (place - first).astype(np.float32)
 
 
-def _resampled(layer: U8, matrix: F64) -> Iterator[tuple[slice, F32]]:
+def _resampled(layer: U8, matrix: F64, beside: int) -> Iterator[tuple[slice, F32]]:
     """Strips of rows of the shown layer and their codes (rows, w, 4), not yet rounded; overwritten by the next."""
     su, sv, tu, tv = scale_and_shift(matrix)
     height, width = layer.shape[:2]
@@ -181,7 +181,7 @@ def _resampled(layer: U8, matrix: F64) -> Iterator[tuple[slice, F32]]:
         strip = slice(begin, min(begin + ROWS, height))
         first, weight = rows[strip], down[strip, None, None]
         low, high = int(first.min()), int(first.max()) + 2  # in padded rows
-        source = np.full((high - low, width + 2, 4), EVEN_CODE, np.float32)
+        source = np.full((high - low, width + 2, 4), beside, np.float32)
         source[..., 3] = 255.0
         inside = slice(max(low, 1), min(high, height + 1))
         source[inside.start - low : max(inside.stop, inside.start) - low, 1:-1] = layer[

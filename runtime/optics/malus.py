@@ -12,6 +12,18 @@ from runtime.records import F64
 HALF_PI = np.pi / 2
 Branch = Literal[1, 2]
 T = TypeVar("T", bound=np.floating[Any])
+# Values of panels at rest, before anything is asked of them: their sum is in the middle of one of sin²'s slopes.
+REST = {2: 0.75, 3: 0.5, 4: 0.375, 5: 0.5}
+
+
+def rest_value(panels: int) -> float:
+    """What each of so many panels shows at rest, in [0, 1]."""
+    return REST.get(panels, 1.5 / panels)
+
+
+def rest_code(panels: int) -> int:
+    """The same as an 8-bit code."""
+    return int(rest_value(panels) * 255 + 0.5)
 
 
 def jones_rotator(angle_rad: float) -> F64:

@@ -6,7 +6,8 @@ import moderngl
 import numpy as np
 
 from runtime.config import PanelSettings
-from runtime.optics.alignment import EVEN_CODE, is_identity, scale_and_shift
+from runtime.optics.alignment import is_identity, scale_and_shift
+from runtime.optics.malus import rest_code
 from runtime.panels import lut
 from runtime.panels.geometry import layer_from_screen, permutes_pixels
 from runtime.records import Layers, PanelFrame, pixels_of
@@ -98,7 +99,7 @@ class FrameTextures:
     def __init__(self, context: moderngl.Context, size_px: tuple[int, int], *, count: int) -> None:
         """size_px: columns and rows of a layer."""
         self._context = context
-        self.size_px, self._count = size_px, count
+        self.size_px, self.count = size_px, count
         self._solved: tuple[moderngl.Texture, ...] = ()
         self._flat: tuple[moderngl.Texture, ...] = ()
         self._solved_version: int | None = None
@@ -138,7 +139,7 @@ class FrameTextures:
     def _written(self, held: tuple[moderngl.Texture, ...], layers: Layers) -> tuple[moderngl.Texture, ...]:
         """One texture a panel, made when the first layers come."""
         if not held:
-            held = tuple(self._context.texture(self.size_px, 4) for _ in range(self._count))
+            held = tuple(self._context.texture(self.size_px, 4) for _ in range(self.count))
             for texture in held:
                 texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
                 texture.repeat_x = texture.repeat_y = False
@@ -189,7 +190,6 @@ class Painter:
         self._program["solved"] = 0
         self._program["flat_picture"] = 1
         self._program["curve"] = 2
-        self._program["even"] = EVEN_CODE / 255
         self._program["screen_px"] = tuple(map(float, screen_px))
         self._program["layer_from_screen"] = tuple(matrix.T.ravel())
         self._program["exact"] = permutes_pixels(matrix)
@@ -197,6 +197,7 @@ class Painter:
     def draw(self, textures: FrameTextures, frame: PanelFrame, index: int) -> None:
         """Panel `index` of the frame that was uploaded, over the whole of the framebuffer in use."""
         matrix = frame.solved_from_shown[index] if frame.solved_from_shown else np.eye(3)
+        self._program["even"] = rest_code(textures.count) / 255
         self._program["size_px"] = tuple(map(float, textures.size_px))
         self._program["aligned"] = not is_identity(matrix)
         self._program["solved_from_shown"] = scale_and_shift(matrix)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from runtime.model.targets import FULL, SUBCODE, flat_layers, phase_codes
-from runtime.optics.malus import intensity_from_phase
+from runtime.optics.malus import intensity_from_phase, rest_value
 from runtime.optics.stack import PanelStack
 
 
-@pytest.mark.parametrize("panels", [2, 3, 4])
+@pytest.mark.parametrize("panels", [2, 3, 4, 5, 8])
 def test_every_eye_sees_the_picture_whatever_it_looks_through(panels: int) -> None:
     """The outer panels are even, so that a ray meets the same phases beside the middle one wherever it comes from."""
     stack = PanelStack(0.5, 0.3, tuple(np.linspace(-0.06, 0.06, panels)), 256, 16)
@@ -23,6 +23,14 @@ def test_every_eye_sees_the_picture_whatever_it_looks_through(panels: int) -> No
     seen = intensity_from_phase(layers[..., :3].astype(np.float64).sum(axis=0) / 255) * 255
     assert np.abs(seen - picture[..., :3]).max() < 1.0  # half a code of the middle panel, at sin²'s steepest
     assert (layers[..., 3] == 255).all()
+
+
+@pytest.mark.parametrize("panels", [2, 3, 4, 5])
+def test_fading_to_the_flat_picture_stays_on_the_solver_s_slope(panels: int) -> None:
+    """Or every fade would pass through black or white."""
+    stack = PanelStack(0.5, 0.3, tuple(np.linspace(-0.06, 0.06, panels)), 256, 16)
+    flat = flat_layers(np.full((16, 256, 4), 128, np.uint8), stack)[:, 0, 0, 0].sum() / 255
+    assert int(flat) == int(rest_value(panels) * panels)
 
 
 def test_colours_stay_in_their_channels() -> None:

@@ -11,9 +11,7 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from runtime.model.solver import NEUTRAL
 from runtime.optics.alignment import (
-    EVEN_CODE,
     FARTHEST_M,
     MOST_SCALE,
     MOST_SHIFT,
@@ -24,6 +22,7 @@ from runtime.optics.alignment import (
     reference_x_m,
     shown_layers,
 )
+from runtime.optics.malus import intensity_from_phase
 from runtime.optics.stack import PanelStack
 from runtime.records import PanelFrame
 from tests.optics import reference
@@ -243,8 +242,11 @@ def test_a_shown_pixel_is_a_bilinear_sample_and_mid_grey_outside(layers: np.ndar
     assert np.abs(shown[2, ..., :3] - expected).max() <= 0.501
 
 
-def test_even_is_where_the_solver_starts_its_outer_panels() -> None:
-    assert EVEN_CODE == NEUTRAL
+@pytest.mark.parametrize("count", [2, 3, 4, 5])
+def test_all_panels_beside_the_solution_show_half_of_the_light(count: int) -> None:
+    shown = shown_layers(PanelFrame(1, np.zeros((count, 8, 8, 4), np.uint8), 1, (matrix(shift_u=500.0),) * count))
+    light = intensity_from_phase(shown[:, 4, 4, 0].sum() / 255)
+    assert light == pytest.approx(0.5, abs=0.02)
 
 
 def test_where_nothing_moves_nothing_is_resampled_or_copied(layers: np.ndarray) -> None:
