@@ -1,7 +1,7 @@
 // What a stack of panels shows and what eyes see of it: optics, WebGL 2, and the plan of eyes and panels.
 // Frame `stack`: metres, x out of the screen, y to the viewer's right, z up. Matrices are 3x3, row after row.
 
-const EVEN = 128 / 255; // beside a solution that was shifted
+const REST = { 2: 0.75, 3: 0.5, 4: 0.375, 5: 0.5 }; // of panels of that number, beside a solution that was shifted
 const NEAREST_M = 0.01, MOST_SHIFT = 0.5, MOST_SCALE = 2; // limits of an alignment, as the runtime has them
 const PUPILS = 7;
 
@@ -105,11 +105,11 @@ void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 -
 // One layer as its panel shows it: aligned, mixed with the flat picture. Rounded to 8 bits by what it is drawn into.
 const SHOW = `#version 300 es
 precision highp float; precision highp sampler2DArray;
-uniform sampler2DArray solved, flat_picture; uniform int panel; uniform vec4 map; uniform float flatness; uniform vec2 size;
+uniform sampler2DArray solved, flat_picture; uniform int panel; uniform vec4 map; uniform float flatness, rest; uniform vec2 size;
 out vec4 colour;
 vec3 texel(ivec2 at) {
   bool inside = all(greaterThanEqual(at, ivec2(0))) && all(lessThan(at, ivec2(size)));
-  return inside ? texelFetch(solved, ivec3(at, panel), 0).rgb : vec3(${EVEN});
+  return inside ? texelFetch(solved, ivec3(at, panel), 0).rgb : vec3(rest);
 }
 void main() {
   vec2 place = clamp(gl_FragCoord.xy * map.xy + map.zw - 0.5, vec2(-2.0), size + 1.0), low = floor(place), w = place - low;
@@ -304,6 +304,7 @@ export class Display {
     g.bindTexture(g.TEXTURE_2D_ARRAY, this.textures.flat);
     g.uniform1i(places.flat_picture, 1);
     g.uniform1f(places.flatness, flatness);
+    g.uniform1f(places.rest, Math.round((REST[maps.length] ?? 1.5 / maps.length) * 255) / 255);
     g.uniform2f(places.size, w, h);
     g.bindFramebuffer(g.FRAMEBUFFER, this.framebuffer);
     g.viewport(0, 0, w, h);
