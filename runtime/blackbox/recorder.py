@@ -309,11 +309,11 @@ class Recorder(logging.Handler):
         if self._fault is not None:
             self.save(self._fault[1])
         self._fault = None
-        if self._writer is not None:
-            self._writer.wait(WRITTEN_WITHIN_S)
-        if self._journaling is not None:
-            self._journaling.wait(WRITTEN_WITHIN_S)
-        self._journal.close()
+        jobs = [job for job in (self._writer, self._journaling) if job is not None]
+        for job in jobs:
+            job.wait(WRITTEN_WITHIN_S)
+        if all(job.done for job in jobs):  # else the next run finds it: a file that is not there yet may never be
+            self._journal.close()
         self._presenter = None
         super().close()
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Coroutine
 from typing import Any
 
 from runtime.errors import one_line
-from runtime.support.background import BACKGROUND_NICENESS, begin, set_niceness
+from runtime.support.background import BACKGROUND_NICENESS, begin, patience_s, set_niceness
 
 log = logging.getLogger("phasestack.service")
 
@@ -58,7 +58,7 @@ class Listener(ABC):
         thread, self._thread = self._thread, None
         if thread is not None:
             self._loop.call_soon_threadsafe(self._loop.stop)
-            thread.join(timeout=2.0)
+            thread.join(patience_s(2.0))
 
     # On the server's thread.
 

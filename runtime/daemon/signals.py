@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import signal
+import time
 from types import FrameType, TracebackType
 from typing import Any, Self
+
+from runtime.support.background import STOPS_WITHIN_S, ends_by
 
 
 class Signals:
@@ -29,6 +33,7 @@ class Signals:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
         self._previous.clear()
+        ends_by(math.inf)
 
     def take_reload(self) -> bool:
         """True once for each time (or burst) that a reload was asked for."""
@@ -41,4 +46,6 @@ class Signals:
             return
         if number == signal.SIGINT and self.stop:
             raise KeyboardInterrupt
+        if not self.stop:
+            ends_by(time.monotonic() + STOPS_WITHIN_S)
         self.stop = signal.Signals(number).name

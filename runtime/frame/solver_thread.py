@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import math
 import queue
@@ -16,7 +17,7 @@ from runtime.errors import ContextLost, FatalError, PhasestackError, Stopped, Tr
 from runtime.frame.solver import SolverStep
 from runtime.frame.solver_host import COST_GAIN, FIRST_REQUEST, SolverHost, SolverParts, Task, taken_in, total_ns
 from runtime.records import SolveRequest
-from runtime.support.background import SOLVER_NICENESS, begin, set_niceness
+from runtime.support.background import SOLVER_NICENESS, begin, patience_s, set_niceness
 from runtime.support.memory import give_back
 from runtime.support.untrusted_input import LIMITS
 
@@ -26,9 +27,14 @@ LATE_S = 0.5  # a step that takes longer is late; one that takes twice as long i
 ABANDON_S = 10.0  # a step that does not return for so long is left behind, and the solver is made anew
 # Making it may take `LIMITS.start_s`, as at the start, and a task, which makes content, `LIMITS.load_s`.
 IDLE_S = 0.02  # between two looks at tasks while nothing is asked
+USUAL_S = 0.2  # that a step under way is waited for at the end
 LATE_STEPS = 3  # in a row that are late begin a fault, so many in time end it: a busy processor is none
 ANSWER_STEP_MS = 500  # of how long no answer came, as it is reported
 ABANDONED_MAX = 4  # hung threads that are left behind; with more, the solver stays as it is
+
+
+class _Leave(BaseException):
+    """Raised in the middle of a step whose result nobody waits for any more."""
 
 
 class _Attempt:
@@ -42,6 +48,13 @@ class _Attempt:
         self.took_ns: deque[int] = deque(maxlen=LATE_STEPS)  # the last steps
         self.error: BaseException | None = None
         self.thread: threading.Thread | None = None
+
+    def leave(self) -> None:
+        """End a step where it is: one that draws holds Python's lock again and again, against all that closes."""
+        thread = self.thread
+        if thread is not None and thread.is_alive() and thread is not threading.current_thread() and self.error is None:
+            number = ctypes.c_ulong(thread.ident or 0)
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(number, ctypes.py_object(_Leave))
 
 
 class SolverThread(SolverHost):
@@ -96,9 +109,14 @@ class SolverThread(SolverHost):
         self._closing.set()
         with self._lock:
             self._lock.notify_all()
-        thread = self._attempt.thread
-        if thread is not None and thread is not threading.current_thread() and self._attempt.ready.is_set():
-            thread.join(timeout_s)
+        newest, here = self._attempt, threading.current_thread()
+        thread = newest.thread if newest.ready.is_set() and newest.thread is not here else None
+        if thread is not None:
+            thread.join(patience_s(min(USUAL_S, timeout_s)))
+        for attempt in (newest, *self._hung):
+            attempt.leave()
+        if thread is not None:
+            thread.join(patience_s(timeout_s))
 
     def _late_reason(self) -> str:
         """Why there is no solver at the moment, empty where all is well; leaves a hung thread behind."""
@@ -144,6 +162,10 @@ class SolverThread(SolverHost):
             give_back()
 
     def _run(self, attempt: _Attempt) -> None:
+        with suppress(_Leave):
+            self._solve(attempt)
+
+    def _solve(self, attempt: _Attempt) -> None:
         set_niceness(SOLVER_NICENESS)
         parts: SolverParts | None = None
         try:
@@ -154,7 +176,7 @@ class SolverThread(SolverHost):
                 parts.close()
             attempt.error, attempt.busy_since_ns = error, self._clock.now_ns()
             attempt.ready.set()
-            if attempt.number > 1 and not isinstance(error, PhasestackError):
+            if attempt.number > 1 and not isinstance(error, PhasestackError | _Leave):
                 log.exception("solver: it could not be made anew")
             return
         self._publish(attempt, first)
@@ -169,6 +191,8 @@ class SolverThread(SolverHost):
         except (ContextLost, Stopped) as error:
             log.error("solver: %s", _line(error))  # a record that held the error would hold what it held
             attempt.error, attempt.busy_since_ns = error.with_traceback(None), self._clock.now_ns()
+        except _Leave:
+            raise
         except BaseException as error:  # what no step answers with: a bug of ours, or a library's
             log.exception("solver")
             attempt.error, attempt.busy_since_ns = error.with_traceback(None), self._clock.now_ns()

@@ -16,7 +16,7 @@ from runtime.errors import EndOfRecording, FatalError, SensorLost, SensorTimeout
 from runtime.records import SensorFrame
 from runtime.sensor.base import Capabilities, Sensor
 from runtime.sensor.samples import FindEyes, Samples, finder, searched
-from runtime.support.background import begin
+from runtime.support.background import begin, patience_s
 
 TIMEOUTS_TO_REOPEN = 2  # in a row, without an error: then the sensor is reopened
 REOPEN_AFTER_S, REOPEN_AFTER_MAX_S = 0.25, 0.5  # the wait before a lost sensor is opened again doubles up to the second
@@ -139,7 +139,7 @@ class SensorWorker(Samples):
         attempt, self._attempt = self._attempt, None
         if attempt is not None:
             attempt.abandoned.set()
-            attempt.thread.join(timeout_s)
+            attempt.thread.join(patience_s(timeout_s))
         self._state, self.reason = SensorState.STOPPED, ""
 
     def _watch(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import threading
 import time
@@ -17,15 +18,29 @@ log = logging.getLogger("phasestack.background")
 PRESENTER_NICENESS = -10
 SOLVER_NICENESS = 5
 BACKGROUND_NICENESS = 10
+STOPS_WITHIN_S = 1.2  # of being told to: the rest of two seconds is for what can't be waited for with a limit
 T = TypeVar("T")
+
+_ends_by_s = math.inf
 
 
 _running: set[threading.Thread] = set()
 
 
+def ends_by(at_s: float) -> None:
+    """Of `time.monotonic`, when all waits are over that `patience_s` limits: this process has been told to stop."""
+    global _ends_by_s
+    _ends_by_s = at_s
+
+
+def patience_s(most_s: float) -> float:
+    """How long to wait for something that may be left behind: so long at most, less where the process is to stop."""
+    return max(0.0, min(most_s, _ends_by_s - time.monotonic()))
+
+
 def wait_for_all(timeout_s: float) -> int:
     """Wait for the jobs that still run, so long at most; how many still do then."""
-    deadline_s = time.monotonic() + timeout_s
+    deadline_s = time.monotonic() + patience_s(timeout_s)
     for thread in tuple(_running):
         thread.join(max(0.0, deadline_s - time.monotonic()))
     return sum(thread.is_alive() for thread in tuple(_running))
@@ -58,7 +73,7 @@ class Job(Generic[T]):
     def wait(self, timeout_s: float) -> None:
         """Until its thread has ended, so long at most."""
         if self._thread is not None:
-            self._thread.join(timeout_s)
+            self._thread.join(patience_s(timeout_s))
 
     def take(self) -> T | None:
         """The result, which is the caller's from now on; None where there is none (yet)."""

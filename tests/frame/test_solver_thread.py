@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import queue
 import threading
 from collections.abc import Callable, Iterator
@@ -390,3 +391,20 @@ def test_where_no_thread_can_be_started_what_hangs_is_left_behind_later(
     shop.behave = solves
     shop.solve(3)
     assert shop.host.news().solution.solved_for_ns == 3
+
+
+def test_a_stop_ends_a_step_that_draws_with_python_s_lock(shop: Workshop) -> None:
+    drawn = 0
+
+    def draws(request: SolveRequest) -> SolverStep:
+        nonlocal drawn
+        while drawn < 300:
+            ctypes.PyDLL(None).usleep(20_000)  # as OpenGL's calls do: the lock is kept meanwhile
+            drawn += 1
+        return solves(request)
+
+    shop.behave = draws
+    shop.post(1)
+    shop.host.close(PATIENCE_S)
+    assert [parts.closed for parts in shop.all] == [1]
+    assert drawn < 150
