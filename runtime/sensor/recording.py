@@ -198,7 +198,8 @@ class Recording:
             raise InputError(self.path, "", f"cannot be read ({error.strerror})") from None
         except Exception as error:  # mcap, lz4 and zstandard each raise their own for a broken file
             if self.is_whole:
-                log.warning("%s: is cut off or damaged; it is read up to there (%s)", self.path, error)
+                why = str(error) or type(error).__name__
+                log.warning("%s: is cut off or damaged; it is read up to there (%s)", self.path, why)
             self.is_whole = False
 
     def samples(self) -> Iterator[SensorFrame]:
