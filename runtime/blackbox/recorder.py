@@ -309,11 +309,11 @@ class Recorder(logging.Handler):
         if self._fault is not None:
             self.save(self._fault[1])
         self._fault = None
-        jobs = [job for job in (self._writer, self._journaling) if job is not None]
-        for job in jobs:
-            job.wait(WRITTEN_WITHIN_S)
-        if all(job.done for job in jobs):  # else the next run finds it: a file that is not there yet may never be
-            self._journal.close()
+        for job in (self._writer, self._journaling):
+            if job is not None:
+                job.wait(WRITTEN_WITHIN_S)
+        if self._writer is None or self._writer.done:  # else the next run finds the journal in the file's place
+            self._journal.close(in_use=self._journaling is not None and not self._journaling.done)
         self._presenter = None
         super().close()
 
@@ -406,9 +406,9 @@ class _Journal:
     def _place(self) -> Path:
         return self._folder / f".{PREFIX}{JOURNAL}{self._turn}{PART}"
 
-    def close(self) -> None:
-        """The run has ended in order: it is not needed."""
-        if self._file is not None:
+    def close(self, *, in_use: bool = False) -> None:
+        """The run has ended in order: it is not needed. in_use: another thread still writes."""
+        if self._file is not None and not in_use:
             with suppress(OSError):
                 self._file.close()
             self._file = None

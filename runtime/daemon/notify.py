@@ -13,6 +13,7 @@ from runtime.records import State
 
 NS_PER_US = 1000
 START_STEP_S = 60.0  # that no step of a start takes, on the slowest machine
+SETTLED_AFTER = 100  # presented refreshes: the first ones compile shaders, seconds each at a twentieth of a core
 
 
 class Notifier:
@@ -28,7 +29,7 @@ class Notifier:
             self._channel.socket.setblocking(False)
         self._watchdog_ns = watchdog_ns(environment)
         self._fed_ns = -self._watchdog_ns
-        self._is_lengthened = False  # the watchdog's period, while it starts
+        self._settling = 0  # presented refreshes until the watchdog's own period holds
         self._status = ""
         self._ready = False
 
@@ -42,6 +43,7 @@ class Notifier:
         if not self._ready:
             self._ready = True
             self._send("READY=1")
+            self.starting()
 
     def status(self, text: str) -> None:
         """One line for `systemctl status`; sent when it changes."""
@@ -51,12 +53,12 @@ class Notifier:
             self._send(f"STATUS={line}")
 
     def starting(self) -> None:
-        """Report progress before the first frame: extends the start's or the watchdog's time-out."""
+        """Report progress until it runs steadily: extends the start's or the watchdog's time-out."""
         step_us = round(START_STEP_S * 1e6)
         if not self._ready:
             self._send(f"EXTEND_TIMEOUT_USEC={step_us}")
         elif self._watchdog_ns:
-            self._is_lengthened = True
+            self._settling = SETTLED_AFTER
             self._send(f"WATCHDOG_USEC={step_us}\nWATCHDOG=1")
 
     def refreshed(self, state: State, missing: tuple[str, ...], *, presented: bool) -> None:
@@ -64,15 +66,16 @@ class Notifier:
 
         The rule: the presenter's clock alone feeds it. A solver that fails or hangs leaves the last solution on the
         panels, aligned to the eyes, and is made anew by itself: no reason to restart. Where a panel is missing
-        nothing can be presented, and a completed refresh is enough. While it starts,
-        the start's own limit watches. Sent at most four times per watchdog period.
+        nothing can be presented, and a completed refresh is enough. Before READY the start's own limit
+        watches, until a hundred refreshes after it a longer period. Sent at most four times per watchdog period.
         """
         alive = presented or (state is State.DEGRADED and "panel" in missing)
         if not (alive and self._watchdog_ns):
             return
-        if self._is_lengthened:
-            self._is_lengthened = False
-            self._send(f"WATCHDOG_USEC={self._watchdog_ns // NS_PER_US}")
+        if self._settling:
+            self._settling -= 1
+            if not self._settling:
+                self._send(f"WATCHDOG_USEC={self._watchdog_ns // NS_PER_US}")
         now_ns = self._clock.now_ns()
         if now_ns - self._fed_ns >= self._watchdog_ns // 4:
             self._fed_ns = now_ns

@@ -58,6 +58,7 @@ for o in 0 1 2; do
   xrandr --query >/dev/null
 done
 """
+QUOTAS = Path("/sys/fs/cgroup/cpu")
 UP = ("multi-user.target", "phasestack", "phasestack-page")
 
 
@@ -138,6 +139,11 @@ class Pc:
              "DEBIAN_FRONTEND=noninteractive", *become, "sh", "-c", command],
             check=False, capture_output=True, text=True, timeout=timeout_s, errors="replace",
         )  # fmt: skip
+
+    def limit(self, pid: str, group: Path) -> None:
+        """Put a process inside into a control group of the host's."""
+        put = f"echo {pid} > {group}/cgroup.procs"
+        subprocess.run(["nsenter", "-t", str(self._leader), "-p", "sh", "-c", put], check=True)
 
     def done(self, command: str) -> str:
         result = self.run(command)
@@ -261,6 +267,22 @@ def test_it_stops_within_two_seconds(pc: Pc, after_s: float) -> None:
     took_s = time.monotonic() - begun_s
     assert pc.prop("Result") == "success"
     assert took_s < 2.5, took_s  # with the commands' own time
+
+
+@pytest.mark.skipif(not QUOTAS.is_dir(), reason="needs the cpu controller of cgroups v1: nspawn hands down no other")
+def test_at_a_twentieth_of_a_core_it_shows_a_picture_and_goes_on(pc: Pc) -> None:
+    group = QUOTAS / "phasestack-test"
+    group.mkdir(exist_ok=True)
+    (group / "cpu.cfs_quota_us").write_text("5000")  # of each 100,000
+    pc.done("systemctl start --no-block phasestack")
+    assert eventually(lambda: pc.prop("MainPID") != "0")
+    pid = pc.prop("MainPID")
+    pc.limit(pid, group)
+    assert eventually(pc.shows, within_s=300)
+    time.sleep(60)
+    assert pc.prop("MainPID") == pid and pc.is_active(*UP)
+    pc.done("systemctl stop phasestack")
+    group.rmdir()
 
 
 def test_an_upgrade_swaps_the_program_and_goes_back_if_it_cannot_start(pc: Pc) -> None:

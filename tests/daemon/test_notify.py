@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from runtime.clock import NS_PER_MS, Clock, SimulatedClock
-from runtime.daemon.notify import Notifier
+from runtime.daemon.notify import SETTLED_AFTER, Notifier
 from runtime.records import State
 
 
@@ -72,19 +72,21 @@ def test_the_start_can_be_extended_until_it_is_over(
     notifier = notifier_of(environment=WATCHED)
     notifier.starting()
     notifier.ready()
-    assert supervisor.heard() == ["EXTEND_TIMEOUT_USEC=60000000", "READY=1"]
+    assert supervisor.heard() == ["EXTEND_TIMEOUT_USEC=60000000", "READY=1", "WATCHDOG_USEC=60000000\nWATCHDOG=1"]
 
 
-def test_a_start_that_continues_after_ready_keeps_the_watchdog_patient(
+def test_the_watchdog_is_patient_until_refreshes_come_steadily(
     supervisor: Supervisor, notifier_of: Callable[..., Notifier]
 ) -> None:
     notifier = notifier_of(environment=WATCHED)
     notifier.ready()
-    notifier.starting()
-    for _ in range(2):
-        notifier.refreshed(State.TRACKING, (), presented=True)
+    for count in (1, SETTLED_AFTER - 2, 1):
+        for _ in range(count):
+            notifier.refreshed(State.TRACKING, (), presented=True)
+        notifier.status(f"{count} more")
     assert supervisor.heard() == [
-        "READY=1", "WATCHDOG_USEC=60000000\nWATCHDOG=1", "WATCHDOG_USEC=1000000", "WATCHDOG=1",
+        "READY=1", "WATCHDOG_USEC=60000000\nWATCHDOG=1", "WATCHDOG=1", "STATUS=1 more",
+        f"STATUS={SETTLED_AFTER - 2} more", "WATCHDOG_USEC=1000000", "STATUS=1 more",
     ]  # fmt: skip
 
 
