@@ -50,7 +50,7 @@ class _Attempt:
         self.thread: threading.Thread | None = None
 
     def leave(self) -> None:
-        """End a step where it is: one that draws holds Python's lock again and again, against all that closes."""
+        """End a step where it is: one that draws holds Python's lock again and again."""
         thread = self.thread
         if thread is not None and thread.is_alive() and thread is not threading.current_thread() and self.error is None:
             number = ctypes.c_ulong(thread.ident or 0)

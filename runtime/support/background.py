@@ -28,13 +28,13 @@ _running: set[threading.Thread] = set()
 
 
 def ends_by(at_s: float) -> None:
-    """Of `time.monotonic`, when all waits are over that `patience_s` limits: this process has been told to stop."""
+    """When, of `time.monotonic`, all waits are over that `patience_s` limits."""
     global _ends_by_s
     _ends_by_s = at_s
 
 
 def patience_s(most_s: float) -> float:
-    """How long to wait for something that may be left behind: so long at most, less where the process is to stop."""
+    """How long to wait for what may be left behind: so long at most, less once told to stop."""
     return max(0.0, min(most_s, _ends_by_s - time.monotonic()))
 
 

@@ -270,7 +270,7 @@ def test_it_stops_within_two_seconds(pc: Pc, after_s: float) -> None:
 
 
 @pytest.mark.skipif(not QUOTAS.is_dir(), reason="needs the cpu controller of cgroups v1: nspawn hands down no other")
-def test_at_a_twentieth_of_a_core_it_shows_a_picture_and_goes_on(pc: Pc) -> None:
+def test_at_a_twentieth_of_a_core_it_goes_on_showing(pc: Pc) -> None:
     group = QUOTAS / "phasestack-test"
     group.mkdir(exist_ok=True)
     (group / "cpu.cfs_quota_us").write_text("5000")  # of each 100,000
