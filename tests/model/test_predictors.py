@@ -108,7 +108,7 @@ def test_a_viewer_at_the_side_is_served_as_well(angle_deg: float) -> None:
     """Seen: 5 dB less at 45 degrees, where one eye is 4 cm nearer than the other."""
     ahead, pair = (eyes_at(distance_m=0.7, angle_deg=angle) for angle in (0, angle_deg))
     from_ahead = displayed(solved("balanced", ahead), ahead, STACK).psnr_db
-    assert displayed(solved("balanced", pair), pair, STACK).psnr_db > from_ahead - 4.5
+    assert displayed(solved("balanced", pair), pair, STACK).psnr_db > from_ahead - 3.2
 
 
 def test_a_head_that_lies_down_and_sits_up_again_leaves_nothing_behind() -> None:
@@ -158,7 +158,7 @@ def test_solving_for_sigma_helps_displaced_eyes_and_costs_exact_ones() -> None:
         s: expected_psnrs_db(layers, pictures, STACK, eyes_m=pair, fov_deg=FOV_DEG, sigmas_mm=[12.0])[12.0]
         for s, layers in shown.items()
     }
-    assert expected[12.0] > expected[0.0] + 0.5
+    assert expected[12.0] > expected[0.0] + 0.7
     exact = {s: displayed(layers, pair, STACK).psnr_db for s, layers in shown.items()}
     assert exact[0.0] > exact[12.0] + 1
 
