@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import io
+import math
 import re
 from collections.abc import Sequence
 from functools import cache
@@ -16,9 +17,11 @@ from PIL import Image
 
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
-from runtime.support.artifacts import to_json
+from runtime.support.artifacts import png_bytes, to_json
 
 WEBP_MAX_PX = 16383
+BESIDE_BYTES = 60 << 10  # that a page may have beside its layers as PNG files
+QUALITIES = (92, 84, 76, 66, 54)  # of AVIF: the first that fits
 
 
 def asset(name: str) -> str:
@@ -39,21 +42,18 @@ def viewer_html(
 ) -> str:
     """The viewer page. layers: (N, h, w, 3 or 4), rear to front, as shown to eyes (2, 3), frame `stack`.
 
-    Layers are stored exactly. wanted: an (h, w, 3) picture for each eye, `fov_deg` wide, stored to some 48 dB; () where
+    Layers are stored exactly. wanted: an (h, w, 3) picture for each eye, `fov_deg` wide, in what room is left; () where
     none is known; lines: what stands below.
     follows: outer panels follow the head until one says otherwise.
     """
-    scene = {"stack": stack_table(stack), "eyes_m": eyes_m, "fov_deg": fov_deg, "title": title, "lines": list(lines)}
-    targets = [_stored(picture) for picture in wanted]
-    scene |= {"follows": follows, "target_error": float(np.mean([error for _, error in targets] or 0))}
-    parts = {
-        "TITLE": html.escape(title),
-        "CSS": asset("look.css"),
-        "SCRIPT": _script(),
-        "SCENE": _embedded(scene),
-        "LAYERS": _embedded([_exact(layer) for layer in layers]),
-        "WANTED": _embedded([url for url, _ in targets]),
-    }
+    scene = {"stack": stack_table(stack), "eyes_m": eyes_m, "fov_deg": fov_deg, "title": title, "follows": follows}
+    parts = {"TITLE": html.escape(title), "CSS": asset("look.css"), "SCRIPT": _script()}
+    parts["LAYERS"] = _embedded([_exact(layer) for layer in layers])
+    room = BESIDE_BYTES + sum(len(png_bytes(layer)) for layer in layers) - len("".join(parts.values())) - 2048
+    targets, error = _stored(wanted, room) if wanted else ([], 0.0)
+    told = [f"What was asked for is stored to {-10 * math.log10(error):.0f} dB."] if error else []
+    scene |= {"target_error": error, "lines": [*lines, *told]}
+    parts |= {"SCENE": _embedded(scene), "WANTED": _embedded(targets)}
     return re.sub(r"@([A-Z]+)@", lambda found: parts.get(found[1], found[0]), asset("still.html"))
 
 
@@ -68,9 +68,9 @@ def stack_table(stack: PanelStack) -> dict[str, Any]:
 
 @cache
 def _script() -> str:
-    """The modules as one script: what they export to each other is in one scope."""
+    """The modules as one script, without comments: what they export to each other is in one scope."""
     text = "\n".join(asset(name) for name in ("display.js", "look.js", "still.js"))
-    return re.sub(r"^export |^import .*\n", "", text, flags=re.MULTILINE)
+    return re.sub(r"^ *//.*\n|^ +|^export |^import .*\n", "", text, flags=re.MULTILINE)
 
 
 def _exact(layer: U8) -> str:
@@ -79,11 +79,16 @@ def _exact(layer: U8) -> str:
     return _url(layer, **(how if max(layer.shape) <= WEBP_MAX_PX else {"format": "PNG"}))
 
 
-def _stored(picture: U8) -> tuple[str, float]:
-    """A target as a data URL, and the mean square of what its coding changes (1: full scale)."""
-    url = _url(picture, format="AVIF", quality=92, speed=8, subsampling="4:4:4")
-    decoded = np.asarray(Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))).convert("RGB"), np.float32)
-    return url, float(np.square((decoded - picture[..., :3]) / 255).mean())
+def _stored(pictures: Sequence[U8], room: int) -> tuple[list[str], float]:
+    """Targets as data URLs of at most `room` bytes where that can be; the mean square of what coding changes (of 1)."""
+    urls: list[str] = []
+    for quality in QUALITIES:
+        urls = [_url(p, format="AVIF", quality=quality, speed=8, subsampling="4:4:4") for p in pictures]
+        if sum(map(len, urls)) <= room:
+            break
+    coded = [Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))).convert("RGB") for url in urls]
+    differences = [np.asarray(a, np.float32) - b[..., :3] for a, b in zip(coded, pictures, strict=True)]
+    return urls, float(np.mean(np.square(differences)) / 255**2)
 
 
 def _url(picture: U8, **how: Any) -> str:

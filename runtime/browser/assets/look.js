@@ -19,7 +19,7 @@ const REST_MS = 200, REST_RAYS = 5, STRIPS = 12, WIGGLE_MS = 280, SAMPLED = 12; 
 const PAGE = `
 <div class="stage"><canvas tabindex="0" aria-label="What the eyes see. Arrow keys move the head, + and - bring it nearer and farther."></canvas>
 <svg class="over" aria-hidden="true"></svg><div class="names" aria-hidden="true"></div></div>
-<aside><h1></h1><div class="modes"></div><p class="hint"></p>
+<aside><h1></h1><p class="how">The pointer (or a finger, or the arrow keys) is your head; the wheel brings it nearer.</p><div class="modes"></div><p class="hint"></p>
 <div class="switches"><label><input type="checkbox" data-key="aligned" checked> outer panels follow the head</label>
 <label><input type="checkbox" data-key="pupil"> pupils 4 mm wide</label><button type="button" class="quiet">Head back</button></div>
 <p class="head" role="status"></p><p class="light"></p><div class="point"></div>

@@ -192,6 +192,7 @@ function connect() {
       const same = look && ["width_px", "height_px"].every((k) => look.stack[k] === message.stack[k]) && look.stack.x_m.length === message.stack.x_m.length;
       if (same) look.turnTo(message.stack);
       else build(message);
+      look.$(".how").hidden = !sensor;
       form("camera").checked = message.is_camera;
       form("camera_fov_deg").parentElement.hidden = sensor;
       if (sensor) main.querySelector(".found").hidden = true;
