@@ -137,7 +137,7 @@ def check_static(network: Network, *, width_px: int, height_px: int) -> None:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """The exporters advise developers of models, not users of this command, and print graphs, from C++ too."""
+    """Exporters advise developers of models, not users of this command; from C++ they print graphs."""
     sys.stdout.flush()
     level, output = logging.root.manager.disable, os.dup(1)
     with Path(os.devnull).open("wb") as nothing:
