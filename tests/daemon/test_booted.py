@@ -236,6 +236,7 @@ def test_the_socket_is_the_group_s_and_the_journal_tells_the_truth(pc: Pc) -> No
     assert pc.run("phasestack status", user="tech").returncode == 0
     assert pc.run("phasestack ctl pause", user="other").returncode == 1
     assert "this user's alone" not in pc.done("journalctl -b -u phasestack -o cat")
+    assert "phasestack.conf" not in pc.done("journalctl -b -t systemd-sysusers -o cat")
     pc.done("systemctl reload phasestack")
     with (pc.root / "etc/phasestack/phasestack.toml").open("a") as config:
         config.write("[broken")
