@@ -59,6 +59,9 @@ class InputError(FatalError):
         where = [one_line(part) for part in (self.source, field) if part]
         super().__init__(": ".join([*where, one_line(problem, most=PROBLEM_CHARACTERS_MAX)]))
 
+    def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
+        return type(self), (self.source, self.field, self.problem)
+
 
 class MissingPart(FatalError):
     """Something optional is needed here and is not installed; the text names what to install."""

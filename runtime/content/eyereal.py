@@ -5,9 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -81,22 +80,30 @@ def read_folder(folder: Path, preset: str) -> tuple[Pair, ...]:
     return tuple(pairs)
 
 
-def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
+def prepare(file: SceneFile) -> Callable[..., ContentSource]:
     """Read a folder as the preset that was chosen, or that its name holds. Raises InputError."""
     path, settings = file.path, file.settings
     name = file.preset or next((name for name in preset_names() if name in path.resolve().name), "")
     if not name:
         raise InputError(path, "name", "names no preset: set content.scene to one and content.file to the folder")
     pairs = read_folder(path, name)
-    source = EyeRealSource(pairs, fov_deg=settings.fov_deg, background=settings.background or WHITE, name=name)
-    return lambda context: source
+    background = settings.background or WHITE
+    make = partial(EyeRealSource, pairs, fov_deg=settings.fov_deg, background=background, name=name)
+    make()  # refuses a picture that can't be read
+    return make
 
 
 class EyeRealSource(ContentSource):
     """The pair taken nearest to the viewer, warped to the view through the display's centre plane."""
 
     def __init__(
-        self, pairs: tuple[Pair, ...], *, fov_deg: float, background: tuple[float, float, float], name: str
+        self,
+        pairs: tuple[Pair, ...],
+        *,
+        fov_deg: float,
+        background: tuple[float, float, float],
+        name: str,
+        context: object = None,
     ) -> None:
         self._pairs, self._fov_deg, self._background = pairs, fov_deg, background
         self._eyes_m = np.stack([pair.eyes_m for pair in pairs])

@@ -6,7 +6,9 @@ trimesh passes over a texture that it cannot read; here that is an error that na
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -16,7 +18,7 @@ import numpy as np
 from runtime.errors import InputError, one_line
 from runtime.records import U8
 from runtime.support import untrusted_input
-from runtime.support.picture_header import decoded_picture
+from runtime.support.picture_header import decoded_picture, picture_size
 from runtime.support.untrusted_input import LIMITS
 
 ELEMENTS_PER_TRIANGLE = 10  # all accessors together, for the limit on triangles
@@ -77,12 +79,15 @@ def _check(path: Path, table: Table, binary: bytes, read: Read) -> None:
     untrusted_input.within(len(placed), LIMITS.instances, source=path, field="nodes")
     triangles = [_triangles(table, mesh) for mesh in table.get("meshes", [])]
     untrusted_input.within(sum(triangles[index] for index in placed), LIMITS.triangles, source=path, field="meshes")
+    numbers = sorted({_source(path, table, texture) for texture in _drawn_textures(table)})
+    coded = {number: _coded(table, table["images"][number], binary, read) for number in numbers}
     pixels = 0
-    for number in sorted({_source(path, table, texture) for texture in _drawn_textures(table)}):
-        coded = _coded(table, table["images"][number], binary, read)
-        image = decoded_picture(coded, source=path, field="texture", name=f"images[{number}]")
-        pixels += image.width * image.height
+    for picture in coded.values():  # by their headers, before one is decoded
+        with suppress(ValueError):
+            pixels += math.prod(picture_size(picture))
         untrusted_input.within(pixels, LIMITS.texture_pixels, source=path, field="textures' pixels")
+    for number, picture in coded.items():
+        decoded_picture(picture, source=path, field="texture", name=f"images[{number}]")
 
 
 def _drawn_textures(table: Table) -> Iterator[Table]:

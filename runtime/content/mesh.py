@@ -6,7 +6,7 @@ import io
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ GLTF = (".glb", ".gltf")
 STL_HEAD, STL_FACET = 84, 50  # bytes of a binary file's head and of each of its triangles
 LARGEST_COORDINATE = 1e15  # products of three still fit in float32's range
 LARGEST_TEXTURE_PX = 4096
+AT_ONCE = 1 << 17  # vertices or faces that are worked on together: bounds the memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +44,7 @@ class MeshData:
     high: F64
 
 
-def prepare(file: SceneFile) -> Callable[[Any], TriangleSource]:
+def prepare(file: SceneFile) -> Callable[..., TriangleSource]:
     """Read the file and find its outlines; the result uploads them to GL. Raises InputError."""
     data = load_mesh(file.path)
     parts = []
@@ -52,7 +53,7 @@ def prepare(file: SceneFile) -> Callable[[Any], TriangleSource]:
         parts.append(DrawnPart(part))
     places = [file.placed(data.low, data.high)] * len(parts)
     info = ContentInfo(file.path.stem, background=file.background)
-    return lambda context: TriangleSource(parts, places, context=context, info=info)
+    return partial(TriangleSource, parts, places, info=info)
 
 
 def load_mesh(path: Path) -> MeshData:
@@ -62,7 +63,8 @@ def load_mesh(path: Path) -> MeshData:
     _check_counts(path, data)
     pictures: dict[int, U8] = {}
     with np.errstate(all="ignore"):  # coordinates beyond any scene overflow; they are refused below
-        placed, parts = _loaded(path, data), []
+        parts = [_binary_stl(data)] if _is_binary_stl(path, data) else []
+        placed = [] if parts else _loaded(path, data)
         for number, (mesh, matrix) in enumerate(placed):
             progress.tell(f"{path.name}: parts", number, len(placed))
             parts.append(_part(mesh, matrix, path, pictures))
@@ -82,13 +84,15 @@ def _check(path: Path, parts: Sequence[Part]) -> None:
         raise InputError(path, "faces", "there are none")
     has_area = False
     for part in parts:
-        points = part.shape.positions_m.astype(np.float64)
+        points = part.shape.positions_m
         broken = int((~(np.abs(points) <= LARGEST_COORDINATE).all(1)).sum())  # NaN too
         if broken:
             problem = f"{broken} of {len(points)} are not finite, or beyond {LARGEST_COORDINATE:g}"
             raise InputError(path, "vertices", problem)
-        corner = points[part.shape.triangles]
-        has_area |= bool(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]).any())
+        for first in range(0, len(part.shape.triangles), AT_ONCE):
+            if not has_area:
+                corner = points[part.shape.triangles[first : first + AT_ONCE]].astype(np.float64)
+                has_area = bool(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]).any())
     if not has_area:
         raise InputError(path, "faces", "none has an area")
 
@@ -104,6 +108,26 @@ def _check_counts(path: Path, data: bytes) -> None:
     elif suffix == ".obj":
         promised = data.count(b"\nf ")
     untrusted_input.within(promised, LIMITS.triangles, source=path, field="faces")
+
+
+def _is_binary_stl(path: Path, data: bytes) -> bool:
+    count = int.from_bytes(data[STL_HEAD - 4 : STL_HEAD], "little")
+    return path.suffix.lower() == ".stl" and count > 0 and len(data) == STL_HEAD + count * STL_FACET
+
+
+def _binary_stl(data: bytes) -> Part:
+    """Without trimesh, which takes ten times the memory of the largest files."""
+    facets = np.frombuffer(data, [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")], offset=STL_HEAD)
+    positions, normals = np.empty((2, len(facets), 3, 3), np.float32)
+    for first in range(0, len(facets), AT_ONCE):
+        rows = slice(first, first + AT_ONCE)
+        positions[rows] = facets["corners"][rows]
+        corner = positions[rows].astype(np.float64)
+        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        normals[rows] = (normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30))[:, None]
+    triangles = np.arange(3 * len(facets), dtype=np.int32).reshape(-1, 3)
+    uv = np.zeros((triangles.size, 2), np.float32)
+    return Part(Shape(positions.reshape(-1, 3), normals.reshape(-1, 3), uv, triangles), colour=UNCOLOURED)
 
 
 def _loaded(path: Path, data: bytes) -> list[tuple[Any, F64]]:
@@ -169,7 +193,6 @@ def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8]) -> Part:
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(path, "faces", "are no triangles of vertices that are there")
-    normals = np.asarray(mesh.vertex_normals)
     visual, kind = mesh.visual, mesh.visual.kind
     picture, colour, colours = None, WHITE, None
     uv: Any
@@ -181,22 +204,26 @@ def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8]) -> Part:
     elif kind == "vertex":
         colours = visual.vertex_colors
     elif kind == "face":
-        colours, normals = np.repeat(visual.face_colors, 3, axis=0), np.repeat(mesh.face_normals, 3, axis=0)
-        vertices, faces = vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3)
+        colours = np.repeat(visual.face_colors, 3, axis=0)
+        vertices, faces = vertices[faces].reshape(-1, 3), np.arange(faces.size, dtype=np.int32).reshape(-1, 3)
     elif path.suffix.lower() not in GLTF:  # whose default is white
         colour = UNCOLOURED
+    normals = np.repeat(mesh.face_normals, 3, axis=0) if kind == "face" else mesh.vertex_normals
     if picture is None or visual.uv is None:
-        picture, uv = None, np.zeros((len(vertices), 2))
+        picture, uv = None, np.zeros((len(vertices), 2), np.float32)
     else:
         uv = np.column_stack([visual.uv[:, 0], 1.0 - visual.uv[:, 1]])
     if not np.isfinite(uv).all():
         raise InputError(path, "texture coordinates", "are not all finite")
-    vertices, normals = vertices @ matrix[:3, :3].T + matrix[:3, 3], normals @ np.linalg.pinv(matrix[:3, :3])
-    normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    positions, turned = np.empty((2, len(vertices), 3), np.float32)
+    for first in range(0, len(vertices), AT_ONCE):  # in double precision
+        rows = slice(first, first + AT_ONCE)
+        positions[rows] = vertices[rows] @ matrix[:3, :3].T + matrix[:3, 3]
+        normal = normals[rows] @ np.linalg.pinv(matrix[:3, :3])
+        turned[rows] = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
     if np.linalg.det(matrix[:3, :3]) < 0:
         faces = faces[:, ::-1]
-    positions, normals, uv = (array.astype(np.float32) for array in (vertices, normals, uv))
-    shape = Shape(positions, normals, uv, faces.astype(np.int32))
+    shape = Shape(positions, turned, uv.astype(np.float32), faces.astype(np.int32))
     return Part(shape, picture=picture, colour=colour, vertex_colours=None if colours is None else _unit(colours))
 
 

@@ -6,8 +6,8 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -198,6 +198,9 @@ class Video(Frames):
     def close(self) -> None:
         self._capture.release()
 
+    def __reduce__(self) -> tuple[type, tuple[Path]]:
+        return Video, (self._path,)
+
 
 def open_frames(path: Path, settings: ContentSettings) -> Frames:
     """A picture, a video, or a folder of pictures. Raises InputError."""
@@ -211,17 +214,18 @@ def open_frames(path: Path, settings: ContentSettings) -> Frames:
     return PictureFiles(paths, rate_hz=settings.picture_rate_hz)
 
 
-def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
+def prepare(file: SceneFile) -> Callable[..., ContentSource]:
     """Open a picture, a video or a folder of pictures. Raises InputError."""
-    layout = layout_of(file.path, file.settings)
-    source = PicturesSource(open_frames(file.path, file.settings), layout=layout, file=file)
-    return lambda context: source
+    frames = open_frames(file.path, file.settings)
+    make = partial(PicturesSource, frames, layout=layout_of(file.path, file.settings), file=file)
+    make()  # refuses what is too small
+    return make
 
 
 class PicturesSource(ContentSource):
     """Views of pictures or films that hang in the plane of the display's centre."""
 
-    def __init__(self, frames: Frames, *, layout: Layout, file: SceneFile) -> None:
+    def __init__(self, frames: Frames, *, layout: Layout, file: SceneFile, context: object = None) -> None:
         """Raises InputError where the picture is too small for its layout."""
         self._frames, self._layout, self._file = frames, layout, file
         first = frames.frame(0)

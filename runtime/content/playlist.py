@@ -78,7 +78,7 @@ def read_playlist(path: Path, settings: ContentSettings) -> Playlist:
 class PlaylistSource(ForwardingSource):
     """The scenes of a list, one after another, counted from its first request."""
 
-    def __init__(self, playlist: Playlist, openers: list[Callable[[Any], ContentSource]], *, context: Any) -> None:
+    def __init__(self, playlist: Playlist, openers: list[Callable[..., ContentSource]], *, context: Any) -> None:
         """Raises InputError where one of them can't be shown."""
         self._list = playlist
         self._ends_ns = list(accumulate(round(entry.seconds * NS_PER_S) for entry in playlist.entries))
@@ -88,7 +88,7 @@ class PlaylistSource(ForwardingSource):
         try:
             for number, opener in enumerate(openers):
                 try:
-                    self._sources.append(opener(context))
+                    self._sources.append(opener(context=context))
                 except InputError as error:
                     raise InputError(playlist.path, f"show[{number}]", str(error)) from None
         except BaseException:

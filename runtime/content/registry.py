@@ -20,15 +20,19 @@ from runtime.errors import InputError, PhasestackError, without_secrets
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import raster_from_stack
 from runtime.support import progress, untrusted_input
+from runtime.support.child import in_child
 from runtime.support.crash import written
+from runtime.support.picture_header import size_of_file
 from runtime.support.plausible import nearest
 from runtime.support.plugins import is_plugin, plugin_class, strict
 from runtime.support.untrusted_input import LIMITS
 
 MESHES = (".glb", ".gltf", ".obj", ".stl")
 PLAYLISTS = (".toml", ".json")
+HARMLESS = (".png", ".jpg", ".jpeg")  # read here, where the header states no more pixels than
+HARMLESS_PX = 4096 * 4096
 TRIED_PX = (32, 18)  # a picture that a class is asked for before it is shown
-Opener = Callable[[Any], ContentSource]
+Opener = Callable[..., ContentSource]  # of `context`
 
 
 def open_content(settings: ContentSettings, stack: PanelStack, context: Any) -> ContentSource:
@@ -36,14 +40,14 @@ def open_content(settings: ContentSettings, stack: PanelStack, context: Any) -> 
 
     context: the moderngl context of the thread that will call `render`. Raises InputError, naming file and field.
     """
-    return prepare_content(settings, stack)(context)
+    return prepare_content(settings, stack)(context=context)
 
 
 def prepare_content(settings: ContentSettings, stack: PanelStack) -> Opener:
     """Read and check `settings.scene`; the result makes the source on the thread with the context.
 
-    This is the slow part and needs no GL: it may run on any thread. How far it is goes to `support.progress`.
-    Raises InputError, naming file and field.
+    This is the slow part and needs no GL: it may run on any thread, and files are read in a process of their own. How
+    far it is goes to `support.progress`. Raises InputError, naming file and field.
     """
     file = SceneFile(Path(settings.scene), settings, stack)
     too_slow = InputError(settings.scene, "", f"takes longer to load than {LIMITS.load_s:g} s")
@@ -53,7 +57,7 @@ def prepare_content(settings: ContentSettings, stack: PanelStack) -> Opener:
 
 def _placed(file: SceneFile) -> Opener:
     opener, placing = _prepared(file), placing_of(file.settings)
-    return lambda context: placed_source(opener(context), placing)
+    return lambda context: placed_source(opener(context=context), placing)
 
 
 def _prepared(file: SceneFile) -> Opener:
@@ -83,20 +87,37 @@ def _prepared(file: SceneFile) -> Opener:
 
 
 def _from_path(file: SceneFile) -> Opener:
-    """By what a path's name and first bytes say."""
     path = file.path
     untrusted_input.checked_path(path, source="content", field="file")
     if not path.exists():
         raise InputError(path, "", "is not there")
     progress.tell(f"loading {path.name}", 0)
+    if path.suffix.lower() in PLAYLISTS and not path.is_dir():
+        return _playlist(file)
+    return _read(file) if _is_harmless(file) else in_child(_read, file, source=path, seconds=LIMITS.load_s)
+
+
+def _is_harmless(file: SceneFile) -> bool:
+    """Whether a file can take neither long nor much memory, by what its header says."""
+    from runtime.content import pictures
+
+    if file.path.suffix.lower() not in HARMLESS or pictures.layout_of(file.path, file.settings).kind == "rgbd":
+        return False
+    if file.path.is_dir():
+        return False
+    width, height = size_of_file(file.path)
+    return width * height <= HARMLESS_PX
+
+
+def _read(file: SceneFile) -> Opener:
+    """By what a path's name and first bytes say; what it answers can be pickled."""
+    path = file.path
     suffix = path.suffix.lower()
     if path.is_dir():
         from runtime.content import eyereal
 
         if eyereal.is_data_set(path):
             return eyereal.prepare(file)
-    elif suffix in PLAYLISTS:
-        return _playlist(file)
     elif suffix in MESHES:
         from runtime.content import mesh
 

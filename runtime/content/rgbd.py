@@ -7,6 +7,7 @@ the colours beside them, so that a viewer who looks past an edge sees neither a 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -171,7 +172,7 @@ def _edge_to_edge(index: Any, count: int) -> F64:
     return np.where(index == 0, 0.0, np.where(index == count - 1, float(count), place))
 
 
-def prepare(file: SceneFile) -> Callable[[Any], TriangleSource]:
+def prepare(file: SceneFile) -> Callable[..., TriangleSource]:
     """Read the file; the result uploads it to GL. Raises InputError where it holds no depth."""
     colour, depth = split_rgbd(open_frames(file.path, file.settings).frame(0), file.path)
     # Outlines of a torn surface run through its inside: samples there, no ramps.
@@ -179,4 +180,4 @@ def prepare(file: SceneFile) -> Callable[[Any], TriangleSource]:
     parts = [DrawnPart(part, outlined=False) for part in found]
     info = ContentInfo(file.path.stem, background=file.background)
     places = [np.eye(4)] * len(parts)
-    return lambda context: TriangleSource(parts, places, context=context, info=info, samples=SAMPLES)
+    return partial(TriangleSource, parts, places, info=info, samples=SAMPLES)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import moderngl
@@ -46,13 +47,13 @@ void main() {
 """
 
 
-def prepare(file: SceneFile) -> Callable[[Any], SplatSource]:
+def prepare(file: SceneFile) -> Callable[..., SplatSource]:
     """Read the file; the result uploads it to GL. Raises InputError."""
     gaussians = load_gaussians(read_header(file.path))
     low, high = np.percentile(gaussians.centres.astype(np.float64), [STRAY, 100 - STRAY], axis=0)
     matrix = file.placed(low, high)
     info = ContentInfo(file.path.stem, background=file.background)
-    return lambda context: SplatSource(gaussians, stack_from_scene=matrix, context=context, info=info)
+    return partial(SplatSource, gaussians, stack_from_scene=matrix, info=info)
 
 
 class SplatSource(CanvasSource):

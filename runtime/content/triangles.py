@@ -23,6 +23,8 @@ from runtime.support.gl import DrawnPicture
 
 OUTLINED_MAX = 200_000  # triangles of a part; beyond, finding its outline costs more than drawing it
 PROJECTED_MAX = 5000  # vertices of a part that are projected to see where it lies; beyond, its box is
+DRAWN_AT_ONCE = 20_000  # triangles
+UPLOADED_AT_ONCE = 8 << 20  # bytes
 OUTLINE_BYTES = 6 * (5 + 8) * 4  # two triangles an edge: clip coordinates and coverage, then the attributes
 OVER = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA)
 
@@ -117,10 +119,14 @@ class DrawnPart:
     def __init__(self, part: Part, *, outlined: bool = True) -> None:
         """outlined: with what ramps along its outline need."""
         mesh = part.shape
-        self.part, self.features = part, part.features
-        colours = np.ones_like(mesh.positions_m) if part.vertex_colours is None else part.vertex_colours
+        self.features, self.picture, self.colour = part.features, part.picture, part.colour
+        self.triangles = np.ascontiguousarray(mesh.triangles, np.int32)
+        self.corner_count, self.is_projected = self.triangles.size, len(mesh.positions_m) <= PROJECTED_MAX
         # (v, 11) position, normal, texture coordinates, colour
-        self.vertices = np.concatenate([mesh.positions_m, mesh.normals, mesh.uv, colours], axis=1, dtype=np.float32)
+        self.vertices = np.ones((len(mesh.positions_m), 11), np.float32)
+        columns = (mesh.positions_m, mesh.normals, mesh.uv, 1.0 if part.vertex_colours is None else part.vertex_colours)
+        for (first, end), values in zip(((0, 3), (3, 6), (6, 8), (8, 11)), columns, strict=True):
+            self.vertices[:, first:end] = values
         self.edges = edges_of(mesh) if outlined and len(mesh.triangles) <= OUTLINED_MAX else None
         low, high = mesh.positions_m.min(0), mesh.positions_m.max(0)
         if part.turning:
@@ -137,8 +143,9 @@ class DrawnPart:
     def upload(self, context: Any, surface_program: Any, outline_program: Any, texture: Any) -> None:
         """Make its GL objects; programs and texture are the source's, and shared."""
         self.surface_program, self.outline_program, self.texture = surface_program, outline_program, texture
-        self._buffer = context.buffer(self.vertices)
-        self._triangles = context.buffer(np.ascontiguousarray(self.part.shape.triangles, np.int32))
+        self._buffer, self._triangles = (_uploaded(context, array) for array in (self.vertices, self.triangles))
+        if self.edges is None and not self.is_projected:  # hundreds of MiB that nobody looks at any more
+            self.vertices, self.triangles = self.vertices[:0].copy(), self.triangles[:0].copy()
         names = ("in_normal", "in_uv", "in_colour")
         layout = _layout(surface_program, self._buffer, ("in_position", *names), (3, 3, 2, 3))
         self.surface = context.vertex_array(surface_program, [layout], index_buffer=self._triangles)
@@ -146,6 +153,11 @@ class DrawnPart:
         self._outline_buffer = context.buffer(reserve=size, dynamic=True)
         layout = _layout(outline_program, self._outline_buffer, ("in_clip", "in_coverage", *names), (4, 1, 3, 2, 3))
         self._outline = context.vertex_array(outline_program, [layout])
+
+    def draw_surface(self) -> None:
+        """In pieces: a software rasteriser holds Python's lock for as long as a call takes."""
+        for first in range(0, self.corner_count, 3 * DRAWN_AT_ONCE):
+            self.surface.render(first=first, vertices=min(3 * DRAWN_AT_ONCE, self.corner_count - first))
 
     def draw_outline(self, corners: F32, vertices: I32) -> None:
         """Ramps (k, 6, 5) along its outline, each corner with the attributes of a vertex (k, 6)."""
@@ -182,7 +194,7 @@ class TriangleSource(CanvasSource):
         self._textures: dict[int, Any] = {}
         for part in self.parts:
             programs = self._program(part.features), self._program((*part.features, "OUTLINE"))
-            picture = part.part.picture
+            picture = part.picture
             part.upload(context, *programs, None if picture is None else self._texture(picture))
         self.held += [*self.parts, *self._textures.values(), *self._programs.values()]
 
@@ -193,7 +205,7 @@ class TriangleSource(CanvasSource):
     def extent(self, view: View, *, time_ns: int) -> PixelRect:
         boxes = []
         for part, matrix in zip(self.parts, self.places(time_ns), strict=True):
-            points = part.corners_m if len(part.vertices) > PROJECTED_MAX else part.positions.astype(np.float64)
+            points = part.positions.astype(np.float64) if part.is_projected else part.corners_m
             boxes.append(camera.covered_box(view, points @ matrix[:3, :3].T + matrix[:3, 3], align_px=1))
         return union(boxes)
 
@@ -211,7 +223,7 @@ class TriangleSource(CanvasSource):
             for part, stack_from_part in placed:
                 _set_look(part.surface_program, part, stack_from_part, view)
                 part.surface_program["clip_from_part"].write(_gl(clip @ stack_from_part))
-                part.surface.render()
+                part.draw_surface()
             if self._with_ramps:
                 self._draw_outlines(placed, clip, view)
 
@@ -258,9 +270,18 @@ def _set_look(program: Any, part: DrawnPart, stack_from_part: F64, view: View) -
         linear = view.display_from_view @ linear
     if "stack_from_part" in program:
         program["stack_from_part"].write(_gl(np.linalg.pinv(linear).T * np.cbrt(abs(np.linalg.det(linear)))))
-    program["colour"] = part.part.colour
+    program["colour"] = part.colour
     if part.texture is not None:
         part.texture.use(0)
+
+
+def _uploaded(context: Any, array: Any) -> Any:
+    """A buffer, in pieces: uploading holds Python's lock."""
+    data = memoryview(array).cast("B")
+    buffer = context.buffer(reserve=data.nbytes)
+    for first in range(0, data.nbytes, UPLOADED_AT_ONCE):
+        buffer.write(data[first : first + UPLOADED_AT_ONCE], offset=first)
+    return buffer
 
 
 def _gl(matrix: F64) -> F32:

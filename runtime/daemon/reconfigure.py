@@ -13,18 +13,19 @@ from runtime.content.placed import placed_source, placing_of
 from runtime.content.registry import Opener, prepare_content
 from runtime.daemon.commands import PLACING
 from runtime.daemon.solver_parts import RunningSolver, ready_predictor
-from runtime.daemon.trial import try_out
 from runtime.errors import PhasestackError, Stopped
 from runtime.eyes.calibration import Calibration, load_calibration
 from runtime.frame.run_state import LEFT_BEHIND
-from runtime.model.predictor import Predictor
+from runtime.model.predictor import SHIPPED, Predictor
 from runtime.optics.stack import PanelStack
 from runtime.support.background import Job
+from runtime.support.child import in_child
 from runtime.support.crash import written
 from runtime.support.memory import give_back
 from runtime.support.progress import listening
 from runtime.support.untrusted_input import LIMITS
 
+MODEL_S = 30.0  # to load a model and solve with it twice, at 1920x1080 on a slow PC
 Ready = tuple[Opener | None, Predictor | None]  # None: stays as it is
 
 
@@ -92,15 +93,17 @@ class Reconfiguration:
         self._calibration = load_calibration(Path(file) if file else None)
         has_content = self._reload_content or settings.content != self._old.content
         has_model = _model_part(settings) != _model_part(self._old)
-        self.progress = "trying it out"
-        try_out(settings, content=has_content, model=has_model, wanted=lambda: not self.abandoned)
-        if has_content:
-            self.progress = f"loading {self.settings.content.scene}"
-            with listening(self._listen):
-                opener = prepare_content(self.settings.content, self._stack)
+        model = settings.model.name
+        with listening(self._listen):
+            if has_model and model not in SHIPPED and Path(model).is_file():
+                self.progress = "trying it out"
+                in_child(_tried, settings, source=model, seconds=MODEL_S)
+            if has_content:
+                self.progress = f"loading {settings.content.scene}"
+                opener = prepare_content(settings.content, self._stack)
         if has_model:
-            self.progress = f"loading model {self.settings.model.name}"
-            predictor = ready_predictor(self.settings, self._stack)
+            self.progress = f"loading model {model}"
+            predictor = ready_predictor(settings, self._stack)
         return opener, predictor
 
     def _listen(self, what: str, done: int, total: int | None) -> None:
@@ -123,7 +126,7 @@ class Reconfiguration:
                     undo.callback(predictor.close)
                     changes["predictor"] = predictor
                 if opener is not None:
-                    changes["content"] = opener(parts.context)
+                    changes["content"] = opener(context=parts.context)
                     undo.callback(changes["content"].close)
                     if moved:
                         changes["content"] = placed_source(changes["content"], placing_of(placed))
@@ -141,6 +144,11 @@ class Reconfiguration:
             before.content.close()
         if predictor is not None:
             before.predictor.close()
+
+
+def _tried(settings: Settings) -> None:
+    """Load a model of nobody knows whom, and solve with it, where that ends nothing but a child process."""
+    ready_predictor(settings, settings.stack.stack()).close()
 
 
 def moved_since(before: ContentSettings, now: ContentSettings) -> dict[str, Any]:

@@ -114,7 +114,7 @@ class SolverMaker:
             predictor = ready_predictor(settings, self._stack)
             undo.callback(predictor.close)
             self._prepared = None
-            content = opener(context)
+            content = opener(context=context)
             undo.callback(content.close)
             backend = self._chosen(predictor, context, simulated=simulated)
             undo.callback(backend.backend.close)

@@ -26,7 +26,7 @@ class Capabilities:
     depth: bool = False
     eye_points: bool = False  # it finds the eyes itself: no detector is needed
     in_stack_frame: bool = False  # its eye points are in frame `stack` already: no calibration is applied
-    may_pause: bool = False  # silence is its own (a gap in a recording): it is neither stalled nor reopened for it
+    may_pause: bool = False  # silence is its own (a recording's gap), as are samples that never change: no fault
 
 
 class Sensor(ABC):

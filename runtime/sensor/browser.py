@@ -25,7 +25,7 @@ class BrowserEyes(Sensor):
     """Samples as pages send them, and between them the last one again."""
 
     name = "browser"
-    capabilities = Capabilities(eye_points=True, in_stack_frame=True)
+    capabilities = Capabilities(eye_points=True, in_stack_frame=True, may_pause=True)
 
     def __init__(self, link: BrowserLink, clock: Clock) -> None:
         self._link, self._clock = link, clock

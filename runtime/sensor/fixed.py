@@ -17,7 +17,7 @@ class FixedDriver(SteppedSensor):
     """Thirty samples a second of one pair of eyes in the `stack` frame."""
 
     name = "fixed"
-    capabilities = Capabilities(eye_points=True, in_stack_frame=True)
+    capabilities = Capabilities(eye_points=True, in_stack_frame=True, may_pause=True)
 
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
         """Raises InputError without eyes in the settings."""

@@ -27,7 +27,7 @@ QUEUE_MAX = 1024  # samples that wait to be read: four seconds of the fastest se
 PICTURES_MAX = 8  # the same of samples that carry pictures
 AHEAD_NS = NS_PER_S // 1000  # a capture time later than its arrival by more than this is not of this machine's clock
 BEHIND_NS = 60 * NS_PER_S  # nor is one earlier by more than this
-FROZEN_NS = 2 * NS_PER_S  # a camera that is well never delivers the same picture for so long: it has noise
+FROZEN_NS = 2 * NS_PER_S  # no sensor that is well delivers the same picture or eye points for so long: it has noise
 LOOKED_AT = slice(None, None, 4)  # rows and columns of a picture
 
 log = logging.getLogger(__name__)
@@ -78,7 +78,7 @@ class SensorWorker(Samples):
         self._hung: list[_Attempt] = []
         self._state, self.reason = SensorState.STOPPED, ""
         self._was_well = False  # a sample was once what it should be
-        self._picture: tuple[int, int] = (0, 0)  # the newest one's checksum, and since when it is the same
+        self._delivered: dict[str, tuple[int, int]] = {}  # the newest one's checksum, and since when it is the same
         self._untimely = ""  # what was wrong with the newest stamp that was
         self._skipped = 0  # samples that a newer one overtook, but those that the driver at hand counts
         self._driver: Sensor | None = None
@@ -282,15 +282,22 @@ class SensorWorker(Samples):
         return timely
 
     def _look_at(self, frame: SensorFrame, now_ns: int) -> None:
-        """Raises SensorLost where a camera's picture never changes."""
-        picture = frame.colour if frame.colour is not None else frame.depth_mm
-        if picture is None:
-            return
-        checksum = zlib.crc32(picture[LOOKED_AT, LOOKED_AT].tobytes())
-        if checksum != self._picture[0]:
-            self._picture = checksum, now_ns
-        elif now_ns - self._picture[1] > FROZEN_NS:
-            raise SensorLost(f"its picture has not changed for {FROZEN_NS / NS_PER_S:g} s")
+        """Raises SensorLost where a picture, or where the eyes are, never changes.
+
+        Nobody before a tracker, and a depth picture without a measurement, may last.
+        """
+        looked_at = {
+            "picture has": None if frame.colour is None else frame.colour[LOOKED_AT, LOOKED_AT],
+            "depth picture has": None if frame.depth_mm is None else frame.depth_mm[LOOKED_AT, LOOKED_AT],
+            "eye points have": None if frame.eyes is None else frame.eyes.eyes_m,
+        }
+        for what, array in looked_at.items():
+            checksum = 0 if array is None else zlib.crc32(array.tobytes())
+            before, since_ns = self._delivered.get(what, (0, 0))
+            if array is None or checksum != before or (what.startswith("depth") and not array.any()):
+                self._delivered[what] = checksum, now_ns
+            elif now_ns - since_ns > FROZEN_NS:
+                raise SensorLost(f"its {what} not changed for {FROZEN_NS / NS_PER_S:g} s")
 
     def _keep(self, frame: SensorFrame) -> None:
         """Let a sample wait to be read; where too many wait, the oldest goes."""

@@ -59,7 +59,7 @@ def test_a_closed_source_has_released_every_object_that_it_made(
     context: Any, stack: PanelStack, tmp_path: Path, kind: str
 ) -> None:
     counting = Counting(context)
-    source = prepare_content(ContentSettings(scene=scene_of(kind, tmp_path)), stack)(counting)
+    source = prepare_content(ContentSettings(scene=scene_of(kind, tmp_path)), stack)(context=counting)
     for side, y_m in enumerate((-0.03, 0.03)):
         source.render(panel_view(np.array([0.7, y_m, 0.0]), stack.panel(1), side), time_ns=0)
     assert len(counting.left) > 2

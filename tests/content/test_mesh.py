@@ -24,7 +24,7 @@ EYE = (0.7, 0.05, 0.1)
 
 
 def source_of(path: Path, context: Any, stack: PanelStack, **settings: Any) -> TriangleSource:
-    return prepare(SceneFile(path, ContentSettings(**settings), stack))(context)
+    return prepare(SceneFile(path, ContentSettings(**settings), stack))(context=context)
 
 
 def textured_quad(folder: Path, suffix: str) -> Path:

@@ -15,8 +15,9 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from runtime.daemon import trial
+from runtime.daemon import reconfigure
 from runtime.model.predictor import model_path
+from runtime.support import child
 from tests.daemon.test_changes import Served
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -73,7 +74,7 @@ def test_an_endless_model_is_refused_and_hangs_no_thread_of_the_daemon(
     endless: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It held a thread for two minutes, and at the end of the daemon for good."""
-    monkeypatch.setattr(trial, "MODEL_S", 10.0)
+    monkeypatch.setattr(reconfigure, "MODEL_S", 10.0)
     with Served(tmp_path) as served:
         answer = served.asked("model", str(endless))
         assert not answer["ok"] and answer["error"].endswith("endless.onnx: is not ready after 10 s")
@@ -81,7 +82,7 @@ def test_an_endless_model_is_refused_and_hangs_no_thread_of_the_daemon(
         served.rig.refresh_until_solved()
 
 
-def test_a_scene_that_takes_all_memory_ends_only_its_trial_process(
+def test_a_scene_that_takes_all_memory_ends_only_the_process_that_reads_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import trimesh
@@ -92,7 +93,7 @@ def test_a_scene_that_takes_all_memory_ends_only_its_trial_process(
         asked = [served.asked("scene", str(tmp_path / name)) for name in ("ball.stl", "bad.stl")]
         assert asked[0].get("ok"), asked
         assert "bad.stl" in asked[1]["error"]
-        monkeypatch.setattr(trial, "MEMORY_MAX", 16 << 20)
+        monkeypatch.setattr(child, "MEMORY_MAX", 48 << 20)
         answer = served.asked("scene", str(tmp_path / "ball.stl"))
-        assert not answer["ok"] and "ball.stl: takes more than 16 MiB" in answer["error"]
+        assert not answer["ok"] and "ball.stl: takes more than 48 MiB" in answer["error"]
         served.rig.refresh_until_solved()

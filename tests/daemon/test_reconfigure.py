@@ -64,7 +64,7 @@ class Bench:
             opener = prepare(chosen, stack, **how)
 
             def make(context: Any) -> Any:
-                self.contents.append(Lent(opener(context)))
+                self.contents.append(Lent(opener(context=context)))
                 return self.contents[-1]
 
             return make

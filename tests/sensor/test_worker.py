@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import statistics
 import threading
 import time
@@ -14,13 +15,14 @@ import pytest
 from runtime.clock import MonotonicClock
 from runtime.config import SensorSettings
 from runtime.errors import EndOfRecording, FatalError, SensorLost, SensorTimeout
-from runtime.records import SensorFrame
+from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.base import Capabilities, Sensor
 from runtime.sensor.worker import SensorState, SensorWorker
 from tests.waiting import eventually
 
 SETTINGS = SensorSettings(timeout_s=0.05)
 FRAME_S = 1 / 60
+DELIVERED = ("picture has", "depth picture has", "eye points have")
 
 
 class Scripted(Sensor):
@@ -273,20 +275,31 @@ def test_an_sdk_that_exits_or_fails_to_close_is_reopened(started: Callable[..., 
 class Camera(Scripted):
     """Stamps its pictures as the test says."""
 
-    ahead_ns, changes = 0, True
+    ahead_ns, frozen = 0, ""  # what of DELIVERED does not change
+    delivered = itertools.count()  # by all of them: one that is opened anew does not begin again
     capabilities = Capabilities(colour=True, eye_points=True)
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
         time.sleep(0.005)
         self._count += 1
-        picture = np.full((16, 16, 3), self._count % 200 if Camera.changes else 7, np.uint8)
-        return SensorFrame(self._count, time.monotonic_ns() + Camera.ahead_ns, colour=picture)
+        number = {
+            what: 7 if Camera.frozen in (what, "it may pause") else next(Camera.delivered) % 200 + 8
+            for what in DELIVERED
+        }
+        picture = np.full((16, 16, 3), number["picture has"], np.uint8)
+        measured = Camera.frozen != "nothing is measured"
+        depth = np.full((16, 16), 600 + number["depth picture has"] if measured else 0, np.uint16)
+        eyes = EyePoints(np.full((2, 3), number["eye points have"] / 1000.0), np.ones(2))
+        stamp_ns = time.monotonic_ns() + Camera.ahead_ns
+        return SensorFrame(
+            self._count, stamp_ns, None if Camera.frozen == "nobody is seen" else eyes, picture, depth_mm=depth
+        )
 
 
 @pytest.fixture
 def camera(monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setattr(Camera, "ahead_ns", 0)
-    monkeypatch.setattr(Camera, "changes", True)
+    monkeypatch.setattr(Camera, "frozen", "")
     worker = SensorWorker(lambda: Camera(None, []), SETTINGS, MonotonicClock())
     worker.start()
     assert eventually(lambda: worker.state is SensorState.RUNNING)
@@ -309,16 +322,28 @@ def test_future_stamps_are_rejected_and_a_persistent_sensor_counts_as_lost(
     assert eventually(lambda: camera.state is SensorState.RUNNING)
 
 
-def test_a_camera_whose_picture_never_changes_is_lost_until_it_does(
-    camera: SensorWorker, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("what", ["picture has", "depth picture has", "eye points have"])
+def test_a_sensor_whose_samples_never_change_is_lost_until_they_do(
+    camera: SensorWorker, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
-    """Frozen eyes were at rest, and sure to 0.7 mm."""
+    """Frozen eyes were at rest, and sure to 0.7 mm. Colour that lives does not hide depth that does not."""
     monkeypatch.setattr("runtime.sensor.worker.FROZEN_NS", 100_000_000)
-    monkeypatch.setattr(Camera, "changes", False)
+    monkeypatch.setattr(Camera, "frozen", what)
     assert eventually(lambda: camera.state is SensorState.LOST)
-    assert camera.fault() == "its picture has not changed for 0.1 s"
+    assert camera.fault() == f"its {what} not changed for 0.1 s"
     for _ in range(30):  # opened anew, it is not well for a moment each time
         time.sleep(0.01)
         assert camera.state is SensorState.LOST
-    monkeypatch.setattr(Camera, "changes", True)
+    monkeypatch.setattr(Camera, "frozen", "")
     assert eventually(lambda: camera.state is SensorState.RUNNING)
+
+
+@pytest.mark.parametrize("still", ["nobody is seen", "nothing is measured", "it may pause"])
+def test_what_may_stay_the_same_is_no_fault(camera: SensorWorker, monkeypatch: pytest.MonkeyPatch, still: str) -> None:
+    monkeypatch.setattr("runtime.sensor.worker.FROZEN_NS", 50_000_000)
+    if still == "it may pause":
+        monkeypatch.setattr(Camera, "capabilities", Capabilities(eye_points=True, may_pause=True))
+    monkeypatch.setattr(Camera, "frozen", still)
+    for _ in range(40):
+        time.sleep(0.01)
+        assert camera.state is SensorState.RUNNING
