@@ -258,3 +258,8 @@ def test_the_command_takes_the_cameras_that_pictures_were_taken_with(
     ):
         with pytest.raises(InputError, match=told):
             app([*command, *given], standalone_mode=False)
+
+
+def test_a_refusal_of_the_model_names_it_once() -> None:
+    with pytest.raises(ValueError, match=r"^model: name: 'nobody' is neither"):
+        phasestack.solve(picture(), picture(3), eyes_m=EYES, stack=STACK, model="nobody")

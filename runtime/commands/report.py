@@ -1,4 +1,4 @@
-"""`phasestack report`: error against run time."""
+"""`phasestack report`: light against run time."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class GrowingPage:
         notes = [f"Not finished: it grows while it is measured. The last that was known: {doing}."] if doing else []
         sections, machine = list(self._sections.values()), self.record["machine"]
         lead = "Light, at a tracking error of 1 mm, is the figure to quote; higher is better."
-        page = Page("Error against run time", lead, sections, machine, self._command, notes)
+        page = Page("Light against run time", lead, sections, machine, self._command, notes)
         page.write(self.out, record="report.json", data=self.record)
 
 
@@ -118,7 +118,7 @@ def _frontier(
     page: GrowingPage, methods: Sequence[Method], pairs: Iterable[StillPair], *, title: str, name: str, key: str
 ) -> list[MethodResult]:
     """One section of pairs that share a resolution; `key`: of the record that its methods are added to."""
-    title = f"Error against run time: {title}"
+    title = f"Light against run time: {title}"
     page.doing(f"{title}: drawing")
     before, results = page.record.get(key, []), dict[str, MethodResult]()
     for done, result in measure(methods, pairs, viewers=page.out):

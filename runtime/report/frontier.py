@@ -1,4 +1,4 @@
-"""Error against run time: every method on every pair, each method in its own process."""
+"""Light against run time: every method on every pair, each method in its own process."""
 
 from __future__ import annotations
 

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from runtime.report.focal import CARDS_M, DISTANCE_M, PUPIL_M, FocalStack
-from runtime.report.frontier import MethodResult
+from runtime.report.frontier import QUOTED, SHIPPED, MethodResult
 from runtime.report.moving import Moving
 from runtime.report.page import Figure, Section, Table, drawing, png
 
-KINDS = {"network": ("o", "C0"), "iterative": ("s", "C1")}
+KINDS = {"shipped": ("o-", "C0"), "added": ("D", "C2"), "iterative": ("s-", "C1")}
 NAMES = ("behind the panels", "in the middle panel", "before the panels")
 
 
@@ -30,15 +30,19 @@ def frontier_section(results: Sequence[MethodResult], *, title: str, name: str) 
 
 
 def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
-    """A curve for each kind of method, more steps to the right."""
+    """The shipped sizes and the reference's steps are a curve each, added models stand alone; every pair is a dot."""
     beside: Any = {"textcoords": "offset points", "fontsize": 8.5}
     with drawing(9.6, 5.0) as figure:
         axes = figure.add_subplot()
-        for kind, (marker, colour) in KINDS.items():
-            dots = sorted((r for r in results if r.kind == kind), key=lambda r: r.ms_p50)
+        for kind, (style, colour) in KINDS.items():
+            dots = sorted((r for r in results if kind_of(r) == kind), key=lambda r: r.ms_p50)
             if dots:
                 places = [(r.ms_p50, r.quoted_db) for r in dots]
-                axes.plot(*zip(*places, strict=True), marker=marker, markersize=7, color=colour, label=kind)
+                axes.plot(*zip(*places, strict=True), style, markersize=7, color=colour, label=kind)
+            of_pairs = [(float(np.median(pair.run_ms)), pair.quality.light_db) for r in dots for pair in r.pairs]
+            if len(of_pairs) > len(dots):
+                seen = [(ms, light_db.get(QUOTED, np.nan)) for ms, light_db in of_pairs]
+                axes.scatter(*zip(*seen, strict=True), s=9, color=colour, alpha=0.5, linewidths=0)
             for result in dots:  # up and to the left of a curve that rises
                 axes.annotate(result.name, (result.ms_p50, result.quoted_db), xytext=(-5, 6), ha="right", **beside)
         axes.set(xscale="log", xlabel="median time of a whole solution, ms", ylabel="light, dB (tracking error 1 mm)")
@@ -48,6 +52,11 @@ def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
         axes.xaxis.set_minor_formatter("")
         axes.legend()
     return Figure(name, png(figure), "Times hold for this machine and this hour: compare their ratios.")
+
+
+def kind_of(result: MethodResult) -> str:
+    """Which curve it belongs to: a model that was added is no step between the shipped ones."""
+    return "shipped" if result.name in SHIPPED else "added" if result.kind == "network" else result.kind
 
 
 def method_table(results: Sequence[MethodResult]) -> Table:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from runtime.commands.report import report
 from runtime.errors import InputError
 from runtime.evaluation.solved import PairQuality
 from runtime.model.predictor import model_path
+from runtime.report import sections
 from runtime.report.assemble import whole_report
 from runtime.report.frontier import MethodResult, PairResult
 from runtime.report.literature import SIZE_PX
@@ -119,11 +121,23 @@ def report_page() -> Page:
         for motion in ("still", "lean")
         for solver_ms in (33.0, 150.0)
     ]
-    sections = [
+    parts = [
         frontier_section(methods, title="Frontier", name="test"),
         moving_section(moving),
     ]
-    return Page("Error against run time", "A lead.", sections, describe(), "phasestack report")
+    return Page("Light against run time", "A lead.", parts, describe(), "phasestack report")
+
+
+def test_added_models_stand_beside_the_curves_and_every_pair_is_a_dot(monkeypatch: pytest.MonkeyPatch) -> None:
+    figures: list[Any] = []
+    monkeypatch.setattr(sections, "png", lambda figure: (figures.append(figure), b"")[1])
+    methods = [method("fast", "network", 20, 36), method("best", "network", 90, 42), method("own", "network", 50, 30)]
+    methods = [replace(one, pairs=one.pairs * 2) for one in (*methods, method("SART-3", "iterative", 300, 38))]
+    sections.frontier_plot(methods, name="test")
+    axes = figures[0].axes[0]
+    drawn = {line.get_label(): (list(line.get_ydata()), line.get_linestyle()) for line in axes.lines}
+    assert drawn == {"shipped": ([36, 42], "-"), "added": ([30], "None"), "iterative": ([38], "-")}
+    assert sum(len(dots.get_offsets()) for dots in axes.collections) == 8
 
 
 def test_the_page_needs_nothing_from_elsewhere() -> None:
