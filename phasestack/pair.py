@@ -38,8 +38,8 @@ from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG, SEPARATION_MIN_M, 
 SAME_PLACE_M = 0.001  # an eye and its camera
 _one_at_a_time = Lock()  # a loaded model has buffers of its own
 
-Eyes = Sequence[Sequence[float]] | F64
-Cameras = Sequence[Sequence[Sequence[float]]] | F64
+Eyes = Sequence[Sequence[float]] | Sequence[F64] | F64
+Cameras = Sequence[Sequence[Sequence[float]]] | Sequence[F64] | F64
 
 
 @dataclass(frozen=True)

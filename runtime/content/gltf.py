@@ -18,7 +18,7 @@ import numpy as np
 from runtime.errors import InputError, one_line
 from runtime.records import U8
 from runtime.support import untrusted_input
-from runtime.support.picture_header import decoded_picture, picture_size
+from runtime.support.picture_header import check_size, decoded_picture, picture_size
 from runtime.support.untrusted_input import LIMITS
 
 ELEMENTS_PER_TRIANGLE = 10  # all accessors together, for the limit on triangles
@@ -82,9 +82,11 @@ def _check(path: Path, table: Table, binary: bytes, read: Read) -> None:
     numbers = sorted({_source(path, table, texture) for texture in _drawn_textures(table)})
     coded = {number: _coded(table, table["images"][number], binary, read) for number in numbers}
     pixels = 0
-    for picture in coded.values():  # by their headers, before one is decoded
+    for number, picture in coded.items():  # by their headers, before one is decoded
         with suppress(ValueError):
-            pixels += math.prod(picture_size(picture))
+            size = picture_size(picture)
+            check_size(*size, source=path, field="texture", name=f"images[{number}]", head=picture)
+            pixels += math.prod(size)
         untrusted_input.within(pixels, LIMITS.texture_pixels, source=path, field="textures' pixels")
     for number, picture in coded.items():
         decoded_picture(picture, source=path, field="texture", name=f"images[{number}]")

@@ -30,7 +30,10 @@ def frontier_section(results: Sequence[MethodResult], *, title: str, name: str) 
 
 
 def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
-    """The shipped sizes and the reference's steps are a curve each, added models stand alone; every pair is a dot."""
+    """A curve for the shipped sizes and one for the reference; added models stand alone.
+
+    More steps are to the right. Small dots are single pairs.
+    """
     beside: Any = {"textcoords": "offset points", "fontsize": 8.5}
     with drawing(9.6, 5.0) as figure:
         axes = figure.add_subplot()

@@ -1,4 +1,4 @@
-"""Work on what is not trusted, in a process of its own: limited in memory and time, and killed where it is over.
+"""Work on untrusted files in a process of its own, limited in memory and time, that can be killed.
 
 Parsers hold Python's lock, and a small file may make them take all memory. The arrays of a result come back in memory
 that both processes have mapped; progress, warnings and refusals are as if the work had been done here.
@@ -30,6 +30,7 @@ from runtime.support.untrusted_input import LIMITS, MIB
 MEMORY_MAX = 4 << 30  # of data; what a scene at every limit takes
 LOOK_S = 0.05  # between two looks at whether it is still wanted
 ALIGNED = 64  # bytes, of an array's place
+SMALL = 1 << 16  # bytes of an array that is copied
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1")
 T = TypeVar("T")
 
@@ -94,12 +95,13 @@ def _outcome(channel: Connection, source: str, seconds: float) -> tuple[bytes, l
             raise InputError(source, "", f"is not ready after {seconds:g} s")
 
 
-def _mapped(memory: int, sizes: list[int]) -> list[memoryview]:
-    """The arrays, one after the other; what is written to is copied."""
+def _mapped(memory: int, sizes: list[int]) -> list[memoryview | bytearray]:
+    """The arrays, one after the other; what is written to is copied, and a small one does not hold the memory of all."""
     total = sum(map(_room, sizes))
     whole = memoryview(mmap.mmap(memory, total, flags=mmap.MAP_PRIVATE) if total else b"")
     ends = [sum(map(_room, sizes[: number + 1])) for number in range(len(sizes))]
-    return [whole[end - _room(size) :][:size] for end, size in zip(ends, sizes, strict=True)]
+    views = [whole[end - _room(size) :][:size] for end, size in zip(ends, sizes, strict=True)]
+    return [bytearray(view) if view.nbytes < SMALL else view for view in views]
 
 
 def _room(size: int) -> int:

@@ -82,9 +82,7 @@ def test_an_endless_model_is_refused_and_hangs_no_thread_of_the_daemon(
         served.rig.refresh_until_solved()
 
 
-def test_a_scene_that_takes_all_memory_ends_only_the_process_that_reads_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_scene_that_takes_all_memory_ends_only_its_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import trimesh
 
     trimesh.creation.icosphere(subdivisions=6).export(tmp_path / "ball.stl")
