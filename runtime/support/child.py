@@ -96,7 +96,7 @@ def _outcome(channel: Connection, source: str, seconds: float) -> tuple[bytes, l
 
 
 def _mapped(memory: int, sizes: list[int]) -> list[memoryview | bytearray]:
-    """The arrays, one after the other; what is written to is copied, and a small one does not hold the memory of all."""
+    """The arrays, one after the other; written to, they are copied; a small one holds nothing else."""
     total = sum(map(_room, sizes))
     whole = memoryview(mmap.mmap(memory, total, flags=mmap.MAP_PRIVATE) if total else b"")
     ends = [sum(map(_room, sizes[: number + 1])) for number in range(len(sizes))]
