@@ -6,8 +6,8 @@ from importlib import resources
 from pathlib import Path
 
 from runtime.config import ModelSettings
-from runtime.errors import InputError
-from runtime.kernels import MAX_PANELS
+from runtime.errors import InputError, MissingPart
+from runtime.kernels import MAX_PANELS, library
 from runtime.model.base import Prediction, Predictor
 from runtime.model.contract import Step
 from runtime.optics.stack import PanelStack
@@ -55,6 +55,10 @@ def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None 
     is served by its steps alone, from even panels; `Predictor.name` says so. Raises InputError, MissingPart.
     """
     keep_freed_memory()
+    try:
+        library()
+    except ImportError as error:  # told here, not by the first picture
+        raise MissingPart(str(error)) from None
     settings = settings or ModelSettings()
     path = model_path(name)
     if path is None:
