@@ -14,7 +14,7 @@ with w_nq the part of the bundle on panel n that pixel q covers: for a bundle as
 *A step.* With T what an eye should see, e = I - T (0 where a ray misses a panel) and A_n the product of the other
 panels' z_m, the squared error's derivative to pixel q of panel n, and a bound of its curvature, are sums over all sets:
 
-    g_q = Im(exp(i·pi·x_q)·sum w·e·A_n)        (pi/2 times it is the derivative of sum e²/2)                  (L3)
+    g_q = Im(exp(i·pi·y_q)·sum w·e·A_n)        (pi/2 times it is the derivative of sum e²/2)                  (L3)
     D_q = sum w·(Im Z)²                                                                                       (L4)
     x' = clip(y - size·g/(1.5·pi·max(D, floor·E))·3/N, 0, 1),   y' = x' + momentum·(x' - x)                   (L5)
 

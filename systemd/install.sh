@@ -116,7 +116,7 @@ fi
 rm -rf "$DESTDIR$library.old"
 cat <<NEXT
 phasestack is installed${DESTDIR:+ in $DESTDIR}. Next:
-  1. edit /etc/phasestack/phasestack.toml (phasestack identify, phasestack doctor)
+  1. phasestack setup (docs/setup.md), or edit /etc/phasestack/phasestack.toml (phasestack identify, phasestack doctor)
   2. systemctl enable --now phasestack
   3. systemctl enable --now phasestack-page   (the operator's page: http://localhost:8717)
 NEXT

@@ -52,7 +52,7 @@ def intensity_from_phase(phase: NDArray[T]) -> NDArray[T]:
 def phase_from_intensity(intensity: NDArray[T], branch: Branch = 2) -> NDArray[T]:
     """(...) the phase sum (units of pi/2) whose sin² is `intensity`, which is clipped to [0, 1].
 
-    Branch 1 lies in [0, 1], branch 2 in [1, 2]: with three panels it keeps every panel far from its limits.
+    Branch 1 lies in [0, 1], branch 2 in [1, 2]: with three panels it keeps the outer ones far from their limits.
     """
     root = np.arcsin(np.sqrt(np.clip(intensity, 0.0, 1.0))) / HALF_PI
     result: NDArray[T] = root if branch == 1 else 2 - root
