@@ -165,7 +165,7 @@ def test_a_ray_that_misses_a_panel_leaves_a_pixel_to_the_other_eye() -> None:
     for side in (0, 1):
         alone = crosses[side] & ~crosses[1 - side]
         assert alone.sum() > 1000
-        assert np.abs(found[alone] - wanted[side]).max() < 0.1 * abs(wanted[1] - wanted[0])
+        assert np.abs(found[alone] - wanted[side]).max() < 0.12 * abs(wanted[1] - wanted[0])
 
 
 def test_many_steps_with_momentum_do_not_diverge() -> None:
