@@ -97,7 +97,8 @@ def whole_report(
     missing = [] if beside else shipped_and_references(quick=True)[: len(SHIPPED)]
     missing += [Method(Path(published).stem, "network", published)] if published else []
     found = measure(missing, like_published or islice(procedural_pairs(small), 1))
-    beside += {result.name: result for _, result in found}.values()
+    by_name = {result.name: result for _, result in found}
+    beside += [by_name[method.name] for method in missing if method.name in by_name]
     page.record["methods_beside_published_figures"] = [result.record() for result in beside]
     page.put("literature", literature_section(beside))
     _moving(page, quick=quick)
