@@ -16,7 +16,7 @@ panels' z_m, the squared error's derivative to pixel q of panel n, and a bound o
 
     g_q = Im(exp(i·pi·y_q)·sum w·e·A_n)        (pi/2 times it is the derivative of sum e²/2)                  (L3)
     D_q = sum w·(Im Z)²                                                                                       (L4)
-    x' = clip(y - size·g/(1.5·pi·max(D, floor·E))·3/N, 0, 1),   y' = x' + momentum·(x' - x)                   (L5)
+    x' = clip(y - size·2/(pi·N)·g/max(D, floor·E), 0, 1),     y' = x' + momentum·(x' - x)                   (L5)
 
 for N panels and E ray sets. The sums over rays through a panel's pixel (the transpose of bilinear sampling) are taken
 as one bilinear sample of the rays' values, through the inverse homography: the same where a ray's pixel and a panel's

@@ -151,7 +151,7 @@ def solve(
             total_ms = (time.perf_counter_ns() - start_ns) / 1e6
             layers = np.ascontiguousarray(solved.layers[..., :3])
         except InputError as error:
-            raise ValueError(f"model: {error}".replace("model: model: ", "model: ", 1)) from None
+            raise ValueError(str(error) if error.source == "model" else f"model: {error}") from None
         except ModelFailure as error:
             raise ValueError(f"eyes_m: {error}") from None
     return Result(layers, pair, model=predictor.name, eye_sigma_mm=eye_sigma_mm, total_ms=total_ms)

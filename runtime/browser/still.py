@@ -15,9 +15,11 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from runtime.optics.malus import rest_code
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 from runtime.support.artifacts import png_bytes, to_json
+from runtime.support.threads import at_once
 
 WEBP_MAX_PX = 16383
 BESIDE_BYTES = 60 << 10  # that a page may have beside its layers as PNG files
@@ -48,8 +50,8 @@ def viewer_html(
     """
     scene = {"stack": stack_table(stack), "eyes_m": eyes_m, "fov_deg": fov_deg, "title": title, "follows": follows}
     parts = {"TITLE": html.escape(title), "CSS": asset("look.css"), "SCRIPT": _script()}
-    parts["LAYERS"] = _embedded([_exact(layer) for layer in layers])
-    room = BESIDE_BYTES + sum(len(png_bytes(layer)) for layer in layers) - len("".join(parts.values())) - 2048
+    parts["LAYERS"] = _embedded(at_once(_exact, list(layers)))
+    room = BESIDE_BYTES + sum(map(len, at_once(png_bytes, list(layers)))) - len("".join(parts.values())) - 2048
     targets, error = _stored(wanted, room) if wanted else ([], 0.0)
     told = [f"What was asked for is stored to {-10 * math.log10(error):.0f} dB."] if error else []
     scene |= {"target_error": error, "lines": [*lines, *told]}
@@ -58,9 +60,10 @@ def viewer_html(
 
 
 def stack_table(stack: PanelStack) -> dict[str, Any]:
-    """The stack's geometry as a table for the script."""
+    """The stack's geometry, and what its panels show at rest, as a table for the script."""
     fields = ("width_m", "height_m", "x_m", "width_px", "height_px")
     table: dict[str, Any] = {name: getattr(stack, name) for name in fields}
+    table["rest_code"] = rest_code(stack.count)
     if stack.tilt is not None:
         table["tilt"] = {"depth": stack.tilt.depth, "seen_from_m": stack.tilt.seen_from_m}
     return table
@@ -83,7 +86,8 @@ def _stored(pictures: Sequence[U8], room: int) -> tuple[list[str], float]:
     """Targets as data URLs of at most `room` bytes where that can be; the mean square of what coding changes (of 1)."""
     urls: list[str] = []
     for quality in QUALITIES:
-        urls = [_url(p, format="AVIF", quality=quality, speed=8, subsampling="4:4:4") for p in pictures]
+        how = {"format": "AVIF", "quality": quality, "speed": 8, "subsampling": "4:4:4"}
+        urls = at_once(lambda picture, how=how: _url(picture, **how), list(pictures))
         if sum(map(len, urls)) <= room:
             break
     coded = [Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))).convert("RGB") for url in urls]

@@ -250,7 +250,9 @@ INLINE void lack(const Problem &problem, const Share &share, int set, int r, Wor
     int16_t *weights = share.row(set, 0, r) + at, *wanted = share.row(set, 1, r) + at;
     float asked[TILE], weight[TILE];
     for (int k = 0; k < count; ++k) asked[k] = problem.table[2 * target[k]], weight[k] = problem.table[2 * target[k] + 1];
-    for (int k = 0; k < count; ++k) weight[k] *= u * C + k < whole.first * C || u * C + k >= whole.last * C ? problem.missing : 1;
+    const int begin = std::clamp((whole.first - u) * C, 0, count), end = std::clamp((whole.last - u) * C, begin, count);
+    for (int k = 0; k < begin; ++k) weight[k] *= problem.missing;
+    for (int k = end; k < count; ++k) weight[k] *= problem.missing;
     for (int e = 0; e < count; e += LANES)
       VECTORISED for (int k = e; k < e + LANES; ++k) {
         weights[k] = rounded(weight[k] * UNIT);

@@ -190,6 +190,16 @@ def test_a_page_is_no_larger_than_its_layers_files_and_60_kib(tmp_path: Path, wi
     assert stored_db > 35
 
 
+def test_the_page_in_the_docs_has_today_s_script() -> None:
+    """Or `make gallery` is due."""
+    stack = replace(STACK, width_px=64, height_px=36)
+    layers = np.zeros((3, 36, 64, 3), np.uint8)
+    today = viewer_html(layers, (), stack, eyes_m=eyes_at(distance_m=0.6), fov_deg=40.0, title="", lines=[])
+    kept = (Path(__file__).parents[2] / "docs" / "images" / "viewer.html").read_text(encoding="utf-8")
+    scripts = [re.findall(r"<script type=\"module\">(.*?)</script>", page, re.DOTALL) for page in (today, kept)]
+    assert len(scripts[0]) == 1 and scripts[0] == scripts[1]
+
+
 def test_a_result_opens_in_a_browser_and_is_a_notebook_s_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     stack = replace(STACK, width_px=64, height_px=36)
     random = np.random.default_rng(5).integers(0, 256, (2, 36, 64, 3)).astype(np.uint8)

@@ -1,7 +1,6 @@
 // What a stack of panels shows and what eyes see of it: optics, WebGL 2, and the plan of eyes and panels.
 // Frame `stack`: metres, x out of the screen, y to the viewer's right, z up. Matrices are 3x3, row after row.
 
-const REST = { 2: 0.75, 3: 0.5, 4: 0.375, 5: 0.5 }; // of panels of that number, beside a solution that was shifted
 const NEAREST_M = 0.01, MOST_SHIFT = 0.5, MOST_SCALE = 2; // limits of an alignment, as the runtime has them
 const PUPILS = 7;
 
@@ -304,7 +303,7 @@ export class Display {
     g.bindTexture(g.TEXTURE_2D_ARRAY, this.textures.flat);
     g.uniform1i(places.flat_picture, 1);
     g.uniform1f(places.flatness, flatness);
-    g.uniform1f(places.rest, Math.round((REST[maps.length] ?? 1.5 / maps.length) * 255) / 255);
+    g.uniform1f(places.rest, this.stack.rest_code / 255); // beside a solution that was shifted
     g.uniform2f(places.size, w, h);
     g.bindFramebuffer(g.FRAMEBUFFER, this.framebuffer);
     g.viewport(0, 0, w, h);
