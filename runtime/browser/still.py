@@ -8,7 +8,7 @@ import io
 import math
 import re
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, partial
 from importlib.resources import files
 from typing import Any
 
@@ -86,8 +86,8 @@ def _stored(pictures: Sequence[U8], room: int) -> tuple[list[str], float]:
     """Targets as data URLs of at most `room` bytes where that can be; the mean square of what coding changes (of 1)."""
     urls: list[str] = []
     for quality in QUALITIES:
-        how = {"format": "AVIF", "quality": quality, "speed": 8, "subsampling": "4:4:4"}
-        urls = at_once(lambda picture, how=how: _url(picture, **how), list(pictures))
+        coder = partial(_url, format="AVIF", quality=quality, speed=8, subsampling="4:4:4")
+        urls = at_once(coder, list(pictures))
         if sum(map(len, urls)) <= room:
             break
     coded = [Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))).convert("RGB") for url in urls]
