@@ -12,7 +12,7 @@ from runtime.evaluation.displayed import EyeViews
 from runtime.optics.carried import intensities
 from runtime.optics.pupil import PUPIL_MM, TRACKING_SIGMA_MM
 from runtime.optics.retina import as_codes
-from runtime.records import U8
+from runtime.records import F64, U8
 
 TILE_WIDTH = 640  # pixels
 MARGIN = 12  # pixels
@@ -24,12 +24,15 @@ PAPER = 246
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """One refresh of a run, as its sheet shows it."""
+    """One refresh of a run, as its sheet shows it; and what its viewer aligns by itself."""
 
-    layers: U8  # (N, h, w, 3 or 4), as the panels showed them
+    layers: U8  # (N, h, w, 3 or 4), as the panels showed them: aligned
     eye_views: EyeViews
     light_db: float  # of tracking errors of 1 mm
     lines: tuple[str, ...]  # where the eyes were, and how well that was known
+    solution: U8  # (N, h, w, 3 or 4), before it was aligned
+    solved_for_m: F64  # (2, 3) eyes, frame `stack`
+    asked_for: tuple[U8, ...]  # (h, w, 3) what each eye should see there
 
 
 def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, lines: Sequence[str] = ()) -> U8:

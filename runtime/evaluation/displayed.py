@@ -35,10 +35,9 @@ class EyeViews:
     fov_deg: float
 
     def viewer(self, layers: U8, *, title: str, lines: Sequence[str]) -> str:
-        """The layers to look into, in a browser: one HTML page, with `lines` beside it."""
-        wanted = [as_codes(intensities(picture)) for picture in self.wanted]
-        eyes_m, fov_deg = np.asarray(self.eyes_m), self.fov_deg
-        return viewer_html(layers, wanted, self.stack, eyes_m=eyes_m, fov_deg=fov_deg, title=title, lines=lines)
+        """The layers to look into from these eyes, in a browser: one HTML page, with `lines` beside it."""
+        wanted, eyes_m = [as_codes(intensities(picture)) for picture in self.wanted], np.asarray(self.eyes_m)
+        return viewer_html(layers, wanted, self.stack, eyes_m=eyes_m, fov_deg=self.fov_deg, title=title, lines=lines)
 
     def write(self, folder: Path) -> None:
         """What each eye sees and should see, as pictures."""

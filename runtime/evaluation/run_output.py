@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TextIO
 
+from runtime.browser.still import viewer_html
 from runtime.errors import InputError
 from runtime.evaluation.contact_sheet import Moment, contact_sheet, headline
 from runtime.records import U8
@@ -97,7 +98,9 @@ class RunOutput:
             if moment is not None:
                 shown, title, lines = moment.layers, headline(moment.light_db), [*moment.lines, *lines]
                 moment.eye_views.write(folder)
-                page = moment.eye_views.viewer(shown, title=title, lines=lines)
+                look = moment.eye_views
+                how: Any = {"eyes_m": moment.solved_for_m, "fov_deg": look.fov_deg, "title": title, "lines": lines}
+                page = viewer_html(moment.solution, moment.asked_for, look.stack, **how)
             views = None if moment is None else moment.eye_views
             write_png(folder / "contact-sheet.png", contact_sheet(shown, views, headline=title, lines=lines))
             write_text(folder / "viewer.html", page)

@@ -260,7 +260,7 @@ class RunObserver:
                 "fov": self._fov_deg,
             }
             self._output.light(account.frame, layers=layers, drawn=drawn.get("solved"), info=info)
-        if "used" not in drawn or account.eyes_m is None or account.solved_for_m is None:
+        if "used" not in drawn or account.eyes_m is None or account.solved_for_m is None or refresh.solution is None:
             return None
         stack, fov_deg, solved_for_m = self._stack, self._fov_deg, account.solved_for_m
 
@@ -280,7 +280,8 @@ class RunObserver:
                 fov_deg=fov_deg,
                 sampling=MEASURED,
             )
-            moment = Moment(layers, views, light[TRACKING_SIGMA_MM], _where(account))
+            light_db, solution = light[TRACKING_SIGMA_MM], refresh.solution.layers
+            moment = Moment(layers, views, light_db, _where(account), solution, solved_for_m, drawn["solved"])
             values = [moment.light_db, views.quality.psnr_db, views.quality.ssim]
             values.append(seen_db("solved", solved_for_m=solved_for_m, eyes_m=account.eyes_m))
             if true_m is not None:

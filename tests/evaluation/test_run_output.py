@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import base64
 import errno
+import json
 import os
+import re
 import signal
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -44,13 +48,20 @@ def test_the_sheet_shows_the_moment_with_the_one_figure_to_quote(
     monkeypatch.setattr(contact_sheet, "_write", lambda sheet, text, **_: written.append(text))
     layers, wanted = pictures()
     look = displayed(layers, wanted, STACK, eyes_m=EYES, fov_deg=40)
-    moment = contact_sheet.Moment(pictures(1)[0], look, 33.25, ("This moment",))
+    solution, solved_for_m = pictures(2)[0], EYES + np.array([0.0, 0.01, 0.0])
+    lines = ("This moment",)
+    moment = contact_sheet.Moment(pictures(1)[0], look, 33.25, lines, solution, solved_for_m, pictures(2)[1])
     with RunOutput(tmp_path) as output:
         output.finish(SUMMARY | {"light_db": 31.0, "quality_frames": 2}, layers, moment)
     assert written[0] == "PSNR 33.2 dB at the eyes (pixels as squares, pupil 4 mm, tracking error 1 mm)"
     assert "This moment" in written
     assert any("light 31.0 dB, mean of 2 refreshes" in text for text in written)
     np.testing.assert_array_equal(read_image(tmp_path / "layer-0.png"), layers[0, ..., :3])  # the last frame's
+    page = (tmp_path / "viewer.html").read_text(encoding="utf-8")
+    scene, urls = (json.loads(re.findall(rf'id="{name}">(.*?)</script>', page)[0]) for name in ("scene", "layers"))
+    assert scene["eyes_m"] == solved_for_m.tolist()  # the page aligns by itself, from where it was solved for
+    decoded = cv2.imdecode(np.frombuffer(base64.b64decode(urls[1].partition(",")[2]), np.uint8), cv2.IMREAD_COLOR_RGB)
+    np.testing.assert_array_equal(decoded, solution[1, ..., :3])
 
 
 class FullDisk:
