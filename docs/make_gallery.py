@@ -48,28 +48,21 @@ HEAD = """\
 
 # Performance: light against run time
 
-    phasestack report --out report            # the page is there within a minute, and grows; stop it when you like
+    phasestack report --out report            # the page is there within a minute, and grows
     phasestack report --pairs DIR --focal     # on your own pairs too, and with focal parallax
     phasestack bench --out new.json           # the regression file
     phasestack bench compare old.json new.json
 
-**Quote light, at a tracking error of 1 mm** (`light_db`, `"1"`): a panel's pixel is an even box, and an eye makes of a
-pixel of its picture the mean intensity over that pixel and over its pupil, 4 mm wide. It is the PSNR of displayed
-layers, clipped and rounded to 8 bits, against that picture, expected over such errors, and
-[measured without bias](mathematics.md#light). The other figures:
-
-* *one ray* (`psnr_db`, `expected_db`): panels sampled bilinearly along one ray a pixel, as published evaluations do;
-  a solver can polish those rays without the light getting better.
-* *carried*: what eyes that are elsewhere by now see, against the picture that the layers were solved for.
-* *time*: of a whole solution, from two decoded pictures to 8-bit layers; p50 and p99. Every method runs in a process
-  of its own, whose peak is its memory. Times hold for one machine and hour: compare ratios.
-* The published network (`eyereal`), exported from its checkpoint, is compared as `--model FILE.onnx`.
+**Quote light, at a tracking error of 1 mm** (`light_db`, `"1"`), which [contracts](contracts.md#error) define, as they do
+*one ray* (`psnr_db`) and *carried*. *Time* is that of a whole solution, from two decoded pictures to 8-bit layers. Every
+method runs in a process of its own, whose peak is its memory. Times hold for one machine and hour: compare ratios.
+The published network (`eyereal`), exported from its checkpoint, is compared as `--model FILE.onnx`.
 
 `bench compare` divides times by a yardstick of the same run, does not compare them where the machine was busy, and
 exits with 1 where a model got slower by more than the noise, lost 0.1 dB or took 15% more memory.
 
-A case file is any `*.json` in DIR like this one; eyes are left, right, metres, frame `stack`; `fov` is horizontal;
-`off` (optional) is what should be seen `mm` beside an eye:
+A [case file](contracts.md#cases-pairs-calibration) is any `*.json` in DIR like this one; `off` (optional) is what should
+be seen `mm` beside an eye:
 
     {"panels": {"width_m": 0.5184, "height_m": 0.2916, "x_m": [-0.06, 0.0, 0.06]},
      "eyes": [[0.78, -0.03, 0.24], [0.78, 0.03, 0.24]], "images": ["left.png", "right.png"], "fov": 40.0,

@@ -20,8 +20,8 @@ phasestack is licensed under Apache-2.0. A running phasestack uses the packages 
 PyPI, unchanged, and brings its licence texts along in its `*.dist-info`. Made by `python docs/make_licences.py` from
 `requirements/runtime.lock` and the packages' own metadata.
 
-| package | version | licence | home |
-| --- | --- | --- | --- |
+| package | version | licence |
+| --- | --- | --- |
 """
 TAIL = """
 Wheels of binary packages bundle further libraries, each under the licence in that wheel's texts: among them
@@ -58,8 +58,8 @@ def licences(names: list[str]) -> list[dict[str, str]]:
 
 def page(packages: list[dict[str, str]]) -> str:
     """The whole page."""
-    rows = [[package[key].replace("|", "/") for key in ("Name", "Version", "License", "URL")] for package in packages]
-    return HEAD + "".join(f"| {' | '.join(row)} |\n" for row in rows) + TAIL
+    rows = [[package[key].replace("|", "/") for key in ("Name", "URL", "Version", "License")] for package in packages]
+    return HEAD + "".join(f"| [{name}]({home}) | {' | '.join(rest)} |\n" for name, home, *rest in rows) + TAIL
 
 
 if __name__ == "__main__":

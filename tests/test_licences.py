@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from pathlib import Path
 from typing import Any
 
@@ -23,19 +24,17 @@ def plain(name: str) -> str:
 
 
 def listed() -> dict[str, list[str]]:
-    """Version, licence and home by name, as the page has them."""
-    rows = [
-        row.strip("| ").split(" | ") for row in TEXT.partition("| --- |")[2].splitlines()[1:] if row.startswith("|")
-    ]
+    """Home, version and licence by name, as the page has them."""
+    rows = re.findall(r"^\| \[(.+)\]\((.+)\) \| (.+) \| (.+) \|$", TEXT, re.MULTILINE)
     return {plain(name): rest for name, *rest in rows}
 
 
 def test_the_page_lists_exactly_the_packages_of_the_runtime_s_lock() -> None:
     locked = {plain(name): version for name, version in script().locked().items()}
-    assert {name: rest[0] for name, rest in listed().items()} == locked
+    assert {name: version for name, (_, version, _) in listed().items()} == locked
 
 
 def test_every_licence_is_known_and_as_the_package_says() -> None:
-    assert all(licence not in {"", "UNKNOWN"} for _, licence, _ in listed().values())
+    assert all(licence not in {"", "UNKNOWN"} for *_, licence in listed().values())
     (told,) = script().licences(["numpy"])
-    assert listed()["numpy"][1:] == [told["License"], told["URL"]]
+    assert listed()["numpy"] == [told["URL"], told["Version"], told["License"]]
