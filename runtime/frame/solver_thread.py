@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import logging
 import math
 import queue
@@ -17,7 +16,7 @@ from runtime.errors import ContextLost, FatalError, PhasestackError, Stopped, Tr
 from runtime.frame.solver import SolverStep
 from runtime.frame.solver_host import COST_GAIN, FIRST_REQUEST, SolverHost, SolverParts, Task, taken_in, total_ns
 from runtime.records import SolveRequest
-from runtime.support.background import SOLVER_NICENESS, begin, patience_s, set_niceness
+from runtime.support.background import SOLVER_NICENESS, Left, ask_to_leave, begin, patience_s, set_niceness
 from runtime.support.memory import give_back
 from runtime.support.untrusted_input import LIMITS
 
@@ -33,10 +32,6 @@ ANSWER_STEP_MS = 500  # of how long no answer came, as it is reported
 ABANDONED_MAX = 4  # hung threads that are left behind; with more, the solver stays as it is
 
 
-class _Leave(BaseException):
-    """Raised in the middle of a step whose result nobody waits for any more."""
-
-
 class _Attempt:
     """One thread with one solver. Once abandoned, nothing that it makes counts any more."""
 
@@ -50,11 +45,9 @@ class _Attempt:
         self.thread: threading.Thread | None = None
 
     def leave(self) -> None:
-        """End a step where it is: one that draws holds Python's lock again and again."""
-        thread = self.thread
-        if thread is not None and thread.is_alive() and thread is not threading.current_thread() and self.error is None:
-            number = ctypes.c_ulong(thread.ident or 0)
-            ctypes.pythonapi.PyThreadState_SetAsyncExc(number, ctypes.py_object(_Leave))
+        """End a step between two drawings: one that draws holds Python's lock again and again."""
+        if self.thread is not None and self.thread is not threading.current_thread():
+            ask_to_leave(self.thread)
 
 
 class SolverThread(SolverHost):
@@ -162,7 +155,7 @@ class SolverThread(SolverHost):
             give_back()
 
     def _run(self, attempt: _Attempt) -> None:
-        with suppress(_Leave):
+        with suppress(Left):
             self._solve(attempt)
 
     def _solve(self, attempt: _Attempt) -> None:
@@ -176,7 +169,7 @@ class SolverThread(SolverHost):
                 parts.close()
             attempt.error, attempt.busy_since_ns = error, self._clock.now_ns()
             attempt.ready.set()
-            if attempt.number > 1 and not isinstance(error, PhasestackError | _Leave):
+            if attempt.number > 1 and not isinstance(error, PhasestackError | Left):
                 log.exception("solver: it could not be made anew")
             return
         self._publish(attempt, first)
@@ -191,7 +184,7 @@ class SolverThread(SolverHost):
         except (ContextLost, Stopped) as error:
             log.error("solver: %s", _line(error))  # a record that held the error would hold what it held
             attempt.error, attempt.busy_since_ns = error.with_traceback(None), self._clock.now_ns()
-        except _Leave:
+        except Left:
             raise
         except BaseException as error:  # what no step answers with: a bug of ours, or a library's
             log.exception("solver")

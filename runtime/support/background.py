@@ -25,6 +25,7 @@ _ends_by_s = math.inf
 
 
 _running: set[threading.Thread] = set()
+_leaving: set[threading.Thread] = set()
 
 
 def ends_by(at_s: float) -> None:
@@ -54,6 +55,24 @@ def begin(name: str, run: Callable[..., None], *given: Any) -> threading.Thread:
     except RuntimeError as error:
         raise TransientError(f"{name}: {error}") from error
     return thread
+
+
+class Left(BaseException):
+    """Raised on a thread that was asked to leave: nobody waits for what it makes."""
+
+
+def ask_to_leave(thread: threading.Thread) -> None:
+    """Have a thread end its work at the next `leave_if_asked`."""
+    _leaving.add(thread)
+
+
+def leave_if_asked() -> None:
+    """Between two pieces of work that hold Python's lock, such as drawings. Raises Left.
+
+    An exception raised in a thread from outside would reach it within moderngl's calls as well, which crash on it.
+    """
+    if _leaving and threading.current_thread() in _leaving:
+        raise Left
 
 
 class Job(Generic[T]):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import queue
 import threading
 from collections.abc import Callable, Iterator
@@ -17,9 +16,10 @@ from runtime.errors import ContextLost, FatalError, InputError
 from runtime.frame.solver import SolverStep
 from runtime.frame.solver_thread import ABANDON_S, ABANDONED_MAX, LATE_S, SolverThread
 from runtime.records import SolveRequest
+from runtime.report.pairs import Painter
 from runtime.support.memory import keep_freed_memory
 from runtime.support.untrusted_input import LIMITS
-from tests.frame.fakes import FakeParts, aside, solution
+from tests.frame.fakes import STACK, FakeParts, aside, solution
 from tests.waiting import eventually
 
 PATIENCE_S = 20.0  # of a test with another thread, on a busy machine
@@ -393,18 +393,20 @@ def test_where_no_thread_can_be_started_what_hangs_is_left_behind_later(
     assert shop.host.news().solution.solved_for_ns == 3
 
 
-def test_a_stop_ends_a_step_that_draws_with_python_s_lock(shop: Workshop) -> None:
+def test_a_stop_ends_a_step_between_two_drawings(shop: Workshop) -> None:
     drawn = 0
 
     def draws(request: SolveRequest) -> SolverStep:
         nonlocal drawn
-        while drawn < 300:
-            ctypes.PyDLL(None).usleep(20_000)  # as OpenGL's calls do: the lock is kept meanwhile
-            drawn += 1
+        with Painter("demo", STACK) as painter:
+            while drawn < 3000:
+                painter.image(aside(0.0)[0], width_px=160, height_px=90)
+                drawn += 1
         return solves(request)
 
     shop.behave = draws
     shop.post(1)
+    assert eventually(lambda: drawn > 0)
     shop.host.close(PATIENCE_S)
     assert [parts.closed for parts in shop.all] == [1]
-    assert drawn < 150
+    assert drawn < 3000
