@@ -78,7 +78,7 @@ def in_torch(module: nn.Module) -> Reference:
 def spectral_model(name: str) -> tuple[bytes, nn.Module]:
     """One of the shipped family, from its recipe."""
     recipe = read_recipe(name)
-    net = SpectralSolver(recipe.cell_px, recipe.iterations).eval()
+    net = SpectralSolver(recipe.cell_px).eval()
     return spectral_file(net, recipe), net
 
 

@@ -23,24 +23,21 @@ class SpectralSolver(nn.Module):
     separation on either panel, e the centre panel's own, and a frequency w along the eyes' line, the eyes' difference
     is D = 4i·(sin(ws)cos(we)·g + cos(ws)sin(we)·h). Eyes that err by c columns and r rows (standard deviations) move
     both panels' pictures in opposite directions: m = exp(-(c²w² + r²v²)/2) is what is left of a wave in the mean, and
-    what is not left is noise. The least squares of the expected error are closed-form for every frequency (`gains`);
-    the panels' range is kept by unrolled steps of ADMM with over-relaxation. Frequencies are those of the chain times
-    those of a block of `BLOCK_ROWS` rows and one cell's columns.
+    what is not left is noise. The least squares of the expected error are closed-form for every frequency (`gains`).
+    Frequencies are those of the chain times those of a block of `BLOCK_ROWS` rows and one cell's columns.
     """
 
-    def __init__(self, cell_px: int = 4, iterations: int = 4) -> None:
+    def __init__(self, cell_px: int = 4) -> None:
         super().__init__()
-        self.cell_px, self.iterations = cell_px, iterations
+        self.cell_px = cell_px
         columns, w = _fourier(2 * cell_px)
         rows, v = _cosines(BLOCK_ROWS)
         self.columns: Tensor
-        self.rows: Tensor
         self.rows_in: Tensor
         self.rows_out: Tensor
         self.w: Tensor
         self.v: Tensor
         self.register_buffer("columns", columns, persistent=False)
-        self.register_buffer("rows", rows, persistent=False)
         # Difference and sum along with the block's rows: of the eyes on the way in, of g and h on the way out.
         into = torch.cat([torch.cat([-rows, rows], dim=1), torch.cat([rows, rows], dim=1)]) / IN_SCALE
         back = rows.transpose(0, 1) * FULL
@@ -53,9 +50,6 @@ class SpectralSolver(nn.Module):
         self.log_floor = nn.Parameter(torch.log(torch.tensor([0.01, 0.2])))  # λ of g and of h
         self.log_rough = nn.Parameter(torch.log(torch.tensor([0.05, 0.2])))  # and how they grow with w²
         self.log_doubt = nn.Parameter(torch.zeros(2))  # how much the doubt along the line and across it weighs
-        # The first turn is nearly the unclipped solution, later ones hold on to the range; the last ends on it.
-        self.log_penalty = nn.Parameter(torch.linspace(math.log(0.02), math.log(0.2), iterations))
-        self.relaxation = nn.Parameter(torch.tensor([1.3] * (iterations - 1) + [1.0] * min(1, iterations)))
 
     def gains(self, spectrum: Tensor, doubt: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(patterns, cells + 1) each: numerator and denominator of g without h's share, and h's gain."""
@@ -105,58 +99,15 @@ class SpectralSolver(nn.Module):
         numerator, gain_h = numerator * (IN_SCALE / FULL), gain_h * (IN_SCALE / FULL)
         sides = torch.cat([_by_block_rows(left), _by_block_rows(right)]).to(torch.float32)
         bias = torch.full((BLOCK_ROWS,), BOX * FULL + added, device=left.device)
-        if self.iterations == 0:
-            both = self._waved(sides, self.rows_in, modes_in)
-            both = self._in_columns(both, torch.cat([numerator / denominator, gain_h]), channels)
-            both = both.reshape(2, BLOCK_ROWS, both.shape[1], -1)
-            both = torch.matmul(torch.stack([waves, shifted_waves])[:, None], both).reshape(1, 2 * BLOCK_ROWS, -1)
-            # As a convolution, a product with a matrix adds and clamps while its numbers are at hand.
-            rear, front = (functional.conv1d(both, rows[..., None], bias) for rows in self.rows_out)
-            return rear, front, _size(both)
-        difference, counterpart = (self._waved(sides, rows, modes_in) for rows in self.rows_in.chunk(2))
-        h = self._in_columns(counterpart, gain_h, channels)
-        h = torch.matmul(shifted_waves, h.reshape(BLOCK_ROWS, h.shape[1], -1)).reshape(1, BLOCK_ROWS, -1)
-        g, size = self._boxed(difference, numerator, denominator, waves, channels)
-        check = _size(h) + size
-        h = functional.conv1d(h, self.rows_out[1, :, BLOCK_ROWS:, None], bias)
-        return h - g, h + g, check
-
-    def _waved(self, sides: Tensor, rows: Tensor, modes_in: Tensor) -> Tensor:
-        """Waves (rows' waves, modes, blocks, 2K·C) of both eyes' (2 of the block's rows, cells, blocks, 2K·C)."""
-        count, cells = rows.shape[0], sides.shape[1]
-        x = torch.matmul(rows, sides.reshape(2 * BLOCK_ROWS, -1)).reshape(count, cells, -1)
-        return torch.matmul(modes_in, x).reshape(count, -1, *sides.shape[2:])
-
-    def _boxed(
-        self, difference: Tensor, numerator: Tensor, denominator: Tensor, waves: Tensor, channels: int
-    ) -> tuple[Tensor, Tensor]:
-        """Alternating directions: the quadratic in the modes, the panels' range in the pixels. g in codes, its check.
-
-        With z = clamp(v), a turn solves the quadratic near 2z - v for x, and makes v + relaxation·(x - z) the next v.
-        All but the clamp is linear and done in the modes; of the pixels z alone goes back there.
-        """
-        count, modes, _, row = difference.shape
-        same = _same(channels, like=self.columns)
-        to_waves = (self.columns.transpose(0, 1)[:, None, :, None] * same).reshape(row, row)
-        difference = torch.matmul(difference, to_waves)
-        v = z = difference  # used from the second turn on: the first starts from nothing, at the regularised solution
-        for k in range(self.iterations):
-            penalty, relaxation, last = torch.exp(self.log_penalty[k]), self.relaxation[k], k == self.iterations - 1
-            gain = relaxation / (denominator + penalty)
-            turned = difference * _along_rows(gain * numerator, channels)
-            if k:
-                turned = turned + v * _along_rows(1 - penalty * gain, channels)
-                turned = turned + z * _along_rows(2 * penalty * gain - relaxation, channels)
-            v = turned
-            along = torch.matmul(v, to_waves.transpose(0, 1)).reshape(count, modes, -1)
-            along = torch.matmul(waves, along)
-            unit = FULL if last else 1
-            x = torch.matmul(self.rows.transpose(0, 1) * unit, along.reshape(count, -1))
-            x = torch.clamp(x, -BOX * unit, BOX * unit)
-            if not last:
-                z = torch.matmul(self.rows, x).reshape(count, modes, -1)
-                z = torch.matmul(torch.matmul(waves.transpose(0, 1), z).reshape(difference.shape), to_waves)
-        return x, _size(along)  # what isn't finite stays in v from turn to turn, whatever the clamp makes of it
+        rows, cells = 2 * BLOCK_ROWS, sides.shape[1]
+        both = torch.matmul(self.rows_in, sides.reshape(rows, -1)).reshape(rows, cells, -1)
+        both = torch.matmul(modes_in, both).reshape(rows, -1, *sides.shape[2:])
+        both = self._in_columns(both, torch.cat([numerator / denominator, gain_h]), channels)
+        both = both.reshape(2, BLOCK_ROWS, both.shape[1], -1)
+        both = torch.matmul(torch.stack([waves, shifted_waves])[:, None], both).reshape(1, rows, -1)
+        # As a convolution, a product with a matrix adds and clamps while its numbers are at hand.
+        rear, front = (functional.conv1d(both, out[..., None], bias) for out in self.rows_out)
+        return rear, front, _size(both)
 
     def _in_columns(self, x: Tensor, gains: Tensor, channels: int) -> Tensor:
         """x (n rows' waves, modes, blocks, 2K·C), each of the columns' waves in it times its gain (n·2K, modes).
@@ -175,12 +126,6 @@ def _same(channels: int, *, like: Tensor) -> Tensor:
     """(C, 1, C): 1 where both are one channel, else 0."""
     one = torch.arange(channels, device=like.device)
     return (one[:, None, None] == one).to(torch.float32)
-
-
-def _along_rows(gains: Tensor, channels: int) -> Tensor:
-    """(block's rows' waves · 2K, modes) to (block's rows' waves, modes, 1, 2K·C): one for every channel."""
-    gains = gains.reshape(BLOCK_ROWS, -1, gains.shape[1]).transpose(1, 2)[..., None]
-    return gains.expand(-1, -1, -1, channels).reshape(BLOCK_ROWS, gains.shape[1], 1, -1)
 
 
 def _by_block_rows(image: Tensor) -> Tensor:

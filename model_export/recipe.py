@@ -24,7 +24,6 @@ class Recipe(Section):
 
     name: str
     arch: Literal["spectral"] = "spectral"
-    iterations: Annotated[int, Field(ge=0, le=32)] = Field(4, description="of the box, within the network")
     cell_px: Annotated[int, Field(ge=1, le=64)] = 4
     reduction: Literal[1, 2, 4] = 2
     steps: Steps = ()
