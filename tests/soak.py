@@ -1,6 +1,8 @@
 """The daemon for a while: delays in its threads, four clients that change it, two losses of the sensor a minute.
 
     python -m tests.soak --seconds 1200
+    python -m tests.soak --seconds 3600 --windows    # on an X server with OpenGL's solver; cables are pulled, contexts
+                                                     # lost, and solvers fail
 
 Fails where it ends otherwise than tracking, where a request gets no answer, and where memory, files or threads grow.
 """
@@ -31,9 +33,13 @@ from runtime.daemon.build import RunOptions
 from runtime.daemon.client import ask
 from runtime.errors import SensorLost
 from runtime.frame import solver_thread
+from runtime.panels import window
 from runtime.sensor.replay import ReplayDriver
+from tests.panels.xserver import HEIGHT_PX, WIDTH_PX, XServer
 
 LOST_EVERY_S = 30.0
+HARM_EVERY_S = 40.0  # a cable, or the panels' contexts
+FAILING = 0.002  # of the solver's steps
 WARM_UP = 0.4  # of the time
 REFUSED = ("skipped: a newer change came", "there is no next one", "nobody's", "the loop did not answer", "made anew")
 DELAYS = (
@@ -47,6 +53,11 @@ SETTINGS: dict[str, Any] = {
     "model": {"name": "fast", "threads": 1, "backend": "cpu"},
     "output": {"kind": "offscreen"},
 }
+ON_WINDOWS: dict[str, Any] = {
+    "stack": {"width_px": WIDTH_PX, "height_px": HEIGHT_PX},
+    "model": {"name": "fast", "threads": 1, "backend": "gl"},
+    "output": {"kind": "windows", "panels": [{"connector": f"DUMMY{index}"} for index in range(3)]},
+}
 
 
 class Soak:
@@ -54,7 +65,8 @@ class Soak:
 
     def __init__(self, folder: Path, seconds: float) -> None:
         self.socket, self._end_s, self._warm_s = folder / "s.sock", time.monotonic() + seconds, seconds * WARM_UP
-        self._lost_s, self.lost = 0.0, 0
+        self._lost_s, self.lost, self.failures, self.harms = 0.0, 0, 0, 0
+        self._reset = False
         self.answers: Counter[str] = Counter()
         self.usage: list[tuple[int, int, int]] = []  # MiB, files, threads
         self.last: dict[str, Any] = {}
@@ -75,6 +87,33 @@ class Soak:
             return read(*given, **named)
 
         return arrived
+
+    def failing(self, step: Callable[..., Any]) -> Callable[..., Any]:
+        def fails(*given: Any) -> Any:
+            if random.random() < FAILING and time.monotonic() < self._end_s - 60.0:
+                self.failures += 1
+                raise RuntimeError("soaked")
+            return step(*given)
+
+        return fails
+
+    def reset(self, status: Callable[[], str]) -> Callable[[], str]:
+        def lost() -> str:
+            self._reset, now = False, self._reset
+            return "was reset (soaked)" if now else status()
+
+        return lost
+
+    def harm(self, server: XServer) -> None:
+        """Pull a cable for a while, or have the contexts lost, in turn."""
+        while time.monotonic() < self._end_s - 60.0:
+            time.sleep(HARM_EVERY_S / 2)
+            index = random.randrange(3)
+            server.unplug(index)
+            time.sleep(random.uniform(0.1, 3.0))
+            server.plug(index)
+            time.sleep(HARM_EVERY_S / 2)
+            self._reset, self.harms = True, self.harms + 1
 
     def client(self, number: int) -> None:
         """Asks for anything, again and again."""
@@ -111,7 +150,7 @@ class Soak:
         ] += 1
 
 
-def soak(seconds: float, *, growth_mib: int) -> None:
+def soak(seconds: float, *, growth_mib: int, windows: bool = False) -> None:
     """Raises AssertionError where something piles up, is lost or gets no answer."""
     with ExitStack() as cleanup:
         folder = Path(cleanup.enter_context(tempfile.TemporaryDirectory(prefix="ps-")))
@@ -120,19 +159,28 @@ def soak(seconds: float, *, growth_mib: int) -> None:
         for owner, name, share, most_s in DELAYS:
             cleanup.enter_context(patch.object(owner, name, run.delayed(getattr(owner, name), share, most_s)))
         cleanup.enter_context(patch.object(ReplayDriver, "read_arrived", run.losing(ReplayDriver.read_arrived)))
-        cleanup.enter_context(patch.multiple(solver_thread, LATE_S=0.3, ABANDON_S=1.0))
+        cleanup.enter_context(patch.multiple(solver_thread, LATE_S=0.3, ABANDON_S=5.0 if windows else 1.0))
         service = {"socket": str(run.socket), "blackbox_minutes": 0.2}
-        settings = Settings.model_validate({**SETTINGS, "service": service})
-        beside = [threading.Timer(8.0, run.client, (number,)) for number in range(4)] + [
-            threading.Thread(target=run.watch)
-        ]
+        settings = Settings.model_validate({**SETTINGS, **(ON_WINDOWS if windows else {}), "service": service})
+        beside = [threading.Timer(8.0, run.client, (number,)) for number in range(4)]
+        beside.append(threading.Thread(target=run.watch))
+        if windows:
+            server = XServer(folder)
+            cleanup.callback(server.stop)
+            cleanup.enter_context(patch.dict(os.environ, DISPLAY=server.name))
+            parts = solver_parts.RunningSolver
+            cleanup.enter_context(patch.object(parts, "step", run.failing(parts.step)))
+            cleanup.enter_context(patch.object(window, "_reset_status", run.reset(window._reset_status)))
+            beside.append(threading.Timer(8.0, run.harm, (server,)))
         for thread in beside:
             thread.daemon = True
             thread.start()
         print(supervise.run_daemon(lambda: settings, RunOptions()))
-    print(run.last["state"], run.lost, "losses", run.last["faults"], dict(run.answers))
+    print(run.last["state"], run.lost, "losses", run.failures, "failures", run.harms, "cables and resets")
+    print(run.last["faults"], dict(run.answers))
     assert run.last["state"] in ("tracking", "holding", "flat") and set(run.answers) <= {"ok", *REFUSED}
-    assert run.last["dropped"] == 0 and run.last["turn_age_s"] < 1.0
+    assert windows or run.last["dropped"] == 0
+    assert run.last["turn_age_s"] < 1.0
     (first_mib, files, threads), (last_mib, files_then, threads_then) = run.usage[0], run.usage[-1]
     assert last_mib - first_mib <= growth_mib and files_then <= files + 4 and threads_then <= threads + 4, run.usage
 
@@ -140,4 +188,6 @@ def soak(seconds: float, *, growth_mib: int) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=1200.0)
-    soak(parser.parse_args().seconds, growth_mib=64)
+    parser.add_argument("--windows", action="store_true")
+    given = parser.parse_args()
+    soak(given.seconds, growth_mib=64, windows=given.windows)
