@@ -6,21 +6,27 @@ import json
 import re
 from dataclasses import fields
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
+import numpy as np
+import onnx
 import pytest
 import typer
+from onnx import TensorProto, helper, numpy_helper
 
 from calib.solution import Method
 from runtime.commands.app import app
 from runtime.config import Settings, with_options
 from runtime.daemon.build import RunOptions
 from runtime.daemon.drive import drive
-from runtime.model.contract import Contract
+from runtime.model.contract import METADATA_KEY, Contract
 from runtime.report.frontier import MethodResult
+from runtime.report.pairs import read_pairs
 from runtime.report.stability.trial import Case
+from runtime.support.artifacts import write_png
+from tests.eyes.scene import eileen
 from tests.test_cli import pair_in, solve_arguments
-from tests.test_docs import walk
+from tests.test_docs import PAGES, blocks_of, walk
 
 PAGE = (Path(__file__).parents[1] / "docs" / "contracts.md").read_text(encoding="utf-8")
 
@@ -53,7 +59,7 @@ def test_a_run_leaves_every_file_and_every_field(left: Path) -> None:
     for name in re.findall(r"`([\w-]+\.(?:png|jsonl|json))`", section):
         assert list(left.rglob(name.replace("-K", "-0"))), name
     lines = [json.loads(line) for line in (left / "frames.jsonl").read_text().splitlines()]
-    assert all(fields_of("field of frames.jsonl") <= line.keys() for line in lines)
+    assert fields_of("field of frames.jsonl") == set().union(*lines) == lines[-1].keys()
     summary = json.loads((left / "summary.json").read_text())
     assert fields_of("field of summary.json") <= summary.keys()
     assert summary["plan"] and all({"what", "why", "saves_ms", "costs_db"} <= item.keys() for item in summary["plan"])
@@ -81,8 +87,43 @@ def test_reports_have_every_field() -> None:
     assert fields_of("field of a case in stability.json") <= {field.name for field in fields(Case)}
 
 
-def test_a_model_s_contract_has_every_field() -> None:
-    assert fields_of("field of the contract") <= Contract.model_fields.keys()
+def shown(first: str) -> dict[str, Any]:
+    """The one JSON object that a page shows and that begins with this field."""
+    found = [json.loads(block) for page in PAGES for block in blocks_of(page) if block.startswith("{")]
+    (one,) = (example for example in found if next(iter(example)) == first)
+    assert isinstance(one, dict) and len(found) == 3  # what pages show: each has its test below
+    return one
+
+
+def test_the_contract_that_is_shown_is_taken_with_its_model(tmp_path: Path) -> None:
+    contract = shown("version")
+    assert contract.keys() == fields_of("field of the contract") <= Contract.model_fields.keys()
+    weights = numpy_helper.from_array(np.full((9, 6, 1, 1), 0.1, np.float32), "weights")
+    ports = [helper.make_tensor_value_info(contract[way][0]["name"], TensorProto.FLOAT, [1, channels, 36, 64])
+             for way, channels in (("inputs", 6), ("outputs", 9))]  # fmt: skip
+    node = helper.make_node("Conv", [ports[0].name, "weights"], [ports[1].name])
+    graph = helper.make_graph([node], "mine", ports[:1], ports[1:], [weights])
+    model = helper.make_model(graph, ir_version=10, opset_imports=[helper.make_opsetid("", 17)])
+    helper.set_model_props(model, {METADATA_KEY: json.dumps(contract)})
+    onnx.save(model, str(tmp_path / "mine.onnx"))
+    assert not app(["validate", str(tmp_path / "mine.onnx")], standalone_mode=False)
+
+
+def test_the_case_that_is_shown_is_read(tmp_path: Path) -> None:
+    case = shown("panels")
+    for name in (*case["images"], *(view["image"] for view in case["off"])):
+        write_png(tmp_path / name, np.zeros((18, 32, 3), np.uint8))
+    (tmp_path / "case.json").write_text(json.dumps(case))
+    assert case.keys() == {"panels", "eyes", "images", "fov", "off"} and len(read_pairs(tmp_path)) == 1
+
+
+def test_eyes_answers_with_what_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_png(tmp_path / "a.png", eileen().picture)
+    app(["eyes", str(tmp_path / "a.png"), "--json"], standalone_mode=False)
+    (found,) = json.loads(capsys.readouterr().out)["pictures"]
+    (entry,) = shown("pictures")["pictures"]
+    assert {name: type(found[name]) for name in entry} == {name: type(value) for name, value in entry.items()}
+    assert np.shape(found["eyes_px"]) == np.shape(entry["eyes_px"]) and found["eyes_px"][0] > found["eyes_px"][1]
 
 
 def test_every_method_and_model_is_named() -> None:
