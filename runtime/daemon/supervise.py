@@ -29,6 +29,7 @@ from runtime.frame.presenter import Presenter
 from runtime.records import RefreshAccount, State
 from runtime.support import logs
 from runtime.support.folders import state_folder
+from runtime.support.memory import keep_freed_memory
 
 log = logging.getLogger("phasestack.daemon")
 
@@ -299,6 +300,7 @@ def run_daemon(read_settings: Callable[[], Settings], options: RunOptions) -> di
 
     Raises FatalError where the configuration or a file is wrong, TransientError where starting again may help.
     """
+    keep_freed_memory()  # before GL, the server and whatever else begins threads
     settings = read_settings()
     service, clock = settings.service, MonotonicClock()
     logs.configure()
