@@ -68,7 +68,7 @@ def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None 
     from runtime.model.network import PictureProposal
     from runtime.model.proposal import ChainProposal
     from runtime.model.session import ModelSession
-    from runtime.model.solver import Solver
+    from runtime.model.solver import StepPredictor
 
     if stack.count > MAX_PANELS:
         raise InputError("model", "name", f"{name} serves up to {MAX_PANELS} panels; use the model sart")
@@ -76,12 +76,14 @@ def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None 
     contract = session.contract
     if name in SHIPPED and not (stack.count == 3 and stack.is_evenly_spaced):
         title = f"{name} (without its network: needs three even panels)"
-        return Solver(stack, None, steps_from_even(len(contract.steps)), name=title, threads=settings.threads)
+        return StepPredictor(stack, None, steps_from_even(len(contract.steps)), name=title, threads=settings.threads)
     if contract.panels != stack.count:
         raise InputError(path, "contract.panels", f"{contract.panels}, but the stack has {stack.count}")
     if contract.input_frame == "chain":
         if not stack.is_evenly_spaced:
             raise InputError(path, "contract.panels", "needs evenly spaced panels; use the model sart")
-        return Solver(stack, ChainProposal(session), contract.steps, name=contract.name, threads=settings.threads)
+        return StepPredictor(
+            stack, ChainProposal(session), contract.steps, name=contract.name, threads=settings.threads
+        )
     pictures = PictureProposal(session, stack, source=path)
-    return Solver(stack, pictures, contract.steps, name=contract.name, threads=settings.threads)
+    return StepPredictor(stack, pictures, contract.steps, name=contract.name, threads=settings.threads)

@@ -26,7 +26,7 @@ from runtime.optics.tilt import coarse_layer_from_seen
 from runtime.records import F32, F64, I16, U8
 from runtime.support.threads import at_once
 
-HALF_IPD_M = 0.031
+HALF_IPD_M = 0.031  # of eyes that nobody told
 EDGE_SHARE = 1 / 40  # of a picture: so far beside it at most its edge goes on
 UNSEEN = -1  # what pictures ask for is positive
 SHARPENED = 0.2  # of the difference, on either side: what two interpolations blur

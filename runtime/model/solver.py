@@ -22,7 +22,7 @@ from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64
 
 
-class Solver(Predictor):
+class StepPredictor(Predictor):
     """Steps from a network's proposal, or from even panels: any stack, any pose."""
 
     def __init__(
@@ -55,10 +55,10 @@ class Solver(Predictor):
     def reads_textures_of(self, context: object) -> bool:
         return context is not None and self._backend.context is context
 
-    def on_panels(self, stack: PanelStack) -> Solver | None:
+    def on_panels(self, stack: PanelStack) -> StepPredictor | None:
         if isinstance(self._proposal, PictureProposal) or stack.count != 3:
             return None
-        return Solver(stack, self._proposal, self._steps, name=self.name, threads=self._threads)
+        return StepPredictor(stack, self._proposal, self._steps, name=self.name, threads=self._threads)
 
     def set_backend(self, backend: SolverBackend) -> None:
         self.close()

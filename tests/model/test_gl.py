@@ -18,7 +18,7 @@ from runtime.model.gl.backend import GlBackend
 from runtime.model.gl.state import GlState
 from runtime.model.job import Job, Part
 from runtime.model.predictor import SHIPPED, Predictor, load_predictor
-from runtime.model.solver import Solver
+from runtime.model.solver import StepPredictor
 from runtime.model.still import solve_still
 from runtime.model.trim import Savings, Scene, trim
 from runtime.optics.carried import light_psnrs_db
@@ -64,10 +64,10 @@ def gl(made: tuple[Any, GlBackend]) -> Iterator[GlBackend]:
         yield backend
 
 
-def both(name: str, stack: PanelStack, gl: GlBackend) -> tuple[Solver, Solver]:
+def both(name: str, stack: PanelStack, gl: GlBackend) -> tuple[StepPredictor, StepPredictor]:
     """The model on the processor, and by OpenGL."""
     cpu, opengl = (load_predictor(name, stack, ModelSettings(threads=1)) for _ in range(2))
-    assert isinstance(cpu, Solver) and isinstance(opengl, Solver)
+    assert isinstance(cpu, StepPredictor) and isinstance(opengl, StepPredictor)
     opengl.set_backend(gl)
     return cpu, opengl
 
@@ -201,7 +201,7 @@ def test_a_panel_wider_than_the_driver_allows_is_refused(gl: GlBackend) -> None:
     widest = int(gl.passes.context.info["GL_MAX_TEXTURE_SIZE"])
     stack = replace(STACK, width_px=widest + 8)
     predictor = load_predictor("fast", STACK)
-    assert isinstance(predictor, Solver)
+    assert isinstance(predictor, StepPredictor)
     with pytest.raises(InputError, match=rf"stack: width_px: {widest + 8}: this OpenGL driver allows {widest}"):
         choose("gl", predictor.on_panels(stack), lambda: gl.passes.context)
 

@@ -20,7 +20,7 @@ from runtime.model.cpu import CpuState
 from runtime.model.geometry import geometry_of
 from runtime.model.job import Job, Own
 from runtime.model.predictor import load_predictor, steps_from_even
-from runtime.model.solver import Solver
+from runtime.model.solver import StepPredictor
 from runtime.model.still import solve_still
 from runtime.model.targets import FULL, SUBCODE, rest_of, target_table
 from runtime.optics.carried import light_psnrs_db
@@ -185,7 +185,7 @@ def test_every_step_makes_light_better(stack: PanelStack, sigma_mm: float) -> No
     pair, found_db = eyes(0.6, 0.05, 0.1), []
     pictures = [card_scene(eye) for eye in pair]
     solver = load_predictor("best", stack, ModelSettings(threads=2))
-    assert isinstance(solver, Solver)
+    assert isinstance(solver, StepPredictor)
     steps = solver._steps
     for count in (0, 1, 3, len(steps)):
         solver._steps = steps[:count]
@@ -200,7 +200,7 @@ def test_every_step_makes_light_better(stack: PanelStack, sigma_mm: float) -> No
 def test_panels_that_begin_even_show_both_eyes_a_picture(stack: str) -> None:
     pair = eyes(0.6)
     pictures = [card_scene(eye) for eye in pair]
-    solver = Solver(STACKS[stack], None, steps_from_even(3), name="even")
+    solver = StepPredictor(STACKS[stack], None, steps_from_even(3), name="even")
     how: Any = {"eyes_m": pair, "fov_deg": FOV_DEG}
     layers = solve_still(*pictures, **how, predictor=solver, eye_sigma_mm=0.0).layers
     assert light_psnrs_db(layers, pictures, STACKS[stack], **how, sigmas_mm=[0.0])[0.0] > 22
