@@ -22,6 +22,8 @@ root_doc = "docs/index"
 html_theme = "furo"
 html_show_sphinx = html_show_copyright = False
 html_copy_source = False
+html_static_path = ["static"]
+html_css_files = ["site.css"]
 templates_path: list[str] = []
 myst_heading_anchors = 3
 myst_enable_extensions = ["deflist"]
