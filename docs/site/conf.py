@@ -29,6 +29,9 @@ myst_heading_anchors = 3
 myst_enable_extensions = ["deflist"]
 # Code without a language is a shell's or Python's: it is shown as it stands.
 highlight_language = "none"
+# Names in docstrings stand in single backticks; `--out` keeps both dashes.
+default_role = "code"
+smartquotes = False
 suppress_warnings = ["myst.xref_ambiguous"]
 autodoc_typehints = "description"
 autodoc_member_order = "bysource"
