@@ -10,7 +10,7 @@ from pathlib import Path
 
 PART_CHARACTERS_MAX = 300  # of a message: an untrusted name must not fill the screen, nor forge a line of the log
 PROBLEM_CHARACTERS_MAX = 1500  # of what is wrong with a file, all its fields together
-_USER_OF_ADDRESS = re.compile(r"""://[^/\s'"]*@""")
+_USER_OF_ADDRESS = re.compile(r"""(:/{1,2})[^/\s'"]*@""")  # a path's normal form has one slash
 # The system has none left, or its hardware failed this once.
 PASSING = frozenset(
     (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.ENOBUFS, errno.EINTR)
@@ -20,10 +20,10 @@ PASSING = frozenset(
 def without_secrets(text: str) -> str:
     """Text without the name and password of addresses (before an `@`).
 
-    >>> without_secrets("rtsp://user:a@b@host/door")
-    'rtsp://host/door'
+    >>> without_secrets("rtsp://user:a@b@host/door"), without_secrets("/etc/rtsp:/user:a@host/door")
+    ('rtsp://host/door', '/etc/rtsp:/host/door')
     """
-    return _USER_OF_ADDRESS.sub("://", text) if "://" in text else text
+    return _USER_OF_ADDRESS.sub(r"\1", text) if ":/" in text else text
 
 
 def one_line(text: str, *, most: int = PART_CHARACTERS_MAX) -> str:

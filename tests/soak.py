@@ -35,6 +35,7 @@ from runtime.errors import SensorLost
 from runtime.frame import solver_thread
 from runtime.panels import window
 from runtime.sensor.replay import ReplayDriver
+from runtime.support.memory import keep_freed_memory
 from tests.panels.xserver import HEIGHT_PX, WIDTH_PX, XServer
 
 LOST_EVERY_S = 30.0
@@ -152,6 +153,7 @@ class Soak:
 
 def soak(seconds: float, *, growth_mib: int, windows: bool = False) -> None:
     """Raises AssertionError where something piles up, is lost or gets no answer."""
+    keep_freed_memory()  # as the daemon does first of all, but clients are threads of its process here
     with ExitStack() as cleanup:
         folder = Path(cleanup.enter_context(tempfile.TemporaryDirectory(prefix="ps-")))
         run = Soak(folder, seconds)

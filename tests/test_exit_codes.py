@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -59,6 +60,15 @@ def test_without_a_home_the_file_is_in_the_temporary_folder(tmp_path: Path, monk
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     answer = broken("1 / 0", home)
     assert answer.returncode == 70 and f"{tmp_path}/phasestack-error-" in answer.stderr
+
+
+def test_without_home_and_user_it_works(tmp_path: Path) -> None:
+    """A container's user, whom no passwd knows, ended with 70."""
+    nobody = "import os, pwd; os.environ.pop('HOME')\ndef unknown(uid): raise KeyError(uid)\npwd.getpwuid = unknown\n"
+    done = run("demo", "--frames", "2", "--out", str(tmp_path / "out"), code=nobody + MAIN, home=tmp_path, cwd=tmp_path)
+    assert done.returncode == 0 and (tmp_path / "out" / "layer-0.png").exists(), done.stderr
+    told = f"{nobody}from runtime.support.folders import state_folder; print(state_folder())"
+    assert run(code=told, home=tmp_path).stdout == f"{tempfile.gettempdir()}/phasestack-state-{os.geteuid()}\n"
 
 
 def test_an_error_in_a_thread_is_told_so_too(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from runtime.clock import NS_PER_S
+from runtime.errors import without_secrets
 from runtime.records import EyesLabel, State
 
 Part = Literal["sensor", "content", "model", "panel"]
@@ -72,7 +73,8 @@ class StateMachine:
         if self.state is State.STOPPING:
             return False
         before = self.name
-        self.state, self.reason = judge(conditions)
+        self.state, reason = judge(conditions)
+        self.reason = without_secrets(reason)  # a camera's address may be in it, and this goes everywhere
         self.missing = tuple(part for part in PARTS if part in conditions.missing)
         return self.name != before
 

@@ -20,6 +20,7 @@ from runtime.support.film import open_film
 WAITED_NS = 3 * NS_PER_MS  # a picture that comes sooner lay in the driver's queue, and a newer one may
 QUEUE_MAX = 8  # pictures that one read takes out of the driver's queue at most
 STAMP_AGE_NS = NS_PER_S  # a picture's stamp that is older, or in the future, is none
+STREAMS = ("rtsp", "rtsps", "http", "https")  # what else FFmpeg takes for an address may listen, or open other files
 
 
 class UsbCameraDriver(Sensor):
@@ -29,13 +30,16 @@ class UsbCameraDriver(Sensor):
     capabilities = Capabilities(colour=True)
 
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
-        """settings.source: empty or `demo`: the first camera; a number, a device, or a stream's address.
+        """settings.source: empty or `demo`: the first camera; a number, a device, or an address of `STREAMS`.
 
-        Raises InputError without a field of view, which no webcam reports.
+        Raises InputError for another address, or without a field of view, which no webcam reports.
         """
         if not settings.fov_deg:
             raise InputError("sensor", "fov_deg", "is needed by usb-camera: the picture's horizontal angle, degrees")
         source = settings.source if settings.source != "demo" else ""
+        kind, _, rest = source.partition("://")
+        if rest and kind not in STREAMS:
+            raise InputError("sensor", "source", f"{kind}:// is no camera's address: {', '.join(STREAMS)} are")
         self._source = f"/dev/video{source or 0}" if re.fullmatch(r"\d*", source) else source
         self._fov, self._clock = radians(settings.fov_deg), clock
         self._capture: Any = None

@@ -32,6 +32,8 @@ def test_what_is_missing_is_named_with_its_reason() -> None:
     assert machine.update(well(missing={"panel": "DUMMY1 was disconnected", "sensor": "unplugged"}), now_ns=1)
     assert machine.name == "degraded: sensor, panel"
     assert machine.reason == "sensor: unplugged; panel: DUMMY1 was disconnected"
+    machine.update(well(missing={"sensor": "rtsp://operator:pass@camera/1: cannot be opened"}), now_ns=2)
+    assert machine.reason == "sensor: rtsp://camera/1: cannot be opened"  # black box and service's status have it too
 
 
 def test_a_transition_is_told_once_and_again_when_what_is_missing_changes() -> None:
