@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
-import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,11 +15,12 @@ from runtime.errors import InputError, MissingPart, ModelFailure
 from runtime.model.contract import Contract, parse_contract
 from runtime.model.onnx_bytes import digest, has_external_data
 from runtime.support import untrusted_input
+from runtime.support.child import in_child
 from runtime.support.onnx_runtime import onnxruntime
 from runtime.support.untrusted_input import LIMITS
 
 FILE_BYTES_MAX = 1 << 30
-MEMORY_MAX = 1 << 30  # addresses, of a process that loads a file of nobody knows whom
+MEMORY_MAX = 1 << 30  # of a process that loads a file of nobody knows whom
 
 log = logging.getLogger("phasestack.model")
 
@@ -59,13 +57,11 @@ class ModelSession:
         data = _checked(path, sha256)
         if not sha256:
             _try_out(path, data)
+        self._session = _opened(path, data, options, name)
         try:
-            self._session = ort.InferenceSession(data, options, providers=[name])
             metadata = self._session.get_modelmeta().custom_metadata_map
         except UnicodeDecodeError:
             raise InputError(path, "metadata", "is no UTF-8 text") from None
-        except Exception as error:  # onnxruntime raises its own hierarchy of undocumented exceptions
-            raise InputError(path, "", f"is no model that onnxruntime can load ({_first_line(error)})") from None
         if name not in self._session.get_providers():  # onnxruntime goes on without, and says so to stderr alone
             raise MissingPart(f"model.provider: {provider} is installed and does not start here: {package}, its driver")
         self.provider: str = provider
@@ -157,41 +153,32 @@ def _checked(path: Path, sha256: str) -> bytes:
     return data
 
 
-TRY_OUT = """
-import resource, sys
-data = sys.stdin.buffer.read()
-most = int(sys.argv[1]) + 8 * len(data)
-resource.setrlimit(resource.RLIMIT_AS, (most, most))
-import onnxruntime
-options = onnxruntime.SessionOptions()
-options.intra_op_num_threads, options.log_severity_level = 1, 4
-try:
-    onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-except Exception as error:
-    print(str(error).strip()[:500] or type(error).__name__)
-    sys.exit(1)
-"""
+def _opened(path: Path, data: bytes, options: Any, provider: str) -> Any:
+    try:
+        return onnxruntime().InferenceSession(data, options, providers=[provider])
+    except Exception as error:  # onnxruntime raises its own hierarchy of undocumented exceptions
+        if "bad_alloc" in str(error):
+            raise MemoryError from error
+        raise InputError(path, "", f"is no model that onnxruntime can load ({_first_line(error)})") from None
+
+
 _tried_out: set[bytes] = set()  # digests of files that onnxruntime loads within its limits
 
 
 def _try_out(path: Path, data: bytes) -> None:
-    """Load it in a process that may take so much memory and time, and that is killed: constants of a few bytes are
-    worked out, when a model is loaded, to as many as there is memory for. Raises InputError."""
+    """Load it in a process that may take so much memory and time: constants of a few bytes are worked out, when a model
+    is loaded, to as many as there is memory for. Raises InputError."""
     found = hashlib.sha256(data).digest()
-    if found in _tried_out:
-        return
-    command = [sys.executable, "-P", "-c", TRY_OUT, str(MEMORY_MAX)]
-    environment = os.environ | {"ORT_DISABLE_TELEMETRY": "1"}
-    try:
-        done = subprocess.run(command, input=data, capture_output=True, timeout=LIMITS.load_s, env=environment)
-    except subprocess.TimeoutExpired:
-        raise InputError(path, "", f"takes longer to load than {LIMITS.load_s:g} s") from None
-    if done.returncode:
-        told = (done.stdout.decode(errors="replace").strip().splitlines() or [""])[0][:200]
-        if not told or "bad_alloc" in told:
-            told = f"its constants take more than {MEMORY_MAX >> 20} MiB, or it ends the process"
-        raise InputError(path, "", f"is no model that onnxruntime can load ({told})")
-    _tried_out.add(found)
+    if found not in _tried_out:
+        most = MEMORY_MAX + 8 * len(data)
+        in_child(_tried_here, path, data, source=path, seconds=LIMITS.load_s, memory_bytes=most)
+        _tried_out.add(found)
+
+
+def _tried_here(path: Path, data: bytes) -> None:
+    options = onnxruntime().SessionOptions()
+    options.intra_op_num_threads, options.log_severity_level = 1, 4
+    _opened(path, data, options, "CPUExecutionProvider")
 
 
 def _named(ranks: Mapping[str, int]) -> str:

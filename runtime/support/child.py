@@ -6,12 +6,14 @@ that both processes have mapped; progress, warnings and refusals are as if the w
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import logging
 import mmap
 import os
 import pickle
 import resource
+import signal
 import subprocess
 import sys
 import time
@@ -30,17 +32,21 @@ from runtime.support.untrusted_input import LIMITS, MIB
 MEMORY_MAX = 4 << 30  # of data; what a scene at every limit takes
 LOOK_S = 0.05  # between two looks at whether it is still wanted
 ALIGNED = 64  # bytes, of an array's place
+PR_SET_PDEATHSIG = 1  # prctl.h of Linux
 SMALL = 1 << 16  # bytes of an array that is copied
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1")
 T = TypeVar("T")
 
 
-def in_child(work: Callable[..., T], *given: Any, source: str | Path, seconds: float) -> T:
-    """What `work`, a function of a module, answers to `given`.
+def in_child(
+    work: Callable[..., T], *given: Any, source: str | Path, seconds: float, memory_bytes: int | None = None
+) -> T:
+    """What `work`, a function of a module, answers to `given`. memory_bytes: that it may take; None: `MEMORY_MAX`.
 
     It is ended where the progress's listener raises. Raises what `work` raises on purpose; InputError, naming `source`,
     where it is over a limit, fails or ends the process; TransientError where no process can be started.
     """
+    most = memory_bytes or MEMORY_MAX
     ours, theirs = Pipe()
     memory = os.memfd_create("result")
     command = [sys.executable, "-P", "-m", __name__, str(theirs.fileno()), str(memory)]
@@ -62,10 +68,10 @@ def in_child(work: Callable[..., T], *given: Any, source: str | Path, seconds: f
     with child, ours:
         try:
             with suppress(BrokenPipeError):
-                ours.send((work, given, str(source), asdict(LIMITS), (MEMORY_MAX, seconds)))
+                ours.send((work, given, str(source), asdict(LIMITS), (most, seconds)))
             result = _outcome(ours, str(source), seconds)
             if result is None:
-                why = f"takes more than {MEMORY_MAX // MIB} MiB, or ends the process that reads it ({child.wait()})"
+                why = f"takes more than {most // MIB} MiB, or ends the process that reads it ({child.wait()})"
                 raise InputError(source, "", why)
             return pickle.loads(result[0], buffers=_mapped(memory, result[1]))  # type: ignore[no-any-return]
         finally:
@@ -121,6 +127,7 @@ class _Forwarded(logging.Handler):
 
 def main(channel: Connection, memory: int) -> None:
     """Entry point of the child process."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # nobody waits for a child whose parent was killed
     work, given, source, limits, (memory_bytes, seconds) = channel.recv()
     for name, limit in limits.items():
         setattr(LIMITS, name, limit)
@@ -130,6 +137,8 @@ def main(channel: Connection, memory: int) -> None:
         (resource.RLIMIT_CPU, processor_s),
         (resource.RLIMIT_CORE, 0),
     ):
+        held = resource.getrlimit(kind)[1]  # by whoever began it, another child at times
+        most = most if held == resource.RLIM_INFINITY else min(most, held)
         resource.setrlimit(kind, (most, most))
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("1000")

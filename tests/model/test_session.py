@@ -168,12 +168,12 @@ def test_constants_that_are_worked_out_to_all_memory_are_refused(
     model = helper.make_model(grows, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     (tmp_path / "grows.onnx").write_bytes(model.SerializeToString())
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with pytest.raises(InputError, match="its constants take more than 512 MiB"):
+    with pytest.raises(InputError, match="takes more than 512 MiB"):
         ModelSession(tmp_path / "grows.onnx")
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100 << 10
 
 
 def test_a_model_that_takes_for_ever_to_load_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(LIMITS, "load_s", 0.01)
-    with pytest.raises(InputError, match=r"takes longer to load than 0\.01 s"):
+    with pytest.raises(InputError, match=r"is not ready after 0\.01 s"):
         ModelSession(saved(shipped(), tmp_path, name="slow"))
