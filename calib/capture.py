@@ -154,13 +154,13 @@ class Walk:
     def _announce(self) -> None:
         viewpoint = self.current
         x, y, z = viewpoint.midpoint_m
+        if self._chart is not None:
+            self._chart(viewpoint)
         self._say(
             f"{viewpoint.name} ({self._index + 1} of {len(self._left)}): {x * 100:.0f} cm before the display, "
             f"{abs(y) * 100:.0f} cm to its {'right' if y > 0 else 'left'}, {z * 100:.0f} cm up; "
             f"Enter: fused, n: next, p: previous, q: stop"
         )
-        if self._chart is not None:
-            self._chart(viewpoint)
 
 
 def capture_live(

@@ -132,7 +132,7 @@ def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F6
     seen = find_marks(picture, stack, name="")
     mine, marks_seen = seen.panel == panel, seen.marks[panel]
     if marks_seen < MIN_MARKS:
-        problem = f"shows {marks_seen} marks of panel {panel}: blurred, cut off, or another panel's chart"
+        problem = f"shows {marks_seen} marks of panel {panel}: blurred, too small, cut off, or another panel's chart"
         raise InputError(source, "", problem)
     image_from_panel, _ = cv2.findHomography(seen.panel_px[mine], seen.image_px[mine], cv2.RANSAC, 8.0)
     step = (np.arange(SAMPLES) + 0.5) / SAMPLES * INNER + (1 - INNER) / 2

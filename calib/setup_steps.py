@@ -85,8 +85,8 @@ def identify(setup: Setup) -> Figures:
     tables: list[dict[str, Any]] = []
 
     def ask(question: str, keys: str, answers: Mapping[Key, Any]) -> Any:
-        setup.say(f"{monitors[free[0]]} shows its card, the others are clear. {question} ({keys}; q: stop)")
         hardware.show_card(free[0], [question, f"{keys}; q: stop"])
+        setup.say(f"{monitors[free[0]]} shows its card, the others are clear. {question} ({keys}; q: stop)")
         while (key := hardware.key()) not in answers:
             if key is Key.QUIT:
                 raise Stopped
