@@ -12,16 +12,8 @@ import cv2
 import numpy as np
 import torch
 
-from model_export.light import Views, light, step, traced
+from model_export.light import Views, light, light_db, step
 from runtime.config import load_stack
-
-
-def decibels(panels: torch.Tensor, targets: torch.Tensor, views: Views) -> float:
-    """Light of displayed panels by two sets of random rays, without bias: each errs independently of the other."""
-    codes = (panels * 255).round() / 255
-    (a, in_a), (b, in_b) = (traced(codes, views, rays=3) for _ in range(2))
-    counts = in_a & in_b
-    return float(-10 * torch.log10(((a - targets) * (b - targets) * counts).sum() / (counts.sum() * 3)))
 
 
 def main() -> None:
@@ -49,9 +41,8 @@ def main() -> None:
     for number in range(asked.steps + 1):
         with torch.no_grad():
             if number in (0, 1, 2, 4, 8, 16, 32, 64, 128, asked.steps) or number % 100 == 0:
-                print(
-                    f"{number}, {decibels(x, targets, views):.2f}, {decibels(panels.clamp(0, 1), targets, views):.2f}"
-                )
+                shown = [(values.clamp(0, 1) * 255).round() / 255 for values in (x, panels)]
+                print(", ".join([str(number), *(f"{light_db(codes, targets, views):.2f}" for codes in shown)]))
             x, y = step(x, y, targets, views, size=0.8)
         adam.zero_grad()
         seen, counts = light(panels.clamp(0, 1), views)

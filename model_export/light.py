@@ -25,6 +25,7 @@ are equally large, elsewhere the same but for a factor that g and D share.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -44,6 +45,7 @@ from runtime.optics.views import image_from_stack
 NEAR_PX = 0.5  # a ray counts that is at least so far inside every panel
 SIZE = 0.8  # of a few steps from panels that a learned network proposes; larger ones overshoot from poor ones
 MOMENTUM, FLOOR = 0.7, 0.1
+LEAST_ERROR = 1e-6  # squared: beyond 60 dB nothing is won
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,10 +95,7 @@ def light(panels: Tensor, views: Views) -> tuple[Tensor, Tensor]:
 def traced(
     panels: Tensor, views: Views, *, rays: int = 2, random: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Intensities by rays x rays random rays a pixel, noisy but unbiased; and where all of them count.
-
-    Two calls err independently of each other: the mean of the product of both errors is the squared error, unbiased.
-    """
+    """Intensities by rays x rays random rays a pixel, noisy but unbiased; and where all of them count."""
     size, angle = (views.height_px, views.width_px), torch.pi * panels
     total, counts = torch.zeros((), dtype=panels.dtype, device=panels.device), torch.tensor(True, device=panels.device)
     for stratum in range(rays * rays):
@@ -107,6 +106,20 @@ def traced(
         total = total + (1 - torch.cos(sums)) / (2 * rays * rays)
         counts = counts & torch.stack([inside.all(dim=0) for _, inside in found])
     return total, counts
+
+
+def light_db(
+    panels: Tensor, targets: Tensor, views: Views, *, rays: int = 3, random: torch.Generator | None = None
+) -> float:
+    """PSNR of the light that eyes, as points, get of panels, against targets (E, C, h, w).
+
+    Two sets of rays err independently of each other: the mean of the product of both errors is the squared error,
+    without bias.
+    """
+    (a, in_a), (b, in_b) = (traced(panels, views, rays=rays, random=random) for _ in range(2))
+    counts = in_a & in_b
+    error = ((a - targets) * (b - targets) * counts).sum() / (counts.sum() * targets.shape[1])
+    return -10 * math.log10(max(float(error), LEAST_ERROR))
 
 
 def step(

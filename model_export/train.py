@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from model_export.checkpoint import fill, load_checkpoint, save_checkpoint
-from model_export.light import Views, improved, light, traced
+from model_export.light import LEAST_ERROR, Views, improved, light, light_db
 from model_export.modules import COLOURS, PANELS, Form, Network, blamed, made, probe
 from model_export.pairs import Pairs, folder_pairs
 from runtime.config import Section, load_stack
@@ -33,7 +33,6 @@ from runtime.support.progress import progress_bar
 
 HELD_OUT_SEED = 9_000_001  # of the validation pairs: no training seed reaches it
 HELD_OUT, HELD_OUT_SHARE = 6, 8  # procedural pairs; one in so many of a folder's
-LEAST_ERROR = 1e-6  # squared: beyond 60 dB nothing is won
 COLUMNS = ("iteration", "light_db", "held_out_light_db")
 Device = Literal["auto", "cpu", "cuda"]
 Batch = dict[str, Tensor]
@@ -149,10 +148,7 @@ def _held_out_db(network: Network, batches: list[Batch], device: torch.device) -
         targets = batch["targets"][0]
         views = Views(batch["views"][0], targets.shape[-1], targets.shape[-2])
         random = torch.Generator().manual_seed(number)
-        (a, in_a), (b, in_b) = (traced(panels, views, rays=1, random=random) for _ in range(2))
-        counts = in_a & in_b
-        error = float(((a - targets) * (b - targets) * counts).sum() / (counts.sum() * COLOURS))
-        found.append(-10 * math.log10(max(error, LEAST_ERROR)))
+        found.append(light_db(panels, targets, views, rays=1, random=random))
     return sum(found) / len(found)
 
 

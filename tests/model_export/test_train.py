@@ -22,7 +22,7 @@ from typer.testing import CliRunner  # noqa: E402
 from model_export.checkpoint import load_checkpoint  # noqa: E402
 from model_export.data import TrainingPair, random_pair  # noqa: E402
 from model_export.export import export_model, picture_file  # noqa: E402
-from model_export.light import Views, improved, traced  # noqa: E402
+from model_export.light import Views, improved, light_db  # noqa: E402
 from model_export.modules import Form, made  # noqa: E402
 from model_export.pairs import Pairs, network_input  # noqa: E402
 from model_export.scene import Plane, Scene, draw  # noqa: E402
@@ -239,16 +239,14 @@ def served(path: Path, number: int) -> tuple[Prediction, float]:
     solved = solve_still(*pair.images, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, predictor=predictor, eye_sigma_mm=0.0)
     panels = torch.from_numpy(solved.layers[..., :3].transpose(0, 3, 1, 2).copy()) / 255
     predictor.close()
-    return solved, light_db(panels, pair)
+    return solved, of_pair(panels, pair)
 
 
-def light_db(panels: Any, pair: TrainingPair) -> float:
+def of_pair(panels: Any, pair: TrainingPair) -> float:
+    """Its light in dB by rays."""
     views = Views.of(pair.stack, pair.eyes_m, **SMALL, fov_deg=pair.fov_deg)
     targets = torch.from_numpy(np.stack(pair.images).transpose(0, 3, 1, 2).copy()) / 255
-    random = torch.Generator().manual_seed(1)
-    (a, in_a), (b, in_b) = (traced(panels, views, rays=3, random=random) for _ in range(2))
-    counts = in_a & in_b
-    return -10 * math.log10(float(((a - targets) * (b - targets) * counts).sum() / (counts.sum() * 3)))
+    return light_db(panels, targets, views, random=torch.Generator().manual_seed(1))
 
 
 def test_steps_after_a_learned_proposal_are_trained_and_raise_its_light(tmp_path: Path) -> None:
@@ -288,6 +286,6 @@ def test_unrolled_steps_learn_their_sizes_and_are_served_with_them(tmp_path: Pat
         views = Views.of(pair.stack, pair.eyes_m, **SMALL, fov_deg=pair.fov_deg)
         targets = torch.from_numpy(np.stack(pair.images).transpose(0, 3, 1, 2).copy()) / 255
         x = network.net(batch["input"])[0].reshape(3, 3, 96, 160)
-        in_torch = light_db(displayed(improved(x, targets, views, *network.steps())), pair)
+        in_torch = of_pair(displayed(improved(x, targets, views, *network.steps())), pair)
     solved, db = served(path, 1)
     assert solved.steps == 4 and db == pytest.approx(in_torch, abs=0.5)
