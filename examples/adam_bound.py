@@ -1,4 +1,7 @@
-"""What three panels could show of a pair: Adam on light itself, beside the solver's own kind of step.
+"""What three panels could show of a pair: the solver's own kind of step, and then Adam.
+
+Adam minimises the squared error of random rays through square pixels, another set at every iteration. On the model of
+light (`light`) it would do worse than the steps: it finds panels where the model is wrong, up to 2 dB of 44.
 
 python examples/adam_bound.py left.png right.png --panels panels.json --left-eye 0.6 -0.03 0 --right-eye 0.6 0.03 0
 """
@@ -12,8 +15,10 @@ import cv2
 import numpy as np
 import torch
 
-from model_export.light import Views, light, light_db, step
+from model_export.light import Views, light_db, step, traced
 from runtime.config import load_stack
+
+STEPS = 24
 
 
 def main() -> None:
@@ -24,7 +29,7 @@ def main() -> None:
     parser.add_argument("--right-eye", nargs=3, type=float, required=True)
     parser.add_argument("--fov", type=float, default=40.0)
     parser.add_argument("--width", type=int, default=480, help="of the pictures and panels, pixels")
-    parser.add_argument("--steps", type=int, default=300)
+    parser.add_argument("--iterations", type=int, default=800, help="of Adam")
     asked = parser.parse_args()
     pictures = [cv2.imread(str(path))[..., ::-1] for path in asked.pictures]
     size = asked.width, round(asked.width * pictures[0].shape[0] / pictures[0].shape[1])
@@ -34,21 +39,29 @@ def main() -> None:
     eyes = np.array([asked.left_eye, asked.right_eye])
     views = Views.of(stack, eyes, width_px=size[0], height_px=size[1], fov_deg=asked.fov)
     x = y = torch.full((stack.count, 3, *reversed(size)), 0.5)
-    panels = x.clone().requires_grad_()
-    adam = torch.optim.Adam([panels], lr=0.03)
-    rate = torch.optim.lr_scheduler.CosineAnnealingLR(adam, asked.steps)
-    print("steps, dB by steps, dB by Adam")
-    for number in range(asked.steps + 1):
-        with torch.no_grad():
-            if number in (0, 1, 2, 4, 8, 16, 32, 64, 128, asked.steps) or number % 100 == 0:
-                shown = [(values.clamp(0, 1) * 255).round() / 255 for values in (x, panels)]
-                print(", ".join([str(number), *(f"{light_db(codes, targets, views):.2f}" for codes in shown)]))
+    print("method, number, dB")
+    for number in range(STEPS + 1):
+        shown("steps", number, x, targets, views)
+        if number < STEPS:
             x, y = step(x, y, targets, views, size=0.8)
+    panels = x.clone().requires_grad_()
+    adam = torch.optim.Adam([panels], lr=0.002)
+    rate = torch.optim.lr_scheduler.CosineAnnealingLR(adam, asked.iterations)
+    for number in range(1, asked.iterations + 1):
         adam.zero_grad()
-        seen, counts = light(panels.clamp(0, 1), views)
-        (((seen - targets) * counts) ** 2).sum().backward()
+        (a, in_a), (b, in_b) = (traced(panels, views, rays=1) for _ in range(2))
+        ((a - targets) * (b - targets) * (in_a & in_b)).sum().backward()
         adam.step()
         rate.step()
+        with torch.no_grad():
+            panels.clamp_(0, 1)
+        if number % 100 == 0 or number == asked.iterations:
+            shown("Adam", number, panels.detach(), targets, views)
+
+
+def shown(method: str, number: int, panels: torch.Tensor, targets: torch.Tensor, views: Views) -> None:
+    """A line of the table: light of the panels in 8 bits."""
+    print(f"{method}, {number}, {light_db((panels * 255).round() / 255, targets, views):.2f}")
 
 
 if __name__ == "__main__":

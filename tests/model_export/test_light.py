@@ -174,13 +174,13 @@ def test_the_example_that_bounds_what_panels_could_show_runs(tmp_path: Path, sti
     ]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
-        [*command, *eyes, "--width", "96", "--steps", "16"],
+        [*command, *eyes, "--width", "96", "--iterations", "200"],
         cwd=tmp_path,
         env=environment,
         capture_output=True,
         text=True,
     )
     rows = [row.split(", ") for row in done.stdout.splitlines()]
-    assert rows[0] == ["steps", "dB by steps", "dB by Adam"], done.stderr
-    by_steps, by_adam = ([float(row[column]) for row in rows[1:]] for column in (1, 2))
-    assert by_steps[-1] > by_steps[0] + 10 and by_adam[-1] > by_adam[0] + 3
+    assert rows[0] == ["method", "number", "dB"], done.stderr
+    by_steps, by_adam = ([float(row[2]) for row in rows if row[0] == method] for method in ("steps", "Adam"))
+    assert by_steps[-1] > by_steps[0] + 10 and by_adam[-1] > by_steps[-1] + 0.5, (by_steps, by_adam)
