@@ -41,10 +41,11 @@ T = TypeVar("T")
 def in_child(
     work: Callable[..., T], *given: Any, source: str | Path, seconds: float, memory_bytes: int | None = None
 ) -> T:
-    """What `work`, a function of a module, answers to `given`. memory_bytes: that it may take; None: `MEMORY_MAX`.
+    """What `work`, a function of a module, answers to `given`.
 
-    It is ended where the progress's listener raises. Raises what `work` raises on purpose; InputError, naming `source`,
-    where it is over a limit, fails or ends the process; TransientError where no process can be started.
+    memory_bytes: that it may take; None: `MEMORY_MAX`. It is ended where the progress's listener raises. Raises what
+    `work` raises on purpose; InputError, naming `source`, where it is over a limit, fails or ends the process;
+    TransientError where no process can be started.
     """
     most = memory_bytes or MEMORY_MAX
     ours, theirs = Pipe()
