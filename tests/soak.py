@@ -65,7 +65,8 @@ class Soak:
     """What is done to a daemon beside it, and what came of it."""
 
     def __init__(self, folder: Path, seconds: float) -> None:
-        self.socket, self._end_s, self._warm_s = folder / "s.sock", time.monotonic() + seconds, seconds * WARM_UP
+        self.socket, self._end_s = folder / "s.sock", time.monotonic() + seconds
+        self._warm_left_s = seconds * (1.0 - WARM_UP)
         self._lost_s, self.lost, self.failures, self.harms = 0.0, 0, 0, 0
         self._reset = False
         self.answers: Counter[str] = Counter()
@@ -133,7 +134,7 @@ class Soak:
         process = psutil.Process()
         while (left_s := self._end_s - time.monotonic()) > 20.0:
             time.sleep(min(10.0, max(0.1, left_s - 20.0)))
-            if left_s < self._end_s - self._warm_s:
+            if left_s < self._warm_left_s:
                 gc.collect()
                 now = process.memory_info().rss >> 20, process.num_fds(), threading.active_count()
                 self.usage.append(now)
