@@ -18,7 +18,7 @@ from runtime.eyes.detect import EyeFinder
 from runtime.panels.card import alone, identity_card
 from runtime.panels.monitors import Monitor
 from runtime.panels.window import every_monitor
-from runtime.records import U8, EyePoints
+from runtime.records import U8, EyePoints, SensorFrame
 from runtime.sensor.registry import open_sensor
 from runtime.sensor.worker import OPEN_TIMEOUT_S, SensorWorker
 
@@ -43,6 +43,7 @@ class SetupHardware:
         self._charts: Charts | None = None
         self._cards: tuple[list[U8], tuple[Monitor, ...]] = ([], ())
         self._worker: SensorWorker | None = None
+        self._frames: list[SensorFrame] = []  # that were taken from the worker and not returned yet
 
     def poll(self) -> Key | None:
         """A key that was pressed in the terminal or on a panel's window, which stays alive by being asked."""
@@ -123,7 +124,7 @@ class SetupHardware:
         return f"{settings.sensor.driver} {worker.serial}".strip()
 
     def sample(self, standing_at: Viewpoint) -> Sample | None:
-        """The newest sample, if there is one that was not returned before.
+        """The oldest sample that was not returned before, if there is one: slow panels lose none between two calls.
 
         standing_at: where the person is asked to stand; a simulated one does.
         """
@@ -131,8 +132,12 @@ class SetupHardware:
             return None
         if self._worker.error is not None:
             raise self._worker.error
-        frames = self._worker.take()
-        return (frames[-1].capture_ns, frames[-1].eyes, self._worker.serial) if frames else None
+        if not self._frames:
+            self._frames = self._worker.take()
+        if not self._frames:
+            return None
+        frame = self._frames.pop(0)
+        return frame.capture_ns, frame.eyes, self._worker.serial
 
     def chart(self, settings: Settings) -> Callable[[Viewpoint], None] | None:
         """What shows a viewpoint's chart while capturing; None: nobody sees any."""
@@ -156,4 +161,4 @@ class SetupHardware:
     def _stop_sensor(self) -> None:
         if self._worker is not None:
             self._worker.close()
-            self._worker = None
+            self._worker, self._frames = None, []

@@ -15,15 +15,18 @@ from typer.testing import CliRunner
 
 from calib.capture import Walk
 from calib.commands import app
+from calib.hardware import SetupHardware
 from calib.keys import Key, TerminalKeys, parse
 from calib.pairs import PairsFile, read_pairs
 from calib.viewpoints import grid
 from runtime.clock import NS_PER_S
+from runtime.config import Settings, with_options
 from runtime.errors import InputError
 from runtime.eyes.calibration import demo_stack_from_sensor
 from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
+from tests.waiting import eventually
 
 STEP_NS = NS_PER_S // 30
 run = CliRunner()
@@ -49,6 +52,19 @@ def test_restless_eyes_are_not_taken(tmp_path: Path) -> None:
     person.press(Key.ACCEPT)
     assert "hold still" in said[-1]
     assert not (tmp_path / "pairs.csv").exists()
+
+
+def test_slow_panels_lose_no_sample(tmp_path: Path) -> None:
+    hardware = SetupHardware(lambda: None)
+    source = str(recording(tmp_path / "r.mcap", [np.array([0.5, 0.0, 0.1])] * 9, true=False))
+    hardware.open_sensor(with_options(Settings(), replay=source))
+    try:
+        worker = hardware._worker
+        assert eventually(lambda: len(worker._queue) >= 5)
+        seen = [hardware.sample(grid()[0]) for _ in range(5)]
+        assert np.diff([sample[0] for sample in seen]).max() < 2 * STEP_NS
+    finally:
+        hardware.close()
 
 
 def recording(path: Path, places: list[np.ndarray], *, true: bool) -> Path:
