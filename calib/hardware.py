@@ -124,7 +124,7 @@ class SetupHardware:
         return f"{settings.sensor.driver} {worker.serial}".strip()
 
     def sample(self, standing_at: Viewpoint) -> Sample | None:
-        """The oldest sample that was not returned before, if there is one: slow panels lose none between two calls.
+        """The oldest sample that was not returned before, if there is one: slow panels lose none.
 
         standing_at: where the person is asked to stand; a simulated one does.
         """
