@@ -201,9 +201,11 @@ def monitors(settings: Settings) -> Iterator[Row]:
     except PanelLost as error:
         yield Row("monitors", "fail", str(error), "start the X server; DISPLAY and XAUTHORITY name it")
         return
-    for monitor in there:
-        yield Row("monitor", "ok", str(monitor), "" if monitor.serial else "has no EDID serial: bind it by connector")
     panels = panel_settings(settings.output, len(settings.stack.x_m))
+    named = {panel.connector for panel in panels}
+    for monitor in there:
+        known = monitor.serial or monitor.connector in named
+        yield Row("monitor", "ok", str(monitor), "" if known else "has no EDID serial: bind it by connector")
     try:
         bound = bind(panels, there)
         check_modes(panels, bound, width_px=settings.stack.width_px, height_px=settings.stack.height_px)

@@ -138,6 +138,7 @@ def test_the_doctor_lists_monitors_and_their_binding(x: XServer, config: Path, m
     checks = json.loads(invoke(doctor, "--json", "--config", config).stdout)["checks"]
     assert any("A1B2-0003" in check["detail"] for check in checks if check["name"] == "monitor")
     assert [check["state"] for check in checks if check["name"] == "panels"] == ["ok"] * 3
+    assert not any(check["remedy"] for check in checks)  # a monitor without a serial is bound by its connector
 
 
 @pytest.mark.windows
