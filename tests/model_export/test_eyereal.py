@@ -20,7 +20,7 @@ from runtime.errors import InputError  # noqa: E402
 from runtime.model.contract import parse_contract  # noqa: E402
 from runtime.model.network import PictureProposal  # noqa: E402
 from runtime.model.session import ModelSession  # noqa: E402
-from runtime.model.solver import Solver  # noqa: E402
+from runtime.model.solver import StepPredictor  # noqa: E402
 from runtime.model.still import solve_still  # noqa: E402
 from runtime.optics.stack import PanelStack  # noqa: E402
 from runtime.support.artifacts import read_image, write_png  # noqa: E402
@@ -163,13 +163,13 @@ def pair_of(folder: Path, place: str) -> Pair:
     return pair
 
 
-def predictor_of(official: Path, folder: Path) -> Solver:
+def predictor_of(official: Path, folder: Path) -> StepPredictor:
     path = folder / "eyereal.onnx"
     path.write_bytes(eyereal_file(official, width_px=SIZE[0], height_px=SIZE[1], eye_order="right-left"))
     # The published code's panels of lego_bulldozer: with square pixels, whatever their shape.
     stack = PanelStack(0.5184, 0.5184 * SIZE[1] / SIZE[0], (-0.06, 0.0, 0.06), *SIZE)
     session = ModelSession(path, threads=1)
-    return Solver(stack, PictureProposal(session, stack, source=path), (), name=session.contract.name)
+    return StepPredictor(stack, PictureProposal(session, stack, source=path), (), name=session.contract.name)
 
 
 @pytest.mark.parametrize("place", EYES)
