@@ -15,16 +15,16 @@ PICTURE_FOV_DEG = 40.0  # horizontal; the published code feeds black outside it
 OFFSET = 0.2  # the published code shows sigmoid(y) - 0.2, clipped at the panel
 INPUT, OUTPUT = "eyes", "panels"
 LEAST_PX = 32  # five halvings
-STATISTICS = 0.02  # share of a batch in running means: batches are of one pair, of which the last ten are too few
+NORM_MOMENTUM = 0.02  # of running means: batches are of one pair, and torch's 0.1 would average ten
 
 
 def _block(channels: int, middle: int, out: int) -> nn.Sequential:
     return nn.Sequential(
         nn.Conv2d(channels, middle, 3, padding=1, bias=False),
-        nn.BatchNorm2d(middle, momentum=STATISTICS),
+        nn.BatchNorm2d(middle, momentum=NORM_MOMENTUM),
         nn.ReLU(inplace=True),
         nn.Conv2d(middle, out, 3, padding=1, bias=False),
-        nn.BatchNorm2d(out, momentum=STATISTICS),
+        nn.BatchNorm2d(out, momentum=NORM_MOMENTUM),
         nn.ReLU(inplace=True),
     )
 

@@ -35,13 +35,11 @@ from runtime.errors import SensorLost
 from runtime.frame import solver_thread
 from runtime.panels import window
 from runtime.sensor.replay import ReplayDriver
-from runtime.support.memory import keep_freed_memory
 from tests.panels.xserver import HEIGHT_PX, WIDTH_PX, XServer
 
 LOST_EVERY_S = 30.0
 HARM_EVERY_S = 40.0  # a cable, or the panels' contexts
 FAILING = 0.002  # of the solver's steps
-WARM_UP = 0.4  # of the time
 REFUSED = ("skipped: a newer change came", "there is no next one", "nobody's", "the loop did not answer", "made anew")
 DELAYS = (
     (solver_parts.RunningSolver, "step", 0.02, 2.5), (solver_parts.RunningSolver, "close", 0.3, 1.5),
@@ -66,7 +64,6 @@ class Soak:
 
     def __init__(self, folder: Path, seconds: float) -> None:
         self.socket, self._end_s = folder / "s.sock", time.monotonic() + seconds
-        self._warm_left_s = seconds * (1.0 - WARM_UP)
         self._lost_s, self.lost, self.failures, self.harms = 0.0, 0, 0, 0
         self._reset = False
         self.answers: Counter[str] = Counter()
@@ -134,11 +131,10 @@ class Soak:
         process = psutil.Process()
         while (left_s := self._end_s - time.monotonic()) > 20.0:
             time.sleep(min(10.0, max(0.1, left_s - 20.0)))
-            if left_s < self._warm_left_s:
-                gc.collect()
-                now = process.memory_info().rss >> 20, process.num_fds(), threading.active_count()
-                self.usage.append(now)
-                print(f"{left_s:6.0f} s left: {now[0]} MiB, {now[1]} files, {now[2]} threads", flush=True)
+            gc.collect()
+            now = process.memory_info().rss >> 20, process.num_fds(), threading.active_count()
+            self.usage.append(now)
+            print(f"{left_s:6.0f} s left: {now[0]} MiB, {now[1]} files, {now[2]} threads", flush=True)
         for request in ({"command": "scene", "value": "demo"}, {"command": "resume"}):
             self._ask(request)
         time.sleep(10.0)
@@ -154,7 +150,6 @@ class Soak:
 
 def soak(seconds: float, *, growth_mib: int, windows: bool = False) -> None:
     """Raises AssertionError where something piles up, is lost or gets no answer."""
-    keep_freed_memory()  # as the daemon does first of all, but clients are threads of its process here
     with ExitStack() as cleanup:
         folder = Path(cleanup.enter_context(tempfile.TemporaryDirectory(prefix="ps-")))
         run = Soak(folder, seconds)

@@ -59,7 +59,7 @@ def test_a_run_leaves_every_file_and_every_field(left: Path) -> None:
     for name in re.findall(r"`([\w-]+\.(?:png|jsonl|json))`", section):
         assert list(left.rglob(name.replace("-K", "-0"))), name
     lines = [json.loads(line) for line in (left / "frames.jsonl").read_text().splitlines()]
-    assert fields_of("field of frames.jsonl") == set().union(*lines) == lines[-1].keys()
+    assert all(fields_of("field of frames.jsonl") == line.keys() for line in lines)
     summary = json.loads((left / "summary.json").read_text())
     assert fields_of("field of summary.json") <= summary.keys()
     assert summary["plan"] and all({"what", "why", "saves_ms", "costs_db"} <= item.keys() for item in summary["plan"])

@@ -26,7 +26,7 @@ from runtime.optics.tilt import coarse_layer_from_seen
 from runtime.records import F32, F64, I16, U8
 from runtime.support.threads import at_once
 
-HALF_IPD_M = 0.031  # of eyes that nobody told
+HALF_BASELINE_M = 0.031  # of one eye that stands for both: any would do
 EDGE_SHARE = 1 / 40  # of a picture: so far beside it at most its edge goes on
 UNSEEN = -1  # what pictures ask for is positive
 SHARPENED = 0.2  # of the difference, on either side: what two interpolations blur
@@ -151,7 +151,7 @@ def _local(geometry: Geometry, *, whole: bool) -> _Local:
         eyes_m = np.stack([eyes_m[:, 0], -eyes_m[:, 2], -eyes_m[:, 1]], axis=1)
         stack, plane_from_local = replace(stack, tilt=None).transposed(), plane_from_local @ _SWAPPED
     elif not apart_m.any():  # one eye that stands for both asks for no difference: any line will do
-        eyes_m = eyes_m + HALF_IPD_M * np.array([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
+        eyes_m = eyes_m + HALF_BASELINE_M * np.array([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
     order = (0, 1) if eyes_m[1, 1] >= eyes_m[0, 1] else (1, 0)
     return _Local(stack, eyes_m[list(order)], order, plane_from_local)
 

@@ -20,7 +20,7 @@ from runtime.support.onnx_runtime import onnxruntime
 from runtime.support.untrusted_input import LIMITS
 
 FILE_BYTES_MAX = 1 << 30
-MEMORY_MAX = 1 << 30  # of a process that loads a file of nobody knows whom
+MEMORY_MAX = 1 << 30  # bytes, of a process that loads an untrusted file
 
 log = logging.getLogger("phasestack.model")
 
@@ -170,8 +170,8 @@ def _try_out(path: Path, data: bytes) -> None:
     is loaded, to as many as there is memory for. Raises InputError."""
     found = hashlib.sha256(data).digest()
     if found not in _tried_out:
-        most = MEMORY_MAX + 8 * len(data)
-        in_child(_tried_here, path, data, source=path, seconds=LIMITS.load_s, memory_bytes=most)
+        memory_bytes = MEMORY_MAX + 8 * len(data)
+        in_child(_tried_here, path, data, source=path, seconds=LIMITS.load_s, memory_bytes=memory_bytes)
         _tried_out.add(found)
 
 

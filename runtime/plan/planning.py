@@ -16,7 +16,6 @@ from runtime.content.registry import open_content
 from runtime.errors import InputError
 from runtime.model.backends import choose
 from runtime.model.predictor import load_predictor
-from runtime.model.proposal import HALF_IPD_M
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.plan.measure import MAX_DRIFT_M, measure
@@ -25,6 +24,7 @@ from runtime.records import F64
 from runtime.support.gl import offscreen_context
 
 MIDDLE_M = (0.6, 0.0, 0.05)
+HALF_IPD_M = 0.031
 
 
 def plan_for(

@@ -37,9 +37,9 @@ class UsbCameraDriver(Sensor):
         if not settings.fov_deg:
             raise InputError("sensor", "fov_deg", "is needed by usb-camera: the picture's horizontal angle, degrees")
         source = settings.source if settings.source != "demo" else ""
-        kind, _, rest = source.partition("://")
-        if rest and kind not in STREAMS:
-            raise InputError("sensor", "source", f"{kind}:// is no camera's address: {', '.join(STREAMS)} are")
+        protocol = re.match(r"([\w+.-]+):", source)
+        if protocol is not None and protocol[1] not in STREAMS:
+            raise InputError("sensor", "source", f"{protocol[1]}: is no camera's address: {', '.join(STREAMS)} are")
         self._source = f"/dev/video{source or 0}" if re.fullmatch(r"\d*", source) else source
         self._fov, self._clock = radians(settings.fov_deg), clock
         self._capture: Any = None

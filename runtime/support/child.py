@@ -47,7 +47,7 @@ def in_child(
     `work` raises on purpose; InputError, naming `source`, where it is over a limit, fails or ends the process;
     TransientError where no process can be started.
     """
-    most = memory_bytes or MEMORY_MAX
+    memory_bytes = memory_bytes or MEMORY_MAX
     ours, theirs = Pipe()
     memory = os.memfd_create("result")
     command = [sys.executable, "-P", "-m", __name__, str(theirs.fileno()), str(memory)]
@@ -69,10 +69,10 @@ def in_child(
     with child, ours:
         try:
             with suppress(BrokenPipeError):
-                ours.send((work, given, str(source), asdict(LIMITS), (most, seconds)))
+                ours.send((work, given, str(source), asdict(LIMITS), (memory_bytes, seconds)))
             result = _outcome(ours, str(source), seconds)
             if result is None:
-                why = f"takes more than {most // MIB} MiB, or ends the process that reads it ({child.wait()})"
+                why = f"takes more than {memory_bytes // MIB} MiB, or ends the process that reads it ({child.wait()})"
                 raise InputError(source, "", why)
             return pickle.loads(result[0], buffers=_mapped(memory, result[1]))  # type: ignore[no-any-return]
         finally:

@@ -124,7 +124,11 @@ def test_who_listens_ends_it_and_it_is_gone(tmp_path: Path, work: Any) -> None:
 
     with pytest.raises(Stopped), progress.listening(listen):
         run(work, str(place))
-    assert eventually(lambda: is_gone(int(place.read_text())), within_s=20.0)
+    number = int(place.read_text())
+    if work is writes:
+        with pytest.raises(ProcessLookupError):
+            os.kill(number, 0)
+    assert eventually(lambda: is_gone(number), within_s=20.0)
 
 
 def test_no_process_at_the_moment_passes(monkeypatch: pytest.MonkeyPatch) -> None:
