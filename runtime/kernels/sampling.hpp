@@ -17,14 +17,12 @@
 
 constexpr int LANES = 32;     // elements that loops work on together, whatever a processor makes of that
 constexpr int TILE_PX = 256;  // pixels of a row that are sampled at once: what they need stays in the first-level cache
-constexpr int EDGE_PX = 4;   // beyond an image, that may be looked at where a run ends a little late
-constexpr int PIECE_PX = 64;  // of a tile
-constexpr int RUN_PX = 32;    // of a row, along which a weight grows evenly
+constexpr int EDGE_PX = 4;    // beyond an image, that may be looked at
 constexpr int MAX_PANELS = 5;
 constexpr int MAX_CHANNELS = 3;
 constexpr int TILE = TILE_PX * MAX_CHANNELS + 2 * LANES;  // elements; what follows the last one may be written over
-constexpr int SOURCE = 2 * TILE;
-constexpr int FIELDS = 3;  // sampled together, at most
+constexpr int SOURCE = 2 * TILE + MAX_CHANNELS * LANES;
+constexpr int FIELDS = 2;  // sampled together, at most
 constexpr float WEIGHT_UNIT = 16384;
 
 // An image of 16-bit elements, channels beside each other. Whole vectors are read behind a row's end.
@@ -36,9 +34,9 @@ struct Image {
 };
 
 struct Ramp {  // the pixel that an element belongs to
-  int16_t one_channel[RUN_PX * MAX_CHANNELS + LANES] = {}, three_channels[RUN_PX * MAX_CHANNELS + LANES] = {};
+  int16_t one_channel[LANES + MAX_CHANNELS] = {}, three_channels[LANES + MAX_CHANNELS] = {};
   constexpr Ramp() {
-    for (int e = 0; e < RUN_PX * MAX_CHANNELS + LANES; ++e) one_channel[e] = int16_t(e), three_channels[e] = int16_t(e / 3);
+    for (int e = 0; e < LANES + MAX_CHANNELS; ++e) one_channel[e] = int16_t(e), three_channels[e] = int16_t(e / 3);
   }
 };
 constexpr Ramp RAMP;
@@ -87,30 +85,38 @@ INLINE Span inside(const Line &line, int count, const Image &image, double near)
   return span.first < span.last ? span : Span{0, 0};
 }
 
+INLINE int64_t whole_vectors(int64_t elements) { return (elements + LANES - 1) / LANES * LANES; }
+
 INLINE int16_t rounded(float x) { return int16_t(int(std::nearbyintf(x))); }
 
-// From a to b by a share in WEIGHT_UNIT. Both are 8191 at most, either way, so that twice their difference fits.
-INLINE int16_t mixed(int16_t a, int16_t b, int16_t share) {
-  const int16_t twice = int16_t(2 * (b - a));
-  return int16_t(a + int16_t((((int32_t(twice) * int32_t(share)) >> 14) + 1) >> 1));
-}
+// a·b/32768, rounded: one instruction of most processors.
+INLINE int16_t product(int16_t a, int16_t b) { return int16_t((((int32_t(a) * int32_t(b)) >> 14) + 1) >> 1); }
 
-struct Work {
+// From a to b by a share in WEIGHT_UNIT. Both are 8191 at most, either way, so that twice their difference fits.
+INLINE int16_t part_of(int16_t a, int16_t b, int16_t share) { return product(int16_t(2 * (b - a)), share); }
+INLINE int16_t mixed(int16_t a, int16_t b, int16_t share) { return int16_t(a + part_of(a, b, share)); }
+
+struct alignas(2 * LANES) Work {
   int16_t source[FIELDS][SOURCE];
   int16_t tile[2 * MAX_PANELS][TILE];
   int16_t sum[FIELDS][TILE];
 };
 
 // F images alike at pixels first to last of a line (TILE_PX at most, all of them `inside`), into out[f], from its first
-// element on. Two rows of the image are mixed first, for the pixels between which the line runs; then each two pixels of
-// that. Both go run by run: along a run the same two are mixed, with weights that grow evenly.
+// element on. Two rows of the image are mixed first, for the pixels between which the line runs: run by run, with weights
+// that grow evenly. Then neighbours of that, a vector at a time: the source's pixels move on by a little more or less
+// than the line's, so that a vector needs two neighbours, or a third and a fourth. Pixels on pixels need none.
 template <int F, int C, typename AnyLine>
 INLINE void sample(const Image *images, const AnyLine &line, int first, int last, Work &work, int16_t (*out)[TILE]) {
   const Image &image = images[0];
   const int16_t *ramp = C == 1 ? RAMP.one_channel : RAMP.three_channels;
   const double xs = line.x(first), xe = line.x(last - 1), ys = line.y(first), ye = line.y(last - 1);
   const double slope = xe - xs > 0.5 ? (ye - ys) / (xe - xs) : 0, bottom = image.rows - 1;
-  const int s0 = std::clamp(int(std::floor(xs)) - 1, 0, image.width - 1);
+  const int steps = last - 1 - first;
+  const auto whole_px = [](double px) { return std::abs(px - std::nearbyint(px)) < 1e-6; };
+  const bool straight = xs >= 0 && xe < image.width && whole_px(xs) && std::abs(xe - xs - steps) < 1e-6 &&
+                        std::abs(line.x(first + 0.5 * steps) - xs - 0.5 * steps) < 1e-6;  // every pixel on one of the source
+  const int s0 = straight ? int(std::nearbyint(xs)) : std::clamp(int(std::floor(xs)) - 1, 0, image.width - 1) / LANES * LANES;
   const int s1 = std::clamp(int(std::floor(xe)) + 2, 0, image.width - 1);
   const int elements = std::min((s1 - s0 + 1) * C, SOURCE - 4 * LANES);
   for (int at = 0, length; at < elements; at += length) {
@@ -122,22 +128,23 @@ INLINE void sample(const Image *images, const AnyLine &line, int first, int last
       until = std::min((end - y) / slope, 1e6);
     }
     length = std::min(elements - at, (int(until) + 1) * C);
-    float share = float((within - row) * WEIGHT_UNIT);
-    const float growth = float(grows / C * WEIGHT_UNIT);
-    const int16_t step = rounded(growth);
+    const double share = (within - row) * WEIGHT_UNIT;
+    const int16_t step = rounded(float(grows * WEIGHT_UNIT));
     const int64_t from = int64_t(s0) * C + at;
-    for (int e = 0; e < length; e += LANES, share += growth * LANES) {
+    for (int e = 0; e < length; e += LANES) {
+      const int px = e / C, phase = e - px * C;
+      const int16_t begin = rounded(float(share + grows * WEIGHT_UNIT * px));
       int16_t weights[LANES];
-      const int16_t begin = rounded(share);
-      VECTORISED for (int k = 0; k < LANES; ++k) weights[k] = int16_t(begin + step * RAMP.one_channel[k]);
+      VECTORISED for (int k = 0; k < LANES; ++k) weights[k] = int16_t(begin + step * ramp[k + phase]);
       for (int f = 0; f < F; ++f) {
         const int16_t *upper = images[f].row(row) + from + e;
         const int16_t *lower = images[f].row(std::min(row + 1, image.rows - 1)) + from + e;
-        int16_t *to = work.source[f] + LANES + at + e;
+        int16_t *to = (straight ? out[f] : work.source[f] + LANES) + at + e;
         VECTORISED for (int k = 0; k < LANES; ++k) to[k] = mixed(upper[k], lower[k], weights[k]);
       }
     }
   }
+  if (straight) return;
   for (int f = 0; f < F; ++f) {  // an image's edges go on
     int16_t *source = work.source[f] + LANES;
     for (int beyond = 1; beyond <= EDGE_PX; ++beyond)
@@ -146,42 +153,47 @@ INLINE void sample(const Image *images, const AnyLine &line, int first, int last
         source[elements + (beyond - 1) * C + c] = source[elements - C + c];
       }
   }
-  const int steps = last - 1 - first;
   const double half = 0.5 * steps, middle = steps > 1 ? line.x(first + half) : 0.5 * (xs + xe);
   const double bend = steps > 1 ? (xs + xe - 2 * middle) / (half * half) * 0.5 : 0;  // along a tile: a parabola
   const double scale = steps > 0 ? (xe - xs) / steps - bend * steps : 1;  // where it begins
-  const int piece = std::max(2, int(std::min(std::sqrt(0.5 / std::max(std::abs(bend), 1e-9)), double(PIECE_PX))));
-  for (int k = 0, next; k <= steps; k = next) {  // along a piece, its chord tells where runs end, to an eighth of a pixel
-    next = std::min(k + piece, steps + 1);
-    const double begin = xs - s0 + k * (scale + bend * k) - k;  // how much further to the right the source is
-    const double drift = scale - 1 + bend * (k + next - 1), per_run = std::abs(drift) > 1e-3 ? std::abs(1 / drift) : 1e3;
-    const int way = drift < 0 ? -1 : 1;
-    int beside = int(std::floor(begin));
-    double until = k + (way < 0 ? begin - beside : beside + 1 - begin) * per_run;
-    for (; k < next; until += per_run, beside += way)
-      for (int length, end = std::min(int(std::min(until, 1e6)) + 1, next); k < end; k += length) {
-        length = std::min(end - k, RUN_PX);
-        const int16_t share = rounded(float((xs - s0 - beside - k + k * (scale + bend * k)) * WEIGHT_UNIT));
-        const int16_t growth = rounded(float((scale + bend * (2 * k + length - 1) - 1) * WEIGHT_UNIT));
-        for (int e = 0; e < length * C; e += LANES) {
-          int16_t weights[LANES];
-          VECTORISED for (int i = 0; i < LANES; ++i) weights[i] = int16_t(share + growth * ramp[e + i]);
-          for (int f = 0; f < F; ++f) {
-            const int16_t *left = work.source[f] + LANES + (k + beside) * C + e;
-            int16_t *to = out[f] + k * C + e;
-            VECTORISED for (int i = 0; i < LANES; ++i) to[i] = mixed(left[i], left[i + C], weights[i]);
-          }
-        }
-      }
+  // So many elements at once that the source gains two pixels on them at most, and that a chord stands for the parabola.
+  const double most = std::max(std::abs(scale - 1), std::abs(scale - 1 + 2 * bend * steps));
+  int at_once = LANES;
+  for (int px; px = (at_once + C - 2) / C, at_once > 1 && (most * px > 1.9 || std::abs(bend) * px * px > 0.004);) at_once /= 2;
+  constexpr double one = 4294967296.0;  // fixed point: how much further to the right the source is, in 2^-32 pixels
+  const int64_t begin = int64_t((xs - s0) * one), drift = int64_t((scale - 1) * one), turn = int64_t(bend * one);
+  for (int e = 0; e < (steps + 1) * C; e += at_once) {
+    const int k = e / C, phase = e - k * C, px = (at_once - 1 + phase) / C;
+    const int first_at = int((begin + k * (drift + turn * k)) >> 18);  // in WEIGHT_UNIT from here on, as weights are
+    const int each = int((drift + turn * (2 * k + px) + (1 << 17)) >> 18), last_at = first_at + each * px;
+    const int beside = std::min(first_at, last_at) >> 14, further = (std::max(first_at, last_at) >> 14) - beside;
+    const uint16_t share = uint16_t(first_at - beside * int(WEIGHT_UNIT));
+    int16_t weights[3][LANES];  // from each neighbour to the next
+    VECTORISED for (int i = 0; i < LANES; ++i) {
+      constexpr uint16_t full = uint16_t(WEIGHT_UNIT);
+      const uint16_t weight = uint16_t(share + uint16_t(each) * uint16_t(ramp[i + phase])), to_second = std::min(weight, full);
+      const uint16_t to_third = std::min(uint16_t(weight - to_second), full);
+      weights[0][i] = int16_t(to_second), weights[1][i] = int16_t(to_third);
+      weights[2][i] = int16_t(weight - to_second - to_third);
+    }
+    for (int f = 0; f < F; ++f) {
+      const int16_t *source = work.source[f] + LANES + (k + beside) * C + phase;
+      int16_t *to = out[f] + e;
+      if (further == 0) VECTORISED for (int i = 0; i < LANES; ++i) to[i] = mixed(source[i], source[i + C], weights[0][i]);
+      else VECTORISED for (int i = 0; i < LANES; ++i)
+        to[i] = int16_t(mixed(source[i], source[i + C], weights[0][i]) + part_of(source[i + C], source[i + 2 * C], weights[1][i]));
+      if (further > 1) VECTORISED for (int i = 0; i < LANES; ++i)
+        to[i] = int16_t(to[i] + part_of(source[i + 2 * C], source[i + 3 * C], weights[2][i]));
+    }
   }
 }
 
-// How long a tile of a line may be: short enough that a parabola stands for it, and that its source has room.
+// How long a tile of a line may be: short enough that a parabola is a hundredth of a pixel off, with room for its source.
 INLINE int tile_px(const Line &line, Span span) {
-  const double first = line.w0 + line.wu * span.first, last = line.w0 + line.wu * span.last;
-  const double nearest = std::min(std::abs(first), std::abs(last)), turn = std::abs(line.wu) * TILE_PX;
+  const double nearest = std::min(std::abs(line.w0 + line.wu * span.first), std::abs(line.w0 + line.wu * span.last));
+  const double turn = std::max(std::abs(line.wu) / nearest, 1e-9);
   const double scale = std::max(std::abs(line.xu - line.wu * (line.x(span.first) + 0.5)),
                                 std::abs(line.xu - line.wu * (line.x(span.last) + 0.5))) / nearest;
-  const double bent = turn > 0.1 * nearest ? 0.1 * nearest / turn : 1, wide = scale > 1.8 ? 1.8 / scale : 1;
-  return std::max(4, int(TILE_PX * std::min(bent, wide)));
+  const double bent = std::cbrt(0.2 / (turn * turn * std::max(scale, 1.0))), wide = scale > 1.8 ? 1.8 / scale : 1;
+  return std::max(4, int(std::min(bent, TILE_PX * wide)));
 }

@@ -1,0 +1,74 @@
+"""The compiled sampler, by `warp`: bilinear samples, as numpy has them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from runtime.model.warp import warp
+from runtime.records import F64
+
+BESIDE = -1
+TOLERANCE = 2.5  # of elements up to 4080: two mixtures, rounded, with weights of 14 bits that grow from pixel to pixel
+
+
+def bilinear(
+    image: NDArray[Any], image_from_result: F64, size: tuple[int, int], *, near_px: float = 0.0
+) -> tuple[F64, NDArray[Any]]:
+    """Samples (rows, columns, C), an image's edge going on, and which lie in it, so far from its edges."""
+    v, u = np.mgrid[: size[0], : size[1]] + 0.5
+    x, y, w = np.einsum("ij,jhw->ihw", image_from_result, np.stack([u, v, np.ones_like(u)]))
+    height, width = image.shape[:2]
+    x, y = x / w, y / w
+    within = (w > 0) & (x >= near_px) & (x <= width - near_px) & (y >= near_px) & (y <= height - near_px)
+    x, y = np.clip(x - 0.5, 0, width - 1), np.clip(y - 0.5, 0, height - 1)
+    left, top = np.minimum(x.astype(int), width - 2), np.minimum(y.astype(int), height - 2)
+    to_right, down = (x - left)[..., None], (y - top)[..., None]
+    upper, lower = (
+        (1 - to_right) * image[row, left] + to_right * image[row, left + 1].astype(np.float64) for row in (top, top + 1)
+    )
+    return (1 - down) * upper + down * lower, within
+
+
+def scaled(scale: float, size: tuple[int, int], *, shift_px: float = 0.3) -> F64:
+    """About a picture's middle."""
+    height, width = size
+    middle = [width / 2 * (1 - scale) + shift_px, height / 2 * (1 - min(scale, 2)) + 0.2]
+    return np.array([[scale, 0, middle[0]], [0, min(scale, 2), middle[1]], [0, 0, 1.0]])
+
+
+@pytest.mark.parametrize("size", [(8, 64), (90, 777)])
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("scale", [0.02, 0.4, 0.91, 1.0, 1.0625, 1.1, 1.6, 2.5, 5.0, 37.0])
+def test_any_scale(size: tuple[int, int], channels: int, scale: float) -> None:
+    image = np.random.default_rng(0).integers(0, 4081, (*size, channels)).astype(np.int16)
+    matrix = scaled(scale, size)
+    expected, within = bilinear(image, matrix, size)
+    found = warp(image[..., 0] if channels == 1 else image, matrix, size=size, beside=BESIDE, reach_px=0.0)
+    off = np.abs(found.reshape(expected.shape) - expected)[within]
+    assert off.size
+    assert off.max() < TOLERANCE
+
+
+@pytest.mark.parametrize("shift_px", [(0.0, 0.0), (7.0, 0.0), (-5.0, 3.0), (3.0, 0.5)])
+def test_pixels_on_pixels_are_the_images_own(shift_px: tuple[float, float]) -> None:
+    image = np.random.default_rng(1).integers(0, 4081, (40, 333, 3)).astype(np.int16)
+    matrix = np.array([[1.0, 0, shift_px[0]], [0, 1.0, shift_px[1]], [0, 0, 1.0]])
+    expected, within = bilinear(image, matrix, (40, 333))
+    found = warp(image, matrix, size=(40, 333), beside=BESIDE, reach_px=0.0)
+    assert np.abs(found - expected)[within].max() <= (0.5 if shift_px[1] % 1 else 0)
+    assert (found[~within] == BESIDE).all()
+
+
+@pytest.mark.parametrize("turn", [-9e-4, 1e-5, 3e-4, 9e-4])
+def test_perspective_along_rows(turn: float) -> None:
+    """Smooth, since places are exact to some thousandths of a pixel."""
+    rows, columns = np.mgrid[:90, :777]
+    image = np.repeat((2040 + 1500 * np.sin(columns / 5) * np.cos(rows / 7))[..., None], 3, axis=2).astype(np.int16)
+    matrix = np.array([[0.9, 0.01, 20], [0.004, 0.95, 2], [turn, 0, 1.0 - 388 * turn]])
+    expected, within = bilinear(image, matrix, (90, 777), near_px=1.0)
+    found = warp(image, matrix, size=(90, 777), beside=BESIDE, reach_px=0.0)
+    assert np.abs(found - expected)[within].max() < 4
