@@ -11,10 +11,10 @@ of an eye's picture is a bundle of rays. Within it the panels' values are nearly
 
 with w_nq the part of the bundle on panel n that pixel q covers: for a bundle as wide as a pixel, bilinear weights.
 
-*A step.* With T what an eye should see, e = I - T (0 where a ray misses a panel) and A_n the product of the other
-panels' z_m, the squared error's derivative to pixel q of panel n, and a bound of its curvature, are sums over all sets:
+*A step.* With T what an eye should see and e = I - T (0 where a ray misses a panel), the squared error's derivative to
+a common change of all of a panel's pixels that a bundle crosses, and a bound of its curvature, are sums over all sets:
 
-    g_q = Im(exp(i·pi·y_q)·sum w·e·A_n)        (pi/2 times it is the derivative of sum e²/2)                  (L3)
+    g_q = sum w·e·Im Z            (pi/2 times it is the derivative of sum e²/2)                               (L3)
     D_q = sum w·(Im Z)²                                                                                       (L4)
     x' = clip(y - size·2/(pi·N)·g/max(D, floor·E), 0, 1),     y' = x' + momentum·(x' - x)                   (L5)
 
@@ -134,23 +134,20 @@ def step(
 ) -> tuple[Tensor, Tensor]:
     """One step (L5): x' and y' from panels x and their extrapolation y, both (N, C, H, W).
 
-    targets: (2, C, h, w) what the left and the right eye should see, on the rays' raster.
+    targets: (2, C, h, w) what the left and the right eye should see. Where the views have fewer rows, places take turns
+    from row to row of them.
     """
-    count, sets, shape = len(y), len(views.panels_from_rays), y.shape[-2:]
-    back = torch.linalg.inv(views.panels_from_rays)
+    sets, turns = len(views.panels_from_rays), targets.shape[-2] // views.height_px
+    back, size_px = torch.linalg.inv(views.panels_from_rays), y.shape[-2:]
     bundles, counts = _bundles(y, views)
-    slope, bound = torch.zeros_like(torch.complex(y, y)), torch.zeros_like(y)
+    gradient, bound = torch.zeros_like(y), torch.zeros_like(y)
     for e, z in enumerate(bundles):
-        whole = reduce(torch.mul, z)
-        error = ((1 - whole.real) / 2 - targets[e % 2]) * counts[e]
-        others = [error * reduce(torch.mul, [z[m] for m in range(count) if m != n]) for n in range(count)]
-        curved = whole.imag.square() * counts[e]
-        rays = torch.stack([torch.cat([b.real, b.imag, curved]) for b in others])
-        real, imaginary, curvature = _sample(rays, back[e], shape, near_px=0.0)[0].chunk(3, dim=1)
-        slope, bound = slope + torch.complex(real, imaginary), bound + curvature
-    gradient = (_phasors(y) * slope).imag
-    moved = size * gradient / (1.5 * torch.pi * bound.clamp(min=floor * sets)) * (3 / count)
-    new = (y - moved).clamp(0, 1)
+        whole, turn = reduce(torch.mul, z), e // 2 if turns > 1 else 0
+        error = (1 - whole.real) / 2 - targets[e % 2][:, turn::turns][:, : views.height_px]
+        rays = torch.cat([error * whole.imag, whole.imag.square()]) * counts[e]
+        found = _sample(rays.expand(len(y), -1, -1, -1), back[e], size_px, near_px=0.0)[0].chunk(2, dim=1)
+        gradient, bound = gradient + found[0], bound + found[1]
+    new = (y - size * 2 / (torch.pi * len(y)) * gradient / bound.clamp(min=floor * sets)).clamp(0, 1)
     return new, new + momentum * (new - x)
 
 

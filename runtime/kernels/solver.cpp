@@ -9,10 +9,12 @@
 
 namespace {
 
-constexpr float FULL = 255 * 16;  // of a panel that shows 1: sixteenths of a code
-constexpr float UNIT = 8191;      // of 1 in phasors, and in what goes back to the panels
+constexpr int FULL = 255 * 16;   // of a panel that shows 1: sixteenths of a code
+constexpr float UNIT = 8100;     // of 1 in phasors: rounding takes no product of theirs beyond 8191
+constexpr float WEIGHT = 8191;   // of 1 in targets' weights
 constexpr float PI = 3.14159265f;
-constexpr double NEAR_PX = 0.5;   // a ray counts that crosses every panel so far inside its edges
+constexpr double NEAR_PX = 0.5;  // a ray counts that crosses every panel so far inside its edges
+constexpr int MAX_SETS = 4;      // of rays, whose sums fit 16 bits
 
 struct Panel {
   Image ahead;  // what the rays see: with momentum
@@ -22,16 +24,21 @@ struct Panel {
 
 struct Problem {
   int32_t panels, sets, channels;  // sets of rays: left and right eye in turn, for each place that they may be at
-  int32_t height, width;           // of the rays' raster
+  int32_t height, width;           // of a set's rays: places take turns, from row to row of a picture
   const double *panels_from_rays;  // (sets, panels, 3, 3)
   const double *rays_from_panels;  // their inverses
-  const uint8_t *targets[2];       // left and right eye's, (height, width, channels)
-  const float *column_taper;       // (width, channels) what the rays' errors are multiplied with
-  const float *row_taper;          // (height)
-  const float *table;              // (256, 2): of a target's code, the sum of all panels that shows it, and its weight
+  const uint8_t *targets[2];       // left and right eye's, (rows of all places, width, channels)
+  const int16_t *column_taper;     // (width, channels) what the rays' errors are multiplied with, 32767 for 1
+  const int16_t *row_taper;        // (rows of all places)
+  const int32_t *table;            // (256,) of a target's code, the sum of all panels that shows it, and 65536 times its weight
   float rest, missing;             // closing: what lies beside a panel counts for; weight of a ray that misses one
   Panel panel[MAX_PANELS];
   float size, momentum, floor;
+
+  int places() const { return sets / 2; }
+  const uint8_t *target(int set, int r, int64_t at) const {
+    return targets[set % 2] + (int64_t(r) * places() + set / 2) * width * channels + at;
+  }
 };
 
 // What one thread does: rows of rays, and those of panels that are complete by then.
@@ -84,35 +91,47 @@ Share share_of(const Problem &problem, int part, int parts, int fields, bool pha
     held[n] = 2;
     for (int q = 0, oldest = 0; q < image.rows; held[n] = std::max(held[n], int64_t(++q - oldest) + 2))
       while (oldest < q && until[oldest + 1] < since[std::max(q - 1, 0)]) ++oldest;
-    total += phasors ? 2 * held[n] * (image.width * problem.channels + LANES) : 0;
+    total += phasors ? 2 * held[n] * whole_vectors(image.width * problem.channels + LANES) : 0;
   }
   share.first = begin;
-  share.stride = int64_t(problem.width) * problem.channels + 2 * LANES;
+  share.stride = whole_vectors(int64_t(problem.width) * problem.channels + LANES);
   share.plane = share.stride * share.rows;
   const int64_t rings = problem.sets * fields * share.plane + 2 * LANES;
-  memory.resize(size_t(rings + total + 2 * LANES));
-  share.ring = memory.data();
+  memory.resize(size_t(rings + total + 3 * LANES));
+  share.ring = memory.data() + (LANES - (reinterpret_cast<uintptr_t>(memory.data()) / sizeof(int16_t)) % LANES);
   int16_t *at = share.ring + rings;
   for (int n = 0; phasors && n < problem.panels; ++n)
     for (Image *image : {share.cosine + n, share.sine + n}) {
       const Image &like = problem.panel[n].ahead;
-      *image = {at, int64_t(like.width) * problem.channels + LANES, like.rows, like.width, int32_t(held[n])};
+      *image = {at, whole_vectors(int64_t(like.width) * problem.channels + LANES), like.rows, like.width, int32_t(held[n])};
       at += image->stride * held[n];
     }
   return share;
 }
 
+// Of x, x^3, x^5 and x^7 in sin(pi/2 x), and UNIT, for 16384; what 32768 / FULL has beyond 8, for 32768.
+struct Factors {
+  int16_t first = 25736, third = -10583, fifth = 1302, seventh = -71, unit = int16_t(UNIT * 2), beyond_eight = 1028;
+};
+
+// UNIT times the cosine of an angle; 32768 is half a turn.
+INLINE int16_t cosine_of(int16_t angle, const Factors &by) {
+  const int16_t within = int16_t(16384 - (angle < 0 ? -angle : angle));     // sine's, a quarter turn to either side
+  const int16_t x = int16_t(2 * within - (within >> 14)), y = product(x, x);  // one less where 16 bits don't hold it
+  const int16_t series = int16_t(by.third + product(y, int16_t(by.fifth + product(y, by.seventh))));
+  return product(product(x, int16_t(by.first + product(y, series))), by.unit);
+}
+
 // Row q of a panel as cosine and sine of pi times what it shows.
 INLINE void to_phasors(const Problem &problem, const Share &share, int n, int q) {
+  Factors by;
+  asm("" : "+m"(by));  // products with numbers that a compiler knows are taken apart, which takes four times as long
   const int16_t *row = problem.panel[n].ahead.row(q);
   int16_t *cosine = const_cast<int16_t *>(share.cosine[n].row(q)), *sine = const_cast<int16_t *>(share.sine[n].row(q));
   const int count = problem.panel[n].ahead.width * problem.channels;
   VECTORISED for (int k = 0; k < count; ++k) {
-    const float t = (float(row[k]) - FULL / 2) * (PI / FULL), y = t * t;  // series about the middle of the range
-    const float s = ((((-1.0f / 39916800 * y + 1.0f / 362880) * y - 1.0f / 5040) * y + 1.0f / 120) * y - 1.0f / 6) * y + 1;
-    const float c = (((1.0f / 479001600 * y - 1.0f / 3628800) * y + 1.0f / 40320) * y - 1.0f / 720) * y + 1.0f / 24;
-    cosine[k] = rounded(UNIT * std::clamp(-s * t, -1.0f, 1.0f));
-    sine[k] = rounded(UNIT * std::clamp((c * y - 0.5f) * y + 1, -1.0f, 1.0f));
+    const int16_t angle = int16_t(8 * row[k] + product(row[k], by.beyond_eight));
+    cosine[k] = cosine_of(angle, by), sine[k] = cosine_of(int16_t(angle - 16384), by);
   }
 }
 
@@ -125,7 +144,14 @@ INLINE void clear_beside(const Problem &problem, const Share &share, int set, in
   }
 }
 
-// Row r of a set of rays: the squared slope, and for every panel the error times the other panels' phasors.
+// What 1 is in the product of so many panels' phasors.
+INLINE float unit_of(int panels) {
+  float unit = UNIT;
+  for (int n = 1; n < panels; ++n) unit *= UNIT / 8192;
+  return unit;
+}
+
+// Row r of a set of rays: the squared slope, and the error times the slope.
 template <int C, int N>
 INLINE void compare(const Problem &problem, const Share &share, int set, int r, Work &work) {
   Line lines[N];
@@ -134,7 +160,8 @@ INLINE void compare(const Problem &problem, const Share &share, int set, int r, 
     lines[n] = Line(problem.panels_from_rays + (set * N + n) * 9, r);
     span = common(span, inside(lines[n], problem.width, problem.panel[n].ahead, NEAR_PX));
   }
-  const float row_taper = problem.row_taper[r] * UNIT;
+  const int16_t one = rounded(unit_of(N)), twice = rounded(512.0f / 255 * unit_of(N));
+  const int16_t row_taper = problem.row_taper[r * problem.places() + set / 2];
   int tile = TILE_PX;
   for (const Line &line : lines) tile = std::min(tile, tile_px(line, span));
   for (int u = span.first; u < span.last; u += tile) {
@@ -144,49 +171,48 @@ INLINE void compare(const Problem &problem, const Share &share, int set, int r, 
       sample<2, C>(phasor, lines[n], u, end, work, work.tile + 2 * n);
     }
     const int64_t at = int64_t(u) * C;
-    const uint8_t *target = problem.targets[set % 2] + int64_t(r) * problem.width * C + at;
-    const float *taper = problem.column_taper + at;
-    int16_t *out[1 + 2 * N];
-    for (int f = 0; f < 1 + 2 * N; ++f) out[f] = share.row(set, f, r) + at;
+    const uint8_t *target = problem.target(set, r, at);
+    const int16_t *taper = problem.column_taper + at;
+    int16_t *curvature = share.row(set, 0, r) + at, *gradient = share.row(set, 1, r) + at;
     for (int e = 0; e < count; e += LANES)
       VECTORISED for (int k = e; k < e + LANES; ++k) {
-        float re[N], im[N], before_re[N + 1], before_im[N + 1], after_re[N + 1], after_im[N + 1];
-        before_re[0] = after_re[N] = 1, before_im[0] = after_im[N] = 0;
-        for (int n = 0; n < N; ++n) {
-          re[n] = work.tile[2 * n][k] * (1 / UNIT), im[n] = work.tile[2 * n + 1][k] * (1 / UNIT);
-          before_re[n + 1] = before_re[n] * re[n] - before_im[n] * im[n];
-          before_im[n + 1] = before_re[n] * im[n] + before_im[n] * re[n];
+        int16_t re = work.tile[0][k], im = work.tile[1][k];
+        for (int n = 1; n < N; ++n) {
+          const int16_t c = work.tile[2 * n][k], s = work.tile[2 * n + 1][k], a = int16_t(4 * re), b = int16_t(4 * im);
+          re = int16_t(product(a, c) - product(b, s)), im = int16_t(product(a, s) + product(b, c));
         }
-        for (int n = N - 1; n >= 0; --n) {
-          after_re[n] = after_re[n + 1] * re[n] - after_im[n + 1] * im[n];
-          after_im[n] = after_re[n + 1] * im[n] + after_im[n + 1] * re[n];
-        }
-        const float seen = 0.5f - 0.5f * before_re[N], slope = before_im[N];
-        const float error = (seen - float(target[k]) * (1.0f / 255)) * (taper[k] * row_taper);
-        out[0][k] = rounded(slope * slope * UNIT);
-        for (int n = 0; n < N; ++n) {
-          out[1 + 2 * n][k] = rounded(error * (before_re[n] * after_re[n + 1] - before_im[n] * after_im[n + 1]));
-          out[2 + 2 * n][k] = rounded(error * (before_re[n] * after_im[n + 1] + before_im[n] * after_re[n + 1]));
-        }
+        const int16_t wanted = product(int16_t(target[k] << 7), twice);  // twice what should be seen
+        const int16_t error = product(int16_t(one - re - wanted), product(taper[k], row_taper));  // twice as well
+        curvature[k] = product(int16_t(2 * im), int16_t(2 * im)), gradient[k] = product(error, int16_t(2 * im));
       }
   }
   clear_beside(problem, share, set, r, span);
 }
 
-// What F fields of all sets (four at most, whose sum fits) come to at pixels of a panel's row, into work.sum.
+// Where all sets' rays through a panel's row are.
+struct Back {
+  Line line[MAX_SETS];
+  Span span[MAX_SETS];
+  Back(const Problem &problem, const Share &share, int n, int q) {
+    for (int set = 0; set < problem.sets; ++set) {
+      line[set] = Line(problem.rays_from_panels + (set * problem.panels + n) * 9, q);
+      span[set] = inside(line[set], problem.panel[n].ahead.width, share.image(problem, set, 0), 0);
+    }
+  }
+};
+
+// What the first F fields of all sets come to at pixels of a panel's row, into work.sum.
 template <int F, int C>
-INLINE void gather(const Problem &problem, const Share &share, const int *fields, int n, int q, Span tile, Work &work) {
-  const int width = problem.panel[n].ahead.width;
+INLINE void gather(const Problem &problem, const Share &share, const Back &back, Span tile, Work &work) {
   for (int f = 0; f < F; ++f) std::memset(work.sum[f], 0, sizeof work.sum[f]);
   for (int set = 0; set < problem.sets; ++set) {
-    const Line line(problem.rays_from_panels + (set * problem.panels + n) * 9, q);
     Image images[F];
-    for (int f = 0; f < F; ++f) images[f] = share.image(problem, set, fields[f]);
-    const Span span = common(tile, inside(line, width, images[0], 0));
+    for (int f = 0; f < F; ++f) images[f] = share.image(problem, set, f);
+    const Span span = common(tile, back.span[set]);
     if (span.first == span.last) continue;
-    for (int u = span.first, length = tile_px(line, span); u < span.last; u += length) {
+    for (int u = span.first, length = tile_px(back.line[set], span); u < span.last; u += length) {
       const int end = std::min(u + length, span.last), count = (end - u) * C;
-      sample<F, C>(images, line, u, end, work, work.tile);
+      sample<F, C>(images, back.line[set], u, end, work, work.tile);
       for (int f = 0; f < F; ++f) {
         std::memset(work.tile[f] + count, 0, LANES * sizeof *work.tile[f]);
         int16_t *sum = work.sum[f] + (u - tile.first) * C;
@@ -201,21 +227,22 @@ INLINE void gather(const Problem &problem, const Share &share, const int *fields
 template <int C, int N>
 INLINE void move(const Problem &problem, const Share &share, int n, int q, Work &work) {
   const Panel &panel = problem.panel[n];
-  const int fields[3] = {0, 1 + 2 * n, 2 + 2 * n};
-  const float least = problem.floor * float(problem.sets) * UNIT, size = problem.size * FULL / (N * PI / 2) / UNIT;
+  const Back back(problem, share, n, q);
+  const float least = problem.floor * float(problem.sets) * unit_of(N) * unit_of(N) / 8192;
+  const float size = problem.size * FULL / (N * PI / 2);
+  const int16_t momentum = rounded(32768 * problem.momentum);
   for (int u = 0; u < panel.ahead.width; u += TILE_PX) {
     const Span tile{u, std::min(u + TILE_PX, panel.ahead.width)};
-    gather<3, C>(problem, share, fields, n, q, tile, work);
+    gather<2, C>(problem, share, back, tile, work);
     const int64_t at = int64_t(u) * C, count = int64_t(tile.last - u) * C;
-    const int16_t *cosine = share.cosine[n].row(q) + at, *sine = share.sine[n].row(q) + at, *ahead = panel.ahead.row(q) + at;
+    const int16_t *ahead = panel.ahead.row(q) + at;
     int16_t *last = const_cast<int16_t *>(panel.last.row(q)) + at, *moved = const_cast<int16_t *>(panel.moved.row(q)) + at;
     for (int e = 0; e < count; e += LANES)
       VECTORISED for (int k = e; k < e + LANES; ++k) {
-        const float gradient = float(sine[k]) * float(work.sum[1][k]) + float(cosine[k]) * float(work.sum[2][k]);
-        const float change = size * gradient / std::max(float(work.sum[0][k]), least);
-        const float now = std::min(std::max(float(ahead[k]) - change, 0.0f), FULL);
-        moved[k] = rounded(now + problem.momentum * (now - float(last[k])));
-        last[k] = rounded(now);
+        const float change = size * float(work.sum[1][k]) / std::max(float(work.sum[0][k]), least);
+        const int16_t now = rounded(std::min(std::max(float(ahead[k]) - change, 0.0f), float(FULL)));
+        moved[k] = int16_t(now + product(int16_t(now - last[k]), momentum));
+        last[k] = now;
       }
   }
 }
@@ -232,7 +259,8 @@ INLINE void lack(const Problem &problem, const Share &share, int set, int r, Wor
   for (int u = span.first; u < span.last; u += TILE_PX) {
     const Span tile{u, std::min(u + TILE_PX, span.last)};
     const int count = (tile.last - u) * C;
-    float sum[TILE] = {};
+    int16_t *sum = work.sum[0];
+    std::fill(sum, sum + TILE, int16_t(0));
     for (int n = 0; n < problem.panels; ++n) {
       if (n == middle) continue;
       const Line line(homographies + n * 9, r);
@@ -243,21 +271,22 @@ INLINE void lack(const Problem &problem, const Share &share, int set, int r, Wor
         sample<1, C>(&problem.panel[n].last, line, v, end, work, work.tile + 1);
         std::memcpy(work.tile[0] + (v - u) * C, work.tile[1], size_t(end - v) * C * sizeof(int16_t));
       }
-      VECTORISED for (int k = 0; k < TILE; ++k) sum[k] += float(work.tile[0][k]);
+      VECTORISED for (int k = 0; k < TILE; ++k) sum[k] = int16_t(sum[k] + work.tile[0][k]);
     }
     const int64_t at = int64_t(u) * C;
-    const uint8_t *target = problem.targets[set % 2] + int64_t(r) * problem.width * C + at;
+    const uint8_t *target = problem.target(set, r, at);
     int16_t *weights = share.row(set, 0, r) + at, *wanted = share.row(set, 1, r) + at;
-    float asked[TILE], weight[TILE];
-    for (int k = 0; k < count; ++k) asked[k] = problem.table[2 * target[k]], weight[k] = problem.table[2 * target[k] + 1];
-    const int begin = std::clamp((whole.first - u) * C, 0, count), end = std::clamp((whole.last - u) * C, begin, count);
-    for (int k = 0; k < begin; ++k) weight[k] *= problem.missing;
-    for (int k = end; k < count; ++k) weight[k] *= problem.missing;
     for (int e = 0; e < count; e += LANES)
       VECTORISED for (int k = e; k < e + LANES; ++k) {
-        weights[k] = rounded(weight[k] * UNIT);
-        wanted[k] = rounded(std::min(std::max(asked[k] - sum[k], -FULL), 2 * FULL) * weight[k] * 0.5f);
+        const int32_t entry = problem.table[target[k]];
+        const int16_t left = int16_t(int16_t(entry) - sum[k]);
+        sum[k] = std::min(std::max(left, int16_t(-FULL)), int16_t(2 * FULL)), weights[k] = int16_t(entry >> 16);
       }
+    const int begin = std::clamp((whole.first - u) * C, 0, count), end = std::clamp((whole.last - u) * C, begin, count);
+    for (int k = 0; k < begin; ++k) weights[k] = rounded(float(weights[k]) * problem.missing);
+    for (int k = end; k < count; ++k) weights[k] = rounded(float(weights[k]) * problem.missing);
+    for (int e = 0; e < count; e += LANES)
+      VECTORISED for (int k = e; k < e + LANES; ++k) wanted[k] = product(int16_t(2 * sum[k]), int16_t(2 * weights[k]));
   }
   clear_beside(problem, share, set, r, span);
 }
@@ -265,14 +294,16 @@ INLINE void lack(const Problem &problem, const Share &share, int set, int r, Wor
 // Row q of the middle panel: the mean of what all rays through it lack.
 template <int C>
 INLINE void fill(const Problem &problem, const Share &share, int q, Work &work) {
-  const int middle = problem.panels / 2, fields[2] = {0, 1};
-  const Image &image = problem.panel[middle].last;
+  const Image &image = problem.panel[problem.panels / 2].last;
+  const Back back(problem, share, problem.panels / 2, q);
   for (int u = 0; u < image.width; u += TILE_PX) {
     const Span tile{u, std::min(u + TILE_PX, image.width)};
-    gather<2, C>(problem, share, fields, middle, q, tile, work);
+    gather<2, C>(problem, share, back, tile, work);
     int16_t *out = const_cast<int16_t *>(image.row(q)) + int64_t(u) * C;
-    for (int k = 0; k < (tile.last - u) * C; ++k)
-      if (work.sum[0][k] > 0) out[k] = rounded(std::clamp(2 * UNIT * float(work.sum[1][k]) / float(work.sum[0][k]), 0.0f, FULL));
+    VECTORISED for (int k = 0; k < (tile.last - u) * C; ++k) {
+      const float weight = work.sum[0][k], mean = 8192 * float(work.sum[1][k]) / std::max(weight, 1.0f);
+      out[k] = weight > 0 ? rounded(std::min(std::max(mean, 0.0f), float(FULL))) : out[k];
+    }
   }
 }
 
@@ -308,7 +339,7 @@ INLINE void close_rows(const Problem &problem, const Share &share) {
 
 // One of so many parts of a step, all of which may run at once; a panel's phasors are `ahead`'s.
 FOR_EVERY_CPU void step(const Problem *problem, int part, int parts) {
-  const Share share = share_of(*problem, part, parts, 1 + 2 * problem->panels, true);
+  const Share share = share_of(*problem, part, parts, 2, true);
   switch (problem->channels * 10 + problem->panels) {
     case 12: return step_rows<1, 2>(*problem, share);
     case 13: return step_rows<1, 3>(*problem, share);

@@ -32,7 +32,7 @@ class Step(Section):
     places: Places = Field(
         "middle",
         description="where unsure eyes are taken to be: where they are, or a standard deviation to either side, "
-        "the right one higher or lower",
+        "the right one higher or lower, in turn from row to row of a picture",
     )
 
 

@@ -17,9 +17,10 @@ from runtime.model.job import Job
 from runtime.model.targets import beside_codes, rest_of, target_table, without_alpha
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
-from runtime.records import F64, I16, U8
+from runtime.records import F32, F64, I16, U8
 from runtime.support.threads import at_once, on_rows
 
+WEIGHT, TAPER = 8191, 32767  # of 1 in targets' weights, and in tapers
 SAFE = 4 * MARGIN  # elements around rows of panels that whole vectors touch
 
 
@@ -61,7 +62,7 @@ class CpuState:
             pictures = [images[0][rays.slices] for images in job.arrays]
         self._targets = at_once(lambda picture: without_alpha(picture, job.channels), pictures)
         across, down = geometry.tapers()
-        self._tapers = np.repeat(across, job.channels), down
+        self._tapers = [np.rint(TAPER * taper).astype(np.int16) for taper in (np.repeat(across, job.channels), down)]
         for n, panel in enumerate(self._held.last):
             box = geometry.boxes[n]
             panel[: box.height_px, : box.width_px * job.channels] = self._rest
@@ -122,10 +123,10 @@ class CpuState:
         """What the loops are given; and arrays that must live as long."""
         geometry, held, channels = self._geometry, self._held, self._channels
         seen, back = np.ascontiguousarray(panels_from_rays), np.ascontiguousarray(inverse(panels_from_rays))
-        table = target_table(self._stack.count)
+        table = _packed(target_table(self._stack.count))
         problem = Problem(
             panels=self._stack.count, sets=len(seen), channels=channels,
-            height=geometry.rays.height_px, width=geometry.rays.width_px,
+            height=geometry.rays.height_px // (len(seen) // 2), width=geometry.rays.width_px,
             panels_from_rays=seen.ctypes.data, rays_from_panels=back.ctypes.data,
             targets=(c_void_p * 2)(*(target.ctypes.data for target in self._targets)),
             column_taper=self._tapers[0].ctypes.data, row_taper=self._tapers[1].ctypes.data,
@@ -135,6 +136,12 @@ class CpuState:
             images = (held.ahead[n], held.moved[n], held.last[n])
             problem.panel[n] = Panel(*(Image.of(image, rows=box.height_px, width=box.width_px) for image in images))
         return problem, (seen, back, table)
+
+
+def _packed(table: F32) -> NDArray[np.int32]:
+    """A table's sums in the lower 16 bits, its weights above."""
+    sums, weights = np.rint(table * np.array((1, WEIGHT), np.float32)).astype(np.int32).T
+    return np.asarray(sums + (weights << 16), np.int32)
 
 
 class _Buffers:

@@ -62,18 +62,23 @@ class Geometry:
         return tuple(box.cut(self.stack.panel(n)) for n, box in enumerate(self.boxes))
 
     def panels_from_rays(self, places: Places, eye_sigma_mm: float) -> F64:
-        """(2P, N, 3, 3) panel pixels (from the box's first) for P eye places, left and right in turn."""
+        """(2P, N, 3, 3) panel pixels (from the box's first) for P eye places, left and right in turn.
+
+        Places take turns from row to row of a picture: row k of place p's rays is the picture's row P·k + p.
+        """
         right, up = stack_from_eye(self.eyes_m.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
-        centre = np.array([self.rays.width_px / 2, self.rays.height_px / 2, 1.0])
-        found = []
-        for across, down in PLACES[places] if eye_sigma_mm > 0 else PLACES["middle"]:
+        taken = PLACES[places] if eye_sigma_mm > 0 and self.rays.height_px > 1 else PLACES["middle"]
+        turns, found = len(taken), []
+        centre = np.array([self.rays.width_px / 2, self.rays.height_px / turns / 2, 1.0])
+        for turn, (across, down) in enumerate(taken):
+            rows = np.array([[1.0, 0.0, 0.0], [0.0, turns, turn + (1 - turns) / 2], [0.0, 0.0, 1.0]])
             moved_m = eye_sigma_mm / 1e3 * (across * right + down * up)
             for eye_m, from_rays in zip(self.eyes_m + moved_m, self.middle_from_rays, strict=True):
                 between = [
                     panel_from_middle(self.stack, self.rasters, eye_m, n) if n != self.middle else np.eye(3)
                     for n in range(self.stack.count)
                 ]
-                seen = np.stack(between) @ from_rays
+                seen = np.stack(between) @ from_rays @ rows
                 found.append(seen / (seen[:, 2] @ centre)[:, None, None])
         return np.array(found)
 

@@ -78,24 +78,24 @@ class GlState:
 
     def step(self, step: Step) -> None:
         seen = self._geometry.panels_from_rays(step.places, self._sigma_mm)
-        back = inverse(seen)
+        back, places = inverse(seen), len(seen) // 2
         ahead = {f"ahead{n}": self._panel(self._ahead, n) for n in range(PANELS)}
-        names = ("curvature", *(f"{part}{n}" for n in range(PANELS) for part in ("real", "imaginary")))
+        tapers = {name: self._taper(name) for name in ("column_taper", "row_taper")}
+        fields: dict[str, Image] = {}
         for number, matrices in enumerate(seen):
-            fields = tuple(self._rays(f"{name} {number}") for name in names)
-            tapers = {name: self._taper(name) for name in ("column_taper", "row_taper")}
-            self._draw("compare", fields, {**ahead, **self._wanted(number % 2), **tapers}, self._through(matrices))
+            drawn = {f"{name}{number}": self._rays(f"{name} {number}", places) for name in ("curvature", "gradient")}
+            inputs = {**ahead, **self._wanted(number % 2), **tapers}
+            how = {**self._through(matrices), "turn": (places, number // 2)}
+            self._draw("compare", tuple(drawn.values()), inputs, how)
+            fields |= drawn
         how = {
             "size": step.size / (PANELS * np.pi / 2), "momentum": step.momentum, "least": step.floor * len(seen),
         }  # fmt: skip
         for n in range(PANELS):
-            inputs = {"ahead": ahead[f"ahead{n}"], "last": self._panel("last", n)}
-            for number in range(len(seen)):
-                for name in ("curvature", f"real{n}", f"imaginary{n}"):
-                    inputs[f"{name.rstrip('012')}{number}"] = self._rays(f"{name} {number}")
+            inputs = {"ahead": ahead[f"ahead{n}"], "last": self._panel("last", n), **fields}
             outputs = self._panel("moved", n), self._panel("spare", n)
-            defines = ("FOUR_SETS",) if len(seen) == 4 else ()
-            self._draw("move", outputs, inputs, {**self._back(back[:, n]), **how}, defines=defines)
+            defines = ("FOUR_SETS",) if places == 2 else ()
+            self._draw("move", outputs, inputs, {**self._back(back[:, n], places), **how}, defines=defines)
             self._swap("ahead", "moved", n)
             self._swap("last", "spare", n)
         self._ahead = "ahead"
@@ -152,8 +152,8 @@ class GlState:
             found |= {f"from_rays{n}": _mat3(matrix), f"size{n}": (box.width_px, box.height_px)}
         return found
 
-    def _back(self, matrices: F64) -> dict[str, Any]:
-        rays = self._geometry.rays.width_px, self._geometry.rays.height_px
+    def _back(self, matrices: F64, places: int = 1) -> dict[str, Any]:
+        rays = self._geometry.rays.width_px, self._geometry.rays.height_px // places
         return {"rays": rays, **{f"rays_from{number}": _mat3(matrix) for number, matrix in enumerate(matrices)}}
 
     def _draw(
@@ -189,9 +189,10 @@ class GlState:
         a, b = f"{one} {n}", f"{other} {n}"
         self._names[a], self._names[b] = self._names.get(b, other), self._names.get(a, one)
 
-    def _rays(self, name: str) -> Image:
+    def _rays(self, name: str, places: int = 1) -> Image:
         rays = self._geometry.rays
-        return self._grown(name, rays.width_px, rays.height_px, self._components, "nu2")
+        whole = self._grown(name, rays.width_px, rays.height_px, self._components, "nu2")
+        return Image(whole.texture, rays.width_px, rays.height_px // places)
 
     def _taper(self, name: str) -> Image:
         return Image(self._texture(name, (self._longest, 1), 1, dtype="f4"), self._longest, 1)

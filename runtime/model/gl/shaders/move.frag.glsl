@@ -1,11 +1,11 @@
 #version 330 core
-// A panel moved by what all rays through its pixels see wrong (L5). SETS: two, or four.
+// A panel moved by what all rays through its pixels see wrong (L5).
 uniform vec2 origin;
 #include "places.glsl"
-uniform sampler2D ahead, last, curvature0, real0, imaginary0, curvature1, real1, imaginary1;
+uniform sampler2D ahead, last, curvature0, gradient0, curvature1, gradient1;
 uniform mat3 rays_from0, rays_from1;
 #ifdef FOUR_SETS
-uniform sampler2D curvature2, real2, imaginary2, curvature3, real3, imaginary3;
+uniform sampler2D curvature2, gradient2, curvature3, gradient3;
 uniform mat3 rays_from2, rays_from3;
 #endif
 uniform vec2 rays;
@@ -13,28 +13,25 @@ uniform float size, momentum, least;
 layout(location = 0) out vec4 moved;
 layout(location = 1) out vec4 now;
 
-vec4 curved = vec4(0.0), real = vec4(0.0), imaginary = vec4(0.0);
+vec4 curved = vec4(0.0), slope = vec4(0.0);
 
-void gather(mat3 rays_from, sampler2D of_curvature, sampler2D of_real, sampler2D of_imaginary) {
+void gather(mat3 rays_from, sampler2D of_curvature, sampler2D of_gradient) {
     vec2 at = place(rays_from);
     if (!inside(at, rays, 0.0)) return;
     curved += sampled(of_curvature, at, rays);
-    real += signed_number(sampled(of_real, at, rays));
-    imaginary += signed_number(sampled(of_imaginary, at, rays));
+    slope += signed_number(sampled(of_gradient, at, rays));
 }
 
 void main() {
     ivec2 here = ivec2(gl_FragCoord.xy);
     vec4 shown = panel(texelFetch(ahead, here, 0)), before = panel(texelFetch(last, here, 0));
-    gather(rays_from0, curvature0, real0, imaginary0);
-    gather(rays_from1, curvature1, real1, imaginary1);
+    gather(rays_from0, curvature0, gradient0);
+    gather(rays_from1, curvature1, gradient1);
 #ifdef FOUR_SETS
-    gather(rays_from2, curvature2, real2, imaginary2);
-    gather(rays_from3, curvature3, real3, imaginary3);
+    gather(rays_from2, curvature2, gradient2);
+    gather(rays_from3, curvature3, gradient3);
 #endif
-    vec4 angle = 3.14159265 * shown;
-    vec4 gradient = sin(angle) * real + cos(angle) * imaginary;
-    vec4 after = clamp(shown - size * gradient / max(curved, least), 0.0, 1.0);
+    vec4 after = clamp(shown - size * slope / max(curved, least), 0.0, 1.0);
     now = held_panel(after);
     moved = held_panel(after + momentum * (after - before));
 }
