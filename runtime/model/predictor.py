@@ -9,7 +9,7 @@ from runtime.config import ModelSettings
 from runtime.errors import InputError, MissingPart
 from runtime.kernels import MAX_PANELS, library
 from runtime.model.base import Prediction, Predictor
-from runtime.model.contract import Step
+from runtime.model.contract import Places, Step
 from runtime.optics.stack import PanelStack
 from runtime.support.memory import keep_freed_memory
 
@@ -45,7 +45,9 @@ def shipped_sha256(name: str) -> str:
 
 def steps_from_even(steps: int) -> tuple[Step, ...]:
     """What serves where panels begin even in place of so many steps from a network's proposal."""
-    return (Step(size=1.2),) * (5 * steps + 3) + (Step(size=0.8),) * (2 * steps + 1)
+    in_turn: tuple[Places, ...] = ("rising", "middle", "falling", "middle")
+    sizes = (1.2,) * (4 * steps) + (0.8,) * (3 * steps // 2)
+    return tuple(Step(size=size, places=in_turn[n % 4]) for n, size in enumerate(sizes))
 
 
 def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None = None) -> Predictor:
