@@ -27,6 +27,7 @@ MIN_WEIGHT = (
     0.05  # of a corner in a picture's homography, beside the middle's: nearer to the eye's plane it has no place
 )
 MISSING_WEIGHT = 1 / 8  # 2 dB in two pairs of twelve: the other eye's ray through such a pixel may cross all panels
+SURE_PX = 0.25  # of an outer panel: eyes that are sure to less are where they are
 TAPERED_SHARE = 1 / 6  # of a window's taper, over which its rays fade: they mend the error of the wave's own
 PLACES: dict[Places, tuple[tuple[float, float], ...]] = {  # right and up, standard deviations of the eyes' place
     "middle": ((0.0, 0.0),),
@@ -67,7 +68,8 @@ class Geometry:
         Places take turns from row to row of a picture: row k of place p's rays is the picture's row P·k + p.
         """
         right, up = stack_from_eye(self.eyes_m.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
-        taken = PLACES[places] if eye_sigma_mm > 0 and self.rays.height_px > 1 else PLACES["middle"]
+        sure = self.rays.height_px == 1 or self._moved_px(eye_sigma_mm) < SURE_PX
+        taken = PLACES["middle" if sure else places]
         turns, found = len(taken), []
         centre = np.array([self.rays.width_px / 2, self.rays.height_px / turns / 2, 1.0])
         for turn, (across, down) in enumerate(taken):
@@ -81,6 +83,12 @@ class Geometry:
                 seen = np.stack(between) @ from_rays @ rows
                 found.append(seen / (seen[:, 2] @ centre)[:, None, None])
         return np.array(found)
+
+    def _moved_px(self, eye_sigma_mm: float) -> float:
+        """How far one sigma of the eyes moves what they see of a panel against the middle one, at most."""
+        pitch_m, middle_x_m = self.stack.panel(self.middle).pitch_u_m, self.stack.x_m[self.middle]
+        shares = [abs((x_m - middle_x_m) / (self.eyes_m[:, 0].mean() - middle_x_m)) for x_m in self.stack.x_m]
+        return float(eye_sigma_mm / 1e3 * max(shares) / pitch_m)
 
     def tapers(self) -> tuple[F32, F32]:
         """(width,) and (height,) what rays' errors are multiplied with: 0 at a window's edges to 1 inside."""

@@ -59,7 +59,8 @@ def smooth(seed: int, channels: int) -> U8:
 def begun(stack: PanelStack, pair: F64, *, own: bool, channels: int = 3, threads: int = 2) -> tuple[CpuState, Job, Any]:
     """A state with random panels, and what it was begun for."""
     pictures = [smooth(seed, channels) for seed in (8, 9)]
-    job = Job([[cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA)] for picture in pictures], pair, channels=channels)  # type: ignore[list-item]
+    drawn: Any = [[cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA)] for picture in pictures]
+    job = Job(drawn, pair, channels=channels, eye_sigma_mm=5.0)
     if own:
         at = [image_from_stack(eye, width_px=480, height_px=270, fov_deg=FOV_DEG) for eye in pair]
         job = replace(job, own=Own(pictures, np.stack(at)))
