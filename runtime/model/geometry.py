@@ -27,7 +27,7 @@ MIN_WEIGHT = (
     0.05  # of a corner in a picture's homography, beside the middle's: nearer to the eye's plane it has no place
 )
 MISSING_WEIGHT = 1 / 8  # 2 dB in two pairs of twelve: the other eye's ray through such a pixel may cross all panels
-SURE_PX = 0.25  # of an outer panel: eyes that are sure to less are where they are
+SURE_PX = 1 / 8  # of an outer panel: eyes that are sure to less are where they are
 TAPERED_SHARE = 1 / 6  # of a window's taper, over which its rays fade: they mend the error of the wave's own
 PLACES: dict[Places, tuple[tuple[float, float], ...]] = {  # right and up, standard deviations of the eyes' place
     "middle": ((0.0, 0.0),),
