@@ -180,7 +180,7 @@ def test_pictures_of_parallel_cameras_are_solved_for_what_they_are() -> None:
 
     solved = phasestack.solve(*pictures, cameras=cameras, stack=STACK, model="fast")
     assert solved.quality.psnr_db > 30 and truth_db(cameras=cameras) > 30
-    assert abs(solved.quality.psnr_db - truth_db(cameras=cameras)) < 3  # of 53
+    assert abs(solved.quality.psnr_db - truth_db(cameras=cameras)) < 2.8  # of 53
     with pytest.warns(UserWarning, match="beside the panels"):
         assert truth_db(eyes_m=eyes_m, fov_deg=62) < 20
 

@@ -11,7 +11,6 @@ namespace {
 
 constexpr int FULL = 255 * 16;   // of a panel that shows 1: sixteenths of a code
 constexpr float UNIT = 8100;     // of 1 in phasors: rounding takes no product of theirs beyond 8191
-constexpr float WEIGHT = 8191;   // of 1 in targets' weights
 constexpr float PI = 3.14159265f;
 constexpr double NEAR_PX = 0.5;  // a ray counts that crosses every panel so far inside its edges
 constexpr int MAX_SETS = 4;      // of rays, whose sums fit 16 bits

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from ctypes import byref, c_void_p
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from runtime.model.job import Job
 from runtime.model.targets import beside_codes, rest_of, target_table, without_alpha
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
-from runtime.records import F32, F64, I16, U8
+from runtime.records import F64, I16, U8
 from runtime.support.threads import at_once, on_rows
 
 WEIGHT, TAPER = 8191, 32767  # of 1 in targets' weights, and in tapers
@@ -123,7 +124,7 @@ class CpuState:
         """What the loops are given; and arrays that must live as long."""
         geometry, held, channels = self._geometry, self._held, self._channels
         seen, back = np.ascontiguousarray(panels_from_rays), np.ascontiguousarray(inverse(panels_from_rays))
-        table = _packed(target_table(self._stack.count))
+        table = _packed_table(self._stack.count)
         problem = Problem(
             panels=self._stack.count, sets=len(seen), channels=channels,
             height=geometry.rays.height_px // (len(seen) // 2), width=geometry.rays.width_px,
@@ -138,9 +139,10 @@ class CpuState:
         return problem, (seen, back, table)
 
 
-def _packed(table: F32) -> NDArray[np.int32]:
-    """A table's sums in the lower 16 bits, its weights above."""
-    sums, weights = np.rint(table * np.array((1, WEIGHT), np.float32)).astype(np.int32).T
+@lru_cache(maxsize=8)
+def _packed_table(panels: int) -> NDArray[np.int32]:
+    """(256,) of `target_table`: sums in the lower 16 bits, weights above."""
+    sums, weights = np.rint(target_table(panels) * np.array((1, WEIGHT), np.float32)).astype(np.int32).T
     return np.asarray(sums + (weights << 16), np.int32)
 
 

@@ -171,7 +171,7 @@ def test_grey_windows_are_solved_in_one_channel(context: Any) -> None:
     layers = predictor.solve(job).layers.astype(np.int16)
     difference = np.abs(layers - predictor.solve(replace(job, channels=3)).layers)
     assert difference.max() <= 2
-    assert (difference > 0).mean() < 0.002  # a vector of one channel begins at other pixels than one of three
+    assert (difference > 0).mean() < 0.0015  # a vector of one channel begins at other pixels than one of three
 
 
 def test_models_that_can_t_be_cut_are_left_whole(context: Any) -> None:

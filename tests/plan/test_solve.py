@@ -50,7 +50,7 @@ def test_the_window_is_solved_alone_and_costs_little(tmp_path: Path, model: str)
     assert item["what"] == "inference beside the active window"
     plain = solved(tmp_path, "--no-plan", model=model)
     assert plain["plan"] == []
-    assert plain["psnr_db"] - planned["psnr_db"] < 0.85  # steps beside the window
+    assert plain["psnr_db"] - planned["psnr_db"] < 0.8  # steps beside the window
 
 
 def test_grey_pictures_are_solved_in_one_channel(tmp_path: Path) -> None:
