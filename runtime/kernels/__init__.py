@@ -34,7 +34,7 @@ class Image(ctypes.Structure):
 class Panel(ctypes.Structure):
     """One panel between steps."""
 
-    _fields_ = (("ahead", Image), ("moved", Image), ("last", Image))
+    _fields_ = (("ahead", Image), ("moved", Image), ("before", Image), ("last", Image))
 
 
 class Problem(ctypes.Structure):

@@ -99,7 +99,7 @@ INLINE int16_t mixed(int16_t a, int16_t b, int16_t share) { return int16_t(a + p
 struct alignas(2 * LANES) Work {
   int16_t source[FIELDS][SOURCE];
   int16_t tile[2 * MAX_PANELS][TILE];
-  int16_t sum[FIELDS][TILE];
+  int16_t sum[TILE];
 };
 
 // F images alike at pixels first to last of a line (TILE_PX at most, all of them `inside`), into out[f], from its first
@@ -107,7 +107,7 @@ struct alignas(2 * LANES) Work {
 // that grow evenly. Then neighbours of that, a vector at a time: the source's pixels move on by a little more or less
 // than the line's, so that a vector needs two neighbours, or a third and a fourth. Pixels on pixels need none.
 template <int F, int C, typename AnyLine>
-INLINE void sample(const Image *images, const AnyLine &line, int first, int last, Work &work, int16_t (*out)[TILE]) {
+INLINE void sample(const Image *images, const AnyLine &line, int first, int last, Work &work, int16_t (*out)[TILE], int begin_at = 0) {
   const Image &image = images[0];
   const int16_t *ramp = C == 1 ? RAMP.one_channel : RAMP.three_channels;
   const double xs = line.x(first), xe = line.x(last - 1), ys = line.y(first), ye = line.y(last - 1);
@@ -139,7 +139,7 @@ INLINE void sample(const Image *images, const AnyLine &line, int first, int last
       for (int f = 0; f < F; ++f) {
         const int16_t *upper = images[f].row(row) + from + e;
         const int16_t *lower = images[f].row(std::min(row + 1, image.rows - 1)) + from + e;
-        int16_t *to = (straight ? out[f] : work.source[f] + LANES) + at + e;
+        int16_t *to = (straight ? out[f] + begin_at : work.source[f] + LANES) + at + e;
         VECTORISED for (int k = 0; k < LANES; ++k) to[k] = mixed(upper[k], lower[k], weights[k]);
       }
     }
@@ -156,10 +156,12 @@ INLINE void sample(const Image *images, const AnyLine &line, int first, int last
   const double half = 0.5 * steps, middle = steps > 1 ? line.x(first + half) : 0.5 * (xs + xe);
   const double bend = steps > 1 ? (xs + xe - 2 * middle) / (half * half) * 0.5 : 0;  // along a tile: a parabola
   const double scale = steps > 0 ? (xe - xs) / steps - bend * steps : 1;  // where it begins
-  // So many elements at once that the source gains two pixels on them at most, and that a chord stands for the parabola.
+  // So many elements at once that the source gains three pixels on them at most, or two where many pixels would add up
+  // what a weight's growth is rounded by, and that a chord stands for the parabola.
+  constexpr double gains = C == 1 ? 1.9 : 2.9;
   const double most = std::max(std::abs(scale - 1), std::abs(scale - 1 + 2 * bend * steps));
   int at_once = LANES;
-  for (int px; px = (at_once + C - 2) / C, at_once > 1 && (most * px > 1.9 || std::abs(bend) * px * px > 0.004);) at_once /= 2;
+  for (int px; px = (at_once + C - 2) / C, at_once > 1 && (most * px > gains || std::abs(bend) * px * px > 0.008);) at_once /= 2;
   constexpr double one = 4294967296.0;  // fixed point: how much further to the right the source is, in 2^-32 pixels
   const int64_t begin = int64_t((xs - s0) * one), drift = int64_t((scale - 1) * one), turn = int64_t(bend * one);
   for (int e = 0; e < (steps + 1) * C; e += at_once) {
@@ -168,22 +170,24 @@ INLINE void sample(const Image *images, const AnyLine &line, int first, int last
     const int each = int((drift + turn * (2 * k + px) + (1 << 17)) >> 18), last_at = first_at + each * px;
     const int beside = std::min(first_at, last_at) >> 14, further = (std::max(first_at, last_at) >> 14) - beside;
     const uint16_t share = uint16_t(first_at - beside * int(WEIGHT_UNIT));
-    int16_t weights[3][LANES];  // from each neighbour to the next
+    int16_t weights[4][LANES];  // from each neighbour to the next
     VECTORISED for (int i = 0; i < LANES; ++i) {
       constexpr uint16_t full = uint16_t(WEIGHT_UNIT);
       const uint16_t weight = uint16_t(share + uint16_t(each) * uint16_t(ramp[i + phase])), to_second = std::min(weight, full);
-      const uint16_t to_third = std::min(uint16_t(weight - to_second), full);
+      const uint16_t rest = uint16_t(weight - to_second), to_third = std::min(rest, full);
+      const uint16_t beyond = uint16_t(rest - to_third), to_fourth = std::min(beyond, full);
       weights[0][i] = int16_t(to_second), weights[1][i] = int16_t(to_third);
-      weights[2][i] = int16_t(weight - to_second - to_third);
+      weights[2][i] = int16_t(to_fourth), weights[3][i] = int16_t(beyond - to_fourth);
     }
     for (int f = 0; f < F; ++f) {
       const int16_t *source = work.source[f] + LANES + (k + beside) * C + phase;
-      int16_t *to = out[f] + e;
+      int16_t *to = out[f] + begin_at + e;
       if (further == 0) VECTORISED for (int i = 0; i < LANES; ++i) to[i] = mixed(source[i], source[i + C], weights[0][i]);
       else VECTORISED for (int i = 0; i < LANES; ++i)
         to[i] = int16_t(mixed(source[i], source[i + C], weights[0][i]) + part_of(source[i + C], source[i + 2 * C], weights[1][i]));
-      if (further > 1) VECTORISED for (int i = 0; i < LANES; ++i)
-        to[i] = int16_t(to[i] + part_of(source[i + 2 * C], source[i + 3 * C], weights[2][i]));
+      for (int n = 2; n <= further; ++n)
+        VECTORISED for (int i = 0; i < LANES; ++i)
+          to[i] = int16_t(to[i] + part_of(source[i + n * C], source[i + (n + 1) * C], weights[n][i]));
     }
   }
 }

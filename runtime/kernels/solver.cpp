@@ -16,9 +16,10 @@ constexpr double NEAR_PX = 0.5;  // a ray counts that crosses every panel so far
 constexpr int MAX_SETS = 4;      // of rays, whose sums fit 16 bits
 
 struct Panel {
-  Image ahead;  // what the rays see: with momentum
-  Image moved;  // the same after the step
-  Image last;   // without momentum, read and written
+  Image ahead;   // what the rays see: with momentum
+  Image moved;   // the same after the step
+  Image before;  // without momentum
+  Image last;    // the same after the step; with the first one it is not `before`, which is `ahead`
 };
 
 struct Problem {
@@ -200,24 +201,25 @@ struct Back {
   }
 };
 
-// What the first F fields of all sets come to at pixels of a panel's row, into work.sum.
+// What the first F fields of all sets come to at pixels of a panel's row, into work.tile.
 template <int F, int C>
 INLINE void gather(const Problem &problem, const Share &share, const Back &back, Span tile, Work &work) {
-  for (int f = 0; f < F; ++f) std::memset(work.sum[f], 0, sizeof work.sum[f]);
+  const int count = (tile.last - tile.first) * C;
   for (int set = 0; set < problem.sets; ++set) {
     Image images[F];
     for (int f = 0; f < F; ++f) images[f] = share.image(problem, set, f);
     const Span span = common(tile, back.span[set]);
-    if (span.first == span.last) continue;
-    for (int u = span.first, length = tile_px(back.line[set], span); u < span.last; u += length) {
-      const int end = std::min(u + length, span.last), count = (end - u) * C;
-      sample<F, C>(images, back.line[set], u, end, work, work.tile);
-      for (int f = 0; f < F; ++f) {
-        std::memset(work.tile[f] + count, 0, LANES * sizeof *work.tile[f]);
-        int16_t *sum = work.sum[f] + (u - tile.first) * C;
-        for (int e = 0; e < count; e += LANES)
-          VECTORISED for (int k = e; k < e + LANES; ++k) sum[k] = int16_t(sum[k] + work.tile[f][k]);
-      }
+    int16_t(*out)[TILE] = work.tile + set * F;
+    const int begin = std::max(span.first - tile.first, 0) * C, end = std::max(span.last - tile.first, 0) * C;
+    for (int u = span.first, length = tile_px(back.line[set], span); u < span.last; u += length)
+      sample<F, C>(images, back.line[set], u, std::min(u + length, span.last), work, out, (u - tile.first) * C);
+    for (int f = 0; f < F; ++f) {
+      std::memset(out[f], 0, size_t(begin) * sizeof *out[f]);
+      std::memset(out[f] + end, 0, size_t(count - end) * sizeof *out[f]);
+      if (set == 0) continue;
+      int16_t *sum = work.tile[f];
+      for (int e = 0; e < count; e += LANES)
+        VECTORISED for (int k = e; k < e + LANES; ++k) sum[k] = int16_t(sum[k] + out[f][k]);
     }
   }
 }
@@ -235,12 +237,13 @@ INLINE void move(const Problem &problem, const Share &share, int n, int q, Work 
     gather<2, C>(problem, share, back, tile, work);
     const int64_t at = int64_t(u) * C, count = int64_t(tile.last - u) * C;
     const int16_t *ahead = panel.ahead.row(q) + at;
-    int16_t *last = const_cast<int16_t *>(panel.last.row(q)) + at, *moved = const_cast<int16_t *>(panel.moved.row(q)) + at;
+    const int16_t *before = panel.before.row(q) + at;
+  int16_t *last = const_cast<int16_t *>(panel.last.row(q)) + at, *moved = const_cast<int16_t *>(panel.moved.row(q)) + at;
     for (int e = 0; e < count; e += LANES)
       VECTORISED for (int k = e; k < e + LANES; ++k) {
-        const float change = size * float(work.sum[1][k]) / std::max(float(work.sum[0][k]), least);
+        const float change = size * float(work.tile[1][k]) / std::max(float(work.tile[0][k]), least);
         const int16_t now = rounded(std::min(std::max(float(ahead[k]) - change, 0.0f), float(FULL)));
-        moved[k] = int16_t(now + product(int16_t(now - last[k]), momentum));
+        moved[k] = int16_t(now + product(int16_t(now - before[k]), momentum));
         last[k] = now;
       }
   }
@@ -258,19 +261,18 @@ INLINE void lack(const Problem &problem, const Share &share, int set, int r, Wor
   for (int u = span.first; u < span.last; u += TILE_PX) {
     const Span tile{u, std::min(u + TILE_PX, span.last)};
     const int count = (tile.last - u) * C;
-    int16_t *sum = work.sum[0];
+    int16_t *sum = work.sum;
     std::fill(sum, sum + TILE, int16_t(0));
     for (int n = 0; n < problem.panels; ++n) {
       if (n == middle) continue;
       const Line line(homographies + n * 9, r);
       const Span seen = common(tile, inside(line, problem.width, problem.panel[n].last, 0));
-      std::fill(work.tile[0], work.tile[0] + TILE, int16_t(problem.rest));
-      for (int v = seen.first, length = tile_px(line, seen); v < seen.last; v += length) {
-        const int end = std::min(v + length, seen.last);
-        sample<1, C>(&problem.panel[n].last, line, v, end, work, work.tile + 1);
-        std::memcpy(work.tile[0] + (v - u) * C, work.tile[1], size_t(end - v) * C * sizeof(int16_t));
-      }
-      VECTORISED for (int k = 0; k < TILE; ++k) sum[k] = int16_t(sum[k] + work.tile[0][k]);
+      int16_t *one = work.tile[0], *begin = one + std::max(seen.first - u, 0) * C, *end = one + std::max(seen.last - u, 0) * C;
+      for (int v = seen.first, length = tile_px(line, seen); v < seen.last; v += length)
+        sample<1, C>(&problem.panel[n].last, line, v, std::min(v + length, seen.last), work, work.tile, (v - u) * C);
+      std::fill(one, begin, int16_t(problem.rest)), std::fill(end, one + count, int16_t(problem.rest));
+      for (int e = 0; e < count; e += LANES)
+        VECTORISED for (int k = e; k < e + LANES; ++k) sum[k] = int16_t(sum[k] + one[k]);
     }
     const int64_t at = int64_t(u) * C;
     const uint8_t *target = problem.target(set, r, at);
@@ -290,7 +292,7 @@ INLINE void lack(const Problem &problem, const Share &share, int set, int r, Wor
   clear_beside(problem, share, set, r, span);
 }
 
-// Row q of the middle panel: the mean of what all rays through it lack.
+// Row q of the middle panel: the mean of what all rays through it lack; it rests where there are none.
 template <int C>
 INLINE void fill(const Problem &problem, const Share &share, int q, Work &work) {
   const Image &image = problem.panel[problem.panels / 2].last;
@@ -300,8 +302,8 @@ INLINE void fill(const Problem &problem, const Share &share, int q, Work &work) 
     gather<2, C>(problem, share, back, tile, work);
     int16_t *out = const_cast<int16_t *>(image.row(q)) + int64_t(u) * C;
     VECTORISED for (int k = 0; k < (tile.last - u) * C; ++k) {
-      const float weight = work.sum[0][k], mean = 8192 * float(work.sum[1][k]) / std::max(weight, 1.0f);
-      out[k] = weight > 0 ? rounded(std::min(std::max(mean, 0.0f), float(FULL))) : out[k];
+      const float weight = work.tile[0][k], mean = 8192 * float(work.tile[1][k]) / std::max(weight, 1.0f);
+      out[k] = weight > 0 ? rounded(std::min(std::max(mean, 0.0f), float(FULL))) : int16_t(problem.rest);
     }
   }
 }

@@ -64,28 +64,34 @@ class CpuState:
         self._targets = at_once(lambda picture: without_alpha(picture, job.channels), pictures)
         across, down = geometry.tapers()
         self._tapers = [np.rint(TAPER * taper).astype(np.int16) for taper in (np.repeat(across, job.channels), down)]
-        for n, panel in enumerate(self._held.last):
-            box = geometry.boxes[n]
-            panel[: box.height_px, : box.width_px * job.channels] = self._rest
+        self._resting = set(range(self._stack.count))
         return nullcontext()
 
     def set_panel(self, panel: int, codes: I16) -> None:
         box, channels = self._geometry.boxes[panel], self._channels
         self._held.last[panel, : box.height_px, : box.width_px * channels] = codes.reshape(box.height_px, -1)
+        self._resting.discard(panel)
 
     def close_middle(self) -> None:
-        problem, _keep = self._problem(self._geometry.panels_from_rays("middle", 0.0))
+        self._resting.discard(self._geometry.middle)  # all of it is written
+        self._rest_others()
+        held = self._held
+        problem, _keep = self._problem(self._geometry.panels_from_rays("middle", 0.0), ahead=held.ahead, last=held.last)
         self._in_parts(library().close_middle, problem)
 
     def start(self) -> None:
-        np.copyto(self._held.ahead, self._held.last)
+        self._rest_others()
+        self._starts = True
 
     def step(self, step: Step) -> None:
         held = self._held
-        problem, _keep = self._problem(self._geometry.panels_from_rays(step.places, self._sigma_mm))
+        # What the rays see is read long after a row has moved: the first step, which sees `last`, writes it elsewhere.
+        ahead, last = (held.last, held.ahead) if self._starts else (held.ahead, held.last)
+        panels_from_rays = self._geometry.panels_from_rays(step.places, self._sigma_mm)
+        problem, _keep = self._problem(panels_from_rays, ahead=ahead, last=last)
         problem.size, problem.momentum, problem.floor = step.size, step.momentum, step.floor
         self._in_parts(library().step, problem)
-        held.ahead, held.moved = held.moved, held.ahead
+        held.last, held.ahead, held.moved, self._starts = last, held.moved, ahead, False
 
     def write(self, beside: int | tuple[int, ...] | None) -> U8:
         geometry, loops = self._geometry, library()
@@ -117,10 +123,17 @@ class CpuState:
             pixel = np.array([*beside_codes(self._stack.count, n, beside), 255], np.uint8).view(np.uint32)[0]
             layer.view(np.uint32)[..., 0] = pixel
 
+    def _rest_others(self) -> None:
+        """All panels that nothing was set in."""
+        for n in self._resting:
+            box = self._geometry.boxes[n]
+            self._held.last[n, : box.height_px, : box.width_px * self._channels] = self._rest
+        self._resting.clear()
+
     def _in_parts(self, work: Any, problem: Problem) -> None:
         at_once(lambda part: work(byref(problem), part, self._threads), range(self._threads))
 
-    def _problem(self, panels_from_rays: F64) -> tuple[Problem, object]:
+    def _problem(self, panels_from_rays: F64, *, ahead: I16, last: I16) -> tuple[Problem, object]:
         """What the loops are given; and arrays that must live as long."""
         geometry, held, channels = self._geometry, self._held, self._channels
         seen, back = np.ascontiguousarray(panels_from_rays), np.ascontiguousarray(inverse(panels_from_rays))
@@ -134,7 +147,7 @@ class CpuState:
             table=table.ctypes.data, rest=self._rest, missing=geometry.missing_weight,
         )  # fmt: skip
         for n, box in enumerate(geometry.boxes):
-            images = (held.ahead[n], held.moved[n], held.last[n])
+            images = ahead[n], held.moved[n], held.last[n], last[n]
             problem.panel[n] = Panel(*(Image.of(image, rows=box.height_px, width=box.width_px) for image in images))
         return problem, (seen, back, table)
 
