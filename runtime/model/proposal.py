@@ -6,6 +6,7 @@ whole number of columns, and answers with both outer panels there.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -77,22 +78,18 @@ class ChainProposal:
         middle_x_m = geometry.rasters[geometry.middle].x_m
         pictures = at_once(self._wanted, reduced_pictures(job, geometry, self._reduction))
 
-        def lacked(side: int) -> I16:
-            """Half of what an eye wants more than the other one, along its rays."""
+        def wanted(side: int) -> list[I16]:
+            """What an eye wants along its rays, and the other one in the same place."""
             to_plane = local.plane_from_local @ frame.plane_from_frame(local.eyes_m[side], x_m=middle_x_m)
-            own, other = (
+            return [
                 warp(
                     codes, from_plane @ to_plane, size=(frame.rows, frame.width_px), beside=UNSEEN,
                     reach_px=min(REACH_PX, EDGE_SHARE * min(codes.shape[:2])), result_columns=frame.columns,
                 )
                 for codes, from_plane in (pictures[local.order[side]], pictures[local.order[1 - side]])
-            )  # fmt: skip
-            half = np.asarray(cv2.subtract(own, other), np.int16) >> 1
-            # What one eye's picture does not show contradicts nothing.
-            np.copyto(half, 0, where=cv2.min(own, other) < 0)
-            return np.asarray(cv2.sepFilter2D(half, cv2.CV_16S, SHARPENING, SHARPENING), np.int16)
+            ]  # fmt: skip
 
-        left, right = map(lacked, (0, 1))
+        left, right = at_once(_lacked, [wanted(side) for side in (0, 1)])
         waves, shifted_waves, spectrum, modes_in = chain_modes(frame.cells)
         feeds: dict[str, NDArray[Any]] = {
             "left": left.reshape(frame.rows, frame.cells, -1),
@@ -133,6 +130,15 @@ class ChainProposal:
             weights = weights[..., None] if codes.ndim == 3 else weights
             codes = np.rint(EVEN + (codes - np.float32(EVEN)) * weights).astype(np.int16)
         return codes
+
+
+def _lacked(wanted: Sequence[I16]) -> I16:
+    """Half of what an eye wants more than the other one."""
+    own, other = wanted
+    half = np.asarray(cv2.subtract(own, other), np.int16) >> 1
+    # What one eye's picture does not show contradicts nothing.
+    np.copyto(half, 0, where=cv2.min(own, other) < 0)
+    return np.asarray(cv2.sepFilter2D(half, cv2.CV_16S, SHARPENING, SHARPENING), np.int16)
 
 
 def _local(geometry: Geometry, *, whole: bool) -> _Local:
