@@ -20,7 +20,7 @@ a common change of all of a panel's pixels that a bundle crosses, and a bound of
 
 for N panels and E ray sets. The sums over rays through a panel's pixel (the transpose of bilinear sampling) are taken
 as one bilinear sample of the rays' values, through the inverse homography: the same where a ray's pixel and a panel's
-are equally large, elsewhere the same but for a factor that g and D share.
+are equally large, elsewhere the same but for a factor that g and D share. A picture's edge goes on for two pixels.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
 
 NEAR_PX = 0.5  # a ray counts that is at least so far inside every panel
+BESIDE_PX = 2.0  # a picture's edge goes on: its outermost bundles cover panels' pixels there
 SIZE = 0.8  # of a few steps from panels that a learned network proposes; larger ones overshoot from poor ones
 MOMENTUM, FLOOR = 0.7, 0.1
 LEAST_ERROR = 1e-6  # squared: beyond 60 dB nothing is won
@@ -145,7 +146,7 @@ def step(
         whole, turn = reduce(torch.mul, z), e // 2 if turns > 1 else 0
         error = (1 - whole.real) / 2 - targets[e % 2][:, turn::turns][:, : views.height_px]
         rays = torch.cat([error * whole.imag, whole.imag.square()]) * counts[e]
-        found = _sample(rays.expand(len(y), -1, -1, -1), back[e], size_px, near_px=0.0)[0].chunk(2, dim=1)
+        found = _sample(rays.expand(len(y), -1, -1, -1), back[e], size_px, near_px=-BESIDE_PX)[0].chunk(2, dim=1)
         gradient, bound = gradient + found[0], bound + found[1]
     new = (y - size * 2 / (torch.pi * len(y)) * gradient / bound.clamp(min=floor * sets)).clamp(0, 1)
     return new, new + momentum * (new - x)

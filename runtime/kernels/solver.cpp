@@ -13,6 +13,7 @@ constexpr int FULL = 255 * 16;   // of a panel that shows 1: sixteenths of a cod
 constexpr float UNIT = 8100;     // of 1 in phasors: rounding takes no product of theirs beyond 8191
 constexpr float PI = 3.14159265f;
 constexpr double NEAR_PX = 0.5;  // a ray counts that crosses every panel so far inside its edges
+constexpr double BESIDE_PX = 2;  // of a picture's pixels, its edge goes on: its outermost bundles cover panels' pixels there
 constexpr int MAX_SETS = 4;      // of rays, whose sums fit 16 bits
 
 struct Panel {
@@ -196,7 +197,7 @@ struct Back {
   Back(const Problem &problem, const Share &share, int n, int q) {
     for (int set = 0; set < problem.sets; ++set) {
       line[set] = Line(problem.rays_from_panels + (set * problem.panels + n) * 9, q);
-      span[set] = inside(line[set], problem.panel[n].ahead.width, share.image(problem, set, 0), 0);
+      span[set] = inside(line[set], problem.panel[n].ahead.width, share.image(problem, set, 0), -BESIDE_PX);
     }
   }
 };
