@@ -13,6 +13,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 MAX_PANELS = 5
+MAX_SETS = 4  # of rays, in the loops
 MARGIN = 64  # elements behind an image's rows that loops may touch
 _AGAIN = "install phasestack again (it needs g++)"
 _pointer, _int, _long, _float, _double = (

@@ -13,8 +13,9 @@ constexpr int FULL = 255 * 16;   // of a panel that shows 1: sixteenths of a cod
 constexpr float UNIT = 8100;     // of 1 in phasors: rounding takes no product of theirs beyond 8191
 constexpr float PI = 3.14159265f;
 constexpr double NEAR_PX = 0.5;  // a ray counts that crosses every panel so far inside its edges
-constexpr double BESIDE_PX = 2;  // of a picture's pixels, its edge goes on: its outermost bundles cover panels' pixels there
-constexpr int MAX_SETS = 4;      // of rays, whose sums fit 16 bits
+constexpr double BESIDE_PX = 2;  // of a picture, its edge goes on: its outermost bundles cover panels' pixels there
+constexpr int MAX_SETS = 4;      // of rays, whose sums of squared slopes, 7830 each, fit 16 bits
+static_assert(FIELDS * MAX_SETS <= 2 * MAX_PANELS, "tiles of work that all sets are gathered in");
 
 struct Panel {
   Image ahead;   // what the rays see: with momentum
@@ -237,9 +238,8 @@ INLINE void move(const Problem &problem, const Share &share, int n, int q, Work 
     const Span tile{u, std::min(u + TILE_PX, panel.ahead.width)};
     gather<2, C>(problem, share, back, tile, work);
     const int64_t at = int64_t(u) * C, count = int64_t(tile.last - u) * C;
-    const int16_t *ahead = panel.ahead.row(q) + at;
-    const int16_t *before = panel.before.row(q) + at;
-  int16_t *last = const_cast<int16_t *>(panel.last.row(q)) + at, *moved = const_cast<int16_t *>(panel.moved.row(q)) + at;
+    const int16_t *ahead = panel.ahead.row(q) + at, *before = panel.before.row(q) + at;
+    int16_t *last = const_cast<int16_t *>(panel.last.row(q)) + at, *moved = const_cast<int16_t *>(panel.moved.row(q)) + at;
     for (int e = 0; e < count; e += LANES)
       VECTORISED for (int k = e; k < e + LANES; ++k) {
         const float change = size * float(work.tile[1][k]) / std::max(float(work.tile[0][k]), least);

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.kernels import MARGIN, Image, Panel, Problem, library
+from runtime.kernels import MARGIN, MAX_SETS, Image, Panel, Problem, library
 from runtime.model.contract import Step
 from runtime.model.geometry import Geometry, inverse
 from runtime.model.job import Job
@@ -137,6 +137,8 @@ class CpuState:
         """What the loops are given; and arrays that must live as long."""
         geometry, held, channels = self._geometry, self._held, self._channels
         seen, back = np.ascontiguousarray(panels_from_rays), np.ascontiguousarray(inverse(panels_from_rays))
+        if len(seen) > MAX_SETS:
+            raise ValueError(f"{len(seen)} sets of rays; {MAX_SETS} at most")
         table = _packed_table(self._stack.count)
         problem = Problem(
             panels=self._stack.count, sets=len(seen), channels=channels,

@@ -94,7 +94,7 @@ class GlState:
         for n in range(PANELS):
             inputs = {"ahead": ahead[f"ahead{n}"], "last": self._panel("last", n), **fields}
             outputs = self._panel("moved", n), self._panel("spare", n)
-            defines = ("FOUR_SETS",) if places == 2 else ()
+            defines = {1: (), 2: ("FOUR_SETS",)}[places]
             self._draw("move", outputs, inputs, {**self._back(back[:, n], places), **how}, defines=defines)
             self._swap("ahead", "moved", n)
             self._swap("last", "spare", n)
