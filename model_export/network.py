@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-INPUTS = ("left", "right", "waves", "shifted_waves", "spectrum", "modes_in", "doubt")
+INPUTS = ("left", "right", "waves", "shifted_waves", "spectrum", "modes_in", "eye_sigma_px")
 OUTPUTS = ("rear", "front", "check")
 BLOCK_ROWS = 8  # rows that are transformed together; the raster has whole blocks
 FULL = 255 * 16  # one panel's range in the units of inputs and outputs: sixteenths of an 8-bit code
@@ -17,7 +17,7 @@ IN_SCALE = 64  # codes in the waves' unit on the way in: in codes they would be 
 
 
 class SpectralSolver(nn.Module):
-    """What both outer panels must carry, from what each eye lacks, chain by chain.
+    """What both outer panels must carry, from each eye's residual, chain by chain.
 
     With front = h + g and rear = h - g about the middle of their range, s columns the parallax of half the eyes'
     separation on either panel, e the centre panel's own, and a frequency w along the eyes' line, the eyes' difference
@@ -49,21 +49,23 @@ class SpectralSolver(nn.Module):
         self.register_buffer("v", v.repeat_interleave(2 * cell_px), persistent=False)
         self.log_floor = nn.Parameter(torch.log(torch.tensor([0.01, 0.2])))  # λ of g and of h
         self.log_rough = nn.Parameter(torch.log(torch.tensor([0.05, 0.2])))  # and how they grow with w²
-        self.log_doubt = nn.Parameter(torch.zeros(2))  # how much the doubt along the line and across it weighs
+        self.log_sigma_scale = nn.Parameter(
+            torch.zeros(2)
+        )  # what eye_sigma_px along the line and across it is multiplied with
 
-    def gains(self, spectrum: Tensor, doubt: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def gains(self, spectrum: Tensor, eye_sigma_px: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(patterns, cells + 1) each: numerator and denominator of g without h's share, and h's gain."""
-        scale = torch.exp(self.log_doubt)
+        scale = torch.exp(self.log_sigma_scale)
         # A mode of the chain in a pattern of the block is two waves, its frequency beside the pattern's either way.
         beside = 2 * torch.asin(torch.clamp(spectrum / 4, 0, 1))[None] / (2 * self.cell_px)
         pattern = self.w[:, None]
-        along2 = (doubt[0] * scale[0]) ** 2 * (pattern * pattern + beside * beside)
-        across = (doubt[1] * scale[1] * self.v)[:, None]
+        along2 = (eye_sigma_px[0] * scale[0]) ** 2 * (pattern * pattern + beside * beside)
+        across = (eye_sigma_px[1] * scale[1] * self.v)[:, None]
         m2 = torch.exp(-(along2 + across * across))
         s2 = (spectrum * spectrum)[None]  # 16 sin²(ws)
         c2 = 16 - s2
         cos_2ws = 1 - s2 / 8
-        cos_2we = torch.cos(2 * pattern * doubt[2]) * torch.cos(2 * beside * doubt[2])
+        cos_2we = torch.cos(2 * pattern * eye_sigma_px[2]) * torch.cos(2 * beside * eye_sigma_px[2])
         alpha2, beta2 = m2 * s2 * (1 + cos_2we) / 2, m2 * c2 * (1 - cos_2we) / 2
         floor = torch.exp(self.log_floor)[:, None, None] + torch.exp(self.log_rough)[:, None, None] * pattern * pattern
         noise, crossed = 8 * (1 - m2), 8 * cos_2ws * (m2 - m2 * m2)
@@ -78,9 +80,9 @@ class SpectralSolver(nn.Module):
 
         Also one number that is finite if every intermediate is.
 
-        feeds: `INPUTS`. left, right (rows, cells, 2K·C), 16-bit codes: what each eye lacks along its rays through the
+        feeds: `INPUTS`. left, right (rows, cells, 2K·C), 16-bit codes: each eye's residual along its rays through the
         raster; waves (cells + 1, cells + 1) V, shifted_waves Ũ, spectrum (cells + 1,) s and modes_in
-        (cells + 1, cells) U^T (`runtime.model.chain.chain_modes`); doubt (3,): c columns, r rows, e columns.
+        (cells + 1, cells) U^T (`runtime.model.chain.chain_modes`); eye_sigma_px (3,): c columns, r rows, e columns.
         """
         rear, front, check = self._solved(feeds, added=0.5)
         # Nothing is below zero once it is clamped, and a cast cuts off what follows the point: the half makes it round.
@@ -93,9 +95,9 @@ class SpectralSolver(nn.Module):
         A row of a cell stays in one piece from end to end, those of all blocks beside each other: moving it is cheap,
         and the products with the rows' and the chain's matrices are few and large.
         """
-        left, right, waves, shifted_waves, spectrum, modes_in, doubt = feeds
+        left, right, waves, shifted_waves, spectrum, modes_in, eye_sigma_px = feeds
         channels = left.shape[2] // (2 * self.cell_px)
-        numerator, denominator, gain_h = self.gains(spectrum, doubt)
+        numerator, denominator, gain_h = self.gains(spectrum, eye_sigma_px)
         numerator, gain_h = numerator * (IN_SCALE / FULL), gain_h * (IN_SCALE / FULL)
         sides = torch.cat([_by_block_rows(left), _by_block_rows(right)]).to(torch.float32)
         bias = torch.full((BLOCK_ROWS,), BOX * FULL + added, device=left.device)

@@ -23,14 +23,14 @@ CELL_AXES = {
     "shifted_waves": ("cells_and_one", "modes"),
     "spectrum": ("modes",),
     "modes_in": ("modes", "cells"),
-    "doubt": ("doubts",),
+    "eye_sigma_px": ("eye_sigmas",),
     "rear": ("rows", "cells_and_one", "columns"),
     "front": ("rows", "cells_and_one", "columns"),
     "check": ("one",),
 }
 PICTURE_AXES = {name: ("one", "channels", "height", "width") for name in (eyereal.INPUT, eyereal.OUTPUT)}
 OPSET = 17
-FIXED = {"one", "channels", "doubts"}
+FIXED = {"one", "channels", "eye_sigmas"}
 
 
 def spectral_bytes(net: nn.Module, *, cell_px: int) -> bytes:

@@ -50,7 +50,7 @@ def ordinary_pictures(height: int, width: int) -> tuple[F32, F32]:
 def spectral_cases(cell_px: int) -> dict[str, Feeds]:
     """Inputs of the solver along the eyes' line: short and long chains, for points and for unsure eyes."""
     cases = {}
-    for cells, doubt in ((16, (0.0, 0.0, 0.5)), (112, (0.13, 0.15, 0.3)), (400, (0.5, 0.6, 0.1))):
+    for cells, eye_sigma_px in ((16, (0.0, 0.0, 0.5)), (112, (0.13, 0.15, 0.3)), (400, (0.5, 0.6, 0.1))):
         size = (64, cells * 2 * cell_px)
         for name, pictures in {ORDINARY: ordinary_pictures(*size), **stress_pictures(*size)}.items():
             left, right = (phase_from_intensity(picture) for picture in pictures)
@@ -60,7 +60,7 @@ def spectral_cases(cell_px: int) -> dict[str, Feeds]:
                 "left": -half,
                 "right": half,
                 **modes,
-                "doubt": np.array(doubt, np.float32),
+                "eye_sigma_px": np.array(eye_sigma_px, np.float32),
             }
     return cases
 

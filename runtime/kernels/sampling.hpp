@@ -102,10 +102,10 @@ struct alignas(2 * LANES) Work {
   int16_t sum[TILE];
 };
 
-// F images alike at pixels first to last of a line (TILE_PX at most, all of them `inside`), into out[f], from its first
-// element on. Two rows of the image are mixed first, for the pixels between which the line runs: run by run, with weights
+// F images alike at pixels first to last of a line (TILE_PX at most, all of them `inside`), into out[f], from element
+// `begin_at` on; a vector and two pixels behind the last may be written over, nothing before the first. Two rows of the image are mixed first, for the pixels between which the line runs: run by run, with weights
 // that grow evenly. Then neighbours of that, a vector at a time: the source's pixels move on by a little more or less
-// than the line's, so that a vector needs two neighbours, or a third and a fourth. Pixels on pixels need none.
+// than the line's, so that a vector needs two neighbours, or up to three more. Pixels on pixels need none.
 template <int F, int C, typename AnyLine>
 INLINE void sample(const Image *images, const AnyLine &line, int first, int last, Work &work, int16_t (*out)[TILE], int begin_at = 0) {
   const Image &image = images[0];
@@ -156,8 +156,8 @@ INLINE void sample(const Image *images, const AnyLine &line, int first, int last
   const double half = 0.5 * steps, middle = steps > 1 ? line.x(first + half) : 0.5 * (xs + xe);
   const double bend = steps > 1 ? (xs + xe - 2 * middle) / (half * half) * 0.5 : 0;  // along a tile: a parabola
   const double scale = steps > 0 ? (xe - xs) / steps - bend * steps : 1;  // where it begins
-  // So many elements at once that the source gains three pixels on them at most, or two where many pixels would add up
-  // what a weight's growth is rounded by, and that a chord stands for the parabola.
+  // At most so many elements at once that the source gains less than three pixels on them (two with one channel: over 32
+  // pixels the rounding of a weight's growth adds up), and that a chord stands for the parabola.
   constexpr double gains = C == 1 ? 1.9 : 2.9;
   const double most = std::max(std::abs(scale - 1), std::abs(scale - 1 + 2 * bend * steps));
   int at_once = LANES;

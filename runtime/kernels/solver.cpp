@@ -21,7 +21,7 @@ struct Panel {
   Image ahead;   // what the rays see: with momentum
   Image moved;   // the same after the step
   Image before;  // without momentum
-  Image last;    // the same after the step; with the first one it is not `before`, which is `ahead`
+  Image last;    // the same after the step: the same image, but for the first step, where `before` is `ahead`
 };
 
 struct Problem {
@@ -183,8 +183,8 @@ INLINE void compare(const Problem &problem, const Share &share, int set, int r, 
           const int16_t c = work.tile[2 * n][k], s = work.tile[2 * n + 1][k], a = int16_t(4 * re), b = int16_t(4 * im);
           re = int16_t(product(a, c) - product(b, s)), im = int16_t(product(a, s) + product(b, c));
         }
-        const int16_t wanted = product(int16_t(target[k] << 7), twice);  // twice what should be seen
-        const int16_t error = product(int16_t(one - re - wanted), product(taper[k], row_taper));  // twice as well
+        const int16_t doubled = product(int16_t(target[k] << 7), twice);
+        const int16_t error = product(int16_t(one - re - doubled), product(taper[k], row_taper));  // twice
         curvature[k] = product(int16_t(2 * im), int16_t(2 * im)), gradient[k] = product(error, int16_t(2 * im));
       }
   }
@@ -203,7 +203,7 @@ struct Back {
   }
 };
 
-// What the first F fields of all sets come to at pixels of a panel's row, into work.tile.
+// What the first F fields of all sets come to at pixels of a panel's row, into work.tile[0] to [F - 1].
 template <int F, int C>
 INLINE void gather(const Problem &problem, const Share &share, const Back &back, Span tile, Work &work) {
   const int count = (tile.last - tile.first) * C;
@@ -252,7 +252,7 @@ INLINE void move(const Problem &problem, const Share &share, int n, int q, Work 
 
 // Row r of a set of rays: the weight of a target, and that times what the other panels leave to the middle one.
 template <int C>
-INLINE void lack(const Problem &problem, const Share &share, int set, int r, Work &work) {
+INLINE void residual(const Problem &problem, const Share &share, int set, int r, Work &work) {
   const int middle = problem.panels / 2;
   const double *homographies = problem.panels_from_rays + set * problem.panels * 9;
   const Span span = inside(Line(homographies + middle * 9, r), problem.width, problem.panel[middle].last, 0);
@@ -277,7 +277,7 @@ INLINE void lack(const Problem &problem, const Share &share, int set, int r, Wor
     }
     const int64_t at = int64_t(u) * C;
     const uint8_t *target = problem.target(set, r, at);
-    int16_t *weights = share.row(set, 0, r) + at, *wanted = share.row(set, 1, r) + at;
+    int16_t *weights = share.row(set, 0, r) + at, *weighted = share.row(set, 1, r) + at;
     for (int e = 0; e < count; e += LANES)
       VECTORISED for (int k = e; k < e + LANES; ++k) {
         const int32_t entry = problem.table[target[k]];
@@ -288,12 +288,12 @@ INLINE void lack(const Problem &problem, const Share &share, int set, int r, Wor
     for (int k = 0; k < begin; ++k) weights[k] = rounded(float(weights[k]) * problem.missing);
     for (int k = end; k < count; ++k) weights[k] = rounded(float(weights[k]) * problem.missing);
     for (int e = 0; e < count; e += LANES)
-      VECTORISED for (int k = e; k < e + LANES; ++k) wanted[k] = product(int16_t(2 * sum[k]), int16_t(2 * weights[k]));
+      VECTORISED for (int k = e; k < e + LANES; ++k) weighted[k] = product(int16_t(2 * sum[k]), int16_t(2 * weights[k]));
   }
   clear_beside(problem, share, set, r, span);
 }
 
-// Row q of the middle panel: the mean of what all rays through it lack; it rests where there are none.
+// Row q of the middle panel: the mean of all rays' residuals there; it rests where there are none.
 template <int C>
 INLINE void fill(const Problem &problem, const Share &share, int q, Work &work) {
   const Image &image = problem.panel[problem.panels / 2].last;
@@ -332,7 +332,7 @@ INLINE void close_rows(const Problem &problem, const Share &share) {
   const int middle = problem.panels / 2;
   int q = share.panel_first[middle];
   for (int r = share.first; r < share.end; ++r) {
-    for (int set = 0; set < problem.sets; ++set) lack<C>(problem, share, set, r, work);
+    for (int set = 0; set < problem.sets; ++set) residual<C>(problem, share, set, r, work);
     while (q < share.panel_end[middle] && share.until[middle][q] <= r) fill<C>(problem, share, q++, work);
   }
 }

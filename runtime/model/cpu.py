@@ -94,6 +94,7 @@ class CpuState:
         held.last, held.ahead, held.moved, self._starts = last, held.moved, ahead, False
 
     def write(self, beside: int | tuple[int, ...] | None) -> U8:
+        self._rest_others()
         geometry, loops = self._geometry, library()
         if beside is not None and self._beside != (beside, geometry.boxes):
             self._fill(beside)

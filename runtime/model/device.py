@@ -16,7 +16,7 @@ class SolverState(Protocol):
     """The panels of one stack on one device, kept from frame to frame. One thread uses it."""
 
     def begin(self, job: Job, geometry: Geometry) -> AbstractContextManager[None]:
-        """Take what is wanted; panels rest in their boxes until set. All else is done within what it answers."""
+        """Take the targets; panels rest in their boxes until set. All else is done within what it answers."""
 
     def set_panel(self, panel: int, codes: I16) -> None:
         """What a panel shows within its box: (rows, columns[, 3]), sixteenths of a code."""

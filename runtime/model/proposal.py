@@ -76,10 +76,10 @@ class ChainProposal:
         except ValueError as error:
             raise EyesNotServed(str(error)) from None
         middle_x_m = geometry.rasters[geometry.middle].x_m
-        pictures = at_once(self._wanted, reduced_pictures(job, geometry, self._reduction))
+        pictures = at_once(self._target_codes, reduced_pictures(job, geometry, self._reduction))
 
-        def wanted(side: int) -> list[I16]:
-            """What an eye wants along its rays, and the other one in the same place."""
+        def targets(side: int) -> list[I16]:
+            """An eye's targets along its rays, and the other one's in the same places."""
             to_plane = local.plane_from_local @ frame.plane_from_frame(local.eyes_m[side], x_m=middle_x_m)
             return [
                 warp(
@@ -89,7 +89,7 @@ class ChainProposal:
                 for codes, from_plane in (pictures[local.order[side]], pictures[local.order[1 - side]])
             ]  # fmt: skip
 
-        left, right = at_once(_lacked, [wanted(side) for side in (0, 1)])
+        left, right = at_once(_residual, [targets(side) for side in (0, 1)])
         waves, shifted_waves, spectrum, modes_in = chain_modes(frame.cells)
         feeds: dict[str, NDArray[Any]] = {
             "left": left.reshape(frame.rows, frame.cells, -1),
@@ -98,7 +98,7 @@ class ChainProposal:
             "shifted_waves": shifted_waves,
             "spectrum": spectrum,
             "modes_in": modes_in,
-            "doubt": frame.eye_sigma_px(local.stack, eye_sigma_mm=job.eye_sigma_mm),
+            "eye_sigma_px": frame.eye_sigma_px(local.stack, eye_sigma_mm=job.eye_sigma_mm),
         }
         shape = (frame.rows, frame.cells + 1, feeds["left"].shape[2])
         watch.lap("prepare")
@@ -109,7 +109,7 @@ class ChainProposal:
         outer = {n: answer[name].reshape(frame.rows, -1, *left.shape[2:]) for n, name in ((0, "rear"), (2, "front"))}
         return {n: self._on_panel(n, panel, geometry, local, frame) for n, panel in outer.items()}
 
-    def _wanted(self, picture: tuple[U8, F64]) -> tuple[I16, F64]:
+    def _target_codes(self, picture: tuple[U8, F64]) -> tuple[I16, F64]:
         """The sum of all panels, sixteenths of a code, that each pixel of a picture asks for, but for a constant."""
         return np.asarray(cv2.LUT(picture[0], self._codes), np.int16), picture[1]
 
@@ -132,9 +132,9 @@ class ChainProposal:
         return codes
 
 
-def _lacked(wanted: Sequence[I16]) -> I16:
-    """Half of what an eye wants more than the other one."""
-    own, other = wanted
+def _residual(targets: Sequence[I16]) -> I16:
+    """Half of how far an eye's target lies above the other one's."""
+    own, other = targets
     half = np.asarray(cv2.subtract(own, other), np.int16) >> 1
     # What one eye's picture does not show contradicts nothing.
     np.copyto(half, 0, where=cv2.min(own, other) < 0)

@@ -128,7 +128,7 @@ def test_eyes_behind_each_other_are_a_passing_model_failure() -> None:
     assert isinstance(caught.value, ModelFailure)
 
 
-def test_a_doubt_that_is_no_number_is_a_model_failure() -> None:
+def test_an_eye_sigma_that_is_no_number_is_a_model_failure() -> None:
     predictor = load_predictor("fast", STACK)
     grey = np.full((270, 480, 4), 128, np.uint8)
     for sigma_mm in (np.nan, np.inf):

@@ -222,11 +222,12 @@ def test_equal_grey_pictures_and_panels_that_show_them_stay() -> None:
         assert np.abs(panel.astype(int) - old).max() <= SUBCODE // 2
 
 
+@pytest.mark.parametrize("sigma_mm", [0.0, 5.0])
 @pytest.mark.parametrize("code", [0, 255])
-def test_no_seam_is_seen_along_a_picture_s_edge(code: int) -> None:
+def test_no_seam_is_seen_along_a_picture_s_edge(code: int, sigma_mm: float) -> None:
     pair, pictures = eyes(0.6), [np.full((270, 480, 3), code, np.uint8)] * 2
     predictor = load_predictor("fast", STACK)
-    layers = solve_still(*pictures, eyes_m=pair, fov_deg=FOV_DEG, predictor=predictor).layers
+    layers = solve_still(*pictures, eyes_m=pair, fov_deg=FOV_DEG, predictor=predictor, eye_sigma_mm=sigma_mm).layers
     predictor.close()
     light = light_psnrs_db(layers, pictures, STACK, eyes_m=pair, fov_deg=FOV_DEG, sigmas_mm=(0.0,))
     assert light[0.0] > 60  # 40 to 46 where what lies a pixel beyond the edge rests at mid-grey

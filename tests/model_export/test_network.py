@@ -23,7 +23,7 @@ def feeds_of(*, cells: int = 9, blocks: int = 3, channels: int = 3, most: int = 
     random = np.random.default_rng(cells + channels)
     sides = random.integers(-most, most + 1, (2, blocks * BLOCK, cells, 2 * K * channels)).astype(np.int16)
     modes = dict(zip(MODES, chain_modes(cells), strict=True))
-    return {"left": sides[0], "right": sides[1], **modes, "doubt": np.array([0.2, 0.3, 0.4], np.float32)}
+    return {"left": sides[0], "right": sides[1], **modes, "eye_sigma_px": np.array([0.2, 0.3, 0.4], np.float32)}
 
 
 def answers(net: SpectralSolver, feeds: dict[str, np.ndarray]) -> tuple[np.ndarray, ...]:
@@ -34,7 +34,7 @@ def answers(net: SpectralSolver, feeds: dict[str, np.ndarray]) -> tuple[np.ndarr
 def plainly(net: SpectralSolver, feeds: dict[str, np.ndarray]) -> tuple[F64, F64]:
     """Rear and front panel (rows, cells + 1, 2K·C), not clamped: one transform after another, in double precision."""
     left, right, v, shifted, _, modes_in, _ = (np.asarray(x, np.float64) for x in feeds.values())
-    spectrum, unsure = torch.from_numpy(feeds["spectrum"]), torch.from_numpy(feeds["doubt"])
+    spectrum, unsure = torch.from_numpy(feeds["spectrum"]), torch.from_numpy(feeds["eye_sigma_px"])
     with torch.no_grad():
         gains = (x.double().reshape(BLOCK, 2 * K, -1).numpy() for x in net.gains(spectrum, unsure))
     numerator, denominator, gain_h = (x.transpose(0, 2, 1)[:, :, :, None, None] for x in gains)  # rows, modes, columns
@@ -90,7 +90,7 @@ def test_a_number_that_is_not_finite_is_told_wherever_it_comes_in(name: str, bad
     good = feeds_of()
     assert np.isfinite(session.run(["check"], good)[0]).all()
     random = np.random.default_rng(3)
-    for field in ("waves", "shifted_waves", "modes_in", "doubt"):
+    for field in ("waves", "shifted_waves", "modes_in", "eye_sigma_px"):
         for at in random.integers(0, good[field].size, 6):
             spoilt: dict[str, Any] = {key: value.copy() for key, value in good.items()}
             spoilt[field].flat[at] = bad

@@ -66,10 +66,15 @@ class GlState:
         inputs = {"last0": self._panel("last", 0), "last2": self._panel("last", 2), "table": Image(table, 256, 1)}
         gathered: dict[str, Image] = {"last": self._panel("last", MIDDLE)}
         for side in (0, 1):
-            weight, lacked = (self._rays(f"{name}{side}") for name in ("weight", "lacked"))
+            weight, residual = (self._rays(f"{name}{side}") for name in ("weight", "residual"))
             how = {"rest": 0.5, "missing": self._geometry.missing_weight}
-            self._draw("lack", (weight, lacked), {**inputs, **self._wanted(side)}, {**self._through(seen[side]), **how})
-            gathered |= {f"weight{side}": weight, f"lacked{side}": lacked}
+            self._draw(
+                "residual",
+                (weight, residual),
+                {**inputs, **self._target_of(side)},
+                {**self._through(seen[side]), **how},
+            )
+            gathered |= {f"weight{side}": weight, f"residual{side}": residual}
         self._draw("fill", (self._panel("spare", MIDDLE),), gathered, self._back(back[:, MIDDLE]))
         self._swap("last", "spare", MIDDLE)
 
@@ -84,7 +89,7 @@ class GlState:
         fields: dict[str, Image] = {}
         for number, matrices in enumerate(seen):
             drawn = {f"{name}{number}": self._rays(f"{name} {number}", places) for name in ("curvature", "gradient")}
-            inputs = {**ahead, **self._wanted(number % 2), **tapers}
+            inputs = {**ahead, **self._target_of(number % 2), **tapers}
             how = {**self._through(matrices), "turn": (places, number // 2)}
             self._draw("compare", tuple(drawn.values()), inputs, how)
             fields |= drawn
@@ -142,12 +147,12 @@ class GlState:
             image.texture.write(np.ascontiguousarray(rgba), viewport=(0, 0, *image.size))
             self._targets.append((image, (0, 0)))
 
-    def _wanted(self, side: int) -> dict[str, Any]:
-        image, self._wanted_origin = self._targets[side]
-        return {"wanted": image}
+    def _target_of(self, side: int) -> dict[str, Any]:
+        image, self._targets_origin = self._targets[side]
+        return {"targets": image}
 
     def _through(self, matrices: F64) -> dict[str, Any]:
-        found: dict[str, Any] = {"wanted_origin": self._wanted_origin}
+        found: dict[str, Any] = {"targets_origin": self._targets_origin}
         for n, (matrix, box) in enumerate(zip(matrices, self._geometry.boxes, strict=True)):
             found |= {f"from_rays{n}": _mat3(matrix), f"size{n}": (box.width_px, box.height_px)}
         return found

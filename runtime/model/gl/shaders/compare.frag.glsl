@@ -2,10 +2,10 @@
 // One set of rays: the squared slope, and the error times the slope (L1 to L4).
 uniform vec2 origin;
 #include "places.glsl"
-uniform sampler2D ahead0, ahead1, ahead2, wanted, column_taper, row_taper;
+uniform sampler2D ahead0, ahead1, ahead2, targets, column_taper, row_taper;
 uniform mat3 from_rays0, from_rays1, from_rays2;
 uniform vec2 size0, size1, size2;
-uniform ivec2 wanted_origin, turn;  // turn: of so many places, which; they take turns from row to row of a picture
+uniform ivec2 targets_origin, turn;  // turn: of so many places, which; they take turns from row to row of a picture
 layout(location = 0) out vec4 curvature;
 layout(location = 1) out vec4 gradient;
 
@@ -34,7 +34,7 @@ void main() {
     phasor(ahead2, at2, size2, g, h);
     vec4 re = p * g - q * h, im = p * h + q * g, slope = a * im + b * re;
     ivec2 pixel = ivec2(gl_FragCoord.x, int(gl_FragCoord.y) * turn.x + turn.y);
-    vec4 target = texelFetch(wanted, pixel + wanted_origin, 0);
+    vec4 target = texelFetch(targets, pixel + targets_origin, 0);
     float taper = texelFetch(column_taper, ivec2(pixel.x, 0), 0).r * texelFetch(row_taper, ivec2(pixel.y, 0), 0).r;
     vec4 error = (0.5 - 0.5 * (a * re - b * im) - target) * taper;
     curvature = slope * slope;
