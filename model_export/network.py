@@ -49,9 +49,7 @@ class SpectralSolver(nn.Module):
         self.register_buffer("v", v.repeat_interleave(2 * cell_px), persistent=False)
         self.log_floor = nn.Parameter(torch.log(torch.tensor([0.01, 0.2])))  # λ of g and of h
         self.log_rough = nn.Parameter(torch.log(torch.tensor([0.05, 0.2])))  # and how they grow with w²
-        self.log_sigma_scale = nn.Parameter(
-            torch.zeros(2)
-        )  # what eye_sigma_px along the line and across it is multiplied with
+        self.log_sigma_scale = nn.Parameter(torch.zeros(2))  # of eye_sigma_px along the line, and across it
 
     def gains(self, spectrum: Tensor, eye_sigma_px: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(patterns, cells + 1) each: numerator and denominator of g without h's share, and h's gain."""

@@ -103,9 +103,10 @@ struct alignas(2 * LANES) Work {
 };
 
 // F images alike at pixels first to last of a line (TILE_PX at most, all of them `inside`), into out[f], from element
-// `begin_at` on; a vector and two pixels behind the last may be written over, nothing before the first. Two rows of the image are mixed first, for the pixels between which the line runs: run by run, with weights
-// that grow evenly. Then neighbours of that, a vector at a time: the source's pixels move on by a little more or less
-// than the line's, so that a vector needs two neighbours, or up to three more. Pixels on pixels need none.
+// `begin_at` on; a vector and two pixels behind the last may be written over, nothing before the first. Two rows of the
+// image are mixed first, for the pixels between which the line runs: run by run, with weights that grow evenly. Then
+// neighbours of that, a vector at a time: the source's pixels move on by a little more or less than the line's, so that
+// a vector needs two neighbours, or up to three more. Pixels on pixels need none.
 template <int F, int C, typename AnyLine>
 INLINE void sample(const Image *images, const AnyLine &line, int first, int last, Work &work, int16_t (*out)[TILE], int begin_at = 0) {
   const Image &image = images[0];

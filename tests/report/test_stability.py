@@ -43,19 +43,14 @@ def test_there_are_at_least_120_cases_over_six_stages_and_all_pass(record: tuple
     assert json.loads((record[1] / "stability.json").read_text())["cases"] == cases
 
 
-# By one ray a pixel, 0.0052 where 0.0042 is allowed and 0.0049 where 0.0037 is: each row of panels covers three rows
-# of the picture and shows their mean. In light they are 0.5 dB better than when the limits were recorded.
-WORSE = {"fast: panels of 333x77", "best: panels of 333x77"}
-
-
 @pytest.mark.slow
-def test_the_long_cases_pass_but_for_those_that_are_known(tmp_path: Path) -> None:
+def test_the_long_cases_pass_too(tmp_path: Path) -> None:
     """Seen: limits of cases that only --full runs were those of a model that no longer shipped."""
     done = command("--out", str(tmp_path), "--full", "--json")
     cases = json.loads(done.stdout)["cases"]
     assert {"1000000 updates of a still head", "best: panels of 3840x2160"} <= {case["name"] for case in cases}
-    assert {case["name"] for case in cases if not case["passed"]} == WORSE
-    assert done.exit_code == 1
+    assert [case["name"] for case in cases if not case["passed"]] == []
+    assert done.exit_code == 0
 
 
 STAGES = {"eye pose", "RPU", "phase", "Jones optics", "solve", "network", "tracker", "calibration"}

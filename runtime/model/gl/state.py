@@ -68,12 +68,8 @@ class GlState:
         for side in (0, 1):
             weight, residual = (self._rays(f"{name}{side}") for name in ("weight", "residual"))
             how = {"rest": 0.5, "missing": self._geometry.missing_weight}
-            self._draw(
-                "residual",
-                (weight, residual),
-                {**inputs, **self._target_of(side)},
-                {**self._through(seen[side]), **how},
-            )
+            targets = self._target_of(side)
+            self._draw("residual", (weight, residual), {**inputs, **targets}, {**self._through(seen[side]), **how})
             gathered |= {f"weight{side}": weight, f"residual{side}": residual}
         self._draw("fill", (self._panel("spare", MIDDLE),), gathered, self._back(back[:, MIDDLE]))
         self._swap("last", "spare", MIDDLE)
