@@ -19,7 +19,7 @@ from runtime.optics.malus import rest_code
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 from runtime.support.artifacts import png_bytes, to_json
-from runtime.support.threads import at_once
+from runtime.support.threads import parallel_map
 
 WEBP_MAX_PX = 16383
 BESIDE_BYTES = 60 << 10  # that a page may have beside its layers as PNG files
@@ -50,8 +50,8 @@ def viewer_html(
     """
     scene = {"stack": stack_table(stack), "eyes_m": eyes_m, "fov_deg": fov_deg, "title": title, "follows": follows}
     parts = {"TITLE": html.escape(title), "CSS": asset("look.css"), "SCRIPT": _script()}
-    parts["LAYERS"] = _embedded(at_once(_exact, list(layers)))
-    room = BESIDE_BYTES + sum(map(len, at_once(png_bytes, list(layers)))) - len("".join(parts.values())) - 2048
+    parts["LAYERS"] = _embedded(parallel_map(_exact, list(layers)))
+    room = BESIDE_BYTES + sum(map(len, parallel_map(png_bytes, list(layers)))) - len("".join(parts.values())) - 2048
     targets, error = _stored(wanted, room) if wanted else ([], 0.0)
     told = [f"What was asked for is stored to {-10 * math.log10(error):.0f} dB."] if error else []
     scene |= {"target_error": error, "lines": [*lines, *told]}
@@ -87,7 +87,7 @@ def _stored(pictures: Sequence[U8], room: int) -> tuple[list[str], float]:
     urls: list[str] = []
     for quality in QUALITIES:
         coder = partial(_url, format="AVIF", quality=quality, speed=8, subsampling="4:4:4")
-        urls = at_once(coder, list(pictures))
+        urls = parallel_map(coder, list(pictures))
         if sum(map(len, urls)) <= room:
             break
     coded = [Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))).convert("RGB") for url in urls]

@@ -12,7 +12,7 @@ import numpy as np
 from runtime.content.base import WHITE, ContentInfo, ContentSource, View
 from runtime.optics.rect import PixelRect
 from runtime.records import U8
-from runtime.support.background import leave_if_asked
+from runtime.support.background import raise_if_abandoned
 from runtime.support.gl import DrawnPicture
 
 SIDES = 2
@@ -51,7 +51,7 @@ class CanvasSource(ContentSource):
 
     def drawn(self, view: View, box: PixelRect, paint: Callable[[], None]) -> DrawnPicture:
         """Clear, let `paint` draw inside `box`; the picture of the view's side, valid until its next one."""
-        leave_if_asked()
+        raise_if_abandoned()
         target = self._target(view.width_px, view.height_px)
         plain = target.plain[view.side]
         plain.use()

@@ -19,7 +19,7 @@ from runtime.content.fringe import edges_of, ramps, silhouette
 from runtime.content.shapes import I32, Shape
 from runtime.optics.rect import PixelRect, union
 from runtime.records import F32, F64, U8
-from runtime.support.background import leave_if_asked
+from runtime.support.background import raise_if_abandoned
 from runtime.support.gl import DrawnPicture
 
 OUTLINED_MAX = 200_000  # triangles of a part; beyond, finding its outline costs more than drawing it
@@ -158,7 +158,7 @@ class DrawnPart:
     def draw_surface(self) -> None:
         """In pieces: a software rasteriser holds Python's lock for as long as a call takes."""
         for first in range(0, self.corner_count, 3 * DRAWN_AT_ONCE):
-            leave_if_asked()
+            raise_if_abandoned()
             self.surface.render(first=first, vertices=min(3 * DRAWN_AT_ONCE, self.corner_count - first))
 
     def draw_outline(self, corners: F32, vertices: I32) -> None:
@@ -233,7 +233,7 @@ class TriangleSource(CanvasSource):
 
     def _program(self, features: tuple[str, ...]) -> Any:
         if features not in self._programs:
-            leave_if_asked()
+            raise_if_abandoned()
             head = "#version 330\n" + "".join(f"#define {name}\n" for name in features)
             shaders = {"vertex_shader": head + VERTEX, "fragment_shader": head + FRAGMENT}
             self._programs[features] = self.context.program(**shaders)

@@ -16,7 +16,7 @@ from runtime.errors import ContextLost, FatalError, PhasestackError, Stopped, Tr
 from runtime.frame.solver import SolverStep
 from runtime.frame.solver_host import COST_GAIN, FIRST_REQUEST, SolverHost, SolverParts, Task, taken_in, total_ns
 from runtime.records import SolveRequest
-from runtime.support.background import SOLVER_NICENESS, Left, ask_to_leave, begin, patience_s, set_niceness
+from runtime.support.background import SOLVER_NICENESS, ThreadAbandoned, abandon, begin, patience_s, set_niceness
 from runtime.support.memory import give_back
 from runtime.support.untrusted_input import LIMITS
 
@@ -47,7 +47,7 @@ class _Attempt:
     def leave(self) -> None:
         """End a step between two drawings: one that draws holds Python's lock again and again."""
         if self.thread is not None and self.thread is not threading.current_thread():
-            ask_to_leave(self.thread)
+            abandon(self.thread)
 
 
 class SolverThread(SolverHost):
@@ -155,7 +155,7 @@ class SolverThread(SolverHost):
             give_back()
 
     def _run(self, attempt: _Attempt) -> None:
-        with suppress(Left):
+        with suppress(ThreadAbandoned):
             self._solve(attempt)
 
     def _solve(self, attempt: _Attempt) -> None:
@@ -169,7 +169,7 @@ class SolverThread(SolverHost):
                 parts.close()
             attempt.error, attempt.busy_since_ns = error, self._clock.now_ns()
             attempt.ready.set()
-            if attempt.number > 1 and not isinstance(error, PhasestackError | Left):
+            if attempt.number > 1 and not isinstance(error, PhasestackError | ThreadAbandoned):
                 log.exception("solver: it could not be made anew")
             return
         self._publish(attempt, first)
@@ -184,7 +184,7 @@ class SolverThread(SolverHost):
         except (ContextLost, Stopped) as error:
             log.error("solver: %s", _line(error))  # a record that held the error would hold what it held
             attempt.error, attempt.busy_since_ns = error.with_traceback(None), self._clock.now_ns()
-        except Left:
+        except ThreadAbandoned:
             raise
         except BaseException as error:  # what no step answers with: a bug of ours, or a library's
             log.exception("solver")

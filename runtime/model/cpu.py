@@ -19,7 +19,7 @@ from runtime.model.targets import beside_codes, rest_of, target_table, without_a
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, I16, U8
-from runtime.support.threads import at_once, on_rows
+from runtime.support.threads import on_rows, parallel_map
 
 WEIGHT, TAPER = 8191, 32767  # of 1 in targets' weights, and in tapers
 SAFE = 4 * MARGIN  # elements around rows of panels that whole vectors touch
@@ -61,7 +61,7 @@ class CpuState:
             pictures = [images[0][within.slices] for images in job.arrays]
         else:
             pictures = [images[0][rays.slices] for images in job.arrays]
-        self._targets = at_once(lambda picture: without_alpha(picture, job.channels), pictures)
+        self._targets = parallel_map(lambda picture: without_alpha(picture, job.channels), pictures)
         across, down = geometry.tapers()
         self._tapers = [np.rint(TAPER * taper).astype(np.int16) for taper in (np.repeat(across, job.channels), down)]
         self._resting = set(range(self._stack.count))
@@ -132,7 +132,7 @@ class CpuState:
         self._resting.clear()
 
     def _in_parts(self, work: Any, problem: Problem) -> None:
-        at_once(lambda part: work(byref(problem), part, self._threads), range(self._threads))
+        parallel_map(lambda part: work(byref(problem), part, self._threads), range(self._threads))
 
     def _problem(self, panels_from_rays: F64, *, ahead: I16, last: I16) -> tuple[Problem, object]:
         """What the loops are given; and arrays that must live as long."""

@@ -25,7 +25,7 @@ from runtime.model.warp import REACH_PX, reduced_pictures, warp
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.tilt import coarse_layer_from_seen
 from runtime.records import F32, F64, I16, U8
-from runtime.support.threads import at_once
+from runtime.support.threads import parallel_map
 
 HALF_BASELINE_M = 0.031  # of one eye that stands for both: any would do
 EDGE_SHARE = 1 / 40  # of a picture: so far beside it at most its edge goes on
@@ -76,7 +76,7 @@ class ChainProposal:
         except ValueError as error:
             raise EyesNotServed(str(error)) from None
         middle_x_m = geometry.rasters[geometry.middle].x_m
-        pictures = at_once(self._target_codes, reduced_pictures(job, geometry, self._reduction))
+        pictures = parallel_map(self._target_codes, reduced_pictures(job, geometry, self._reduction))
 
         def targets(side: int) -> list[I16]:
             """An eye's targets along its rays, and the other one's in the same places."""
@@ -89,7 +89,7 @@ class ChainProposal:
                 for codes, from_plane in (pictures[local.order[side]], pictures[local.order[1 - side]])
             ]  # fmt: skip
 
-        left, right = at_once(_residual, [targets(side) for side in (0, 1)])
+        left, right = parallel_map(_residual, [targets(side) for side in (0, 1)])
         waves, shifted_waves, spectrum, modes_in = chain_modes(frame.cells)
         feeds: dict[str, NDArray[Any]] = {
             "left": left.reshape(frame.rows, frame.cells, -1),

@@ -15,7 +15,7 @@ from runtime.optics.pupil import TRACKING_SIGMA_MM
 from runtime.optics.stack import PlaneRaster
 from runtime.optics.views import image_from_raster, image_from_stack
 from runtime.records import F64, U8
-from runtime.support.threads import at_once
+from runtime.support.threads import parallel_map
 
 RAYS_PX = 0.6, 1.6  # pixels of a picture, along a side, for one of a panel: others are resized to one for one
 
@@ -43,7 +43,7 @@ def solve_still(
     images: Sequence[list[U8]] = ([], [])
     if predictor.needs_rasters:
         for side in (0, 1):
-            images[side].extend(at_once(lambda raster, side=side: _warped(own, side, raster, predictor), rasters))  # type: ignore[misc]
+            images[side].extend(parallel_map(lambda raster, side=side: _warped(own, side, raster, predictor), rasters))  # type: ignore[misc]
     job = changed(Job(images, eyes_m, eye_sigma_mm=eye_sigma_mm, own=own))
     watch.lap("prepare")
     made = predictor.solve(job)

@@ -20,7 +20,7 @@ from runtime.optics.rect import PixelRect, union
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 from runtime.support.gl import DrawnPicture
-from runtime.support.threads import PIECE_ROWS, at_once
+from runtime.support.threads import PIECE_ROWS, parallel_map
 
 TOLERANCE_CODES = 2  # eyes that differ by no more agree: a tenth of what 8 bits cost at 40 dB
 NOWHERE = PixelRect(0, 0, 0, 0)
@@ -145,7 +145,7 @@ def differing_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES, know
         return PixelRect(found.u0 + part.u0, found.v0 + part.v0, found.u1 + part.u0, found.v1 + part.v0)
 
     parts = known.beside(width_px=width, height_px=height)
-    return union([known, *at_once(look, [piece for part in parts for piece in part.in_rows(PIECE_ROWS)])])
+    return union([known, *parallel_map(look, [piece for part in parts for piece in part.in_rows(PIECE_ROWS)])])
 
 
 def coarse_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES) -> PixelRect:

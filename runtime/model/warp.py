@@ -19,7 +19,7 @@ from runtime.model.targets import without_alpha
 from runtime.optics.stack import PlaneRaster
 from runtime.optics.views import image_from_raster
 from runtime.records import F64, I16, U8
-from runtime.support.threads import at_once, on_rows
+from runtime.support.threads import on_rows, parallel_map
 
 LEAST_PX, MIN_SCALE = 16, 0.25  # of a picture: smaller ones, and finer rasters, would tell nothing new
 REACH_PX = 3.0  # beside an image, to which its edge goes on at most: less than the loop's EDGE_PX
@@ -78,7 +78,7 @@ def reduced_pictures(job: Job, geometry: Geometry, reduction: int) -> list[tuple
         image_from_plane = np.diag([1 / by_u, 1 / by_v, 1.0]) @ from_raster @ raster.raster_from_plane()
         return without_alpha(picture, job.channels), image_from_plane
 
-    return at_once(reduced, pictures)
+    return parallel_map(reduced, pictures)
 
 
 def resample(

@@ -1,4 +1,4 @@
-"""Jobs on background threads, and thread priorities: presenter, solver, then the rest."""
+"""Background threads: priorities (presenter, then solver, then the rest), abandonment and one-off jobs."""
 
 from __future__ import annotations
 
@@ -18,38 +18,36 @@ log = logging.getLogger("phasestack.background")
 PRESENTER_NICENESS = -10
 SOLVER_NICENESS = 5
 BACKGROUND_NICENESS = 10
-STOPS_WITHIN_S = 1.2  # of being told to: the rest of two seconds is for what can't be waited for with a limit
+STOPS_WITHIN_S = 1.2  # after a stop request; the rest of the two seconds is for calls without a timeout
 T = TypeVar("T")
 
 _ends_by_s = math.inf
-
-
 _running: set[threading.Thread] = set()
-_leaving: set[threading.Thread] = set()
+_abandoned: set[threading.Thread] = set()
 
 
 def ends_by(at_s: float) -> None:
-    """When, of `time.monotonic`, all waits are over that `patience_s` limits."""
+    """Set the deadline, in `time.monotonic` seconds, of every wait that `patience_s` limits."""
     global _ends_by_s
     _ends_by_s = at_s
 
 
 def patience_s(most_s: float) -> float:
-    """How long to wait for what may be left behind: so long at most, less once told to stop."""
+    """Timeout for a thread that may be abandoned: `most_s`, or the time to the deadline if that is less."""
     return max(0.0, min(most_s, _ends_by_s - time.monotonic()))
 
 
 def wait_for_all(timeout_s: float) -> int:
-    """Wait for the jobs that still run, so long at most; how many still do then."""
+    """Wait for running jobs and return how many have not finished after `timeout_s`."""
     deadline_s = time.monotonic() + patience_s(timeout_s)
     for thread in tuple(_running):
         thread.join(max(0.0, deadline_s - time.monotonic()))
     return sum(thread.is_alive() for thread in tuple(_running))
 
 
-def begin(name: str, run: Callable[..., None], *given: Any) -> threading.Thread:
-    """A thread that has been started. Raises TransientError where the system has none left."""
-    thread = threading.Thread(target=run, args=given, name=name, daemon=True)
+def begin(name: str, run: Callable[..., None], *args: Any) -> threading.Thread:
+    """Start a thread. Raises TransientError if the system refuses another."""
+    thread = threading.Thread(target=run, args=args, name=name, daemon=True)
     try:
         thread.start()
     except RuntimeError as error:
@@ -57,32 +55,32 @@ def begin(name: str, run: Callable[..., None], *given: Any) -> threading.Thread:
     return thread
 
 
-class Left(BaseException):
-    """Raised on a thread that was asked to leave: nobody waits for what it makes."""
+class ThreadAbandoned(BaseException):
+    """Raised on an abandoned thread: its result is no longer wanted."""
 
 
-def ask_to_leave(thread: threading.Thread) -> None:
-    """Have a thread end its work at the next `leave_if_asked`."""
-    _leaving.add(thread)
+def abandon(thread: threading.Thread) -> None:
+    """Have a thread end its work at the next `raise_if_abandoned`."""
+    _abandoned.add(thread)
 
 
-def leave_if_asked() -> None:
-    """Between two pieces of work that hold Python's lock, such as drawings. Raises Left.
+def raise_if_abandoned() -> None:
+    """Raise ThreadAbandoned on an abandoned thread. Called between operations that hold Python's lock, such as drawing.
 
-    An exception raised in a thread from outside would reach it within moderngl's calls as well, which crash on it.
+    An asynchronous exception could arrive inside a call to moderngl, which would crash.
     """
-    if _leaving and threading.current_thread() in _leaving:
-        raise Left
+    if _abandoned and threading.current_thread() in _abandoned:
+        raise ThreadAbandoned
 
 
 class Job(Generic[T]):
-    """Begins at once. `done`, `problem` and `take` never wait; one that could not begin has a problem."""
+    """A job that starts on construction. `done`, `problem` and `take` never block; a failed start is a problem."""
 
     def __init__(self, name: str, work: Callable[[], T]) -> None:
         self._name, self._work = name, work
         self._result: T | None = None
         self.done = False
-        self.problem = ""  # one line, where it failed
+        self.problem = ""  # one line if it failed
         self._thread: threading.Thread | None = None
         try:
             self._thread = begin(f"job {name}", self._run)
@@ -90,12 +88,12 @@ class Job(Generic[T]):
             self.problem, self.done = str(error), True
 
     def wait(self, timeout_s: float) -> None:
-        """Until its thread has ended, so long at most."""
+        """Wait up to `timeout_s` for the thread to end."""
         if self._thread is not None:
             self._thread.join(patience_s(timeout_s))
 
     def take(self) -> T | None:
-        """The result, which is the caller's from now on; None where there is none (yet)."""
+        """Hand over the result; None if there is none yet or it was already taken."""
         result, self._result = self._result, None
         return result
 
@@ -106,7 +104,7 @@ class Job(Generic[T]):
             self._result = self._work()
         except PhasestackError as error:
             self.problem = str(error)
-        except BaseException as error:  # whatever a library raises, or a vendor's `sys.exit()`
+        except BaseException as error:  # from a library, or a vendor's `sys.exit()`
             self.problem = one_line(f"{self._name}: {type(error).__name__}: {error}")
             log.exception("%s", self._name)
         finally:
@@ -116,7 +114,7 @@ class Job(Generic[T]):
 
 @contextmanager
 def niceness(value: int) -> Iterator[None]:
-    """The calling thread's niceness within a block; as it was afterwards."""
+    """Set the calling thread's niceness within a block and restore it afterwards."""
     before = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
     set_niceness(value)
     try:
@@ -126,6 +124,6 @@ def niceness(value: int) -> Iterator[None]:
 
 
 def set_niceness(niceness: int) -> None:
-    """Of the calling thread, and of those that it starts from now on; where the system allows it."""
+    """Set the niceness of the calling thread and of threads it starts later, if the system allows it."""
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)

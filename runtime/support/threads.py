@@ -1,4 +1,4 @@
-"""Work on several threads, for loops that release the interpreter's lock (numpy, OpenCV, C++)."""
+"""Parallel loops over work that releases the interpreter's lock (numpy, OpenCV, C++)."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import TypeVar
 
 import cv2
 
-PIECE_ROWS = 128  # of a picture, that are done at once where `at_once` works on it in pieces
+PIECE_ROWS = 128  # picture rows per item where `parallel_map` splits a picture
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-def at_once(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    """`work` of every item, on as many threads as OpenCV may use; what it raises is raised here."""
+def parallel_map(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+    """Call `work` on every item, on as many threads as OpenCV may use; its exceptions propagate."""
     threads = cv2.getNumThreads()
     if threads < 2 or len(items) < 2:
         return [work(item) for item in items]
@@ -24,16 +24,16 @@ def at_once(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Resul
 
 
 def on_rows(work: Callable[[int, int], None], rows: int, *, threads: int | None = None) -> None:
-    """`work(first, last)` on as many of so many rows for each thread; None: for each of OpenCV's."""
-    at_once(lambda part: work(*part), shares(rows, threads or max(1, cv2.getNumThreads())))
+    """Split `rows` among `threads` (default: OpenCV's) and call `work(begin, end)` on each range in parallel."""
+    parallel_map(lambda span: work(*span), row_ranges(rows, threads or max(1, cv2.getNumThreads())))
 
 
-def shares(count: int, threads: int) -> list[tuple[int, int]]:
-    """As many rows for each thread: the first, and the first beyond."""
+def row_ranges(count: int, threads: int) -> list[tuple[int, int]]:
+    """Split `count` rows into `threads` half-open ranges [begin, end)."""
     return list(pairwise([count * k // threads for k in range(threads + 1)]))
 
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """Threads that stay: a new one begins two milliseconds late."""
-    return ThreadPoolExecutor(threads, "at-once")
+    """Keep the threads: starting one takes two milliseconds."""
+    return ThreadPoolExecutor(threads, "parallel-map")

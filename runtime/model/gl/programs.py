@@ -12,7 +12,7 @@ from typing import Any
 import moderngl
 
 from runtime.errors import ContextLost, PhasestackError
-from runtime.support.background import leave_if_asked
+from runtime.support.background import raise_if_abandoned
 
 INCLUDE = re.compile(r'^#include "([a-z_]+\.glsl)"$', re.MULTILINE)
 SHADERS = "runtime.model.gl"
@@ -78,7 +78,7 @@ class Passes:
 
         Inputs and uniforms are named as in the shader. defines: of the shader; at: first column and row, width, height.
         """
-        leave_if_asked()
+        raise_if_abandoned()
         program, array, held = self._program(name, defines)
         for unit, (key, image) in enumerate(inputs.items()):
             image.texture.use(unit)
