@@ -20,7 +20,7 @@ from calib.hardware import Say, SetupHardware
 from calib.keys import Key
 from calib.registration import register_photos
 from calib.solve_run import solve_file
-from runtime.config import NAMES_OR_PATHS, PATHS, Settings, load_settings
+from runtime.config import Settings, load_settings
 from runtime.errors import InputError
 from runtime.panels.geometry import Arrow, mounting_of
 from runtime.panels.monitors import Monitor
@@ -260,10 +260,10 @@ def gather(config: Path, out: Path) -> list[str]:
     settings = load_settings(config)
     document: Any = read_document(config)
     copies: dict[str, bytes] = {}
-    for section, key in (*PATHS, *NAMES_OR_PATHS):
-        value = getattr(getattr(settings, section), key)
-        if value and key in document.get(section, {}):
-            document[section][key] = value
+    for section, values in settings:
+        for key, value in values:
+            if key in document.get(section, {}) and isinstance(value, str):  # a path is absolute here
+                document[section][key] = value
     if settings.calibration.file:
         copies["calibration.toml"] = untrusted_input.read_bytes(settings.calibration.file, most_bytes=MAX_BYTES)
         document["calibration"]["file"] = "calibration.toml"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def config() -> None:
-    """Print a complete configuration: every setting, its default and what it means. It is valid TOML.
+    """Print a complete configuration in TOML: every setting with its default and its meaning.
 
     Paths in a configuration are relative to its folder. `phasestack doctor --config FILE` checks one.
 
@@ -19,7 +19,7 @@ def config() -> None:
     for name, values in defaults.model_dump(mode="json").items():
         document.add(tomlkit.nl())
         document[name] = table = tomlkit.table()
-        table.add(tomlkit.comment(Settings.model_fields[name].description or ""))
+        table.add(tomlkit.comment(type(getattr(defaults, name)).__doc__ or ""))
         for key, value in values.items():
             table.add(tomlkit.comment(type(getattr(defaults, name)).model_fields[key].description))
             if value is None:

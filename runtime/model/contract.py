@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from runtime.config import Section, validated
 from runtime.errors import InputError
 from runtime.kernels import MAX_PANELS
+from runtime.support.sections import Section, validated
 
 METADATA_KEY = "phasestack.contract"
 VERSION = 2

@@ -1,0 +1,42 @@
+"""Validated, frozen settings of one TOML file. Defaults and meanings are in `settings.py`."""
+
+from runtime.config.files import load_settings, load_stack
+from runtime.config.overrides import changed, with_options
+from runtime.config.settings import (
+    MOST,
+    CalibrationSettings,
+    ContentSettings,
+    LoopSettings,
+    ModelSettings,
+    OutputSettings,
+    PanelSettings,
+    SensorSettings,
+    ServiceSettings,
+    Settings,
+    StackGeometry,
+    TrackerSettings,
+)
+from runtime.support.sections import Section, validated
+from runtime.support.tables import read_table
+
+__all__ = [
+    "MOST",
+    "CalibrationSettings",
+    "ContentSettings",
+    "LoopSettings",
+    "ModelSettings",
+    "OutputSettings",
+    "PanelSettings",
+    "Section",
+    "SensorSettings",
+    "ServiceSettings",
+    "Settings",
+    "StackGeometry",
+    "TrackerSettings",
+    "changed",
+    "load_settings",
+    "load_stack",
+    "read_table",
+    "validated",
+    "with_options",
+]

@@ -1,0 +1,367 @@
+"""Every setting: its type, range, default and meaning.
+
+Ranges are those of displays that can be built, so that a wrong unit is refused with a suggestion.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, field_validator, model_validator
+
+from runtime.config.paths import NameOrPath, PathText, path_in
+from runtime.optics.stack import PanelStack, Tilt
+from runtime.support.plausible import nearest, within
+from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG
+from runtime.support.sections import Section
+
+MOST = 1e9  # of any number that has no narrower range
+PIXEL_ASPECT_TOLERANCE = 0.03  # relative: data sheets round the active area
+LEAST_GAP_M = 1e-5  # between panels: thinner than any panel
+PANELS_MOST = 8  # in a stack
+
+NonNegative = Annotated[float, Field(ge=0, le=MOST)]
+Unit = Annotated[float, Field(ge=0, le=1)]
+Entry = Annotated[float, Field(ge=-MOST, le=MOST)]  # of a matrix
+Slope = Annotated[float, Field(ge=-0.2, le=0.2)]  # of a panel that should be upright
+Coordinate = Annotated[float, within(-EYE_MOST_M, EYE_MOST_M, "m")]  # of an eye
+Point = tuple[Coordinate, Coordinate, Coordinate]
+Offset = Annotated[float, within(-10.0, 10.0, "m")]  # of a scene
+Turn = Annotated[float, within(-360.0, 360.0, "degrees")]
+
+
+class StackGeometry(Section):
+    """Geometry of the stack: contents of `--panels FILE` and of the configuration's `[stack]`."""
+
+    width_m: Annotated[float, within(0.005, 20.0, "m")] = Field(
+        0.5184, description="active width of every panel, metres"
+    )
+    height_m: Annotated[float, within(0.005, 20.0, "m")] = Field(
+        0.2916, description="active height of every panel, metres"
+    )
+    x_m: Annotated[
+        tuple[Annotated[float, within(-10.0, 10.0, "m")], ...], Field(min_length=2, max_length=PANELS_MOST)
+    ] = Field((-0.06, 0.0, 0.06), description="panel positions along +x, rear to front, metres")
+    width_px: Annotated[int, Field(ge=16, le=16384)] = Field(1920, description="columns of every panel")
+    height_px: Annotated[int, Field(ge=16, le=16384)] = Field(1080, description="rows of every panel")
+    pixel_aspect: Annotated[float, within(0.1, 10.0, "")] = Field(
+        1.0, description="width of a pixel over its height; must agree with the sizes above to 3%"
+    )
+
+    tilt: Annotated[tuple[tuple[Slope, Slope], ...], Field(max_length=PANELS_MOST)] = Field(
+        (),
+        description="per panel, slope of x towards the viewer's right, and upwards; "
+        "written by `calibrate panels`; empty: parallel panels",
+    )
+    registered_from_m: Point = Field(
+        (0.5, 0.0, 0.0),
+        description="eye in frame `stack` to whom the homographies make tilted panels look parallel",
+    )
+
+    @model_validator(mode="after")
+    def _tilted(self) -> StackGeometry:
+        if len(self.tilt) not in (0, len(self.x_m)):
+            raise ValueError(f"tilt: has {len(self.tilt)} panels, x_m has {len(self.x_m)}")
+        if any(any(slopes) for slopes in self.tilt) and self.registered_from_m[0] <= self.x_m[-1]:
+            raise ValueError("registered_from_m: is not before the front panel")
+        return self
+
+    @model_validator(mode="after")
+    def _ascending(self) -> StackGeometry:
+        gaps = [b - a for a, b in zip(self.x_m, self.x_m[1:], strict=False)]
+        if any(gap <= 0 for gap in gaps):
+            raise ValueError("x_m: must ascend from rear to front")
+        if min(gaps) < LEAST_GAP_M:
+            raise ValueError(f"x_m: panels {min(gaps):g} m apart are one panel; {LEAST_GAP_M:g} m is the least")
+        return self
+
+    def check_pixels(self) -> None:
+        """Raise ValueError where the sizes in metres and in pixels contradict `pixel_aspect`."""
+        aspect = (self.width_m / self.width_px) / (self.height_m / self.height_px)
+        if abs(aspect / self.pixel_aspect - 1) > PIXEL_ASPECT_TOLERANCE:
+            square_m = self.width_m / self.width_px * self.height_px / self.pixel_aspect
+            raise ValueError(
+                f"stack.height_m: {self.width_m:g} x {self.height_m:g} m of {self.width_px} x {self.height_px} pixels "
+                f"have pixels {aspect:.3g} times as wide as high, not {self.pixel_aspect:g}: did you mean "
+                f"height_m = {square_m:.4g}? (or set stack.pixel_aspect)"
+            )
+
+    def stack(self) -> PanelStack:
+        """Return the geometry as a `PanelStack`."""
+        tilt = None
+        if any(any(slopes) for slopes in self.tilt):
+            tilt = Tilt(tuple((0.0, right, up) for right, up in self.tilt), self.registered_from_m)
+        return PanelStack(self.width_m, self.height_m, self.x_m, self.width_px, self.height_px, tilt)
+
+
+class SensorSettings(Section):
+    """Sensor that delivers eye positions or images."""
+
+    driver: str = Field("replay", description="replay, openni2, usb-camera, fixed, or your own class: `module:Class`")
+    source: str = Field("demo", description="a recording, `demo`, a serial number or a device URI")
+    timeout_s: Annotated[float, within(0.001, 600.0, "s")] = Field(
+        0.5, description="the sensor counts as stalled after this long without a sample"
+    )
+    loop: bool = Field(False, description="driver `replay`: restart the recording when it ends")
+    openni2_folder: PathText = Field(
+        "", description="driver `openni2`: folder with libOpenNI2.so and OpenNI2/Drivers; empty: the system's"
+    )
+    fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
+        0.0,
+        description="horizontal field of view of a camera that does not report its own (usb-camera); 0: unknown",
+    )
+    fixed_eyes_m: tuple[Point, Point] | None = Field(
+        None, description="driver `fixed`: left and right eye in the stack frame"
+    )
+    options: dict[str, Any] = Field(
+        default_factory=dict, description="options of your own driver, validated by its `Options`"
+    )
+
+    @field_validator("source")
+    @classmethod
+    def _resolve_source(cls, source: str, info: ValidationInfo) -> str:
+        # Other drivers' sources are serial numbers and URIs, with slashes of their own.
+        if info.data.get("driver") == "replay" or source.endswith(".oni"):
+            return path_in(info.context, source, or_name=source == "demo")
+        return source
+
+
+class TrackerSettings(Section):
+    """Tracker of the two eyes."""
+
+    hold_s: Annotated[float, within(0.0, 60.0, "s")] = Field(
+        0.5, description="keep the last eye positions this long after losing the viewer, then show the flat picture"
+    )
+    noise_m: Annotated[float, within(1e-6, 0.2, "m")] = Field(
+        0.003, description="standard deviation of a measured eye per axis, for sensors that do not report it"
+    )
+
+
+class CalibrationSettings(Section):
+    """Calibration from the sensor's frame to the stack's, and the viewing range."""
+
+    file: PathText = Field("", description="calibration TOML; empty: the demo recording's")
+    ipd_m: Annotated[float, within(0.04, 0.08, "m", zero=True)] = Field(
+        0.0,
+        description="the viewer's eye separation; 0: unknown; for calibration charts and cameras without depth",
+    )
+    viewing_m: tuple[Annotated[float, within(0.05, 20.0, "m")], Annotated[float, within(0.05, 20.0, "m")]] = Field(
+        (0.4, 0.6),
+        description="nearest and farthest viewer, for calibration charts and registration",
+    )
+    viewing_side_deg: Annotated[float, Field(ge=2, le=40)] = Field(
+        10.0, description="angle to either side within which viewers stand, from the display's middle"
+    )
+    viewing_up_deg: tuple[float, float] = Field((0.0, 20.0), description="elevation of their eyes: lowest, highest")
+
+    @model_validator(mode="after")
+    def _viewing(self) -> CalibrationSettings:
+        if self.viewing_m[1] < self.viewing_m[0] * 1.1:
+            raise ValueError("viewing_m: must be the nearest, then the farthest, at least a tenth farther")
+        low, high = self.viewing_up_deg
+        if not (-40 <= low < high <= 40 and high - low >= 2):
+            raise ValueError("viewing_up_deg: must be lowest, then highest, between -40 and 40, 2 degrees apart")
+        return self
+
+
+LAYOUT = r"^(auto|mono|(half-)?side-by-side|(half-)?top-bottom|rgbd|qs\d{1,6}x\d{1,6}(a\d+(\.\d+)?)?)$"
+
+
+class ContentSettings(Section):
+    """Content to show, and its placement."""
+
+    scene: NameOrPath = Field(
+        "demo", description="a built-in scene, a preset, a file, a folder, or a class `module:Class`"
+    )
+    options: dict[str, Any] = Field(
+        default_factory=dict, description="options of a scene that is a class; for `program`: port"
+    )
+    fov_deg: Annotated[float, within(*FOV_RANGE_DEG, "degrees")] = Field(
+        40.0, description="horizontal field of view of the eye images"
+    )
+    background: tuple[Unit, Unit, Unit] | None = Field(
+        None, description="colour behind the scene, 0-1; unset: dark, or white for the built-in scenes"
+    )
+    file: PathText = Field("", description="data of a preset: its .ply or .glb, or its data-set folder")
+    layout: Annotated[str, Field(pattern=LAYOUT)] = Field(
+        "auto",
+        description="arrangement of views in a picture or video: mono, side-by-side, top-bottom, half-side-by-side, "
+        "half-top-bottom, rgbd, a quilt's qs8x6a0.75; auto: by file name (_sbs, _tb, _hsbs, _htb, _rgbd, _qs8x6a0.75)",
+    )
+    cone_deg: Annotated[float, Field(gt=0, lt=180)] = Field(40.0, description="angle spanned by a quilt's views")
+    depth_m: tuple[Annotated[float, within(-10.0, 10.0, "m")], Annotated[float, within(-10.0, 10.0, "m")]] = Field(
+        (-0.05, 0.05),
+        description="depth range (rear, front) of an RGBD picture; a mesh scaled by `fit` may take up to twice this",
+    )
+    picture_rate_hz: Annotated[float, within(0.01, 1000.0, "Hz")] = Field(
+        30.0, description="frame rate of a folder of pictures"
+    )
+    fit: bool = Field(True, description="scale a mesh or splat without a preset to the display, and centre it")
+    axes: Annotated[str, Field(pattern=r"^(auto|[+-][xyz] [+-][xyz])$")] = Field(
+        "auto",
+        description="axes of a mesh or splat that point up and to the viewer, such as `+z -y`; auto: glTF's own, "
+        "otherwise guessed from the extent",
+    )
+    library: PathText = Field("", description="folder of pictures, films, models and playlists offered on the page")
+    scale: Annotated[float, within(0.001, 1000.0, "")] = Field(
+        1.0, description="scale factor of the scene, about the display's middle"
+    )
+    offset_m: tuple[Offset, Offset, Offset] = Field(
+        (0.0, 0.0, 0.0), description="displacement of the scene: out of the screen, to the right, up; metres"
+    )
+    rotation_deg: tuple[Turn, Turn, Turn] = Field(
+        (0.0, 0.0, 0.0),
+        description="rotation of the scene about the axes out of the screen, to the right and up, in this order",
+    )
+    turntable_per_min: Annotated[float, within(-600.0, 600.0, "turns a minute")] = Field(
+        0.0, description="rotation of the scene about the vertical, turns per minute; negative: the other way"
+    )
+
+    @model_validator(mode="after")
+    def _ordered(self) -> ContentSettings:
+        if self.depth_m[0] >= self.depth_m[1]:
+            raise ValueError("depth_m: must be rear, then front")
+        if self.axes != "auto" and self.axes[1] == self.axes[4]:
+            raise ValueError("axes: must be two different ones")
+        return self
+
+
+def _accept_legacy_backend(name: Any) -> Any:
+    """Return the backend's name; old scripts call the processor `opencv`."""
+    return "cpu" if name == "opencv" else name
+
+
+class ModelSettings(Section):
+    """Model of the panels, and where it runs."""
+
+    name: NameOrPath = Field("balanced", description="fast, balanced, best, sart, or an ONNX file with our contract")
+    effort: Literal["auto", "full"] = Field(
+        "auto",
+        description="raster and steps of each solution: auto (chosen by the loop, at most those of the model) or full "
+        "(always all of the model's)",
+    )
+    provider: Literal["cpu", "cuda", "tensorrt", "openvino"] = Field(
+        "cpu", description="the network's execution provider"
+    )
+    backend: Annotated[Literal["auto", "cpu", "gl"], BeforeValidator(_accept_legacy_backend)] = Field(
+        "auto",
+        description="device for everything except the network: the processor, or the GPU by OpenGL; "
+        "auto: the faster one, measured at the start",
+    )
+    threads: Annotated[int, Field(ge=0, le=256)] = Field(2, description="inference threads; 0: all cores")
+    eye_sigma_mm: Literal["auto"] | NonNegative = Field(
+        "auto",
+        description="tracking error that solutions allow for: standard deviation of both eyes together, "
+        "millimetres per axis; 0: eyes known exactly; auto: from the tracker",
+    )
+    budget_ms: NonNegative = Field(
+        0.0, description="no step of a solution starts later than this after its start, drawing included; 0: no limit"
+    )
+
+
+class PanelSettings(Section):
+    """One physical panel: its monitor, mounting and grey curve."""
+
+    edid_serial: str = Field("", description="monitor by EDID serial (first choice)")
+    connector: str = Field("", description="monitor by connector name, as HDMI-1 (second choice)")
+    rotation_deg: Literal[0, 90, 180, 270] = Field(0, description="mounting of the panel, counter-clockwise")
+    mirror: Literal["none", "horizontal", "vertical"] = Field("none", description="mirroring, before rotation")
+    homography: tuple[tuple[Entry, Entry, Entry], tuple[Entry, Entry, Entry], tuple[Entry, Entry, Entry]] = Field(
+        ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+        description="3x3 matrix from ideal to true panel pixels, from `calibrate panels`",
+    )
+    lut: PathText = Field("", description="CSV of phase (0-1) and grey (0-1) per channel; empty: identity")
+    gamma: Annotated[float, within(0.1, 10.0, "")] = Field(1.0, description="without a LUT: grey = phase^(1/gamma)")
+
+
+class OutputSettings(Section):
+    """Output to the panels."""
+
+    kind: Literal["offscreen", "windows"] = Field(
+        "offscreen", description="no windows, or one fullscreen window per panel"
+    )
+    panels: tuple[PanelSettings, ...] = Field(
+        (), max_length=PANELS_MOST, description="one table per panel, rear to front"
+    )
+
+
+STAGES = ("sensor", "track", "render", "prepare", "inference", "finish", "step", "present", "wait")
+
+
+def _check_stages(cost_ms: dict[str, float]) -> dict[str, float]:
+    for name in cost_ms:
+        if name not in STAGES:
+            raise ValueError(f"{name} is no stage{nearest(name, STAGES)} (stages: {', '.join(STAGES)})")
+    return cost_ms
+
+
+class LoopSettings(Section):
+    """Pacing, and the simulated clock."""
+
+    rate_hz: Annotated[float, within(1.0, 1000.0, "Hz")] = Field(
+        60.0, description="refreshes per second, for a display that does not report its own rate"
+    )
+    sensor_latency_ms: Annotated[float, within(0.0, 10_000.0, "ms")] = Field(
+        15.0, description="delay of a replayed sample from capture to arrival"
+    )
+    scanout_ms: Annotated[float, within(0.0, 1000.0, "ms")] = Field(
+        8.0, description="delay from the buffer swap to the middle of the panel's light"
+    )
+    simulated_stage_ms: Annotated[dict[str, NonNegative], AfterValidator(_check_stages)] = Field(
+        default_factory=lambda: {
+            "sensor": 0.1,
+            "track": 0.1,
+            "render": 8.0,
+            "prepare": 4.0,
+            "inference": 3.0,
+            "finish": 8.0,
+            "present": 2.0,
+            "wait": 0.0,
+        },
+        description="cost of each stage on the simulated clock of --max-speed",
+    )
+    evaluate_every: Annotated[int, Field(ge=0)] = Field(
+        20, description="with --out: refreshes between two measurements of what the eyes see; 0: only the last refresh"
+    )
+
+
+class PlanSettings(Section):
+    """Allowed savings."""
+
+    enabled: bool = Field(
+        True,
+        description="skip work made unnecessary by the scene or a resting head; false: draw and solve everything",
+    )
+    align: bool = Field(True, description="shift and scale the panels at every refresh to follow the eyes")
+
+
+class ServiceSettings(Section):
+    """Socket and black box of the daemon."""
+
+    socket: PathText = Field("/run/phasestack/status.sock", description="status and control socket")
+    blackbox_minutes: Annotated[float, within(0.0, 60.0, "min")] = Field(
+        2.0, description="minutes kept in memory by the black box; 0: off"
+    )
+
+
+class Settings(Section):
+    """All settings, as printed by `phasestack config`."""
+
+    stack: StackGeometry = StackGeometry()
+    sensor: SensorSettings = SensorSettings()
+    tracker: TrackerSettings = TrackerSettings()
+    calibration: CalibrationSettings = CalibrationSettings()
+    content: ContentSettings = ContentSettings()
+    model: ModelSettings = ModelSettings()
+    output: OutputSettings = OutputSettings()
+    loop: LoopSettings = LoopSettings()
+    plan: PlanSettings = PlanSettings()
+    service: ServiceSettings = ServiceSettings()
+
+    @model_validator(mode="after")
+    def _agree(self) -> Settings:
+        self.stack.check_pixels()
+        tables, panels = len(self.output.panels), len(self.stack.x_m)
+        if tables not in (0, panels):
+            raise ValueError(f"output.panels: has {tables} of {panels} tables: one per panel, rear to front")
+        return self
