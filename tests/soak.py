@@ -28,7 +28,7 @@ import psutil
 
 from runtime.config import Settings
 from runtime.content.scenes import SCENES
-from runtime.daemon import reconfigure, solver_parts, supervise
+from runtime.daemon import changes, reconfigure, solver_parts, supervise
 from runtime.daemon.build import RunOptions
 from runtime.daemon.client import ask
 from runtime.errors import SensorLost
@@ -44,7 +44,7 @@ REFUSED = ("skipped: a newer change came", "there is no next one", "nobody's", "
 DELAYS = (
     (solver_parts.RunningSolver, "step", 0.02, 2.5), (solver_parts.RunningSolver, "close", 0.3, 1.5),
     (solver_parts, "prepare_content", 0.3, 2.5), (reconfigure, "prepare_content", 0.3, 2.5),
-    (reconfigure.Reconfiguration, "_take_over", 0.3, 2.5), (supervise.Daemon, "_carry_out", 0.05, 0.3),
+    (reconfigure.Reconfiguration, "_take_over", 0.3, 2.5), (changes.Changes, "carry_on", 0.05, 0.3),
 )  # fmt: skip  # where, how often, seconds at most
 SETTINGS: dict[str, Any] = {
     "stack": {"width_px": 64, "height_px": 36},

@@ -154,6 +154,7 @@ def test_content_that_can_t_be_loaded_is_refused_and_the_old_stays(
         assert str(path) in answer["error"] and field in answer["error"]
         assert all(account.presented for account in served.rig.refreshes(3))
         assert served.rig.content is content
+        served.rig.refresh_until(TRACKING)
         status = served.status()
         assert (status["scene"], status["refused"], status["state"]) == ("demo", answer["error"], TRACKING)
         (told,) = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
@@ -202,9 +203,12 @@ def test_what_takes_very_long_is_answered_with_where_to_look(served: Served, mon
     assert "status" in answer["note"]
 
 
-def configuration(scene: str = "demo", **model: Any) -> str:
-    tables = {name: {**SMALL.get(name, {}), **STEADY.get(name, {})} for name in {**SMALL, **STEADY}}
-    tables |= {"model": tables["model"] | model, "content": {"scene": scene}}
+def configuration(scene: str = "demo", **changes: dict[str, Any]) -> str:
+    changes |= {"content": {"scene": scene}}
+    tables = {
+        name: {**SMALL.get(name, {}), **STEADY.get(name, {}), **changes.get(name, {})}
+        for name in {**SMALL, **STEADY, **changes}
+    }
     return "\n".join(
         f"[{section}]\n" + "\n".join(f"{name} = {value!r}" for name, value in table.items())
         for section, table in tables.items()
@@ -231,13 +235,47 @@ def test_a_reload_keeps_what_was_chosen_unless_the_file_changed_it(
     assert served.status()["scene"] == "flat"
 
 
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("loop", {"loop": {"rate_hz": 90.0}}),
+        ("loop", {"loop": {"scanout_ms": 4.0}}),
+        ("calibration.ipd_m", {"calibration": {"ipd_m": 0.064}}),
+        ("model.backend", {"model": {"backend": "gl"}}),
+    ],
+)
+def test_a_reload_refuses_what_is_read_only_at_the_start(
+    served: Served, name: str, change: dict[str, dict[str, Any]]
+) -> None:
+    """`[loop]` and `calibration.ipd_m` were accepted, and changed nothing."""
+    served.config.write_text(configuration(**change))
+    answer = served.asked("reload")
+    assert answer == {"ok": False, "error": f"reload: {name}: a change needs a restart of the service"}
+
+
+def test_only_the_presenter_s_thread_writes_what_was_chosen(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scene was moved on the solver's thread, which wrote what the presenter's thread was reading."""
+    writers: dict[str, set[str]] = {}
+
+    def note(self: Any, name: str, value: Any) -> None:
+        writers.setdefault(name, set()).add(threading.current_thread().name)
+        object.__setattr__(self, name, value)
+
+    monkeypatch.setattr(type(served.daemon.changes), "__setattr__", note)
+    served.config.write_text(configuration())
+    assert served.asked("place", {"scale": 1.2})["placing"]["scale"] == 1.2
+    for name, value in (("next", None), ("scene", "sparse"), ("model", "sart"), ("reload", None)):
+        served.asked(name, value)
+    assert writers.keys() >= {"choices", "refused"} and set().union(*writers.values()) == {"MainThread"}
+
+
 def test_a_command_that_fails_unexpectedly_is_refused_and_the_run_continues(
     served: Served, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def broken(*_: Any) -> None:
         raise OverflowError("int too large to convert to float")
 
-    monkeypatch.setattr(served.daemon, "_place", broken)
+    monkeypatch.setattr(served.daemon.changes, "place", broken)
     answer = served.asked("place", {"scale": 2.0})
     assert answer == {"ok": False, "error": "unexpected error (OverflowError): see the log"}
     (line,) = (TextFormat(journald=False).format(record) for record in caplog.records if record.exc_info)

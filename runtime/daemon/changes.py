@@ -1,0 +1,214 @@
+"""Changes by operators: what is configured, what is chosen over it, and the one change that is loading."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from operator import attrgetter
+from queue import SimpleQueue
+from typing import Any
+
+from runtime.config import Settings, changed
+from runtime.content.placed import placed_source, placing_of
+from runtime.daemon import status
+from runtime.daemon.commands import PLACING, Command
+from runtime.daemon.reconfigure import Reconfiguration, moved_since
+from runtime.errors import InputError, PhasestackError
+from runtime.frame.presenter import Presenter
+
+log = logging.getLogger("phasestack.daemon")
+
+NEEDS_RESTART = ("stack", "sensor", "output", "service", "loop", "model.backend", "calibration.ipd_m")  # read once
+
+
+@dataclass(frozen=True, slots=True)
+class Choices:
+    """The configuration as last read, and an operator's choices, which override it."""
+
+    configured: Settings
+    chosen: dict[tuple[str, str], Any] = field(default_factory=dict)  # by section and key
+
+    def settings(self) -> Settings:
+        """Return the settings with all choices applied. Raises InputError."""
+        settings = self.configured
+        for (section, key), value in self.chosen.items():
+            settings = changed(settings, section, {key: value}, source="ctl")
+        return settings
+
+    def choosing(self, section: str, **values: Any) -> Choices:
+        """Return the choices with some of one section added."""
+        return replace(self, chosen=self.chosen | {(section, key): value for key, value in values.items()})
+
+    def another_scene(self, scene: str) -> Choices:
+        """Return the choices with another scene, placed as configured and not as the one before was moved."""
+        kept = {setting: value for setting, value in self.chosen.items() if setting[1] not in PLACING}
+        return replace(self, chosen=kept).choosing("content", scene=scene)
+
+    def reloaded(self, read: Callable[[], Settings]) -> Choices:
+        """Return the new configuration, with the choices for which it has no new value. Raises InputError."""
+        settings, before = read(), self.configured
+        frozen = [name for name in NEEDS_RESTART if attrgetter(name)(settings) != attrgetter(name)(before)]
+        if frozen:
+            raise InputError("reload", ", ".join(frozen), "a change needs a restart of the service")
+        same = {at: value for at, value in self.chosen.items() if _value(settings, at) == _value(before, at)}
+        return Choices(settings, same)
+
+
+def _value(settings: Settings, at: tuple[str, str]) -> Any:
+    return getattr(getattr(settings, at[0]), at[1])
+
+
+@dataclass(slots=True)
+class _Change:
+    """A change of settings for a command."""
+
+    command: Command
+    choose: Callable[[Choices], Choices]  # on the loading thread; raises InputError
+    reload_content: bool = False
+    choices: Choices | None = None  # set by the loading thread before its job is done
+
+    def settings(self, before: Choices) -> Settings:
+        """Choose, and return the new settings. Raises InputError."""
+        self.choices = self.choose(before)
+        return self.choices.settings()
+
+
+class Changes:
+    """Changes to a run, loaded one at a time. Only the presenter's thread uses this object.
+
+    Work on other threads is handed all it needs, and its outcome comes back through a queue: settings are read and
+    loaded by a job (`Reconfiguration`), and a scene is moved on the solver's thread.
+    """
+
+    def __init__(self, presenter: Presenter) -> None:
+        self._presenter = presenter
+        self.choices = Choices(presenter.run_cell.state.settings)
+        self.refused = ""  # why the last change was refused; empty after one that was accepted
+        self._loading: tuple[_Change, Reconfiguration] | None = None
+        self._next: _Change | None = None  # begins when that has ended
+        self._outcomes: SimpleQueue[Callable[[], None]] = SimpleQueue()  # of work on the solver's thread
+
+    @property
+    def loading(self) -> Reconfiguration | None:
+        """The change that is loading."""
+        return None if self._loading is None else self._loading[1]
+
+    def carry_on(self) -> None:
+        """Finish what other threads have done, and begin what waits; once a refresh."""
+        finished = self._loading is not None and self._loading[1].finished
+        while not self._outcomes.empty():  # those from before a scene was replaced, first
+            self._outcomes.get()()
+        if self._loading is not None and finished:
+            (change, loading), self._loading = self._loading, None
+            if not loading.abandoned:
+                self._finish(change, loading)
+        if self._loading is None and self._next is not None:
+            change, self._next = self._next, None
+            self.attempt(change.command, partial(self._load, change))
+
+    def begin(self, command: Command, choose: Callable[[Choices], Choices], *, reload_content: bool = False) -> None:
+        """Begin a change, or have it wait until the one that is loading has been abandoned.
+
+        choose: the new choices, on the loading thread; reload_content: also if its settings are the same.
+        """
+        change = _Change(command, choose, reload_content)
+        if self._loading is None:
+            self._load(change)
+            return
+        (current, loading), waiting = self._loading, self._next
+        for skipped in (None if loading.abandoned else current, waiting):
+            if skipped is not None:
+                self.answer(skipped.command, "skipped: a newer change came")
+        loading.abandon()
+        self._next = change
+
+    def place(self, command: Command) -> None:
+        """Move the scene: settings and content change together, on the solver's thread. Raises InputError."""
+        values = command.value or status.placing_in(self.choices.configured)
+        changed(self._presenter.run_cell.state.settings, "content", values, source="place")
+
+        def move(parts: Any) -> str:
+            state = parts.run.state
+            settings = changed(state.settings, "content", values, source="place")
+            source = placed_source(state.content, placing_of(settings.content))
+            parts.replace(settings=settings, content=source)
+            return ""
+
+        def moved() -> None:
+            self.choices = self.choices.choosing("content", **values)
+
+        self._between_steps(command, move, moved)
+
+    def skip(self, command: Command) -> None:
+        """Advance the playlist to its next entry, on the solver's thread."""
+
+        def skip(parts: Any) -> str:
+            skipped = parts.run.state.content.skip(time_ns=self._presenter.clock.now_ns())
+            return "" if skipped else "there is no next entry: the scene is no playlist, or shows its last one"
+
+        self._between_steps(command, skip)
+
+    def attempt(self, command: Command, work: Callable[[], None]) -> None:
+        """Do the work; a failure refuses the command and does not end the run."""
+        if problem := _problem_of(command, work):
+            self.answer(command, problem)
+
+    def answer(self, command: Command, problem: str) -> None:
+        """Report the outcome of a change to its client, the log and the status; problem: why it was refused."""
+        self.refused = problem
+        if problem:
+            log.error("refused, nothing has changed: %s", problem)
+            command.refuse(problem)
+        else:
+            command.done(**status.holds(self._presenter))
+
+    def _load(self, change: _Change) -> None:
+        present = self._presenter.run_cell.state.settings
+        read = partial(change.settings, self.choices)
+        loading = Reconfiguration(read, present, self._presenter.stack, reload_content=change.reload_content)
+        self._loading = change, loading
+        self._presenter.solver.do(loading.advance)
+
+    def _finish(self, change: _Change, loading: Reconfiguration) -> None:
+        """Adopt the choices of a change that took effect, and answer its command."""
+        if not loading.problem and change.choices is not None:
+            state = self._presenter.run_cell.state
+            moved = moved_since(loading.settings.content, state.settings.content)  # while it was loading
+            self.choices = change.choices.choosing("content", **moved)
+            log.info("changed: scene %s, model %s", state.content.info.name, state.predictor.name)
+        self.answer(change.command, loading.problem)
+
+    def _between_steps(
+        self, command: Command, work: Callable[[Any], str], succeeded: Callable[[], None] = lambda: None
+    ) -> None:
+        """Do the work on the solver's thread between two solutions, then answer on this one.
+
+        work: returns why it was refused, or nothing; succeeded: runs on the presenter's thread.
+        """
+
+        def finish(problem: str) -> None:
+            if not problem:
+                succeeded()
+            self.answer(command, problem)
+
+        def task(parts: Any) -> bool:
+            refusals: list[str] = []
+            problem = _problem_of(command, lambda: refusals.append(work(parts)))
+            self._outcomes.put(partial(finish, problem or refusals[0]))
+            return True
+
+        self._presenter.solver.do(task)
+
+
+def _problem_of(command: Command, work: Callable[[], None]) -> str:
+    """Do the work; return what went wrong, or an empty text. Unexpected errors are logged."""
+    try:
+        work()
+    except PhasestackError as error:
+        return str(error)
+    except (Exception, SystemExit) as error:
+        log.exception("%s", command.name)
+        return f"unexpected error ({type(error).__name__}): see the log"
+    return ""
