@@ -1,10 +1,10 @@
-"""The last minutes of a run in memory, written to an MCAP file on request or at a fault.
+"""The last minutes of a run in memory, written to an MCAP file on request or after a fault.
 
-Every few seconds what is new goes to a journal on the disk, which a run that ends takes away: after a power cut or a
-kill the next run finds it, and it becomes a file of the kind `cut`.
+Every few seconds new messages go to a journal on the disk, which an orderly end of the run deletes. After a power cut
+or a kill the next run finds it and renames it to a file of the kind `cut`.
 
-The file is a recording too: `run --replay` plays its samples through the same code, other tools read the rest. What
-happens is made into bytes at once (the garbage collector never looks through them); a thread of its own writes files.
+The file is also a recording: `run --replay` plays its samples through the same code. Messages are serialised when they
+arrive, so that the garbage collector never visits them; a background job writes the files.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, NamedTuple, Self
@@ -41,15 +42,15 @@ from runtime.support.version import version
 
 log = logging.getLogger("phasestack.blackbox")
 
-Saved = Callable[[str, Path | None], None]  # why it could not be written (empty: it was), and the file
+Saved = Callable[[str, Path | None], None]  # the problem (empty: none) and the file
 
-BYTES_MAX = 32 << 20  # that are kept in memory
-OVERHEAD_BYTES = 150  # of a message besides its data
-AFTER_FAULT_NS = 5 * NS_PER_S  # what follows a fault is in its file too
-FAULTS_APART_NS = 60 * NS_PER_S  # a fault that repeats does not fill the disk
+BYTES_MAX = 32 << 20  # kept in memory
+OVERHEAD_BYTES = 150  # of a message in addition to its data
+AFTER_FAULT_NS = 5 * NS_PER_S  # recorded after a fault, before its file is written
+FAULTS_APART_NS = 60 * NS_PER_S  # between files of one kind: a repeated fault does not fill the disk
 STATE_EVERY_NS = NS_PER_S
-WRITTEN_WITHIN_S = 5.0  # that the end of a run waits for a black box to be written
-JOURNAL_EVERY_NS = 3 * NS_PER_S  # what a power cut takes at most, with a chunk
+WRITTEN_WITHIN_S = 5.0  # the end of a run waits this long for a file to be written
+JOURNAL_EVERY_NS = 3 * NS_PER_S  # lost in a power cut at most, with one chunk
 CHUNK_BYTES = 16384  # of the journal
 CUT = "cut"
 LINES_KEPT, STATES_KEPT = 200, 50  # for the operator's page
@@ -60,7 +61,7 @@ JOURNAL = "journal"
 PART = ".part"
 
 LOG, REFRESH, STATE = "/log", "/refresh", "/state"
-# Viewers plot a number wherever it stands; only what they show in a way of its own needs its fields named.
+# Viewers plot any number they find; only topics that they show in a special way need their fields named.
 SCHEMAS: dict[str, dict[str, Any]] = {
     **fmt.SCHEMAS,
     LOG: {
@@ -79,7 +80,7 @@ SCHEMAS: dict[str, dict[str, Any]] = {
 
 
 def refresh_message(account: RefreshAccount) -> bytes:
-    """A refresh, as `frames.jsonl` has it, and its latency."""
+    """Return a refresh as in `frames.jsonl`, with its latency."""
     latency_ms = None
     if account.eyes_m is not None and account.capture_ns:
         latency_ms = round((account.photon_ns - account.capture_ns) / NS_PER_MS, 4)
@@ -87,14 +88,14 @@ def refresh_message(account: RefreshAccount) -> bytes:
 
 
 def state_message(name: str, reason: str, *, monotonic_ns: int) -> bytes:
-    """A state as people read it (`degraded: sensor, panel`), taken apart."""
+    """Return a displayed state (`degraded: sensor, panel`), split into its parts."""
     plain, _, missing = name.partition(": ")
     parts = missing.split(", ") if missing else []
     return to_json({"monotonic_ns": monotonic_ns, "state": plain, "missing": parts, "reason": reason}).encode()
 
 
 def log_message(record: logging.LogRecord) -> bytes:
-    """A log line."""
+    """Return a log record as Foxglove's log message."""
     seconds, nanoseconds = divmod(round(record.created * NS_PER_S), NS_PER_S)
     line = {
         "timestamp": {"sec": seconds, "nsec": nanoseconds},
@@ -106,7 +107,7 @@ def log_message(record: logging.LogRecord) -> bytes:
 
 
 def text_of(record: logging.LogRecord) -> str:
-    """A log record's message on one line, with the exception that it is about."""
+    """Return a log record's message on one line, with its exception."""
     text = record.getMessage()
     if record.exc_info and record.exc_info[1] is not None:
         text += f": {type(record.exc_info[1]).__name__}: {record.exc_info[1]}"
@@ -114,34 +115,37 @@ def text_of(record: logging.LogRecord) -> str:
 
 
 class Message(NamedTuple):
-    """An event as it will be written to a file."""
+    """An event, serialised for a file."""
 
-    at_ns: int  # on the run's clock: the wall's may be set
+    at_ns: int  # on the run's clock: the wall clock may be set back
     wall_ns: int  # since 1970
     topic: str
     data: bytes  # JSON
     sequence: int
 
 
-class _Asked(NamedTuple):
-    """A file that is to be written."""
+class _Pending(NamedTuple):
+    """A file to be written."""
 
     kind: str
     kept: list[Message]
     header: RecordingHeader
     settings: str
-    told: list[Saved]  # at its end
+    listeners: list[Saved]
 
-    def tell(self, problem: str, path: Path | None) -> None:
-        for saved in self.told:
+    def report(self, problem: str, path: Path | None) -> None:
+        for saved in self.listeners:
             saved(problem, path)
 
 
 class Recorder(logging.Handler):
-    """An observer of a run, and of its log. `watches` begins; `close` ends it."""
+    """Observer of a run and of its log, from `watches` to `close`.
+
+    The presenter's thread drives it; any thread may log, and a job writes each file.
+    """
 
     def __init__(self, folder: Path, *, minutes: float) -> None:
-        """folder: where files are written; minutes: kept in memory; 0: none, and nothing is written."""
+        """folder: for the files; minutes: kept in memory; 0: keep and write nothing."""
         super().__init__()
         self._folder, self._most_ns = folder, round(60 * minutes * NS_PER_S)
         self._kept_lock = threading.Lock()
@@ -150,15 +154,15 @@ class Recorder(logging.Handler):
         self._presenter: Presenter | None = None
         self._sensor_from_stack: F64 | None = None
         self._state, self._state_ns = ("", ""), 0
-        self._fault: tuple[int, str] | None = None  # since when, and its kind: it waits for what follows it
-        self._faults_ns: dict[str, int] = {}  # by kind: when its file was written
+        self._fault: tuple[int, str] | None = None  # its start and kind, until its file is written
+        self._faults_ns: dict[str, int] = {}  # last fault of each kind
         self._last_file: Path | None = None
         self._lines: deque[dict[str, Any]] = deque(maxlen=LINES_KEPT)
         self._passed: deque[dict[str, Any]] = deque(maxlen=STATES_KEPT)
         self._waiting_lock, self._is_writing = threading.Lock(), False
-        self._waiting: deque[_Asked] = deque()  # for the writer
+        self._waiting: deque[_Pending] = deque()  # for the writer
         self._writer: Job[None] | None = None
-        self._fresh: list[Message] = []  # not in the journal yet
+        self._fresh = 0  # newest of the kept messages that are not in the journal yet
         self._journal, self._journaled_ns = _Journal(folder), 0
         self._journaling: Job[None] | None = None
         if self._most_ns:
@@ -167,7 +171,7 @@ class Recorder(logging.Handler):
         _sweep(folder)
 
     def watches(self, presenter: Presenter, *, in_stack_frame: bool) -> None:
-        """Begin recording. in_stack_frame: points arrive in `stack`; they are written in `sensor`."""
+        """Begin recording. in_stack_frame: points arrive in frame `stack`; they are written in `sensor`."""
         self._presenter = presenter
         if in_stack_frame:
             self._sensor_from_stack = np.asarray(np.linalg.inv(presenter.run_cell.state.calibration.stack_from_sensor))
@@ -195,9 +199,10 @@ class Recorder(logging.Handler):
         if self._most_ns and is_due and (self._journaling is None or self._journaling.done):
             self._journaled_ns = at_ns
             with self._kept_lock:
-                fresh, self._fresh = self._fresh, []
+                fresh = list(islice(reversed(self._kept), self._fresh))[::-1]
+                self._fresh = 0
             work = partial(self._journal.add, fresh, *self._head(), most_ns=self._most_ns)
-            self._journaling = Job("black box's journal", work)  # beside: no refresh waits for a disk
+            self._journaling = Job("black box's journal", work)  # no refresh waits for a disk
         if self._fault is not None and at_ns - self._fault[0] >= AFTER_FAULT_NS:
             kind, self._fault = self._fault[1], None
             self.save(kind)
@@ -212,7 +217,7 @@ class Recorder(logging.Handler):
             self._fault, self._faults_ns[kind] = (at_ns, kind), at_ns
 
     def emit(self, record: logging.LogRecord) -> None:
-        """A log line, on whichever thread logs."""
+        """Keep a log record; called on the thread that logs."""
         line = {"time_s": round(record.created, 3), "level": record.levelname.lower()}
         self._lines.append(line | {"text": text_of(record)})
         self._keep(LOG, log_message(record))
@@ -222,14 +227,14 @@ class Recorder(logging.Handler):
         at_ns = self._presenter.clock.now_ns()
         with self._kept_lock:
             self._kept.append(Message(at_ns, time.time_ns(), topic, data, sequence & 0xFFFFFFFF))
-            if self._most_ns:
-                self._fresh.append(self._kept[-1])
+            self._fresh += 1
             self._bytes += len(data) + OVERHEAD_BYTES
             while self._kept and (self._bytes > BYTES_MAX or at_ns - self._kept[0].at_ns > self._most_ns):
                 self._bytes -= len(self._kept.popleft().data) + OVERHEAD_BYTES
+            self._fresh = min(self._fresh, len(self._kept))  # a journal that hangs costs no more memory
 
     def save(self, kind: str, saved: Saved = lambda problem, path: None) -> None:
-        """Write what is kept to a file, in the background. kind: `asked` or a fault; saved: at its end."""
+        """Write the kept messages to a file in the background, then call `saved`. kind: `asked` or a fault."""
         if not self._most_ns or self._presenter is None:
             saved("nothing is kept in memory (service.blackbox_minutes is 0)", None)
             return
@@ -237,56 +242,56 @@ class Recorder(logging.Handler):
         with self._kept_lock:
             kept = list(self._kept)
         with self._waiting_lock:
-            told = [saved]
+            listeners = [saved]
             if self._waiting and self._waiting[-1].kind == kind:  # not begun: one file is enough for both
-                told = [*self._waiting.pop().told, saved]
-            self._waiting.append(_Asked(kind, kept, header, settings, told))
+                listeners = [*self._waiting.pop().listeners, saved]
+            self._waiting.append(_Pending(kind, kept, header, settings, listeners))
             if self._is_writing:
                 return
             self._writer = Job("black box", self._write)
             self._is_writing = not self._writer.problem
             refused = self._waiting.pop() if self._writer.problem else None
         if refused is not None:
-            refused.tell(self._writer.problem, None)
+            refused.report(self._writer.problem, None)
 
     def _head(self) -> tuple[RecordingHeader, str]:
-        """What stands before the messages of a file."""
+        """Return the header and the settings written before the messages of a file."""
         assert self._presenter is not None
         settings = self._presenter.run_cell.state.settings
         header = RecordingHeader(settings.sensor.driver, self._presenter.samples.serial)
         return header, without_secrets(settings.model_dump_json())
 
     def _write(self) -> None:
-        """What waits, one file after the other; on the writer's thread."""
+        """Write the pending files; on the writer's thread."""
         while True:
             with self._waiting_lock:
                 self._is_writing = bool(self._waiting)
                 if not self._waiting:
                     return
-                asked = self._waiting.popleft()
+                pending = self._waiting.popleft()
             try:
-                path = write_file(self._folder, asked.kind, asked.kept, asked.header, asked.settings)
+                path = write_file(self._folder, pending.kind, pending.kept, pending.header, pending.settings)
                 make_room(self._folder)
             except OSError as error:
                 log.error("the black box could not be written: %s", error)
-                asked.tell(f"{self._folder}: cannot be written ({error.strerror})", None)
+                pending.report(f"{self._folder}: cannot be written ({error.strerror})", None)
                 continue
             self._last_file = path
             log.info("black box written: %s", path, extra={"always": True})
-            asked.tell("", path)
+            pending.report("", path)
 
     def look_at_log(self) -> dict[str, Any]:
-        """The newest log lines and states, the oldest first; times since 1970."""
+        """Return the newest log lines and states, oldest first; times since 1970."""
         return {"lines": list(self._lines), "states": list(self._passed)}
 
     def describe(self) -> dict[str, Any]:
-        """The black box's entry in the status."""
+        """Return the black box's entry in the status."""
         with self._kept_lock:
             kept_ns = self._kept[-1].at_ns - self._kept[0].at_ns if self._kept else 0
-            held_bytes = self._bytes
+            kept_bytes = self._bytes
         return {
             "kept_s": round(kept_ns / NS_PER_S, 1),
-            "kept_mib": round(held_bytes / (1 << 20), 2),
+            "kept_mib": round(kept_bytes / (1 << 20), 2),
             "last_file": str(self._last_file) if self._last_file is not None else None,
         }
 
@@ -296,7 +301,7 @@ class Recorder(logging.Handler):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Where the run ends with an error of its own, what is kept is written."""
+        """Close; after an unexpected error, write what is kept."""
         if isinstance(error, Exception) and not isinstance(error, Stopped | InputError) and self._presenter is not None:
             log.error("%s", one_line(f"{type(error).__name__}: {error}"))
             self._fault = (0, "error")
@@ -312,16 +317,16 @@ class Recorder(logging.Handler):
         for job in (self._writer, self._journaling):
             if job is not None:
                 job.wait(WRITTEN_WITHIN_S)
-        if self._writer is None or self._writer.done:  # else the next run finds the journal in the file's place
+        if self._writer is None or self._writer.done:  # otherwise the next run finds the journal
             self._journal.close(in_use=self._journaling is not None and not self._journaling.done)
         self._presenter = None
         super().close()
 
 
 def write_file(folder: Path, kind: str, kept: list[Message], header: RecordingHeader, settings: str) -> Path:
-    """Write a new file atomically, readable by its owner alone (it shows who was here). Raises OSError.
+    """Write a new file atomically, readable only by its owner: it shows who was here. Raises OSError.
 
-    Its number is above all others in the folder: the wall's clock may be set back.
+    Its number is higher than all others in the folder: the wall clock may be set back.
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = _next_name(folder, kind, datetime.now(UTC))
@@ -347,12 +352,12 @@ def _next_name(folder: Path, kind: str, at: datetime) -> Path:
 
 def _opened(part: Path) -> IO[bytes]:
     file = os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600), "wb")
-    fcntl.flock(file, fcntl.LOCK_EX)  # a part that nobody holds is swept
+    fcntl.flock(file, fcntl.LOCK_EX)  # an unlocked part is swept
     return file
 
 
 class _Written:
-    """A file that messages are added to."""
+    """An open MCAP file."""
 
     def __init__(self, file: IO[bytes], header: RecordingHeader, settings: str) -> None:
         from mcap.writer import CompressionType, Writer
@@ -375,24 +380,24 @@ class _Written:
 
 
 class _Journal:
-    """What happened lately, on the disk: two files in turn, each of half the time that is kept or of half the bytes."""
+    """Recent messages on the disk: two alternating files, each with at most half the kept time and bytes."""
 
     def __init__(self, folder: Path) -> None:
-        self._folder, self._turn, self._begun_ns = folder, 0, 0
+        self._folder, self._current, self._begun_ns = folder, 0, 0
         self._file: IO[bytes] | None = None
         self._written: _Written | None = None
 
     def add(self, fresh: list[Message], header: RecordingHeader, settings: str, *, most_ns: int) -> None:
-        """On the disk once this returns. A disk that takes nothing costs the journal alone."""
+        """Write messages through to the disk. If that fails, the journal ends and the run continues."""
         now_ns = time.monotonic_ns()
         try:
             if self._file is None or now_ns - self._begun_ns > most_ns // 2 or self._file.tell() > BYTES_MAX // 2:
-                self._turn, self._begun_ns = 1 - self._turn, now_ns
+                self._current, self._begun_ns = 1 - self._current, now_ns
                 if self._file is not None:
                     self._file.close()
                 self._folder.mkdir(parents=True, exist_ok=True)
-                self._place.unlink(missing_ok=True)
-                self._file = _opened(self._place)
+                self._path.unlink(missing_ok=True)
+                self._file = _opened(self._path)
                 self._written = _Written(self._file, header, settings)
             assert self._written is not None
             self._written.add(fresh)
@@ -403,32 +408,32 @@ class _Journal:
             self.close()
 
     @property
-    def _place(self) -> Path:
-        return self._folder / f".{PREFIX}{JOURNAL}{self._turn}{PART}"
+    def _path(self) -> Path:
+        return self._folder / f".{PREFIX}{JOURNAL}{self._current}{PART}"
 
     def close(self, *, in_use: bool = False) -> None:
-        """The run has ended in order: it is not needed. in_use: another thread still writes."""
+        """Delete the journal after an orderly end. in_use: another thread is still writing."""
         if self._file is not None and not in_use:
             with suppress(OSError):
                 self._file.close()
             self._file = None
-        for self._turn in (0, 1):
+        for self._current in (0, 1):
             with suppress(OSError):
-                self._place.unlink(missing_ok=True)
+                self._path.unlink(missing_ok=True)
 
 
 def _find_cut(folder: Path) -> None:
-    """The journals of a run that did not end in order become files of their own."""
+    """Rename the journals of a killed run to files of their own."""
     for journal in sorted(folder.glob(f".{PREFIX}{JOURNAL}*{PART}"), key=lambda path: path.stat().st_mtime):
         with suppress(OSError), journal.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             at = datetime.fromtimestamp(journal.stat().st_mtime, UTC)
             journal.rename(path := _next_name(folder, CUT, at))
-            log.warning("the run before was cut: what it was like is in %s", path)
+            log.warning("the previous run was killed: its last minutes are in %s", path)
 
 
 def make_room(folder: Path) -> None:
-    """Delete surplus files, of the most frequent kind first, but never a kind's first or the newest file."""
+    """Delete surplus files, of the most frequent kind first, but never a kind's first file or the newest."""
     kinds: dict[str, list[Path]] = {}
     *earlier, _ = sorted(folder.glob(f"{PREFIX}*.mcap"), key=lambda path: (_number(path), path.name)) or [folder]
     for file in earlier:
@@ -440,13 +445,13 @@ def make_room(folder: Path) -> None:
 
 
 def _number(path: Path) -> int:
-    """Of a file by its name; 0: it has none."""
+    """Return the number in a file's name, or 0."""
     first = path.name.removeprefix(".").removeprefix(PREFIX).partition("-")[0]
     return int(first) if first.isdecimal() else 0
 
 
 def _sweep(folder: Path) -> None:
-    """Parts that a killed process left."""
+    """Delete the unfinished files of killed processes."""
     for part in folder.glob(f".{PREFIX}*{PART}"):
         with suppress(OSError), part.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

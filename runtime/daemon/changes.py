@@ -1,4 +1,4 @@
-"""Changes by operators: what is configured, what is chosen over it, and the one change that is loading."""
+"""Changes by operators: the configuration, choices that override it, and the change being loaded."""
 
 from __future__ import annotations
 

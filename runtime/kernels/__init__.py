@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 from functools import cache
+from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 from typing import Any
 
@@ -78,11 +79,11 @@ class Result(ctypes.Structure):
 @cache
 def library() -> Any:
     """The loops. Raises ImportError where the package was not built for this machine."""
-    built = sorted(Path(__file__).parent.glob("compiled*.so"))
-    if not built:
-        raise ImportError(f"runtime.kernels is not compiled: {_AGAIN}")
-    loops = ctypes.CDLL(str(built[0]))
-    other = ImportError(f"{built[0]} is of another version: {_AGAIN}")
+    built = Path(__file__).with_name("compiled" + EXTENSION_SUFFIXES[0])  # another Python's may be a stale one
+    if not built.exists():
+        raise ImportError(f"runtime.kernels is not compiled for this Python: {_AGAIN}")
+    loops = ctypes.CDLL(str(built))
+    other = ImportError(f"{built} is of another version: {_AGAIN}")
     for name, arguments in {
         "step": (_pointer, _int, _int),
         "close_middle": (_pointer, _int, _int),

@@ -39,6 +39,7 @@ class Predictor(ABC):
     name: str
     provider: str
     parameters: int
+    precision: str = "fp32"  # the network's weights and arithmetic
     stack: PanelStack
     backend: str = "cpu"  # what does all that surrounds the network at present
     fell_back: tuple[str, ...] = ()  # nodes of the network that run on another provider than the wished one

@@ -41,7 +41,7 @@ class StepPredictor(Predictor):
         if proposal is not None:
             session = proposal.session
             self.provider, self.parameters = session.provider, session.contract.parameters
-            self.fell_back = session.fell_back
+            self.precision, self.fell_back = session.contract.precision, session.fell_back
         self.trims = isinstance(proposal, ChainProposal)
         self.needs_rasters = isinstance(proposal, PictureProposal)
         self.black_beside = isinstance(proposal, PictureProposal) and proposal.black_beside

@@ -174,9 +174,7 @@ def run_method(method: Method, pair: StillPair, threads: int) -> MethodRun:
         slow_s=SLOW_S,
     )
     layers, peak_mib = np.array(done.answer[..., :3]), _peak_mib()
-    session = getattr(predictor, "session", None)
-    precision = "fp32" if session is None else str(session.contract.precision)
-    return MethodRun(layers, done.times_ms, peak_mib, predictor.parameters, precision)
+    return MethodRun(layers, done.times_ms, peak_mib, predictor.parameters, predictor.precision)
 
 
 def _forget_peak() -> None:

@@ -135,6 +135,29 @@ def test_it_keeps_no_more_than_its_minutes_and_its_bytes(tmp_path: Path, monkeyp
         recorder.close()
 
 
+def test_a_journal_that_hangs_costs_no_more_memory_than_is_kept(tmp_path: Path, monkeypatch: Any) -> None:
+    """What waited for the journal was kept without bound."""
+    hangs, added, add = threading.Event(), [], recording._Journal.add
+    monkeypatch.setattr(recording, "JOURNAL_EVERY_NS", 0)
+    monkeypatch.setattr(recording, "BYTES_MAX", 20_000)
+
+    def slow(self: Any, fresh: list[Any], *more: Any, **named: Any) -> None:
+        added.append(len(fresh))
+        if len(added) == 1:
+            assert hangs.wait(60.0)
+        add(self, fresh, *more, **named)
+
+    monkeypatch.setattr(recording._Journal, "add", slow)
+    recorder = Recorder(tmp_path, minutes=2.0)
+    with Rig(recorder=recorder) as rig:
+        rig.refreshes(300)
+        assert len(added) == 1
+        hangs.set()
+        rig.refresh_until(lambda: len(added) > 1)
+        recorder.close()
+    assert 10 < added[1] < 100  # 20,000 bytes hold no more
+
+
 def test_a_fault_writes_what_preceded_and_followed_it_for_its_owner_alone(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr(recording, "AFTER_FAULT_NS", NS_PER_S // 2)
     recorder = Recorder(tmp_path, minutes=2.0)

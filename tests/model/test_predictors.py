@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
+from importlib.machinery import EXTENSION_SUFFIXES
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from runtime import kernels
 from runtime.config import ModelSettings
 from runtime.errors import EyesNotServed, ModelFailure
 from runtime.model.geometry import visible_boxes
@@ -180,3 +185,15 @@ def test_every_pixel_on_a_ray_through_all_panels_is_solved(pose: str) -> None:
                 assert box.u1 >= u[through].max() + 0.5
                 assert box.v0 <= v[through].min() - 0.5
                 assert box.v1 >= v[through].max() + 0.5
+
+
+def test_the_kernels_of_another_python_are_not_loaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of several builds in the folder the first by name was loaded, which may have been of an older source."""
+    (built,) = Path(kernels.__file__).parent.glob(f"compiled{EXTENSION_SUFFIXES[0]}")
+    shutil.copy(built, tmp_path)
+    (tmp_path / "compiled.cpython-310-x86_64-linux-gnu.so").write_bytes(b"stale")
+    monkeypatch.setattr(kernels, "__file__", str(tmp_path / "__init__.py"))
+    assert kernels.library.__wrapped__().step.restype is None
+    (tmp_path / built.name).unlink()
+    with pytest.raises(ImportError, match="not compiled for this Python"):
+        kernels.library.__wrapped__()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,9 @@ from runtime.optics.carried import expected_psnrs_db, intensities, light_psnrs_d
 from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
-from runtime.report.frontier import Method, MethodRun, apart, measure, pair_result
+from runtime.report.frontier import Method, MethodResult, MethodRun, apart, measure, pair_result, run_method
 from runtime.report.pairs import Painter, StillPair, eyes_at
+from tests.model.test_session import saved, shipped
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 192, 108)
 
@@ -65,6 +66,19 @@ def test_methods_are_measured_whole_pair_by_pair(
         assert result.quoted_db == result.light_db["1"]
         # What is exact at the eyes is less so beside them.
         assert result.psnr_db_off_eye["6mm"] < result.psnr_db
+
+
+def test_the_precision_is_the_model_s_own(pair: StillPair, tmp_path: Path) -> None:
+    """It was always fp32."""
+    half = saved(shipped(), tmp_path, precision="fp16")
+    run = run_method(Method("half", "network", str(half)), replace(pair, off=()), 1)
+    assert run.precision == "fp16"
+
+
+def test_the_contracts_page_names_every_field_of_a_method() -> None:
+    page = (Path(__file__).parents[2] / "docs/contracts.md").read_text(encoding="utf-8")
+    table = page.partition("| field of a method in report.json |")[2].partition("\n\n")[0]
+    assert [field.name for field in fields(MethodResult) if f"`{field.name}`" not in table] == []
 
 
 def echo(value: int) -> int:
