@@ -1,7 +1,8 @@
-"""Draws docs/images/optics.png, architecture.png and clocks.png: `python -m docs.make_figures`."""
+"""Draws docs/images/optics.png, architecture.png, clocks.png and the example pair: `python -m docs.make_figures`."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +10,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
+from phasestack.example import EYES_M, SCENE
+from phasestack.example import FOV_DEG as EXAMPLE_FOV_DEG
 from runtime.config import ModelSettings, StackGeometry
 from runtime.model.predictor import load_predictor
 from runtime.model.still import solve_still
 from runtime.optics.retina import seen_by
 from runtime.report.pairs import Painter, eyes_at
+from runtime.support.artifacts import write_png
 
 IMAGES = Path(__file__).resolve().parent / "images"
 LEFT, RIGHT, INK, SOFT = "#1f6fb4", "#d1661b", "#222222", "#8a8f98"
@@ -46,11 +50,11 @@ def blank(figure: Any, place: Any, x: tuple[float, float], y: tuple[float, float
 
 
 def optics() -> Figure:
-    """The stack from above with both eyes' rays, the layers of the built-in scene, and what each eye sees of them."""
+    """The stack from above with both eyes' rays, the layers of a built-in scene, and what each eye sees of them."""
     stack = StackGeometry().stack()
     eyes = eyes_at(distance_m=0.6, height_m=0.05)
-    with Painter("demo", stack) as painter:
-        pair = painter.pair("demo", eyes, stack, off_mm=())
+    with Painter("room", stack) as painter:
+        pair = painter.pair("room", eyes, stack, off_mm=())
     predictor = load_predictor("balanced", stack, ModelSettings())
     layers = np.array(solve_still(*pair.images, eyes_m=eyes, fov_deg=FOV_DEG, predictor=predictor).layers[..., :3])
     seen = [seen_by(eye, layers, stack, fov_deg=FOV_DEG).codes() for eye in eyes]
@@ -68,7 +72,7 @@ def optics() -> Figure:
         axes.plot([100 * x_m] * 2, [-half, half], color=INK, lw=3)
         axes.text(100 * x_m, -half - 1, f"panel {n}", ha="center", va="top", fontsize=9)
     for eye, colour, name in ((eyes[0], LEFT, "left eye"), (eyes[1], RIGHT, "right eye")):
-        x, y = 100 * eye[0], -100 * eye[1]  # seen from above: the viewer's right is down
+        x, y = 100 * eye[0], 100 * eye[1]  # seen from above: the viewer's right is up
         for place in (9.0, -7.0):
             slope = (y - place) / x
             axes.plot([x, -16], [y, place - 16 * slope], color=colour, lw=1.1, alpha=0.8)
@@ -160,8 +164,18 @@ def clocks() -> Figure:
     return figure
 
 
+def draw_example() -> None:
+    """The pictures of `phasestack.example_pair`."""
+    stack = replace(StackGeometry().stack(), width_px=640, height_px=360)
+    with Painter(SCENE, stack) as painter:
+        pair = painter.pair(SCENE, np.array(EYES_M), stack, fov_deg=EXAMPLE_FOV_DEG, off_mm=())
+    for side, picture in zip(("left", "right"), pair.images, strict=True):
+        write_png(IMAGES.parents[1] / "phasestack" / "data" / f"{side}.png", picture)
+
+
 def main() -> None:
-    """Write all three."""
+    """Write all of them."""
+    draw_example()
     for draw in (optics, architecture, clocks):
         draw().savefig(IMAGES / f"{draw.__name__}.png", dpi=110, metadata={"Software": None})
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 
 import phasestack
 from calib.board import boards as boards_of
@@ -153,8 +153,8 @@ def look_into(folder: Path) -> None:
     aligned; and the solution's `viewer.html`."""
     stack = replace(StackGeometry().stack(), width_px=640, height_px=360)
     eyes = eyes_at(distance_m=0.65, angle_deg=4, height_m=0.08)
-    with Painter("demo", stack) as painter:
-        pair = painter.pair("demo", eyes, stack, off_mm=())
+    with Painter("room", stack) as painter:
+        pair = painter.pair("room", eyes, stack, off_mm=())
     result = phasestack.solve(*pair.images, eyes_m=eyes, stack=stack)
     result.save(folder)
     codes = np.concatenate([result.layers, np.full_like(result.layers[..., :1], 255)], axis=-1)
@@ -168,7 +168,12 @@ def look_into(folder: Path) -> None:
         for n, retina in enumerate(seen):
             picture = np.rint(255 * np.where(retina.mask[..., None], retina.image, 0.1)).astype(np.uint8)
             sheet.paste(Image.fromarray(picture), (n * stack.width_px, 0))
-        frames.append(sheet.resize((960, 270), Image.Resampling.LANCZOS))
+        sheet, moved_mm = sheet.resize((960, 270), Image.Resampling.LANCZOS), 1000 * (now - eyes)[0, 1]
+        side = "right" if moved_mm > 0 else "left"
+        _label(sheet, (8, 8), "panels as they were solved")
+        _label(sheet, (488, 8), "the same, aligned at every refresh")
+        _label(sheet, (8, 244), f"the head is {abs(moved_mm):.0f} mm to the {side}")
+        frames.append(sheet)
     path = folder / "looked-into.webp"
     options: dict[str, Any] = {"duration": MOVED_MS, "loop": 0, "method": 6}
     for quality in range(60, 10, -10):
@@ -176,6 +181,11 @@ def look_into(folder: Path) -> None:
         if path.stat().st_size <= LIMIT_BYTES:
             return
     raise SystemExit(f"{path.name}: more than {LIMIT_BYTES} bytes")
+
+
+def _label(sheet: Image.Image, place: tuple[int, int], text: str) -> None:
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(15)
+    draw.text(place, text, fill="white", font=font, stroke_width=3, stroke_fill="black")
 
 
 def smaller(source: Path, name: str) -> bytes:

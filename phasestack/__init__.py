@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from phasestack.example import ExamplePair, example_pair
 from phasestack.pair import Result, camera, evaluate, project, solve
 from phasestack.pictures import find_eyes
 from phasestack.stack import Stack
@@ -19,6 +20,7 @@ __all__ = [
     "Capabilities",
     "ContentSource",
     "DeviceClock",
+    "ExamplePair",
     "EyePoints",
     "Pupils",
     "Quality",
@@ -31,6 +33,7 @@ __all__ = [
     "__version__",
     "camera",
     "evaluate",
+    "example_pair",
     "find_eyes",
     "project",
     "solve",

@@ -18,6 +18,8 @@ import phasestack
 from runtime.commands.app import app
 from runtime.errors import InputError
 from runtime.evaluation import solved
+from runtime.optics.stack import PanelStack
+from runtime.report.pairs import Painter, read_pairs
 from tests.test_cli import pair_in, solve_arguments
 
 STACK = phasestack.Stack(width_m=0.5184, height_m=0.2916, x_m=(-0.06, 0.0, 0.06), width_px=320, height_px=180)
@@ -263,3 +265,15 @@ def test_the_command_takes_the_cameras_that_pictures_were_taken_with(
 def test_a_refusal_of_the_model_names_it_once() -> None:
     with pytest.raises(ValueError, match=r"^model: name: 'nobody' is neither"):
         phasestack.solve(picture(), picture(3), eyes_m=EYES, stack=STACK, model="nobody")
+
+
+def test_the_example_pair_shows_its_scene_and_is_a_case(tmp_path: Path) -> None:
+    pair = phasestack.example_pair()
+    with Painter("room", pair.stack) as painter:
+        drawn = painter.pair("room", pair.eyes_m, pair.stack, fov_deg=pair.fov_deg, off_mm=())
+    for given, image in zip((pair.left, pair.right), drawn.images, strict=True):
+        assert np.abs(given.astype(int) - image).mean() < 0.05
+    pair.save(tmp_path / "pair")
+    (case,) = read_pairs(tmp_path / "pair")
+    assert case.stack == PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 640, 360) and case.fov_deg == pair.fov_deg
+    assert np.array_equal(case.images[1], pair.right) and np.array_equal(case.eyes_m, pair.eyes_m)

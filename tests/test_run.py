@@ -250,6 +250,17 @@ def test_real_and_simulated_time_pass_the_same_states(tmp_path: Path) -> None:
     assert "fps" in simulated["configured"] and real["configured"] == []
 
 
+def test_the_demo_ends_in_time_and_names_its_simulated_clock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("runtime.commands.demo.LONGEST_S", 0.0)
+    with pytest.raises(SystemExit):
+        app(["demo", "--out", str(tmp_path)])
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["frames"] == 1 and "0 s are up" in summary["stopped"]
+    assert (summary["clock"], summary["scene"]) == ("simulated", "room")
+
+
 def test_the_demo_recording_begins_anew_unless_it_is_told_how_long(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -26,6 +26,7 @@ from runtime.page.connections import LOOPBACK, listening, server_of
 from runtime.page.server import application
 
 SIZE_PX = {"width_px": 960, "height_px": 540}  # without a configuration: solved often on a small machine
+SCENE = "room"  # without a configuration
 WEBCAM_FOV_DEG = 65.0  # of most cameras in or on a screen; a configuration says it of others
 SLOW_PAGE_S = 2.0  # without a picture of a page's camera
 MEASURED_EVERY_S = 4.0  # the light at the eyes
@@ -34,7 +35,7 @@ MEASURED_EVERY_S = 4.0  # the light at the eyes
 def settings_of(config: Path | None, *, scene: str | None, model: str | None, webcam: bool) -> Settings:
     """Raises InputError."""
     settings = load_settings(config) if config else changed(Settings(), "stack", SIZE_PX, source="try")
-    settings = with_options(settings, scene=scene, model=model)
+    settings = with_options(settings, scene=scene or (None if config else SCENE), model=model)
     if settings.sensor.driver != "usb-camera" or not webcam:
         sensor: dict[str, Any] = (
             {"driver": "usb-camera", "source": "", "fov_deg": WEBCAM_FOV_DEG} if webcam else {"driver": "browser"}

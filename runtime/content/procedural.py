@@ -9,7 +9,7 @@ import numpy as np
 
 from runtime.clock import NS_PER_S
 from runtime.content import shapes, textures
-from runtime.content.base import WHITE, Colour, ContentInfo
+from runtime.content.base import Colour, ContentInfo
 from runtime.content.scenes import SCENES, Scene, Thing
 from runtime.content.triangles import DrawnPart, Part, TriangleSource
 from runtime.optics.stack import PanelStack
@@ -48,7 +48,7 @@ class ProceduralSource(TriangleSource):
         background: Colour | None = None,
         parts: Sequence[DrawnPart] | None = None,
     ) -> None:
-        """background: None: white; parts: `parts_of` the scene, where they were made on another thread."""
+        """background: None: the scene's own; parts: `parts_of` the scene, where they were made on another thread."""
         self._scene = SCENES[built_in]() if isinstance(built_in, str) else built_in
         self._scale = stack.height_m / MODELLED_HEIGHT_M
         parts = parts or parts_of(self._scene)
@@ -57,7 +57,7 @@ class ProceduralSource(TriangleSource):
             name=self._scene.name,
             moving=self._scene.moving,
             grey=self._scene.grey,
-            background=background or WHITE,
+            background=background or self._scene.background,
             flat_x_m=0.0 if self._scene.flat else None,
         )
         super().__init__(parts, still, context=context, info=info)

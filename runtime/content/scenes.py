@@ -32,6 +32,7 @@ class Scene:
 
     name: str
     things: tuple[Thing, ...]
+    background: Colour = WHITE
     moving: bool = False
     grey: bool = False
     flat: bool = False  # everything in the middle panel's plane
@@ -82,6 +83,43 @@ def _demo(turns_per_s: float = 0.0) -> tuple[Thing, ...]:
     )
 
 
+def _room() -> tuple[Thing, ...]:
+    """A dim room behind the display, wider than it, and things that stand out of it: nearest is the globe."""
+    wide, high, back = 0.56, 0.34, -0.14
+    deep = 0.02 - back
+    middle, down = (0.02 + back) / 2, shapes.rotation_about(1, -np.pi / 2)
+    floor = shapes.card(wide, deep, repeat=(2.0, 0.5))
+    wall = shapes.card(deep, high, repeat=(0.5, 1.0))
+    sides = [
+        Thing(wall, "mosaic", (middle, -edge * wide / 2, 0.0), (0.16, 0.18, 0.26), _turned(90 * edge), lit=False)
+        for edge in (1, -1)
+    ]
+    poster = shapes.card(0.105, 0.072)
+    return (
+        Thing(shapes.card(wide, high, repeat=(2.0, 1.0)), "mosaic", (back, 0.0, 0.0), (0.10, 0.12, 0.19), lit=False),
+        *sides,
+        Thing(floor, "checker", (middle, 0.0, -0.11), (0.34, 0.33, 0.36), rotation=down, lit=False),
+        Thing(poster, "picture", (back + 0.004, -0.105, 0.035), (0.75, 0.75, 0.75), lit=False),
+        Thing(shapes.fence(0.16, 0.10, bars=13, bar_m=0.002), "plain", (-0.075, 0.10, -0.058), (0.50, 0.62, 0.78)),
+        Thing(shapes.box((0.07,) * 3), "crate", (-0.04, -0.05, -0.075), rotation=_turned(28)),
+        Thing(shapes.torus(0.036, 0.012), "stripes", (0.02, 0.075, -0.045), rotation=_turned(-24, -12)),
+        Thing(
+            shapes.lettering("PHASE", cell_m=0.0042, depth_m=0.006),
+            "plain",
+            (0.0, 0.09, 0.07),
+            (0.95, 0.55, 0.16),
+        ),
+        Thing(shapes.sphere(0.030), "globe", (0.085, -0.035, 0.028)),
+        Thing(
+            shapes.lettering("3D", cell_m=0.0050, depth_m=0.009),
+            "plain",
+            (0.075, -0.11, -0.050),
+            (0.30, 0.62, 0.95),
+            rotation=_turned(14),
+        ),
+    )
+
+
 def _sparse() -> tuple[Thing, ...]:
     return (Thing(shapes.torus(0.021, 0.0075), "stripes", (0.02, 0.03, 0.0), rotation=_turned(-32, -18)),)
 
@@ -98,6 +136,7 @@ def _flat() -> tuple[Thing, ...]:
 
 SCENES: dict[str, Callable[[], Scene]] = {
     "demo": lambda: Scene("demo", _demo()),
+    "room": lambda: Scene("room", _room(), background=(0.02, 0.02, 0.03)),
     "sparse": lambda: Scene("sparse", _sparse()),
     "texture": lambda: Scene("texture", _texture()),
     "grey": lambda: Scene("grey", _demo(), grey=True),

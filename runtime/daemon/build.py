@@ -90,6 +90,7 @@ class Run:
     def summary(self) -> dict[str, Any]:
         """summary.json (contract 5.2)."""
         return {
+            "clock": "simulated" if self.simulated else "real",
             **self.presenter.summary(simulated=self.simulated),
             **self.observer.summary(),
             "backend": self.presenter.run_cell.state.predictor.backend,

@@ -13,7 +13,7 @@ from contextvars import ContextVar
 from typing import Any, TextIO, TypeVar
 
 T = TypeVar("T")
-NOW_AND_THEN_S = 30.0  # between two lines where nobody watches
+NOW_AND_THEN_S = 10.0  # between two lines where nobody watches
 
 Listener = Callable[[str, int, int | None], None]  # what is done, how many of them, of how many (None: not known)
 

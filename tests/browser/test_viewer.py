@@ -102,6 +102,17 @@ def test_the_page_looks_through_the_pixels_that_the_runtime_looks_through(stack:
         np.testing.assert_allclose(ours[:2] / ours[2], theirs[:2] / theirs[2], atol=1e-6)
 
 
+def test_a_picture_is_as_wide_as_what_all_panels_show() -> None:
+    eyes = [[0.6, -0.03, 0.0], [0.6, 0.03, 0.0]]
+    found = in_node("reach(given[0], given[1])", [stack_table(STACK), eyes])
+    rear_m = 0.6 - STACK.x_m[0]  # the rear panel is the smallest
+    back = np.array([0.6, 0.03, 0.0]) / np.hypot(0.6, 0.03)
+    edges = np.array([[STACK.x_m[0], side * STACK.width_m / 2, 0.0] for side in (-1, 1)]) - [0.6, 0.03, 0.0]
+    across = np.abs(edges @ [-back[1], back[0], 0.0] / (edges @ back))
+    assert found[0] == pytest.approx(across.max(), rel=1e-6)
+    assert found[1] == pytest.approx(STACK.height_m / 2 / rear_m, rel=0.05)
+
+
 def pair(stack: phasestack.Stack) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
     eyes = eyes_at(distance_m=0.7, angle_deg=6, height_m=0.1)
     with Painter("demo", stack) as painter:

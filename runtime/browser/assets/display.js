@@ -32,6 +32,23 @@ export function planeFromPicture(eye, picture, x_m) {
     ...ray[0].map((v) => -v)];
 }
 
+// How far from the middle of their pictures, at a focal length of 1, eyes see through all panels: across and up.
+export function reach(stack, eyes) {
+  const { width_m, height_m, x_m } = stack;
+  const found = eyes.map((eye) => {
+    const norm = Math.hypot(...eye), back = eye.map((v) => v / norm), across = Math.hypot(eye[0], eye[1]) || 1;
+    const right = [-eye[1] / across, eye[0] / across, 0];
+    const up = [-back[2] * right[1], back[2] * right[0], back[0] * right[1] - back[1] * right[0]];
+    const panels = x_m.map((x) => [-1, 1].flatMap((a) => [-1, 1].map((b) => {
+      const ray = [x, (a * width_m) / 2, (b * height_m) / 2].map((v, k) => v - eye[k]), depth = Math.max(1e-6, -dot(ray, back));
+      return [dot(ray, right) / depth, dot(ray, up) / depth];
+    })));
+    return [0, 1].map((k) => Math.max(...[-1, 1].map((side) => // of what every panel still has there
+      Math.min(...panels.map((corners) => Math.max(...corners.map((corner) => side * corner[k])))))));
+  });
+  return [0, 1].map((k) => Math.max(1e-3, ...found.map((one) => one[k])));
+}
+
 // Where the layer of a tilted panel has what an eye sees at (y, z, 1) of the ideal one; null: it is not tilted.
 function layerFromSeen(stack, n, eye) {
   const depth = stack.tilt?.depth[n];
@@ -411,7 +428,9 @@ export class Display {
 // Eyes and panels in an SVG, from above (axis 1) or from the side (axis 2): x, to the viewer, is drawn to the right.
 export function drawPlan(svg, { stack, eyes, axis, range = null, sigma_m = 0, solved = null, far_m = 1 }) {
   const size_m = axis === 1 ? stack.width_m : stack.height_m;
-  const far = Math.max(far_m, eyes ? 1.15 * Math.max(eyes[0][0], eyes[1][0]) : 0), scale = 300 / (far + 0.15);
+  const far = Math.max(far_m, eyes ? 1.15 * Math.max(eyes[0][0], eyes[1][0]) : 0);
+  const wide = Math.max(size_m / 2, ...[...(eyes ?? []), ...(solved ?? [])].map((eye) => Math.abs(eye[axis])));
+  const scale = Math.min(300 / (far + 0.15), 78 / wide);
   const at = (x, across) => [10 + (x + 0.15) * scale, 85 - across * scale], shapes = [];
   const add = (name, attributes) => {
     const made = document.createElementNS("http://www.w3.org/2000/svg", name);

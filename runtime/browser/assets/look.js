@@ -1,13 +1,13 @@
 // The page around a display: pointer and keys are the head, modes to look in, what is told beside it.
-import { Display, alignment, asTheyStand, drawPlan, middle, moved } from "/display.js";
+import { Display, alignment, asTheyStand, drawPlan, middle, moved, reach } from "/display.js";
 
 const MODES = [ // key, name, group, what it says of itself
+  ["wiggle", "Wiggle", "Eyes", "Both eyes' pictures in turn: what jumps most is nearest."],
   ["parallel", "Side by side", "Eyes", "Look through the screen: the left picture is the left eye's."],
   ["crossed", "Crossed", "Eyes", "Cross your eyes: the left picture is the right eye's."],
   ["anaglyph", "Red and cyan", "Eyes", "For glasses with a red left and a cyan right glass."],
   ["left", "Left eye", "Eyes", ""],
   ["right", "Right eye", "Eyes", ""],
-  ["wiggle", "Wiggle", "Eyes", "Both eyes' pictures in turn: what jumps most is nearest."],
   ["panels", "Each panel", "Panels", "What each panel shows, rear to front."],
   ["apart", "Drawn apart", "Panels", "A point of the picture, and the rays that reach each eye from there. Point at another one."],
   ["target", "Asked for", "Check", "What each eye should see where the layers were solved for."],
@@ -18,7 +18,7 @@ const STEP_M = 0.005, REACH_M = [0.5, 0.3]; // of a key; of the picture's whole 
 const REST_MS = 200, REST_RAYS = 5, STRIPS = 12, WIGGLE_MS = 280, SAMPLED = 12; // every so-manieth pixel, each way, tells the light
 const PAGE = `
 <div class="stage"><canvas tabindex="0" aria-label="What the eyes see. Arrow keys move the head, + and - bring it nearer and farther."></canvas>
-<svg class="over" aria-hidden="true"></svg><div class="names" aria-hidden="true"></div></div>
+<svg class="over" aria-hidden="true"></svg><div class="names" aria-hidden="true"></div><p class="notice" role="status" hidden></p></div>
 <aside><h1></h1><p class="how">The pointer (or a finger, or the arrow keys) is your head; the wheel brings it nearer.</p><div class="modes"></div><p class="hint"></p>
 <div class="switches"><label><input type="checkbox" data-key="aligned" checked> outer panels follow the head</label>
 <label><input type="checkbox" data-key="pupil"> pupils 4 mm wide</label><button type="button" class="quiet">Head back</button></div>
@@ -46,6 +46,7 @@ export class Look {
     this.onframe = () => {};
     this.onmode = () => {}; // called where another mode is chosen, with whether it needs what eyes should see
     this.$("h1").textContent = title;
+    this.$(".stage").style.setProperty("--aspect", this.stack.width_m / this.stack.height_m);
     this.#modes();
     this.#controls();
     new ResizeObserver(() => this.draw()).observe(this.canvas);
@@ -73,6 +74,13 @@ export class Look {
     this.draw();
   }
 
+  // What stands over the picture where there is none to look at; empty: nothing.
+  notice(text) {
+    const box = this.$(".notice");
+    if (box.textContent !== text) box.textContent = text;
+    box.hidden = !text;
+  }
+
   // Soon; with more rays once nothing has moved for a while.
   draw() {
     this.moving = performance.now();
@@ -82,6 +90,7 @@ export class Look {
 
   #frame(now) {
     this.next = null;
+    clearTimeout(this.turn);
     if (this.before !== undefined) { // pictures after each other: as fine as this machine draws in time
       this.pace = 0.8 * (this.pace ?? 30) + 0.2 * (now - this.before);
       if (this.pace > 50 && this.rays > 1) [this.rays, this.pace] = [this.rays - 1, 30];
@@ -100,11 +109,16 @@ export class Look {
       this.strip = undefined;
       this.#paint(width, height, this.rays);
       this.onframe();
-      if (!resting) this.#tell(limited);
-      if (!resting || turning) {
-        this.before = now;
+      if (!resting) {
+        this.#tell(limited);
+        [this.before, this.isMeasured] = [now, false];
         this.next = requestAnimationFrame((then) => this.#frame(then));
-      } else this.#measure();
+        return;
+      }
+      if (!this.isMeasured) this.#measure();
+      this.isMeasured = true;
+      const again = () => (this.next ??= requestAnimationFrame((then) => this.#frame(then)));
+      if (turning) this.turn = setTimeout(again, WIGGLE_MS - (performance.now() % WIGGLE_MS) + 1);
       return;
     }
     const g = this.display.g, rows = Math.ceil(height / STRIPS);
@@ -130,17 +144,17 @@ export class Look {
     return { width, height, resized };
   }
 
-  // The display fills a picture of this size for a head where the layers were solved for.
+  // What can be seen through all panels fills a picture of this size for a head where the layers were solved for.
   #picture(width, height) {
-    const away = middle(this.scene.eyes_m ?? this.eyes)[0] - this.stack.x_m.at(-1);
-    const focal = 0.94 * away * Math.min(width / this.stack.width_m, height / this.stack.height_m);
+    const [across, up] = reach(this.stack, this.scene.eyes_m ?? this.eyes);
+    const focal = 0.48 * Math.min(width / across, height / up);
     return { width, height, fov_deg: (Math.atan(width / 2 / focal) * 360) / Math.PI };
   }
 
   #paint(width, height, rays) {
     const { display, mode } = this, g = display.g, pupil_mm = this.pupil ? 4 : 0;
     const wide = width >= height, checks = mode === "target" || mode === "difference", two = checks || mode === "parallel" || mode === "crossed";
-    const across = two && wide ? 2 : 1, down = two && !wide ? 2 : 1, w = Math.floor(width / across), h = Math.floor(height / down);
+    const across = two && (checks ? this.#fitsBeside(width, height) : wide) ? 2 : 1, down = two && across === 1 ? 2 : 1, w = Math.floor(width / across), h = Math.floor(height / down);
     this.$(".over").replaceChildren();
     g.clearColor(0.07, 0.08, 0.1, 1);
     const sides = two ? (mode === "crossed" ? [1, 0] : [0, 1]) : [mode === "right" || (mode === "wiggle" && Math.floor(performance.now() / WIGGLE_MS) % 2) ? 1 : 0];
@@ -167,6 +181,12 @@ export class Look {
         part: [(k % across) * w, height - (Math.floor(k / across) + 1) * h, w, h] }));
     }
     this.#names(mode === "anaglyph" ? [] : sides.map((side, k) => [`${side ? "right" : "left"} eye`, ((k % across) + 0.5) / across, (Math.floor(k / across) + 1) / down]));
+  }
+
+  // Whether two pictures become larger beside than above each other.
+  #fitsBeside(width, height) {
+    const { width: pw, height: ph } = this.scene.picture;
+    return Math.min(width / 2 / pw, height / ph) >= Math.min(width / pw, height / 2 / ph);
   }
 
   #names(names) {
@@ -297,7 +317,8 @@ export class Look {
       box.append(button);
     });
     this.$(".modes").append(...Object.entries(groups).map(([name, box]) => (box.prepend(node("span", name)), box)));
-    this.choose(this.scene.eyes_m && this.canvas.clientWidth >= 500 ? "parallel" : "left");
+    const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
+    this.choose(!still ? "wiggle" : this.canvas.clientWidth >= 500 ? "parallel" : "left");
   }
 
   choose(mode) {

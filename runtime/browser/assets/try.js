@@ -70,6 +70,7 @@ function build({ stack, fov_deg }) {
   main.querySelector(".more").innerHTML = CONTROLS;
   for (const [name, value] of [["noise_mm", 0.2], ["latency_ms", 0], ["ipd_mm", ipd_m * 1000]]) form(name).value = value;
   for (const name of ["noise_mm", "latency_ms", "gap_mm", "camera_fov_deg"]) form(name).addEventListener("change", (event) => say({ [name]: Number(event.target.value) }));
+  look.notice("Solving the first picture …");
   form("ipd_mm").addEventListener("change", (event) => {
     ipd_m = Math.max(45, Math.min(80, Number(event.target.value))) / 1000;
     look.moveTo(look.head);
@@ -90,7 +91,8 @@ function check(on) {
   if (on === checks) return;
   checks = on;
   for (const side of [0, 1]) look.display.target(side, null);
-  main.querySelector(".light").textContent = on ? "A moment is being measured …" : "";
+  main.querySelector(".light").textContent = "";
+  look.notice(on ? "A moment is being measured …" : "");
   say({ checks });
 }
 
@@ -159,9 +161,17 @@ function take({ refresh, viewer: mine }) {
   const flatness = checks ? 0 : layersSeen.solved ? (layersSeen.flat ? refresh.flatness : 0) : 1;
   const same = before && look.flatness === flatness && JSON.stringify(before.eyes_m) === JSON.stringify(refresh.eyes_m);
   look.flatness = flatness;
-  look.state = refresh.state === "tracking" ? "" : `${refresh.state.split(":")[0]}: ${refresh.reason}`;
+  look.state = refresh.state === "tracking" ? "" : explained(refresh);
   if (!same || before.state !== refresh.state) look.draw();
   if (layersSeen.solved && flatness < 1) first?.();
+}
+
+// Why the picture is not what two eyes should see.
+function explained({ state, reason }) {
+  const late = /solutions take (\d+) ms/.exec(reason);
+  if (!late) return `${state.split(":")[0]}: ${reason}`;
+  return `A solution takes ${(late[1] / 1000).toFixed(1)} s on this machine. Until the next one the panels are aligned to your head. ` +
+    "Sooner: choose the model fast, close other programs, or give smaller panels (--config).";
 }
 
 function load(bytes) {
@@ -174,6 +184,7 @@ function load(bytes) {
       look.display.target(side, new ImageData(new Uint8ClampedArray(bytes, size + side * length, length), width, height));
   }
   layersSeen[kind] = true;
+  if (kind === "solved" && (target || !checks)) look.notice("");
   if (kind === "solved") look.scene.eyes_m = solved_for_m ?? look.scene.eyes_m;
   look.draw();
   say({ drawn: true });
@@ -190,7 +201,7 @@ function connect() {
       layersSeen = { solved: false, flat: false };
       sensor = message.is_sensor;
       const same = look && ["width_px", "height_px"].every((k) => look.stack[k] === message.stack[k]) && look.stack.x_m.length === message.stack.x_m.length;
-      if (same) look.turnTo(message.stack);
+      if (same) look.turnTo(message.stack), look.notice("Solving the first picture …");
       else build(message);
       look.$(".how").hidden = !sensor;
       form("camera").checked = message.is_camera;
@@ -202,14 +213,15 @@ function connect() {
     else if (message.refresh) take(message);
   };
   socket.onclose = () => {
-    if (look) look.state = "phasestack try has ended, or its page was closed";
-    look?.draw();
+    [newest, drawn.length, latencies.length] = [null, 0, 0];
+    main.querySelector(".figures")?.replaceChildren();
+    look?.notice("phasestack try has ended. Start it again, and open the address that it names.");
     setTimeout(connect, RETRY_MS);
   };
 }
 
 const status = async () => (await ask("/now/status")).json();
-const number = (value, digits = 1) => (typeof value === "number" ? value.toFixed(digits) : "–");
+const number = (value, digits = 1) => (value ?? 0).toFixed(digits);
 
 async function about() {
   try {
@@ -225,17 +237,18 @@ async function about() {
 // asked_ms: when it was asked for. What is older than a command says nothing of what that set.
 function figures(now, asked_ms) {
   const at = (share) => [...latencies].sort((a, b) => a - b)[Math.floor(share * (latencies.length - 1))];
-  const rows = {
-    "this page draws": `${drawn.length} pictures in the last second`,
-    "the panels are given": `${number(now.fps_now)} refreshes a second`,
-    "the solver makes": `${now.solutions_per_s_now === 0 ? "nothing new now" : `${number(now.solutions_per_s_now)} solutions a second`}, ${now.model ?? ""}`,
-    "the newest is": `${number(now.solution_age_now_ms, 0)} ms old`,
-    "the eyes are known to": `${number(now.eye_sigma_now_mm, 2)} mm (${now.eyes_label ?? "–"})`,
-    "pointer to aligned picture": `${number(at(0.5), 0)} ms, 99 of 100 within ${number(at(0.99), 0)} ms`,
-    ...(now.program ? { "a program draws": now.missing?.content ?? `${number(now.program.frame_ms, 0)} ms a frame`, "it connects to": now.program.address } : {}),
-    "light at the eyes": now.light_db === null || now.light_db === undefined ? "not measured yet" : `${number(now.light_db)} dB`,
+  const rests = now.eyes_label === "rested", solves = now.solutions_per_s_now > 0;
+  const rows = { // what is not known is left out
+    "this page draws": drawn.length > 1 && `${drawn.length} pictures a second`,
+    "the panels are given": now.fps_now > 0 && `${number(now.fps_now)} refreshes a second`,
+    "the solver makes": solves ? `${number(now.solutions_per_s_now)} solutions a second (${now.model})` : now.paused ? "nothing: it is held" : rests && "nothing new while the head rests",
+    "the newest is": solves && `${number(now.solution_age_now_ms, 0)} ms old`,
+    "the eyes are known to": typeof now.eye_sigma_now_mm === "number" && `${number(now.eye_sigma_now_mm, 2)} mm (${now.eyes_label})`,
+    "pointer to aligned picture": latencies.length > 20 && `${number(at(0.5), 0)} ms, 99 of 100 within ${number(at(0.99), 0)} ms`,
+    ...(now.program ? { "a program draws": now.missing?.content ?? (now.program.frame_ms > 0 && `${number(now.program.frame_ms, 0)} ms a frame`), "it connects to": now.program.address } : {}),
+    "light at the eyes": typeof now.light_db === "number" && `${number(now.light_db)} dB`,
   };
-  main.querySelector(".figures")?.replaceChildren(...Object.entries(rows).flatMap(([name, text]) =>
+  main.querySelector(".figures")?.replaceChildren(...Object.entries(rows).filter(([, text]) => text).flatMap(([name, text]) =>
     [["dt", name], ["dd", text]].map(([kind, textContent]) => Object.assign(document.createElement(kind), { textContent }))));
   if (wishes || asked_ms < answered_ms) return;
   for (const [name, value] of [["scene", now.scene], ["model", now.model_asked]]) {

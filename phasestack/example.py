@@ -1,0 +1,44 @@
+"""A stereo pair to begin with, drawn by phasestack itself: free of rights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+
+from phasestack.stack import Stack
+from runtime.records import F64, U8
+from runtime.support.artifacts import read_image, write_json, write_png
+
+SCENE, EYES_M, FOV_DEG = "room", ((0.6, -0.0315, 0.03), (0.6, 0.0315, 0.03)), 40.0
+
+
+@dataclass(frozen=True)
+class ExamplePair:
+    """Two pictures, and the eyes, the panels and the field of view that they are for."""
+
+    left: U8  # (360, 640, 3)
+    right: U8
+    eyes_m: F64  # (2, 3) left, right; frame `stack`
+    stack: Stack
+    fov_deg: float
+
+    def save(self, folder: str | Path) -> None:
+        """Write left.png, right.png, panels.json, and pair.json, a case for `phasestack report --pairs`."""
+        out, stack = Path(folder), self.stack
+        panels = {"width_m": stack.width_m, "height_m": stack.height_m, "x_m": stack.x_m}
+        for name, picture in (("left.png", self.left), ("right.png", self.right)):
+            write_png(out / name, picture)
+        write_json(out / "panels.json", panels)
+        case = {"panels": panels, "eyes": self.eyes_m, "images": ["left.png", "right.png"], "fov": self.fov_deg}
+        write_json(out / "pair.json", case)
+
+
+def example_pair() -> ExamplePair:
+    """Two pictures of a built-in scene, with depth behind and before the panels."""
+    folder = Path(str(files("phasestack") / "data"))
+    left, right = (read_image(folder / f"{side}.png") for side in ("left", "right"))
+    stack = Stack(0.5184, 0.2916, (-0.06, 0.0, 0.06), width_px=left.shape[1], height_px=left.shape[0])
+    return ExamplePair(left, right, np.array(EYES_M), stack, FOV_DEG)
