@@ -32,7 +32,7 @@ def photographs(folder: Path) -> Iterator[tuple[str, U8]]:
 
 def read_photograph(path: Path) -> U8:
     """(h, w) grey, as the camera saw it: a note to turn it is not heeded. Raises InputError."""
-    data = read_coded(path)
+    data, _ = read_coded(path)
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
     picture = None if is_cut_off(data) else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if picture is None:

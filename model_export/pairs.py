@@ -27,8 +27,8 @@ from runtime.optics.malus import phase_from_intensity
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_raster, image_from_stack, stack_from_eye
 from runtime.records import F32, F64, U8
-from runtime.support.artifacts import read_image
 from runtime.support.gl import offscreen_context
+from runtime.support.picture_file import read_image
 
 PICTURE_FOV_DEG = 40.0  # of the published data set's pictures
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from phasestack.stack import Stack
 from runtime.records import F64, U8
-from runtime.support.artifacts import read_image, write_json, write_png
+from runtime.support.artifacts import write_json, write_png
+from runtime.support.picture_file import read_image
 
 SCENE, EYES_M, FOV_DEG = "room", ((0.6, -0.0315, 0.03), (0.6, 0.0315, 0.03)), 40.0
 

@@ -26,7 +26,7 @@ from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.recording import Recording, recording_to
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.sensor.replay import demo_recording_path
-from runtime.support.artifacts import read_image
+from runtime.support.picture_file import read_image
 from tests.test_cli import phasestack
 from tests.waiting import PATIENT
 

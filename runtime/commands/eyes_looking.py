@@ -21,8 +21,9 @@ from runtime.eyes.pupils import Pupils
 from runtime.records import U8, SensorFrame
 from runtime.sensor.recording import Recording
 from runtime.sensor.registry import open_sensor
-from runtime.support.artifacts import OutputFolder, held_back, png_bytes, read_image
+from runtime.support.artifacts import OutputFolder, held_back, png_bytes
 from runtime.support.film import VIDEOS, open_film
+from runtime.support.picture_file import read_image
 
 RECORDING = ".mcap"
 OVERLAY_MIN_PX = 640  # longer side of an overlay, at least

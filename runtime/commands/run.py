@@ -24,6 +24,9 @@ def run(
     ] = False,
     out: Annotated[Path | None, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = None,
     scene: Annotated[str | None, typer.Option(help="a built-in scene, a file or folder")] = None,
+    layout: Annotated[
+        str | None, typer.Option(help="how pictures hold their views, as content.layout has it: side-by-side, ...")
+    ] = None,
     model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
     scale: Annotated[float, number(0.05, 2.0, help="pixels of offscreen panels, times the configured")] = 1.0,
     backend: Annotated[
@@ -55,7 +58,7 @@ def run(
         settings = load_settings(config)
         loop = replay == "demo" and frames is None and out is None and not max_speed
         given: dict[str, Any] = {"headless": headless, "scene": scene, "model": model, "backend": backend}
-        return with_options(settings, replay=replay, loop=loop, **given)
+        return with_options(settings, replay=replay, loop=loop, layout=layout, **given)
 
     options = RunOptions(
         max_speed=max_speed, measure=out is not None, scale=scale, keep_light=keep_light, frames=frames, out=out

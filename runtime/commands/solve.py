@@ -15,9 +15,12 @@ def solve(
     left: Annotated[
         Path, typer.Option(help="picture of a pinhole camera at the left eye that looks at the stack's origin")
     ],
-    right: Annotated[Path, typer.Option(help="the same of the right eye")],
     panels: Annotated[Path, typer.Option(help="TOML or JSON: width_m, height_m, x_m")],
     out: Annotated[Path, typer.Option(help="folder for the layers")],
+    right: Annotated[Path | None, typer.Option(help="the same of the right eye; without: --left holds both")] = None,
+    layout: Annotated[
+        str | None, typer.Option(help="how --left holds both, as content.layout has it; without: by its name")
+    ] = None,
     left_eye: Annotated[tuple[float, float, float] | None, place(help="left eye, metres, stack frame")] = None,
     right_eye: Annotated[tuple[float, float, float] | None, place(help="right eye, metres")] = None,
     camera: Annotated[
@@ -47,12 +50,12 @@ def solve(
     Example: phasestack solve --left l.png --right r.png --left-eye 0.6 -0.03 0 --right-eye 0.6 0.03 0 --fov 40
     --panels panels.json --out out/solve
     """
-    from runtime.commands.solving import Eyes, solve_pair
+    from runtime.commands.solving import Eyes, Files, solve_pair
     from runtime.support.figures import shown
 
     with blame_option("solve", model=model):
         result = solve_pair(
-            (left, right),
+            Files(left, right, layout),
             Eyes(left_eye, right_eye, fov, camera),
             panels,
             out,

@@ -15,6 +15,7 @@ import typer
 from runtime.clock import Stopwatch
 from runtime.config import Settings, load_stack, read_table, with_options
 from runtime.content.base import ContentInfo
+from runtime.content.frames import read_pair
 from runtime.errors import EyesNotServed, InputError
 from runtime.evaluation.solved import SolvedPair
 from runtime.evaluation.trials import timed
@@ -27,8 +28,9 @@ from runtime.optics.cameras import as_cameras, doubts, looking_at_origin
 from runtime.optics.stack import PanelStack
 from runtime.plan.savings import Measured, network_items
 from runtime.records import F64
-from runtime.support.artifacts import OutputFolder, read_image, write_json
+from runtime.support.artifacts import OutputFolder, write_json
 from runtime.support.gl import offscreen_context
+from runtime.support.picture_file import read_image
 from runtime.support.ranges import SEPARATION_MIN_M
 
 MEASURED_FROM = 10  # runs that are worth a look at which backend is faster
@@ -44,8 +46,33 @@ class Eyes:
     cameras: Path | None
 
 
+@dataclass(frozen=True, slots=True)
+class Files:
+    """Two picture files, or one that holds both views."""
+
+    left: Path
+    right: Path | None
+    layout: str | None  # of the one
+
+    @property
+    def name(self) -> str:
+        return self.left.name if self.right is None else f"{self.left.name} and {self.right.name}"
+
+    def read(self) -> list[Any]:
+        """The left and the right eye's picture. Raises InputError."""
+        if self.right is None:
+            return list(read_pair(self.left, with_options(Settings(), layout=self.layout).content))
+        if self.layout is not None:
+            raise InputError("solve", "--layout", "is of one file that holds both views: leave --right out")
+        pictures = [read_image(path) for path in (self.left, self.right)]
+        if pictures[0].shape != pictures[1].shape:
+            sizes = " and ".join(f"{p.shape[1]}x{p.shape[0]}" for p in pictures)
+            raise InputError(self.right, "size", f"the two pictures differ: {sizes}")
+        return pictures
+
+
 def solve_pair(
-    files: tuple[Path, Path],
+    files: Files,
     eyes: Eyes,
     panels: Path,
     out: Path,
@@ -60,10 +87,7 @@ def solve_pair(
     watch = Stopwatch()
     settings = with_options(Settings(), model=model, backend=backend).model
     cv2.setNumThreads(settings.threads)
-    pictures: list[Any] = [read_image(path) for path in files]
-    if pictures[0].shape != pictures[1].shape:
-        sizes = " and ".join(f"{p.shape[1]}x{p.shape[0]}" for p in pictures)
-        raise InputError(files[1], "size", f"the two pictures differ: {sizes}")
+    pictures = files.read()
     stack = load_stack(panels, width_px=pictures[0].shape[1], height_px=pictures[0].shape[0])
     pictures, eyes_m, fov_deg = taken(pictures, eyes, stack)
     for line in doubts(eyes_m, stack, fov_deg=fov_deg, size=(pictures[0].shape[1], pictures[0].shape[0])):
@@ -110,11 +134,11 @@ def solve_pair(
             except ValueError as error:
                 why = f"{error}: nothing of the display can be seen from there"
                 raise InputError("solve", "--left-eye", why) from None
-            line = f"{files[0].name} and {files[1].name}, model {predictor.name}, solved for a tracking error of "
+            line = f"{files.name}, model {predictor.name}, solved for a tracking error of "
             line += f"{eye_sigma_mm:g} mm; one ray a pixel, as published: {quality.psnr_db:.1f} dB"
             seen.write(folder.staging, lines=[line])
             watch.lap("measure and write")
-            items = network_items(ContentInfo(files[0].name), Measured(left_out=left_out))
+            items = network_items(ContentInfo(files.name), Measured(left_out=left_out))
             result = quality.table() | {
                 "inference_ms": round(float(np.median(inference_ms[-repeat:])), 3),
                 "total_ms": round(done.median_ms, 3),

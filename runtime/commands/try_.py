@@ -13,6 +13,9 @@ from runtime.support.options import blame_option, number
 def try_(
     config: Annotated[Path | None, typer.Option(help="TOML file; without: panels of 960x540")] = None,
     scene: Annotated[str | None, typer.Option(help="a built-in scene, a file or folder")] = None,
+    layout: Annotated[
+        str | None, typer.Option(help="how pictures hold their views, as content.layout has it: side-by-side, ...")
+    ] = None,
     model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
     webcam: Annotated[bool, typer.Option("--webcam", help="your own head, before this PC's camera")] = False,
     port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0: any that is free")] = 0,
@@ -27,5 +30,5 @@ def try_(
     from runtime.commands.trying import settings_of, try_display
 
     with blame_option("try", scene=scene, model=model):
-        settings = settings_of(config, scene=scene, model=model, webcam=webcam)
+        settings = settings_of(config, scene=scene, layout=layout, model=model, webcam=webcam)
         try_display(settings, port=port, opens=not no_browser, seconds=seconds, as_json=as_json)

@@ -32,10 +32,12 @@ SLOW_PAGE_S = 2.0  # without a picture of a page's camera
 MEASURED_EVERY_S = 4.0  # the light at the eyes
 
 
-def settings_of(config: Path | None, *, scene: str | None, model: str | None, webcam: bool) -> Settings:
+def settings_of(
+    config: Path | None, *, scene: str | None, layout: str | None, model: str | None, webcam: bool
+) -> Settings:
     """Raises InputError."""
     settings = load_settings(config) if config else changed(Settings(), "stack", SIZE_PX, source="try")
-    settings = with_options(settings, scene=scene or (None if config else SCENE), model=model)
+    settings = with_options(settings, scene=scene or (None if config else SCENE), layout=layout, model=model)
     if settings.sensor.driver != "usb-camera" or not webcam:
         sensor: dict[str, Any] = (
             {"driver": "usb-camera", "source": "", "fov_deg": WEBCAM_FOV_DEG} if webcam else {"driver": "browser"}

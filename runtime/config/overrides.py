@@ -15,6 +15,7 @@ def with_options(
     loop: bool = False,
     headless: bool = False,
     scene: str | None = None,
+    layout: str | None = None,
     model: str | None = None,
     backend: str | None = None,
 ) -> Settings:
@@ -27,6 +28,7 @@ def with_options(
         ("--replay", "sensor", {"loop": True} if loop else None),
         ("--headless", "output", {"kind": "offscreen"} if headless else None),
         ("--scene", "content", None if scene is None else {"scene": scene}),
+        ("--layout", "content", None if layout is None else {"layout": layout}),
         ("--model", "model", None if model is None else {"name": model}),
         ("--backend", "model", None if backend is None else {"backend": backend}),
     )

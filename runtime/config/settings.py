@@ -164,7 +164,9 @@ class CalibrationSettings(Section):
         return self
 
 
-LAYOUT = r"^(auto|mono|(half-)?side-by-side|(half-)?top-bottom|rgbd|qs\d{1,6}x\d{1,6}(a\d+(\.\d+)?)?)$"
+LAYOUT = (
+    r"^(auto|mono|(half-)?(side-by-side|top-bottom|cross-eyed)|anaglyph|rgbd|qs\d{1,6}x\d{1,6}(a(\d+(\.\d+)?|\.\d+))?)$"
+)
 
 
 class ContentSettings(Section):
@@ -185,8 +187,8 @@ class ContentSettings(Section):
     file: PathText = Field("", description="data of a preset: its .ply or .glb, or its data-set folder")
     layout: Annotated[str, Field(pattern=LAYOUT)] = Field(
         "auto",
-        description="arrangement of views in a picture or video: mono, side-by-side, top-bottom, half-side-by-side, "
-        "half-top-bottom, rgbd, a quilt's qs8x6a0.75; auto: by file name (_sbs, _tb, _hsbs, _htb, _rgbd, _qs8x6a0.75)",
+        description="arrangement of views in a picture or video: mono, side-by-side, top-bottom, cross-eyed (the "
+        "right eye's on the left), each with half- before it, anaglyph, rgbd, a quilt's qs8x6a0.75; auto: by file name",
     )
     cone_deg: Annotated[float, Field(gt=0, lt=180)] = Field(40.0, description="angle spanned by a quilt's views")
     depth_m: tuple[Annotated[float, within(-10.0, 10.0, "m")], Annotated[float, within(-10.0, 10.0, "m")]] = Field(

@@ -17,7 +17,7 @@ from runtime.content.presets import drawn_scene_from_stack, preset_names
 from runtime.errors import ContentFailure, InputError
 from runtime.optics.views import image_from_stack
 from runtime.records import F64, U8
-from runtime.support.artifacts import read_image
+from runtime.support.picture_file import read_image
 
 NUMBER = r"(-?(?:\d+\.?\d*|\.\d+))"
 NAME = re.compile(rf"pair(\d+)_x{NUMBER}_y{NUMBER}_z{NUMBER}_([01]|left|right)\.(?:jpg|jpeg|png)$", re.IGNORECASE)

@@ -22,14 +22,14 @@ from runtime.optics.views import raster_from_stack
 from runtime.support import progress, untrusted_input
 from runtime.support.child import in_child
 from runtime.support.crash import written
-from runtime.support.picture_header import size_of_file
+from runtime.support.picture_header import JPEG, PNG, header_of_file
 from runtime.support.plausible import nearest
 from runtime.support.plugins import is_plugin, plugin_class, strict
 from runtime.support.untrusted_input import LIMITS
 
 MESHES = (".glb", ".gltf", ".obj", ".stl")
 PLAYLISTS = (".toml", ".json")
-HARMLESS = (".png", ".jpg", ".jpeg")  # read here, where the header states no more pixels than
+HARMLESS = {".png": PNG, ".jpg": JPEG, ".jpeg": JPEG}  # stills of their own kind, and of few pixels, are read here
 HARMLESS_PX = 4096 * 4096
 TRIED_PX = (32, 18)  # a picture that a class is asked for before it is shown
 Opener = Callable[..., ContentSource]  # of `context`
@@ -99,14 +99,16 @@ def _from_path(file: SceneFile) -> Opener:
 
 def _is_harmless(file: SceneFile) -> bool:
     """Whether a file can take neither long nor much memory, by what its header says."""
-    from runtime.content import pictures
+    from runtime.content.layout import layout_of
 
-    if file.path.suffix.lower() not in HARMLESS or pictures.layout_of(file.path, file.settings).kind == "rgbd":
+    mark = HARMLESS.get(file.path.suffix.lower())
+    if mark is None or file.path.is_dir() or layout_of(file.path, file.settings).kind == "rgbd":
         return False
-    if file.path.is_dir():
-        return False
-    width, height = size_of_file(file.path)
-    return width * height <= HARMLESS_PX
+    with untrusted_input.open_regular(file.path) as opened:
+        if opened.read(len(mark)) != mark:
+            return False
+    header = header_of_file(file.path)
+    return not header.is_animated and header.width_px * header.height_px <= HARMLESS_PX
 
 
 def _read(file: SceneFile) -> Opener:
@@ -127,8 +129,9 @@ def _read(file: SceneFile) -> Opener:
 
         return splat.prepare(file) if read_header(path).kind == "splats" else mesh.prepare(file)
     from runtime.content import pictures, rgbd
+    from runtime.content.layout import layout_of
 
-    is_rgbd = pictures.layout_of(path, file.settings).kind == "rgbd"
+    is_rgbd = layout_of(path, file.settings).kind == "rgbd"
     return rgbd.prepare(file) if is_rgbd else pictures.prepare(file)
 
 

@@ -18,8 +18,9 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
 from runtime.content.base import ContentInfo
+from runtime.content.frames import open_frames
 from runtime.content.images import rgba_from_rgb
-from runtime.content.pictures import open_frames, screen
+from runtime.content.pictures import screen
 from runtime.content.placing import SceneFile
 from runtime.content.shapes import I32, Shape
 from runtime.content.triangles import DrawnPart, Part, TriangleSource

@@ -13,7 +13,7 @@ import numpy as np
 from runtime.browser.link import BrowserLink
 from runtime.clock import NS_PER_MS
 from runtime.config import ContentSettings, Settings
-from runtime.content.pictures import PICTURES
+from runtime.content.frames import PICTURES
 from runtime.content.presets import preset_names
 from runtime.content.registry import MESHES, PLAYLISTS
 from runtime.content.scenes import SCENES

@@ -17,7 +17,7 @@ from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack, stack_from_eye
 from runtime.records import F64, U8
-from runtime.support.artifacts import read_image
+from runtime.support.picture_file import read_image
 from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG
 
 if TYPE_CHECKING:

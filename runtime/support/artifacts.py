@@ -21,12 +21,8 @@ import numpy as np
 
 from runtime.errors import InputError
 from runtime.records import U8
-from runtime.support.picture_header import PNG, is_cut_off, read_coded
 
 STAGING = ".phasestack-staging-"
-JPEG = b"\xff\xd8\xff"
-ROWS_AT_ONCE = 64  # of a picture that are converted together: bounds the memory
-TURNED = "a transparent picture that its EXIF entry turns can't be read"
 
 
 def sync(path: Path) -> None:
@@ -126,50 +122,6 @@ def png_bytes(image: U8) -> bytes:
 def write_png(path: Path, image: U8) -> None:
     """Write a PNG atomically; alpha is dropped."""
     write_bytes(path, png_bytes(image))
-
-
-def read_image(path: Path) -> U8:
-    """(h, w, 3) 8-bit RGB of any common picture file, composed over white. Raises InputError.
-
-    Raises InputError, naming the file: also for one that would take too much memory, before it is unpacked.
-    """
-    import cv2
-
-    data = read_coded(path)
-    if is_cut_off(data):
-        raise InputError(path, "", "is not an image that can be decoded (it is cut off)")
-    coded = np.frombuffer(data, np.uint8)
-    stored: Any = None
-    with held_back() as said:
-        image: Any = cv2.imdecode(coded, cv2.IMREAD_COLOR)
-        if image is not None and _may_be_transparent(data):
-            stored = cv2.imdecode(coded, cv2.IMREAD_UNCHANGED)
-    if image is None:
-        why = f" ({said.first_line})" if said.first_line else ""
-        raise InputError(path, "", f"is not an image that can be decoded{why}")
-    if stored is not None and stored.ndim == 3 and stored.shape[2] == 4:
-        if stored.shape[:2] != image.shape[:2]:
-            raise InputError(path, "orientation", TURNED)
-        for first in range(0, len(image), ROWS_AT_ONCE):  # what is worked out takes several times the picture's memory
-            rows = slice(first, first + ROWS_AT_ONCE)
-            part = stored[rows] >> 8 if stored.dtype == np.uint16 else stored[rows]
-            part = np.ascontiguousarray(part, np.uint8)
-            if cv2.absdiff(np.ascontiguousarray(part[..., :3]), image[rows]).max() > 1:
-                raise InputError(path, "orientation", TURNED)
-            image[rows] = _on_white(image[rows], part[..., 3:])
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image), np.uint8)
-
-
-def _may_be_transparent(data: bytes) -> bool:
-    if data.startswith(PNG):
-        return data[25:26] in (b"\x04", b"\x06") or b"tRNS" in data[: data.find(b"IDAT")]
-    return not data.startswith(JPEG)
-
-
-def _on_white(colour: U8, alpha: Any) -> U8:
-    """colour·a + white·(1 - a), rounded."""
-    mixed = colour.astype(np.uint16) * alpha + np.uint16(255) * (255 - alpha.astype(np.uint16))  # 65,025 at most
-    return np.asarray((mixed + 127) // 255, np.uint8)
 
 
 class OutputFolder:

@@ -1,9 +1,15 @@
-"""A picture's size from its header, checked against the limits before it is decoded."""
+"""What a picture file says of itself before it is decoded, checked against the limits."""
 
 from __future__ import annotations
 
+import importlib.util
 import io
+import struct
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import IO, Any
 
@@ -11,31 +17,193 @@ from runtime.errors import InputError
 from runtime.support import untrusted_input
 from runtime.support.untrusted_input import LIMITS
 
-PNG = b"\x89PNG\r\n\x1a\n"
+PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
+JPEG_END = b"\xff\xd9"
 PNG_DEPTH = slice(24, 25)  # where a PNG has its bits a channel
 CHUNK_BYTES = 12  # of a PNG's part without what it holds: length, kind, checksum
 SIDE_MAX_PX = 1 << 16  # that a header may claim
-FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "PPM", "TGA")  # Pillow's; of EPS it would start Ghostscript
+# Pillow's: of EPS it would start Ghostscript. An MPO is a JPEG to it.
+FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "PPM", "TGA", "AVIF")
+ANIMATED = ("GIF", "PNG", "WEBP", "AVIF")
 ORIENTATION = 0x0112  # EXIF's tag
 TURNED = (5, 6, 7, 8)  # by a quarter: width and height are exchanged
+MP_ENTRIES, MP_NUMBER = 0xB002, 0xB101  # tags of an MPO: its pictures; which viewpoint one is, from the left
+DISPARITY, UNDEFINED = "Multi-Frame Image: (Disparity)", "Undefined"
+GAIN_MAP = (b"hdrgm", b"21496-1")  # marks of a second picture that is no view, but tells how much brighter the first is
+HEAD_BYTES = 512  # of a file, by which its kind is told
+UNDECODED = "is not an image that can be decoded"
+ANOTHER = "save it as PNG, JPEG or AVIF"
+OTHER_KINDS = (  # that are not read: where their mark stands, the mark, name and way out
+    (0, b"\xff\x0a", "JPEG XL", f"{ANOTHER} (djxl in.jxl out.png)"),
+    (4, b"JXL \r\n", "JPEG XL", f"{ANOTHER} (djxl in.jxl out.png)"),
+    (0, b"v/1\x01", "OpenEXR", "its values have no range: expose it and save it as PNG"),
+    (0, b"#?RADIANCE", "Radiance HDR", "its values have no range: expose it and save it as PNG"),
+    (4, b"jP  \r\n", "JPEG 2000", ANOTHER),
+    (0, b"8BPS", "a Photoshop document", ANOTHER),
+    (0, b"%PDF", "PDF", "make pictures of its pages (pdftoppm -png)"),
+    (0, b"%!PS", "PostScript", ANOTHER),
+    (0, b"DDS ", "a texture (DDS)", ANOTHER),
+    (1, b"KTX ", "a texture (KTX)", ANOTHER),
+    (8, b"CR", "a camera's raw picture", "develop it and save it as JPEG"),
+    (0, b"FUJIFILMCCD-RAW", "a camera's raw picture", "develop it and save it as JPEG"),
+    (0, b"version https://git-lfs", "a pointer of Git LFS", "fetch the file itself (git lfs pull)"),
+    (0, b"<svg", "SVG", ANOTHER),
+    (0, b"<!DOCTYPE html", "a web page", "download the picture itself"),
+    (0, b"<!doctype html", "a web page", "download the picture itself"),
+)
 
 
-def picture_size(coded: bytes | IO[bytes], *, turned: bool = False) -> tuple[int, int]:
-    """Width and height of a coded picture; turned: after its EXIF orientation. Raises ValueError."""
+@dataclass(frozen=True, slots=True)
+class Header:
+    """A picture as its file tells of it."""
+
+    kind: str  # Pillow's name of the format
+    width_px: int
+    height_px: int
+    views: tuple[int, ...]  # frames: the one that is shown, or the left and the right eye's
+    is_animated: bool
+    warning: str = ""  # what the file promises and does not hold
+
+
+@contextmanager
+def opened(coded: bytes | IO[bytes]) -> Iterator[Any]:
+    """Pillow's image, not decoded, without Pillow's own limits: the caller has some.
+
+    Raises what Pillow's formats raise.
+    """
     from PIL import Image
 
+    file = io.BytesIO(coded) if isinstance(coded, bytes) else coded
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Pillow's own warning of large pictures: the caller has limits
+        warnings.simplefilter("ignore")
         most, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
         try:
-            with Image.open(io.BytesIO(coded) if isinstance(coded, bytes) else coded, formats=FORMATS) as image:
-                width, height = image.size
-                is_turned = turned and _orientation(image) in TURNED
-        except Exception as error:  # each of Pillow's formats raises its own
-            raise ValueError(f"not a picture that can be read ({type(error).__name__})") from None
+            with Image.open(file, formats=_formats()) as image:
+                yield image
         finally:
             Image.MAX_IMAGE_PIXELS = most
-    return (height, width) if is_turned else (width, height)
+
+
+@cache
+def _formats() -> tuple[str, ...]:
+    """Pillow's formats, with HEIC where the extra `heic` is installed."""
+    if importlib.util.find_spec("pillow_heif") is None:
+        return FORMATS
+    import pillow_heif
+
+    pillow_heif.register_heif_opener(thumbnails=False, decode_threads=1)
+    return (*FORMATS, "HEIF")
+
+
+def header_of(coded: bytes | IO[bytes], *, name: str = "") -> Header:
+    """What the beginning of a coded picture says. Raises ValueError with the problem.
+
+    name: of its file: a second picture that an MPO does not call a view is one only where the file is named .mpo.
+    """
+    try:
+        with opened(coded) as image:
+            width, height = image.size
+            if _orientation(image) in TURNED:
+                width, height = height, width
+            is_animated = image.format in ANIMATED and bool(getattr(image, "is_animated", False))
+            views, warning = _views(image, is_named_so=name.lower().endswith(".mpo"))
+            return Header(image.format, width, height, views, is_animated, warning)
+    except Exception as error:  # each of Pillow's formats raises its own
+        raise ValueError(undecodable(_all(coded), error)) from None
+
+
+def _views(image: Any, *, is_named_so: bool) -> tuple[tuple[int, ...], str]:
+    """Frames of the left and the right eye, or the one to show; and what is missing.
+
+    A second picture is an eye's only if the file calls it one, and if it is as large as the first.
+    """
+    shown = (image.tell(),)
+    if image.format == "HEIF":
+        for group in image.info.get("entity_groups", ()):
+            left, right = (*group["images"], None, None)[:2]
+            if group["type"] == "ster" and left is not None and right is not None:
+                return ((left, right), "") if _size_of(image, left) == _size_of(image, right) else (shown, "")
+    if image.format != "MPO":
+        return shown, ""
+    kinds = [entry["Attribute"]["MPType"] for entry in image.mpinfo[MP_ENTRIES]]
+    if kinds[1] != DISPARITY and not (kinds[1] == UNDEFINED and is_named_so):
+        return shown, ""
+    size = image.size
+    try:
+        image.seek(1)
+    except Exception:  # as every decoder's
+        return (0,), "its second picture is missing: the first one is shown to both eyes"
+    extra = b"".join(content for _, content in image.applist)
+    if image.size != size or image.layers != 3 or any(mark in extra for mark in GAIN_MAP):
+        return (0,), ""
+    return ((1, 0) if _viewpoint(image) == 1 else (0, 1)), ""
+
+
+def _size_of(image: Any, frame: int) -> tuple[int, int]:
+    image.seek(frame)
+    size: tuple[int, int] = image.size
+    return size
+
+
+def _viewpoint(image: Any) -> int | None:
+    """The number of a frame's viewpoint in an MPO, 1 the leftmost; None: it is not told."""
+    from PIL import TiffImagePlugin
+
+    with suppress(Exception):  # a malformed one tells nothing
+        file = io.BytesIO(image.info["mp"])
+        table = TiffImagePlugin.ImageFileDirectory_v2(file.read(8))
+        file.seek(struct.unpack((">" if file.getvalue()[:1] == b"M" else "<") + "L", file.getvalue()[4:8])[0])
+        table.load(file)
+        return int(table[MP_NUMBER])
+    return None
+
+
+def picture_size(coded: bytes | IO[bytes]) -> tuple[int, int]:
+    """Width and height of a coded picture as it is stored. Raises ValueError with the problem."""
+    try:
+        with opened(coded) as image:
+            width, height = image.size
+            return width, height
+    except Exception as error:  # each of Pillow's formats raises its own
+        raise ValueError(undecodable(_all(coded), error)) from None
+
+
+def _all(coded: bytes | IO[bytes]) -> bytes:
+    if isinstance(coded, bytes):
+        return coded
+    coded.seek(0)
+    return coded.read(LIMITS.file_bytes)
+
+
+def undecodable(data: bytes, error: Exception | None = None) -> str:
+    """Why a picture can't be decoded: its kind, with the way out, or that it is cut off."""
+    from PIL import UnidentifiedImageError
+
+    brand = data[8:12] if data[4:8] == b"ftyp" else b""
+    if brand in (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1") and "HEIF" not in _formats():
+        return f"is HEIC, which the extra `heic` reads (pip install pillow-heif); or {ANOTHER}"
+    for place, mark, name, way_out in OTHER_KINDS:
+        if data[place : place + len(mark)] == mark and (mark != b"CR" or data[:2] in (b"II", b"MM")):
+            return f"is {name}, which is not read: {way_out}"
+    if data[:5] == b"<?xml" and b"<svg" in data[:HEAD_BYTES]:
+        return f"is SVG, which is not read: {ANOTHER}"
+    told = str(error).lower()
+    if is_cut_off(data) or _promises_more(data) or "truncated" in told or "end of file" in told:
+        return f"{UNDECODED} (it is cut off)"
+    return UNDECODED if error is None or isinstance(error, UnidentifiedImageError) else f"{UNDECODED} (it is damaged)"
+
+
+def _promises_more(data: bytes) -> bool:
+    """Whether a WebP, or a box of an AVIF or HEIC, is longer by its own word than the file."""
+    if data[:4] == b"RIFF":
+        return 8 + int.from_bytes(data[4:8], "little") > len(data)
+    place = 0
+    while data[4:8] == b"ftyp" and place + 8 <= len(data):
+        size = int.from_bytes(data[place : place + 4], "big")
+        if size < 8:  # to the file's end, or with a longer number: none of those that cameras write
+            return False
+        place += size
+    return place > len(data)
 
 
 def is_cut_off(coded: bytes) -> bool:
@@ -62,7 +230,8 @@ def _orientation(image: Any) -> int:
     if image.format == "TIFF" or not isinstance(coded, bytes):
         return 1
     exif = Image.Exif()
-    exif.load(coded)
+    with suppress(Exception):  # a malformed one turns nothing
+        exif.load(coded)
     found = exif.get(ORIENTATION)
     return found if isinstance(found, int) else 1
 
@@ -83,37 +252,37 @@ def check_size(
 
 def decoded_picture(coded: bytes, *, source: str | Path, field: str, name: str) -> Any:
     """Pillow's image of a picture that is whole and within the limit. Raises InputError."""
-    from PIL import Image
-
     try:
         width, height = picture_size(coded)
         check_size(width, height, source=source, field=field, name=name, head=coded)
-        image = Image.open(io.BytesIO(coded), formats=FORMATS)
-        image.load()
-        return image
+        with opened(coded) as image:
+            image.load()
+            return image
     except InputError:
         raise
-    except Exception:  # each of Pillow's decoders raises its own
-        raise InputError(source, field, f"{name} is not an image that can be decoded") from None
+    except Exception as error:  # each of Pillow's decoders raises its own
+        raise InputError(source, field, f"{name} {undecodable(coded, error)}") from None
 
 
-def read_coded(path: Path) -> bytes:
+def read_coded(path: Path) -> tuple[bytes, Header]:
     """A picture file's undecoded bytes, checked by its header. Raises InputError."""
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
     try:
-        width, height = picture_size(data)
-    except ValueError:
-        raise InputError(path, "", "is not an image that can be decoded") from None
-    check_size(width, height, source=path, head=data)
-    return data
+        header = header_of(data, name=path.name)
+    except ValueError as error:
+        raise InputError(path, "", str(error)) from None
+    check_size(header.width_px, header.height_px, source=path, head=data)
+    return data, header
 
 
-def size_of_file(path: Path) -> tuple[int, int]:
-    """Width and height as a decoder shows them, from the file's beginning. Raises InputError."""
+def header_of_file(path: Path) -> Header:
+    """What a picture file's beginning says. Raises InputError, also for more pixels than the limit."""
     with untrusted_input.open_regular(path, most_bytes=LIMITS.file_bytes) as file:
         try:
-            width, height = picture_size(file, turned=True)
-        except ValueError:
-            raise InputError(path, "", "is not an image that can be decoded") from None
-    check_size(width, height, source=path)
-    return width, height
+            header = header_of(file, name=path.name)
+        except ValueError as error:
+            raise InputError(path, "", str(error)) from None
+        file.seek(0)
+        head = file.read(HEAD_BYTES)
+    check_size(header.width_px, header.height_px, source=path, head=head)
+    return header

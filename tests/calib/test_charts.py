@@ -14,7 +14,7 @@ from runtime.config import CalibrationSettings, load_settings
 from runtime.optics.quality import psnr_db
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
-from runtime.support.artifacts import read_image
+from runtime.support.picture_file import read_image
 
 SMALL = "[stack]\nwidth_px = 480\nheight_px = 270\n"
 

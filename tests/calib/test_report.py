@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from calib.commands import app
 from runtime.errors import InputError
-from runtime.support.artifacts import read_image
+from runtime.support.picture_file import read_image
 from tests.calib.camera import measured, write_pairs
 
 run = CliRunner()

@@ -22,13 +22,13 @@ from PIL import EpsImagePlugin, Image
 from runtime.clock import MonotonicClock
 from runtime.commands.eyes_looking import _filmed
 from runtime.config import ContentSettings, SensorSettings
+from runtime.content.frames import open_frames
 from runtime.content.mesh import load_mesh
-from runtime.content.pictures import open_frames
 from runtime.content.registry import prepare_content
 from runtime.errors import InputError, SensorLost
 from runtime.optics.stack import PanelStack
 from runtime.sensor.usb_camera import UsbCameraDriver
-from runtime.support.artifacts import read_image
+from runtime.support.picture_file import read_image
 from runtime.support.progress import listening
 from runtime.support.untrusted_input import LIMITS
 from tests.content.gltf_files import Buffer
@@ -181,14 +181,14 @@ def test_a_texture_starts_no_program(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
     monkeypatch.setattr(EpsImagePlugin, "gs_binary", None)
     eps = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 64 64\n%%EndComments\nshowpage\n%%EOF\n"
-    assert "is not an image that can be decoded" in refused(painted(tmp_path, eps))
+    assert "is PostScript, which is not read" in refused(painted(tmp_path, eps))
     assert not (tmp_path / "started").exists()
 
 
 READS = """
 import resource, sys
 from pathlib import Path
-from runtime.support.artifacts import read_image
+from runtime.support.picture_file import read_image
 resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 print(read_image(Path(sys.argv[1])).shape, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)

@@ -16,7 +16,7 @@ from runtime.commands.app import app
 from runtime.errors import InputError
 from runtime.evaluation.displayed import displayed, on_panels_raster
 from runtime.optics.stack import PanelStack
-from runtime.support.artifacts import read_image
+from runtime.support.picture_file import read_image
 from tests.optics import reference
 
 STACK = PanelStack(0.4, 0.3, (-0.06, 0.0, 0.06), 80, 60)

@@ -22,7 +22,8 @@ from runtime.evaluation.displayed import displayed
 from runtime.evaluation.run_output import RunOutput
 from runtime.optics.stack import PanelStack
 from runtime.records import State
-from runtime.support.artifacts import OutputFolder, read_image
+from runtime.support.artifacts import OutputFolder
+from runtime.support.picture_file import read_image
 
 STACK = PanelStack(0.5, 0.3, (-0.06, 0.0, 0.06), 32, 18)
 EYES = np.array([[0.7, -0.03, 0.05], [0.7, 0.03, 0.05]])

@@ -16,7 +16,8 @@ from runtime.errors import InputError
 from runtime.evaluation.motion_recording import write_motion
 from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
-from runtime.support.artifacts import read_image, write_png
+from runtime.support.artifacts import write_png
+from runtime.support.picture_file import read_image
 from tests.eyes.scene import camera, eileen, frame, scene
 
 CAMERA = camera(640, 480, 65.0)

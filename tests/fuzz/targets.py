@@ -23,9 +23,9 @@ from calib.pairs import read_pairs
 from calib.setup_run import read_progress
 from runtime.clock import MonotonicClock, SimulatedClock
 from runtime.config import ContentSettings, Settings, load_settings, load_stack
+from runtime.content.frames import open_frames
 from runtime.content.gaussians import load_gaussians
 from runtime.content.mesh import load_mesh
-from runtime.content.pictures import open_frames
 from runtime.content.playlist import read_playlist
 from runtime.content.ply import read_header
 from runtime.content.triangles import DrawnPart
@@ -42,6 +42,7 @@ from runtime.sensor.recording import RecordingWriter
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.sensor.replay import ReplayDriver
 from runtime.support.untrusted_input import parsed_json
+from tests.content.picture_files import heic_pair, mpo, swapped_profile
 from tests.content.test_untrusted_files import PNG_URI, gltf, textured
 from tests.panels.edids import block
 from tests.sensor.taken import taken_until
@@ -171,20 +172,28 @@ def checkpoint(path: Path) -> object:
 
 def pictures() -> list[bytes]:
     random = np.random.default_rng(1)
-    picture = Image.fromarray(random.integers(0, 255, (24, 32, 3)).astype(np.uint8))
+    codes = random.integers(0, 255, (2, 24, 32, 3)).astype(np.uint8)
+    first, second = (Image.fromarray(part) for part in codes)
     exif = Image.Exif()
     exif[0x0112] = 6
     made = []
-    for kind, mode in (*((kind, "RGB") for kind in ("PNG", "JPEG", "TIFF", "WEBP", "BMP")), ("PNG", "RGBA")):
+    for kind, mode in (*((kind, "RGB") for kind in ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "AVIF")), ("PNG", "RGBA")):
         held = io.BytesIO()
-        turned = {"exif": exif} if mode == "RGB" and kind != "BMP" else {}
-        picture.convert(mode).save(held, kind, **turned)
+        told = {"exif": exif, "icc_profile": swapped_profile()} if mode == "RGB" and kind != "BMP" else {}
+        first.convert(mode).save(held, kind, **told)
         made.append(held.getvalue())
+    for kind in ("GIF", "PNG", "WEBP", "AVIF"):
+        held = io.BytesIO()
+        first.save(held, kind, save_all=True, append_images=[second], duration=50)
+        made.append(held.getvalue())
+    with tempfile.TemporaryDirectory() as folder:
+        made.append(mpo(Path(folder) / "a.mpo", *codes).read_bytes())
+        made.append(heic_pair(Path(folder) / "a.heic", list(codes), group=(0, 1)).read_bytes())
     return made
 
 
 def picture(data: bytes, folder: Path) -> object:
-    path = at(folder, "a.png", data)
+    path = at(folder, "a.mpo", data)
     with contextlib.suppress(PhasestackError):
         open_frames(folder, ContentSettings()).frame(0)
     return open_frames(path, ContentSettings()).frame(0)

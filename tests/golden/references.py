@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from runtime.records import U8
-from runtime.support.artifacts import read_image, write_png
+from runtime.support.artifacts import write_png
+from runtime.support.picture_file import read_image
 from tests.golden.cases import CASES
 from tests.golden.compare import Moved, as_lines, compare_picture, compare_text
 from tests.golden.play import Played, play

@@ -23,7 +23,8 @@ from runtime.model.session import ModelSession  # noqa: E402
 from runtime.model.solver import StepPredictor  # noqa: E402
 from runtime.model.still import solve_still  # noqa: E402
 from runtime.optics.stack import PanelStack  # noqa: E402
-from runtime.support.artifacts import read_image, write_png  # noqa: E402
+from runtime.support.artifacts import write_png  # noqa: E402
+from runtime.support.picture_file import read_image  # noqa: E402
 from tests.model_export.golden import EYES, SIZE, WIDTH, golden, picture, weights  # noqa: E402
 
 

@@ -35,7 +35,8 @@ from runtime.model.predictor import load_predictor  # noqa: E402
 from runtime.model.still import solve_still  # noqa: E402
 from runtime.optics.stack import PanelStack  # noqa: E402
 from runtime.optics.views import raster_from_stack  # noqa: E402
-from runtime.support.artifacts import read_image, write_png  # noqa: E402
+from runtime.support.artifacts import write_png  # noqa: E402
+from runtime.support.picture_file import read_image  # noqa: E402
 from tests.model_export.golden import EYES as PUBLISHED_EYES  # noqa: E402
 from tests.model_export.golden import picture  # noqa: E402
 from tests.model_export.unservable import FAULTS  # noqa: E402

@@ -1,0 +1,212 @@
+"""Pictures in time: a still, an animation, a folder, a film; with the layout of each."""
+
+from __future__ import annotations
+
+import logging
+from abc import ABC, abstractmethod
+from bisect import bisect_right
+from collections.abc import Sequence
+from itertools import accumulate
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from runtime.clock import NS_PER_MS, NS_PER_S
+from runtime.config import ContentSettings
+from runtime.content.layout import MONO, PAIR, Layout, hint, layout_of
+from runtime.content.placing import DARK
+from runtime.errors import ContentFailure, InputError
+from runtime.records import U8
+from runtime.support import progress
+from runtime.support.film import VIDEOS, open_film
+from runtime.support.picture_file import read_animation, read_views
+from runtime.support.picture_header import Header, check_size, header_of_file
+
+log = logging.getLogger("phasestack.content")
+
+PICTURES = (
+    ".png", ".jpg", ".jpeg", ".jfif", ".mpo", ".jps", ".pns", ".bmp", ".tif", ".tiff", ".webp", ".gif", ".apng",
+    ".avif", ".heic", ".heif", ".hif",
+)  # fmt: skip
+NOT_READ = (".jxl", ".exr", ".hdr", ".psd", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".svg", ".jp2")
+TOLD = 3  # files of a folder that are left out and named in the log
+TELL_EVERY = 64  # pictures between two reports of progress
+VIDEO_FRAMES_MAX = 1e8  # that a header may claim: five weeks at 30 a second
+VIDEO_PROPERTIES = (
+    cv2.CAP_PROP_FRAME_COUNT,
+    cv2.CAP_PROP_FPS,
+    cv2.CAP_PROP_FRAME_WIDTH,
+    cv2.CAP_PROP_FRAME_HEIGHT,
+)
+
+
+class Frames(ABC):
+    """Pictures in time. Constructors raise InputError; later failures are ContentFailure."""
+
+    count: int
+    rate_hz: float
+    layouts: Sequence[Layout]  # of each picture; of a single one, of all
+
+    @abstractmethod
+    def frame(self, index: int) -> U8:
+        """(h, w, 3) RGB, with the views of its layout. Raises ContentFailure."""
+
+    def layout(self, index: int) -> Layout:
+        return self.layouts[min(index, len(self.layouts) - 1)]
+
+    def at(self, time_ns: int) -> int:
+        """Which picture is shown at a time."""
+        return int(time_ns * self.rate_hz / NS_PER_S) % self.count
+
+    def close(self) -> None:  # noqa: B027 - most hold nothing
+        """Release files."""
+
+
+class PictureFiles(Frames):
+    """One still picture, or a folder's in the order of their names.
+
+    Two views of one file stand side by side.
+    """
+
+    def __init__(self, paths: Sequence[Path], settings: ContentSettings, *, folder: Path | None = None) -> None:
+        """folder: that holds them, where they are a folder's: what can't be shown of it is left out, and logged."""
+        self._background = settings.background or DARK
+        self.layouts, self._paths, refused = [], [], []
+        for number, path in enumerate(paths):
+            if number % TELL_EVERY == 0:
+                progress.tell(f"{path.parent.name}: pictures", number, len(paths))
+            try:
+                header = header_of_file(path)  # by its header alone: a long sequence opens quickly
+            except InputError as error:
+                refused.append(error)
+                continue
+            self.layouts.append(layout_in(header, path, settings, folder))
+            self._paths.append(path)
+        if not self._paths:
+            raise refused[0]
+        if refused:
+            some = "; ".join(f"{Path(error.source).name} {error.problem}" for error in refused[:TOLD])
+            log.warning("%s: %d of %d pictures are left out: %s", folder, len(refused), len(paths), some)
+        self._held = -1, np.empty((0, 0, 3), np.uint8)
+        self._held = 0, self._read(0)
+        self.count, self.rate_hz = len(self._paths), settings.picture_rate_hz
+        if folder is None and self.layouts == [MONO] and settings.layout == "auto" and (found := hint(self._held[1])):
+            log.warning("%s: its halves nearly agree: two views? then --layout %s (content.layout)", paths[0], found)
+
+    def frame(self, index: int) -> U8:
+        if index != self._held[0]:
+            try:
+                self._held = index, self._read(index)
+            except InputError as error:
+                raise ContentFailure(str(error)) from None
+        return self._held[1]
+
+    def _read(self, index: int) -> U8:
+        views = read_views(self._paths[index], background=self._background)
+        is_pair = len(views) == 2 and self.layouts[index] != MONO
+        return np.concatenate(views, axis=1) if is_pair else views[0]
+
+
+class Animation(Frames):
+    """An animated picture, decoded whole."""
+
+    def __init__(self, path: Path, settings: ContentSettings) -> None:
+        self.layouts = [layout_of(path, settings)]
+        self._frames, shown_ms = read_animation(path, background=settings.background or DARK)
+        self.count = len(self._frames)
+        self._ends_ns = list(accumulate(round(ms * NS_PER_MS) for ms in shown_ms))
+        self.rate_hz = self.count * NS_PER_S / self._ends_ns[-1]
+
+    def frame(self, index: int) -> U8:
+        return self._frames[index]
+
+    def at(self, time_ns: int) -> int:
+        return bisect_right(self._ends_ns, time_ns % self._ends_ns[-1])
+
+
+class Video(Frames):
+    """A video file, read by OpenCV as it goes."""
+
+    def __init__(self, path: Path, layout: Layout) -> None:
+        self._path, self.layouts = path, [layout]
+        self._capture = open_film(path)
+        if not self._capture.isOpened():
+            raise InputError(path, "", "is not a video that can be decoded")
+        try:
+            count, self.rate_hz, width, height = (float(self._capture.get(key)) for key in VIDEO_PROPERTIES)
+            if not (1 <= count <= VIDEO_FRAMES_MAX and 0.1 < self.rate_hz < 1000):
+                raise InputError(path, "frames", f"{count:g} at {self.rate_hz:g} Hz cannot be played")
+            check_size(round(width), round(height), source=path)
+        except BaseException:
+            self._capture.release()
+            raise
+        self.count = int(count)
+        self._next = 0
+        self._last: U8 = np.empty((0, 0, 3), np.uint8)
+        self.frame(0)
+
+    def frame(self, index: int) -> U8:
+        if index == self._next - 1 and self._last.size:
+            return self._last
+        if index < self._next or index > self._next + 60:
+            self._capture.set(cv2.CAP_PROP_POS_FRAMES, index)
+            self._next = index
+        while self._next < index:
+            self._capture.grab()
+            self._next += 1
+        done, bgr = self._capture.read()
+        if not done:
+            if self._next == 0:
+                raise InputError(self._path, "frames", "the first one cannot be decoded")
+            self.count = self._next  # containers count more frames than they hold
+            raise ContentFailure(f"{self._path}: frame {index} cannot be decoded")
+        self._next = index + 1
+        self._last = np.ascontiguousarray(bgr[..., ::-1], np.uint8)
+        return self._last
+
+    def close(self) -> None:
+        self._capture.release()
+
+    def __reduce__(self) -> tuple[type, tuple[Path, Layout]]:
+        return Video, (self._path, self.layouts[0])
+
+
+def layout_in(header: Header, path: Path, settings: ContentSettings, folder: Path | None = None) -> Layout:
+    """The layout of a picture as it is read: of a file with two views, else as it or its folder is named."""
+    layout = layout_of(path, settings)
+    if len(header.views) == 1:
+        return layout if layout != MONO or folder is None else layout_of(folder, settings)
+    if settings.layout == "mono":
+        return MONO
+    return layout if layout.right_first and settings.layout != "auto" else PAIR
+
+
+def open_frames(path: Path, settings: ContentSettings) -> Frames:
+    """A picture, an animation, a video, or a folder of pictures. Raises InputError."""
+    if not path.is_dir():
+        if path.suffix.lower() in VIDEOS:
+            return Video(path, layout_of(path, settings))
+        return Animation(path, settings) if header_of_file(path).is_animated else PictureFiles([path], settings)
+    paths = sorted(item for item in path.iterdir() if item.suffix.lower() in (*PICTURES, *NOT_READ))
+    if not paths:
+        raise InputError(path, "", "the folder holds no pictures")
+    return PictureFiles(paths, settings, folder=path)
+
+
+def read_pair(path: Path, settings: ContentSettings) -> list[U8]:
+    """The left and the right eye's view of one file, of square pixels, over white.
+
+    Raises InputError where it holds one, or a quilt's many.
+    """
+    views = read_views(path)
+    if len(views) == 2:
+        return views
+    layout = layout_of(path, settings)
+    views = layout.views(views[0])
+    if len(views) != 2:
+        raise InputError(path, "layout", f"holds {len(views)} view{'s' * (len(views) > 1)}: give --right, or --layout")
+    height, width = views[0].shape[:2]
+    aspect = layout.pixel_aspect(width_px=width, height_px=height)
+    size = (round(width * max(aspect, 1)), round(height / min(aspect, 1)))
+    return [np.asarray(cv2.resize(view, size, interpolation=cv2.INTER_CUBIC), np.uint8) for view in views]

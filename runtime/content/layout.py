@@ -1,0 +1,137 @@
+"""How a picture holds its views: by a setting, by its name, and what its halves look like."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from runtime.config import ContentSettings
+from runtime.errors import InputError
+from runtime.records import U8
+
+QUILT = re.compile(r"(?<![a-z0-9])qs([0-9]{1,6})x([0-9]{1,6})(?:a([0-9]*\.?[0-9]+))?(?![0-9])")
+ASPECT_MIN, ASPECT_MAX = 0.05, 20.0  # width over height of one view
+RIGHT_FIRST = (".jps", ".pns")  # by custom, side by side and cross-eyed
+MARKS = {  # words anywhere in a name; a film's stand in the middle
+    "half-side-by-side": "(half|h) ?(sbs|side by side|lr|left right)|sbs h(alf)?",
+    "half-top-bottom": "(half|h) ?(tb|tab|over under|top bottom)|(half|h|3d) (ou|hou)|halfou|(ou|tb|tab) half",
+    "cross-eyed": "cross ?eyed?|crossview|sbs rl",
+    "side-by-side": "f?sbs|side by side|sidebyside|3dh|3d (lr|left right)",
+    "top-bottom": "over under|overunder|3dv|3d (ou|tb|tab|top bottom)",
+    "anaglyph": "anaglyph",
+    "rgbd": "rgbd",
+}
+LAST_MARKS = {  # that mean other things too: only as a name's last words, but for such as 1080p
+    "half-top-bottom": "hou",
+    "cross-eyed": "rl|right left",
+    "side-by-side": "lr|left right|2x1|parallel",
+    "top-bottom": "ou|tb|tab|top bottom|1x2",
+}
+COPY = re.compile(r"( copy)?( ?\([0-9]+\))?$")  # what a browser or a desktop adds to a second download's name
+ALIKE = 0.8  # correlation of a picture's halves from which they may be two views
+SMALL_PX = (64, 48)  # to which halves are brought to be compared
+SHIFT_PX = 6  # of these, that views may be apart
+ROUGH = 6.0  # codes of detail without which halves are alike whatever they are
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Arrangement of the views in a picture."""
+
+    kind: str  # mono, rgbd, quilt, side-by-side, top-bottom, anaglyph
+    columns: int = 1
+    rows: int = 1
+    half: bool = False  # its views are squeezed to half their width or height
+    right_first: bool = False  # the right eye's view comes first
+    view_aspect: float = 0.0  # of a quilt's views, width over height; 0: as their pixels have it
+
+    def views(self, picture: U8) -> list[U8]:
+        """[left, right], [one], or a quilt's from the leftmost camera to the rightmost.
+
+        Raises ValueError for a picture that is smaller than one pixel a view.
+        """
+        height, width = picture.shape[:2]
+        if not 0 < self.columns <= width or not 0 < self.rows <= height:
+            raise ValueError(f"{width} x {height} pixels cannot hold {self.columns} x {self.rows} views")
+        if self.kind == "anaglyph":  # red for the left eye, cyan for the right one
+            cyan = cv2.addWeighted(picture[..., 1], 0.8, picture[..., 2], 0.2, 0)
+            return [np.repeat(np.asarray(part)[..., None], 3, axis=2) for part in (picture[..., 0], cyan)]
+        wide, high = width // self.columns, height // self.rows
+        if self.kind != "quilt":  # an odd pixel in the middle is of neither view
+            rows, columns = (0, height - high)[: self.rows], (0, width - wide)[: self.columns]
+            views = [picture[v : v + high, u : u + wide] for v in rows for u in columns]
+            return views[::-1] if self.right_first else views
+        # The first view is at the bottom left, then rightwards, then upwards.
+        return [
+            picture[height - (row + 1) * high : height - row * high, column * wide : (column + 1) * wide]
+            for row in range(self.rows)
+            for column in range(self.columns)
+        ]
+
+    def pixel_aspect(self, *, width_px: int, height_px: int) -> float:
+        """Width over height of a pixel of a view of that size."""
+        if self.half:
+            return float(self.columns) if self.columns > 1 else 1 / self.rows
+        return self.view_aspect * height_px / width_px if self.view_aspect else 1.0
+
+
+MONO, PAIR = Layout("mono"), Layout("side-by-side", columns=2)  # one view; two, as a file of two pictures is read
+
+
+def layout_of(path: Path, settings: ContentSettings) -> Layout:
+    """The arrangement of views in a file, by the setting or by its name. Raises InputError."""
+    named = settings.layout
+    if named == "auto":
+        named = _named(path)
+    if found := QUILT.search(named):
+        columns, rows, aspect = int(found[1]), int(found[2]), float(found[3] or 0)
+        if not columns or not rows:
+            raise InputError(path, "layout", f"a quilt of {columns} x {rows} views")
+        if aspect and not ASPECT_MIN <= aspect <= ASPECT_MAX:
+            problem = f"an aspect of {aspect:g}; must be {ASPECT_MIN:g} to {ASPECT_MAX:g}"
+            raise InputError(path, "layout", problem)
+        return Layout("quilt", columns, rows, view_aspect=aspect)
+    kind = named.removeprefix("half-").replace("cross-eyed", "side-by-side")
+    columns, rows = {"side-by-side": (2, 1), "top-bottom": (1, 2)}.get(kind, (1, 1))
+    return Layout(kind, columns, rows, half=named.startswith("half-"), right_first=named.endswith("cross-eyed"))
+
+
+def _named(path: Path) -> str:
+    """The layout that the name of a file or folder tells, as `content.layout` has it."""
+    if path.suffix.lower() in RIGHT_FIRST:
+        return "cross-eyed"
+    stem = COPY.sub("", path.name if path.is_dir() else path.stem).lower()
+    if QUILT.search(stem):
+        return stem
+    words = " ".join(re.split(r"[^a-z0-9]+", stem)) + " "
+    for marks, rest in ((MARKS, r" .*"), (LAST_MARKS, r" (\S*[0-9]\S* )*")):
+        for layout, mark in marks.items():
+            if re.search(rf"(^|.* )({mark}){rest}$", words):
+                return layout
+    return "mono"
+
+
+def hint(picture: U8) -> str:
+    """The layout that a picture's halves suggest, since they nearly agree; empty where they do not."""
+    for layout in ("side-by-side", "top-bottom"):
+        columns = 2 if layout == "side-by-side" else 1
+        if min(picture.shape[0] * columns, picture.shape[1] * (3 - columns)) < 4 * SMALL_PX[0]:
+            continue
+        views = Layout(layout, columns, 3 - columns).views(picture)
+        first, second = (_detail(view) for view in views)
+        if min(first.std(), second.std()) < ROUGH:
+            continue
+        middle = first[2:-2, SHIFT_PX:-SHIFT_PX]
+        if cv2.matchTemplate(second, middle, cv2.TM_CCOEFF_NORMED).max() > ALIKE:
+            return layout
+    return ""
+
+
+def _detail(view: U8) -> U8:
+    """A view, small and grey, without what is the same over wide areas: any two skies are alike."""
+    small = cv2.cvtColor(cv2.resize(view, SMALL_PX, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+    return np.asarray(small.astype(np.float32) - cv2.GaussianBlur(small, (0, 0), 8).astype(np.float32), np.float32)

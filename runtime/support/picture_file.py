@@ -1,0 +1,164 @@
+"""Picture files as upright 8-bit sRGB over a colour: stills, stereo pairs, animations."""
+
+from __future__ import annotations
+
+import io
+import logging
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageCms, ImageOps
+
+from runtime.errors import InputError
+from runtime.records import U8
+from runtime.support.artifacts import held_back
+from runtime.support.picture_header import (
+    ORIENTATION,
+    Header,
+    check_size,
+    is_cut_off,
+    opened,
+    read_coded,
+    undecodable,
+)
+from runtime.support.untrusted_input import LIMITS
+
+log = logging.getLogger("phasestack.pictures")
+
+Colour = tuple[float, float, float]  # 0-1
+WHITE: Colour = (1.0, 1.0, 1.0)
+ROWS_AT_ONCE = 64  # of a picture that are converted together: bounds the memory
+LATTICE = 9  # colours a channel, on which a profile is compared with sRGB's
+SRGB_CODES = 2  # a profile that is nowhere farther off than this is sRGB's own, rounded
+STILL_MS = 100.0  # of an animation's frame that says 0, as browsers have it
+DEEP = {"I;16": "<u2", "I;16L": "<u2", "I;16B": ">u2", "I;16N": "=u2"}  # Pillow's modes of 16 bits
+
+
+def read_image(path: Path, *, background: Colour = WHITE) -> U8:
+    """(h, w, 3) 8-bit sRGB of any common picture file, composed over a colour.
+
+    Of several pictures it is the first. Raises InputError, naming the file: also for one that would take too much
+    memory, before it is unpacked.
+    """
+    return read_views(path, background=background)[0]
+
+
+def read_views(path: Path, *, background: Colour = WHITE) -> list[U8]:
+    """One picture, or the left and the right eye's where the file holds both, as `read_image` has them."""
+    data, header = read_coded(path)
+    if header.warning:
+        log.warning("%s: %s", path, header.warning)
+    return [picture for picture, _ in _decoded(path, data, header, header.views, background)]
+
+
+def read_animation(path: Path, *, background: Colour = WHITE) -> tuple[list[U8], list[float]]:
+    """Frames of an animated picture, with the time that each is shown, milliseconds.
+
+    One that would take more memory than the largest picture is shown as a still, and the log says so.
+    Raises InputError.
+    """
+    data, header = read_coded(path)
+    with opened(data) as image:
+        numbers = range(1 if image.info.get("default_image") else 0, image.n_frames)
+    if len(numbers) * header.width_px * header.height_px > LIMITS.pixels:
+        size = f"{header.width_px} x {header.height_px}"
+        told = f"{len(numbers)} frames of {size} pixels; at most {LIMITS.pixels:,} in all"
+        log.warning("%s: its first frame is shown as a still: it has %s", path, told)
+        numbers = numbers[:1]
+    found = list(_decoded(path, data, header, tuple(numbers), background))
+    return [picture for picture, _ in found], [shown_ms for _, shown_ms in found]
+
+
+def _decoded(
+    path: Path, data: bytes, header: Header, frames: tuple[int, ...], background: Colour
+) -> Iterator[tuple[U8, float]]:
+    """Frames with the time that each is shown. Raises InputError, naming the file."""
+    if is_cut_off(data):
+        raise InputError(path, "", undecodable(data))
+    try:
+        with held_back(), opened(data) as image:
+            for number in frames:
+                if image.tell() != number:
+                    image.seek(number)
+                    check_size(*image.size, source=path)
+                image.load()
+                shown_ms = float(image.info.get("duration") or 0) or STILL_MS
+                yield rgb_of(image, path, background=background), shown_ms
+    except InputError:
+        raise
+    except Exception as error:  # each of Pillow's decoders raises its own
+        raise InputError(path, "", undecodable(data, error)) from None
+
+
+def rgb_of(image: Any, source: object, *, background: Colour = WHITE) -> U8:
+    """(h, w, 3) 8-bit sRGB of Pillow's decoded image, over a colour.
+
+    It is turned as EXIF says, and its profile is applied. Raises InputError where its values have no range.
+    """
+    profile = image.info.get("icc_profile")
+    image = _upright(image)
+    if image.mode == "F" or (image.mode == "I" and image.format not in (None, "PPM")):
+        raise InputError(str(source), "", "holds values without a range (32 bits): save it with 8 or 16 bits a channel")
+    colours = "CMYK" if image.mode == "CMYK" else "L" if image.mode in ("1", "L", "LA", *DEEP) else "RGB"
+    to_srgb = _to_srgb(profile, colours, source) if profile else None
+    is_clear = image.has_transparency_data
+    behind = np.array([round(value * 255) for value in background], np.uint16)
+    result = np.empty((image.height, image.width, 3), np.uint8)
+    for first in range(0, image.height, ROWS_AT_ONCE):  # what is worked out takes several times the picture's memory
+        rows = slice(first, min(first + ROWS_AT_ONCE, image.height))
+        part = _eight_bits(image.crop((0, rows.start, image.width, rows.stop)))
+        alpha = np.asarray(part.convert("RGBA"))[..., 3:] if is_clear else None
+        part = part.convert(colours)
+        result[rows] = np.asarray(to_srgb(part) if to_srgb else part.convert("RGB"))
+        if alpha is not None:
+            result[rows] = composed(result[rows], alpha, behind)
+    return result
+
+
+def composed(colour: U8, alpha: U8, behind: Any) -> U8:
+    """colour·a + behind·(1 - a), rounded."""
+    mixed = colour.astype(np.uint16) * alpha + behind.astype(np.uint16) * (255 - alpha.astype(np.uint16))  # < 65,026
+    return np.asarray((mixed + 127) // 255, np.uint8)
+
+
+def _upright(image: Any) -> Any:
+    with suppress(Exception):  # a malformed entry turns nothing
+        if image.getexif().get(ORIENTATION, 1) != 1:
+            return ImageOps.exif_transpose(image)
+    return image
+
+
+def _eight_bits(image: Any) -> Any:
+    """Of 16 bits a channel the upper byte."""
+    if image.mode == "I":
+        return Image.fromarray((np.asarray(image).clip(0, 65535) >> 8).astype(np.uint8))
+    if image.mode in DEEP:
+        return Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
+    return image
+
+
+def _to_srgb(profile: bytes, colours: str, source: object) -> Any:
+    """A function from an image in the profile's colours to sRGB; None where they are sRGB, or it is no profile."""
+    try:
+        transform = ImageCms.buildTransform(
+            ImageCms.ImageCmsProfile(io.BytesIO(profile)),
+            ImageCms.createProfile("sRGB"),
+            colours,
+            "RGB",
+            renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
+            flags=ImageCms.Flags.BLACKPOINTCOMPENSATION,
+        )
+    except Exception as error:  # as browsers do with one that is broken, or of another kind of colours
+        log.info("%s: its colour profile is left out (%s)", source, error)
+        return None
+    if colours == "CMYK":
+        return transform.apply
+    channels = 1 if colours == "L" else 3
+    steps = [np.linspace(0, 255, LATTICE).astype(np.uint8)] * channels
+    codes = np.stack(np.meshgrid(*steps, indexing="ij"), -1).reshape(1, -1, channels)
+    plain = Image.fromarray(codes[..., 0] if channels == 1 else codes)
+    off = np.asarray(transform.apply(plain)).astype(int) - np.asarray(plain.convert("RGB"))
+    return transform.apply if np.abs(off).max() > SRGB_CODES else None
