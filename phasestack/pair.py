@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from phasestack.pictures import as_codes, as_picture
+from phasestack.pictures import as_array, as_codes, as_picture
 from phasestack.stack import checked_stack
 from runtime.errors import InputError, ModelFailure
 from runtime.evaluation.displayed import Picture
@@ -124,8 +124,9 @@ def solve(
 ) -> Result:
     """Layers with which two eyes see two pictures.
 
-    left, right: (h, w, 3 or 4), uint8 or float in 0..1: what a pinhole camera at each eye sees that looks at the
-    stack's origin, x to its right and parallel to the ground, `fov_deg` wide; nothing else has to be known of them.
+    left, right: (h, w, 3 or 4), uint8 or float in 0..1, or images of Pillow: what a pinhole camera at each eye sees
+    that looks at the stack's origin, x to its right and parallel to the ground, `fov_deg` wide; nothing else has to be
+    known of them.
     eyes_m: left and right eye, metres, frame `stack` (+x out of the screen, +y the viewer's right, +z up).
     cameras: how the pictures were taken, where it was otherwise (parallel, shifted, any pinhole): two 3x4 matrices from
     homogeneous metres of the stack's frame to pixels, +u right, +v down, a pixel's centre at a half: K·[R | t] with
@@ -174,7 +175,7 @@ def evaluate(
     The rest is as for `solve`. Raises ValueError, naming the argument.
     """
     pair = _checked((left, right), stack=stack, eyes_m=eyes_m, fov_deg=fov_deg, cameras=cameras)
-    given: Any = np.asarray(layers)
+    given = as_array("layers", layers)
     wanted = (pair.stack.count, pair.stack.height_px, pair.stack.width_px)
     if given.ndim != 4 or given.shape[:3] != wanted or given.shape[3] not in (3, 4):
         last = given.ndim == 4 and given.shape[1] in (3, 4) and given.shape[3] not in (3, 4)

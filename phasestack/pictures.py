@@ -8,48 +8,97 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from runtime.errors import InputError
 from runtime.evaluation.displayed import Picture
 from runtime.eyes import pupils
 from runtime.eyes.pupils import Pupils
 from runtime.records import U8
+from runtime.support.picture_file import rgb_of
 
 LEAST_PX = 16
+SLACK = 1e-3  # a quarter of a code, by which rounding goes over or under
+OVERSHOOT = 0.3  # of what is white, that a sharp resampling goes over or under
 
 
-def as_picture(name: str, given: ArrayLike) -> Picture:
+def as_picture(name: str, given: Any) -> Picture:
     """(h, w, 3) uint8, or intensities in [0, 1] as float32; where it is transparent, white shows through.
 
-    Raises ValueError, naming the argument.
+    given: an array or tensor, or an image of Pillow of any kind. Raises ValueError, naming the argument.
     """
-    if isinstance(given, str | os.PathLike):
-        raise ValueError(f"{name}: is a file's name: read it first, as with numpy.asarray(PIL.Image.open({given!r}))")
-    picture: Any = np.asarray(given)
+    picture: Any = _from_pillow(name, given) if hasattr(given, "getbands") else as_array(name, given)
     if picture.ndim != 3 or picture.shape[2] not in (3, 4) or min(picture.shape[:2]) < LEAST_PX:
-        advice = ""
-        if picture.ndim == 2:
-            advice = f": a grey one is np.dstack([{name}] * 3)"
-        elif picture.ndim == 3 and picture.shape[0] in (3, 4):
-            advice = f": channels come last, np.moveaxis({name}, 0, -1)"
-        elif picture.ndim == 4 and picture.shape[0] == 1:
-            advice = f": one picture, {name}[0]"
-        raise ValueError(
-            f"{name}: has the shape {picture.shape}, not (h, w, 3|4) with {LEAST_PX} pixels at least{advice}"
-        )
+        told = f"has the shape {picture.shape}, not (h, w, 3|4) with {LEAST_PX} pixels at least"
+        raise ValueError(f"{name}: {told}{_advice_on_shape(name, picture)}")
     if picture.dtype != np.uint8:
         if not np.issubdtype(picture.dtype, np.floating):
-            advice = f": codes are {name}.astype(np.uint8)" if np.issubdtype(picture.dtype, np.integer) else ""
-            raise ValueError(f"{name}: is of {picture.dtype}, neither uint8 (0..255) nor floating point (0..1){advice}")
+            told = f"is of {picture.dtype}, neither uint8 (0..255) nor floating point (0..1)"
+            raise ValueError(f"{name}: {told}{_advice_on_type(name, picture)}")
         low, high = (float(bound) for bound in (picture.min(), picture.max()))
-        if not (low >= 0 and high <= 1):  # nor NaN
-            advice = f": divide by 255, or {name}.astype(np.uint8)" if low >= 0 and 1 < high <= 255 else ""
-            raise ValueError(f"{name}: holds {low:g} to {high:g}, not within 0 and 1{advice}")
-        picture = picture.astype(np.float32)
+        if not (low >= -SLACK and high <= 1 + SLACK):  # nor NaN
+            raise ValueError(f"{name}: holds {low:g} to {high:g}, not 0 to 1{_advice_on_range(name, low, high)}")
+        picture = picture.astype(np.float32).clip(0, 1)
     if picture.shape[2] == 3:
         return np.ascontiguousarray(picture)
     full = 255 if picture.dtype == np.uint8 else 1
     alpha = picture[..., 3:].astype(np.float32) / full
     mixed = picture[..., :3] * alpha + full * (1 - alpha)
     return np.ascontiguousarray((np.rint(mixed) if full == 255 else mixed).astype(picture.dtype))
+
+
+def as_array(name: str, given: Any) -> Any:
+    """A numpy array of what is one, or a tensor on any device. Raises ValueError, naming the argument."""
+    if isinstance(given, str | os.PathLike):
+        raise ValueError(f"{name}: is a file's name: read it first, as with PIL.Image.open({os.fspath(given)!r})")
+    if hasattr(given, "detach"):  # torch's, with or without a gradient
+        given = given.detach().cpu()
+        given = given.float() if given.is_floating_point() else given
+    try:
+        array = np.asarray(given)
+    except (TypeError, ValueError, RuntimeError):
+        array = np.empty(0, object)
+    if array.dtype.name == "bfloat16":  # jax's
+        array = array.astype(np.float32)
+    if array.dtype.kind not in "buif":
+        raise ValueError(f"{name}: is {type(given).__name__}, no array of numbers")
+    return array
+
+
+def _from_pillow(name: str, image: Any) -> U8:
+    """An image of Pillow as its file is read: palettes, CMYK and profiles become sRGB, EXIF turns it."""
+    try:
+        return rgb_of(image, name)
+    except InputError as error:
+        raise ValueError(str(error)) from None
+    except OSError as error:  # a file that is cut off is noticed when its pixels are asked for
+        raise ValueError(f"{name}: cannot be decoded ({error})") from None
+
+
+def _advice_on_shape(name: str, picture: Any) -> str:
+    if picture.ndim == 2 or (picture.ndim == 3 and picture.shape[2] == 1):
+        return f": a grey one is np.dstack([{name}] * 3)"
+    if picture.ndim == 3 and picture.shape[0] in (3, 4):
+        return f": channels come last, np.moveaxis({name}, 0, -1)"
+    return f": one picture, {name}[0]" if picture.ndim == 4 and picture.shape[0] == 1 else ""
+
+
+def _advice_on_type(name: str, picture: Any) -> str:
+    if picture.dtype == np.bool_:
+        return f": codes are {name} * np.uint8(255)"
+    if picture.min() >= 0 and picture.max() <= 255:
+        return f": codes are {name}.astype(np.uint8)"
+    return f": {name} / 65535 where that is white" if picture.dtype == np.uint16 else ": divide by what is white"
+
+
+def _advice_on_range(name: str, low: float, high: float) -> str:
+    if not np.isfinite([low, high]).all():
+        return ": some are not finite"
+    if low >= -OVERSHOOT and high <= 1 + OVERSHOOT:
+        return f": clip it, np.clip({name}, 0, 1)"
+    if low >= -1 - OVERSHOOT and high <= 1 + OVERSHOOT:
+        return f": from -1 to 1 it is ({name} + 1) / 2"
+    if low >= -255 * OVERSHOOT and high <= 255 * (1 + OVERSHOOT):
+        return f": divide by 255, np.clip({name} / 255, 0, 1)"
+    return f": divide by 65535, np.clip({name} / 65535, 0, 1)" if low >= 0 and high <= 65535 else ""
 
 
 def as_codes(picture: Picture) -> U8:

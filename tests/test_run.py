@@ -250,9 +250,7 @@ def test_real_and_simulated_time_pass_the_same_states(tmp_path: Path) -> None:
     assert "fps" in simulated["configured"] and real["configured"] == []
 
 
-def test_the_demo_ends_in_time_and_names_its_simulated_clock(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_demo_ends_in_time_and_names_its_simulated_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("runtime.commands.demo.LONGEST_S", 0.0)
     with pytest.raises(SystemExit):
         app(["demo", "--out", str(tmp_path)])
