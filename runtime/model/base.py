@@ -1,4 +1,4 @@
-"""What every model answers: which pictures it wants drawn, and the layers it makes of a job."""
+"""What every model answers: the layers of a job."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from runtime.model.job import Job
-from runtime.optics.stack import PanelStack, PlaneRaster
-from runtime.records import F64, U8, Layers, pixels_of
+from runtime.clock import Stopwatch
+from runtime.model.job import Job, Savings, grey_job
+from runtime.optics.stack import PanelStack
+from runtime.records import F64, U8
 
 if TYPE_CHECKING:
     from runtime.model.device import SolverBackend
@@ -21,16 +20,13 @@ STAGES = ("prepare", "inference", "finish")  # inference: the network alone
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """The layers for a job, and what they took."""
+    """The layers of a job, and their cost."""
 
-    made: Layers  # (N, height_px, width_px, 4) RGBA, rear to front; an array is the predictor's until its next call
+    layers: U8  # (N, height_px, width_px, 4) RGBA, rear to front, of the job's stack; read-only
     stage_ms: dict[str, float] = field(default_factory=dict)  # by STAGES
-    steps: int = 1  # of the model, that were done
-
-    @property
-    def layers(self) -> U8:
-        """What was made, as an array. Raises ContextLost."""
-        return pixels_of(self.made)
+    savings: Savings = Savings()
+    steps: int = 0  # updates of all panels, of this and of the solutions that it continues
+    continued_from: int = 0  # those of them that the solution before had
 
 
 class Predictor(ABC):
@@ -40,12 +36,12 @@ class Predictor(ABC):
     provider: str
     parameters: int
     precision: str = "fp32"  # the network's weights and arithmetic
-    stack: PanelStack
-    backend: str = "cpu"  # what does all that surrounds the network at present
-    fell_back: tuple[str, ...] = ()  # nodes of the network that run on another provider than the wished one
-    needs_rasters: bool = True  # whether still pictures are warped for it; else it looks along their own rays
-    black_beside: bool = False  # whether those end in black, not in their repeated edge
-    trims: bool = False  # whether it solves a part of the panels, or one channel (`trim`)
+    stack: PanelStack  # the display's
+    backend: str = "cpu"  # device for everything except the network
+    trims: bool = False  # whether it solves a window of the panels, or one channel (`trim`)
+    reductions: tuple[int, ...] = (1,)  # rasters it solves on: this many times fewer rows and columns than the display
+    steps: int = 0  # updates of all panels that a solution has
+    refined_steps: int = 0  # up to which a solution can be continued
 
     def reads_textures_of(self, context: object) -> bool:
         """Whether `solve` takes pictures that were left in textures of a GL context (`DrawnPicture`)."""
@@ -56,25 +52,20 @@ class Predictor(ABC):
         return None
 
     def set_backend(self, backend: SolverBackend) -> None:  # noqa: B027 - most have one
-        """Run everything but the network on another backend from the next call on (solver's thread)."""
+        """Run everything except the network on another backend from the next call on (solver's thread)."""
 
     @abstractmethod
-    def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
-        """The rasters that each eye's picture must be drawn on, for eyes (2, 3), frame `stack`."""
+    def solve(self, job: Job, watch: Stopwatch | None = None) -> Prediction:
+        """Compute the layers of a job. watch: its stages are added to.
 
-    @abstractmethod
-    def solve(self, job: Job) -> Prediction:
-        """The layers of a job.
-
-        Raises ModelFailure where inference fails or does not answer with finite numbers; of these EyesNotServed where
+        Raises ModelFailure where inference fails or yields numbers that are not finite; of these EyesNotServed where
         the model has no picture for two eyes like these.
         """
 
     def warm_up(self, eyes_m: F64) -> None:
-        """Solve once for grey pictures, so that the first frame does not pay for allocation."""
-        rasters = self.rasters(eyes_m)
-        grey = [np.full((raster.height_px, raster.width_px, 4), 128, np.uint8) for raster in rasters]
-        self.solve(Job([grey, grey], eyes_m))
+        """Solve grey pictures on every raster, so that the first frame does not pay for allocation."""
+        for reduction in self.reductions:
+            self.solve(grey_job(eyes_m, self.stack.reduced(reduction)))
 
     def close(self) -> None:  # noqa: B027 - most hold nothing
         """Release threads and sessions. May be called twice."""

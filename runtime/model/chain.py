@@ -88,14 +88,14 @@ class ChainFrame:
         found = np.linalg.inv(self.plane_from_frame(self.middle_m, x_m=x_m))
         return np.asarray(found / found[2, 2], np.float64)
 
-    def eye_sigma_px(self, stack: PanelStack, *, eye_sigma_mm: float) -> F32:
+    def eye_sigma_px(self, stack: PanelStack, *, eye_sigma_m: float) -> F32:
         """(3,) movement of the outer panels' pictures, columns and rows, for one sigma of the eyes.
 
         The third is the centre panel's own parallax against this raster's plane, in columns.
         """
         reach = (stack.x_m[-1] - self.x_m) / (self.middle_m[0] - stack.x_m[-1])
         centre = (self.x_m - stack.x_m[1]) / (self.middle_m[0] - stack.x_m[1])
-        moved_m = eye_sigma_mm / 1e3 * reach
+        moved_m = eye_sigma_m * reach
         across_m, along_m, down_m = self._steps_m()
         columns = moved_m / abs(across_m)
         rows = moved_m * np.hypot(1.0, along_m / across_m) / abs(down_m)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from ctypes import byref, c_void_p
 from functools import lru_cache
@@ -12,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.kernels import MARGIN, MAX_SETS, Image, Panel, Problem, library
+from runtime.model.buffers import LayerBuffer
 from runtime.model.contract import Step
 from runtime.model.geometry import Geometry, inverse
 from runtime.model.job import Job
-from runtime.model.targets import beside_codes, rest_of, target_table, without_alpha
-from runtime.optics.rect import PixelRect
+from runtime.model.targets import outside_codes, rest_of, target_table, without_alpha
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, I16, U8
-from runtime.support.threads import on_rows, parallel_map
+from runtime.support.threads import parallel_map, on_rows
 
 WEIGHT, TAPER = 8191, 32767  # of 1 in targets' weights, and in tapers
 SAFE = 4 * MARGIN  # elements around rows of panels that whole vectors touch
@@ -45,26 +44,17 @@ class CpuState:
         self._stack, self._threads = stack, max(1, threads)
         self._rest = rest_of(stack.count)
         self._buffers: dict[int, _Buffers] = {}  # by channels
-        self._layers = np.full((stack.count, stack.height_px, stack.width_px, 4), 255, np.uint8)
-        self._beside: object = None  # what the layers hold beside what was written last
 
-    def begin(self, job: Job, geometry: Geometry) -> AbstractContextManager[None]:
-        self._geometry, self._channels, self._sigma_mm = geometry, job.channels, job.eye_sigma_mm
+    def begin(self, job: Job, geometry: Geometry, *, resumed: bool = False) -> AbstractContextManager[None]:
+        self._geometry, self._channels, self._sigma_m = geometry, job.channels, job.eye_sigma_m
         if job.channels not in self._buffers:
             self._buffers[job.channels] = _Buffers(self._stack, job.channels)
         self._held = self._buffers[job.channels]
-        box, rays = geometry.boxes[geometry.middle], geometry.rays
-        if job.own is not None:
-            pictures: Sequence[U8] = [picture[rays.slices] for picture in job.own.pictures]
-        elif job.part is not None and job.part.drawn:
-            within = PixelRect(rays.u0 - box.u0, rays.v0 - box.v0, rays.u1 - box.u0, rays.v1 - box.v0)
-            pictures = [images[0][within.slices] for images in job.arrays]
-        else:
-            pictures = [images[0][rays.slices] for images in job.arrays]
-        self._targets = parallel_map(lambda picture: without_alpha(picture, job.channels), pictures)
+        seen = [view.pixels[geometry.rays.slices] for view in job.views]
+        self._targets = parallel_map(lambda picture: without_alpha(picture, job.channels), seen)
         across, down = geometry.tapers()
         self._tapers = [np.rint(TAPER * taper).astype(np.int16) for taper in (np.repeat(across, job.channels), down)]
-        self._resting = set(range(self._stack.count))
+        self._resting = set() if resumed else set(range(self._stack.count))
         return nullcontext()
 
     def set_panel(self, panel: int, codes: I16) -> None:
@@ -87,41 +77,40 @@ class CpuState:
         held = self._held
         # What the rays see is read long after a row has moved: the first step, which sees `last`, writes it elsewhere.
         ahead, last = (held.last, held.ahead) if self._starts else (held.ahead, held.last)
-        panels_from_rays = self._geometry.panels_from_rays(step.places, self._sigma_mm)
+        panels_from_rays = self._geometry.panels_from_rays(step.places, self._sigma_m)
         problem, _keep = self._problem(panels_from_rays, ahead=ahead, last=last)
         problem.size, problem.momentum, problem.floor = step.size, step.momentum, step.floor
         self._in_parts(library().step, problem)
         held.last, held.ahead, held.moved, self._starts = last, held.moved, ahead, False
 
-    def write(self, beside: int | tuple[int, ...] | None) -> U8:
+    def write(self, buffer: LayerBuffer, outside: int | tuple[int, ...] | None) -> None:
         self._rest_others()
-        geometry, loops = self._geometry, library()
-        if beside is not None and self._beside != (beside, geometry.boxes):
-            self._fill(beside)
-            self._beside = beside, geometry.boxes
-        elif beside is None:
-            self._beside = None
+        geometry, loops, layers = self._geometry, library(), buffer.pixels
+        if outside is None:
+            buffer.outside = None
+        elif buffer.outside != (key := (outside, geometry.boxes, geometry.kept)):
+            self._fill(layers, outside)
+            buffer.outside = key
         for n, box in enumerate(geometry.boxes):
             kept = geometry.kept if n == geometry.middle else box
             if not kept.width_px or not kept.height_px:
                 continue
             first = self._held.last[n, kept.v0 - box.v0 :, (kept.u0 - box.u0) * self._channels :]
             image = Image.of(first, rows=kept.height_px, width=kept.width_px)
-            pixels = self._layers[n].view(np.uint32)[kept.v0 :, kept.u0 :, 0]
+            pixels = layers[n].view(np.uint32)[kept.v0 :, kept.u0 :, 0]
 
             def show(first: int, end: int, image: Image = image, pixels: NDArray[Any] = pixels) -> None:
                 loops.show(byref(image), self._channels, pixels.ctypes.data, self._stack.width_px, first, end)
 
             on_rows(show, kept.height_px, threads=self._threads)
-        return self._layers
 
     def close(self) -> None:
         self._buffers = {}
 
-    def _fill(self, beside: int | tuple[int, ...]) -> None:
+    def _fill(self, layers: U8, outside: int | tuple[int, ...]) -> None:
         """All panels at rest, the middle one as if all eyes saw one colour; whole pixels at a time."""
-        for n, layer in enumerate(self._layers):
-            pixel = np.array([*beside_codes(self._stack.count, n, beside), 255], np.uint8).view(np.uint32)[0]
+        for n, layer in enumerate(layers):
+            pixel = np.array([*outside_codes(self._stack.count, n, outside), 255], np.uint8).view(np.uint32)[0]
             layer.view(np.uint32)[..., 0] = pixel
 
     def _rest_others(self) -> None:

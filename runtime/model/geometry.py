@@ -1,6 +1,7 @@
-"""The rays of a solution: windows, and homographies from each eye's rays to panel pixels.
+"""The rays of a solution: what each eye should see, the panels' windows, and homographies from rays to panel pixels.
 
-A ray belongs to a pixel of a raster: a still picture's own pixels, or the middle panel's where content is drawn there.
+A ray belongs to a pixel of a picture. Where the picture's pixels are is the only thing that tells apart content that
+was drawn on the middle panel's raster, in a window of it or on a coarser one, and captured photographs.
 """
 
 from __future__ import annotations
@@ -13,27 +14,39 @@ from math import ceil, floor
 import numpy as np
 
 from runtime.model.contract import Places
-from runtime.model.job import Job, Own
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.tilt import coarse_layer_from_seen, layer_pixels_from_seen
-from runtime.optics.views import image_from_raster, relative_scale_shift, stack_from_eye
-from runtime.records import F32, F64
+from runtime.optics.views import relative_scale_shift, stack_from_eye
+from runtime.records import F32, F64, U8
+from runtime.support.gl import DrawnPicture
 
 PAD_PX = 2  # of what is visible
 ALIGN_PX = 8  # boxes begin and end at multiples of this, so that a half or a quarter of them is whole
 LEAST_PX = 32
-MIN_WEIGHT = (
-    0.05  # of a corner in a picture's homography, beside the middle's: nearer to the eye's plane it has no place
-)
+MIN_WEIGHT = 0.05  # least homogeneous weight of a window's corner relative to its middle: below, it has no image
+SNAPPED = 1e-6  # pixels by which a homography may miss whole pixels and still count as a translation by them
 MISSING_WEIGHT = 1 / 8  # 2 dB in two pairs of twelve: the other eye's ray through such a pixel may cross all panels
-SURE_PX = 1 / 8  # of an outer panel: eyes that are sure to less are where they are
-TAPERED_SHARE = 1 / 6  # of a window's taper, over which its rays fade: they mend the error of the wave's own
+KNOWN_PX = 1 / 8  # eye errors that move an outer panel's picture by less than this are ignored
+TAPERED_SHARE = 1 / 6  # share of a window's taper over which its rays fade: they correct the error of its edge
 PLACES: dict[Places, tuple[tuple[float, float], ...]] = {  # right and up, standard deviations of the eyes' place
     "middle": ((0.0, 0.0),),
     "rising": ((1.0, 1.0), (-1.0, -1.0)),
     "falling": ((1.0, -1.0), (-1.0, 1.0)),
 }
+
+
+@dataclass(frozen=True, slots=True)
+class TargetView:
+    """The picture that one eye should see, and where its pixels' rays cross the middle panel's plane."""
+
+    picture: U8 | DrawnPicture  # (h, w, 3 or 4) RGB or RGBA
+    plane_from_picture: F64  # 3x3: (y, z, 1) on the plane, metres, from the picture's pixels (u, v, 1)
+
+    @property
+    def pixels(self) -> U8:
+        """The picture as an array, read back where it was left in a texture."""
+        return self.picture.pixels() if isinstance(self.picture, DrawnPicture) else self.picture
 
 
 @dataclass(frozen=True)
@@ -42,11 +55,11 @@ class Geometry:
 
     stack: PanelStack
     eyes_m: F64  # (2, 3) left and right, frame `stack`
-    boxes: tuple[PixelRect, ...]  # of each panel, that is solved
-    kept: PixelRect  # of the middle panel's box, that rays look through
-    rays: PixelRect  # of a picture's pixels, or of the middle panel's
-    middle_from_rays: F64  # (2, 3, 3) the middle panel's pixels, from its box's first, for each eye
-    taper_px: tuple[float, float] = (0.0, 0.0)  # of the middle panel, right and down; over which a window's rays fade
+    boxes: tuple[PixelRect, ...]  # solved pixels of each panel
+    kept: PixelRect  # pixels of the middle panel's box that rays look through
+    rays: PixelRect  # pixels of the views' pictures that look through `kept`
+    middle_from_rays: F64  # (2, 3, 3) for each eye: the middle panel's pixels (0: its box's first) from rays (0: first)
+    taper_px: tuple[float, float] = (0.0, 0.0)  # pixels of the middle panel, right and down, over which rays fade
 
     @property
     def middle(self) -> int:
@@ -57,24 +70,33 @@ class Geometry:
         """Of a ray that misses a box, where the middle panel is closed; beside a window panels rest, and it counts."""
         return 1.0 if any(self.taper_px) else MISSING_WEIGHT
 
+    def is_like(self, other: Geometry) -> bool:
+        """True where rays and boxes are the same: panels solved for one are where steps for the other may begin."""
+        return (
+            (self.stack, self.boxes, self.kept, self.rays, self.taper_px)
+            == (other.stack, other.boxes, other.kept, other.rays, other.taper_px)
+            and np.array_equal(self.eyes_m, other.eyes_m)
+            and np.array_equal(self.middle_from_rays, other.middle_from_rays)
+        )
+
     @cached_property
     def rasters(self) -> tuple[PlaneRaster, ...]:
         """The panels' pixels within their boxes."""
         return tuple(box.cut(self.stack.panel(n)) for n, box in enumerate(self.boxes))
 
-    def panels_from_rays(self, places: Places, eye_sigma_mm: float) -> F64:
+    def panels_from_rays(self, places: Places, eye_sigma_m: float) -> F64:
         """(2P, N, 3, 3) panel pixels (from the box's first) for P eye places, left and right in turn.
 
         Places take turns from row to row of a picture: row k of place p's rays is the picture's row P·k + p.
         """
         right, up = stack_from_eye(self.eyes_m.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
-        sure = self.rays.height_px == 1 or self._moved_px(eye_sigma_mm) < SURE_PX
+        sure = self.rays.height_px == 1 or self._moved_px(eye_sigma_m) < KNOWN_PX
         taken = PLACES["middle" if sure else places]
         turns, found = len(taken), []
         centre = np.array([self.rays.width_px / 2, self.rays.height_px / turns / 2, 1.0])
         for turn, (across, down) in enumerate(taken):
             rows = np.array([[1.0, 0.0, 0.0], [0.0, turns, turn + (1 - turns) / 2], [0.0, 0.0, 1.0]])
-            moved_m = eye_sigma_mm / 1e3 * (across * right + down * up)
+            moved_m = eye_sigma_m * (across * right + down * up)
             for eye_m, from_rays in zip(self.eyes_m + moved_m, self.middle_from_rays, strict=True):
                 between = [
                     panel_from_middle(self.stack, self.rasters, eye_m, n) if n != self.middle else np.eye(3)
@@ -84,11 +106,11 @@ class Geometry:
                 found.append(seen / (seen[:, 2] @ centre)[:, None, None])
         return np.array(found)
 
-    def _moved_px(self, eye_sigma_mm: float) -> float:
+    def _moved_px(self, eye_sigma_m: float) -> float:
         """How far one sigma of the eyes moves what they see of a panel against the middle one, at most."""
         pitch_m, middle_x_m = self.stack.panel(self.middle).pitch_u_m, self.stack.x_m[self.middle]
         shares = [abs((x_m - middle_x_m) / (self.eyes_m[:, 0].mean() - middle_x_m)) for x_m in self.stack.x_m]
-        return float(eye_sigma_mm / 1e3 * max(shares) / pitch_m)
+        return float(eye_sigma_m * max(shares) / pitch_m)
 
     def tapers(self) -> tuple[F32, F32]:
         """(width,) and (height,) what rays' errors are multiplied with: 0 at a window's edges to 1 inside."""
@@ -109,33 +131,37 @@ def inverse(homographies: F64) -> F64:
     return np.asarray(back / np.abs(back[..., 2:, 2:]), np.float64)
 
 
-def geometry_of(job: Job, stack: PanelStack, *, whole: bool = False, unseen: bool = False) -> Geometry:
-    """For a job's part of the panels; whole: for all of what its eyes see of them; unseen: and all else."""
-    part = None if whole or unseen else job.part
-    if unseen:
-        boxes: tuple[PixelRect, ...] = (PixelRect(0, 0, stack.width_px, stack.height_px),) * stack.count
-        kept, taper_px = boxes[0], (0.0, 0.0)
-    elif part is None:
-        boxes = visible_boxes(job.eyes_m, stack)
-        kept, taper_px = boxes[stack.count // 2], (0.0, 0.0)
-    else:
-        boxes, kept, taper_px = (part.box,) * stack.count, part.kept, part.taper_px
+def geometry_of(
+    stack: PanelStack,
+    eyes_m: F64,
+    views: Sequence[TargetView],
+    *,
+    boxes: tuple[PixelRect, ...],
+    kept: PixelRect | None = None,
+    taper_px: tuple[float, float] = (0.0, 0.0),
+) -> Geometry:
+    """Rays of both views' pixels through `kept` of the middle panel (None: its whole box); `boxes` of each panel."""
     box = boxes[stack.count // 2]
-    if job.own is None:
-        shift = np.array([[1.0, 0.0, kept.u0 - box.u0], [0.0, 1.0, kept.v0 - box.v0], [0.0, 0.0, 1.0]])
-        return Geometry(stack, job.eyes_m, boxes, kept, kept, np.stack([shift, shift]), taper_px)
-    raster = stack.panel(stack.count // 2)
-    pictures_from_middle = [image_from_raster(projection, raster) for projection in job.own.projections]
-    rays = _looked_through(pictures_from_middle, kept, job.own)
+    kept = kept or box
+    middle_from_plane = stack.panel(stack.count // 2).raster_from_plane()
+    middle_from_pictures = [_snapped(middle_from_plane @ view.plane_from_picture) for view in views]
+    rays = _looked_through([np.linalg.inv(matrix) for matrix in middle_from_pictures], kept, views[0].picture.shape)
     first = np.array([[1.0, 0.0, rays.u0], [0.0, 1.0, rays.v0], [0.0, 0.0, 1.0]])
     to_box = np.array([[1.0, 0.0, -box.u0], [0.0, 1.0, -box.v0], [0.0, 0.0, 1.0]])
-    middle_from_rays = np.stack([to_box @ np.linalg.inv(matrix) @ first for matrix in pictures_from_middle])
-    return Geometry(stack, job.eyes_m, boxes, kept, rays, middle_from_rays, taper_px)
+    middle_from_rays = np.stack([to_box @ matrix @ first for matrix in middle_from_pictures])
+    return Geometry(stack, eyes_m, boxes, kept, rays, middle_from_rays, taper_px)
 
 
-def _looked_through(pictures_from_middle: Sequence[F64], box: PixelRect, own: Own) -> PixelRect:
-    """The pixels of either picture that look through a box of the middle panel."""
-    height, width = own.pictures[0].shape[:2]
+def _snapped(homography: F64) -> F64:
+    """Exact where it takes pixels to pixels: sampling is then a copy."""
+    homography = homography / homography[2, 2]
+    whole = np.rint(homography)
+    return whole if np.abs(homography - whole).max() < SNAPPED else np.asarray(homography, np.float64)
+
+
+def _looked_through(pictures_from_middle: Sequence[F64], box: PixelRect, shape: tuple[int, ...]) -> PixelRect:
+    """Pixels of either picture (h, w, ...) that look through a box of the middle panel."""
+    height, width = shape[:2]
     corners = np.array([[box.u0, box.u1, box.u0, box.u1], [box.v0, box.v0, box.v1, box.v1], [1.0] * 4])
     centre = np.array([(box.u0 + box.u1) / 2, (box.v0 + box.v1) / 2, 1.0])
     ends = []
@@ -144,7 +170,7 @@ def _looked_through(pictures_from_middle: Sequence[F64], box: PixelRect, own: Ow
         if w.min() < MIN_WEIGHT:
             return PixelRect(0, 0, width, height)
         ends.append((x / w, y / w))
-    low, high = np.floor(np.min(ends, axis=(0, 2))), np.ceil(np.max(ends, axis=(0, 2)))
+    low, high = np.floor(np.min(ends, axis=(0, 2)) + SNAPPED), np.ceil(np.max(ends, axis=(0, 2)) - SNAPPED)
     u0, v0 = int(np.clip(low[0], 0, width - 1)), int(np.clip(low[1], 0, height - 1))
     return PixelRect(u0, v0, int(np.clip(high[0], u0 + 1, width)), int(np.clip(high[1], v0 + 1, height)))
 

@@ -1,64 +1,140 @@
-"""The input of one solution: pictures, eyes, window of the panels, channels, deadline."""
+"""The input of one solution: what both eyes should see, on which rays, and how much of the panels is solved."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
+import numpy as np
+
+from runtime.model.geometry import Geometry, TargetView, geometry_of, visible_boxes
+from runtime.model.warp import reduced_view
 from runtime.optics.pupil import TRACKING_SIGMA_MM
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 from runtime.support.gl import DrawnPicture
+from runtime.support.threads import parallel_map
 
-Picture = U8 | DrawnPicture
+TRACKING_SIGMA_M = TRACKING_SIGMA_MM / 1e3
+NOWHERE = PixelRect(0, 0, 0, 0)
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
-    """The window of every panel that is solved.
+class SolveWindow:
+    """Window of every panel that is solved.
 
-    Outside it the outer panels stay at mid-range, where the solver starts; the middle panel carries the common picture.
+    Outside it the outer panels stay at mid-range, where the solver starts, and the middle panel carries the picture
+    that both eyes see.
     """
 
     box: PixelRect  # panel pixels; empty: nothing is solved
-    kept: PixelRect  # of the middle panel, within the box: beside it that panel belongs to the rest
-    taper_px: tuple[float, float]  # right and down: how far inwards what drives the outer panels fades out
-    colour: tuple[int, ...] | None = None  # 8-bit codes beside the box; None: what the pictures have there
-    drawn: bool = False  # the job's pictures are of the box alone, not of the whole middle panel
+    kept: PixelRect  # middle-panel pixels inside `box` that are written; outside, the flat fill owns them
+    taper_px: tuple[float, float]  # right and down: width over which the outer panels' drive is tapered to zero
+    colour: tuple[int, ...] | None = None  # 8-bit codes of the background outside; None: the views show it
+
+
+@dataclass(frozen=True)
+class Targets:
+    """What both eyes should see, and the rays of its pixels through a stack of a given raster."""
+
+    stack: PanelStack  # the panels' pixels as they are solved: the display's own, or coarser ones
+    eyes_m: F64  # (2, 3) left and right, frame `stack`
+    views: tuple[TargetView, TargetView]  # left and right
+
+    @cached_property
+    def visible(self) -> Geometry:
+        """Rays of all that the eyes see through every panel."""
+        return geometry_of(self.stack, self.eyes_m, self.views, boxes=visible_boxes(self.eyes_m, self.stack))
+
+    @cached_property
+    def every_pixel(self) -> Geometry:
+        """Rays through every pixel of every panel, whether an eye sees it or not."""
+        whole = PixelRect(0, 0, self.stack.width_px, self.stack.height_px)
+        return geometry_of(self.stack, self.eyes_m, self.views, boxes=(whole,) * self.stack.count)
+
+    def within(self, window: SolveWindow) -> Geometry:
+        """Rays through a window."""
+        boxes = (window.box,) * self.stack.count
+        return geometry_of(
+            self.stack, self.eyes_m, self.views, boxes=boxes, kept=window.kept, taper_px=window.taper_px
+        )
+
+    def reduced(self, reduction: int) -> tuple[TargetView, TargetView]:
+        """The views with about one pixel for `reduction` x `reduction` of the panels'. Computed once for each value."""
+        if reduction not in self._reduced:
+            middle = self.stack.panel(self.stack.count // 2)
+            left, right = parallel_map(lambda view: reduced_view(view, middle, reduction), self.views)
+            self._reduced[reduction] = left, right
+        return self._reduced[reduction]
+
+    @cached_property
+    def _reduced(self) -> dict[int, tuple[TargetView, TargetView]]:
+        return {}
 
 
 @dataclass(frozen=True, slots=True)
-class Own:
-    """Still pictures, along whose own pixels' rays panels are solved."""
+class Savings:
+    """What was left out of a job."""
 
-    pictures: Sequence[U8]  # (h, w, 3) of the left and the right eye
-    projections: F64  # (2, 3, 4) their pixels from frame `stack`
+    solved_share: float = 1.0  # of the panels' pixels
+    channels: int = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """The task of one solution; what a cheaper solution changes is a field (`runtime.model.trim`)."""
+    """One solution's task; a cheaper solution differs in a field (`runtime.model.trim`)."""
 
-    pictures: Sequence[Sequence[Picture]]  # [eye][raster] (h, w, 4) RGBA, left eye first, on `Predictor.rasters`
-    eyes_m: F64  # (2, 3) left and right, frame `stack`
+    targets: Targets
     # Standard deviation of the tracker's error, an axis, common to both eyes, right and up; 0: they are known.
-    eye_sigma_mm: float = TRACKING_SIGMA_MM
-    own: Own | None = None  # None: the rays of `pictures`
-    part: Part | None = None  # None: all of the panels
+    eye_sigma_m: float = TRACKING_SIGMA_M
+    window: SolveWindow | None = None  # None: all that the eyes see
     channels: int = 3  # 1: the pictures are grey, and one channel is solved for all three
+    steps: int | None = None  # at most; None: the model's
+    continued: bool = False  # begin from the panels of the solution before, where its rays were the same
     deadline_ns: int | None = None  # of `time.perf_counter_ns`: no further step begins after it; None: none
 
     @property
-    def arrays(self) -> list[list[U8]]:
-        """The pictures, read back where they were left in textures."""
-        return [
-            [picture.pixels() if isinstance(picture, DrawnPicture) else picture for picture in images]
-            for images in self.pictures
-        ]
+    def views(self) -> tuple[TargetView, TargetView]:
+        """Left and right eye's."""
+        return self.targets.views
 
-    def solved_share(self, stack: PanelStack) -> float:
-        """Of the panels' pixels, those that are solved."""
-        if self.part is None:
-            return 1.0
-        return self.part.box.width_px * self.part.box.height_px / (stack.width_px * stack.height_px)
+    @property
+    def stack(self) -> PanelStack:
+        """The panels' pixels as they are solved."""
+        return self.targets.stack
+
+    @property
+    def eyes_m(self) -> F64:
+        """(2, 3) left and right, frame `stack`."""
+        return self.targets.eyes_m
+
+    @property
+    def savings(self) -> Savings:
+        """What is left out."""
+        box = None if self.window is None else self.window.box
+        pixels = self.stack.width_px * self.stack.height_px
+        return Savings(1.0 if box is None else box.width_px * box.height_px / pixels, self.channels)
+
+
+def drawn_views(
+    pictures: Sequence[U8 | DrawnPicture], stack: PanelStack, window: SolveWindow | None = None
+) -> tuple[TargetView, TargetView]:
+    """Left and right eye's views of pictures (h, w, 3 or 4) on the pixels of the middle panel, or of its window."""
+    raster = stack.panel(stack.count // 2)
+    if window is not None:
+        raster = window.box.cut(raster)
+    left, right = (TargetView(picture, raster.plane_from_raster()) for picture in pictures)
+    return left, right
+
+
+def drawn_job(pictures: Sequence[U8 | DrawnPicture], eyes_m: F64, stack: PanelStack) -> Job:
+    """The task of solving a whole stack for pictures (h, w, 3 or 4) on the middle panel's pixels; eyes (2, 3)."""
+    return Job(Targets(stack, eyes_m, drawn_views(pictures, stack)))
+
+
+def grey_job(eyes_m: F64, stack: PanelStack) -> Job:
+    """A task of grey pictures, to warm up with."""
+    grey = np.full((stack.height_px, stack.width_px, 4), 128, np.uint8)
+    return drawn_job((grey, grey), eyes_m, stack)

@@ -9,23 +9,25 @@ import numpy as np
 
 from runtime.clock import Stopwatch
 from runtime.errors import InputError, ModelFailure
-from runtime.model.geometry import Geometry
+from runtime.model.geometry import Geometry, panel_from_middle
 from runtime.model.job import Job
 from runtime.model.session import ModelSession
 from runtime.model.targets import FULL
-from runtime.model.warp import resample
+from runtime.model.warp import picture_on, resample
 from runtime.optics.malus import phase_from_intensity
-from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_raster, image_from_stack
-from runtime.records import F64, I16, U8
+from runtime.records import I16, U8
 
 
 class PictureProposal:
     """Models of `input_frame` panel (one picture per eye and panel) or centre (one per eye), layout NCHW.
 
-    Channels are panel-major, then eye, then RGB; black beside what an eye's picture of the contract's field of view
-    covers, as the network was trained.
+    Channels are panel-major, then eye, then RGB. Each eye's picture is warped to the pixels of every panel that the
+    network reads (EyeReal supplement, (47)); outside the contract's field of view it is black, as in training.
     """
+
+    any_raster = False  # it proposes whole panels of one size
 
     def __init__(self, session: ModelSession, stack: PanelStack, *, source: Path) -> None:
         """Raises InputError where the model's fixed size is not the panels'."""
@@ -40,26 +42,18 @@ class PictureProposal:
         if contract.layout != "NCHW":
             raise InputError(source, "contract.layout", f"{contract.layout} does not fit {contract.input_frame}")
         self._panels = range(stack.count) if contract.input_frame == "panel" else (stack.count // 2,)
-        self.rasters: tuple[PlaneRaster, ...] = tuple(stack.panel(n) for n in self._panels)
         self._order = (0, 1) if contract.eye_order == "left-right" else (1, 0)
         channels = len(self._panels) * 2 * 3
         self._input = np.empty((1, channels, stack.height_px, stack.width_px), np.float32)
         table = np.arange(256, dtype=np.float32) / np.float32(255)
         self._table = table if contract.input_value == "intensity" else phase_from_intensity(table, contract.branch)
 
-    @property
-    def black_beside(self) -> bool:
-        """Whether still pictures end in black, not in their repeated edge."""
-        return self.session.contract.picture_fov_deg > 0
-
     def panels(self, job: Job, geometry: Geometry, watch: Stopwatch) -> dict[int, I16]:
-        contract, count, images, channel = self.session.contract, self._stack.count, job.arrays, 0
-        for number, raster in enumerate(self.rasters):
+        contract, count, channel = self.session.contract, self._stack.count, 0
+        for n in self._panels:
             for side in self._order:
-                cover = self._covered(job.eyes_m[side], raster)
-                for plane in cv2.split(images[side][number])[:3]:
-                    covered = np.asarray(plane if cover is None else cv2.min(plane, cover), np.uint8)
-                    self._input[0, channel] = cv2.LUT(covered, self._table)
+                for plane in cv2.split(self._seen(job, n, side))[:3]:
+                    self._input[0, channel] = cv2.LUT(plane, self._table)
                     channel += 1
         watch.lap("prepare")
         answered = [n for n in range(count) if contract.output == "panels" or n != count // 2]
@@ -75,17 +69,17 @@ class PictureProposal:
             for n, panel in zip(answered, values, strict=True)
         }
 
-    def _covered(self, eye_m: F64, raster: PlaneRaster) -> U8 | None:
-        """(h, w) how much of each pixel a picture of the contract's view covers, 0 to 255; None where it has none.
-
-        What a white picture of the panels' pixels would leave there, black beside: bilinear, so that its edge fades
-        over one pixel as it did in training. The least of it and the picture is what the network is fed: a still
-        picture has faded by itself.
-        """
+    def _seen(self, job: Job, n: int, side: int) -> U8:
+        """(h, w, 3 or 4) an eye's picture on panel n's pixels, black outside what the contract's field of view covers."""
+        stack, eye_m, view, middle = self._stack, job.eyes_m[side], job.views[side], self._stack.count // 2
+        rasters, size = [stack.panel(n) for n in range(stack.count)], (stack.height_px, stack.width_px)
+        middle_from_panel = np.linalg.inv(panel_from_middle(stack, rasters, eye_m, n)) if n != middle else np.eye(3)
         fov_deg = self.session.contract.picture_fov_deg
+        edge = cv2.BORDER_CONSTANT if fov_deg else cv2.BORDER_REPLICATE
+        picture = picture_on(view, rasters[middle], middle_from_result=middle_from_panel, edge=edge, size=size)
         if not fov_deg:
-            return None
-        width, height = self._stack.width_px, self._stack.height_px
-        projection = image_from_stack(eye_m, width_px=width, height_px=height, fov_deg=fov_deg)
-        white = np.full((height, width), 255, np.uint8)
-        return np.asarray(resample(white, image_from_raster(projection, raster), size=(height, width)), np.uint8)
+            return picture
+        # A white picture of that view, bilinear: its edge fades over one pixel as it did in training.
+        projection = image_from_stack(eye_m, width_px=size[1], height_px=size[0], fov_deg=fov_deg)
+        cover = resample(np.full(size, 255, np.uint8), image_from_raster(projection, rasters[n]), size=size)
+        return np.asarray(cv2.min(picture, cv2.merge([cover] * picture.shape[2])), np.uint8)

@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from runtime.clock import Stopwatch
 from runtime.errors import EyesNotServed, ModelFailure
 from runtime.model.chain import ChainFrame, ColumnLaw, chain_frame, chain_modes
-from runtime.model.geometry import Geometry, taper
+from runtime.model.geometry import Geometry, TargetView, taper
 from runtime.model.job import Job
 from runtime.model.session import ModelSession
-from runtime.model.targets import FULL, phase_codes, rest_of
-from runtime.model.warp import REACH_PX, reduced_pictures, warp
+from runtime.model.targets import FULL, phase_codes, rest_of, without_alpha
+from runtime.model.warp import REACH_PX, warp
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.tilt import coarse_layer_from_seen
-from runtime.records import F32, F64, I16, U8
+from runtime.records import F32, F64, I16
 from runtime.support.threads import parallel_map
 
 HALF_BASELINE_M = 0.031  # of one eye that stands for both: any would do
@@ -37,7 +37,10 @@ _SWAPPED = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # (y
 
 
 class Proposal(Protocol):
-    """Where the steps begin."""
+    """A network that proposes panels from which the steps begin."""
+
+    any_raster: bool  # whether it serves stacks of every raster, and windows of them
+    session: ModelSession
 
     def panels(self, job: Job, geometry: Geometry, watch: Stopwatch) -> dict[int, I16]:
         """Boxes of the proposed panels, (rows, columns[, 3]), in sixteenths of a code; the others rest.
@@ -63,6 +66,8 @@ class _Local:
 class ChainProposal:
     """Networks of `input_frame` chain: three panels, evenly spaced or nearly so, any pose."""
 
+    any_raster = True
+
     def __init__(self, session: ModelSession) -> None:
         self.session = session
         self._cell_px, self._reduction = session.contract.cell_px, session.contract.reduction
@@ -70,13 +75,13 @@ class ChainProposal:
         self._codes = codes - codes.min()
 
     def panels(self, job: Job, geometry: Geometry, watch: Stopwatch) -> dict[int, I16]:
-        local = _local(geometry, whole=job.part is None)
+        local = _local(geometry, whole=job.window is None)
         try:
             frame = chain_frame(local.eyes_m, local.stack, cell_px=self._cell_px, reduction=self._reduction)
         except ValueError as error:
             raise EyesNotServed(str(error)) from None
         middle_x_m = geometry.rasters[geometry.middle].x_m
-        pictures = parallel_map(self._target_codes, reduced_pictures(job, geometry, self._reduction))
+        pictures = parallel_map(lambda view: self._target_codes(view, job.channels), job.targets.reduced(self._reduction))
 
         def targets(side: int) -> list[I16]:
             """An eye's targets along its rays, and the other one's in the same places."""
@@ -98,7 +103,7 @@ class ChainProposal:
             "shifted_waves": shifted_waves,
             "spectrum": spectrum,
             "modes_in": modes_in,
-            "eye_sigma_px": frame.eye_sigma_px(local.stack, eye_sigma_mm=job.eye_sigma_mm),
+            "eye_sigma_px": frame.eye_sigma_px(local.stack, eye_sigma_m=job.eye_sigma_m),
         }
         shape = (frame.rows, frame.cells + 1, feeds["left"].shape[2])
         watch.lap("prepare")
@@ -109,9 +114,10 @@ class ChainProposal:
         outer = {n: answer[name].reshape(frame.rows, -1, *left.shape[2:]) for n, name in ((0, "rear"), (2, "front"))}
         return {n: self._on_panel(n, panel, geometry, local, frame) for n, panel in outer.items()}
 
-    def _target_codes(self, picture: tuple[U8, F64]) -> tuple[I16, F64]:
-        """The sum of all panels, sixteenths of a code, that each pixel of a picture asks for, but for a constant."""
-        return np.asarray(cv2.LUT(picture[0], self._codes), np.int16), picture[1]
+    def _target_codes(self, view: TargetView, channels: int) -> tuple[I16, F64]:
+        """Target sum of all panels for each pixel, sixteenths of a code up to a constant; its picture_from_plane."""
+        codes = cv2.LUT(without_alpha(view.pixels, channels), self._codes)
+        return np.asarray(codes, np.int16), np.linalg.inv(view.plane_from_picture)
 
     def _on_panel(self, n: int, answer: I16, geometry: Geometry, local: _Local, frame: ChainFrame) -> I16:
         """The network's answer for an outer panel, within its box."""

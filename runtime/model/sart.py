@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 from runtime.clock import Stopwatch
 from runtime.errors import ModelFailure
 from runtime.model.base import STAGES, Prediction, Predictor
-from runtime.model.geometry import panel_from_middle
+from runtime.model.geometry import TargetView, panel_from_middle
 from runtime.model.job import Job
 from runtime.model.targets import FULL, target_table
+from runtime.model.warp import picture_on
 from runtime.optics.malus import rest_value
-from runtime.optics.stack import PanelStack, PlaneRaster
-from runtime.records import F32, F64
+from runtime.optics.stack import PanelStack
+from runtime.records import F32, F64, U8
 
 ITERATIONS = 10
 RELAXATION = 1.7  # of both eyes' mean residual; found by trial, diverges from 2 on
@@ -36,13 +37,10 @@ class SartPredictor(Predictor):
     def __init__(self, stack: PanelStack, *, iterations: int = ITERATIONS, relaxation: float = RELAXATION) -> None:
         self.stack, self.iterations, self._relaxation = stack, iterations, relaxation
 
-    def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
-        return (self.stack.panel(self.stack.count // 2),)
-
-    def solve(self, job: Job) -> Prediction:
-        watch, stack = Stopwatch(*STAGES), self.stack
+    def solve(self, job: Job, watch: Stopwatch | None = None) -> Prediction:
+        watch, stack = watch or Stopwatch(*STAGES), self.stack
         table = np.ascontiguousarray(target_table(stack.count)[:, 0] / np.float32(FULL))
-        targets = [cv2.LUT(np.ascontiguousarray(image[0][..., :3]), table) for image in job.arrays]
+        targets = [cv2.LUT(np.ascontiguousarray(self._picture(view)[..., :3]), table) for view in job.views]
         shape, rest = (stack.height_px, stack.width_px, 3), rest_value(stack.count)
         panels: list[NDArray[np.float32]] = [np.full(shape, rest, np.float32) for _ in range(stack.count)]
         forward = [[self._panel_from_middle(eye, n) for n in range(stack.count)] for eye in job.eyes_m]
@@ -66,7 +64,13 @@ class SartPredictor(Predictor):
                 raise ModelFailure("the solver diverged")
             layers[n, ..., :3] = np.rint(panel * 255)
         watch.lap("finish")
-        return Prediction(layers, watch.stage_ms, self.iterations)
+        return Prediction(layers, watch.stage_ms, job.savings, self.iterations)
+
+    def _picture(self, view: TargetView) -> U8:
+        """(h, w, 3 or 4) on the middle panel's pixels."""
+        middle, edge = self.stack.panel(self.stack.count // 2), cv2.BORDER_REPLICATE
+        size = self.stack.height_px, self.stack.width_px
+        return picture_on(view, middle, middle_from_result=np.eye(3), edge=edge, size=size)
 
     def _panel_from_middle(self, eye_m: F64, index: int) -> F64:
         """3x3: a layer's pixels from the middle panel's, as an eye sees them in line; OpenCV's pixel centres."""

@@ -1,6 +1,6 @@
 """The solver: a network's proposal, the middle panel closed, steps (docs/mathematics.md).
 
-A device (`cpu`, `gl`) does single steps; their order is here.
+A device (`cpu`, `gl`) does single operations; their order is here.
 """
 
 from __future__ import annotations
@@ -10,43 +10,50 @@ from time import perf_counter_ns
 
 from runtime.clock import Stopwatch
 from runtime.model.base import STAGES, Prediction, Predictor
+from runtime.model.buffers import LayerBuffer, LayerPool
 from runtime.model.contract import Step
 from runtime.model.cpu import CpuBackend
 from runtime.model.device import SolverBackend, SolverState
-from runtime.model.geometry import Geometry, geometry_of
+from runtime.model.geometry import Geometry
 from runtime.model.job import Job
-from runtime.model.network import PictureProposal
-from runtime.model.proposal import ChainProposal
+from runtime.model.proposal import Proposal
 from runtime.optics.malus import rest_code
-from runtime.optics.stack import PanelStack, PlaneRaster
-from runtime.records import F64
+from runtime.optics.stack import PanelStack
+
+_Done = tuple[int, int]  # steps in all, and those of them that the solution before had
+REDUCTIONS = (1, 2, 4)  # rasters that are solved on: the display's own, and with this many times fewer rows and columns
+REFINED_STEPS = 8  # a solution is continued up to this many steps, as many as `best` has
+REFINING = (Step(size=0.8, places="falling"), Step(size=0.8, places="rising"))  # in turn, after the model's own
 
 
 class StepPredictor(Predictor):
-    """Steps from a network's proposal, or from even panels: any stack, any pose."""
+    """Steps from a network's proposal, or from panels at rest: any stack, any pose."""
 
     def __init__(
         self,
         stack: PanelStack,
-        proposal: ChainProposal | PictureProposal | None,
+        proposal: Proposal | None,
         steps: Sequence[Step],
         *,
         name: str,
         threads: int = 2,
         backend: SolverBackend | None = None,
     ) -> None:
-        """proposal: None: panels begin even; backend: None: the processor."""
+        """proposal: None: panels begin at rest; backend: None: the processor."""
         self.stack, self.name, self._proposal, self._steps = stack, name, proposal, tuple(steps)
         self.provider, self.parameters, self._threads = "cpu", 0, threads
         if proposal is not None:
-            session = proposal.session
-            self.provider, self.parameters = session.provider, session.contract.parameters
-            self.precision, self.fell_back = session.contract.precision, session.fell_back
-        self.trims = isinstance(proposal, ChainProposal)
-        self.needs_rasters = isinstance(proposal, PictureProposal)
-        self.black_beside = isinstance(proposal, PictureProposal) and proposal.black_beside
+            contract = proposal.session.contract
+            self.provider = proposal.session.provider
+            self.parameters, self.precision = contract.parameters, contract.precision
+        self.any_raster = proposal is None or proposal.any_raster
+        self.trims = proposal is not None and proposal.any_raster
+        self.reductions = REDUCTIONS if self.any_raster else (1,)
+        self.steps = len(self._steps)
+        self.refined_steps = max(self.steps, REFINED_STEPS)
         self._backend: SolverBackend = backend or CpuBackend()
-        self._state: SolverState | None = None
+        self._rasters: dict[PanelStack, tuple[SolverState, LayerPool]] = {}
+        self._improved: tuple[Geometry, int, int] | None = None  # rays, channels and steps that panels are held of
 
     @property
     def backend(self) -> str:  # type: ignore[override]
@@ -56,7 +63,7 @@ class StepPredictor(Predictor):
         return context is not None and self._backend.context is context
 
     def on_panels(self, stack: PanelStack) -> StepPredictor | None:
-        if isinstance(self._proposal, PictureProposal) or stack.count != 3:
+        if not self.any_raster or stack.count != 3:
             return None
         return StepPredictor(stack, self._proposal, self._steps, name=self.name, threads=self._threads)
 
@@ -64,46 +71,78 @@ class StepPredictor(Predictor):
         self.close()
         self._backend = backend
 
-    def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
-        if isinstance(self._proposal, PictureProposal):
-            return self._proposal.rasters
-        return (self.stack.panel(self.stack.count // 2),)
-
-    def solve(self, job: Job) -> Prediction:
-        rest = rest_code(self.stack.count)
-        watch, part, beside = Stopwatch(*STAGES), job.part, (rest if job.part is None else job.part.colour)
-        if self._state is None:
-            self._state = self._backend.state(self.stack, threads=self._threads)
-        state, steps, layers = self._state, 0, None
-        if part is not None and beside is None:  # beside the window both eyes see one picture
-            with state.begin(job, geometry_of(job, self.stack, whole=True)):
-                state.close_middle()
-                layers = state.write(rest)
-        if part is None or part.box.width_px or layers is None:
-            # Of a network of whole pictures all that it answers is shown.
-            geometry = geometry_of(job, self.stack, unseen=self.needs_rasters)
-            with state.begin(job, geometry):
-                if part is None or part.box.width_px:
-                    steps = self._solve(job, geometry, state, watch)
-                layers = state.write(beside)
+    def solve(self, job: Job, watch: Stopwatch | None = None) -> Prediction:
+        watch = watch or Stopwatch(*STAGES)
+        if job.stack not in self._rasters:
+            state = self._backend.state(job.stack, threads=self._threads)
+            self._rasters[job.stack] = state, LayerPool(job.stack)
+        state, pool = self._rasters[job.stack]
+        buffer = pool.take()
+        if job.window is None:
+            done = self._solve_whole(job, state, buffer, watch)
+        elif not job.window.box.width_px:
+            done = self._show_flat(job, state, buffer)
+        else:
+            done = self._solve_window(job, state, buffer, watch)
         watch.lap("finish")
-        return Prediction(layers, watch.stage_ms, steps)
+        return Prediction(buffer.handed_over(), watch.stage_ms, job.savings, *done)
 
-    def _solve(self, job: Job, geometry: Geometry, state: SolverState, watch: Stopwatch) -> int:
-        """Steps done, the network counted."""
+    def _solve_whole(self, job: Job, state: SolverState, buffer: LayerBuffer, watch: Stopwatch) -> _Done:
+        """All that the eyes see; of a network of whole pictures, all that it proposes."""
+        geometry = job.targets.visible if self.any_raster else job.targets.every_pixel
+        return self._improve(job, geometry, state, buffer, watch, outside=rest_code(job.stack.count))
+
+    def _show_flat(self, job: Job, state: SolverState, buffer: LayerBuffer) -> _Done:
+        """Both eyes' common picture on the middle panel, in closed form."""
+        self._improved = None
+        with state.begin(job, job.targets.visible):
+            state.close_middle()
+            state.write(buffer, rest_code(job.stack.count))
+        return 0, 0
+
+    def _solve_window(self, job: Job, state: SolverState, buffer: LayerBuffer, watch: Stopwatch) -> _Done:
+        """A window within a background of one colour, or within the flat picture."""
+        assert job.window is not None
+        if job.window.colour is None:
+            self._show_flat(job, state, buffer)
+        return self._improve(job, job.targets.within(job.window), state, buffer, watch, outside=job.window.colour)
+
+    def _improve(
+        self,
+        job: Job,
+        geometry: Geometry,
+        state: SolverState,
+        buffer: LayerBuffer,
+        watch: Stopwatch,
+        *,
+        outside: int | tuple[int, ...] | None,
+    ) -> _Done:
+        """Steps from the proposal, or from the panels of the solution before where its rays were the same."""
+        before = self._improved
+        resumed = job.continued and before is not None and before[1] == job.channels and geometry.is_like(before[0])
+        first = before[2] if before is not None and resumed else 0
+        self._improved, done = None, first
+        with state.begin(job, geometry, resumed=resumed):
+            if not resumed:
+                self._propose(job, geometry, state, watch)
+            while done < (self.steps if job.steps is None else job.steps):
+                if job.deadline_ns is not None and perf_counter_ns() >= job.deadline_ns:
+                    break
+                state.step(self._steps[done] if done < self.steps else REFINING[(done - self.steps) % len(REFINING)])
+                done += 1
+            state.write(buffer, outside)
+        self._improved = geometry, job.channels, done
+        return done, first
+
+    def _propose(self, job: Job, geometry: Geometry, state: SolverState, watch: Stopwatch) -> None:
         proposed = {} if self._proposal is None else self._proposal.panels(job, geometry, watch)
         for n, codes in proposed.items():
             state.set_panel(n, codes)
         if geometry.middle not in proposed:
             state.close_middle()
         state.start()
-        for done, step in enumerate(self._steps, 1):
-            if job.deadline_ns is not None and perf_counter_ns() >= job.deadline_ns:
-                return done
-            state.step(step)
-        return 1 + len(self._steps)
 
     def close(self) -> None:
-        if self._state is not None:
-            self._state.close()
-        self._state = None
+        for state, _ in self._rasters.values():
+            state.close()
+        self._rasters, self._improved = {}, None

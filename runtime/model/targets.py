@@ -48,11 +48,11 @@ def middle_codes(panels: int) -> U8:
     return np.clip(np.rint(codes), 0, 255).astype(np.uint8)
 
 
-def beside_codes(panels: int, n: int, beside: int | tuple[int, ...]) -> list[int]:
+def outside_codes(panels: int, n: int, outside: int | tuple[int, ...]) -> list[int]:
     """RGB code of panel n outside the window: at rest; the middle one a code, or a colour."""
     if n != panels // 2:
         return [rest_code(panels)] * 3
-    return middle_codes(panels)[list(beside)].tolist() if isinstance(beside, tuple) else [beside] * 3
+    return middle_codes(panels)[list(outside)].tolist() if isinstance(outside, tuple) else [outside] * 3
 
 
 @lru_cache(maxsize=4)

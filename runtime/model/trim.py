@@ -1,142 +1,146 @@
 """Reduces a job to the window where the eyes' pictures differ, and to one channel if grey.
 
 Panels that are cut to a window and moved to its centre are a smaller stack, seen by eyes moved the same way. Where the
-eyes agree, the outer panels stand at the middle of their range, and the centre panel carries the picture. What drives
-the outer panels fades out towards the window's edge (`Geometry.tapers`): there is no seam.
+eyes agree, the outer panels rest at mid-range, and the centre panel carries the picture. The outer panels' drive is
+tapered towards the window's edge (`Geometry.tapers`), so that there is no seam.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
 
-from runtime.model.geometry import geometry_of
-from runtime.model.job import Job, Part, Picture
+from runtime.model.geometry import TargetView
+from runtime.model.job import NOWHERE, Job, SolveWindow
 from runtime.model.targets import is_grey
-from runtime.model.warp import coarser, reduced_pictures, resample
+from runtime.model.warp import picture_on
 from runtime.optics.rect import PixelRect, union
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 from runtime.support.gl import DrawnPicture
 from runtime.support.threads import PIECE_ROWS, parallel_map
 
-TOLERANCE_CODES = 2  # eyes that differ by no more agree: a tenth of what 8 bits cost at 40 dB
-NOWHERE = PixelRect(0, 0, 0, 0)
-COARSE_STEP = 16  # of the look that decides whether a closer one is worth its time
+TOLERANCE_CODES = 2  # pictures within 2 codes count as equal; the error is a tenth of 8-bit quantisation's at 40 dB
+COARSE_STEP = 16  # pixels between samples of the quick look that decides whether a close one is worth its time
 MAX_SHARE = 0.6  # of the panel: a larger window is not worth cutting out
-MAX_SLACK = 1.3  # of a kept window's area over the one that would do
-STEPS = 16  # windows are whole sixteenths of the panel, so that a few sizes serve all
-# Measured with the shipped models: a wave along the line of the eyes that fades out over fourteen parallaxes beside a
-# difference costs 0.06 dB before mid-grey, where sin² is steepest, and over six up to 0.4; before white or black,
-# where it is level, six cost 0.02. A window must also hold each panel's part of what the eyes see through another.
-WAVE_STEPS = (6.0, 14.0)
+MAX_SLACK = 1.3  # area of a window that is kept from the solution before, relative to the one needed
+WINDOW_SHARES = 16  # windows are whole sixteenths of the panel, so that few shapes occur
+# Measured with the shipped models: tapering the outer panels over 14 parallaxes around a differing region costs 0.06 dB
+# on a mid-grey background, where sin² is steepest, and over 6 up to 0.4 dB; on white or black, where it is level, 6
+# cost 0.02 dB. A window must also hold each panel's part of the rays through another.
+TAPER_PARALLAXES = (6.0, 14.0)
 PANEL_CROSSINGS = 2.0
 MARGIN_PX = 16
 EDGE_PX = 2
-COARSER = 2  # times fewer pixels, either way, on which still pictures are compared
+COMPARED = 2  # captured pictures are compared on a raster this many times coarser than the panels
 
 
-@dataclass(frozen=True, slots=True)
-class Scene:
-    """What is known of what the pictures show, besides the pictures."""
+def trim(job: Job, before: SolveWindow | None = None) -> Job:
+    """The job with less work: a window, unless it has one already, and one channel where nothing in it has a colour.
 
-    stack: PanelStack
-    extent: PixelRect | None = None  # centre-panel pixels beside which both eyes see `colour` alone; None: not known
-    colour: tuple[int, ...] = (255, 255, 255)  # 8-bit codes
-    before: Part | None = None  # of the job before: kept where it will do, so that nothing is allocated again
-
-
-@dataclass(frozen=True, slots=True)
-class Savings:
-    """What was left out of a job."""
-
-    solved_share: float = 1.0  # of the panels' pixels
-    channels: int = 3
-
-
-def trim(job: Job, scene: Scene) -> tuple[Job, Savings]:
-    """The job with less work, and what that leaves out.
-
-    Called twice a frame: before its pictures are drawn, if the content knows its extent, and after.
+    before: the window of the solution before, kept where it still fits.
     """
-    part = job.part
-    if part is None and (job.pictures or job.own):
-        part = _differing_part(job, scene)
-    elif part is None and scene.extent is not None and scene.extent.width_px:
-        steep = max(steepness(np.array([code], np.uint8)) for code in scene.colour)
-        part = _part_around(scene.extent, job.eyes_m, scene, steep=steep)
-        part = part and replace(part, colour=scene.colour, drawn=True)
-    grey = False
-    if job.own is not None:
-        grey = all(map(is_grey, job.own.pictures))
-    elif job.pictures and not (part is not None and not part.box.width_px):
-        grey = all(_is_grey(images[0], part) for images in job.pictures)
-    trimmed = replace(job, part=part, channels=1 if grey else job.channels)
-    return trimmed, Savings(trimmed.solved_share(scene.stack), trimmed.channels)
+    window = job.window or differing_window(job, before)
+    grey = (window is None or window.box.width_px > 0) and all(_is_grey(view, job, window) for view in job.views)
+    return replace(job, window=window, channels=1 if grey else job.channels)
 
 
-def _differing_part(job: Job, scene: Scene) -> Part | None:
-    """Where the pictures differ; None where that is too much, or they were left in textures."""
-    if job.own is not None:
-        geometry = geometry_of(job, scene.stack)
-        raster = coarser(geometry.rasters[geometry.middle], COARSER)
-        left, right = (
-            np.asarray(
-                resample(
-                    picture,
-                    from_plane @ raster.plane_from_raster(),
-                    size=(raster.height_px, raster.width_px),
-                    edge=cv2.BORDER_REPLICATE,
-                )
-            )
-            for picture, from_plane in reduced_pictures(replace(job, channels=3), geometry, COARSER)
-        )
-        begin, scale = geometry.boxes[geometry.middle], COARSER
+def extent_window(
+    extent: PixelRect, colour: tuple[int, ...], eyes_m: F64, stack: PanelStack, before: SolveWindow | None = None
+) -> SolveWindow | None:
+    """The window of content that both eyes see within `extent` of the middle panel, on a background of 8-bit `colour`.
+
+    Found before the content is drawn. None: the whole panel is as fast.
+    """
+    if not extent.width_px:
+        return None
+    steep = max(steepness(np.array([code], np.uint8)) for code in colour)
+    window = _window_around(extent, eyes_m, stack, before, steep=steep)
+    return window and replace(window, colour=colour)
+
+
+def differing_window(job: Job, before: SolveWindow | None = None) -> SolveWindow | None:
+    """The window in which the eyes' pictures differ; empty where they agree.
+
+    None where the whole panel is as fast, or the pictures were left in textures.
+    """
+    if any(isinstance(view.picture, DrawnPicture) for view in job.views):
+        return None
+    stack = job.stack
+    if all(_on_middle_panel(view, stack) for view in job.views):
+        left, right = (view.pixels for view in job.views)
+        origin, scale = (0, 0), 1
     else:
-        left, right = (images[0] for images in job.pictures)  # type: ignore[assignment]
-        begin, scale = PixelRect(0, 0, 0, 0), 1
-        if isinstance(left, DrawnPicture) or isinstance(right, DrawnPicture):
-            return None
+        left, right, origin = _compared(job)
+        scale = COMPARED
 
-    def part_of(box: PixelRect) -> Part | None:
-        grown = PixelRect(*(begin_px + scale * at for begin_px, at in zip((begin.u0, begin.v0) * 2, box.corners)))
-        return _part_around(grown, job.eyes_m, scene, steep=steepness_beside(left, box))
+    def window_of(box: PixelRect) -> SolveWindow | None:
+        grown = PixelRect(*(first + scale * at for first, at in zip(origin * 2, box.corners)))
+        return _window_around(grown, job.eyes_m, stack, before, steep=steepness_beside(left, box))
 
-    # A coarse look tells for next to nothing what is too large; only the rest is worth a close one.
-    box, part = coarse_box(left, right), None
+    # A quick look recognises windows that would be too large; only the others are worth a close one.
+    box, window = coarse_box(left, right), None
     if box.width_px:
-        part = part_of(box)
-    if not box.width_px or part is not None:
+        window = window_of(box)
+    if not box.width_px or window is not None:
         box = differing_box(left, right, known=box)
-        part = part_of(box) if box.width_px else Part(NOWHERE, NOWHERE, (0.0, 0.0))
-    return part
+        window = window_of(box) if box.width_px else SolveWindow(NOWHERE, NOWHERE, (0.0, 0.0))
+    return window
 
 
-def _part_around(box: PixelRect, eyes_m: F64, scene: Scene, *, steep: float) -> Part | None:
+def _on_middle_panel(view: TargetView, stack: PanelStack) -> bool:
+    """True where a view's pixels are the middle panel's."""
+    middle = stack.panel(stack.count // 2)
+    same_size = view.picture.shape[:2] == (stack.height_px, stack.width_px)
+    return same_size and np.allclose(view.plane_from_picture, middle.plane_from_raster(), rtol=0, atol=1e-9)
+
+
+def _compared(job: Job) -> tuple[U8, U8, tuple[int, int]]:
+    """Both pictures on one coarse raster of the visible part of the middle panel, and its first panel pixel."""
+    visible = job.targets.visible
+    box, middle = visible.boxes[visible.middle], job.stack.panel(visible.middle)
+    size = max(1, box.height_px // COMPARED), max(1, box.width_px // COMPARED)
+    middle_from_compared = np.array([
+        [box.width_px / size[1], 0.0, box.u0],
+        [0.0, box.height_px / size[0], box.v0],
+        [0.0, 0.0, 1.0],
+    ])  # fmt: skip
+    left, right = (
+        picture_on(view, middle, middle_from_result=middle_from_compared, edge=cv2.BORDER_REPLICATE, size=size)
+        for view in job.targets.reduced(COMPARED)
+    )
+    return left, right, (box.u0, box.v0)
+
+
+def _window_around(
+    box: PixelRect, eyes_m: F64, stack: PanelStack, before: SolveWindow | None, *, steep: float
+) -> SolveWindow | None:
     """What is solved for a box in which the eyes' pictures differ; None where that is as good as all."""
-    stack, steps = scene.stack, wave_steps(steep)
-    window = window_around(box, eyes_m, stack, steps=steps)
+    parallaxes = taper_parallaxes(steep)
+    window = window_around(box, eyes_m, stack, parallaxes=parallaxes)
     if window is None:
         return None
-    if scene.before is not None and still_fits(scene.before.box, window):
-        window = scene.before.box
+    if before is not None and still_fits(before.box, window):
+        window = before.box
     # Near the window's edge the centre panel can't know what rays meet that leave the window.
-    return Part(window, whole_rays(window, eyes_m, stack), wave_px(eyes_m, stack, steps=steps))
+    return SolveWindow(window, whole_rays(window, eyes_m, stack), taper_px(eyes_m, stack, parallaxes=parallaxes))
 
 
-def _is_grey(picture: Picture, part: Part | None) -> bool:
-    """Whether there is no colour in what is solved; as far as it is told, where that was left in a texture."""
-    if isinstance(picture, DrawnPicture):
-        return picture.grey
-    return is_grey(picture if part is None or part.drawn else picture[part.box.slices])
+def _is_grey(view: TargetView, job: Job, window: SolveWindow | None) -> bool:
+    """True if nothing that is solved has a colour; as far as it is known, where a picture was left in a texture."""
+    if isinstance(view.picture, DrawnPicture):
+        return view.picture.grey
+    if window is not None and _on_middle_panel(view, job.stack):
+        return is_grey(view.picture[window.box.slices])
+    return is_grey(view.picture)
 
 
 def differing_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES, known: PixelRect = NOWHERE) -> PixelRect:
     """The smallest box in which two (h, w, 3 or 4) pictures differ; empty where they agree.
 
-    known: a box within it, as `coarse_box` finds one: only what is beside that is looked at.
+    known: a box within it, as `coarse_box` finds one: only the rest is compared.
     """
     height, width = left.shape[:2]
 
@@ -194,35 +198,35 @@ def steepness(codes: U8) -> float:
 
 
 def steepness_beside(picture: U8, box: PixelRect) -> float:
-    """The same of what lies right and left of a box in an (h, w, 4) picture: there a wave must fade."""
+    """`steepness` of an (h, w, 3 or 4) picture right and left of a box, where the outer panels' drive is tapered."""
     rows = slice(box.v0, box.v1, COARSE_STEP)
     beside = (picture[rows, : box.u0 : COARSE_STEP, :3], picture[rows, box.u1 :: COARSE_STEP, :3])
     return max(steepness(side) for side in beside)
 
 
-def wave_steps(steep: float) -> float:
-    """Parallaxes that outer panels are driven beside a difference, by the background's steepness."""
-    least, most = WAVE_STEPS
+def taper_parallaxes(steep: float) -> float:
+    """Parallaxes over which the outer panels' drive is tapered around a difference, by the background's steepness."""
+    least, most = TAPER_PARALLAXES
     return least + (most - least) * steep
 
 
-def wave_px(eyes_m: F64, stack: PanelStack, *, steps: float) -> tuple[float, float]:
-    """The same in pixels, right and down. eyes_m: (2, 3), frame `stack`."""
+def taper_px(eyes_m: F64, stack: PanelStack, *, parallaxes: float) -> tuple[float, float]:
+    """Width of that taper in pixels, right and down. eyes_m: (2, 3), frame `stack`."""
     left, right = parallax_margin_px(eyes_m, stack)
-    across, down = np.abs(left - right).max(axis=0) * steps
+    across, down = np.abs(left - right).max(axis=0) * parallaxes
     return float(across), float(down)
 
 
-def room_px(low: float, high: float, parallax: F64, *, eyes_px: F64, weights: F64, steps: float) -> tuple[float, float]:
+def room_px(low: float, high: float, parallax: F64, *, eyes_px: F64, weights: F64, parallaxes: float) -> tuple[float, float]:
     """Along one axis: margins before and after a difference from `low` to `high`.
 
     Pixels from the centre of the panel. parallax: (2, N), one axis of `parallax_margin_px`; eyes_px: (2,) the eyes'
-    places on this axis; weights: (2, N) how far along its ray from the centre panel to the eye each panel lies; steps:
-    as `wave_steps` has it.
+    places on this axis; weights: (2, N) how far along its ray from the centre panel to the eye each panel lies; parallaxes:
+    see `taper_parallaxes`.
     """
     before = (weights * (low - eyes_px[:, None])).max()
     after = (weights * (eyes_px[:, None] - high)).max()
-    room = steps * float(np.abs(parallax[0] - parallax[1]).max()) + MARGIN_PX
+    room = parallaxes * float(np.abs(parallax[0] - parallax[1]).max()) + MARGIN_PX
     return PANEL_CROSSINGS * max(float(before), 0.0) + room, PANEL_CROSSINGS * max(float(after), 0.0) + room
 
 
@@ -258,10 +262,10 @@ def _eyes_px(eyes_m: F64, stack: PanelStack) -> F64:
     return places
 
 
-def window_around(box: PixelRect, eyes_m: F64, stack: PanelStack, *, steps: float) -> PixelRect | None:
+def window_around(box: PixelRect, eyes_m: F64, stack: PanelStack, *, parallaxes: float) -> PixelRect | None:
     """The window of a difference: grown by its margins, rounded up to sixteenths of the panel.
 
-    steps: as `wave_steps` has it. None where it would be most of the panel: then the whole is as fast.
+    parallaxes: see `taper_parallaxes`. None where it would be most of the panel: then the whole is as fast.
     """
     parallax, weights, eyes_px = parallax_margin_px(eyes_m, stack), _weights(eyes_m, stack), _eyes_px(eyes_m, stack)
     spans: list[tuple[int, int]] = []
@@ -272,10 +276,10 @@ def window_around(box: PixelRect, eyes_m: F64, stack: PanelStack, *, steps: floa
             parallax[..., axis],
             eyes_px=eyes_px[:, axis],
             weights=weights,
-            steps=steps,
+            parallaxes=parallaxes,
         )
         low, high = max(start - before, 0.0), min(end + after, float(whole))
-        step = whole / STEPS
+        step = whole / WINDOW_SHARES
         size = min(int(np.ceil(np.ceil((high - low) / step) * step / 8) * 8), whole)
         first = int(np.clip(np.floor((low + high - size) / 2), 0, whole - size))
         spans.append((first, first + size))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from ctypes import byref, c_double
-from dataclasses import replace
 from math import prod
 from typing import Any
 
@@ -13,25 +12,15 @@ from numpy.typing import NDArray
 
 from runtime.kernels import MARGIN, Image, Warp, library
 from runtime.model.chain import EVEN_COLUMNS, ColumnLaw
-from runtime.model.geometry import Geometry
-from runtime.model.job import Job
-from runtime.model.targets import without_alpha
+from runtime.model.geometry import SNAPPED, TargetView
 from runtime.optics.stack import PlaneRaster
-from runtime.optics.views import image_from_raster
 from runtime.records import F64, I16, U8
-from runtime.support.threads import on_rows, parallel_map
+from runtime.support.threads import on_rows
 
 LEAST_PX, MIN_SCALE = 16, 0.25  # of a picture: smaller ones, and finer rasters, would tell nothing new
 REACH_PX = 3.0  # beside an image, to which its edge goes on at most: less than the loop's EDGE_PX
 LARGEST = 8191  # of an element that the compiled loop samples, either way
 _TRANSPOSED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-
-
-def coarser(raster: PlaneRaster, reduction: int) -> PlaneRaster:
-    """The same rectangle in fewer pixels."""
-    width, height = max(1, raster.width_px // reduction), max(1, raster.height_px // reduction)
-    pitch_u_m, pitch_v_m = raster.pitch_u_m * raster.width_px / width, raster.pitch_v_m * raster.height_px / height
-    return replace(raster, pitch_u_m=pitch_u_m, pitch_v_m=pitch_v_m, width_px=width, height_px=height)
 
 
 def source_px(image_from_raster: F64, size: tuple[int, int]) -> tuple[float, float]:
@@ -47,38 +36,31 @@ def resized_px(pixels: int, scale: float) -> int:
     return max(min(pixels, LEAST_PX), round(pixels / max(scale, MIN_SCALE)))
 
 
-def reduced_pictures(job: Job, geometry: Geometry, reduction: int) -> list[tuple[U8, F64]]:
-    """For each eye its picture (h, w[, 3]), with so many times fewer pixels than the panels have, and the homography of
-    its pixels from (y, z, 1) on the middle panel."""
-    raster = geometry.rasters[geometry.middle]
-    pictures: list[tuple[U8, F64]] = []
-    if job.own is None:
-        box = geometry.boxes[geometry.middle]
-        rows, columns = (slice(None), slice(None)) if job.part and job.part.drawn else box.slices
-        pictures = [(images[0][rows, columns], np.eye(3)) for images in job.arrays]
-    else:
-        pictures = [
-            (picture, image_from_raster(projection, raster))
-            for picture, projection in zip(job.own.pictures, job.own.projections, strict=True)
-        ]
+def reduced_view(view: TargetView, middle: PlaneRaster, reduction: int) -> TargetView:
+    """A view with about one pixel for `reduction` x `reduction` of the middle panel's, averaged."""
+    picture = view.pixels
+    picture_from_middle = np.linalg.inv(view.plane_from_picture) @ middle.plane_from_raster()
+    scales = source_px(picture_from_middle, (middle.width_px, middle.height_px))
+    height, width = picture.shape[:2]
+    by_u, by_v = (
+        max(1, min(round(scale * reduction), px // LEAST_PX)) for scale, px in zip(scales, (width, height), strict=True)
+    )
+    if (by_u, by_v) == (1, 1):
+        return TargetView(picture, view.plane_from_picture)
+    # Whole multiples, which OpenCV shrinks ten times as fast.
+    cropped = picture[: height // by_v * by_v, : width // by_u * by_u]
+    small = cv2.resize(cropped, (width // by_u, height // by_v), interpolation=cv2.INTER_AREA)
+    return TargetView(np.asarray(small, np.uint8), view.plane_from_picture @ np.diag([by_u, by_v, 1.0]))
 
-    def reduced(item: tuple[U8, F64]) -> tuple[U8, F64]:
-        picture, from_raster = item
-        scales = source_px(from_raster, (raster.width_px, raster.height_px))
-        height, width = picture.shape[:2]
-        by_u, by_v = (
-            max(1, min(round(scale * reduction), px // LEAST_PX))
-            for scale, px in zip(scales, (width, height), strict=True)
-        )
-        # Whole multiples, which OpenCV shrinks ten times as fast.
-        picture = picture[: height // by_v * by_v, : width // by_u * by_u]
-        if (by_u, by_v) != (1, 1):
-            size = width // by_u, height // by_v
-            picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
-        image_from_plane = np.diag([1 / by_u, 1 / by_v, 1.0]) @ from_raster @ raster.raster_from_plane()
-        return without_alpha(picture, job.channels), image_from_plane
 
-    return parallel_map(reduced, pictures)
+def picture_on(view: TargetView, middle: PlaneRaster, *, middle_from_result: F64, edge: int, size: tuple[int, int]) -> U8:
+    """(rows, columns, 3 or 4) a view's picture on a raster of (rows, columns) that a homography takes to the middle
+    panel's pixels; the picture itself where it lies there. edge: OpenCV's name for what is outside it."""
+    picture_from_result = np.linalg.inv(view.plane_from_picture) @ middle.plane_from_raster() @ middle_from_result
+    picture_from_result = picture_from_result / picture_from_result[2, 2]
+    if view.picture.shape[:2] == size and np.abs(picture_from_result - np.eye(3)).max() < SNAPPED:
+        return view.pixels
+    return np.asarray(resample(view.pixels, picture_from_result, size=size, edge=edge), np.uint8)
 
 
 def resample(

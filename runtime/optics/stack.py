@@ -53,12 +53,6 @@ class Tilt:
     depth: tuple[tuple[float, float, float], ...]  # per panel (d, r, u): it stands d + r·y + u·z before its x_m, metres
     seen_from_m: tuple[float, float, float]  # frame `stack`
 
-    def moved(self, y_m: float, z_m: float) -> Tilt:
-        """The same in a frame whose origin lies at (0, y_m, z_m)."""
-        x, y, z = self.seen_from_m
-        depth = tuple((d + r * y_m + u * z_m, r, u) for d, r, u in self.depth)
-        return Tilt(depth, (x, y - y_m, z - z_m))
-
 
 @dataclass(frozen=True, slots=True)
 class PanelStack:
@@ -80,6 +74,13 @@ class PanelStack:
         """True if the gaps are even enough for the shipped networks."""
         gaps = np.diff(self.x_m)
         return bool(gaps.size == 0 or np.ptp(gaps) <= UNEVEN_MOST * gaps.mean())
+
+    def reduced(self, reduction: int) -> PanelStack:
+        """The same panels in `reduction` times fewer rows and columns, at least one."""
+        if reduction == 1:
+            return self
+        size = (max(1, round(px / reduction)) for px in (self.width_px, self.height_px))
+        return PanelStack(self.width_m, self.height_m, self.x_m, *size, self.tilt)
 
     def transposed(self) -> PanelStack:
         """The panels with rows for columns: what was down (-z) is to the right (+y), what was right is down."""
