@@ -23,10 +23,8 @@ from phasestack.stack import checked_stack
 from runtime.errors import InputError, ModelFailure
 from runtime.evaluation.displayed import Picture
 from runtime.evaluation.solved import PairQuality, SolvedPair
-from runtime.model.job import Job
 from runtime.model.predictor import Predictor, load_predictor
 from runtime.model.still import solve_still
-from runtime.model.trim import Scene, trim
 from runtime.optics.cameras import as_cameras, doubts, looking_at_origin
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
@@ -143,12 +141,14 @@ def solve(
             predictor = _loaded(_name_of(model), pair.stack)
             start_ns = time.perf_counter_ns()
             codes = [as_codes(picture) for picture in pair.pictures]
-
-            def trimmed(job: Job) -> Job:
-                return trim(job, Scene(pair.stack))[0] if predictor.trims else job
-
-            how: dict[str, Any] = {"eyes_m": pair.eyes_m, "fov_deg": pair.fov_deg, "eye_sigma_mm": eye_sigma_mm}
-            solved = solve_still(*codes, predictor=predictor, changed=trimmed, **how)
+            solved = solve_still(
+                *codes,
+                eyes_m=pair.eyes_m,
+                fov_deg=pair.fov_deg,
+                predictor=predictor,
+                eye_sigma_mm=eye_sigma_mm,
+                trimmed=True,
+            )
             total_ms = (time.perf_counter_ns() - start_ns) / 1e6
             layers = np.ascontiguousarray(solved.layers[..., :3])
         except InputError as error:

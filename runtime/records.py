@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,29 +17,6 @@ U16 = NDArray[np.uint16]
 
 EyesLabel = Literal["exact", "interpolated", "predicted", "held", "rested", "none"]
 Inference = Literal["ran", "reused", "skipped"]
-
-
-class HeldLayers(Protocol):
-    """Layers (N, h, w, 4) in GL textures."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """(N, h, w, 4)."""
-
-    @property
-    def lost(self) -> bool:
-        """Whether their GL context is gone."""
-
-    def pixels(self) -> U8:
-        """The same as an array, brought here when it is first asked for. Raises ContextLost."""
-
-
-Layers = U8 | HeldLayers
-
-
-def pixels_of(layers: Layers) -> U8:
-    """(N, h, w, 4) layers as an array. Raises ContextLost."""
-    return layers if isinstance(layers, np.ndarray) else layers.pixels()
 
 
 class State(StrEnum):
@@ -104,12 +81,13 @@ class PanelFrame:
     """What all panels show at one refresh: an aligned solution, the flat picture, or a mix."""
 
     number: int  # of the refresh: all panels show the same
-    solved: Layers | None  # (N, height_px, width_px, 4) RGBA, rear to front; layers solved for two eyes; None: none yet
+    solved: U8 | None  # (N, h, w, 4) RGBA, rear to front, of any raster; layers solved for two eyes; None: none yet
     solved_version: int  # another number whenever `solved` holds other values
-    solved_from_shown: tuple[F64, ...] = ()  # per panel (3, 3): pixels of `solved` from shown ones; (): as they are
-    flat: Layers | None = None  # the same shape: the picture for eyes anywhere; never aligned
+    solved_from_shown: tuple[F64, ...] = ()  # per panel (3, 3), both in the panels' pixels; (): layers as solved
+    flat: U8 | None = None  # (N, height_px, width_px, 4): the picture for eyes anywhere; never aligned
     flat_version: int = 0
     flatness: float = 0.0  # 0: `solved` alone, 1: `flat` alone, between: mixed linearly, code by code
+    size_px: tuple[int, int] | None = None  # columns and rows of the panels; None: those of `solved`
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,21 +133,31 @@ class SolveRequest:
 
 
 @dataclass(frozen=True, slots=True)
+class Effort:
+    """Work that a solution has had: its raster and its updates of all panels."""
+
+    reduction: int = 1  # of the panels' rows and columns, on which it was solved
+    steps: int = 0
+    continued_from: int | None = None  # steps that the solution before had already; None: begun from a proposal
+
+    @property
+    def name(self) -> str:
+        """`1/2+1`: half the rows and columns, one step."""
+        return f"1/{self.reduction}+{self.steps}"
+
+
+@dataclass(frozen=True, slots=True)
 class Solution:
     """Immutable layers for one pair of eyes, or the flat picture."""
 
     number: int  # counts up from 1, flat pictures and solutions together
-    made: Layers  # (N, height_px, width_px, 4) RGBA, rear to front
+    layers: U8  # (N, h, w, 4) RGBA, rear to front; the panels' pixels, or fewer (`effort.reduction`)
     solved_for_m: F64 | None  # (2, 3) left, right; frame `stack`; None: flat, for eyes anywhere
-    solved_for_ns: int  # the instant that it was made for; its content is of that instant
-    seeing: tuple[bool, bool] = (True, True)  # left, right: an eye that can't see the display gave way to the other
-    eye_sigma_mm: float | None = None  # tracking error that it was made to hold for
+    solved_for_ns: int  # the instant that it is for; its content is of that instant
+    seeing: tuple[bool, bool] = (True, True)  # left, right: an eye outside the viewing range is replaced by the other
+    eye_sigma_m: float | None = None  # tracking error that it allows for
     stage_ms: dict[str, float] = field(default_factory=dict)  # render, prepare, inference, finish; the run's clock
-
-    @property
-    def layers(self) -> U8:
-        """What was made, as an array: brought from textures when it is first asked for. Raises ContextLost."""
-        return pixels_of(self.made)
+    effort: Effort | None = None  # None: flat
 
 
 @dataclass(frozen=True, slots=True)

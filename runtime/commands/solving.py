@@ -20,10 +20,8 @@ from runtime.errors import EyesNotServed, InputError
 from runtime.evaluation.solved import SolvedPair
 from runtime.evaluation.trials import timed
 from runtime.model.backends import choose
-from runtime.model.job import Job
 from runtime.model.predictor import Prediction, load_predictor
 from runtime.model.still import solve_still
-from runtime.model.trim import Savings, Scene, trim
 from runtime.optics.cameras import as_cameras, doubts, looking_at_origin
 from runtime.optics.stack import PanelStack
 from runtime.plan.savings import Measured, network_items
@@ -107,17 +105,18 @@ def solve_pair(
         predictor.set_backend(choose(wanted, predictor, context).backend)
         watch.lap("load model")
         inference_ms: list[float] = []
-        left_out = Savings()
-
-        def trimmed(job: Job) -> Job:
-            nonlocal left_out
-            if plan and predictor.trims:
-                job, left_out = trim(job, Scene(stack))
-            return job
 
         def solve() -> Prediction:
-            given: dict[str, Any] = {"eyes_m": eyes_m, "fov_deg": fov_deg, "eye_sigma_mm": eye_sigma_mm}
-            prediction = solve_still(*pictures, predictor=predictor, changed=trimmed, **given)
+            left, right = pictures
+            prediction = solve_still(
+                left,
+                right,
+                eyes_m=eyes_m,
+                fov_deg=fov_deg,
+                predictor=predictor,
+                eye_sigma_mm=eye_sigma_mm,
+                trimmed=plan,
+            )
             inference_ms.append(prediction.stage_ms["inference"])
             return prediction
 
@@ -138,7 +137,7 @@ def solve_pair(
             line += f"{eye_sigma_mm:g} mm; one ray a pixel, as published: {quality.psnr_db:.1f} dB"
             seen.write(folder.staging, lines=[line])
             watch.lap("measure and write")
-            items = network_items(ContentInfo(files.name), Measured(left_out=left_out))
+            items = network_items(ContentInfo(files.name), Measured(left_out=done.answer.savings))
             result = quality.table() | {
                 "inference_ms": round(float(np.median(inference_ms[-repeat:])), 3),
                 "total_ms": round(done.median_ms, 3),
@@ -146,7 +145,7 @@ def solve_pair(
                 "provider": predictor.provider,
                 "backend": predictor.backend,
                 "eye_sigma_mm": eye_sigma_mm,
-                "steps": done.answer.steps,
+                "steps": done.answer.steps + 1,  # the proposal counts
                 "plan": [asdict(item) for item in items],
                 "wall_s": {part: round(ms / 1e3, 3) for part, ms in watch.stage_ms.items()},
             }

@@ -16,7 +16,7 @@ from runtime.content.registry import Opener, prepare_content
 from runtime.errors import ContextLost, Stopped
 from runtime.eyes.calibration import Calibration
 from runtime.frame.run_state import RunCell, RunState
-from runtime.frame.solver import Solver, SolverStep
+from runtime.frame.solver import Solver, SolverUpdate
 from runtime.model.backends import Choice, Wanted, choose
 from runtime.model.predictor import Predictor, load_predictor
 from runtime.optics.stack import PanelStack
@@ -60,7 +60,7 @@ class RunningSolver:
         """What is drawn at present."""
         return self.run.state.content
 
-    def step(self, request: SolveRequest) -> SolverStep:
+    def step(self, request: SolveRequest) -> SolverUpdate:
         if self.contexts_lost() != self._lost_before:
             raise ContextLost("the panels have lost their OpenGL context")
         state = self.run.state  # before looking whether it is another solver's

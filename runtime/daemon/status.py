@@ -23,7 +23,7 @@ from runtime.frame.presenter import Presenter, Refresh
 from runtime.model.predictor import SHIPPED
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
-from runtime.records import U8, RefreshAccount, pixels_of
+from runtime.records import U8, RefreshAccount
 from runtime.support.film import VIDEOS
 from runtime.support.version import version
 
@@ -159,8 +159,8 @@ def pictures_of(refresh: Refresh, stack: PanelStack, *, fov_deg: float) -> dict[
     width = min(WIDTH_PX, stack.width_px)
     small = replace(stack, width_px=width, height_px=max(1, round(width * stack.height_px / stack.width_px)))
     size = small.width_px, small.height_px
-    part = slice(None, None, max(1, stack.width_px // (2 * width)))  # twice as fine: averaging all pixels takes 15 ms
-    parts = (np.ascontiguousarray(layer[part, part]) for layer in pixels_of(shown))
+    part = slice(None, None, max(1, shown.shape[2] // (2 * width)))  # twice as fine: averaging all pixels takes 15 ms
+    parts = (np.ascontiguousarray(layer[part, part]) for layer in shown)
     resized = [cv2.resize(layer, size, interpolation=cv2.INTER_AREA) for layer in parts]
     layers: U8 = np.stack(resized).astype(np.uint8, copy=False)
     found = {f"layer-{n}": _jpeg(layer) for n, layer in enumerate(layers)}

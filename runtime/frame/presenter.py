@@ -19,7 +19,7 @@ from runtime.errors import EndOfRecording, PanelLost
 from runtime.frame.pacing import Pacer
 from runtime.frame.policy import Flatness, wants_flat
 from runtime.frame.run_state import RunCell
-from runtime.frame.solver import SolverStep
+from runtime.frame.solver import SolverUpdate
 from runtime.frame.solver_host import SOLVING_STAGES, SolverHost
 from runtime.frame.states import Conditions, Lateness, Part, StateMachine
 from runtime.frame.stats import RunStats
@@ -200,7 +200,7 @@ class Presenter:
             for observer in self._observers:
                 observer.sampled(sample)
 
-    def _compose(self, timing: FrameTiming, eyes: EyesEstimate, news: SolverStep) -> tuple[PanelFrame, str]:
+    def _compose(self, timing: FrameTiming, eyes: EyesEstimate, news: SolverUpdate) -> tuple[PanelFrame, str]:
         """What the panels are given, and why an alignment is at its limit (empty: it is not)."""
         solution, flat = news.solution, news.flat
         target = 1.0 if eyes.eyes_m is None or self.flat_asked else 0.0
@@ -217,12 +217,13 @@ class Presenter:
         matrices, limited = self._alignment(eyes, solution)
         frame = PanelFrame(
             timing.id,
-            solution.made if solution is not None else None,
+            solution.layers if solution is not None else None,
             solution.number if solution is not None else 0,
             matrices,
-            flat.made if flat is not None else None,
+            flat.layers if flat is not None else None,
             flat.number if flat is not None else 0,
             flatness,
+            (self.stack.width_px, self.stack.height_px),
         )
         return frame, limited
 
@@ -280,7 +281,7 @@ class Presenter:
             self.paused,
         )
 
-    def _missing(self, news: SolverStep, lost: str) -> dict[str, str]:
+    def _missing(self, news: SolverUpdate, lost: str) -> dict[str, str]:
         missing = dict(news.missing)
         if lost:
             missing["panel"] = lost
@@ -312,7 +313,7 @@ class Presenter:
         self,
         timing: FrameTiming,
         eyes: EyesEstimate,
-        news: SolverStep,
+        news: SolverUpdate,
         frame: PanelFrame,
         report: PresentReport | None,
         photon_ns: int,

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import logging
 import sys
-import weakref
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from time import perf_counter_ns
 
@@ -16,12 +14,11 @@ from runtime.content.base import View
 from runtime.errors import ContentFailure, ContextLost, ModelFailure
 from runtime.frame.policy import FramePolicy, SolutionKey
 from runtime.frame.run_state import RunCell, RunState
-from runtime.model.job import Part
+from runtime.model.job import SolveWindow
 from runtime.model.targets import flat_layers
-from runtime.model.trim import Savings
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import raster_from_stack
-from runtime.plan.drawing import drawn_for
+from runtime.plan.drawing import drawn_job
 from runtime.plan.savings import Measured, Plan, make_plan, seeing_eyes
 from runtime.records import F64, U8, PlanItem, Solution, SolveRequest
 
@@ -31,7 +28,7 @@ FLAT_EYE_M = (0.7, 0.0, 0.0)  # where the flat picture is drawn from before any 
 
 
 @dataclass(frozen=True, slots=True)
-class SolverStep:
+class SolverUpdate:
     """The result of one request; as news, the newest of all results so far."""
 
     solution: Solution | None = None  # a new one for two eyes
@@ -50,14 +47,13 @@ class Solver:
         self._planned_for: tuple[int, tuple[bool, bool]] | None = None
         self._seeing = (True, True)
         self._policy = FramePolicy()
-        self._buffers = LayerBuffers()
         self._solved: SolutionKey | None = None
         self._flat: SolutionKey | None = None
-        self._part: Part | None = None  # of the panels, that the newest solution is of
+        self._window: SolveWindow | None = None  # of the newest solution
         self._middle_m: F64 = np.array(FLAT_EYE_M)
         self._missing: dict[str, str] = {}
 
-    def step(self, request: SolveRequest, state: RunState | None = None) -> SolverStep:
+    def step(self, request: SolveRequest, state: RunState | None = None) -> SolverUpdate:
         """Do what the request calls for, if anything. A part that fails is named; what there is stays good.
 
         state: to draw and solve with; None: the newest. Raises ContextLost: this solver is of no more use.
@@ -68,7 +64,7 @@ class Solver:
         try:
             revision = state.content.revision(time_ns=time_ns)
         except (Exception, SystemExit) as error:  # a vendor's `sys.exit()` too
-            return SolverStep(missing=self._failed("content", error, expected=ContentFailure))
+            return SolverUpdate(missing=self._failed("content", error, expected=ContentFailure))
         job = self._policy.next_job(
             request,
             plan=self.plan,
@@ -84,59 +80,50 @@ class Solver:
             return self._solve(state, request, job.eyes_m, revision=revision)
         if request.eyes_m is not None and not request.paused:
             self._missing = {}  # what there is is what was asked for
-        return SolverStep(missing=dict(self._missing))
+        return SolverUpdate(missing=dict(self._missing))
 
-    def _solve(self, state: RunState, request: SolveRequest, eyes_m: F64, *, revision: int) -> SolverStep:
+    def _solve(self, state: RunState, request: SolveRequest, eyes_m: F64, *, revision: int) -> SolverUpdate:
         settings, watch = state.settings.model, Stopwatch()
-        sigma_mm = request.sigma_m * 1e3 if settings.eye_sigma_mm == "auto" else settings.eye_sigma_mm
+        sigma_m = request.sigma_m if settings.eye_sigma_mm == "auto" else settings.eye_sigma_mm / 1e3
         limited = self._timed and settings.budget_ms > 0
         deadline_ns = perf_counter_ns() + round(settings.budget_ms * NS_PER_MS) if limited else None
         try:
-            job = drawn_for(
+            job = drawn_job(
                 state.predictor,
                 state.content,
                 eyes_m,
                 time_ns=request.time_ns,
                 trimmed=state.settings.plan.enabled,
-                before=self._part,
-                eye_sigma_mm=sigma_mm,
-                deadline_ns=deadline_ns,
+                before=self._window,
             )
-        except ContextLost:  # content and model are in it: whoever made this solver makes another
+        except ContextLost:  # content and model are in it: the solver's owner makes another
             raise
         except (Exception, SystemExit) as error:
-            return SolverStep(missing=self._failed("content", error, expected=ContentFailure))
+            return SolverUpdate(missing=self._failed("content", error, expected=ContentFailure))
         watch.lap("render")
         try:
-            prediction = state.predictor.solve(job)
+            prediction = state.predictor.solve(replace(job, eye_sigma_m=sigma_m, deadline_ns=deadline_ns), watch)
         except ContextLost:
             raise
         except (Exception, SystemExit) as error:
-            return SolverStep(missing=self._failed("model", error, expected=ModelFailure))
-        made = prediction.made
-        if isinstance(made, np.ndarray):
-            made = self._buffers.copy_of(made)
-        rest_ms = max(0.0, watch.lap("finish") - sum(prediction.stage_ms.values()))
-        stages = watch.stage_ms | prediction.stage_ms
-        stages["finish"] = prediction.stage_ms.get("finish", 0.0) + rest_ms
+            return SolverUpdate(missing=self._failed("model", error, expected=ModelFailure))
         self._missing = {}
-        self._part = job.part if job.part is not None and job.part.box.width_px else None
-        left_out = Savings(job.solved_share(self.stack), job.channels)
-        self.measured = replace(self.measured, left_out=left_out)
+        self._window = job.window if job.window is not None and job.window.box.width_px else None
+        self.measured = replace(self.measured, left_out=prediction.savings)
         self._solved = SolutionKey(state.version, revision, eyes_m)
         self._middle_m = eyes_m.mean(axis=0)
         solution = Solution(
             self.run.next_number(),
-            made,
+            prediction.layers,
             eyes_m,
             request.time_ns,
             seeing=self.plan.eyes if self.plan is not None else (True, True),
-            eye_sigma_mm=sigma_mm,
-            stage_ms=stages,
+            eye_sigma_m=sigma_m,
+            stage_ms=watch.stage_ms,
         )
-        return SolverStep(solution=solution)
+        return SolverUpdate(solution=solution)
 
-    def _draw_flat(self, state: RunState, *, revision: int, time_ns: int) -> SolverStep:
+    def _draw_flat(self, state: RunState, *, revision: int, time_ns: int) -> SolverUpdate:
         watch = Stopwatch()
         missing: dict[str, str] = {}
         try:
@@ -147,7 +134,7 @@ class Solver:
         except (Exception, SystemExit) as error:
             missing = self._failed("content", error, expected=ContentFailure)
             if self._flat is not None:
-                return SolverStep(missing=missing)
+                return SolverUpdate(missing=missing)
             picture = np.full((self.stack.height_px, self.stack.width_px, 4), 255, np.uint8)
         layers: U8 = flat_layers(picture, self.stack)
         if not missing:
@@ -155,7 +142,7 @@ class Solver:
             self._flat = SolutionKey(state.version, revision, None, self._policy.episode)
         watch.lap("render")
         flat = Solution(self.run.next_number(), layers, None, time_ns, stage_ms=watch.stage_ms)
-        return SolverStep(flat=flat, missing=missing)
+        return SolverUpdate(flat=flat, missing=missing)
 
     def plan_items(self, measured: Measured | None = None) -> tuple[PlanItem, ...]:
         """What is left out now, with what is known of its time and error. Any thread may ask."""
@@ -184,27 +171,3 @@ class Solver:
         else:
             log.exception("%s", part)
         return dict(self._missing)
-
-
-class LayerBuffers:
-    """A pool of as many buffers as are held at once: one written, one newest, one shown."""
-
-    def __init__(self) -> None:
-        self._buffers: list[tuple[U8, Callable[[], U8 | None]]] = []
-
-    def copy_of(self, layers: U8) -> U8:
-        """A copy (...) in a pooled buffer, which is the caller's as long as the result lives."""
-        held = [holder() is not None for _, holder in self._buffers]
-        index = held.index(False) if False in held else len(held)
-        if index == len(held):
-            self._buffers.append((np.empty(layers.shape, np.uint8), _nobody))
-        buffer = self._buffers[index][0]
-        np.copyto(buffer, layers)
-        # Not `buffer.view()`: a part of that would hold the buffer, and not the view that is asked about.
-        view: U8 = np.asarray(buffer.data.toreadonly())
-        self._buffers[index] = buffer, weakref.ref(view)
-        return view
-
-
-def _nobody() -> None:
-    return None

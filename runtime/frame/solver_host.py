@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Protocol
 
 from runtime.clock import NS_PER_MS, Clock
-from runtime.frame.solver import SolverStep
+from runtime.frame.solver import SolverUpdate
 from runtime.records import SolveRequest
 
 FIRST_REQUEST = SolveRequest(0, None, "none", 0.0, flat_wanted=True)  # before the first refresh: the flat picture
@@ -19,7 +19,7 @@ COST_GAIN = 0.2  # of the newest solution in the running mean of what one costs
 class SolverParts(Protocol):
     """A solver and what belongs to its thread, such as a GL context."""
 
-    def step(self, request: SolveRequest) -> SolverStep:
+    def step(self, request: SolveRequest) -> SolverUpdate:
         """One request."""
 
     def simulated_stage_ms(self) -> Mapping[str, float]:
@@ -42,7 +42,7 @@ class SolverHost(ABC):
         """Ask for a solution; a request that was not begun is forgotten."""
 
     @abstractmethod
-    def news(self) -> SolverStep:
+    def news(self) -> SolverUpdate:
         """The newest complete solution and flat picture, and what failed."""
 
     @abstractmethod
@@ -54,9 +54,9 @@ class SolverHost(ABC):
         """Stop, and release what the solver holds. May be called twice."""
 
 
-def taken_in(news: SolverStep, step: SolverStep) -> SolverStep:
+def taken_in(news: SolverUpdate, step: SolverUpdate) -> SolverUpdate:
     """The news updated by a step: its results, where it has any, and its failures."""
-    return SolverStep(step.solution or news.solution, step.flat or news.flat, step.missing)
+    return SolverUpdate(step.solution or news.solution, step.flat or news.flat, step.missing)
 
 
 def total_ns(stage_ms: Mapping[str, float]) -> int:
@@ -69,9 +69,9 @@ class SimulatedSolver(SolverHost):
 
     def __init__(self, parts: SolverParts, clock: Clock) -> None:
         self._parts, self._clock = parts, clock
-        self._news = taken_in(SolverStep(), parts.step(FIRST_REQUEST))
+        self._news = taken_in(SolverUpdate(), parts.step(FIRST_REQUEST))
         self._posted: tuple[int, SolveRequest] | None = None
-        self._under_way: tuple[int, SolverStep] | None = None  # when it is complete
+        self._under_way: tuple[int, SolverUpdate] | None = None  # when it is complete
         self._idle_since_ns = clock.now_ns()
         self._tasks: list[Task] = []
         self._closed = False
@@ -82,7 +82,7 @@ class SimulatedSolver(SolverHost):
         self._posted = self._clock.now_ns(), request
         self._advance()
 
-    def news(self) -> SolverStep:
+    def news(self) -> SolverUpdate:
         self._advance()
         return self._news
 
@@ -113,7 +113,7 @@ class SimulatedSolver(SolverHost):
             step = self._timed(self._parts.step(request))
             self._under_way = begun_ns + self._cost_of(step), step
 
-    def _timed(self, step: SolverStep) -> SolverStep:
+    def _timed(self, step: SolverUpdate) -> SolverUpdate:
         """With the stage times that the configuration says."""
         stages = dict(self._parts.simulated_stage_ms())
         self.solve_cost_ns = total_ns(stages)
@@ -126,6 +126,6 @@ class SimulatedSolver(SolverHost):
         return replace(step, solution=solution, flat=flat)
 
     @staticmethod
-    def _cost_of(step: SolverStep) -> int:
+    def _cost_of(step: SolverUpdate) -> int:
         made = step.solution or step.flat
         return total_ns(made.stage_ms) if made is not None else 0

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock
 from runtime.errors import ContextLost, FatalError, PhasestackError, Stopped, TransientError
-from runtime.frame.solver import SolverStep
+from runtime.frame.solver import SolverUpdate
 from runtime.frame.solver_host import COST_GAIN, FIRST_REQUEST, SolverHost, SolverParts, Task, taken_in, total_ns
 from runtime.records import SolveRequest
 from runtime.support.background import SOLVER_NICENESS, ThreadAbandoned, abandon, begin, patience_s, set_niceness
@@ -59,7 +59,7 @@ class SolverThread(SolverHost):
         self._late_ns, self._abandon_ns = round(LATE_S * NS_PER_S), round(ABANDON_S * NS_PER_S)
         self._lock = threading.Condition()
         self._request: SolveRequest | None = None
-        self._news = SolverStep()
+        self._news = SolverUpdate()
         self._tasks: queue.SimpleQueue[Task] = queue.SimpleQueue()
         self._closing = threading.Event()
         self._hung: list[_Attempt] = []
@@ -87,7 +87,7 @@ class SolverThread(SolverHost):
             self._request = request
             self._lock.notify()
 
-    def news(self) -> SolverStep:
+    def news(self) -> SolverUpdate:
         late = self._late_reason()
         news = self._news
         if not late:
@@ -211,7 +211,7 @@ class SolverThread(SolverHost):
             gain = COST_GAIN if self.solve_cost_ns else 1.0
             self.solve_cost_ns += round(gain * (cost_ns - self.solve_cost_ns))
 
-    def _publish(self, attempt: _Attempt, step: SolverStep) -> bool:
+    def _publish(self, attempt: _Attempt, step: SolverUpdate) -> bool:
         """Take a step into the news; False: it was made by one that has been left behind."""
         with self._lock:
             if not attempt.abandoned.is_set():

@@ -1,4 +1,4 @@
-"""Which backend does what surrounds the network: the one that was asked for, or the faster one here."""
+"""Choose the solver's device: the configured one or, for `auto`, the faster on this machine."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from runtime.errors import PhasestackError
 from runtime.model.base import Predictor
-from runtime.model.job import Job
+from runtime.model.job import drawn_job
 from runtime.optics.stack import PanelStack
 from runtime.records import U8
 
@@ -94,7 +94,7 @@ def _solution_ms(predictor: Predictor, stack: PanelStack, backend: SolverBackend
     assert solver is not None
     solver.set_backend(backend)
     # For two points: what an unsure eye costs besides is the same for all.
-    job = Job([[_noise(stack, seed)] for seed in (0, 1)], np.array(EYES_M), eye_sigma_mm=0.0)
+    job = replace(drawn_job([_noise(stack, seed) for seed in (0, 1)], np.array(EYES_M), stack), eye_sigma_m=0.0)
     try:
         solver.solve(job)
         times = []

@@ -24,7 +24,7 @@ class Prediction:
 
     layers: U8  # (N, height_px, width_px, 4) RGBA, rear to front, of the job's stack; read-only
     stage_ms: dict[str, float] = field(default_factory=dict)  # by STAGES
-    savings: Savings = Savings()
+    savings: Savings = field(default_factory=Savings)
     steps: int = 0  # updates of all panels, of this and of the solutions that it continues
     continued_from: int = 0  # those of them that the solution before had
 

@@ -18,7 +18,7 @@ from runtime.model.job import Job
 from runtime.model.targets import outside_codes, rest_of, target_table, without_alpha
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, I16, U8
-from runtime.support.threads import parallel_map, on_rows
+from runtime.support.threads import on_rows, parallel_map
 
 WEIGHT, TAPER = 8191, 32767  # of 1 in targets' weights, and in tapers
 SAFE = 4 * MARGIN  # elements around rows of panels that whole vectors touch

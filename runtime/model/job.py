@@ -57,9 +57,7 @@ class Targets:
     def within(self, window: SolveWindow) -> Geometry:
         """Rays through a window."""
         boxes = (window.box,) * self.stack.count
-        return geometry_of(
-            self.stack, self.eyes_m, self.views, boxes=boxes, kept=window.kept, taper_px=window.taper_px
-        )
+        return geometry_of(self.stack, self.eyes_m, self.views, boxes=boxes, kept=window.kept, taper_px=window.taper_px)
 
     def reduced(self, reduction: int) -> tuple[TargetView, TargetView]:
         """The views with about one pixel for `reduction` x `reduction` of the panels'. Computed once for each value."""

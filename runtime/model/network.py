@@ -70,7 +70,7 @@ class PictureProposal:
         }
 
     def _seen(self, job: Job, n: int, side: int) -> U8:
-        """(h, w, 3 or 4) an eye's picture on panel n's pixels, black outside what the contract's field of view covers."""
+        """(h, w, 3 or 4) an eye's picture on panel n's pixels, black outside the contract's field of view."""
         stack, eye_m, view, middle = self._stack, job.eyes_m[side], job.views[side], self._stack.count // 2
         rasters, size = [stack.panel(n) for n in range(stack.count)], (stack.height_px, stack.width_px)
         middle_from_panel = np.linalg.inv(panel_from_middle(stack, rasters, eye_m, n)) if n != middle else np.eye(3)

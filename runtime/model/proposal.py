@@ -81,7 +81,9 @@ class ChainProposal:
         except ValueError as error:
             raise EyesNotServed(str(error)) from None
         middle_x_m = geometry.rasters[geometry.middle].x_m
-        pictures = parallel_map(lambda view: self._target_codes(view, job.channels), job.targets.reduced(self._reduction))
+        pictures = parallel_map(
+            lambda view: self._target_codes(view, job.channels), job.targets.reduced(self._reduction)
+        )
 
         def targets(side: int) -> list[I16]:
             """An eye's targets along its rays, and the other one's in the same places."""

@@ -217,12 +217,14 @@ def taper_px(eyes_m: F64, stack: PanelStack, *, parallaxes: float) -> tuple[floa
     return float(across), float(down)
 
 
-def room_px(low: float, high: float, parallax: F64, *, eyes_px: F64, weights: F64, parallaxes: float) -> tuple[float, float]:
+def room_px(
+    low: float, high: float, parallax: F64, *, eyes_px: F64, weights: F64, parallaxes: float
+) -> tuple[float, float]:
     """Along one axis: margins before and after a difference from `low` to `high`.
 
     Pixels from the centre of the panel. parallax: (2, N), one axis of `parallax_margin_px`; eyes_px: (2,) the eyes'
-    places on this axis; weights: (2, N) how far along its ray from the centre panel to the eye each panel lies; parallaxes:
-    see `taper_parallaxes`.
+    positions on this axis; weights: (2, N) position of each panel along the ray from the centre panel to the eye;
+    parallaxes: see `taper_parallaxes`.
     """
     before = (weights * (low - eyes_px[:, None])).max()
     after = (weights * (eyes_px[:, None] - high)).max()

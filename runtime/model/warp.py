@@ -53,7 +53,9 @@ def reduced_view(view: TargetView, middle: PlaneRaster, reduction: int) -> Targe
     return TargetView(np.asarray(small, np.uint8), view.plane_from_picture @ np.diag([by_u, by_v, 1.0]))
 
 
-def picture_on(view: TargetView, middle: PlaneRaster, *, middle_from_result: F64, edge: int, size: tuple[int, int]) -> U8:
+def picture_on(
+    view: TargetView, middle: PlaneRaster, *, middle_from_result: F64, edge: int, size: tuple[int, int]
+) -> U8:
     """(rows, columns, 3 or 4) a view's picture on a raster of (rows, columns) that a homography takes to the middle
     panel's pixels; the picture itself where it lies there. edge: OpenCV's name for what is outside it."""
     picture_from_result = np.linalg.inv(view.plane_from_picture) @ middle.plane_from_raster() @ middle_from_result

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from runtime.optics.malus import rest_code
 from runtime.optics.stack import PanelStack
-from runtime.records import F32, F64, U8, PanelFrame, pixels_of
+from runtime.records import F32, F64, U8, PanelFrame
 
 FARTHEST_M = 1e6  # of any coordinate: what is farther counts as not finite
 NEAREST_M = 0.01  # of an eye before the front panel: nearer, its rays graze the panels
@@ -85,28 +85,30 @@ def shown_layers(frame: PanelFrame) -> U8:
     """(N, h, w, 4): exactly what the panels show, before a panel's own curve, rotation and mirroring.
 
     The reference for the presentation shader: bilinear with exact weights (for moved eyes bicubic was never better by
-    more than 0.05 dB: docs/mathematics.md), panels at rest beside the solution, mixed with the flat picture before it
-    is rounded. Where nothing is to be done the frame's own array is answered.
-    Raises ValueError for a frame that has nothing to show, ContextLost where its layers' textures are no more.
+    more than 0.05 dB: docs/mathematics.md), a coarse solution enlarged in the same pass, panels at rest outside the
+    solution, mixed with the flat picture before rounding. The frame's own array where there is nothing to do.
+    Raises ValueError for a frame that has nothing to show.
     """
     flatness = 1.0 if frame.solved is None else frame.flatness
     if flatness > 0.0 and frame.flat is None:
         raise ValueError("a frame without its flat picture")
-    flat = None if frame.flat is None or flatness <= 0.0 else pixels_of(frame.flat)
+    flat = None if flatness <= 0.0 else frame.flat
     if flatness >= 1.0 or frame.solved is None:
         assert flat is not None
         return flat
-    solved = pixels_of(frame.solved)
+    solved = frame.solved
     maps = frame.solved_from_shown or (np.eye(3),) * len(solved)
-    if flatness <= 0.0 and all(is_identity(matrix) for matrix in maps):
+    width, height = frame.size_px or (solved.shape[2], solved.shape[1])
+    coarse = (height, width) != solved.shape[1:3]
+    if flatness <= 0.0 and not coarse and all(is_identity(matrix) for matrix in maps):
         return solved
-    out = np.empty_like(solved)
+    out = np.empty((len(solved), height, width, 4), np.uint8)
     for n, matrix in enumerate(maps):
         mixed = None if flat is None else flat[n]
-        if mixed is None and is_identity(matrix):
+        if mixed is None and not coarse and is_identity(matrix):
             out[n] = solved[n]
             continue
-        for rows, codes in _resampled(solved[n], matrix, rest_code(len(solved))):
+        for rows, codes in _resampled(solved[n], matrix, rest_code(len(solved)), size=(height, width)):
             if mixed is not None:
                 codes += (mixed[rows] - codes) * np.float32(flatness)
             codes += np.float32(0.5)
@@ -164,24 +166,30 @@ def _limits(
         yield step[0] * (weight + smaller), -smaller * distance_m, why
 
 
-def _places(count: int, *, scale: float, shift: float) -> tuple[NDArray[np.intp], F32]:
-    """Before each shown pixel the padded source pixel (0 is the even one beside it), and how far it lies past that."""
-    place = np.clip((np.arange(count) + 0.5) * scale + shift - 0.5, -1.0, count)
+def _places(count: int, shown: int, *, scale: float, shift: float) -> tuple[NDArray[np.intp], F32]:
+    """Padded source pixel before each of `shown` pixels (0: the resting one outside), and its distance past that."""
+    place = np.clip((np.arange(shown) + 0.5) * scale + shift - 0.5, -1.0, count)
     first = np.minimum(np.floor(place), count - 1.0)
     return first.astype(np.intp) + 1, (place - first).astype(np.float32)
 
 
-def _resampled(layer: U8, matrix: F64, beside: int) -> Iterator[tuple[slice, F32]]:
-    """Strips of rows of the shown layer and their codes (rows, w, 4), not yet rounded; overwritten by the next."""
+def _resampled(layer: U8, matrix: F64, rest: int, *, size: tuple[int, int]) -> Iterator[tuple[slice, F32]]:
+    """Strips of rows of the shown layer (height, width) and their codes (rows, w, 4), not yet rounded; overwritten by
+    the next. A coarse layer's edge is extended by a pixel, so that it does not fade where the panel ends."""
     su, sv, tu, tv = scale_and_shift(matrix)
     height, width = layer.shape[:2]
-    columns, across = _places(width, scale=su, shift=tu)
-    rows, down = _places(height, scale=sv, shift=tv)
-    for begin in range(0, height, ROWS):
-        strip = slice(begin, min(begin + ROWS, height))
+    if (height, width) != size:
+        by_u, by_v = width / size[1], height / size[0]
+        su, tu, sv, tv = su * by_u, tu * by_u + 1, sv * by_v, tv * by_v + 1
+        layer = np.pad(layer, ((1, 1), (1, 1), (0, 0)), mode="edge")
+        height, width = layer.shape[:2]
+    columns, across = _places(width, size[1], scale=su, shift=tu)
+    rows, down = _places(height, size[0], scale=sv, shift=tv)
+    for begin in range(0, size[0], ROWS):
+        strip = slice(begin, min(begin + ROWS, size[0]))
         first, weight = rows[strip], down[strip, None, None]
         low, high = int(first.min()), int(first.max()) + 2  # in padded rows
-        source = np.full((high - low, width + 2, 4), beside, np.float32)
+        source = np.full((high - low, width + 2, 4), rest, np.float32)
         source[..., 3] = 255.0
         inside = slice(max(low, 1), min(high, height + 1))
         source[inside.start - low : max(inside.stop, inside.start) - low, 1:-1] = layer[
@@ -191,7 +199,7 @@ def _resampled(layer: U8, matrix: F64, beside: int) -> Iterator[tuple[slice, F32
         # A pixel of four floats is gathered as one number.
         pixels = lines.view(np.complex128)[..., 0]
         left, right = (
-            pixels.take(columns + k, axis=1).view(np.float32).reshape(*pixels.shape[:1], width, 4) for k in (0, 1)
+            pixels.take(columns + k, axis=1).view(np.float32).reshape(*pixels.shape[:1], size[1], 4) for k in (0, 1)
         )
         yield strip, _between(left, right, across[:, None])
 

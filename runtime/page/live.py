@@ -15,7 +15,7 @@ from runtime.browser.link import BrowserLink
 from runtime.browser.still import stack_table
 from runtime.optics.carried import intensities
 from runtime.optics.retina import as_codes
-from runtime.records import Layers, pixels_of
+from runtime.records import U8
 from runtime.support.artifacts import to_json
 
 PAGES_MAX = 8  # live pages at once: each is sent its own pictures
@@ -92,10 +92,10 @@ class _Page:
             await self.news.wait()
             self.news.clear()
 
-    async def _send_layers(self, kind: str, layers: Layers, version: int, solved_for_m: Any) -> None:
-        pixels = await asyncio.to_thread(lambda: pixels_of(layers).tobytes())
+    async def _send_layers(self, kind: str, layers: U8, version: int, solved_for_m: Any) -> None:
+        pixels = await asyncio.to_thread(lambda: layers.tobytes())
         self._sent[kind], self._under_way = version, True
-        await self._say({"layers": kind, "solved_for_m": solved_for_m})
+        await self._say({"layers": kind, "solved_for_m": solved_for_m, "size": [layers.shape[2], layers.shape[1]]})
         await self._socket.send_bytes(pixels)
 
     async def _send_moment(self, moment: Any) -> None:

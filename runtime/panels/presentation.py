@@ -10,7 +10,7 @@ from runtime.optics.alignment import is_identity, scale_and_shift
 from runtime.optics.malus import rest_code
 from runtime.panels import lut
 from runtime.panels.geometry import layer_from_screen, permutes_pixels
-from runtime.records import Layers, PanelFrame, pixels_of
+from runtime.records import U8, PanelFrame
 
 VERTEX = """#version 330 core
 // One triangle that covers the framebuffer; pixel: the monitor's pixels, top left origin, v down.
@@ -32,10 +32,12 @@ FRAGMENT = """#version 330 core
 uniform sampler2D solved;        // this panel's
 uniform sampler2D flat_picture;
 uniform sampler2D curve;
-uniform vec2 size_px;
+uniform vec2 size_px;            // of the panel
+uniform vec2 solved_px;          // of the solution, which may be coarser
+uniform int extended;            // pixels by which its edge is extended: a coarse one's does not fade at the panel's
 uniform bool exact;              // the mounting takes pixels to pixels
-uniform bool aligned;
-uniform vec4 solved_from_shown;  // scale u, v, shift u, v in pixels
+uniform bool aligned;            // or enlarged
+uniform vec4 solved_from_shown;  // scale u, v, shift u, v in pixels of the solution
 uniform float flatness;
 uniform float even;
 in vec3 layer_px;
@@ -44,11 +46,12 @@ float grey(float phase, int channel) {
     return texture(curve, vec2((phase * 255.0 + 0.5) / 256.0, (float(channel) + 0.5) / 3.0)).r;
 }
 vec3 solved_texel(ivec2 at) {
-    bool inside = all(greaterThanEqual(at, ivec2(0))) && all(lessThan(at, ivec2(size_px)));
-    return inside ? texelFetch(solved, at, 0).rgb : vec3(even);
+    ivec2 size = ivec2(solved_px);
+    bool inside = all(greaterThanEqual(at, ivec2(-extended))) && all(lessThan(at, size + extended));
+    return inside ? texelFetch(solved, clamp(at, ivec2(0), size - 1), 0).rgb : vec3(even);
 }
 vec3 aligned_at(vec2 px) {
-    vec2 place = clamp(px * solved_from_shown.xy + solved_from_shown.zw - 0.5, vec2(-2.0), size_px + 1.0);
+    vec2 place = clamp(px * solved_from_shown.xy + solved_from_shown.zw - 0.5, vec2(-3.0), solved_px + 2.0);
     vec2 low = floor(place), weight = place - low;
     ivec2 at = ivec2(low);
     return mix(mix(solved_texel(at), solved_texel(at + ivec2(1, 0)), weight.x),
@@ -62,7 +65,7 @@ vec4 cubic(float t) {  // of four neighbours, as OpenCV's INTER_CUBIC has them (
 }
 vec3 registered_at(vec2 px) {
     vec2 place = (aligned ? px * solved_from_shown.xy + solved_from_shown.zw : px) - 0.5;
-    place = clamp(place, vec2(-2.0), size_px + 1.0);
+    place = clamp(place, vec2(-3.0), solved_px + 2.0);
     vec2 low = floor(place);
     vec4 across = cubic(place.x - low.x), down = cubic(place.y - low.y);
     vec3 total = vec3(0.0);
@@ -70,7 +73,7 @@ vec3 registered_at(vec2 px) {
         for (int i = 0; i < 4; i++) {
             ivec2 at = ivec2(low) + ivec2(i - 1, j - 1);
             vec3 texel = aligned ? solved_texel(at)
-                : texelFetch(solved, clamp(at, ivec2(0), ivec2(size_px) - 1), 0).rgb;
+                : texelFetch(solved, clamp(at, ivec2(0), ivec2(solved_px) - 1), 0).rgb;
             total += across[i] * down[j] * texel;
         }
     }
@@ -94,16 +97,22 @@ void main() {
 
 
 class FrameTextures:
-    """The layers of the newest frame, uploaded where their version is another one."""
+    """The layers of the newest frame, uploaded when their version changes."""
 
     def __init__(self, context: moderngl.Context, size_px: tuple[int, int], *, count: int) -> None:
-        """size_px: columns and rows of a layer."""
+        """size_px: columns and rows of a panel."""
         self._context = context
         self.size_px, self.count = size_px, count
+        self._textures: dict[tuple[str, tuple[int, int]], tuple[moderngl.Texture, ...]] = {}  # by kind and raster
         self._solved: tuple[moderngl.Texture, ...] = ()
         self._flat: tuple[moderngl.Texture, ...] = ()
         self._solved_version: int | None = None
         self._flat_version: int | None = None
+
+    @property
+    def solved_px(self) -> tuple[int, int]:
+        """Columns and rows of the solution."""
+        return self._solved[0].size if self._solved else self.size_px
 
     def lacks(self, frame: PanelFrame) -> tuple[bool, bool]:
         """Whether the frame's solution, and its flat picture, are visible but not uploaded."""
@@ -117,35 +126,37 @@ class FrameTextures:
         lacks_solved, lacks_flat = self.lacks(frame)
         if lacks_solved and frame.solved is not None:
             self._solved_version = None  # until it is here as a whole
-            self._solved = self._written(self._solved, frame.solved)
+            self._solved = self._written("solved", frame.solved)
             self._solved_version = frame.solved_version
         if lacks_flat and frame.flat is not None:
             self._flat_version = None
-            self._flat = self._written(self._flat, frame.flat)
+            self._flat = self._written("flat", frame.flat)
             self._flat_version = frame.flat_version
 
     def use(self, index: int) -> None:
-        """Bind one panel's where a Painter looks for them, in the context that is current."""
+        """Bind one panel's textures where a Painter looks for them, in the context that is current."""
         for unit, uploaded in enumerate((self._solved, self._flat)):
             if uploaded:
                 uploaded[index].use(unit)
 
     def release(self) -> None:
         """Give the GL objects back."""
-        for texture in (*self._solved, *self._flat):
-            texture.release()
-        self._solved = self._flat = ()
+        for textures in self._textures.values():
+            for texture in textures:
+                texture.release()
+        self._textures, self._solved, self._flat = {}, (), ()
 
-    def _written(self, held: tuple[moderngl.Texture, ...], layers: Layers) -> tuple[moderngl.Texture, ...]:
-        """One texture a panel, made when the first layers come."""
-        if not held:
-            held = tuple(self._context.texture(self.size_px, 4) for _ in range(self.count))
-            for texture in held:
+    def _written(self, kind: str, layers: U8) -> tuple[moderngl.Texture, ...]:
+        """One texture a panel, of the layers' raster; created when the first of that raster come."""
+        key = kind, (layers.shape[2], layers.shape[1])
+        if key not in self._textures:
+            self._textures[key] = tuple(self._context.texture(key[1], 4) for _ in range(self.count))
+            for texture in self._textures[key]:
                 texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
                 texture.repeat_x = texture.repeat_y = False
-        for texture, layer in zip(held, pixels_of(layers), strict=True):
+        for texture, layer in zip(self._textures[key], layers, strict=True):
             texture.write(np.ascontiguousarray(layer))
-        return held
+        return self._textures[key]
 
 
 def shows_solved(frame: PanelFrame) -> bool:
@@ -197,10 +208,16 @@ class Painter:
     def draw(self, textures: FrameTextures, frame: PanelFrame, index: int) -> None:
         """Panel `index` of the frame that was uploaded, over the whole of the framebuffer in use."""
         matrix = frame.solved_from_shown[index] if frame.solved_from_shown else np.eye(3)
+        (width, height), (solved_width, solved_height) = textures.size_px, textures.solved_px
+        coarse = (width, height) != (solved_width, solved_height)
+        by_u, by_v = solved_width / width, solved_height / height
+        su, sv, tu, tv = scale_and_shift(matrix)
         self._program["even"] = rest_code(textures.count) / 255
-        self._program["size_px"] = tuple(map(float, textures.size_px))
-        self._program["aligned"] = not is_identity(matrix)
-        self._program["solved_from_shown"] = scale_and_shift(matrix)
+        self._program["size_px"] = float(width), float(height)
+        self._program["solved_px"] = float(solved_width), float(solved_height)
+        self._program["extended"] = int(coarse)
+        self._program["aligned"] = coarse or not is_identity(matrix)
+        self._program["solved_from_shown"] = su * by_u, sv * by_v, tu * by_u, tv * by_v
         self._program["flatness"] = 1.0 if frame.solved is None else float(frame.flatness)
         textures.use(index)
         self._curve.use(2)

@@ -1,4 +1,4 @@
-"""Drawing what a model wants to see: the one place where content, views and models meet."""
+"""Draws the targets of a solution: the one place where content, views and models meet."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ import numpy as np
 
 from runtime.content.base import ContentSource, View
 from runtime.errors import ContextLost, PhasestackError
-from runtime.model.job import Job, Part, Picture
+from runtime.model.job import Job, SolveWindow, Targets, drawn_views
 from runtime.model.predictor import Predictor
-from runtime.model.trim import Scene, trim
-from runtime.optics.pupil import TRACKING_SIGMA_MM
+from runtime.model.trim import extent_window, trim
 from runtime.optics.rect import PixelRect, union
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import image_from_stack, raster_from_stack
@@ -45,66 +44,59 @@ def retina_pictures(
     return left, right
 
 
-def drawn_for(
+def drawn_job(
     predictor: Predictor,
     content: ContentSource,
     eyes_m: F64,
     *,
     time_ns: int,
+    reduction: int = 1,
     trimmed: bool = False,
-    before: Part | None = None,
-    eye_sigma_mm: float = TRACKING_SIGMA_MM,
-    deadline_ns: int | None = None,
+    before: SolveWindow | None = None,
 ) -> Job:
-    """What a model is asked for eyes (2, 3), with the pictures that it wants.
+    """The job of solving for eyes (2, 3), frame `stack`: content drawn for them on the middle panel's pixels.
 
-    They stay in textures where the model reads those. Arrays are copied only where a source's own would be drawn over
-    by the next raster: else they are the source's. trimmed: what the scene does not need is left out (`trim`), also of
-    the drawing where the content knows where it lies; before: of the job before.
+    Pictures stay in textures where the model reads those; else they are the source's own arrays. reduction: of the
+    panels' rows and columns. trimmed: leave out what the scene does not need (`trim`), also of the drawing where the
+    content knows its extent. before: the window of the solution before, on the same raster.
     """
-    stack, trimmed = predictor.stack, trimmed and predictor.trims
-    job, scene = Job((), eyes_m, eye_sigma_mm, deadline_ns=deadline_ns), Scene(stack, before=before)
+    stack, trimmed, window = predictor.stack.reduced(reduction), trimmed and predictor.trims, None
+    raster = stack.panel(stack.count // 2)
     if trimmed and content.info.background is not None:
+        extent = _extent(content, eyes_m, raster, time_ns=time_ns)
         colour = tuple(round(value * 255) for value in content.info.background)
-        extent = _extent(content, eyes_m, stack, time_ns=time_ns)
-        job, _ = trim(job, replace(scene, extent=extent, colour=colour))
-    rasters = predictor.rasters(eyes_m)
-    if job.part is not None:
-        rasters = tuple(job.part.box.cut(raster) for raster in rasters)
-    images: list[list[Picture]] = [[], []]
-    for raster in rasters:
-        views = raster_views(eyes_m, raster)
-        content.expect(views, time_ns=time_ns)
-        for view in views:
-            if len(rasters) == 1 and (drawn := _drawn(predictor, content, view, time_ns=time_ns)) is not None:
-                images[view.side].append(drawn)
-                continue
-            picture = content.render(view, time_ns=time_ns)
-            images[view.side].append(picture.copy() if len(rasters) > 1 else picture)
-    job = replace(job, pictures=images)
-    return trim(job, scene)[0] if trimmed else job
+        window = extent and extent_window(extent, colour, eyes_m, stack, before)
+    if window is not None:
+        raster = window.box.cut(raster)
+    views = raster_views(eyes_m, raster)
+    content.expect(views, time_ns=time_ns)
+    pictures = [_picture(predictor, content, view, time_ns=time_ns) for view in views]
+    job = Job(Targets(stack, eyes_m, drawn_views(pictures, stack, window)), window=window)
+    return trim(job, before) if trimmed else job
 
 
-def _extent(content: ContentSource, eyes_m: F64, stack: PanelStack, *, time_ns: int) -> PixelRect | None:
-    """The centre panel's pixels beside which both eyes see the background alone; None: the content doesn't know."""
-    views = raster_views(eyes_m, stack.panel(stack.count // 2))
+def _extent(content: ContentSource, eyes_m: F64, middle: PlaneRaster, *, time_ns: int) -> PixelRect | None:
+    """Pixels of the middle panel outside which both eyes see the background alone; None: the content doesn't know."""
+    views = raster_views(eyes_m, middle)
     boxes = [content.extent(view, time_ns=time_ns) for view in views]
     known = [box for box in boxes if box is not None]
     return union(known) if len(known) == len(boxes) else None
 
 
-def _drawn(predictor: Predictor, content: ContentSource, view: View, *, time_ns: int) -> DrawnPicture | None:
-    """A picture that is left in a texture which the model reads; None: there is none, or it reads arrays.
+def _picture(predictor: Predictor, content: ContentSource, view: View, *, time_ns: int) -> U8 | DrawnPicture:
+    """A view's picture: in a texture where the content draws one that the model reads, else an array.
 
     Raises ContentFailure, ContextLost.
     """
     if content.draws_in is None or not predictor.reads_textures_of(content.draws_in):
-        return None
+        return content.render(view, time_ns=time_ns)
     try:
         picture = content.draw(view, time_ns=time_ns)
     except PhasestackError:
         raise
     except Exception as error:  # a lost context answers with whatever moderngl has at hand
         raise ContextLost(f"OpenGL: {error}") from error
+    if picture is None:
+        return content.render(view, time_ns=time_ns)
     plain = content.info.background is None or len(set(content.info.background)) == 1
-    return picture and replace(picture, grey=content.info.grey and plain)
+    return replace(picture, grey=content.info.grey and plain)

@@ -12,8 +12,7 @@ from runtime.evaluation.displayed import displayed
 from runtime.evaluation.trials import timed_in_turn
 from runtime.model.job import Job
 from runtime.model.predictor import Predictor
-from runtime.model.trim import Savings
-from runtime.plan.drawing import drawn_for, retina_pictures
+from runtime.plan.drawing import drawn_job, retina_pictures
 from runtime.plan.savings import Measured, Saving
 from runtime.records import F64, U8
 
@@ -55,12 +54,12 @@ def measure(predictor: Predictor, content: ContentSource, eyes_m: F64, *, fov_de
         return lambda: predictor.solve(made()).layers
 
     stack = predictor.stack
-    job = drawn_for(predictor, content, eyes_m, time_ns=0, trimmed=True)
-    left_out = Savings(job.solved_share(stack), job.channels)
+    job = drawn_job(predictor, content, eyes_m, time_ns=0, trimmed=True)
+    left_out = job.savings
     ways: Mapping[str, Callable[[], Job]] = {
-        "without": lambda: drawn_for(predictor, content, eyes_m, time_ns=0),
-        "one channel": lambda: replace(drawn_for(predictor, content, eyes_m, time_ns=0), channels=left_out.channels),
-        "with": lambda: drawn_for(predictor, content, eyes_m, time_ns=0, trimmed=True),
+        "without": lambda: drawn_job(predictor, content, eyes_m, time_ns=0),
+        "one channel": lambda: replace(drawn_job(predictor, content, eyes_m, time_ns=0), channels=left_out.channels),
+        "with": lambda: drawn_job(predictor, content, eyes_m, time_ns=0, trimmed=True),
     }
     if left_out.channels == 3:
         ways = {name: way for name, way in ways.items() if name != "one channel"}

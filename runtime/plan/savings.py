@@ -9,7 +9,7 @@ import numpy as np
 
 from runtime.config import Settings
 from runtime.content.base import ContentInfo
-from runtime.model.trim import Savings
+from runtime.model.job import Savings
 from runtime.records import F64, PlanItem
 
 OPTIONAL_PARTS = {

@@ -16,7 +16,7 @@ import numpy as np
 from runtime.config import ModelSettings
 from runtime.content import shapes
 from runtime.content.scenes import Scene, Thing
-from runtime.model.job import Job
+from runtime.model.job import drawn_job
 from runtime.model.predictor import load_predictor
 from runtime.optics.carried import intensities
 from runtime.optics.pupil import PUPIL_MM
@@ -110,12 +110,10 @@ def focal_stack(
     """Solve the layers for two pinhole eyes, then focus the right one at every plane."""
     eyes = eyes_at(distance_m=DISTANCE_M)
     predictor = load_predictor(model, stack, ModelSettings())
-    rasters = predictor.rasters(eyes)
-    pictures = [
-        [painter.draw(eye, raster_from_stack(eye, r), width_px=r.width_px, height_px=r.height_px) for r in rasters]
-        for eye in eyes
-    ]
-    layers = np.array(predictor.solve(Job(pictures, eyes)).layers)
+    raster = stack.panel(stack.count // 2)
+    size = {"width_px": stack.width_px, "height_px": stack.height_px}
+    pictures = [painter.draw(eye, raster_from_stack(eye, raster), **size) for eye in eyes]
+    layers = np.array(predictor.solve(drawn_job(pictures, eyes, stack)).layers)
     predictor.close()
     eye, points = eyes[1], pupil_points(PUPIL_M)
     gaze = -stack_from_eye(eye)[:3, 2]

@@ -14,7 +14,7 @@ from runtime.eyes.calibration import load_calibration
 from runtime.frame.pacing import Pacer
 from runtime.frame.presenter import Presenter, Refresh
 from runtime.frame.run_state import RunCell
-from runtime.frame.solver import SolverStep
+from runtime.frame.solver import SolverUpdate
 from runtime.frame.solver_host import SolverHost, Task
 from runtime.frame.viewer import Viewer
 from runtime.optics.stack import PanelStack
@@ -80,17 +80,17 @@ class FakeSolver(SolverHost):
 
     def __init__(self, *, cost_ns: int = 20 * NS_PER_MS) -> None:
         self.solve_cost_ns = cost_ns
-        self.there = SolverStep()
+        self.there = SolverUpdate()
         self.requests: list[SolveRequest] = []
         self.tasks: list[Task] = []
 
     def hand_over(self, *, solved: Solution | None = None, flat: Solution | None = None, **missing: str) -> None:
-        self.there = SolverStep(solved or self.there.solution, flat or self.there.flat, missing)
+        self.there = SolverUpdate(solved or self.there.solution, flat or self.there.flat, missing)
 
     def post(self, request: SolveRequest) -> None:
         self.requests.append(request)
 
-    def news(self) -> SolverStep:
+    def news(self) -> SolverUpdate:
         return self.there
 
     def do(self, task: Task) -> None:
@@ -132,12 +132,12 @@ class FakePanels(PanelSink):
 class FakeParts:
     """`SolverParts` whose steps are a test's own function."""
 
-    def __init__(self, step: Callable[[SolveRequest], SolverStep], stage_ms: dict[str, float] | None = None) -> None:
+    def __init__(self, step: Callable[[SolveRequest], SolverUpdate], stage_ms: dict[str, float] | None = None) -> None:
         self.behave, self.stage_ms = step, stage_ms or {}
         self.asked: list[SolveRequest] = []
         self.closed = 0  # times
 
-    def step(self, request: SolveRequest) -> SolverStep:
+    def step(self, request: SolveRequest) -> SolverUpdate:
         self.asked.append(request)
         return self.behave(request)
 

@@ -19,7 +19,7 @@ from runtime.frame.solver_host import Task
 from runtime.model.predictor import Predictor
 from runtime.optics.alignment import align, shown_layers
 from runtime.optics.carried import carried_db
-from runtime.plan.drawing import drawn_for, retina_pictures
+from runtime.plan.drawing import drawn_job, retina_pictures
 from runtime.records import PanelFrame, RefreshAccount, SensorFrame, Solution, State
 from runtime.support.background import wait_for_all
 from tests.frame.conftest import SMALL
@@ -64,7 +64,7 @@ class Drawing(FakeSolver):
 @pytest.fixture
 def solved(predictor: Predictor, content: Any) -> Solution:
     """A real solution for `EYES`."""
-    layers = predictor.solve(drawn_for(predictor, content, EYES, time_ns=0)).layers.copy()
+    layers = predictor.solve(drawn_job(predictor, content, EYES, time_ns=0)).layers.copy()
     return Solution(1, layers, EYES, 0)
 
 

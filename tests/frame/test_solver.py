@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,9 +15,9 @@ from runtime.content.registry import open_content
 from runtime.errors import ContentFailure, ModelFailure
 from runtime.eyes.calibration import load_calibration
 from runtime.frame.run_state import RunCell
-from runtime.frame.solver import Solver, SolverStep
+from runtime.frame.solver import Solver, SolverUpdate
 from runtime.model.predictor import Predictor
-from runtime.plan.drawing import drawn_for
+from runtime.plan.drawing import drawn_job
 from runtime.records import SolveRequest
 from tests.frame.conftest import SMALL
 from tests.frame.fakes import EYES, aside
@@ -50,8 +51,8 @@ def test_the_flat_picture_is_for_eyes_anywhere_and_equal_along_every_ray(cell: R
 def test_a_solution_is_the_model_s_answer_to_the_content_s_pictures(solver: Solver, cell: RunCell) -> None:
     state = cell.state
     solution = solver.step(wish(time_ns=77)).solution
-    job = drawn_for(state.predictor, state.content, EYES, time_ns=77, trimmed=True, eye_sigma_mm=solution.eye_sigma_mm)
-    layers = state.predictor.solve(job).layers
+    job = drawn_job(state.predictor, state.content, EYES, time_ns=77, trimmed=True)
+    layers = state.predictor.solve(replace(job, eye_sigma_m=solution.eye_sigma_m)).layers
     assert np.array_equal(solution.layers, layers)
     assert np.array_equal(solution.solved_for_m, EYES)
     assert solution.solved_for_ns == 77
@@ -79,7 +80,7 @@ def test_a_solution_that_is_held_never_changes_whatever_is_solved_after_it(solve
 
 def test_the_same_eyes_and_content_are_not_solved_for_twice(solver: Solver) -> None:
     assert solver.step(wish()).solution is not None
-    assert solver.step(wish(time_ns=NS_PER_S)) == SolverStep()
+    assert solver.step(wish(time_ns=NS_PER_S)) == SolverUpdate()
     assert solver.step(wish(aside(0.001))).solution is not None
 
 
@@ -89,7 +90,7 @@ def test_another_state_is_solved_for_with_its_own_parts(solver: Solver, cell: Ru
     cell.replace(content=other)
     second = solver.step(wish()).solution
     assert not np.array_equal(first.layers, second.layers)
-    assert solver.step(wish()) == SolverStep()
+    assert solver.step(wish()) == SolverUpdate()
     other.close()
 
 
@@ -102,8 +103,8 @@ def test_content_that_moves_is_solved_for_at_its_instant(solver: Solver, cell: R
 
 
 def test_less_certain_eyes_get_a_more_tolerant_solution(solver: Solver) -> None:
-    sigmas = [solver.step(wish(aside(k / 100), sigma_m=k / 1000)).solution.eye_sigma_mm for k in range(4)]
-    assert sigmas == pytest.approx([0.0, 1.0, 2.0, 3.0]), "the tracker's alone"
+    sigmas = [solver.step(wish(aside(k / 100), sigma_m=k / 1000)).solution.eye_sigma_m for k in range(4)]
+    assert sigmas == pytest.approx([0.0, 0.001, 0.002, 0.003]), "the tracker's alone"
 
 
 def test_after_its_budget_no_further_step_begins_but_on_a_simulated_clock(cell: RunCell, solver: Solver) -> None:

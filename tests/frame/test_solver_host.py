@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from runtime.clock import NS_PER_MS, SimulatedClock
-from runtime.frame.solver import SolverStep
+from runtime.frame.solver import SolverUpdate
 from runtime.frame.solver_host import SimulatedSolver
 from runtime.records import SolveRequest
 from tests.frame.fakes import FakeParts, aside, solution
@@ -28,11 +28,11 @@ class Solving:
     def __init__(self) -> None:
         self.number = 0
 
-    def __call__(self, request: SolveRequest) -> SolverStep:
+    def __call__(self, request: SolveRequest) -> SolverUpdate:
         self.number += 1
         if request.eyes_m is None:
-            return SolverStep(flat=solution(self.number, None, time_ns=request.time_ns))
-        return SolverStep(solution=solution(self.number, request.eyes_m, time_ns=request.time_ns))
+            return SolverUpdate(flat=solution(self.number, None, time_ns=request.time_ns))
+        return SolverUpdate(solution=solution(self.number, request.eyes_m, time_ns=request.time_ns))
 
 
 @pytest.fixture
@@ -107,7 +107,7 @@ def test_a_flat_picture_costs_its_drawing_alone(host: SimulatedSolver, clock: Si
 
 
 def test_where_there_is_nothing_to_do_no_time_passes(clock: SimulatedClock) -> None:
-    parts = FakeParts(lambda request: SolverStep(), COST_MS)
+    parts = FakeParts(lambda request: SolverUpdate(), COST_MS)
     host = SimulatedSolver(parts, clock)
     host.post(wish(1))
     host.post(wish(2))
@@ -121,7 +121,7 @@ def test_what_failed_is_told_and_the_last_solution_stays(
     host.post(wish(1))
     clock.advance_ns(SUM_NS)
     good = host.news().solution
-    parts.behave = lambda request: SolverStep(missing={"model": "out of memory"})
+    parts.behave = lambda request: SolverUpdate(missing={"model": "out of memory"})
     host.post(wish(2))
     assert host.news().missing == {"model": "out of memory"}
     assert host.news().solution is good

@@ -13,7 +13,7 @@ import pytest
 
 from runtime.clock import NS_PER_S, MonotonicClock, SimulatedClock
 from runtime.errors import ContextLost, FatalError, InputError
-from runtime.frame.solver import SolverStep
+from runtime.frame.solver import SolverUpdate
 from runtime.frame.solver_thread import ABANDON_S, ABANDONED_MAX, LATE_S, SolverThread
 from runtime.records import SolveRequest
 from runtime.report.pairs import Painter
@@ -24,16 +24,16 @@ from tests.waiting import eventually
 
 PATIENCE_S = 20.0  # of a test with another thread, on a busy machine
 
-Behaviour = Callable[[SolveRequest], SolverStep]
+Behaviour = Callable[[SolveRequest], SolverUpdate]
 
 
 def wish(number: int) -> SolveRequest:
     return SolveRequest(number, aside(number / 1000), "predicted", 0.001, flat_wanted=False)
 
 
-def solves(request: SolveRequest) -> SolverStep:
+def solves(request: SolveRequest) -> SolverUpdate:
     made = solution(request.time_ns + 1, request.eyes_m, time_ns=request.time_ns, stage_ms={"inference": 20.0})
-    return SolverStep(solution=made)
+    return SolverUpdate(solution=made)
 
 
 class Workshop:
@@ -62,19 +62,19 @@ class Workshop:
         self.made.put(parts)
         return parts
 
-    def _step(self, request: SolveRequest) -> SolverStep:
+    def _step(self, request: SolveRequest) -> SolverUpdate:
         if request.eyes_m is None:
-            return SolverStep(flat=solution(1, None))
+            return SolverUpdate(flat=solution(1, None))
         self.begun.put(request)
         return self.behave(request)
 
-    def hang(self, request: SolveRequest) -> SolverStep:
+    def hang(self, request: SolveRequest) -> SolverUpdate:
         """A step that returns when its gate is opened; what it made is number 99."""
         gate = threading.Event()
         self.hung.append(threading.current_thread())
         self.gates.append(gate)
         assert gate.wait(PATIENCE_S)
-        return SolverStep(solution=solution(99))
+        return SolverUpdate(solution=solution(99))
 
     def post(self, number: int) -> None:
         """Ask, and wait until the step has begun."""
@@ -156,7 +156,7 @@ def test_what_can_t_be_made_is_raised_to_who_waits_for_it() -> None:
 
 def test_waiting_for_a_solver_that_is_never_ready_can_be_ended() -> None:
     gate = threading.Event()
-    made: Any = lambda: FakeParts(lambda _: SolverStep()) if gate.wait(PATIENCE_S) else None  # noqa: E731
+    made: Any = lambda: FakeParts(lambda _: SolverUpdate()) if gate.wait(PATIENCE_S) else None  # noqa: E731
     host = SolverThread(made, MonotonicClock())
     with pytest.raises(FatalError, match=r"not ready after 0\.2 s"):
         host.wait_ready(max_s=0.2)
@@ -203,7 +203,7 @@ def test_what_is_late_is_reported_in_milliseconds_while_the_last_solution_stays(
 
 
 def test_one_late_step_is_no_fault_and_several_in_a_row_are(shop: Workshop) -> None:
-    def slow(request: SolveRequest) -> SolverStep:
+    def slow(request: SolveRequest) -> SolverUpdate:
         shop.clock.advance_ns(round(1.5 * LATE_S * NS_PER_S))
         return solves(request)
 
@@ -265,7 +265,7 @@ def test_a_step_that_raises_is_reported_and_the_solver_remade(shop: Workshop) ->
     """`Solver.step` answers with what is missing; what is raised beside it must not end solving silently."""
     shop.solve(1)
 
-    def fail(request: SolveRequest) -> SolverStep:
+    def fail(request: SolveRequest) -> SolverUpdate:
         raise RuntimeError("a bug in the budget")
 
     shop.behave = fail
@@ -283,7 +283,7 @@ def test_a_step_that_raises_is_reported_and_the_solver_remade(shop: Workshop) ->
 def test_memory_of_a_solver_that_ended_goes_back_to_the_system(shop: Workshop) -> None:
     keep_freed_memory()
 
-    def fail(request: SolveRequest) -> SolverStep:
+    def fail(request: SolveRequest) -> SolverUpdate:
         blocks = [np.ones(1 << 20) for _ in range(48)]  # of 8 MiB, as pictures are; malloc keeps what was freed
         held.append(blocks.pop())
         raise ContextLost("the panels have lost their OpenGL context")
@@ -340,7 +340,7 @@ def test_tasks_behind_a_hung_step_are_done_by_the_new_solver(shop: Workshop) -> 
 def test_making_it_anew_may_take_as_long_as_at_the_start(shop: Workshop, monkeypatch: pytest.MonkeyPatch) -> None:
     """Content of two minutes was begun again every ten seconds, for ever, each time on one more thread."""
 
-    def fail(request: SolveRequest) -> SolverStep:
+    def fail(request: SolveRequest) -> SolverUpdate:
         raise RuntimeError("its context was lost")
 
     shop.behave = fail
@@ -396,7 +396,7 @@ def test_where_no_thread_can_be_started_what_hangs_is_left_behind_later(
 def test_a_stop_ends_a_step_between_two_drawings(shop: Workshop) -> None:
     drawn = 0
 
-    def draws(request: SolveRequest) -> SolverStep:
+    def draws(request: SolveRequest) -> SolverUpdate:
         nonlocal drawn
         with Painter("demo", STACK) as painter:
             while drawn < 3000:

@@ -70,7 +70,7 @@ class Collector:
         if solution is not None and solution.number != self._solution:
             self._solution = solution.number
             codes = solution.layers[..., :3].astype(np.float64)
-            told["solution_sigma_mm"] = solution.eye_sigma_mm
+            told["solution_sigma_mm"] = None if solution.eye_sigma_m is None else solution.eye_sigma_m * 1e3
             told["solution_for_ns"] = solution.solved_for_ns
             told["layer_mean"] = codes.mean(axis=(1, 2)).round(3)
             told["layer_std"] = codes.std(axis=(1, 2)).round(3)

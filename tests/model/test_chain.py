@@ -43,7 +43,7 @@ def test_sigma_moves_the_outer_panels_as_a_displaced_eye_does() -> None:
         there, back = relative_scale_shift(frame.middle_m, from_x_m=x_m, to_x_m=frame.x_m)
         return raster_from_plane @ np.append((at[:2] * here + shift) * there + back, 1.0)
 
-    columns, rows, own = frame.eye_sigma_px(STACK, eye_sigma_mm=2.0)
+    columns, rows, own = frame.eye_sigma_px(STACK, eye_sigma_m=2e-3)
     aside = on(frame.middle_m + np.array([0, 2e-3, 0]), STACK.x_m[2]) - on(frame.middle_m, STACK.x_m[2])
     above = on(frame.middle_m + np.array([0, 0, 2e-3]), STACK.x_m[2]) - on(frame.middle_m, STACK.x_m[2])
     assert abs(aside[0]) == pytest.approx(columns, rel=1e-4) and abs(above[0]) < 1e-6
@@ -205,7 +205,7 @@ def test_where_the_origin_lies_along_x_changes_nothing() -> None:
     assert (there.cells, there.rows) == (here.cells, here.rows)
     np.testing.assert_allclose(there.plane_from_raster, here.plane_from_raster, atol=1e-12)
     np.testing.assert_allclose(
-        there.eye_sigma_px(moved, eye_sigma_mm=2.0), here.eye_sigma_px(STACK, eye_sigma_mm=2.0), rtol=1e-6
+        there.eye_sigma_px(moved, eye_sigma_m=2e-3), here.eye_sigma_px(STACK, eye_sigma_m=2e-3), rtol=1e-6
     )
 
 

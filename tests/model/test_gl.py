@@ -16,11 +16,11 @@ from runtime.evaluation.displayed import displayed, expected_db
 from runtime.model.backends import choose
 from runtime.model.gl.backend import GlBackend
 from runtime.model.gl.state import GlState
-from runtime.model.job import Job, Part
+from runtime.model.job import Job, SolveWindow, Targets, drawn_job
 from runtime.model.predictor import SHIPPED, Predictor, load_predictor
 from runtime.model.solver import StepPredictor
-from runtime.model.still import solve_still
-from runtime.model.trim import Savings, Scene, trim
+from runtime.model.still import captured_views
+from runtime.model.trim import trim
 from runtime.optics.carried import light_psnrs_db
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, Tilt
@@ -35,7 +35,7 @@ TILT = Tilt(((0.001, 0.012, -0.006), (0.0, 0.0, 0.0), (-0.002, 0.004, 0.015)), (
 WITHIN_ONE = 0.85  # of all codes: where hardly any slope is left, a step makes much of a last digit
 UNSURE_MM = 24.0  # pixels are eight times those of 1920x1080: as many of them as 3 mm are there
 LEAST_DB = -0.05  # of displayed quality, against the processor
-PART = Part(PixelRect(40, 24, 200, 135), PixelRect(60, 34, 190, 130), (40.0, 10.0))
+WINDOW = SolveWindow(PixelRect(40, 24, 200, 135), PixelRect(60, 34, 190, 130), (40.0, 10.0))
 HALF_TURN = np.radians(30)
 POSES = {
     "straight": eyes(0.6),
@@ -86,15 +86,16 @@ def layers_of(
     fov_deg: float = FOV_DEG,
     changed: Callable[[Job], Job] = lambda job: job,
 ) -> U8:
-    how: Any = {"eyes_m": pair, "fov_deg": fov_deg, "eye_sigma_mm": sigma_mm, "changed": changed}
-    layers: U8 = solve_still(*pictures, predictor=predictor, **how).layers.copy()
+    views = captured_views(pictures, pair, predictor.stack, fov_deg=fov_deg)
+    job = changed(Job(Targets(predictor.stack, pair, views), eye_sigma_m=sigma_mm / 1e3))
+    layers: U8 = predictor.solve(job).layers.copy()
     return layers
 
 
-def drawn(predictor: Predictor, pictures: tuple[U8, U8], pair: F64, part: Part | None = None) -> U8:
+def drawn(predictor: Predictor, pictures: tuple[U8, U8], pair: F64, window: SolveWindow | None = None) -> U8:
     """Layers for pictures that lie on the middle panel's pixels."""
-    rgba = [[np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA), np.uint8)] for picture in pictures]
-    layers: U8 = predictor.solve(Job(rgba, pair, part=part)).layers.copy()
+    rgba = [np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA), np.uint8) for picture in pictures]
+    layers: U8 = predictor.solve(replace(drawn_job(rgba, pair, predictor.stack), window=window)).layers.copy()
     return layers
 
 
@@ -130,14 +131,14 @@ def test_codes_on_tilted_panels(pose: str, gl: GlBackend) -> None:
 
 
 @pytest.mark.parametrize("channels", [1, 3])
-@pytest.mark.parametrize("part", [None, PART, replace(PART, colour=(200, 200, 200))])
-def test_codes_of_what_is_drawn_whole_or_in_part(part: Part | None, channels: int, gl: GlBackend) -> None:
+@pytest.mark.parametrize("window", [None, WINDOW, replace(WINDOW, colour=(200, 200, 200))])
+def test_codes_of_what_is_drawn_whole_or_in_part(window: SolveWindow | None, channels: int, gl: GlBackend) -> None:
     pair = eyes(0.6)
     grey = cards(pair, STACK, grey=channels == 1)
-    found = [drawn(predictor, grey, pair, part) for predictor in both("balanced", STACK, gl)]
+    found = [drawn(predictor, grey, pair, window) for predictor in both("balanced", STACK, gl)]
     assert within_one(*found) >= WITHIN_ONE
     own = [
-        layers_of(predictor, grey, pair, changed=lambda job: replace(job, part=part, channels=channels))
+        layers_of(predictor, grey, pair, changed=lambda job: replace(job, window=window, channels=channels))
         for predictor in both("balanced", STACK, gl)
     ]
     assert within_one(*own) >= WITHIN_ONE
@@ -151,15 +152,10 @@ def test_windows_of_the_plan(gl: GlBackend) -> None:
         picture[110:150, 220 + shift : 260 + shift] = np.random.default_rng(0).integers(0, 200, (40, 40, 3))
     layers = []
     for predictor in both("balanced", stack, gl):
-        found: list[Savings] = []
-
-        def trimmed(job: Job, found: list[Savings] = found) -> Job:
-            job, savings = trim(job, Scene(stack))
-            found.append(savings)
-            return job
-
-        layers.append(layers_of(predictor, (pictures[0], pictures[1]), eyes(0.6), changed=trimmed))
-        assert 0 < found[0].solved_share < 1
+        views = captured_views(pictures, eyes(0.6), stack, fov_deg=FOV_DEG)
+        prediction = predictor.solve(trim(Job(Targets(stack, eyes(0.6), views))))
+        layers.append(prediction.layers)
+        assert 0 < prediction.savings.solved_share < 1
     assert within_one(*layers) >= WITHIN_ONE
 
 
@@ -266,12 +262,13 @@ def test_nothing_grows_while_a_viewer_walks(gl: GlBackend) -> None:
     places = [eyes(0.5 + 0.01 * step, 0.02 * step, roll_deg=2.0 * step) for step in range(8)]
     for pair in places:
         layers_of(opengl, cards(pair, STACK), pair, sigma_mm=3.0)
-    assert isinstance(opengl._state, GlState)
-    held = len(opengl._state._textures)
+    (state, _), *_ = opengl._rasters.values()
+    assert isinstance(state, GlState)
+    held = len(state._textures)
     targets = len(gl.passes._targets)
     for pair in reversed(places):
         layers_of(opengl, cards(pair, STACK), pair, sigma_mm=3.0)
-    assert len(opengl._state._textures) == held
+    assert len(state._textures) == held
     assert len(gl.passes._targets) == targets
     opengl.close()
     assert len(gl.passes._targets) < targets

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from runtime import kernels
 from runtime.config import ModelSettings
 from runtime.errors import EyesNotServed, ModelFailure
 from runtime.model.geometry import visible_boxes
-from runtime.model.job import Job
+from runtime.model.job import drawn_job
 from runtime.model.predictor import load_predictor
 from runtime.model.sart import SartPredictor
 from runtime.model.still import solve_still
@@ -84,7 +85,7 @@ def test_equal_pictures_on_the_centre_panel_leave_the_outer_panels_even() -> Non
     predictor = load_predictor("balanced", STACK, ModelSettings(threads=1))
     picture = np.full((270, 480, 4), 255, np.uint8)
     picture[..., :3] = np.random.default_rng(0).integers(0, 255, (270, 480, 3))
-    layers = predictor.solve(Job([[picture], [picture]], eyes(0.6))).layers
+    layers = predictor.solve(drawn_job([picture, picture], eyes(0.6), STACK)).layers
     assert np.abs(layers[[0, 2], ..., :3].astype(int) - 128).max() <= 1
 
 
@@ -129,7 +130,7 @@ def test_eyes_behind_each_other_are_a_passing_model_failure() -> None:
     predictor = load_predictor("fast", STACK)
     grey = np.full((270, 480, 4), 128, np.uint8)
     with pytest.raises(EyesNotServed, match="not beside each other") as caught:
-        predictor.solve(Job([[grey], [grey]], np.array([[0.6, 0.0, 0.0], [0.66, 0.0, 0.0]])))
+        predictor.solve(drawn_job([grey, grey], np.array([[0.6, 0.0, 0.0], [0.66, 0.0, 0.0]]), STACK))
     assert isinstance(caught.value, ModelFailure)
 
 
@@ -138,7 +139,7 @@ def test_an_eye_sigma_that_is_no_number_is_a_model_failure() -> None:
     grey = np.full((270, 480, 4), 128, np.uint8)
     for sigma_mm in (np.nan, np.inf):
         with pytest.raises(ModelFailure):
-            predictor.solve(Job([[grey], [grey]], eyes(0.6), eye_sigma_mm=sigma_mm))
+            predictor.solve(replace(drawn_job([grey, grey], eyes(0.6), STACK), eye_sigma_m=sigma_mm / 1e3))
 
 
 def test_one_eye_that_stands_for_both_is_served() -> None:

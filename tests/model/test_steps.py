@@ -17,15 +17,13 @@ from runtime.config import ModelSettings
 from runtime.errors import MissingPart
 from runtime.model.contract import Places, Step
 from runtime.model.cpu import CpuState
-from runtime.model.geometry import geometry_of
-from runtime.model.job import Job, Own
+from runtime.model.job import Job, Targets, drawn_job, drawn_views
 from runtime.model.predictor import load_predictor, steps_from_even
 from runtime.model.solver import StepPredictor
-from runtime.model.still import solve_still
+from runtime.model.still import captured_views, solve_still
 from runtime.model.targets import FULL, SUBCODE, rest_of, target_table
 from runtime.optics.carried import light_psnrs_db
 from runtime.optics.stack import PanelStack, Tilt
-from runtime.optics.views import image_from_stack
 from runtime.records import F64, U8
 from tests.model.scenes import FOV_DEG, card_scene, eyes
 
@@ -59,12 +57,9 @@ def smooth(seed: int, channels: int) -> U8:
 def begun(stack: PanelStack, pair: F64, *, own: bool, channels: int = 3, threads: int = 2) -> tuple[CpuState, Job, Any]:
     """A state with random panels, and what it was begun for."""
     pictures = [smooth(seed, channels) for seed in (8, 9)]
-    drawn: Any = [[cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA)] for picture in pictures]
-    job = Job(drawn, pair, channels=channels, eye_sigma_mm=5.0)
-    if own:
-        at = [image_from_stack(eye, width_px=480, height_px=270, fov_deg=FOV_DEG) for eye in pair]
-        job = replace(job, own=Own(pictures, np.stack(at)))
-    state, geometry = CpuState(stack, threads=threads), geometry_of(job, stack)
+    views = captured_views(pictures, pair, stack, fov_deg=FOV_DEG) if own else drawn_views(pictures, stack)
+    job = Job(Targets(stack, pair, views), channels=channels, eye_sigma_m=5e-3)
+    state, geometry = CpuState(stack, threads=threads), job.targets.visible
     state.begin(job, geometry)
     for n, box in enumerate(geometry.boxes):
         panel = cv2.resize(smooth(n, channels), (box.width_px, box.height_px)).astype(np.int16) * SUBCODE
@@ -94,13 +89,13 @@ def test_steps_are_the_references(stack: str, pair: str, channels: int) -> None:
         last[n, :, : panel.shape[0], : panel.shape[1]] = torch.from_numpy(panel.astype(np.float64) / FULL).movedim(
             -1, 0
         )
-    pictures = job.own.pictures if job.own else [images[0] for images in job.pictures]
+    pictures = [view.pixels for view in job.views]
     targets = torch.from_numpy(np.stack([p[rays.slices][..., :channels] for p in pictures]) / 255.0).movedim(-1, 1)
     ahead = last
     alike = len({(box.width_px, box.height_px) for box in boxes}) == 1
     sequence: tuple[tuple[float, Places], ...] = ((1.6, "middle"), (1.2, "rising"))
     for size, places in sequence:
-        seen = geometry.panels_from_rays(places, job.eye_sigma_mm)
+        seen = geometry.panels_from_rays(places, job.eye_sigma_m)
         views = Views(torch.from_numpy(seen), rays.width_px, rays.height_px * 2 // len(seen))
         last, ahead = step(last, ahead, targets, views, size=size, momentum=0.5)
         state.step(Step(size=size, momentum=0.5, places=places))
@@ -138,10 +133,12 @@ def test_the_middle_panel_closes_on_one_eye_s_target(stack: str) -> None:
     middle, count = geometry.middle, STACKS[stack].count
     for n, box in enumerate(geometry.boxes):
         state.set_panel(n, np.full((box.height_px, box.width_px, 3), rest_of(count), np.int16))
-    same = replace(job, pictures=[job.pictures[0], job.pictures[0]])
+    same = replace(job, targets=replace(job.targets, views=(job.views[0], job.views[0])))
     state.begin(same, geometry)
     state.close_middle()
-    wanted = target_table(count)[:, 0][job.arrays[0][0][geometry.rays.slices][..., :3]] - (count - 1) * rest_of(count)
+    wanted = target_table(count)[:, 0][job.views[0].pixels[geometry.rays.slices][..., :3]] - (count - 1) * rest_of(
+        count
+    )
     off = np.abs(panels_of(state, geometry, 3)[middle] - np.clip(wanted, 0, FULL))
     assert np.median(off) <= 3
     assert off.max() <= 32  # of rays that miss a panel, which weigh little in 16 bits
@@ -152,8 +149,8 @@ def test_a_ray_that_misses_a_panel_leaves_a_pixel_to_the_other_eye() -> None:
     for n, box in enumerate(geometry.boxes):
         state.set_panel(n, np.full((box.height_px, box.width_px, 3), rest_of(3), np.int16))
     codes = 90, 160
-    plain = [[np.full_like(images[0], code)] for images, code in zip(job.pictures, codes, strict=True)]
-    state.begin(replace(job, pictures=plain), geometry)
+    plain = [np.full_like(view.pixels, code) for view, code in zip(job.views, codes, strict=True)]
+    state.begin(replace(job, targets=replace(job.targets, views=drawn_views(plain, STACK))), geometry)
     state.close_middle()
     rays, found = geometry.rays, panels_of(state, geometry, 3)[geometry.middle][..., 0]
     at = np.stack([*np.meshgrid(np.arange(rays.width_px) + 0.5, np.arange(rays.height_px) + 0.5), np.ones(found.shape)])
@@ -187,13 +184,11 @@ def test_every_step_makes_light_better(stack: PanelStack, sigma_mm: float) -> No
     pair, found_db = eyes(0.6, 0.05, 0.1), []
     pictures = [card_scene(eye) for eye in pair]
     solver = load_predictor("best", stack, ModelSettings(threads=2))
-    assert isinstance(solver, StepPredictor)
-    steps = solver._steps
-    for count in (0, 1, 3, len(steps)):
-        solver._steps = steps[:count]
-        how: Any = {"eyes_m": pair, "fov_deg": FOV_DEG}
-        layers = solve_still(*pictures, **how, predictor=solver, eye_sigma_mm=sigma_mm).layers
-        found_db.append(light_psnrs_db(layers, pictures, stack, **how, sigmas_mm=[sigma_mm])[sigma_mm])
+    job = Job(Targets(stack, pair, captured_views(pictures, pair, stack, fov_deg=FOV_DEG)), eye_sigma_m=sigma_mm / 1e3)
+    for count in (0, 1, 3, solver.steps):
+        layers = solver.solve(replace(job, steps=count)).layers
+        light_db = light_psnrs_db(layers, pictures, stack, eyes_m=pair, fov_deg=FOV_DEG, sigmas_mm=[sigma_mm])
+        found_db.append(light_db[sigma_mm])
     assert found_db == sorted(found_db)
     assert found_db[-1] > found_db[0] + 2
 
@@ -211,8 +206,9 @@ def test_panels_that_begin_even_show_both_eyes_a_picture(stack: str) -> None:
 def test_equal_grey_pictures_and_panels_that_show_them_stay() -> None:
     pair = eyes(0.6)
     grey = np.full((270, 480, 4), 128, np.uint8)
-    state, geometry = CpuState(STACK, threads=1), geometry_of(Job([[grey], [grey]], pair), STACK)
-    state.begin(Job([[grey], [grey]], pair), geometry)
+    job = drawn_job([grey, grey], pair, STACK)
+    state, geometry = CpuState(STACK, threads=1), job.targets.visible
+    state.begin(job, geometry)
     state.close_middle()
     state.start()
     before = [panel.copy() for panel in panels_of(state, geometry, 3)]

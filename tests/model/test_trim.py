@@ -14,7 +14,7 @@ from runtime.model.trim import (
     steepness,
     steepness_beside,
     still_fits,
-    wave_steps,
+    taper_parallaxes,
     whole_rays,
     window_around,
 )
@@ -78,7 +78,7 @@ def test_the_margin_is_the_parallax_of_the_outer_panels() -> None:
 def test_a_window_holds_the_difference_and_its_room_or_is_whole(x: float, y: float, z: float, u: int, v: int) -> None:
     eyes = np.array([[x, y - 0.03, z], [x, y + 0.03, z]])
     box = PixelRect(u, v, u + 30, v + 20)
-    held = window_around(box, eyes, STACK, steps=14.0)
+    held = window_around(box, eyes, STACK, parallaxes=14.0)
     if held is None:
         return
     inner = whole_rays(held, eyes, STACK)
@@ -92,7 +92,7 @@ def test_a_window_holds_the_difference_and_its_room_or_is_whole(x: float, y: flo
 def test_windows_have_few_sizes() -> None:
     sizes = set()
     for width in range(5, 200, 3):
-        window = window_around(PixelRect(400, 200, 400 + width, 240), EYES, STACK, steps=14.0)
+        window = window_around(PixelRect(400, 200, 400 + width, 240), EYES, STACK, parallaxes=14.0)
         assert window is not None
         sizes.add(window.width_px)
     assert len(sizes) <= 5
@@ -113,7 +113,7 @@ def test_a_phase_s_error_shows_most_before_mid_grey() -> None:
 
 def test_before_white_a_window_is_smaller_than_before_grey() -> None:
     box = PixelRect(400, 200, 440, 240)
-    white, grey = (window_around(box, EYES, STACK, steps=wave_steps(steep)) for steep in (0.0, 1.0))
+    white, grey = (window_around(box, EYES, STACK, parallaxes=taper_parallaxes(steep)) for steep in (0.0, 1.0))
     assert white is not None
     assert grey is not None
     assert white.width_px < 0.7 * grey.width_px

@@ -21,7 +21,7 @@ from model_export.validate import check_model, validate_file  # noqa: E402
 from runtime.commands.app import app  # noqa: E402
 from runtime.errors import InputError  # noqa: E402
 from runtime.model.contract import Contract, Port  # noqa: E402
-from runtime.model.job import Job  # noqa: E402
+from runtime.model.job import drawn_job  # noqa: E402
 from runtime.model.predictor import SHIPPED, load_predictor, model_path  # noqa: E402
 from runtime.model.still import solve_still  # noqa: E402
 from runtime.optics.stack import PanelStack  # noqa: E402
@@ -73,9 +73,9 @@ def test_the_eye_that_the_data_had_first_gets_the_first_channels(tmp_path: Path)
     layers = {}
     for order in ("left-right", "right-left"):
         predictor = load_predictor(str(exported(narrow_eyereal(tmp_path), eye_order=order)), STACK)
-        rgba = [[np.dstack([p, p[..., :1]])] * 3 for p in pictures]
-        layers[order] = predictor.solve(Job(rgba, EYES)).layers.copy()
-        layers[f"{order} swapped"] = predictor.solve(Job(rgba[::-1], EYES[::-1])).layers.copy()
+        rgba = [np.dstack([p, p[..., :1]]) for p in pictures]
+        layers[order] = predictor.solve(drawn_job(rgba, EYES, STACK)).layers.copy()
+        layers[f"{order} swapped"] = predictor.solve(drawn_job(rgba[::-1], EYES[::-1], STACK)).layers.copy()
     assert np.array_equal(layers["left-right"], layers["right-left swapped"])
     assert not np.array_equal(layers["left-right"], layers["right-left"])
 

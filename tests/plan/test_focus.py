@@ -16,12 +16,13 @@ from runtime.content.scenes import SCENES
 from runtime.content.scenes import Scene as Things
 from runtime.evaluation.displayed import displayed
 from runtime.model.job import Job
+from runtime.model.job import drawn_job as drawn_picture_job
 from runtime.model.predictor import Predictor, load_predictor
-from runtime.model.trim import Scene, trim
+from runtime.model.trim import trim
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack, Tilt
 from runtime.optics.views import image_from_stack
-from runtime.plan.drawing import drawn_for, raster_views, retina_pictures
+from runtime.plan.drawing import drawn_job, raster_views, retina_pictures
 from runtime.plan.savings import make_plan, selected_eyes
 from runtime.records import F64, U8
 from runtime.support.gl import offscreen_context
@@ -49,9 +50,9 @@ def fast() -> Predictor:
 def trimmed(source: ProceduralSource, predictor: Predictor, eyes: F64 = EYES, *, aim: bool = True, **how: Any) -> Job:
     """aim: the content tells where it lies; else that is found in the pictures."""
     if aim:
-        return drawn_for(predictor, source, eyes, time_ns=0, trimmed=True, **how)
-    pictures = [[source.render(view, time_ns=0).copy()] for view in raster_views(eyes, STACK.panel(1))]
-    return trim(Job(pictures, eyes), Scene(STACK, **how))[0]
+        return drawn_job(predictor, source, eyes, time_ns=0, trimmed=True, **how)
+    pictures = [source.render(view, time_ns=0).copy() for view in raster_views(eyes, STACK.panel(1))]
+    return trim(drawn_picture_job(pictures, eyes, STACK), **how)
 
 
 def psnr(layers: U8, source: ProceduralSource, eyes: F64 = EYES, stack: PanelStack = STACK) -> float:
@@ -63,10 +64,10 @@ def compared(
     predictor: Predictor, source: ProceduralSource, eyes: F64 = EYES, **how: Any
 ) -> tuple[float, float, float]:
     """PSNR of the whole and of what is left of it, and how much of the panels that is."""
-    whole = psnr(predictor.solve(drawn_for(predictor, source, eyes, time_ns=0)).layers, source, eyes, predictor.stack)
+    whole = psnr(predictor.solve(drawn_job(predictor, source, eyes, time_ns=0)).layers, source, eyes, predictor.stack)
     job = trimmed(source, predictor, eyes, **how)
     part = psnr(predictor.solve(job).layers, source, eyes, predictor.stack)
-    return whole, part, job.solved_share(predictor.stack)
+    return whole, part, job.savings.solved_share
 
 
 @pytest.mark.parametrize("aim", [True, False], ids=["drawn in the window", "found in the pictures"])
@@ -84,7 +85,7 @@ def test_a_flat_scene_is_filled_in_closed_form(context: Any, fast: Predictor) ->
 
 def test_of_a_full_picture_nothing_is_left_out(context: Any, fast: Predictor) -> None:
     job = trimmed(ProceduralSource("texture", stack=STACK, context=context), fast)
-    assert job.part is None and job.channels == 3
+    assert job.window is None and job.channels == 3
 
 
 def test_nothing_remains_of_an_earlier_window(context: Any, fast: Predictor) -> None:
@@ -94,7 +95,7 @@ def test_nothing_remains_of_an_earlier_window(context: Any, fast: Predictor) -> 
         eyes = EYES + np.array([0.0, step, step / 4])
         for aim in (True, False):
             job = trimmed(source, fast, eyes, aim=aim, before=before)
-            before, layers = job.part, fast.solve(job).layers.copy()
+            before, layers = job.window, fast.solve(job).layers.copy()
             fresh = load_predictor("fast", STACK)
             assert (layers[..., :3] == fresh.solve(job).layers[..., :3]).all()
             fresh.close()
@@ -102,8 +103,8 @@ def test_nothing_remains_of_an_earlier_window(context: Any, fast: Predictor) -> 
 
 def test_a_window_that_still_holds_the_difference_is_kept(context: Any, fast: Predictor) -> None:
     source = ProceduralSource("sparse", stack=STACK, context=context)
-    first = trimmed(source, fast).part
-    second = trimmed(source, fast, EYES + np.array([0.0, 0.002, 0.0]), before=first).part
+    first = trimmed(source, fast).window
+    second = trimmed(source, fast, EYES + np.array([0.0, 0.002, 0.0]), before=first).window
     assert first is not None and second is not None and first.box == second.box
 
 
@@ -113,7 +114,7 @@ def test_there_is_no_seam(context: Any, name: str) -> None:
     source = ProceduralSource("sparse", stack=STACK, context=context, background=(0.5, 0.6, 0.7))
     predictor = load_predictor(name, STACK)
     worst, mean, quality = [], [], []
-    for job in (drawn_for(predictor, source, EYES, time_ns=0), trimmed(source, predictor)):
+    for job in (drawn_job(predictor, source, EYES, time_ns=0), trimmed(source, predictor)):
         layers = predictor.solve(job).layers.copy()
         quality.append(psnr(layers, source))
         errors = []
@@ -126,7 +127,7 @@ def test_there_is_no_seam(context: Any, name: str) -> None:
         error = np.concatenate(errors)
         worst.append(error.max())
         mean.append(np.sqrt((error**2).mean()))
-    assert job.solved_share(STACK) < 0.25
+    assert job.savings.solved_share < 0.25
     assert worst[1] < 1.1 * worst[0]
     assert mean[1] < 1.2 * mean[0]
     assert quality[1] > quality[0] - 0.25  # what the whole gains beside the object, by steps
@@ -157,7 +158,7 @@ def test_one_eye_alone_costs_no_inference(context: Any, fast: Predictor) -> None
     assert plan.eyes == (True, False)
     eyes = selected_eyes(aside, plan.eyes)
     job = trimmed(source, fast, eyes, aim=False)
-    assert job.solved_share(STACK) == 0.0
+    assert job.savings.solved_share == 0.0
     assert psnr(fast.solve(job).layers, source, eyes) > 25
 
 
@@ -167,7 +168,7 @@ def test_grey_windows_are_solved_in_one_channel(context: Any) -> None:
     )
     predictor = load_predictor("balanced", STACK)
     job = trimmed(source, predictor)
-    assert job.channels == 1 and job.solved_share(STACK) < 0.3
+    assert job.channels == 1 and job.savings.solved_share < 0.3
     layers = predictor.solve(job).layers.astype(np.int16)
     difference = np.abs(layers - predictor.solve(replace(job, channels=3)).layers)
     assert difference.max() <= 2
@@ -177,19 +178,19 @@ def test_grey_windows_are_solved_in_one_channel(context: Any) -> None:
 def test_models_that_can_t_be_cut_are_left_whole(context: Any) -> None:
     stack = replace(STACK, width_px=192, height_px=108)
     sart = load_predictor("sart", stack, ModelSettings())
-    assert trimmed(ProceduralSource("sparse", stack=stack, context=context), sart).part is None
+    assert trimmed(ProceduralSource("sparse", stack=stack, context=context), sart).window is None
 
 
 def test_after_the_deadline_no_further_step_begins(context: Any, fast: Predictor) -> None:
     """What there is by then is shown: less than all, more than nothing."""
     source = ProceduralSource("texture", stack=STACK, context=context)
-    job = drawn_for(fast, source, EYES, time_ns=0)
+    job = drawn_job(fast, source, EYES, time_ns=0)
     layers, steps = [], []
     for at in (0, 1 << 62, None):
         solved = fast.solve(replace(job, deadline_ns=at))
         layers.append(solved.layers.copy())
         steps.append(solved.steps)
-    assert steps[0] == 1 < steps[1] == steps[2]
+    assert steps[0] == 0 < steps[1] == steps[2]
     shown = [psnr(one, source) for one in layers]
     assert shown[0] < shown[1] - 0.5
     assert shown[1] == shown[2]

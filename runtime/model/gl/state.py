@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -15,16 +16,25 @@ import moderngl
 import numpy as np
 
 from runtime.errors import InputError
+from runtime.model.buffers import LayerBuffer
 from runtime.model.contract import Step
-from runtime.model.geometry import Geometry, inverse
+from runtime.model.geometry import Geometry, TargetView, inverse
 from runtime.model.gl.programs import Image, Passes
 from runtime.model.job import Job
-from runtime.model.targets import FULL, beside_codes, rest_of, target_table
+from runtime.model.targets import FULL, outside_codes, rest_of, target_table
 from runtime.optics.stack import PanelStack
-from runtime.records import F64, I16, U8
+from runtime.records import F64, I16
 from runtime.support.gl import DrawnPicture, finish
 
 PANELS, MIDDLE = 3, 1
+
+
+@dataclass(frozen=True, slots=True)
+class _Target:
+    """What one eye should see, in a texture."""
+
+    image: Image
+    first: tuple[int, int]  # its column and row that belong to the first ray
 
 
 class GlState:
@@ -36,18 +46,17 @@ class GlState:
         self._passes, self._stack = passes, stack
         self._textures: dict[tuple[Any, ...], Any] = {}
         self._names: dict[str, str] = {}  # which of two images is which
-        self._layers = np.empty((PANELS, stack.height_px, stack.width_px, 4), np.uint8)
         self._closed = False
 
     @contextmanager
-    def begin(self, job: Job, geometry: Geometry) -> Iterator[None]:
+    def begin(self, job: Job, geometry: Geometry, *, resumed: bool = False) -> Iterator[None]:
         with self._passes.drawing():
-            self._geometry, self._channels, self._sigma_mm = geometry, job.channels, job.eye_sigma_mm
-            self._take(job)
+            self._geometry, self._channels, self._sigma_m = geometry, job.channels, job.eye_sigma_m
+            self._targets = [self._loaded(view, side) for side, view in enumerate(job.views)]
             for name, taper in zip(("column_taper", "row_taper"), geometry.tapers(), strict=True):
                 self._texture(name, (self._longest, 1), 1, dtype="f4").write(taper, viewport=(0, 0, len(taper), 1))
             held = (rest_of(PANELS) / FULL + 1) / 3
-            for n in range(PANELS):
+            for n in range(0 if resumed else PANELS):
                 self._passes.target((self._panel("last", n),)).clear(held, held, held, held)
             yield
 
@@ -67,9 +76,10 @@ class GlState:
         gathered: dict[str, Image] = {"last": self._panel("last", MIDDLE)}
         for side in (0, 1):
             weight, residual = (self._rays(f"{name}{side}") for name in ("weight", "residual"))
-            how = {"rest": 0.5, "missing": self._geometry.missing_weight}
-            targets = self._target_of(side)
-            self._draw("residual", (weight, residual), {**inputs, **targets}, {**self._through(seen[side]), **how})
+            weights = {"rest": 0.5, "missing": self._geometry.missing_weight}
+            targets = {"targets": self._targets[side].image}
+            uniforms = {**self._through(seen[side], side), **weights}
+            self._draw("residual", (weight, residual), {**inputs, **targets}, uniforms)
             gathered |= {f"weight{side}": weight, f"residual{side}": residual}
         self._draw("fill", (self._panel("spare", MIDDLE),), gathered, self._back(back[:, MIDDLE]))
         self._swap("last", "spare", MIDDLE)
@@ -78,45 +88,44 @@ class GlState:
         self._ahead = "last"  # until the first step
 
     def step(self, step: Step) -> None:
-        seen = self._geometry.panels_from_rays(step.places, self._sigma_mm)
+        seen = self._geometry.panels_from_rays(step.places, self._sigma_m)
         back, places = inverse(seen), len(seen) // 2
         ahead = {f"ahead{n}": self._panel(self._ahead, n) for n in range(PANELS)}
         tapers = {name: self._taper(name) for name in ("column_taper", "row_taper")}
         fields: dict[str, Image] = {}
         for number, matrices in enumerate(seen):
             drawn = {f"{name}{number}": self._rays(f"{name} {number}", places) for name in ("curvature", "gradient")}
-            inputs = {**ahead, **self._target_of(number % 2), **tapers}
-            how = {**self._through(matrices), "turn": (places, number // 2)}
-            self._draw("compare", tuple(drawn.values()), inputs, how)
+            inputs = {**ahead, "targets": self._targets[number % 2].image, **tapers}
+            uniforms = {**self._through(matrices, number % 2), "turn": (places, number // 2)}
+            self._draw("compare", tuple(drawn.values()), inputs, uniforms)
             fields |= drawn
-        how = {
+        update = {
             "size": step.size / (PANELS * np.pi / 2), "momentum": step.momentum, "least": step.floor * len(seen),
         }  # fmt: skip
         for n in range(PANELS):
             inputs = {"ahead": ahead[f"ahead{n}"], "last": self._panel("last", n), **fields}
             outputs = self._panel("moved", n), self._panel("spare", n)
             defines = {1: (), 2: ("FOUR_SETS",)}[places]
-            self._draw("move", outputs, inputs, {**self._back(back[:, n], places), **how}, defines=defines)
+            self._draw("move", outputs, inputs, {**self._back(back[:, n], places), **update}, defines=defines)
             self._swap("ahead", "moved", n)
             self._swap("last", "spare", n)
         self._ahead = "ahead"
 
-    def write(self, beside: int | tuple[int, ...] | None) -> U8:
+    def write(self, buffer: LayerBuffer, outside: int | tuple[int, ...] | None) -> None:
         width, height = self._stack.width_px, self._stack.height_px
-        targets = [self._texture(("layer", n), (width, height), 4, dtype="f1") for n in range(PANELS)]
-        for n, texture in enumerate(targets):
+        layers = [self._texture(("layer", n), (width, height), 4, dtype="f1") for n in range(PANELS)]
+        for n, texture in enumerate(layers):
             image, box = Image(texture, width, height), self._geometry.boxes[n]
             kept = self._geometry.kept if n == MIDDLE else box
-            if beside is not None:
-                self._passes.target((image,)).clear(*(code / 255 for code in beside_codes(PANELS, n, beside)), 1.0)
+            if outside is not None:
+                self._passes.target((image,)).clear(*(code / 255 for code in outside_codes(PANELS, n, outside)), 1.0)
             if kept.width_px and kept.height_px:
                 place = {"first": (kept.u0 - box.u0, kept.v0 - box.v0), "grey": self._channels == 1}
                 inputs = {"last": self._panel("last", n)}
                 self._draw("show", (image,), inputs, place, at=(kept.u0, kept.v0, kept.width_px, kept.height_px))
         finish()
-        for texture, layer in zip(targets, self._layers, strict=True):
+        for texture, layer in zip(layers, buffer.pixels, strict=True):
             self._passes.target((Image(texture, width, height),)).read_into(layer, components=4)
-        return self._layers
 
     def close(self) -> None:
         if not self._closed:
@@ -126,32 +135,23 @@ class GlState:
                     self._passes.forget(texture)
             self._textures = {}
 
-    def _take(self, job: Job) -> None:
-        """Both eyes' targets: where they were drawn, or uploaded."""
-        rays, box = self._geometry.rays, self._geometry.boxes[MIDDLE]
-        drawn = job.part is not None and job.part.drawn
-        first = (rays.u0 - box.u0, rays.v0 - box.v0) if drawn else (rays.u0, rays.v0)
-        self._targets = []
-        for side in (0, 1):
-            picture: Any = job.own.pictures[side] if job.own is not None else job.pictures[side][0]
-            if isinstance(picture, DrawnPicture):
-                self._targets.append((Image(picture.texture, *picture.texture.size), first))
-                continue
-            cut = picture[first[1] : first[1] + rays.height_px, first[0] : first[0] + rays.width_px]
-            rgba = cut if cut.shape[2] == 4 else cv2.cvtColor(np.ascontiguousarray(cut), cv2.COLOR_RGB2RGBA)
-            image = self._grown(f"target {side}", rays.width_px, rays.height_px, 4, "f1")
-            image.texture.write(np.ascontiguousarray(rgba), viewport=(0, 0, *image.size))
-            self._targets.append((image, (0, 0)))
+    def _loaded(self, view: TargetView, side: int) -> _Target:
+        """An eye's target: where it was drawn, or uploaded."""
+        rays = self._geometry.rays
+        if isinstance(view.picture, DrawnPicture):
+            texture = view.picture.texture
+            return _Target(Image(texture, *texture.size), (rays.u0, rays.v0))
+        seen = np.ascontiguousarray(view.picture[rays.slices])
+        rgba = seen if seen.shape[2] == 4 else cv2.cvtColor(seen, cv2.COLOR_RGB2RGBA)
+        image = self._ray_image(f"target {side}", 4, "f1")
+        image.texture.write(np.ascontiguousarray(rgba), viewport=(0, 0, *image.size))
+        return _Target(image, (0, 0))
 
-    def _target_of(self, side: int) -> dict[str, Any]:
-        image, self._targets_origin = self._targets[side]
-        return {"targets": image}
-
-    def _through(self, matrices: F64) -> dict[str, Any]:
-        found: dict[str, Any] = {"targets_origin": self._targets_origin}
+    def _through(self, matrices: F64, side: int) -> dict[str, Any]:
+        uniforms: dict[str, Any] = {"targets_origin": self._targets[side].first}
         for n, (matrix, box) in enumerate(zip(matrices, self._geometry.boxes, strict=True)):
-            found |= {f"from_rays{n}": _mat3(matrix), f"size{n}": (box.width_px, box.height_px)}
-        return found
+            uniforms |= {f"from_rays{n}": _mat3(matrix), f"size{n}": (box.width_px, box.height_px)}
+        return uniforms
 
     def _back(self, matrices: F64, places: int = 1) -> dict[str, Any]:
         rays = self._geometry.rays.width_px, self._geometry.rays.height_px // places
@@ -191,22 +191,22 @@ class GlState:
         self._names[a], self._names[b] = self._names.get(b, other), self._names.get(a, one)
 
     def _rays(self, name: str, places: int = 1) -> Image:
-        rays = self._geometry.rays
-        whole = self._grown(name, rays.width_px, rays.height_px, self._components, "nu2")
-        return Image(whole.texture, rays.width_px, rays.height_px // places)
+        """An image of one field of a set's rays."""
+        image = self._ray_image(name, self._components, "nu2")
+        return Image(image.texture, image.width_px, image.height_px // places)
 
     def _taper(self, name: str) -> Image:
         return Image(self._texture(name, (self._longest, 1), 1, dtype="f4"), self._longest, 1)
 
-    def _grown(self, name: str, width_px: int, height_px: int, components: int, dtype: str) -> Image:
-        """An image whose size follows pictures and viewer; its texture only grows."""
+    def _ray_image(self, name: str, components: int, dtype: str) -> Image:
+        """An image of all rays. Their number follows pictures and viewer; its texture only grows."""
+        width_px, height_px = self._geometry.rays.width_px, self._geometry.rays.height_px
+        size = width_px, height_px
         held = self._textures.get(key := (name, components, dtype))
         if held is not None and (held.width < width_px or held.height < height_px):
-            width_px, height_px = max(width_px, held.width), max(height_px, held.height)
+            size = max(width_px, held.width), max(height_px, held.height)
             self._passes.forget(self._textures.pop(key))
-        texture = self._texture(name, (width_px, height_px), components, dtype=dtype)
-        rays = self._geometry.rays
-        return Image(texture, rays.width_px, rays.height_px)
+        return Image(self._texture(name, size, components, dtype=dtype), width_px, height_px)
 
     def _texture(self, name: Any, size: tuple[int, int], components: int, *, dtype: str, data: Any = None) -> Any:
         key = (name, components, dtype)
