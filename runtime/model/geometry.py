@@ -145,7 +145,9 @@ def geometry_of(
     kept = kept or box
     middle_from_plane = stack.panel(stack.count // 2).raster_from_plane()
     middle_from_pictures = [_snapped(middle_from_plane @ view.plane_from_picture) for view in views]
-    rays = _looked_through([np.linalg.inv(matrix) for matrix in middle_from_pictures], kept, views[0].picture.shape)
+    rays = _looked_through(
+        [np.asarray(np.linalg.inv(m), np.float64) for m in middle_from_pictures], kept, views[0].picture.shape
+    )
     first = np.array([[1.0, 0.0, rays.u0], [0.0, 1.0, rays.v0], [0.0, 0.0, 1.0]])
     to_box = np.array([[1.0, 0.0, -box.u0], [0.0, 1.0, -box.v0], [0.0, 0.0, 1.0]])
     middle_from_rays = np.stack([to_box @ matrix @ first for matrix in middle_from_pictures])
@@ -154,9 +156,9 @@ def geometry_of(
 
 def _snapped(homography: F64) -> F64:
     """Exact where it takes pixels to pixels: sampling is then a copy."""
-    homography = homography / homography[2, 2]
-    whole = np.rint(homography)
-    return whole if np.abs(homography - whole).max() < SNAPPED else np.asarray(homography, np.float64)
+    normalised = np.asarray(homography / homography[2, 2], np.float64)
+    whole = np.rint(normalised)
+    return whole if np.abs(normalised - whole).max() < SNAPPED else normalised
 
 
 def _looked_through(pictures_from_middle: Sequence[F64], box: PixelRect, shape: tuple[int, ...]) -> PixelRect:

@@ -73,10 +73,16 @@ class PictureProposal:
         """(h, w, 3 or 4) an eye's picture on panel n's pixels, black outside the contract's field of view."""
         stack, eye_m, view, middle = self._stack, job.eyes_m[side], job.views[side], self._stack.count // 2
         rasters, size = [stack.panel(n) for n in range(stack.count)], (stack.height_px, stack.width_px)
-        middle_from_panel = np.linalg.inv(panel_from_middle(stack, rasters, eye_m, n)) if n != middle else np.eye(3)
+        panel_from_mid = panel_from_middle(stack, rasters, eye_m, n) if n != middle else np.eye(3)
         fov_deg = self.session.contract.picture_fov_deg
         edge = cv2.BORDER_CONSTANT if fov_deg else cv2.BORDER_REPLICATE
-        picture = picture_on(view, rasters[middle], middle_from_result=middle_from_panel, edge=edge, size=size)
+        picture = picture_on(
+            view,
+            rasters[middle],
+            middle_from_result=np.asarray(np.linalg.inv(panel_from_mid), np.float64),
+            edge=edge,
+            size=size,
+        )
         if not fov_deg:
             return picture
         # A white picture of that view, bilinear: its edge fades over one pixel as it did in training.

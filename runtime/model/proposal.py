@@ -119,7 +119,7 @@ class ChainProposal:
     def _target_codes(self, view: TargetView, channels: int) -> tuple[I16, F64]:
         """Target sum of all panels for each pixel, sixteenths of a code up to a constant; its picture_from_plane."""
         codes = cv2.LUT(without_alpha(view.pixels, channels), self._codes)
-        return np.asarray(codes, np.int16), np.linalg.inv(view.plane_from_picture)
+        return np.asarray(codes, np.int16), np.asarray(np.linalg.inv(view.plane_from_picture), np.float64)
 
     def _on_panel(self, n: int, answer: I16, geometry: Geometry, local: _Local, frame: ChainFrame) -> I16:
         """The network's answer for an outer panel, within its box."""

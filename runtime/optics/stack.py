@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -79,8 +79,8 @@ class PanelStack:
         """The same panels in `reduction` times fewer rows and columns, at least one."""
         if reduction == 1:
             return self
-        size = (max(1, round(px / reduction)) for px in (self.width_px, self.height_px))
-        return PanelStack(self.width_m, self.height_m, self.x_m, *size, self.tilt)
+        width_px, height_px = (max(1, round(px / reduction)) for px in (self.width_px, self.height_px))
+        return replace(self, width_px=width_px, height_px=height_px)
 
     def transposed(self) -> PanelStack:
         """The panels with rows for columns: what was down (-z) is to the right (+y), what was right is down."""

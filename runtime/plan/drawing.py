@@ -60,12 +60,14 @@ def drawn_job(
     panels' rows and columns. trimmed: leave out what the scene does not need (`trim`), also of the drawing where the
     content knows its extent. before: the window of the solution before, on the same raster.
     """
-    stack, trimmed, window = predictor.stack.reduced(reduction), trimmed and predictor.trims, None
+    stack, trimmed = predictor.stack.reduced(reduction), trimmed and predictor.trims
+    window: SolveWindow | None = None
     raster = stack.panel(stack.count // 2)
     if trimmed and content.info.background is not None:
         extent = _extent(content, eyes_m, raster, time_ns=time_ns)
         colour = tuple(round(value * 255) for value in content.info.background)
-        window = extent and extent_window(extent, colour, eyes_m, stack, before)
+        if extent is not None:
+            window = extent_window(extent, colour, eyes_m, stack, before)
     if window is not None:
         raster = window.box.cut(raster)
     views = raster_views(eyes_m, raster)

@@ -14,7 +14,7 @@ from runtime.clock import SimulatedClock
 from runtime.config import PanelSettings
 from runtime.optics.alignment import align, shown_layers
 from runtime.optics.stack import PanelStack
-from runtime.records import Layers, PanelFrame
+from runtime.records import U8, PanelFrame
 from tests.panels.drawn import DrawnPanels
 
 WIDTH, HEIGHT = 48, 32
@@ -172,13 +172,13 @@ def test_a_gamma_is_applied_to_what_is_aligned_and_mixed(context: moderngl.Conte
 def test_a_solution_is_uploaded_once_however_often_it_is_aligned_and_shown(
     sink: DrawnPanels, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    written: list[Layers] = []
+    written: list[U8] = []
     assert sink._textures is not None
     write = sink._textures._written
 
-    def noted(held: tuple[moderngl.Texture, ...], layers: Layers) -> tuple[moderngl.Texture, ...]:
+    def noted(kind: str, layers: U8) -> tuple[moderngl.Texture, ...]:
         written.append(layers)
-        return write(held, layers)
+        return write(kind, layers)
 
     monkeypatch.setattr(sink._textures, "_written", noted)
     solved, flat = smooth(1), smooth(2)
@@ -198,6 +198,27 @@ def test_a_new_solution_is_recognised_by_its_version_alone(sink: DrawnPanels) ->
     for version in (1, 2):
         sink.present(PanelFrame(version, smooth(version), version))
         assert np.array_equal(codes(sink.read_back()), codes(smooth(version)))
+
+
+@pytest.mark.parametrize("reduction", [2, 4])
+@pytest.mark.parametrize("moved_m", [0.0, 0.016])
+def test_a_coarse_solution_is_enlarged_as_the_reference_does(sink: DrawnPanels, reduction: int, moved_m: float) -> None:
+    coarse = np.ascontiguousarray(smooth(1)[:, ::reduction, ::reduction])
+    matrices = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.0, moved_m, 0.0])).solved_from_shown
+    frame = PanelFrame(1, coarse, 1, matrices, size_px=(STACK.width_px, STACK.height_px))
+    sink.present(frame)
+    shown = shown_layers(frame)
+    assert shown.shape[1:3] == (STACK.height_px, STACK.width_px)
+    assert np.abs(codes(sink.read_back()) - codes(shown)).max() <= 1
+    sink.present(PanelFrame(2, smooth(3), 2))  # and the next may be of the panels' own raster again
+    assert np.array_equal(codes(sink.read_back()), codes(smooth(3)))
+
+
+def test_an_even_coarse_solution_reaches_the_panel_s_edge(sink: DrawnPanels) -> None:
+    even = np.full((3, STACK.height_px // 2, STACK.width_px // 2, 4), 200, np.uint8)
+    sink.present(frame := PanelFrame(1, even, 1, (), size_px=(STACK.width_px, STACK.height_px)))
+    assert (shown_layers(frame)[..., :3] == 200).all()
+    assert (codes(sink.read_back()) == 200).all()
 
 
 def aligned(solved: NDArray[np.uint8], flat: NDArray[np.uint8]) -> PanelFrame:

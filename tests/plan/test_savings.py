@@ -6,7 +6,7 @@ import numpy as np
 
 from runtime.config import Settings
 from runtime.content.base import ContentInfo
-from runtime.model.trim import Savings
+from runtime.model.job import Savings
 from runtime.plan.savings import Measured, Plan, Saving, eyes_in_range, make_plan, seeing_eyes, selected_eyes
 
 EYES = np.array([[0.6, -0.03, 0.05], [0.6, 0.03, 0.05]])
