@@ -168,9 +168,10 @@ function take({ refresh, viewer: mine }) {
 
 // Why the picture is not what two eyes should see.
 function explained({ state, reason }) {
-  const late = /solutions take (\d+) ms/.exec(reason);
+  const late = /solutions take (\d+) ms|has not answered for (\d+) ms/.exec(reason);
   if (!late) return `${state.split(":")[0]}: ${reason}`;
-  return `A solution takes ${(late[1] / 1000).toFixed(1)} s on this machine. Until the next one the panels are aligned to your head. ` +
+  const seconds = ((late[1] ?? late[2]) / 1000).toFixed(1);
+  return `A solution takes ${late[1] ? "" : "more than "}${seconds} s on this machine. Until the next one the panels are aligned to your head. ` +
     "Sooner: choose the model fast, close other programs, or give smaller panels (--config).";
 }
 
@@ -214,7 +215,7 @@ function connect() {
   };
   socket.onclose = () => {
     [newest, drawn.length, latencies.length] = [null, 0, 0];
-    main.querySelector(".figures")?.replaceChildren();
+    for (const kind of [".figures", ".head"]) main.querySelector(kind)?.replaceChildren();
     look?.notice("phasestack try has ended. Start it again, and open the address that it names.");
     setTimeout(connect, RETRY_MS);
   };
