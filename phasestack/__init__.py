@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from phasestack.example import ExamplePair, example_pair
-from phasestack.pair import Result, camera, evaluate, project, solve
+from phasestack.pair import Cameras, Eyes, Measuring, Result, camera, evaluate, project, solve, solve_each
 from phasestack.pictures import find_eyes
 from phasestack.stack import Stack
 from runtime.content.base import ContentSource
 from runtime.errors import SensorLost, SensorTimeout
+from runtime.evaluation.solved import PairQuality
 from runtime.evaluation.solved import PairQuality as Quality
 from runtime.eyes.pupils import Pupils
 from runtime.records import EyePoints, SensorFrame
@@ -17,11 +18,15 @@ from runtime.support.version import version
 __version__ = version()
 
 __all__ = [
+    "Cameras",
     "Capabilities",
     "ContentSource",
     "DeviceClock",
     "ExamplePair",
     "EyePoints",
+    "Eyes",
+    "Measuring",
+    "PairQuality",
     "Pupils",
     "Quality",
     "Result",
@@ -37,4 +42,5 @@ __all__ = [
     "find_eyes",
     "project",
     "solve",
+    "solve_each",
 ]

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import html
 import os
+import sys
 import tempfile
 import time
 import warnings
 import webbrowser
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,7 +22,7 @@ from numpy.typing import ArrayLike
 from phasestack.pictures import as_array, as_codes, as_picture
 from phasestack.stack import checked_stack
 from runtime.errors import InputError, ModelFailure
-from runtime.evaluation.displayed import Picture
+from runtime.evaluation.displayed import SIGMAS_MM, Picture
 from runtime.evaluation.solved import PairQuality, SolvedPair
 from runtime.model.predictor import Predictor, load_predictor
 from runtime.model.still import solve_still
@@ -31,8 +32,10 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
 from runtime.records import F64, U8
 from runtime.support.artifacts import OutputFolder, write_json
+from runtime.support.progress import ShownProgress
 from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG, SEPARATION_MIN_M, refusal
 
+EVERY_LEAST = 20  # pixels of a picture that has to be sampled, along its shorter side
 SAME_PLACE_M = 0.001  # an eye and its camera
 _one_at_a_time = Lock()  # a loaded model has buffers of its own
 
@@ -52,6 +55,13 @@ class _Pair:
     def judged(self, layers: U8) -> SolvedPair:
         """What the eyes make of layers."""
         return SolvedPair(layers, self.pictures, self.stack, self.eyes_m, self.fov_deg)
+
+
+class Measuring(TypedDict, total=False):
+    """What to measure of quality, where that should cost less than all of it."""
+
+    sigmas_mm: Sequence[float]  # tracking errors, each the cost of four measurements; 0, 1 and 2 unless told
+    every: int  # every so-manieth pixel of every so-manieth row of the pictures; 1: all
 
 
 class Result:
@@ -74,6 +84,10 @@ class Result:
     def quality(self) -> PairQuality:
         """Quality of what the eyes see; measured when first read, which may take longer than solving."""
         return self._pair.quality
+
+    def measure(self, **how: Unpack[Measuring]) -> PairQuality:
+        """Quality at less cost: `measure(sigmas_mm=(1,), every=4)`. Raises ValueError, naming the argument."""
+        return _measured(self._pair, how)
 
     @property
     def seen(self) -> U8:
@@ -158,6 +172,37 @@ def solve(
     return Result(layers, pair, model=predictor.name, eye_sigma_mm=eye_sigma_mm, total_ms=total_ms)
 
 
+def solve_each(
+    pairs: Iterable[tuple[ArrayLike, ArrayLike, Eyes]],
+    *,
+    stack: PanelStack,
+    fov_deg: float = 40.0,
+    model: str | Path = "balanced",
+    eye_sigma_mm: float = 1.0,
+    progress: bool = True,
+) -> Iterator[Result]:
+    """The results of many pairs, one after the other: left picture, right picture, eyes_m; the rest as for `solve`.
+
+    A pair is taken when its turn comes, so `pairs` may be a generator that draws or reads. progress: on stderr. Raises
+    ValueError, naming the pair and the argument.
+    """
+    total = len(pairs) if isinstance(pairs, Sized) else None
+    how: Any = {"stack": stack, "fov_deg": fov_deg, "model": model, "eye_sigma_mm": eye_sigma_mm}
+    shown = ShownProgress(sys.stderr) if progress else None
+    try:
+        for number, (left, right, eyes_m) in enumerate(pairs):
+            if shown is not None:
+                shown("solving", number, total)
+            try:
+                result = solve(left, right, eyes_m=eyes_m, **how)
+            except ValueError as error:
+                raise ValueError(f"pairs[{number}]: {error}") from None
+            yield result
+    finally:
+        if shown is not None:
+            shown("", 0, None)
+
+
 def evaluate(
     layers: ArrayLike,
     left: ArrayLike,
@@ -167,11 +212,14 @@ def evaluate(
     eyes_m: Eyes | None = None,
     fov_deg: float = 40.0,
     cameras: Cameras | None = None,
+    **how: Unpack[Measuring],
 ) -> PairQuality:
     """How good what two eyes get of anybody's layers is, against the pictures that they should see.
 
     layers: (panels, h, w, 3 or 4), rear to front, in the stack's pixels, uint8 or float in 0..1: a panel's value v
     turns light by v·90 degrees, and an eye sees sin² of the summed angle; floats are rounded to the panels' 8 bits.
+    sigmas_mm, every: at less cost, `evaluate(..., sigmas_mm=(1,), every=4)` measures the light of these tracking
+    errors alone, at every 4th pixel of every 4th row, with its standard error; SSIM is then left out.
     The rest is as for `solve`. Raises ValueError, naming the argument.
     """
     pair = _checked((left, right), stack=stack, eyes_m=eyes_m, fov_deg=fov_deg, cameras=cameras)
@@ -185,7 +233,23 @@ def evaluate(
     if np.issubdtype(given.dtype, np.floating) and 1 < given.max() <= np.pi / 2:
         raise ValueError(f"layers: hold up to {given.max():g}: angles in radians? divide by pi/2")
     codes = [as_codes(as_picture(f"layers[{n}]", layer[..., :3])) for n, layer in enumerate(given)]
-    return pair.judged(np.stack(codes)).quality
+    return _measured(pair.judged(np.stack(codes)), how)
+
+
+def _measured(pair: SolvedPair, how: Measuring) -> PairQuality:
+    """All of the quality, or what is asked of it. Raises ValueError, naming the argument."""
+    if unknown := sorted(how.keys() - Measuring.__annotations__.keys()):
+        raise TypeError(f"{unknown[0]}: there is no such argument")
+    if not how:
+        return pair.quality
+    sigmas_mm, every = how.get("sigmas_mm", SIGMAS_MM), how.get("every", 1)
+    if not isinstance(sigmas_mm, Sequence) or not sigmas_mm:
+        raise ValueError(f"sigmas_mm: is {sigmas_mm!r}, not some tracking errors, mm, such as (1,)")
+    sigmas = [_number("sigmas_mm", sigma_mm, 0.0, 1000.0, "mm") for sigma_mm in sigmas_mm]
+    most = min(pair.pictures[0].shape[:2]) // EVERY_LEAST
+    if isinstance(every, bool) or not isinstance(every, int | np.integer) or not 1 <= every <= most:
+        raise ValueError(f"every: is {every!r}, not a whole number of pixels from 1 to {most}")
+    return pair.sampled(sigmas_mm=sigmas, every=int(every))
 
 
 def camera(eye_m: Sequence[float] | F64, *, width_px: int, height_px: int, fov_deg: float = 40.0) -> F64:

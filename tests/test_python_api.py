@@ -277,3 +277,34 @@ def test_the_example_pair_shows_its_scene_and_is_a_case(tmp_path: Path) -> None:
     (case,) = read_pairs(tmp_path / "pair")
     assert case.stack == PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 640, 360) and case.fov_deg == pair.fov_deg
     assert np.array_equal(case.images[1], pair.right) and np.array_equal(case.eyes_m, pair.eyes_m)
+
+
+def test_quality_at_a_chosen_price_says_how_exact_it_is() -> None:
+    pair = phasestack.example_pair()
+    how: Any = {"eyes_m": pair.eyes_m, "stack": pair.stack, "fov_deg": pair.fov_deg}
+    result = phasestack.solve(pair.left, pair.right, model="fast", **how)
+    whole = phasestack.evaluate(result.layers, pair.left, pair.right, sigmas_mm=(1,), **how)
+    exact_db: float = whole.light_db["1"]
+    assert set(whole.light_db) == set(whole.expected_db) == {"1"} and whole.standard_error_db == {}
+    assert exact_db == pytest.approx(result.quality.light_db["1"], abs=0.01)
+    for every, most_db in ((2, 0.3), (5, 1.0)):
+        part = result.measure(sigmas_mm=(1,), every=every)
+        error_db = part.standard_error_db["1"]
+        assert 0 < error_db < most_db and abs(part.light_db["1"] - exact_db) < 4 * error_db
+
+
+@pytest.mark.parametrize("how", [{"every": 0}, {"every": 2.0}, {"every": 100}, {"sigmas_mm": 1}, {"sigmas_mm": (-1,)}])
+def test_a_price_that_cannot_be_paid_is_refused(how: Any) -> None:
+    layers = np.zeros((3, 180, 320, 3), np.uint8)
+    with pytest.raises(ValueError, match=next(iter(how))):
+        phasestack.evaluate(layers, picture(), picture(3), eyes_m=EYES, stack=STACK, **how)
+
+
+def test_many_pairs_are_solved_in_turn() -> None:
+    places = [np.add(EYES, (0.0, 0.02 * k, 0.0)) for k in range(3)]
+    pairs = ((picture(), picture(3), eyes) for eyes in places)  # drawn as they are needed
+    results = list(phasestack.solve_each(pairs, stack=STACK, model="fast"))
+    alone = phasestack.solve(picture(), picture(3), eyes_m=places[2], stack=STACK, model="fast")
+    assert len(results) == 3 and np.array_equal(results[2].layers, alone.layers)
+    with pytest.raises(ValueError, match=r"pairs\[1\]: eyes_m"):
+        list(phasestack.solve_each([(picture(), picture(3), EYES), (picture(), picture(3), ())], stack=STACK))

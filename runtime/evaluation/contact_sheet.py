@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -75,7 +76,7 @@ def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, line
 
 def headline(light_db: float | None) -> str:
     """The figure to quote, in words."""
-    if light_db is None:
+    if light_db is None or math.isnan(light_db):
         return "the light at these eyes was not measured"
     told = f"pixels as squares, pupil {PUPIL_MM:g} mm, tracking error {TRACKING_SIGMA_MM:g} mm"
     return f"PSNR {light_db:.1f} dB at the eyes ({told})"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,8 @@ import cv2
 import numpy as np
 
 from runtime.browser.still import viewer_html
-from runtime.optics.carried import expected_psnrs_db, intensities, light_psnrs_db
+from runtime.optics.carried import expected_psnrs_db, intensities, light_psnrs_db, sampled_light_db
+from runtime.optics.light import ONE_RAY
 from runtime.optics.quality import Quality, quality
 from runtime.optics.retina import Retina, as_codes, seen_by
 from runtime.optics.stack import PanelStack
@@ -72,19 +74,33 @@ def displayed(
 
 
 def expected_db(
-    eye_views: EyeViews, layers: U8, *, light: bool = False, sigmas_mm: Sequence[float] = SIGMAS_MM
-) -> dict[str, float | None]:
+    eye_views: EyeViews, layers: U8, *, light: bool = False, sigmas_mm: Sequence[float] = SIGMAS_MM, every: int = 1
+) -> dict[str, float]:
     """Expected PSNR (docs/contracts.md, Error) by tracking error in millimetres: "0", "1", "2".
 
-    light: of what pupils get of the panels' pixels, else of one ray a pixel. None where such an error would take an eye
+    light: of what pupils get of the panels' pixels, else of one ray a pixel; every: which pixels of a row and which
+    rows, of one ray. NaN where such an error would take an eye
     to where it sees nothing.
     """
     psnrs_db = light_psnrs_db if light else expected_psnrs_db
-    values: dict[float, float | None] = dict.fromkeys(sigmas_mm)
+    values = dict.fromkeys(sigmas_mm, math.nan)
     how: Any = {"eyes_m": eye_views.eyes_m, "fov_deg": eye_views.fov_deg, "sigmas_mm": sigmas_mm}
+    how |= {} if light else {"sampling": ONE_RAY._replace(step=every)}
     with contextlib.suppress(ValueError):
         values |= psnrs_db(layers, eye_views.wanted, eye_views.stack, **how)
     return {f"{sigma_mm:g}": value for sigma_mm, value in values.items()}
+
+
+def sampled_db(
+    eye_views: EyeViews, layers: U8, *, sigmas_mm: Sequence[float], every: int
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Light as `expected_db` has it, of every `every`-th pixel of every `every`-th row, and its standard error, dB."""
+    values = dict.fromkeys(sigmas_mm, (math.nan, math.nan))
+    how: Any = {"eyes_m": eye_views.eyes_m, "fov_deg": eye_views.fov_deg, "sigmas_mm": sigmas_mm}
+    with contextlib.suppress(ValueError):
+        values |= sampled_light_db(layers, eye_views.wanted, eye_views.stack, every=every, **how)
+    light, errors = ({f"{sigma_mm:g}": value[k] for sigma_mm, value in values.items()} for k in (0, 1))
+    return light, errors
 
 
 def on_panels_raster(picture: Picture, stack: PanelStack) -> Picture:

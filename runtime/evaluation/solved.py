@@ -2,30 +2,35 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from runtime.evaluation.contact_sheet import contact_sheet, headline
-from runtime.evaluation.displayed import EyeViews, Picture, displayed, expected_db
+from runtime.evaluation.displayed import EyeViews, Picture, displayed, expected_db, sampled_db
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 from runtime.support.artifacts import write_png, write_text
 
-BySigma = Mapping[str, float | None]
+BySigma = Mapping[str, float]
 
 
 @dataclass(frozen=True, slots=True)
 class PairQuality:
-    """Quality of what the eyes see (docs/contracts.md, Error), by "0", "1", "2" mm of tracking error."""
+    """Quality of what the eyes see (docs/contracts.md, Error), by "0", "1", "2" mm of tracking error.
+
+    NaN where such an error takes an eye to where it sees nothing, and what was not asked for.
+    """
 
     light_db: BySigma  # of real pixels and pupils; "1", a good tracker's, is the figure to quote
     expected_db: BySigma  # one ray a pixel
     psnr_db: float  # one ray a pixel, of eyes that are known
     ssim: float
     eye_psnr_db: tuple[float, ...]  # left, right
+    standard_error_db: BySigma = field(default_factory=dict)  # of `light_db`, where it is of a part of the pixels
 
     def table(self) -> dict[str, Any]:
         """As solve.json has it."""
@@ -64,6 +69,17 @@ class SolvedPair:
         at_eyes = views.quality
         return PairQuality(light, expected, at_eyes.psnr_db, at_eyes.ssim, tuple(at_eyes.eye_psnr_db))
 
+    def sampled(self, *, sigmas_mm: Sequence[float], every: int) -> PairQuality:
+        """The light of some tracking errors, of every `every`-th pixel each way, with its standard error; no SSIM."""
+        how: Any = {"eyes_m": self.eyes_m, "fov_deg": self.fov_deg, "similarity": False}
+        views = displayed(self.layers, self.pictures, self.stack, **how)
+        if every == 1:
+            light, errors = expected_db(views, self.layers, light=True, sigmas_mm=sigmas_mm), dict[str, float]()
+        else:
+            light, errors = sampled_db(views, self.layers, sigmas_mm=sigmas_mm, every=every)
+        expected, at_eyes = expected_db(views, self.layers, sigmas_mm=sigmas_mm, every=every), views.quality
+        return PairQuality(light, expected, at_eyes.psnr_db, at_eyes.ssim, tuple(at_eyes.eye_psnr_db), errors)
+
     @property
     def seen(self) -> tuple[U8, ...]:
         """Per eye (h, w, 3): what it sees; black where it looks past a panel."""
@@ -84,4 +100,4 @@ class SolvedPair:
 
 
 def _rounded(by_sigma: BySigma) -> dict[str, float | None]:
-    return {sigma: None if value is None else round(value, 3) for sigma, value in by_sigma.items()}
+    return {sigma: round(value, 3) if math.isfinite(value) else None for sigma, value in by_sigma.items()}

@@ -7,13 +7,14 @@ count as errors; the parallax between nominal and true eye, which no shift of th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from runtime.optics.light import LIGHT, ONE_RAY, Sampling, squared_error
+from runtime.optics.light import LIGHT, ONE_RAY, Sampling, group_errors, squared_error
 from runtime.optics.quality import psnr_db
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import stack_from_eye
@@ -64,15 +65,31 @@ def expected_psnrs_db(
     sampled with a quarter of the rays, which is exact to 0.02 dB: every second pixel of every second row of a picture
     of `PLENTY`, else, for light, two rays instead of four. The other arguments and errors are those of `carried_db`.
     """
+    how: Any = {"eyes_m": eyes_m, "fov_deg": fov_deg, "sigmas_mm": sigmas_mm, "seen_from_m": seen_from_m}
+    found = _expected(squared_error, layers, drawn, stack, sampling=sampling, **how)
+    return {sigma_mm: psnr_db(float(error)) for sigma_mm, error in found.items()}
+
+
+def _expected(
+    measured: Callable[..., Any],
+    layers: U8,
+    drawn: Sequence[U8 | F32],
+    stack: PanelStack,
+    *,
+    sigmas_mm: Sequence[float],
+    sampling: Sampling,
+    eyes_m: ArrayLike,
+    **how: Any,
+) -> dict[float, Any]:
+    """The expected squared error by tracking error; measured: `squared_error`, or `group_errors`."""
+    seen_from_m = how.pop("seen_from_m", None)
     eyes = np.asarray(eyes_m, dtype=np.float64)
     true = eyes if seen_from_m is None else np.asarray(seen_from_m, dtype=np.float64)
     targets = [intensities(picture) for picture in drawn]
     right, up = stack_from_eye(eyes.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
 
-    def error(move_m: F64) -> float:
-        return squared_error(
-            layers, targets, stack, solved_for_m=eyes, eyes_m=true + move_m, fov_deg=fov_deg, sampling=sampling
-        )
+    def error(move_m: F64) -> Any:
+        return measured(layers, targets, stack, solved_for_m=eyes, eyes_m=true + move_m, sampling=sampling, **how)
 
     unmoved = error(np.zeros(3))
     if targets[0].size > PLENTY * sampling.step**2:
@@ -83,7 +100,7 @@ def expected_psnrs_db(
     for sigma_mm in sigmas_mm:
         moves = [side * 2e-3 * sigma_mm * axis for axis in (right, up) for side in (-1, 1)]
         moved = sum(error(move) for move in moves) / 8 if sigma_mm > 0 else unmoved / 2
-        result[sigma_mm] = psnr_db(unmoved / 2 + moved)
+        result[sigma_mm] = unmoved / 2 + moved
     return result
 
 
@@ -97,6 +114,24 @@ def light_psnrs_db(
     if sampling is None:
         sampling = LIGHT if drawn[0].size > PLENTY else LIGHT._replace(rays=2 * LIGHT.rays)
     return expected_psnrs_db(layers, drawn, stack, sampling=sampling, **how)
+
+
+def sampled_light_db(
+    layers: U8, drawn: Sequence[U8 | F32], stack: PanelStack, *, every: int, **how: Any
+) -> dict[float, tuple[float, float]]:
+    """Light and its standard error, dB, of every `every`-th pixel of every `every`-th row.
+
+    The standard error is that of ten interleaved groups of rows. The other arguments are those of `light_psnrs_db`.
+    """
+    found = _expected(group_errors, layers, drawn, stack, sampling=LIGHT._replace(step=every), **how)
+    return {sigma_mm: (psnr_db(float(error[0])), _standard_error_db(error)) for sigma_mm, error in found.items()}
+
+
+def _standard_error_db(error: F64) -> float:
+    """error: (1 + groups,) mean squared error, and that of each group."""
+    groups = error[1:]
+    relative = float(np.std(groups, ddof=1)) / len(groups) ** 0.5 / max(float(error[0]), 1e-12)
+    return float(10 / math.log(10) * relative)
 
 
 def intensities(picture: U8 | F32) -> F32:

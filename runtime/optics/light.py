@@ -13,7 +13,7 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from ctypes import byref
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from runtime.optics.views import stack_from_eye
 from runtime.records import F32, F64, U8
 
 RINGS = 9  # of points, of which each ray of light takes one: 271, as good as a disc
+GROUPS = 10  # of rows, to tell how exact a sampled error is
 TABLE = 16  # entries a code value, of the table that sums along bilinear rays are looked up in
 
 
@@ -70,6 +71,35 @@ def squared_error(
     nearly perfect it can be less than 0, by the rays' noise.
     Raises ValueError for an eye that is not before every panel, or where no pixel counts.
     """
+    how: dict[str, Any] = {"solved_for_m": solved_for_m, "eyes_m": eyes_m, "fov_deg": fov_deg, "sampling": sampling}
+    total, counted = _sums(layers, targets, stack, parts=4 * len(os.sched_getaffinity(0)), **how).sum(axis=0)
+    return float(total / counted)
+
+
+def group_errors(layers: U8, targets: Sequence[F32], stack: PanelStack, *, sampling: Sampling, **how: Any) -> F64:
+    """(GROUPS + 1,) the mean squared error, then those of interleaved groups of rows: their scatter is its exactness.
+
+    Arguments and errors are those of `squared_error`.
+    """
+    rows = -(-min(len(target) for target in targets) // sampling.step)
+    sums = _sums(layers, targets, stack, parts=rows, sampling=sampling, **how).reshape(len(targets), -1, 2).sum(axis=0)
+    groups = np.array([sums[group::GROUPS].sum(axis=0) for group in range(GROUPS)])
+    total, counted = np.concatenate([sums.sum(axis=0)[None], groups]).T
+    return np.asarray(total / np.maximum(counted, 1))
+
+
+def _sums(
+    layers: U8,
+    targets: Sequence[F32],
+    stack: PanelStack,
+    *,
+    solved_for_m: F64,
+    eyes_m: F64,
+    fov_deg: float,
+    sampling: Sampling,
+    parts: int,
+) -> F64:
+    """(eyes x parts, 2) the sum of the squared error and the number of its terms, by consecutive parts of the rows."""
     cores, step = len(os.sched_getaffinity(0)), sampling.step
     codes = np.ascontiguousarray(layers)
     fine = 1 if sampling.rays else TABLE
@@ -77,7 +107,7 @@ def squared_error(
     calls = []
     for side, (nominal, true, target) in enumerate(zip(solved_for_m, eyes_m, targets, strict=True)):
         view = view_of(side, nominal, true, target, stack, fov_deg=fov_deg, pupil_mm=sampling.pupil_mm)
-        rows = range(0, len(target), step * -(-len(target) // (4 * cores * step)))
+        rows = range(0, len(target), step * -(-len(target) // (parts * step)))
         calls += [(view, first, last) for first, last in zip(rows, [*rows[1:], len(target)], strict=True)]
 
     def error(call: tuple[View, int, int]) -> tuple[float, int]:
@@ -85,10 +115,10 @@ def squared_error(
         return _squared_error(codes, view, table, sampling, first, last)
 
     with ThreadPoolExecutor(cores) as pool:
-        total, counted = map(sum, zip(*pool.map(error, calls), strict=True))
-    if counted == 0:
+        sums = np.array(list(pool.map(error, calls)), np.float64)
+    if not sums[:, 1].any():
         raise ValueError("no ray of these eyes crosses every panel")
-    return float(total / counted)
+    return sums
 
 
 def _squared_error(codes: U8, view: View, table: F32, sampling: Sampling, first: int, last: int) -> tuple[float, int]:

@@ -236,5 +236,5 @@ def _together(method: Method, pair: StillPair, run: MethodRun, pairs: list[PairR
 def _means(tables: Sequence[Any]) -> dict[str, float]:
     """By key, over the tables that have a number there."""
     keys = dict.fromkeys(key for table in tables for key in table)
-    found = {key: [table[key] for table in tables if table.get(key) is not None] for key in keys}
+    found = {key: [table[key] for table in tables if math.isfinite(table.get(key, math.nan))] for key in keys}
     return {key: float(np.mean(values)) for key, values in found.items() if values}
