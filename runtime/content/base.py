@@ -46,6 +46,7 @@ class ContentInfo:
     grey: bool = False
     background: Colour | None = WHITE  # uniform, behind it; None: none
     flat_x_m: float | None = None  # all of it lies in this plane of `stack` and looks alike to both eyes
+    left_out: tuple[str, ...] = ()  # what the file holds that is not drawn
 
 
 class ContentSource(ABC):

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
@@ -15,9 +17,18 @@ from runtime.content.ply import Header, read_vertices
 from runtime.errors import InputError
 from runtime.records import F32, F64
 
+log = logging.getLogger("phasestack.content")
+
 LOW_PASS_PX2 = 0.3  # added to each splat's covariance: none falls between the pixels
 ALPHA_MIN = 1 / 255  # of a splat at a pixel: less changes no code value
-LARGEST_RELATIVE_SCALE = 1000.0  # of a splat, in units of the scene's extent
+LARGEST_COORDINATE = 1e15  # squares still fit in float32's range
+LARGEST_RELATIVE_SCALE = 100.0  # of a splat, in units of the scene's extent
+STRAY = 1.0  # percent of the splats at either end of an axis that do not decide the scale
+FAINT = 0.1  # opacity of a splat that decides nothing
+REACH = 2.0  # standard deviations of a splat that are to be seen
+SAMPLED = 10_000  # points whose neighbours are looked for
+FINEST_POINT, LARGEST_POINT = 5e-4, 0.01  # standard deviation of a point, in units of the scene's extent
+FLAT_HARMONIC = 0.28209479177387814  # of degree 0
 COEFFICIENTS = (0, 9, 24, 45)  # f_rest properties: of harmonics to degree 0, 1, 2, 3
 PACKED = [0, 1, 2, 4, 5, 8]  # of a 3x3 matrix, row by row
 
@@ -47,46 +58,83 @@ class Splats:
 
 
 def load_gaussians(header: Header) -> Gaussians:
-    """Read a splat file as the reference implementation writes it.
+    """The splats of a file as the reference implementation writes it, without unusable ones.
 
-    Raises InputError: a property missing, values that aren't finite, absurd scales.
+    Raises InputError: a property missing, none that can be drawn.
     """
     path, table = header.path, read_vertices(header)
+    if not len(table):
+        raise InputError(path, "vertex", "there are none")
     names = set(table.dtype.names or ())
     rest = sum(name.startswith("f_rest_") for name in names)
     if rest not in COEFFICIENTS:
         raise InputError(path, "f_rest", f"{rest} properties; 0, 9, 24 or 45 are needed")
-    if not len(table):
-        raise InputError(path, "vertex", "there are none")
 
-    def columns(field: str, *wanted: str) -> F32:
-        """(n, len(wanted)) finite numbers."""
+    def columns(*wanted: str) -> F32:
+        """(n, len(wanted)) numbers."""
         if missing := [name for name in wanted if name not in names]:
             raise InputError(path, missing[0], "the property is missing: this is no 3D Gaussian splat file")
         with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite
-            values = np.column_stack([table[name] for name in wanted]).astype(np.float32)
-        refuse(field, ~np.isfinite(values).all(1), "are not finite")
-        return values
+            return np.column_stack([table[name] for name in wanted]).astype(np.float32)
 
-    def refuse(field: str, wrong: Any, problem: str) -> None:
-        if wrong.any():
-            raise InputError(path, field, f"{int(wrong.sum())} of {len(wrong)} splats {problem}")
-
-    centres = columns("x, y, z", "x", "y", "z")
-    log_scales = columns("scale", *(f"scale_{axis}" for axis in range(3)))
-    extent = float(np.ptp(np.percentile(centres, [1, 99], axis=0), axis=0).max()) or 1.0
-    absurd = (log_scales > np.log(LARGEST_RELATIVE_SCALE * extent)).any(1)
-    refuse("scale", absurd, f"are over {LARGEST_RELATIVE_SCALE:g} times the scene")
-    harmonics = columns("f_dc", *(f"f_dc_{channel}" for channel in range(3)))[:, None]
+    harmonics = columns(*(f"f_dc_{channel}" for channel in range(3)))[:, None]
     if rest:
-        higher = columns("f_rest", *(f"f_rest_{number}" for number in range(rest))).reshape(len(table), 3, -1)
+        higher = columns(*(f"f_rest_{number}" for number in range(rest))).reshape(len(table), 3, -1)
         harmonics = np.ascontiguousarray(np.concatenate([harmonics, higher.transpose(0, 2, 1)], axis=1))
-    rotations = columns("rot", *(f"rot_{axis}" for axis in range(4)))
-    refuse("rot", ~rotations.any(1), "are no rotations: all four numbers are 0")
-    opacities = np.asarray(expit(columns("opacity", "opacity")[:, 0].astype(np.float64)), dtype=np.float32)
+    return drawable(
+        path,
+        centres=columns("x", "y", "z"),
+        log_scales=columns(*(f"scale_{axis}" for axis in range(3))),
+        quaternions=columns(*(f"rot_{axis}" for axis in range(4))),
+        logits=columns("opacity")[:, 0],
+        harmonics=harmonics,
+    )
+
+
+def drawable(path: Path, *, centres: F32, log_scales: F32, quaternions: F32, logits: F32, harmonics: F32) -> Gaussians:
+    """The splats that can be drawn: not those without numbers or turn, or far larger than the scene.
+
+    quaternions: (n, 4) w, x, y, z of any length; logits: (n,) of opacities. Raises InputError where none is left.
+    """
+    with np.errstate(invalid="ignore"):  # NaN is no less than anything
+        usable = (np.abs(centres) < LARGEST_COORDINATE).all(1) & (quaternions != 0).any(1) & ~np.isnan(logits)
+        for values in (quaternions, harmonics.reshape(len(centres), -1)):
+            usable &= np.isfinite(values).all(1)
+        some = centres[usable]
+        extent = float(np.ptp(np.percentile(some, [1, 99], axis=0), axis=0).max()) if len(some) else 0.0
+        # Minus infinity is a disc, as trainers write it.
+        usable &= (log_scales < np.log(LARGEST_RELATIVE_SCALE * (extent or 1.0))).all(1)
+    if not usable.all():
+        log.warning("%s: is drawn without %d of its %d splats, which are unusable", path, (~usable).sum(), len(usable))
+        centres, log_scales, quaternions = centres[usable], log_scales[usable], quaternions[usable]
+        logits, harmonics = logits[usable], harmonics[usable]
+    opacities = np.asarray(expit(logits.astype(np.float64)), dtype=np.float32)
     if not (opacities > ALPHA_MIN).any():
         raise InputError(path, "opacity", "no splat can be seen")
-    return Gaussians(centres, covariances_of(np.exp(log_scales), rotations), opacities, harmonics)
+    return Gaussians(centres, covariances_of(np.exp(log_scales), quaternions), opacities, harmonics)
+
+
+def of_points(places: F32, colours: F32) -> Gaussians:
+    """Points as small round splats, about as large as they lie apart. colours: (n, 3), 0-1."""
+    some = places[:: max(1, len(places) // SAMPLED)].astype(np.float64)
+    apart = np.median(cKDTree(places).query(some, k=2)[0][:, 1]) if len(places) > 1 else 1.0
+    extent = float(np.ptp(np.percentile(places, [1, 99], axis=0), axis=0).max()) or 1.0
+    sigma = np.clip(apart / 2, extent * FINEST_POINT, extent * LARGEST_POINT)
+    covariances = np.zeros((len(places), 6), np.float32)
+    covariances[:, [0, 3, 5]] = sigma**2
+    harmonics = ((colours - np.float32(0.5)) / np.float32(FLAT_HARMONIC))[:, None]
+    return Gaussians(places.astype(np.float32), covariances, np.ones(len(places), np.float32), harmonics)
+
+
+def bounds(gaussians: Gaussians) -> tuple[F64, F64]:
+    """(3,) corners of the box that holds what is seen of all but strays, to two standard deviations."""
+    seen = gaussians.opacities > FAINT
+    seen = seen if seen.any() else np.ones_like(seen)
+    centres = gaussians.centres[seen].astype(np.float64)
+    reach = REACH * np.sqrt(gaussians.covariances[seen][:, [0, 3, 5]].astype(np.float64))
+    reach = np.minimum(reach, np.percentile(reach, 100 - STRAY, axis=0))
+    low, high = np.percentile(centres - reach, STRAY, axis=0), np.percentile(centres + reach, 100 - STRAY, axis=0)
+    return np.asarray(low), np.asarray(high)
 
 
 def covariances_of(scales: F32, quaternions: F32) -> F32:
@@ -155,7 +203,7 @@ def seen_splats(gaussians: Gaussians, view: View, *, nearest_m: float = 1e-3) ->
 def harmonic_basis(directions: F32, count: int) -> F32:
     """(n, count) real spherical harmonics, order and signs as in the reference implementation."""
     x, y, z = directions.T
-    basis = [np.full_like(x, 0.28209479177387814)]
+    basis = [np.full_like(x, FLAT_HARMONIC)]
     if count > 1:
         c1 = np.float32(0.4886025119029199)
         basis += [-c1 * y, c1 * z, -c1 * x]
@@ -180,6 +228,6 @@ def harmonic_basis(directions: F32, count: int) -> F32:
 def colours_towards(harmonics: F32, directions: F32) -> F32:
     """(n, 3) colours >= 0 of (n, k, 3) coefficients along (n, 3) unit directions from the eye."""
     if harmonics.shape[1] == 1:
-        return np.asarray(np.maximum(harmonics[:, 0] * np.float32(0.28209479177387814) + np.float32(0.5), 0))
+        return np.asarray(np.maximum(harmonics[:, 0] * np.float32(FLAT_HARMONIC) + np.float32(0.5), 0))
     basis = harmonic_basis(directions, harmonics.shape[1])
     return np.asarray(np.maximum(np.einsum("nk,nkc->nc", basis, harmonics) + np.float32(0.5), 0))

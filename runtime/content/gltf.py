@@ -1,155 +1,290 @@
-"""Checks of a glTF file's declared sizes and textures against the limits, before trimesh loads it.
-
-trimesh passes over a texture that it cannot read; here that is an error that names it.
-"""
+"""The scene of a glTF 2.0 file as parts to draw: nodes, primitives and materials, at rest."""
 
 from __future__ import annotations
 
-import base64
-import math
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 import numpy as np
 
+from runtime.content.base import WHITE
+from runtime.content.gltf_file import COMPRESSED, VERSION_1, WAY_OUT, Array, GltfFile, Read, Table, fractions
+from runtime.content.parts import BLACK, Part, Sampler, Wrap, coded
+from runtime.content.shapes import Shape, flat_normals, placed
 from runtime.errors import InputError, one_line
-from runtime.records import U8
-from runtime.support import untrusted_input
-from runtime.support.picture_header import check_size, decoded_picture, picture_size
+from runtime.records import F32, F64
+from runtime.support import progress, untrusted_input
 from runtime.support.untrusted_input import LIMITS
 
-ELEMENTS_PER_TRIANGLE = 10  # all accessors together, for the limit on triangles
-UNDERSTOOD = {  # of what a file may require; the rest is drawn without
-    "KHR_materials_unlit", "KHR_materials_pbrSpecularGlossiness", "KHR_materials_ior", "KHR_materials_specular",
-    "KHR_materials_emissive_strength", "KHR_materials_clearcoat", "KHR_materials_sheen", "KHR_materials_transmission",
-    "KHR_materials_volume", "KHR_lights_punctual", "EXT_texture_webp",
+POINTS, TRIANGLES, STRIP, FAN = 0, 4, 5, 6  # of primitives' modes; those between are of lines
+WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
+NEAREST = 9728
+DRACO = "KHR_draco_mesh_compression"
+GLOSSY = "KHR_materials_pbrSpecularGlossiness"
+DRAWN = {
+    DRACO, GLOSSY, "KHR_materials_unlit", "KHR_materials_emissive_strength", "KHR_texture_transform",
+    "KHR_mesh_quantization", "EXT_texture_webp", "EXT_texture_avif",
 }  # fmt: skip
-Table = dict[str, Any]
-Read = Callable[[str], bytes]  # the file beside it that a URI names
+UNSEEN = {"KHR_materials_ior", "KHR_materials_specular", "KHR_materials_variants", "KHR_xmp_json_ld"}
+# What a file may require and is drawn without.
+WITHOUT = UNSEEN | {
+    "KHR_lights_punctual", "KHR_materials_clearcoat", "KHR_materials_sheen", "KHR_materials_transmission",
+    "KHR_materials_volume", "KHR_materials_anisotropy", "KHR_materials_iridescence", "KHR_materials_dispersion",
+    "KHR_materials_diffuse_transmission", "KHR_animation_pointer",
+}  # fmt: skip
 
 
-def check_gltf(path: Path, data: bytes, read: Read) -> None:
-    """Raises InputError for a file over the limits, a texture that is no picture, or no glTF at all."""
-    text, binary = (data, b"") if data[:4] != b"glTF" else _chunks(path, data)
-    table = untrusted_input.parsed_json(text, source=path, most_depth=LIMITS.depth)
-    try:
-        _check(path, table, binary, read)
-    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        problem = one_line(f"{type(error).__name__}: {error}", most=120)
-        raise InputError(path, "", f"is damaged, or no glTF ({problem})") from None
+class GltfScene:
+    """The parts of a file's scene, and what of it is not drawn."""
 
+    def __init__(self, path: Path, data: bytes, read: Read) -> None:
+        """Raises InputError: no glTF 2.0, damaged, over a limit, an extension that it requires is not read."""
+        self.path = path
+        self.parts: list[Part] = []
+        self.points: list[tuple[F32, F32]] = []  # (n, 3) places and (n, 3) colours, codes of 0-1
+        self.left_out: set[str] = set()
+        try:
+            self.file = GltfFile(path, data, read)
+            self._check()
+            self._read()
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+            problem = one_line(f"{type(error).__name__}: {error}", most=120)
+            raise InputError(path, "", f"is damaged, or no glTF ({problem})") from None
 
-def file_of(uri: str, *, source: Path, field: str) -> Path:
-    """The file beside `source` that a URI names. Raises InputError."""
-    if "://" in uri or uri.startswith("data:"):
-        raise InputError(source, field, f"{untrusted_input.shown(uri)}: only files beside this one are read")
-    name = untrusted_input.checked_path(unquote(uri), source=source, field=field)
-    if name.is_absolute():
-        raise InputError(
-            source, field, f"{untrusted_input.shown(uri)} is an absolute path; files beside this one are read"
-        )
-    if not (source.parent / name).exists():
-        raise InputError(source, field, f"{untrusted_input.shown(str(name), most=200)} is not there")
-    return source.parent / name
+    def _check(self) -> None:
+        file, path = self.file, self.path
+        if str(file.table["asset"]["version"]).startswith("1"):
+            raise InputError(path, "asset.version", VERSION_1)
+        for name in file.table.get("extensionsRequired", []):
+            if name in COMPRESSED and name != DRACO:
+                raise InputError(path, "extensionsRequired", f"{name}: {COMPRESSED[name]} is not read; {WAY_OUT}")
+            if name not in DRAWN | WITHOUT:
+                raise InputError(path, "extensionsRequired", f"{untrusted_input.shown(name)} is not understood")
+        meshes = [node["mesh"] for node in file.all("nodes") if "mesh" in node]
+        untrusted_input.within(len(meshes), LIMITS.instances, source=path, field="nodes")
+        triangles = [sum(map(self._triangles, mesh["primitives"])) for mesh in file.all("meshes")]
+        untrusted_input.within(sum(triangles[index] for index in meshes), LIMITS.triangles, source=path, field="meshes")
+        file.check_pictures([file.item("textures", use["index"]) for use in self._textures()])
 
-
-def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
-    """The JSON and the buffer of a GLB."""
-    size = int.from_bytes(data[12:16], "little")
-    if data[16:20] != b"JSON" or len(data) < 20 + size:
-        raise InputError(path, "", "is cut off, or malformed: a GLB file begins with a chunk of JSON")
-    return data[20 : 20 + size], data[20 + size + 8 :]
-
-
-def _check(path: Path, table: Table, binary: bytes, read: Read) -> None:
-    for name in table.get("extensionsRequired", []):
-        if name not in UNDERSTOOD:
-            raise InputError(path, "extensionsRequired", f"{untrusted_input.shown(name)} is not understood")
-    elements = 0
-    for number, accessor in enumerate(table.get("accessors", [])):
-        elements += int(accessor["count"])
-        most = ELEMENTS_PER_TRIANGLE * LIMITS.triangles
-        untrusted_input.within(elements, most, source=path, field=f"accessors[{number}].count")
-    nodes = table.get("nodes", [])
-    _check_depth(path, nodes, table.get("scenes", []))
-    placed = [node["mesh"] for node in nodes if "mesh" in node]
-    untrusted_input.within(len(placed), LIMITS.instances, source=path, field="nodes")
-    triangles = [_triangles(table, mesh) for mesh in table.get("meshes", [])]
-    untrusted_input.within(sum(triangles[index] for index in placed), LIMITS.triangles, source=path, field="meshes")
-    numbers = sorted({_source(path, table, texture) for texture in _drawn_textures(table)})
-    coded = {number: _coded(table, table["images"][number], binary, read) for number in numbers}
-    pixels = 0
-    for number, picture in coded.items():  # by their headers, before one is decoded
-        with suppress(ValueError):
-            size = picture_size(picture)
-            check_size(*size, source=path, field="texture", name=f"images[{number}]", head=picture)
-            pixels += math.prod(size)
-        untrusted_input.within(pixels, LIMITS.texture_pixels, source=path, field="textures' pixels")
-    for number, picture in coded.items():
-        decoded_picture(picture, source=path, field="texture", name=f"images[{number}]")
-
-
-def _drawn_textures(table: Table) -> Iterator[Table]:
-    """The textures of base colours; others, of normals and the like, are not drawn."""
-    for material in table.get("materials", []):
-        glossy = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
-        base = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
-        for use in filter(None, (base, glossy.get("diffuseTexture"))):
-            yield table["textures"][use["index"]]
-
-
-def _source(path: Path, table: Table, texture: Table) -> int:
-    """The number of a texture's image."""
-    source = texture.get("extensions", {}).get("EXT_texture_webp", texture).get("source")
-    if source is None:
-        raise InputError(path, "textures", "hold a picture in a format that is not understood")
-    number: int = range(len(table["images"]))[source]
-    return number
-
-
-def _check_depth(path: Path, nodes: list[Table], scenes: list[Table]) -> None:
-    seen: set[int] = set()
-    queue = [(root, 1) for scene in scenes for root in scene.get("nodes", [])]
-    while queue:
-        number, depth = queue.pop()
-        if depth > LIMITS.depth:
-            raise InputError(path, "nodes", f"are nested deeper than {LIMITS.depth}")
-        if number not in seen:
-            seen.add(number)
-            queue += [(child, depth + 1) for child in nodes[number].get("children", [])]
-
-
-def _triangles(table: Table, mesh: Table) -> int:
-    total = 0
-    for primitive in mesh["primitives"]:
+    def _triangles(self, primitive: Table) -> int:
         index = primitive.get("indices", primitive["attributes"].get("POSITION"))
-        total += 0 if index is None else int(table["accessors"][index]["count"]) // 3
-    return total
+        corners = 0 if index is None else self.file.count(index)
+        return corners // 3 if primitive.get("mode", TRIANGLES) <= TRIANGLES else corners
+
+    def _textures(self) -> Iterator[Table]:
+        """Where materials use those that are drawn; others, of normals and the like, are not looked at."""
+        for material in self.file.all("materials"):
+            glossy = material.get("extensions", {}).get(GLOSSY, {})
+            base = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
+            own = material.get("emissiveTexture") if any(material.get("emissiveFactor", ())) else None
+            yield from filter(None, (glossy.get("diffuseTexture", base), own))
+
+    def _read(self) -> None:
+        world, file = self._world(), self.file
+        meshes = [(node, matrix) for node, matrix in world.values() if "mesh" in node]
+        for number, (node, matrix) in enumerate(meshes):
+            progress.tell(f"{self.path.name}: parts", number, len(meshes))
+            mesh: Table = file.item("meshes", node["mesh"])
+            matrices = self._joints(node, world) if "skin" in node else matrix
+            weights: list[float] = node["weights"] if "weights" in node else mesh.get("weights", [])
+            for primitive in mesh["primitives"]:
+                self._add(primitive, weights=weights, matrices=matrices)
+        self.left_out |= {"animations"} if file.all("animations") else set()
+        self.left_out |= {str(name) for name in file.table.get("extensionsUsed", [])} - DRAWN - UNSEEN - {*COMPRESSED}
+
+    def _world(self) -> dict[int, tuple[Table, F64]]:
+        """The nodes of the scene, by number, and 4x4 scene_from_node. Raises InputError: nested too deep."""
+        nodes, scenes = self.file.all("nodes"), self.file.all("scenes")
+        children = {child for node in nodes for child in node.get("children", [])}
+        roots = [number for number in range(len(nodes)) if number not in children]
+        if scenes:
+            roots = self.file.item("scenes", self.file.table.get("scene", 0)).get("nodes", [])
+        found: dict[int, tuple[Table, F64]] = {}
+        queue = [(root, np.eye(4), 1) for root in reversed(roots)]
+        while queue:
+            number, parent, depth = queue.pop()
+            if depth > LIMITS.depth:
+                raise InputError(self.path, "nodes", f"are nested deeper than {LIMITS.depth}")
+            if number not in found:
+                node = self.file.item("nodes", number)
+                found[number] = node, parent @ _local(node)
+                queue += [(child, found[number][1], depth + 1) for child in reversed(node.get("children", []))]
+        return found
+
+    def _joints(self, node: Table, world: dict[int, tuple[Table, F64]]) -> F64:
+        """(j, 4, 4) scene_from_mesh by each of a skin's joints, as its nodes stand (section 3.7.3)."""
+        skin = self.file.item("skins", node["skin"])
+        stand = np.array([world[joint][1] if joint in world else np.eye(4) for joint in skin["joints"]])
+        if "inverseBindMatrices" not in skin:
+            return stand
+        columns: F64 = self.file.accessor(skin["inverseBindMatrices"]).astype(np.float64)
+        return np.asarray(stand @ columns[: len(stand)].transpose(0, 2, 1))
+
+    def _add(self, primitive: Table, *, weights: list[float], matrices: F64) -> None:
+        """Add what a primitive draws. matrices: 4x4 scene_from_mesh, or one for each joint of its skin."""
+        file, mode = self.file, primitive.get("mode", TRIANGLES)
+        if "POSITION" not in primitive["attributes"]:
+            return
+        values, corners = self._draco(primitive)
+        if corners is None:
+            count = file.count(primitive["attributes"]["POSITION"])
+            has_index = "indices" in primitive
+            corners = file.accessor(primitive["indices"], as_float=False)[:, 0] if has_index else np.arange(count)
+        if POINTS < mode < TRIANGLES:
+            self.left_out.add("lines")
+            return
+        faces = _faces(corners, mode)
+        has_normals = "NORMAL" in primitive["attributes"] and mode != POINTS
+        if has_normals or mode == POINTS:
+            rows, faces = np.unique(faces, return_inverse=True)  # those of other primitives are left alone
+        else:  # flat: every triangle has corners of its own (section 3.7.2.1)
+            rows, faces = faces.reshape(-1), np.arange(faces.size).reshape(-1, 3)
+
+        def attribute(name: str) -> F32 | None:
+            if name in values:
+                return np.asarray(values[name][rows], np.float32)
+            if name not in primitive["attributes"]:
+                return None
+            found = file.accessor(primitive["attributes"][name], rows=rows)
+            for target, weight in zip(primitive.get("targets", []), weights):
+                if name in target and weight:
+                    found = np.asarray(found + weight * file.accessor(target[name], rows=rows), np.float32)
+            return found
+
+        positions, normals, colours = attribute("POSITION"), attribute("NORMAL"), attribute("COLOR_0")
+        assert positions is not None
+        if matrices.ndim == 3:
+            matrices = self._skinned(matrices, attribute)
+        positions, turned = placed(positions, normals if has_normals else None, matrices)
+        if mode == POINTS:
+            self.points.append((positions, np.ones_like(positions) if colours is None else coded(colours[:, :3])))
+            return
+        if turned is None:
+            turned = np.repeat(flat_normals(positions[faces]), 3, axis=0)
+        if matrices.ndim == 2 and np.linalg.det(matrices[:3, :3]) < 0:
+            faces = faces[:, ::-1]
+            turned = turned if has_normals else -turned
+        look, use = self._look(primitive.get("material"))
+        uv = attribute(f"TEXCOORD_{_coordinates(use)[0]}")
+        if uv is None:
+            look |= {"picture": None, "glow_picture": None}
+            uv = np.zeros((len(positions), 2), np.float32)
+        shape = Shape(positions, turned, _transformed(uv, use), faces.astype(np.int32))
+        is_plain = colours is None and look["glow"] == BLACK and (look["picture"] is None or look["colour"] == WHITE)
+        if is_plain:
+            look["colour"] = tuple(coded(look["colour"]).tolist())
+        self.parts.append(Part(shape, vertex_colours=colours, is_linear=not is_plain, **look))
+
+    def _skinned(self, joints: F64, attribute: Any) -> F64:
+        """(v, 4, 4) of each vertex: the mean of its joints' matrices by its weights."""
+        names, weights = attribute("JOINTS_0"), attribute("WEIGHTS_0")
+        for number in range(1, 4):
+            if (more := attribute(f"JOINTS_{number}")) is not None:
+                names = np.hstack([names, more])
+                weights = np.hstack([weights, attribute(f"WEIGHTS_{number}")])
+        share = weights / np.maximum(weights.sum(1, keepdims=True), 1e-9)
+        total = np.zeros((len(names), 4, 4))
+        for name, part in zip(names.T.astype(np.int64), share.T, strict=True):
+            total += joints[name] * part[:, None, None]
+        return total
+
+    def _draco(self, primitive: Table) -> tuple[dict[str, Array], Array | None]:
+        """The attributes and corners of a primitive that Draco has compressed; nothing of others."""
+        own = primitive.get("extensions", {}).get(DRACO)
+        if own is None:
+            return {}, None
+        try:
+            import DracoPy
+        except ImportError:
+            accessors = [self.file.item("accessors", index) for index in primitive["attributes"].values()]
+            if all("bufferView" in accessor for accessor in accessors):  # the same, uncompressed
+                return {}, None
+            problem = f"Draco needs `pip install 'phasestack[draco]'`; or {WAY_OUT}"
+            raise InputError(self.path, DRACO, problem) from None
+        found = DracoPy.decode(bytes(self.file.view(own["bufferView"])[0]))
+        data = {attribute["unique_id"]: attribute["data"] for attribute in found.attributes}
+        values = {}
+        for name, number in own["attributes"].items():
+            accessor = self.file.item("accessors", primitive["attributes"][name])
+            values[name] = fractions(data[number].reshape(len(data[number]), -1), accessor)
+        return values, np.asarray(found.faces).reshape(-1)
+
+    def _look(self, index: int | None) -> tuple[dict[str, Any], Table]:
+        """Fields of a part of a material, with linear colours; and how its texture is used."""
+        file, material = self.file, {} if index is None else self.file.item("materials", index)
+        own = material.get("extensions", {})
+        base, prefix = material.get("pbrMetallicRoughness", {}), "baseColor"
+        if GLOSSY in own:
+            base, prefix = own[GLOSSY], "diffuse"
+        *colour, opacity = base.get(f"{prefix}Factor", [1.0] * 4)
+        strength = own.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
+        glow = tuple(float(value) * strength for value in material.get("emissiveFactor", BLACK))
+        uses = base.get(f"{prefix}Texture"), material.get("emissiveTexture") if glow != BLACK else None
+        use: Table = uses[0] or uses[1] or {}
+        if uses[0] and uses[1] and _coordinates(uses[0]) != _coordinates(uses[1]):
+            self.left_out.add("an emissive texture with coordinates of its own")
+            uses, glow = (uses[0], None), BLACK
+        textures = [None if used is None else file.item("textures", used["index"]) for used in uses]
+        pictures = [None if texture is None else file.picture(texture) for texture in textures]
+        sampler: Table = {}
+        for texture in filter(None, reversed(textures)):
+            sampler = file.item("samplers", texture["sampler"]) if "sampler" in texture else {}
+        wrap = [WRAPS[sampler.get(name, 10497)] for name in ("wrapS", "wrapT")]
+        return {
+            "picture": pictures[0],
+            "glow_picture": pictures[1],
+            "glow": glow,
+            "colour": tuple(map(float, colour)),
+            "opacity": float(opacity),
+            "alpha": {"MASK": "mask", "BLEND": "blend"}.get(material.get("alphaMode", ""), "opaque"),
+            "cutoff": float(material.get("alphaCutoff", 0.5)),
+            "two_sided": bool(material.get("doubleSided", False)),
+            "lit": "KHR_materials_unlit" not in own,
+            "sampler": Sampler((wrap[0], wrap[1]), sampler.get("magFilter") == NEAREST),
+        }, use
 
 
-def _coded(table: Table, item: Table, binary: bytes, read: Read) -> bytes:
-    """A coded picture's bytes: embedded in the JSON, in a buffer, or in a file beside."""
-    if "uri" in item:
-        return _of_uri(item["uri"], read)
-    view = table["bufferViews"][item["bufferView"]]
-    buffer = table["buffers"][view["buffer"]]
-    data = _of_uri(buffer["uri"], read) if "uri" in buffer else binary
-    start = int(view.get("byteOffset", 0))
-    return data[start : start + int(view["byteLength"])]
+def _local(node: Table) -> F64:
+    """4x4 parent_from_node."""
+    if "matrix" in node:
+        return np.asarray(np.array(node["matrix"], np.float64).reshape(4, 4).T)
+    x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))
+    turn = np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]], np.float64)
+    back = np.array([[w, -z, y, -x], [z, w, -x, -y], [-y, x, w, -z], [x, y, z, w]], np.float64)
+    matrix: F64 = turn @ back / max(x * x + y * y + z * z + w * w, 1e-30)
+    matrix[:3, :3] *= np.array(node.get("scale", (1.0, 1.0, 1.0)), np.float64)
+    matrix[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))
+    return matrix
 
 
-def _of_uri(uri: str, read: Read) -> bytes:
-    mark = "base64,"
-    return base64.b64decode(uri.partition(mark)[2]) if mark in uri else read(uri)
+def _faces(corners: Array, mode: int) -> Array:
+    """(t, 3) rows of attributes, or (n,) of points (section 3.7.2.1). Raises ValueError: no such mode."""
+    corners = np.asarray(corners).astype(np.int64)
+    if mode == POINTS:
+        return corners
+    if mode == TRIANGLES:
+        return corners[: len(corners) // 3 * 3].reshape(-1, 3)
+    number = np.arange(max(len(corners) - 2, 0))
+    if mode == STRIP:
+        return corners[np.column_stack([number, number + 1 + number % 2, number + 2 - number % 2])]
+    if mode == FAN:
+        return corners[np.column_stack([number + 1, number + 2, np.zeros_like(number)])]
+    raise ValueError(f"a primitive's mode is {mode}")
 
 
-def cut_alpha(rgba: U8, material: Any) -> None:
-    """Rescale a trimesh material's alpha (h, w, 4) in place so that its cut-off is one half."""
-    cut = {"MASK": 0.5 if material.alphaCutoff is None else material.alphaCutoff, "BLEND": 0.5}
-    cutoff = cut.get(str(material.alphaMode), 0.0)
-    opacity = 1.0 if material.baseColorFactor is None else float(material.baseColorFactor[3]) / 255
-    cutoff = cutoff / opacity if opacity > 0 else 2.0
-    rgba[..., 3] = np.clip(rgba[..., 3] * (0.5 / max(cutoff, 1e-3)), 0, 255) if cutoff else 255
+def _coordinates(use: Table) -> tuple[int, Table]:
+    own: Table = use.get("extensions", {}).get("KHR_texture_transform", {})
+    number: int = own["texCoord"] if "texCoord" in own else use.get("texCoord", 0)
+    return number, own
+
+
+def _transformed(uv: F32, use: Table) -> F32:
+    """Texture coordinates by KHR_texture_transform: scaled, turned, moved."""
+    own = _coordinates(use)[1]
+    if not own:
+        return uv
+    angle = float(own.get("rotation", 0.0))
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    moved = (uv * np.array(own.get("scale", (1.0, 1.0)))) @ turn.T + np.array(own.get("offset", (0.0, 0.0)))
+    return np.asarray(moved, np.float32)

@@ -17,8 +17,11 @@ log = logging.getLogger("phasestack.content")
 
 FILL = 0.75  # of the display's width and height that a fitted scene takes: its front is seen larger
 DEEPER = 2.0  # times `depth_m`, that a fitted scene may be
+BACK = 0.5  # of a flat surface, as the mean normal has it: what looks away by more is turned around
 FLAT = 0.1  # what is thinner than this share of its other sides is shown from its flat side
 STANDS = 0.2  # of its height: what stands so much higher above 0 along one axis than along another has that one up
+GLTF = (".glb", ".gltf")
+CUSTOMS = {".glb": ("+y", "+z"), ".gltf": ("+y", "+z"), ".obj": ("+y", "+z"), ".stl": ("+z", "-y")}  # up, and forwards
 DARK = (0.12, 0.12, 0.12)  # behind all but the built-in scenes: ghosts are seen on it, brighter and darker ones
 
 
@@ -36,27 +39,31 @@ class SceneFile:
         """Background colour."""
         return self.settings.background or DARK
 
-    def placed(self, low: F64, high: F64) -> F64:
-        """4x4 stack_from_scene of what has these corners: the preset's, else fitted, else its own metres."""
+    def placed(self, low: F64, high: F64, *, custom: tuple[str, str] | None = None, facing: F64 | None = None) -> F64:
+        """4x4 stack_from_scene of what has these corners: the preset's, else fitted, else its own metres.
+
+        custom: its format's axes up and to the viewer; None: by its name. facing: (3,) the mean normal of its surface,
+        by area, of what is turned to the viewer where it is flat.
+        """
         if self.preset:
             return stack_from_preset(self.preset)
-        axes = self._axes(low, high)
+        axes = self._axes(low, high, custom or CUSTOMS.get(self.path.suffix.lower()), facing)
         if self.settings.fit:
             return fitted(low, high, axes=axes, stack=self.stack, depth_m=self.settings.depth_m)
         matrix = np.eye(4)
         matrix[:3, :3] = axes.T
         return matrix
 
-    def _axes(self, low: F64, high: F64) -> F64:
-        """3x3 scene_from_stack rotation: as set, else glTF's, else the display's own, else guessed and said."""
+    def _axes(self, low: F64, high: F64, custom: tuple[str, str] | None, facing: F64 | None) -> F64:
+        """3x3 scene_from_stack rotation: as set, else the format's custom or the display's own, else guessed."""
         if self.settings.axes != "auto":
             up, out = self.settings.axes.split()
-        elif self.path.suffix.lower() in (".glb", ".gltf"):
-            up, out = "+y", "+z"
-        elif not self.settings.fit:
+        elif not self.settings.fit and self.path.suffix.lower() not in GLTF:
             up, out = "+z", "+x"
         else:
-            up, out = guessed_axes(low, high)
+            up, out = custom or guessed_axes(low, high)
+            if self.settings.fit and facing is not None:
+                up, out = turned_to_viewer(up, out, size=high - low, facing=facing)
             log.info("%s: taken to have %s up and %s towards the viewer (content.axes)", self.path.name, up, out)
         return axes_matrix(out=out, up=up)
 
@@ -64,16 +71,33 @@ class SceneFile:
 def guessed_axes(low: F64, high: F64) -> tuple[str, str]:
     """The up axis and the one towards the viewer, guessed from an extent: +y and +z, or +z and -y.
 
-    What lies flat is shown from its flat side. Else the axis is up along which it stands on 0 or above, and not
-    around it; else the longer one.
+    The axis is up along which it stands on 0 or above, and not around it; else the longer one.
     """
     size = np.maximum(high - low, 1e-30)
-    thinnest = int(size.argmin())
-    if size[thinnest] < FLAT * np.sort(size)[1] and thinnest > 0:
-        return ("+z", "-y") if thinnest == 1 else ("+y", "+z")
     y, z = np.maximum(low / size + 0.5, 0.0)[1:]  # 0: around the origin; a half: stands on it
     z_is_up = z > y if abs(z - y) > STANDS else size[2] > size[1]
     return ("+z", "-y") if z_is_up else ("+y", "+z")
+
+
+def turned_to_viewer(up: str, out: str, *, size: F64, facing: F64) -> tuple[str, str]:
+    """The same axes; of what is flat those by which its flat side, or its front, faces the viewer.
+
+    size: (3,) of the box that holds it. What lies is seen from above, with its near edge below.
+    """
+    thinnest = int(size.argmin())
+    axis = "xyz"[thinnest]
+    if size[thinnest] >= FLAT * np.sort(size)[1]:
+        return up, out
+    if axis == up[1]:
+        up, out = _opposite(out), up
+    elif axis != out[1]:
+        out = f"+{axis}"
+    looks = facing[thinnest] * (1 if out[0] == "+" else -1)
+    return (up, _opposite(out)) if looks < -BACK else (up, out)
+
+
+def _opposite(axis: str) -> str:
+    return ("-" if axis[0] == "+" else "+") + axis[1]
 
 
 def fitted(low: F64, high: F64, *, axes: F64, stack: PanelStack, depth_m: tuple[float, float]) -> F64:

@@ -10,8 +10,9 @@ import numpy as np
 from runtime.clock import NS_PER_S
 from runtime.content import shapes, textures
 from runtime.content.base import Colour, ContentInfo
+from runtime.content.parts import Part
 from runtime.content.scenes import SCENES, Scene, Thing
-from runtime.content.triangles import DrawnPart, Part, TriangleSource
+from runtime.content.triangles import DrawnPart, TriangleSource
 from runtime.optics.stack import PanelStack
 from runtime.records import F64
 

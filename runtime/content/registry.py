@@ -27,7 +27,7 @@ from runtime.support.plausible import nearest
 from runtime.support.plugins import is_plugin, plugin_class, strict
 from runtime.support.untrusted_input import LIMITS
 
-MESHES = (".glb", ".gltf", ".obj", ".stl")
+MESHES = (".glb", ".gltf", ".obj", ".off", ".stl")
 PLAYLISTS = (".toml", ".json")
 HARMLESS = {".png": PNG, ".jpg": JPEG, ".jpeg": JPEG}  # stills of their own kind, and of few pixels, are read here
 HARMLESS_PX = 4096 * 4096

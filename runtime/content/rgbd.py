@@ -20,10 +20,11 @@ from scipy.spatial import cKDTree
 from runtime.content.base import ContentInfo
 from runtime.content.frames import open_frames
 from runtime.content.images import rgba_from_rgb
+from runtime.content.parts import Part
 from runtime.content.pictures import screen
 from runtime.content.placing import SceneFile
 from runtime.content.shapes import I32, Shape
-from runtime.content.triangles import DrawnPart, Part, TriangleSource
+from runtime.content.triangles import DrawnPart, TriangleSource
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8

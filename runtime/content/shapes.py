@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from runtime.records import F32, F64
 
 I32 = NDArray[np.int32]
+
+AT_ONCE = 1 << 17  # vertices or faces that are worked on together: bounds the memory
 
 # 5x7 letters, a row a string; only those that the built-in scene spells.
 GLYPHS = {
@@ -52,6 +55,40 @@ def join(shapes: Sequence[Shape]) -> Shape:
             np.int32
         ),
     )
+
+
+def flat_normals(corners: ArrayLike) -> F32:
+    """(t, 3) unit normals of triangles' corners (t, 3, 3); zero where one has no area."""
+    corners = np.asarray(corners)
+    normals = np.empty((len(corners), 3), np.float32)
+    for first in range(0, len(corners), AT_ONCE):
+        corner = corners[first : first + AT_ONCE].astype(np.float64)
+        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        normals[first : first + AT_ONCE] = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    return normals
+
+
+def placed(positions: ArrayLike, normals: ArrayLike | None, matrices: F64) -> tuple[F32, F32 | None]:
+    """(v, 3) places and unit normals, moved by one 4x4 matrix, or by one a vertex (v, 4, 4)."""
+    positions = np.asarray(positions)
+    moved = np.empty(positions.shape, np.float32)
+    turned = None if normals is None else np.empty(positions.shape, np.float32)
+    for first in range(0, len(positions), AT_ONCE):  # in double precision
+        rows = slice(first, first + AT_ONCE)
+        matrix = matrices[rows] if matrices.ndim == 3 else matrices
+        linear = matrix[..., :3, :3]
+        moved[rows] = _times(linear, positions[rows]) + matrix[..., :3, 3]
+        if normals is not None and turned is not None:
+            # Joints turn and scale evenly, nodes as they like.
+            turn = linear if matrices.ndim == 3 else np.linalg.pinv(linear).T
+            normal = _times(turn, np.asarray(normals)[rows])
+            turned[rows] = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    return moved, turned
+
+
+def _times(matrix: NDArray[Any], vectors: NDArray[Any]) -> NDArray[Any]:
+    """(v, 3) vectors by a 3x3 matrix, or each by its own."""
+    return np.asarray(vectors @ matrix.T if matrix.ndim == 2 else np.einsum("nij,nj->ni", matrix, vectors))
 
 
 def rotation_about(axis: int, angle_rad: float) -> F64:

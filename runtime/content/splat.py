@@ -11,7 +11,7 @@ import numpy as np
 
 from runtime.content.base import ContentInfo, View
 from runtime.content.canvas import CanvasSource
-from runtime.content.gaussians import Gaussians, colours_towards, load_gaussians, moved, seen_splats
+from runtime.content.gaussians import Gaussians, bounds, colours_towards, load_gaussians, moved, seen_splats
 from runtime.content.placing import SceneFile
 from runtime.content.ply import read_header
 from runtime.optics.rect import PixelRect
@@ -19,7 +19,7 @@ from runtime.records import F64
 from runtime.support.gl import DrawnPicture
 
 OVER = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA)
-STRAY = 1.0  # percent of the splats at either end of an axis that do not decide the scale
+CUSTOM = ("-y", "-z")  # up, and to the viewer, where cameras are as OpenCV has them: the usual trainers' axes
 FLOATS = 8  # a corner: place in clip space (2), place in standard deviations (2), colour and opacity (4)
 VERTEX = """
 #version 330
@@ -50,8 +50,7 @@ void main() {
 def prepare(file: SceneFile) -> Callable[..., SplatSource]:
     """Read the file; the result uploads it to GL. Raises InputError."""
     gaussians = load_gaussians(read_header(file.path))
-    low, high = np.percentile(gaussians.centres.astype(np.float64), [STRAY, 100 - STRAY], axis=0)
-    matrix = file.placed(low, high)
+    matrix = file.placed(*bounds(gaussians), custom=CUSTOM)
     info = ContentInfo(file.path.stem, background=file.background)
     return partial(SplatSource, gaussians, stack_from_scene=matrix, info=info)
 

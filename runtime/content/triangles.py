@@ -6,7 +6,6 @@ A part pays only for what it has: without lamp, picture, vertex colours or holes
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import moderngl
@@ -16,19 +15,20 @@ from runtime.content import camera
 from runtime.content.base import ContentInfo, View
 from runtime.content.canvas import CanvasSource
 from runtime.content.fringe import edges_of, ramps, silhouette
-from runtime.content.shapes import I32, Shape
+from runtime.content.parts import OPAQUE_FROM, OUTLINED_MAX, Part, Sampler
+from runtime.content.shapes import I32
 from runtime.optics.rect import PixelRect, union
 from runtime.records import F32, F64, U8
 from runtime.support.background import raise_if_abandoned
 from runtime.support.gl import DrawnPicture
 
-OUTLINED_MAX = 200_000  # triangles of a part; beyond, finding its outline costs more than drawing it
 PROJECTED_MAX = 5000  # vertices of a part that are projected to see where it lies; beyond, its box is
 DRAWN_AT_ONCE = 20_000  # triangles
 UPLOADED_AT_ONCE = 8 << 20  # bytes
-OUTLINE_BYTES = 6 * (5 + 8) * 4  # two triangles an edge: clip coordinates and coverage, then the attributes
+OUTLINE_BYTES = 6 * (5 + 9) * 4  # two triangles an edge: clip coordinates and coverage, then the attributes
 OVER = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA)
 
+ANY_ALPHA = 2.0  # beyond every alpha
 VERTEX = """
 #ifdef OUTLINE
 in vec4 in_clip;
@@ -39,11 +39,11 @@ in vec3 in_position;
 #endif
 in vec3 in_normal;
 in vec2 in_uv;
-in vec3 in_colour;
+in vec4 in_colour;
 uniform mat3 stack_from_part;
-uniform vec3 colour;
+uniform vec4 colour;
 out vec2 uv;
-out vec3 shade;
+out vec4 shade;
 out float coverage;
 const vec3 TO_LAMP = vec3(0.66, -0.36, 0.66);
 void main() {
@@ -53,8 +53,11 @@ void main() {
 #endif
 #ifdef LIT
     vec3 normal = stack_from_part * in_normal;
-    float lamp = 0.5 + 0.5 * dot(normal, TO_LAMP) / max(length(normal), 1e-6);
-    shade *= 0.38 + 0.62 * lamp;
+    float lamp = 0.38 + 0.62 * (0.5 + 0.5 * dot(normal, TO_LAMP) / max(length(normal), 1e-6));
+#ifdef LINEAR
+    lamp = pow(lamp, 2.2);
+#endif
+    shade.rgb *= lamp;
 #endif
     uv = in_uv;
 #ifdef OUTLINE
@@ -68,50 +71,59 @@ void main() {
 """
 FRAGMENT = """
 in vec2 uv;
-in vec3 shade;
+in vec4 shade;
 in float coverage;
 out vec4 pixel;
 uniform sampler2D picture;
+uniform sampler2D glow_picture;
+uniform vec3 glow;
+uniform vec2 kept;  // alpha from and below which it is drawn
+float mirrored(float place) { return abs(mod(place + 1.0, 2.0) - 1.0); }
+vec3 linear(vec3 code) { return mix(code / 12.92, pow((code + 0.055) / 1.055, vec3(2.4)), step(0.04045, code)); }
+vec3 coded(vec3 light) {
+    return mix(light * 12.92, 1.055 * pow(max(light, 0.0), vec3(1.0 / 2.4)) - 0.055, step(0.0031308, light));
+}
 void main() {
-    vec3 rgb = shade;
-#ifdef PICTURE
-    vec4 texel = texture(picture, uv);
-    rgb *= texel.rgb;
-#ifdef HOLES
-    if (texel.a < 0.5) discard;
+    vec3 rgb = shade.rgb;
+    float alpha = shade.a;
+    vec2 place = uv;
+#ifdef MIRROR_U
+    place.x = mirrored(place.x);
 #endif
+#ifdef MIRROR_V
+    place.y = mirrored(place.y);
+#endif
+#ifdef PICTURE
+    vec4 texel = texture(picture, place);
+    alpha *= texel.a;
+#ifdef LINEAR
+    texel.rgb = linear(texel.rgb);
+#endif
+    rgb *= texel.rgb;
+#endif
+#if defined(HOLES) || defined(BLEND)
+    if (alpha < kept.x || alpha >= kept.y) discard;
+#endif
+#ifdef GLOW
+    vec3 own = glow;
+#ifdef GLOW_PICTURE
+    own *= linear(texture(glow_picture, place).rgb);
+#endif
+    rgb += own;
+#endif
+#ifdef LINEAR
+    rgb = coded(rgb);
 #endif
 #ifdef GREY
     rgb = vec3(dot(rgb, vec3(0.299, 0.587, 0.114)));
 #endif
+#ifdef BLEND
+    pixel = vec4(rgb, kept.y > 1.0 ? 1.0 : alpha);
+#else
     pixel = vec4(rgb, coverage);
+#endif
 }
 """
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Part:
-    """Triangles of one material, in their own frame."""
-
-    shape: Shape
-    picture: U8 | None = None  # (h, w, 4) RGBA, row 0 at uv 0; parts may share one array
-    colour: tuple[float, float, float] = (1.0, 1.0, 1.0)  # multiplies everything, 0-1
-    vertex_colours: F32 | None = None  # (v, 3), 0-1
-    lit: bool = True
-    grey: bool = False
-    turning: bool = False  # its placement changes: it is boxed for every orientation
-
-    @property
-    def features(self) -> tuple[str, ...]:
-        """The shader switches that it needs."""
-        switches = {
-            "LIT": self.lit,
-            "PICTURE": self.picture is not None,
-            "HOLES": self.picture is not None and bool((self.picture[..., 3] < 128).any()),
-            "COLOURED": self.vertex_colours is not None,
-            "GREY": self.grey,
-        }
-        return tuple(name for name, wanted in switches.items() if wanted)
 
 
 class DrawnPart:
@@ -120,39 +132,43 @@ class DrawnPart:
     def __init__(self, part: Part, *, outlined: bool = True) -> None:
         """outlined: with what ramps along its outline need."""
         mesh = part.shape
-        self.features, self.picture, self.colour = part.features, part.picture, part.colour
+        self.features, self.sampler = part.features, part.sampler
+        self.pictures, self.glow, self.two_sided = (part.picture, part.glow_picture), part.glow, part.two_sided
+        self.colour, self.cutoff = (*part.colour, part.opacity), part.cutoff
+        self.is_blended = "BLEND" in self.features
         self.triangles = np.ascontiguousarray(mesh.triangles, np.int32)
         self.corner_count, self.is_projected = self.triangles.size, len(mesh.positions_m) <= PROJECTED_MAX
-        # (v, 11) position, normal, texture coordinates, colour
-        self.vertices = np.ones((len(mesh.positions_m), 11), np.float32)
-        columns = (mesh.positions_m, mesh.normals, mesh.uv, 1.0 if part.vertex_colours is None else part.vertex_colours)
-        for (first, end), values in zip(((0, 3), (3, 6), (6, 8), (8, 11)), columns, strict=True):
-            self.vertices[:, first:end] = values
-        self.edges = edges_of(mesh) if outlined and len(mesh.triangles) <= OUTLINED_MAX else None
+        # (v, 12) position, normal, texture coordinates, colour and alpha
+        self.vertices = np.ones((len(mesh.positions_m), 12), np.float32)
+        for first, values in ((0, mesh.positions_m), (3, mesh.normals), (6, mesh.uv), (8, part.vertex_colours)):
+            if values is not None:
+                self.vertices[:, first : first + values.shape[1]] = values
+        outlined = outlined and not self.is_blended and len(mesh.triangles) <= OUTLINED_MAX
+        self.edges = edges_of(mesh) if outlined else None
         low, high = mesh.positions_m.min(0), mesh.positions_m.max(0)
         if part.turning:
             reach = float(np.linalg.norm(mesh.positions_m, axis=1).max())
             low, high = np.full(3, -reach), np.full(3, reach)
         self.corners_m = camera.box_corners(low, high)  # (8, 3) of the box that holds it; frame of the part
-        self.texture: Any = None
+        self.textures: list[Any] = []
 
     @property
     def positions(self) -> F32:
         """(v, 3) at present."""
         return self.vertices[:, :3]
 
-    def upload(self, context: Any, surface_program: Any, outline_program: Any, texture: Any) -> None:
-        """Make its GL objects; programs and texture are the source's, and shared."""
-        self.surface_program, self.outline_program, self.texture = surface_program, outline_program, texture
+    def upload(self, context: Any, surface_program: Any, outline_program: Any, textures: list[Any]) -> None:
+        """Make its GL objects; programs and textures are the source's, and shared."""
+        self.surface_program, self.outline_program, self.textures = surface_program, outline_program, textures
         self._buffer, self._triangles = (_uploaded(context, array) for array in (self.vertices, self.triangles))
         if self.edges is None and not self.is_projected:  # hundreds of MiB that nobody looks at any more
             self.vertices, self.triangles = self.vertices[:0].copy(), self.triangles[:0].copy()
         names = ("in_normal", "in_uv", "in_colour")
-        layout = _layout(surface_program, self._buffer, ("in_position", *names), (3, 3, 2, 3))
+        layout = _layout(surface_program, self._buffer, ("in_position", *names), (3, 3, 2, 4))
         self.surface = context.vertex_array(surface_program, [layout], index_buffer=self._triangles)
         size = max(len(self.edges.faces) if self.edges else 0, 1) * OUTLINE_BYTES
         self._outline_buffer = context.buffer(reserve=size, dynamic=True)
-        layout = _layout(outline_program, self._outline_buffer, ("in_clip", "in_coverage", *names), (4, 1, 3, 2, 3))
+        layout = _layout(outline_program, self._outline_buffer, ("in_clip", "in_coverage", *names), (4, 1, 3, 2, 4))
         self._outline = context.vertex_array(outline_program, [layout])
 
     def draw_surface(self) -> None:
@@ -193,11 +209,11 @@ class TriangleSource(CanvasSource):
         self.parts, self.stack_from_parts = list(parts), list(stack_from_parts)
         self._with_ramps = samples == 0
         self._programs: dict[tuple[str, ...], Any] = {}
-        self._textures: dict[int, Any] = {}
+        self._textures: dict[tuple[int, Sampler], Any] = {}
         for part in self.parts:
             programs = self._program(part.features), self._program((*part.features, "OUTLINE"))
-            picture = part.picture
-            part.upload(context, *programs, None if picture is None else self._texture(picture))
+            pictures = [picture for picture in part.pictures if picture is not None]
+            part.upload(context, *programs, [self._texture(picture, part.sampler) for picture in pictures])
         self.held += [*self.parts, *self._textures.values(), *self._programs.values()]
 
     def places(self, time_ns: int) -> Sequence[F64]:
@@ -225,11 +241,33 @@ class TriangleSource(CanvasSource):
             for part, stack_from_part in placed:
                 _set_look(part.surface_program, part, stack_from_part, view)
                 part.surface_program["clip_from_part"].write(_gl(clip @ stack_from_part))
+                least = OPAQUE_FROM if part.is_blended else part.cutoff
+                _set_uniforms(part.surface_program, kept=(least, ANY_ALPHA))
                 part.draw_surface()
             if self._with_ramps:
                 self._draw_outlines(placed, clip, view)
+            if any(part.is_blended for part in self.parts):
+                self._draw_translucent(placed, clip, view)
 
         return self.drawn(view, area, paint)
+
+    def _draw_translucent(self, placed: list[tuple[DrawnPart, F64]], clip: F64, view: View) -> None:
+        """Over what is opaque: the farthest part first, and of each what is turned away first."""
+        context, framebuffer = self.context, self.context.fbo
+        context.enable_only(context.DEPTH_TEST | context.BLEND | context.CULL_FACE)
+        context.blend_func = OVER
+        context.front_face = "cw"  # the raster's rows run along GL's y
+        framebuffer.depth_mask = False
+        for part, stack_from_part in reversed(placed):
+            if part.is_blended:
+                _set_look(part.surface_program, part, stack_from_part, view)
+                part.surface_program["clip_from_part"].write(_gl(clip @ stack_from_part))
+                _set_uniforms(part.surface_program, kept=(1 / 255, OPAQUE_FROM))
+                for hidden in ("front", "back") if part.two_sided else ("back",):
+                    context.cull_face = hidden
+                    part.draw_surface()
+        framebuffer.depth_mask = True
+        context.disable(context.CULL_FACE)
 
     def _program(self, features: tuple[str, ...]) -> Any:
         if features not in self._programs:
@@ -239,14 +277,17 @@ class TriangleSource(CanvasSource):
             self._programs[features] = self.context.program(**shaders)
         return self._programs[features]
 
-    def _texture(self, picture: U8) -> Any:
-        if id(picture) not in self._textures:
+    def _texture(self, picture: U8, sampler: Sampler) -> Any:
+        key = (id(picture), sampler)
+        if key not in self._textures:
             height, width = picture.shape[:2]
             texture = self.context.texture((width, height), 4, np.ascontiguousarray(picture).tobytes())
             texture.build_mipmaps()
-            texture.filter = (self.context.LINEAR_MIPMAP_NEAREST, self.context.LINEAR)
-            self._textures[id(picture)] = texture
-        return self._textures[id(picture)]
+            enlarged = self.context.NEAREST if sampler.nearest else self.context.LINEAR
+            texture.filter = (self.context.LINEAR_MIPMAP_NEAREST, enlarged)
+            texture.repeat_x, texture.repeat_y = (wrap == "repeat" for wrap in sampler.wrap)
+            self._textures[key] = texture
+        return self._textures[key]
 
     def _draw_outlines(self, placed: list[tuple[DrawnPart, F64]], clip_from_stack: F64, view: View) -> None:
         context, framebuffer = self.context, self.context.fbo
@@ -263,6 +304,7 @@ class TriangleSource(CanvasSource):
             corners, vertices = ramps(clip, ends, apex, width_px=view.width_px, height_px=view.height_px)
             if len(corners):
                 _set_look(part.outline_program, part, stack_from_part, view)
+                _set_uniforms(part.outline_program, kept=(part.cutoff, ANY_ALPHA))
                 part.draw_outline(corners, vertices)
         framebuffer.depth_mask = True
 
@@ -273,9 +315,16 @@ def _set_look(program: Any, part: DrawnPart, stack_from_part: F64, view: View) -
         linear = view.display_from_view @ linear
     if "stack_from_part" in program:
         program["stack_from_part"].write(_gl(np.linalg.pinv(linear).T * np.cbrt(abs(np.linalg.det(linear)))))
-    program["colour"] = part.colour
-    if part.texture is not None:
-        part.texture.use(0)
+    _set_uniforms(program, colour=part.colour, glow=part.glow, glow_picture=len(part.textures) - 1)
+    for unit, texture in enumerate(part.textures):
+        texture.use(unit)
+
+
+def _set_uniforms(program: Any, **values: Any) -> None:
+    """Those that the compiler has kept."""
+    for name, value in values.items():
+        if name in program:
+            program[name] = value
 
 
 def _uploaded(context: Any, array: Any) -> Any:

@@ -78,6 +78,7 @@ def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
         "missing": presenter.missing,
         **holds(presenter),
         "content_problem": state.content.problem,
+        "content_left_out": state.content.info.left_out,
         "program": state.content.program,
         "playlist": state.content.describe(time_ns=presenter.clock.now_ns()),
         "plan": run.plan_items(),

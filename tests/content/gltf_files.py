@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
-CODES = {"float32": 5126, "uint16": 5123, "uint8": 5121, "uint32": 5125}
+CODES = {"float32": 5126, "int16": 5122, "uint16": 5123, "int8": 5120, "uint8": 5121, "uint32": 5125}
 
 
 class Buffer:
@@ -21,14 +21,14 @@ class Buffer:
         self.views: list[dict[str, Any]] = []
         self.accessors: list[dict[str, Any]] = []
 
-    def add(self, values: Any, dtype: Any = np.float32) -> int:
-        """(n, w) numbers; answers the accessor's index."""
+    def add(self, values: Any, dtype: Any = np.float32, **more: Any) -> int:
+        """(n, w) numbers; answers the accessor's index. more: of the accessor's table."""
         array = np.ascontiguousarray(np.asarray(values, dtype=dtype).reshape(len(values), -1))
         self.data += b"\0" * (-len(self.data) % 4)
         self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": array.nbytes})
         self.data += array.tobytes()
         kind = {"componentType": CODES[array.dtype.name], "type": KINDS[array.shape[1]]}
-        self.accessors.append({"bufferView": len(self.views) - 1, "count": len(array), **kind})
+        self.accessors.append({"bufferView": len(self.views) - 1, "count": len(array), **kind, **more})
         return len(self.accessors) - 1
 
     def table(self, primitive: dict[str, Any], **tables: Any) -> dict[str, Any]:

@@ -1,7 +1,10 @@
-"""glTF: nodes as trimesh places them, alpha as the material says, colours times textures."""
+"""glTF 2.0 by its specification's text: each section's own kind of file, made here, is drawn as it says."""
 
 from __future__ import annotations
 
+import base64
+import io
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,56 +13,435 @@ import pytest
 from PIL import Image
 
 from runtime.config import ContentSettings
-from runtime.content.base import ContentSource
+from runtime.content.gltf_file import WAY_OUT
 from runtime.content.mesh import load_mesh
 from runtime.content.registry import open_content
+from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from tests.content.conftest import panel_view
 from tests.content.gltf_files import SQUARE, SQUARE_FACES, Buffer
 
 EYE = (0.6, 0.0, 0.0)
+UV = [[0, 1], [1, 1], [1, 0], [0, 0]]  # the whole picture, upright
+HALVES = np.array([[[255, 0, 0, 255], [0, 0, 255, 255]]], np.uint8)  # red left, blue right
+FACING = [[0, 0, 1]] * 4
 
 
-def opened(path: Path, context: Any, stack: PanelStack, **settings: Any) -> ContentSource:
-    return open_content(ContentSettings(scene=str(path), **settings), stack, context)
+def drawn(path: Path, context: Any, stack: PanelStack, **settings: Any) -> np.ndarray:
+    source = open_content(ContentSettings(scene=str(path), **settings), stack, context)
+    return source.render(panel_view(EYE, stack.panel(1)), time_ns=0).copy()
+
+
+def uri_of(picture: np.ndarray) -> str:
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, "PNG")
+    return "data:image/png;base64," + base64.b64encode(file.getvalue()).decode()
+
+
+def square(b: Buffer, uv: Any = UV, **more: Any) -> dict[str, Any]:
+    """A primitive of a square that faces the viewer; uv: coordinates, or an accessor's number."""
+    where = uv if isinstance(uv, int) else b.add(uv)
+    attributes = {"POSITION": b.add(SQUARE), "NORMAL": b.add(FACING), "TEXCOORD_0": where}
+    return {"attributes": attributes, "indices": b.add(SQUARE_FACES, np.uint16), "material": 0, **more}
+
+
+def painted(path: Path, b: Buffer, primitive: dict[str, Any], picture: np.ndarray = HALVES, **tables: Any) -> Path:
+    """With a picture on its base colour unless the tables say otherwise."""
+    base = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}, "extensions": {"KHR_materials_unlit": {}}}
+    own = {"materials": [base], "images": [{"uri": uri_of(picture)}], "textures": [{"source": 0, "sampler": 0}]}
+    return b.write(path, primitive, **({**own, "samplers": [{"magFilter": 9728}]} | tables))
+
+
+def columns(picture: np.ndarray) -> str:
+    """Colours along the middle row, from left to right: r, g, b, or - where nothing is."""
+    row = picture[picture.shape[0] // 2]
+    letters = ["-" if pixel[3] < 255 else "rgb"[int(pixel[:3].argmax())] for pixel in row]
+    return "".join(one for one, before in zip(letters, ["", *letters], strict=False) if one != before).strip("-")
+
+
+# Geometry
 
 
 def test_nodes_place_meshes(tmp_path: Path) -> None:
     """A child's translation counts in its parent's turned and scaled axes."""
     b = Buffer()
-    primitive = {"attributes": {"POSITION": b.add(SQUARE)}, "indices": b.add(SQUARE_FACES, np.uint16)}
     half = np.sqrt(0.5)
     nodes = [
         {"children": [1], "rotation": [0, 0, half, half], "scale": [2, 2, 2]},  # a quarter about z
         {"mesh": 0, "translation": [3, 0, 0]},
     ]
-    data = load_mesh(b.write(tmp_path / "a.gltf", primitive, nodes=nodes))
+    data = load_mesh(b.write(tmp_path / "a.gltf", square(b), nodes=nodes, materials=[{}]))
     assert data.low == pytest.approx([-2, 4, 0], abs=1e-6) and data.high == pytest.approx([2, 8, 0], abs=1e-6)
 
 
-@pytest.mark.parametrize(("mode", "drawn"), [("OPAQUE", True), ("MASK", False), ("BLEND", False)])
-def test_alpha_is_what_the_material_says(
-    tmp_path: Path, context: Any, stack: PanelStack, mode: str, drawn: bool
+def test_only_the_scene_is_drawn(tmp_path: Path) -> None:
+    b = Buffer()
+    nodes = [{"mesh": 0}, {"mesh": 0, "translation": [9, 0, 0]}]
+    scenes = [{"nodes": [0]}, {"nodes": [1]}]
+    data = load_mesh(b.write(tmp_path / "a.gltf", square(b), nodes=nodes, scenes=scenes, scene=1, materials=[{}]))
+    assert data.low[0] == 8
+
+
+@pytest.mark.parametrize(
+    ("mode", "corners"),
+    [(4, [0, 1, 2, 0, 2, 3]), (5, [0, 1, 3, 2]), (6, [0, 1, 2, 3])],
+    ids=["triangles", "a strip", "a fan"],
+)
+@pytest.mark.parametrize("indexed", [True, False])
+def test_every_mode_of_triangles_is_drawn_from_its_front(
+    tmp_path: Path, context: Any, stack: PanelStack, mode: int, corners: list[int], indexed: bool
 ) -> None:
-    Image.new("RGBA", (8, 8), (255, 0, 0, 20)).save(tmp_path / "skin.png")
+    """Section 3.7.2.1. The flat normals follow the winding."""
     b = Buffer()
-    attributes = {"POSITION": b.add(SQUARE), "TEXCOORD_0": b.add([[0, 1], [1, 1], [1, 0], [0, 0]])}
-    b.write(
-        tmp_path / "a.gltf",
-        {"attributes": attributes, "indices": b.add(SQUARE_FACES, np.uint16), "material": 0},
-        images=[{"uri": "skin.png"}],
-        textures=[{"source": 0}],
-        materials=[{"alphaMode": mode, "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
-    )
-    picture = opened(tmp_path / "a.gltf", context, stack).render(panel_view(EYE, stack.panel(1)), time_ns=0)
-    assert bool((picture[..., 3] == 255).any()) is drawn
+    if indexed:
+        primitive = {"attributes": {"POSITION": b.add(SQUARE)}, "indices": b.add(corners, np.uint8)}
+    else:
+        primitive = {"attributes": {"POSITION": b.add(np.array(SQUARE)[corners])}}
+    (part,) = load_mesh(b.write(tmp_path / "a.gltf", primitive | {"mode": mode})).parts
+    assert len(part.shape.triangles) == 2 and (part.shape.normals == (0, 0, 1)).all()
+    side = 0.75 * stack.height_px
+    assert (drawn(tmp_path / "a.gltf", context, stack)[..., 3] == 255).sum() == pytest.approx(side**2, rel=0.05)
 
 
-def test_vertex_colours_multiply_the_materials_colour(tmp_path: Path) -> None:
+def test_a_sparse_accessor_replaces_what_it_names(tmp_path: Path) -> None:
+    """Section 3.6.2.3, with and without a buffer view of its own."""
     b = Buffer()
-    attributes = {"POSITION": b.add(SQUARE), "COLOR_0": b.add([[1.0, 0.5, 0.25]] * 4)}
-    primitive = {"attributes": attributes, "indices": b.add(SQUARE_FACES, np.uint16), "material": 0}
-    materials = [{"pbrMetallicRoughness": {"baseColorFactor": [0.2, 1.0, 1.0, 1.0]}}]
-    (part,) = load_mesh(b.write(tmp_path / "a.gltf", primitive, materials=materials)).parts
-    assert part.colour == pytest.approx((0.2, 1.0, 1.0))
-    assert part.vertex_colours == pytest.approx(np.tile(np.float32([1.0, 0.5, 0.25]), (4, 1)))
+    places, moved = b.add([3], np.uint16), b.add([[-3, 3, 0]])
+    sparse = {"count": 1, "indices": {"bufferView": 0, "componentType": 5123}, "values": {"bufferView": 1}}
+    primitive = square(b)
+    whole = primitive["attributes"]["POSITION"]
+    b.accessors[whole]["sparse"] = sparse
+    data = load_mesh(b.write(tmp_path / "a.gltf", primitive, materials=[{}]))
+    assert data.low.tolist() == [-3, -1, 0] and data.high.tolist() == [1, 3, 0]
+    del b.accessors[whole]["bufferView"]  # zeros
+    data = load_mesh(b.write(tmp_path / "a.gltf", primitive | {"mode": 0}, materials=[{}]))
+    assert data.low.tolist() == [-3, 0, 0] and data.high.tolist() == [0, 3, 0]
+    assert places != moved
+
+
+@pytest.mark.parametrize(("dtype", "most"), [(np.int8, 127), (np.int16, 32767), (np.uint8, 255), (np.uint16, 65535)])
+@pytest.mark.parametrize("normalized", [True, False])
+def test_integers_are_fractions_where_they_are_normalized(
+    tmp_path: Path, dtype: Any, most: int, normalized: bool
+) -> None:
+    """Section 3.6.2.2; KHR_mesh_quantization."""
+    b = Buffer()
+    padded = np.zeros((4, 4), dtype)
+    padded[:, :3] = np.maximum(SQUARE, 0) * most
+    position = b.add(padded, dtype, normalized=normalized, type="VEC3")
+    b.views[-1]["byteStride"] = padded.strides[0]
+    primitive = {"attributes": {"POSITION": position}, "indices": b.add(SQUARE_FACES, np.uint16)}
+    required = ["KHR_mesh_quantization"]
+    data = load_mesh(b.write(tmp_path / "a.gltf", primitive, extensionsRequired=required, extensionsUsed=required))
+    assert data.high[0] == pytest.approx(1.0 if normalized else most) and data.left_out == ()
+
+
+def test_without_normals_it_is_flat_and_with_them_as_they_say(tmp_path: Path) -> None:
+    """Section 3.7.2.1: a roof's two faces share no shade."""
+    b = Buffer()
+    roof = b.add([[-1, 0, 0], [0, 1, 0], [1, 0, 0], [-1, 0, 9], [0, 1, 9], [1, 0, 9]])
+    faces = b.add([0, 3, 4, 0, 4, 1, 1, 4, 5, 1, 5, 2], np.uint16)
+    (flat,) = load_mesh(b.write(tmp_path / "a.gltf", {"attributes": {"POSITION": roof}, "indices": faces})).parts
+    left, right = np.unique(np.round(flat.shape.normals, 3), axis=0).tolist()
+    assert left == pytest.approx([-0.707, 0.707, 0]) and right == pytest.approx([0.707, 0.707, 0])
+    attributes = {"POSITION": roof, "NORMAL": b.add([[0, 1, 0]] * 6)}
+    (smooth,) = load_mesh(b.write(tmp_path / "a.gltf", {"attributes": attributes, "indices": faces})).parts
+    assert (smooth.shape.normals == (0, 1, 0)).all()
+
+
+def test_a_mirrored_node_keeps_its_front(tmp_path: Path) -> None:
+    b = Buffer()
+    for attributes in ({"POSITION": b.add(SQUARE)}, {"POSITION": b.add(SQUARE), "NORMAL": b.add(FACING)}):
+        primitive = {"attributes": attributes, "indices": b.add(SQUARE_FACES, np.uint16)}
+        data = load_mesh(b.write(tmp_path / "a.gltf", primitive, nodes=[{"mesh": 0, "scale": [-1, 1, 1]}]))
+        assert data.facing == pytest.approx([0, 0, 1]) and (data.parts[0].shape.normals == (0, 0, 1)).all()
+
+
+def test_morphs_have_their_default_weights(tmp_path: Path) -> None:
+    """Section 3.7.2.2: the node's weights, else the mesh's."""
+    b = Buffer()
+    target = {"POSITION": b.add([[0, 0, 0], [2, 0, 0], [2, 0, 0], [0, 0, 0]])}
+    meshes = [{"primitives": [square(b, targets=[target])], "weights": [0.5]}]
+    assert load_mesh(b.write(tmp_path / "a.gltf", {}, meshes=meshes, materials=[{}])).high[0] == 2
+    nodes = [{"mesh": 0, "weights": [1.0]}]
+    assert load_mesh(b.write(tmp_path / "a.gltf", {}, meshes=meshes, nodes=nodes, materials=[{}])).high[0] == 3
+
+
+def test_a_skin_has_the_pose_of_its_nodes(tmp_path: Path) -> None:
+    """Section 3.7.3: joints place it; the node that has it does not."""
+    b = Buffer()
+    primitive = square(b)
+    primitive["attributes"]["JOINTS_0"] = b.add([[0, 0, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0], [0, 0, 0, 0]], np.uint8)
+    primitive["attributes"]["WEIGHTS_0"] = b.add([[255, 0, 0, 0]] * 4, np.uint8, normalized=True)
+    back = np.eye(4)
+    back[3, 0] = -1.0  # column by column: the second joint was bound at x = 1
+    skins = [{"joints": [1, 2], "inverseBindMatrices": b.add([np.eye(4), back])}]
+    nodes = [
+        {"mesh": 0, "skin": 0, "translation": [50, 0, 0]},
+        {"children": [2]},
+        {"translation": [4, 0, 0]},
+    ]
+    scenes = [{"nodes": [0, 1]}]
+    data = load_mesh(b.write(tmp_path / "a.gltf", primitive, nodes=nodes, skins=skins, scenes=scenes, materials=[{}]))
+    assert data.low[0] == -1 and data.high[0] == pytest.approx(1 - 1 + 4)
+
+
+# Texture coordinates
+
+
+@pytest.mark.parametrize(("dtype", "most"), [(np.uint8, 255), (np.uint16, 65535)])
+def test_normalized_texture_coordinates_are_those_of_floats(
+    tmp_path: Path, context: Any, stack: PanelStack, dtype: Any, most: int
+) -> None:
+    b = Buffer()
+    painted(tmp_path / "a.gltf", b, square(b, b.add(np.array(UV) * most, dtype, normalized=True)))
+    assert columns(drawn(tmp_path / "a.gltf", context, stack)) == "rb"
+
+
+@pytest.mark.parametrize(
+    ("wrap", "seen"), [(10497, "rbrbrb"), (33071, "rb"), (33648, "brrbbr".replace("rr", "r").replace("bb", "b"))]
+)
+def test_a_sampler_says_how_a_texture_goes_on(
+    tmp_path: Path, context: Any, stack: PanelStack, wrap: int, seen: str
+) -> None:
+    """From -1 to 2 across: repeated, its edge, mirrored."""
+    b = Buffer()
+    across = [[-1, 1], [2, 1], [2, 0], [-1, 0]]
+    painted(tmp_path / "a.gltf", b, square(b, across), samplers=[{"wrapS": wrap, "wrapT": wrap, "magFilter": 9728}])
+    assert columns(drawn(tmp_path / "a.gltf", context, stack)) == seen
+
+
+def test_a_texture_takes_the_coordinates_that_it_names(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    b = Buffer()
+    primitive = square(b, [[0, 0]] * 4)
+    primitive["attributes"]["TEXCOORD_1"] = b.add(UV)
+    materials = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "texCoord": 1}}}]
+    painted(tmp_path / "a.gltf", b, primitive, materials=materials)
+    assert columns(drawn(tmp_path / "a.gltf", context, stack)) == "rb"
+
+
+def test_texture_transforms_scale_turn_and_move(tmp_path: Path) -> None:
+    """KHR_texture_transform's own example: the lower left quarter of the picture, turned clockwise by 90 degrees."""
+    b = Buffer()
+    own = {"offset": [0, 1], "rotation": np.pi / 2, "scale": [0.5, 0.5], "texCoord": 1}
+    materials = [
+        {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "extensions": {"KHR_texture_transform": own}}}}
+    ]
+    primitive = square(b, [[7, 7]] * 4)
+    primitive["attributes"]["TEXCOORD_1"] = b.add([[0, 0], [1, 0], [1, 1], [0, 1]])
+    (part,) = load_mesh(painted(tmp_path / "a.gltf", b, primitive, materials=materials)).parts
+    assert part.shape.uv == pytest.approx(np.array([[0, 1], [0, 0.5], [0.5, 0.5], [0.5, 1]]), abs=1e-6)
+
+
+# Colours: factors and those of vertices are linear light, pictures are codes of sRGB (section 3.9.2)
+
+
+def middle(path: Path, context: Any, stack: PanelStack, **settings: Any) -> list[int]:
+    picture = drawn(path, context, stack, **settings)
+    return picture[picture.shape[0] // 2, picture.shape[1] // 2].astype(int).tolist()
+
+
+def code_of(light: float) -> float:
+    return 255 * (12.92 * light if light <= 0.0031308 else 1.055 * light ** (1 / 2.4) - 0.055)
+
+
+def light_of(code: float) -> float:
+    return code / 255 / 12.92 if code / 255 <= 0.04045 else ((code / 255 + 0.055) / 1.055) ** 2.4
+
+
+def material(**own: Any) -> list[dict[str, Any]]:
+    unlit: dict[str, Any] = {"extensions": {"KHR_materials_unlit": {}}}
+    return [unlit | own]
+
+
+@pytest.mark.parametrize("light", [0.0, 0.002, 0.2, 0.5, 1.0])
+def test_a_factor_is_linear_light(tmp_path: Path, context: Any, stack: PanelStack, light: float) -> None:
+    b = Buffer()
+    materials = material(pbrMetallicRoughness={"baseColorFactor": [light, light, light, 1]})
+    b.write(tmp_path / "a.gltf", square(b), materials=materials)
+    assert middle(tmp_path / "a.gltf", context, stack)[0] == pytest.approx(code_of(light), abs=1)
+
+
+def test_factor_picture_and_vertices_multiply_as_light(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    b = Buffer()
+    primitive = square(b)
+    primitive["attributes"]["COLOR_0"] = b.add([[0.5, 0.25, 1.0]] * 4)
+    grey = np.full((1, 1, 4), (128, 128, 128, 255), np.uint8)
+    base = {"baseColorTexture": {"index": 0}, "baseColorFactor": [0.4, 1.0, 0.2, 1.0]}
+    painted(tmp_path / "a.gltf", b, primitive, grey, materials=material(pbrMetallicRoughness=base))
+    wanted = [code_of(light_of(128) * share) for share in (0.2, 0.25, 0.2)]
+    assert middle(tmp_path / "a.gltf", context, stack)[:3] == pytest.approx(wanted, abs=1)
+
+
+def test_the_lamp_dims_what_is_lit_alone(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    """Unlit shows the picture's own values; lit ones follow the lamp, whatever is multiplied."""
+    grey = np.full((1, 1, 4), (200, 200, 200, 255), np.uint8)
+    base = {"baseColorTexture": {"index": 0}}
+    seen = []
+    for own in (material(pbrMetallicRoughness=base), [{"pbrMetallicRoughness": base}]):
+        b = Buffer()
+        painted(tmp_path / "a.gltf", b, square(b), grey, materials=own)
+        seen.append(middle(tmp_path / "a.gltf", context, stack)[0])
+    assert seen[0] == 200
+    b = Buffer()
+    primitive = square(b)
+    primitive["attributes"]["COLOR_0"] = b.add([[1.0, 1.0, 1.0]] * 4)  # the same, worked out as light
+    painted(tmp_path / "a.gltf", b, primitive, grey, materials=[{"pbrMetallicRoughness": base}])
+    assert 130 < seen[1] < 195 and middle(tmp_path / "a.gltf", context, stack)[0] == pytest.approx(seen[1], abs=2)
+
+
+@pytest.mark.parametrize("pictured", [True, False])
+def test_what_glows_adds_its_light(tmp_path: Path, context: Any, stack: PanelStack, pictured: bool) -> None:
+    """Section 3.9.3, with KHR_materials_emissive_strength."""
+    own = {
+        "emissiveFactor": [0.1, 0.2, 0.0],
+        "pbrMetallicRoughness": {"baseColorFactor": [0, 0, 0, 1]},
+        "extensions": {"KHR_materials_emissive_strength": {"emissiveStrength": 2.0}},
+    } | ({"emissiveTexture": {"index": 0}} if pictured else {})
+    b = Buffer()
+    grey = np.full((1, 1, 4), (128, 128, 128, 255), np.uint8)
+    painted(tmp_path / "a.gltf", b, square(b), grey, materials=[own])
+    share = light_of(128) if pictured else 1.0
+    wanted = [code_of(0.2 * share), code_of(0.4 * share), 0]
+    assert middle(tmp_path / "a.gltf", context, stack)[:3] == pytest.approx(wanted, abs=1)
+
+
+def test_specular_glossiness_has_a_diffuse_palette(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    b = Buffer()
+    file = io.BytesIO()
+    Image.fromarray(HALVES[..., :3]).convert("P").save(file, "PNG")
+    own = {"KHR_materials_pbrSpecularGlossiness": {"diffuseTexture": {"index": 0}}}
+    images = [{"uri": "data:image/png;base64," + base64.b64encode(file.getvalue()).decode()}]
+    required = {"extensionsRequired": [*own], "extensionsUsed": [*own]}
+    painted(tmp_path / "a.gltf", b, square(b), materials=[{"extensions": own}], images=images, **required)
+    assert columns(drawn(tmp_path / "a.gltf", context, stack)) == "rb"
+
+
+# Alpha (section 3.9.4)
+
+
+@pytest.mark.parametrize("place", ["texture", "factor", "vertices"])
+@pytest.mark.parametrize(
+    ("mode", "alpha", "covers"),
+    [("OPAQUE", 0.1, 1.0), ("MASK", 0.3, 0.0), ("MASK", 0.6, 1.0), ("BLEND", 0.3, 0.3), ("BLEND", 1.0, 1.0)],
+)
+def test_alpha_is_what_the_material_says(
+    tmp_path: Path, context: Any, stack: PanelStack, place: str, mode: str, alpha: float, covers: float
+) -> None:
+    b = Buffer()
+    primitive, white = square(b), np.full((1, 1, 4), 255, np.uint8)
+    base: dict[str, Any] = {"baseColorTexture": {"index": 0}}
+    if place == "texture":
+        white[..., 3] = round(255 * alpha)
+    elif place == "factor":
+        base |= {"baseColorFactor": [1, 1, 1, alpha]}
+    else:
+        primitive["attributes"]["COLOR_0"] = b.add([[1, 1, 1, alpha]] * 4)
+    painted(tmp_path / "a.gltf", b, primitive, white, materials=material(alphaMode=mode, pbrMetallicRoughness=base))
+    seen = middle(tmp_path / "a.gltf", context, stack, background=(0.0, 0.0, 0.0))
+    assert seen[0] == pytest.approx(255 * covers, abs=2) and (seen[3] > 0) is (covers > 0)
+
+
+def test_what_is_behind_glass_shows_through_it_whatever_the_order(
+    tmp_path: Path, context: Any, stack: PanelStack
+) -> None:
+    b = Buffer()
+    primitives = [square(b) | {"material": number} for number in (0, 1)]
+    glass = {"alphaMode": "BLEND", "pbrMetallicRoughness": {"baseColorFactor": [0, 0, 1, 0.5]}}
+    materials = [*material(**glass), *material(pbrMetallicRoughness={"baseColorFactor": [1, 0, 0, 1]})]
+    meshes = [{"primitives": [primitive]} for primitive in primitives]
+    for nodes in ([0, 1], [1, 0]):
+        placed = [{"mesh": mesh, "translation": [0, 0, 0.2 if mesh == 0 else -0.2]} for mesh in nodes]
+        b.write(tmp_path / "a.gltf", {}, meshes=meshes, nodes=placed, scenes=[{"nodes": [0, 1]}], materials=materials)
+        assert middle(tmp_path / "a.gltf", context, stack) == pytest.approx([128, 0, 128, 255], abs=2)
+
+
+def test_a_front_alone_is_seen_through_unless_it_has_two_sides(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    """Of a closed glass box: one layer, or two."""
+    b = Buffer()
+    near, far = np.add(SQUARE, [0, 0, 0.5]), np.subtract(SQUARE, [0, 0, 0.5])[::-1]
+    attributes = {"POSITION": b.add([*near, *far]), "NORMAL": b.add([[0, 0, 1]] * 4 + [[0, 0, -1]] * 4)}
+    faces = b.add([*SQUARE_FACES, *(index + 4 for index in SQUARE_FACES)], np.uint16)
+    primitive = {"attributes": attributes, "indices": faces, "material": 0}
+    for two_sided, covers in ((False, 0.5), (True, 0.75)):
+        glass = {"alphaMode": "BLEND", "doubleSided": two_sided}
+        own = material(**glass, pbrMetallicRoughness={"baseColorFactor": [1, 1, 1, 0.5]})
+        b.write(tmp_path / "a.gltf", primitive, materials=own)
+        seen = middle(tmp_path / "a.gltf", context, stack, background=(0.0, 0.0, 0.0))
+        assert seen[0] == pytest.approx(255 * covers, abs=3)
+
+
+# Parts, and what is left out
+
+
+def test_parts_that_look_alike_are_drawn_as_one(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    """Two hundred colours without a picture are one part; what they show is the same."""
+    random = np.random.default_rng(0)
+    b = Buffer()
+    primitives = [square(b) | {"material": number} for number in range(100)]
+    colours = random.uniform(size=(100, 3)).tolist()
+    materials = [{"pbrMetallicRoughness": {"baseColorFactor": [*colour, 1]}} for colour in colours]
+    nodes = [{"mesh": k, "translation": [3 * (k % 10), 3 * (k // 10), 0]} for k in range(100)]
+    meshes = [{"primitives": [primitive]} for primitive in primitives]
+    scenes = [{"nodes": [*range(100)]}]
+    path = b.write(tmp_path / "a.gltf", {}, meshes=meshes, nodes=nodes, scenes=scenes, materials=materials)
+    source = open_content(ContentSettings(scene=str(path)), stack, context)
+    assert len(load_mesh(path).parts) == 100 and len(source.parts) == 1
+    one = source.render(panel_view(EYE, stack.panel(1)), time_ns=0)
+    lit = one[one[..., 3] == 255][:, :3].astype(int)
+    assert len(np.unique(lit, axis=0)) >= 100
+
+
+def test_what_is_not_drawn_is_said_once_and_in_the_info(
+    tmp_path: Path, context: Any, stack: PanelStack, caplog: pytest.LogCaptureFixture
+) -> None:
+    b = Buffer()
+    lines = {"attributes": {"POSITION": b.add(SQUARE)}, "mode": 1}
+    tables = {"animations": [{}], "extensionsUsed": ["KHR_materials_transmission", "KHR_texture_transform"]}
+    path = b.write(tmp_path / "a.gltf", {}, meshes=[{"primitives": [square(b), lines]}], materials=[{}], **tables)
+    source = open_content(ContentSettings(scene=str(path)), stack, context)
+    assert source.info.left_out == ("KHR_materials_transmission", "animations", "lines")
+    assert f"{path}: is drawn without KHR_materials_transmission, animations, lines" in caplog.messages
+
+
+def compressed(path: Path, *, required: bool, fallback: bool) -> Path:
+    """A square that Draco has compressed."""
+    DracoPy = pytest.importorskip("DracoPy")
+    b = Buffer()
+    primitive = square(b)
+    data = DracoPy.encode(np.array(SQUARE, np.float32), np.array(SQUARE_FACES, np.uint32).reshape(-1, 3))
+    number = DracoPy.decode(data).attributes[0]["unique_id"]
+    view = b.accessors[b.add(np.frombuffer(data, np.uint8), np.uint8)]["bufferView"]
+    own = {"bufferView": view, "attributes": {"POSITION": number}}
+    primitive |= {"extensions": {"KHR_draco_mesh_compression": own}}
+    del primitive["attributes"]["NORMAL"], primitive["attributes"]["TEXCOORD_0"]
+    if not fallback:
+        for accessor in (primitive["attributes"]["POSITION"], primitive["indices"]):
+            del b.accessors[accessor]["bufferView"]
+    names = ["KHR_draco_mesh_compression"]
+    return b.write(path, primitive, materials=[{}], extensionsUsed=names, extensionsRequired=names if required else [])
+
+
+def test_draco_is_decoded(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    data = load_mesh(compressed(tmp_path / "a.gltf", required=True, fallback=False))
+    assert len(data.parts[0].shape.triangles) == 2 and data.left_out == ()
+    assert data.low == pytest.approx([-1, -1, 0], abs=1e-3) and data.high == pytest.approx([1, 1, 0], abs=1e-3)
+
+
+def test_without_its_decoder_draco_is_named_unless_there_is_another_form(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alone, both = (compressed(tmp_path / f"{has}.gltf", required=False, fallback=has) for has in (False, True))
+    monkeypatch.setitem(sys.modules, "DracoPy", None)
+    with pytest.raises(InputError) as refused:
+        load_mesh(alone)
+    assert str(refused.value).endswith(f"Draco needs `pip install 'phasestack[draco]'`; or {WAY_OUT}")
+    assert load_mesh(both).high.tolist() == [1, 1, 0]
+
+
+def test_of_a_pictures_two_forms_the_known_one_is_read(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    b = Buffer()
+    textures = [{"source": 1, "extensions": {"KHR_texture_basisu": {"source": 0}}, "sampler": 0}]
+    images = [{"uri": "data:image/ktx2;base64,AAAA"}, {"uri": uri_of(HALVES)}]
+    painted(tmp_path / "a.gltf", b, square(b), textures=textures, images=images)
+    assert columns(drawn(tmp_path / "a.gltf", context, stack)) == "rb"

@@ -15,7 +15,7 @@ from runtime.content.base import ContentInfo
 from runtime.content.gaussians import Gaussians, harmonic_basis, load_gaussians
 from runtime.content.placing import SceneFile
 from runtime.content.ply import read_header
-from runtime.content.splat import SplatSource
+from runtime.content.splat import SplatSource, prepare
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from tests.content.conftest import image_view, panel_view
@@ -123,26 +123,76 @@ def test_the_harmonics_are_the_textbook_s() -> None:
         assert ours == pytest.approx(harmonics(direction, 16), abs=1e-5)
 
 
+@pytest.mark.parametrize("name", ["x", "f_dc_1", "opacity", "scale_2", "rot_3"])
+def test_a_missing_property_is_told(tmp_path: Path, name: str) -> None:
+    table = splat_table(50)
+    table = rfn.repack_fields(table[[other for other in table.dtype.names or () if other != name]])
+    with pytest.raises(InputError, match=rf"scene.ply: {name}: the property is missing"):
+        loaded(written(tmp_path, table))
+
+
 @pytest.mark.parametrize(
-    ("name", "value", "told"),
+    ("names", "value"),
     [
-        *((name, None, f"{name}: the property is missing") for name in ("x", "f_dc_1", "opacity", "scale_2", "rot_3")),
-        ("scale_1", 60.0, "scale: 1 of 50 splats are over"),
-        ("scale_1", np.inf, "scale: 1 of 50"),
-        ("x", np.nan, "x, y, z: 1 of 50"),
-        ("rot_2", np.nan, "rot: 1 of 50"),
-        ("opacity", -np.inf, "opacity: 1 of 50"),
-        ("f_rest_40", np.nan, "f_rest: 1 of 50"),
+        ("scale_1", 60.0),
+        ("scale_1", np.inf),
+        ("scale_2", np.nan),
+        ("x", np.nan),
+        ("y", np.inf),
+        ("z", 1e30),
+        ("rot_2", np.nan),
+        ("rot_0 rot_1 rot_2 rot_3", 0.0),
+        ("opacity", np.nan),
+        ("f_rest_40", np.nan),
     ],
 )
-def test_what_is_missing_or_absurd_is_told(tmp_path: Path, name: str, value: float | None, told: str) -> None:
-    table = splat_table(50)
-    if value is None:
-        table = rfn.repack_fields(table[[other for other in table.dtype.names or () if other != name]])
-    else:
+def test_an_unusable_splat_is_left_out_and_a_line_says_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, names: str, value: float
+) -> None:
+    table, path = splat_table(50), tmp_path / "scene.ply"
+    kept = loaded(written(tmp_path, np.delete(table, 7)))
+    for name in names.split():
         table[name][7] = value
-    with pytest.raises(InputError, match=rf"scene.ply: {told}"):
+    found = loaded(written(tmp_path, table))
+    assert f"{path}: is drawn without 1 of its 50 splats, which are unusable" in caplog.text
+    for name in ("centres", "covariances", "opacities", "harmonics"):
+        assert np.array_equal(getattr(found, name), getattr(kept, name))
+
+
+def test_a_file_without_a_usable_splat_is_refused(tmp_path: Path) -> None:
+    table = splat_table(50)
+    table["x"] = np.nan
+    with pytest.raises(InputError, match="opacity: no splat can be seen"):
         loaded(written(tmp_path, table))
+
+
+def test_nothing_of_a_large_splat_is_cut_off(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    """Its centre alone says nothing of how far it reaches."""
+    table = splat_table(3, degree=0)
+    for axis in range(3):
+        table["xyz"[axis]] = [-0.1, 0.0, 0.1]
+        table[f"scale_{axis}"] = np.log(1.0)
+    table["opacity"] = 4.0
+    path = written(tmp_path, table)
+    source = prepare(SceneFile(path, ContentSettings(), stack))(context=context)
+    covered = source.render(panel_view((0.6, 0.0, 0.0), stack.panel(1)), time_ns=0)[..., 3]
+    assert covered[135, 240] > 200
+    assert max(covered[0].max(), covered[-1].max(), covered[:, 0].max(), covered[:, -1].max()) < 40
+
+
+def test_splats_stand_as_cameras_see_them(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    """Trainers have y down and z away from the camera: a red splat at -y is above."""
+    table = splat_table(2, degree=0)
+    for name in ("x", "y", "z"):
+        table[name] = 0.0
+    table["y"] = [-1.0, 1.0]
+    for axis in range(3):
+        table[f"scale_{axis}"] = np.log(0.2)
+        table[f"f_dc_{axis}"] = [1.5 if axis == 0 else -1.5, 1.5 if axis == 2 else -1.5]
+    table["opacity"] = 4.0
+    source = prepare(SceneFile(written(tmp_path, table), ContentSettings(), stack))(context=context)
+    picture = source.render(panel_view((0.6, 0.0, 0.0), stack.panel(1)), time_ns=0)
+    assert picture[:135, 240, :3].max(0).argmax() == 0 and picture[135:, 240, :3].max(0).argmax() == 2
 
 
 @pytest.mark.parametrize("order", ["<", ">"])

@@ -24,8 +24,10 @@ from calib.setup_run import read_progress
 from runtime.clock import MonotonicClock, SimulatedClock
 from runtime.config import ContentSettings, Settings, load_settings, load_stack
 from runtime.content.frames import open_frames
-from runtime.content.gaussians import load_gaussians
+from runtime.content.gaussians import bounds, load_gaussians, of_points
 from runtime.content.mesh import load_mesh
+from runtime.content.parts import merged
+from runtime.content.placing import SceneFile
 from runtime.content.playlist import read_playlist
 from runtime.content.ply import read_header
 from runtime.content.triangles import DrawnPart
@@ -42,7 +44,9 @@ from runtime.sensor.recording import RecordingWriter
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.sensor.replay import ReplayDriver
 from runtime.support.untrusted_input import parsed_json
+from tests.content.gltf_files import Buffer
 from tests.content.picture_files import heic_pair, mpo, swapped_profile
+from tests.content.test_gltf import square
 from tests.content.test_untrusted_files import PNG_URI, gltf, textured
 from tests.panels.edids import block
 from tests.sensor.taken import taken_until
@@ -225,13 +229,47 @@ def box(kind: str, *, texture: bool = False, **options: Any) -> bytes:
     return data.encode() if isinstance(data, str) else bytes(data)
 
 
+def skinned() -> dict[str, Any]:
+    """A strip with every kind of attribute, a skin, a morph, a sparse accessor, a transform and a sampler."""
+    b = Buffer()
+    primitive = square(b, mode=5)
+    primitive["attributes"] |= {"COLOR_0": b.add([[1, 0.5, 0.2, 0.4]] * 4), "JOINTS_0": b.add([[0] * 4] * 4, np.uint8)}
+    primitive["attributes"]["WEIGHTS_0"] = b.add([[255, 0, 0, 0]] * 4, np.uint8, normalized=True)
+    primitive["targets"] = [{"POSITION": b.add([[0, 0, 1]] * 4)}]
+    b.add([1], np.uint8)
+    values = {"bufferView": b.accessors[b.add([[2, 2, 2]])]["bufferView"]}
+    indices = {"bufferView": values["bufferView"] - 1, "componentType": 5121}
+    b.accessors[primitive["attributes"]["POSITION"]]["sparse"] = {"count": 1, "indices": indices, "values": values}
+    use = {"index": 0, "extensions": {"KHR_texture_transform": {"scale": [2, 2], "rotation": 0.5}}}
+    material = {"pbrMetallicRoughness": {"baseColorTexture": use}, "emissiveTexture": use, "emissiveFactor": [1, 0, 0]}
+    return b.table(
+        {},
+        meshes=[{"primitives": [primitive], "weights": [0.5]}],
+        nodes=[{"mesh": 0, "skin": 0}, {"rotation": [0, 0, 0.7, 0.7]}],
+        scenes=[{"nodes": [0, 1]}],
+        skins=[{"joints": [1], "inverseBindMatrices": b.add([np.eye(4)])}],
+        materials=[{**material, "alphaMode": "BLEND"}],
+        textures=[{"source": 0, "sampler": 0}],
+        samplers=[{"wrapS": 33648, "magFilter": 9728}],
+        images=[{"uri": PNG_URI}],
+    )
+
+
 def gltfs() -> list[bytes]:
-    return [json.dumps(gltf()).encode(), json.dumps(textured(0, [{"source": 0}], [{"uri": PNG_URI}])).encode()]
+    held = [gltf(), textured(0, [{"source": 0}], [{"uri": PNG_URI}]), skinned()]
+    return [json.dumps(table).encode() for table in held]
 
 
 def mesh(path: Path) -> object:
     """Loaded, and its outlines looked for."""
-    return [DrawnPart(part) for part in load_mesh(path).parts]
+    data = load_mesh(path)
+    places = SceneFile(path, ContentSettings(), STACK).placed(data.low, data.high, facing=data.facing)
+    return places, [DrawnPart(part) for part in merged(data.parts)], [of_points(*some) for some in data.points]
+
+
+def points() -> list[bytes]:
+    cloud = trimesh.PointCloud(np.random.default_rng(0).random((9, 3)), np.full((9, 4), 200, np.uint8))
+    return [bytes(cloud.export(file_type="ply"))]
 
 
 def splats() -> list[bytes]:
@@ -293,8 +331,10 @@ TARGETS: dict[str, Target] = {
     "glb": Target(lambda: [box("glb"), box("glb", texture=True)], file("a.glb", mesh)),
     "obj": Target(lambda: [box("obj")], file("a.obj", mesh)),
     "ply": Target(lambda: [box("ply", encoding=form) for form in ("binary", "ascii")], file("a.ply", mesh)),
+    "off": Target(lambda: [box("off")], file("a.off", mesh)),
+    "points": Target(points, file("a.ply", mesh)),
     "stl": Target(lambda: [box("stl"), box("stl_ascii")], file("a.stl", mesh)),
-    "splat": Target(splats, file("a.ply", lambda path: load_gaussians(read_header(path)))),
+    "splat": Target(splats, file("a.ply", lambda path: bounds(load_gaussians(read_header(path))))),
     "playlist": Target(
         lambda: [PLAYLIST.encode(), b'{"show": [{"scene": "flat", "seconds": 3}]}'],
         file("a.toml", lambda path: read_playlist(path, ContentSettings()), json_marks=b"{"),

@@ -1,0 +1,207 @@
+"""The container of a glTF 2.0 file: its table, buffers, accessors and pictures.
+
+Ours, because what else reads glTF drops what it has no place for (trimesh: samplers, sparse accessors, normalized
+integers), leaves accessors undecoded (pygltflib), or gives out no embedded picture (assimp-py).
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import math
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote_to_bytes
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.errors import InputError
+from runtime.records import F32, U8
+from runtime.support import untrusted_input
+from runtime.support.picture_header import check_size, decoded_picture, picture_size
+from runtime.support.untrusted_input import LIMITS
+
+Table = dict[str, Any]
+Array = NDArray[Any]
+Read = Callable[[str], bytes]  # the file beside it that a URI names
+
+ELEMENTS_PER_TRIANGLE = 10  # all accessors together, for the limit on triangles
+LARGEST_TEXTURE_PX = 4096
+COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+SHAPES = {"SCALAR": (1,), "VEC2": (2,), "VEC3": (3,), "VEC4": (4,), "MAT2": (2, 2), "MAT3": (3, 3), "MAT4": (4, 4)}
+PICTURE_EXTENSIONS = ("EXT_texture_webp", "EXT_texture_avif")  # the others' pictures, such as KTX2, are not decoded
+COMPRESSED = {
+    "KHR_draco_mesh_compression": "Draco",
+    "EXT_meshopt_compression": "meshopt",
+    "KHR_meshopt_compression": "meshopt",
+    "KHR_texture_basisu": "KTX2",
+}
+WAY_OUT = "save it without that compression, in Blender or with `gltf-transform`"
+
+
+class GltfFile:
+    """One file. Raises LookupError, TypeError or ValueError where it is malformed, else InputError."""
+
+    def __init__(self, path: Path, data: bytes, read: Read) -> None:
+        text, self._binary = (data, b"") if data[:4] != b"glTF" else _chunks(path, data)
+        self.path, self._read = path, read
+        self.table: Table = untrusted_input.parsed_json(text, source=path, most_depth=LIMITS.depth)
+        self._buffers: dict[int, bytes] = {}
+        self._pictures: dict[int, U8] = {}
+        elements = 0
+        for number, accessor in enumerate(self.all("accessors")):
+            elements += _count(accessor)
+            most = ELEMENTS_PER_TRIANGLE * LIMITS.triangles
+            untrusted_input.within(elements, most, source=path, field=f"accessors[{number}].count")
+
+    def all(self, kind: str) -> list[Table]:
+        """The objects of a kind, such as `meshes`; empty where the file has none."""
+        found: list[Table] = self.table.get(kind, [])
+        return found
+
+    def item(self, kind: str, index: int) -> Table:
+        """Raises IndexError for a reference to what is not there, negative ones included."""
+        items = self.all(kind)
+        return items[range(len(items))[index]]
+
+    def count(self, accessor: int) -> int:
+        return _count(self.item("accessors", accessor))
+
+    def accessor(self, index: int, *, rows: Array | None = None, as_float: bool = True) -> Array:
+        """(n, ...) the elements of an accessor, or chosen rows of them.
+
+        as_float: float32 by `fractions`; else the numbers as they are stored.
+        """
+        accessor = self.item("accessors", index)
+        values = self._stored(accessor)
+        if "sparse" in accessor:
+            values = values.copy()
+            sparse = accessor["sparse"]
+            common = {"count": sparse["count"], "type": accessor["type"], "componentType": accessor["componentType"]}
+            places = self._stored({**common, **sparse["indices"], "type": "SCALAR"})[:, 0]
+            values[places] = self._stored({**common, **sparse["values"]})
+        values = values if rows is None else values[rows]
+        return fractions(values, accessor) if as_float else values
+
+    def _stored(self, accessor: Table) -> Array:
+        """A view of an accessor's bytes, strided as its buffer view says; without one, zeros."""
+        count, shape = _count(accessor), SHAPES[accessor["type"]]
+        dtype = np.dtype(COMPONENTS[accessor["componentType"]])
+        column = shape[0] * dtype.itemsize
+        # Columns of matrices begin at multiples of four bytes.
+        steps = (column,) if len(shape) == 1 else (-(-column // 4) * 4, dtype.itemsize)
+        size = column if len(shape) == 1 else steps[0] * shape[1]
+        strides = (dtype.itemsize,) if len(shape) == 1 else steps
+        if "bufferView" not in accessor:
+            return np.zeros((count, *shape), dtype)
+        data, stride = self.view(accessor["bufferView"])
+        stride, first = stride or size, accessor.get("byteOffset", 0)
+        if not (first >= 0 and dtype.itemsize <= stride) or (count and first + stride * (count - 1) + size > len(data)):
+            raise ValueError("an accessor reaches beyond its buffer view")
+        if not count:
+            return np.zeros((0, *shape), dtype)
+        return np.ndarray((count, *shape), dtype, data, first, (stride, *strides))
+
+    def view(self, index: int) -> tuple[memoryview, int]:
+        """A buffer view's bytes, and its stride, 0 where its elements stand side by side."""
+        view = self.item("bufferViews", index)
+        number, first, size = view["buffer"], view.get("byteOffset", 0), view["byteLength"]
+        buffer = self._buffer(number)
+        if not (0 <= first <= first + size <= len(buffer)):
+            raise ValueError(f"bufferViews[{index}] reaches beyond its buffer")
+        return memoryview(buffer)[first : first + size], view.get("byteStride", 0)
+
+    def _buffer(self, number: int) -> bytes:
+        if number not in self._buffers:
+            buffer = self.item("buffers", number)
+            if "uri" in buffer:
+                self._buffers[number] = self._of_uri(buffer["uri"])
+            elif number == 0 and self._binary:
+                self._buffers[number] = self._binary
+            else:
+                self._buffers[number] = self._without_data(number, buffer)
+        return self._buffers[number]
+
+    def _without_data(self, number: int, buffer: Table) -> bytes:
+        if any(name in buffer.get("extensions", {}) for name in COMPRESSED):
+            raise InputError(self.path, f"buffers[{number}]", f"is compressed with meshopt; {WAY_OUT}")
+        raise InputError(self.path, f"buffers[{number}].uri", "is missing: the file is cut off, or not whole")
+
+    def _of_uri(self, uri: str) -> bytes:
+        if not uri.startswith("data:"):
+            return self._read(uri)
+        head, _, coded = uri.partition(",")
+        if not head.endswith(";base64"):
+            return unquote_to_bytes(coded)
+        try:
+            return base64.b64decode(coded)
+        except binascii.Error as error:
+            raise ValueError(f"a data URI that is not base64: {error}") from None
+
+    def picture(self, texture: Table) -> U8:
+        """(h, w, 4) RGBA of a texture, whose pictures were checked. Raises InputError."""
+        number = self._image_of(texture)
+        if number not in self._pictures:
+            image = decoded_picture(self._coded(number), source=self.path, field="texture", name=f"images[{number}]")
+            image = image.convert("RGBA")
+            image.thumbnail((LARGEST_TEXTURE_PX, LARGEST_TEXTURE_PX))
+            self._pictures[number] = np.array(image)
+        return self._pictures[number]
+
+    def check_pictures(self, textures: list[Table]) -> None:
+        """By their headers, before one is decoded. Raises InputError."""
+        pixels = 0
+        for number in sorted({self._image_of(texture) for texture in textures}):
+            coded = self._coded(number)
+            with suppress(ValueError):
+                size = picture_size(coded)
+                check_size(*size, source=self.path, field="texture", name=f"images[{number}]", head=coded)
+                pixels += math.prod(size)
+            untrusted_input.within(pixels, LIMITS.texture_pixels, source=self.path, field="textures' pixels")
+
+    def _image_of(self, texture: Table) -> int:
+        """The number of a texture's image; of several that its extensions offer, one that is decoded."""
+        own: Table = texture.get("extensions", {})
+        for offered in (*(own[name] for name in PICTURE_EXTENSIONS if name in own), texture):
+            if offered.get("source") is not None:
+                number: int = range(len(self.all("images")))[offered["source"]]
+                return number
+        known = [f"{COMPRESSED[name]} pictures; {WAY_OUT}" for name in own if name in COMPRESSED]
+        problem = "hold " + "".join(known[:1] or ["a picture in a format that is not understood"])
+        raise InputError(self.path, "textures", problem)
+
+    def _coded(self, number: int) -> bytes:
+        """An image's undecoded bytes."""
+        image = self.item("images", number)
+        return self._of_uri(image["uri"]) if "uri" in image else bytes(self.view(image["bufferView"])[0])
+
+
+def fractions(values: Array, accessor: Table) -> F32:
+    """An accessor's numbers as floats: normalized integers are fractions of their largest (3.6.2.2)."""
+    found = np.asarray(values, np.float32)
+    if accessor.get("normalized", False) and values.dtype.kind in "iu":
+        found = np.maximum(found / np.float32(np.iinfo(values.dtype).max), np.float32(-1.0))
+    return found
+
+
+def _count(accessor: Table) -> int:
+    count = accessor["count"]
+    if not isinstance(count, int) or count < 0:
+        raise ValueError("an accessor's count is no whole number")
+    return count
+
+
+def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
+    """The JSON and the buffer of a GLB."""
+    if int.from_bytes(data[4:8], "little") == 1:
+        raise InputError(path, "asset.version", VERSION_1)
+    size = int.from_bytes(data[12:16], "little")
+    if data[16:20] != b"JSON" or len(data) < 20 + size:
+        raise InputError(path, "", "is cut off, or malformed: a GLB file begins with a chunk of JSON")
+    return data[20 : 20 + size], data[20 + size + 8 :]
+
+
+VERSION_1 = "is 1.0, which is not read; convert it to glTF 2.0, with `gltf-pipeline -i old.gltf -o new.glb` or Blender"

@@ -1,0 +1,193 @@
+"""OBJ, OFF, PLY and STL as parts to draw, read by trimesh."""
+
+from __future__ import annotations
+
+import codecs
+import io
+import logging
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from PIL import Image
+
+from runtime.content.base import WHITE, Colour
+from runtime.content.parts import UNCOLOURED, Part
+from runtime.content.shapes import Shape, placed
+from runtime.errors import InputError, one_line
+from runtime.records import F32, F64, U8
+from runtime.support import progress, untrusted_input
+from runtime.support.picture_header import decoded_picture
+from runtime.support.untrusted_input import LIMITS
+
+log = logging.getLogger("phasestack.content")
+
+BOMS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+LARGEST_TEXTURE_PX = 4096
+# Before a texture's name in an MTL: `-s 1 1 1`, `-blendu off`, `-imfchan r`.
+OPTIONS = re.compile(r"(?:-[a-zA-Z]+(?:\s+(?:on|off|[rgbmlz]|[-+.\d]+(?:[eE][-+]?\d+)?))*\s+)+")
+DRIVE = re.compile(r"[A-Za-z]:.*/")  # a path of somebody else's Windows: the name alone is looked for
+Read = Callable[[str], bytes]  # the file beside it that a name stands for
+
+
+class Beside(trimesh.resolvers.FilePathResolver):
+    """Reads files beside the mesh, and keeps the reason of a refusal, which loaders would skip."""
+
+    def __init__(self, path: Path, read: Read, *, has_materials: bool) -> None:
+        super().__init__(str(path))
+        self._path, self._read, self._pixels = path, read, 0
+        self.refused: InputError | None = None
+        self.has_materials = has_materials
+
+    def get(self, name: str) -> bytes:
+        is_material = name.lower().endswith(".mtl")
+        try:
+            found = self._named(name)
+            if found is None:
+                what = "materials" if is_material else "texture"
+                why = f"{untrusted_input.shown(name)} is not there"
+                log.warning("%s: is drawn grey without its %s (%s)", self._path, what, why)
+                self.has_materials = self.has_materials and not is_material
+                return b"" if is_material else _grey()
+            data = self._read(found)
+            if not is_material:
+                image = decoded_picture(data, source=self._path, field="texture", name=untrusted_input.shown(name))
+                self._pixels += image.width * image.height
+                most = LIMITS.texture_pixels
+                untrusted_input.within(self._pixels, most, source=self._path, field="textures' pixels")
+        except InputError as error:
+            self.refused = error
+            raise
+        return data
+
+    def _named(self, name: str) -> str | None:
+        """The name that a file beside has: without options, Windows' strokes, and in its own letters' case."""
+        name = DRIVE.sub("", OPTIONS.sub("", name, count=1).strip().replace("\\", "/"))
+        untrusted_input.checked_path(name, source=self._path, field="texture")
+        if Path(name).is_absolute() or (self._path.parent / name).exists():
+            return name
+        folder = self._path.parent
+        for step in Path(name).parts:
+            alike = {other.name.lower(): other for other in folder.iterdir()} if folder.is_dir() else {}
+            folder = alike.get(step.lower(), folder / step)
+        return str(folder.relative_to(self._path.parent)) if folder.exists() else None
+
+
+def read_mesh(path: Path, data: bytes, read: Read) -> tuple[list[Part], list[tuple[F32, F32]]]:
+    """Parts, and points (n, 3) with their colours where there are no faces. Raises InputError."""
+    kind = path.suffix.lower().removeprefix(".")
+    progress.tell(f"{path.name}: triangles", 0)
+    mark = {"obj": b"mtllib", "ply": b"TextureFile"}.get(kind, b"")
+    resolver = Beside(path, read, has_materials=mark in data.replace(b"\0", b"") if data[:2] in BOMS else mark in data)
+    file = io.StringIO(_text(data)) if kind == "obj" else io.BytesIO(data)
+    try:
+        scene = trimesh.load_scene(file, file_type=kind, resolver=resolver, process=False)
+        found = [(scene.geometry[name], matrix) for matrix, name in map(scene.graph.get, scene.graph.nodes_geometry)]
+    except Exception as error:  # loaders raise whatever their parsers do
+        if resolver.refused is not None:
+            raise resolver.refused from None
+        problem = one_line(str(error), most=120)
+        raise InputError(path, "", f"cannot be read as a mesh ({type(error).__name__}: {problem})") from None
+    if resolver.refused is not None:
+        raise resolver.refused
+    pictures: dict[int, U8] = {}
+    parts, points = [], []
+    for mesh, matrix in found:
+        if not len(getattr(mesh, "faces", ())):
+            points += _points(mesh)
+            continue
+        if mesh.visual.kind == "texture" and not resolver.has_materials:  # the loader's own grey is left out
+            mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=mesh.visual.vertex_attributes.get("color"))
+        parts.append(_part(mesh, matrix, path, pictures))
+    return parts, points
+
+
+def _text(data: bytes) -> str:
+    """Of an OBJ only names and comments can be other than ASCII, and exporters differ in how they write them."""
+    return data.decode("utf-16" if data[:2] in BOMS else "utf-8", errors="replace")
+
+
+def _grey() -> bytes:
+    file = io.BytesIO()
+    Image.new("RGB", (1, 1), tuple(round(255 * value) for value in UNCOLOURED)).save(file, "PNG")
+    return file.getvalue()
+
+
+def _points(cloud: Any) -> list[tuple[F32, F32]]:
+    places = np.asarray(getattr(cloud, "vertices", np.empty((0, 3))), np.float32)
+    if not len(places) or places.shape[1:] != (3,) or not hasattr(cloud, "colors"):
+        return []
+    colours = np.asarray(cloud.colors)
+    return [(places, _unit(colours)[:, :3] if len(colours) == len(places) else np.full_like(places, 0.75))]
+
+
+def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8]) -> Part:
+    """Of a trimesh: its material, and colours of its faces or vertices; grey where it has none of them."""
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or faces.min() < 0 or faces.max() >= len(vertices):
+        raise InputError(path, "faces", "are no triangles of vertices that are there")
+    visual, kind = mesh.visual, mesh.visual.kind
+    picture, colour, opacity, colours = None, UNCOLOURED, 1.0, None
+    if kind == "texture":
+        picture, colour, opacity = _material(visual.material, pictures)
+        colours = visual.vertex_attributes.get("color")
+        if path.suffix.lower() == ".ply":  # which has no materials: the loader's own has a colour
+            colour = WHITE
+    elif kind == "vertex":
+        colours, colour = visual.vertex_colors, WHITE
+    elif kind == "face":
+        colours, colour = np.repeat(visual.face_colors, 3, axis=0), WHITE
+        vertices, faces = vertices[faces].reshape(-1, 3), np.arange(faces.size, dtype=np.int32).reshape(-1, 3)
+    normals = np.repeat(mesh.face_normals, 3, axis=0) if kind == "face" else mesh.vertex_normals
+    uv = np.zeros((len(vertices), 2), np.float32)
+    if picture is None or visual.uv is None:
+        picture = None
+    else:
+        uv = np.column_stack([visual.uv[:, 0], 1.0 - visual.uv[:, 1]]).astype(np.float32)
+    positions, turned = placed(vertices, normals, matrix)
+    assert turned is not None
+    if np.linalg.det(matrix[:3, :3]) < 0:
+        faces = faces[:, ::-1]
+    shape = Shape(positions, turned, uv, faces.astype(np.int32))
+    alpha = "blend" if opacity < 1 else "mask"
+    colours = None if colours is None else _unit(colours)[:, :3]
+    return Part(shape, picture, colour, colours, opacity=opacity, alpha=alpha)  # type: ignore[arg-type]
+
+
+def _unit(colours: Any) -> F32:
+    """(n, 3 or 4) colours, integers or fractions, as floats in [0, 1]."""
+    numbers = np.asarray(colours)
+    scale = np.float32(np.iinfo(numbers.dtype).max if numbers.dtype.kind == "u" else 1.0)
+    return np.asarray(np.clip(numbers.astype(np.float32) / scale, 0.0, 1.0), dtype=np.float32)
+
+
+def _material(material: Any, pictures: dict[int, U8]) -> tuple[U8 | None, Colour, float]:
+    """Texture (RGBA), the colour that multiplies it, and the opacity, of a trimesh material.
+
+    A black colour with a texture is taken for white: some exporters write it for the texture alone.
+    """
+    image, diffuse = getattr(material, "image", None), getattr(material, "diffuse", None)
+    red, green, blue = _unit(np.ones(3) if diffuse is None else diffuse)[:3].tolist()
+    opacity = _opacity(getattr(material, "kwargs", {}))
+    if image is None:
+        return None, UNCOLOURED if diffuse is None else (red, green, blue), opacity
+    if id(material) not in pictures:
+        image = image.convert("RGBA")
+        image.thumbnail((LARGEST_TEXTURE_PX, LARGEST_TEXTURE_PX))
+        pictures[id(material)] = np.array(image)
+    return pictures[id(material)], (red, green, blue) if red or green or blue else WHITE, opacity
+
+
+def _opacity(fields: dict[str, Any]) -> float:
+    """Of an MTL: `d`, or 1 less `tr`; opaque where that is no number, or nothing would be left to see."""
+    for name, sign, start in (("d", 1.0, 0.0), ("tr", -1.0, 1.0)):
+        try:
+            value = start + sign * float(fields[name][-1])
+        except (LookupError, TypeError, ValueError):
+            continue
+        if 0.0 < value <= 1.0:
+            return value
+    return 1.0

@@ -1,0 +1,117 @@
+"""What is drawn as triangles: shapes and their look, and parts that look alike made one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from runtime.content.base import WHITE, Colour
+from runtime.content.shapes import Shape, join
+from runtime.records import F32, U8
+
+BLACK: Colour = (0.0, 0.0, 0.0)
+UNCOLOURED: Colour = (0.70, 0.74, 0.80)  # of a file without colours
+OPAQUE_FROM = 0.99  # alpha: what covers more hides what is behind it
+OUTLINED_MAX = 200_000  # triangles of a part; beyond, finding its outline costs more than drawing it
+Wrap = Literal["repeat", "clamp", "mirror"]
+
+
+@dataclass(frozen=True, slots=True)
+class Sampler:
+    """How a picture goes on beyond its edges (across and down), and whether its pixels stay square."""
+
+    wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
+    nearest: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """Triangles of one material, in their own frame."""
+
+    shape: Shape
+    picture: U8 | None = None  # (h, w, 4) RGBA, row 0 at uv 0; parts may share one array
+    colour: Colour = WHITE  # multiplies everything, 0-1
+    vertex_colours: F32 | None = None  # (v, 3 or 4), 0-1: RGB or RGBA
+    lit: bool = True
+    grey: bool = False
+    turning: bool = False  # its placement changes: it is boxed for every orientation
+    sampler: Sampler = Sampler()
+    opacity: float = 1.0
+    alpha: Literal["opaque", "mask", "blend"] = "mask"
+    cutoff: float = 0.5  # of a mask: where alpha is less nothing is drawn
+    two_sided: bool = True  # else what is translucent shows its front alone
+    is_linear: bool = False  # colours (not pictures) are linear light, and it is what is multiplied and added
+    glow: Colour = BLACK  # its own light, linear, multiplied by its picture
+    glow_picture: U8 | None = None
+
+    @property
+    def features(self) -> tuple[str, ...]:
+        """The shader switches that it needs."""
+        least = self.opacity
+        if self.picture is not None:
+            least *= float(self.picture[..., 3].min()) / 255
+        if self.vertex_colours is not None and self.vertex_colours.shape[1] == 4:
+            least *= float(self.vertex_colours[:, 3].min())
+        switches = {
+            "LIT": self.lit,
+            "PICTURE": self.picture is not None,
+            "HOLES": self.alpha == "mask" and least < self.cutoff,
+            "BLEND": self.alpha == "blend" and least < OPAQUE_FROM,
+            "COLOURED": self.vertex_colours is not None,
+            "GREY": self.grey,
+            "LINEAR": self.is_linear,
+            "GLOW": self.glow != BLACK,
+            "GLOW_PICTURE": self.glow != BLACK and self.glow_picture is not None,
+            "MIRROR_U": self.sampler.wrap[0] == "mirror",
+            "MIRROR_V": self.sampler.wrap[1] == "mirror",
+        }
+        return tuple(name for name, is_on in switches.items() if is_on)
+
+
+def coded(light: ArrayLike) -> F32:
+    """Codes of 0-1, as sRGB has them, of linear light."""
+    linear = np.clip(np.asarray(light, np.float32), 0.0, 1.0)
+    return np.where(linear <= 0.0031308, linear * np.float32(12.92), 1.055 * linear ** np.float32(1 / 2.4) - 0.055)
+
+
+def merged(parts: Sequence[Part]) -> list[Part]:
+    """The same triangles in fewer parts: one for each look, as long as its outlines can be drawn.
+
+    What has no picture differs by its colour alone, which its vertices take.
+    """
+    alike: dict[tuple[object, ...], list[list[Part]]] = {}
+    for part in parts:
+        if part.picture is None and part.glow == BLACK:
+            part = replace(part, vertex_colours=_coloured(part), colour=WHITE, opacity=1.0)
+        look = (
+            *(id(picture) for picture in (part.picture, part.glow_picture)),
+            *(part.colour, part.glow, part.opacity, part.cutoff, part.alpha, part.two_sided, part.sampler),
+            *(part.lit, part.is_linear, part.vertex_colours is None),
+        )
+        groups = alike.setdefault(look, [[]])
+        if sum(len(other.shape.triangles) for other in (*groups[-1], part)) > OUTLINED_MAX and groups[-1]:
+            groups.append([])
+        groups[-1].append(part)
+    return [_one(group) for groups in alike.values() for group in groups]
+
+
+def _coloured(part: Part) -> F32:
+    """(v, 4) the colours of a part's vertices, with its own colour and opacity."""
+    colours = np.ones((len(part.shape.positions_m), 4), np.float32)
+    if part.vertex_colours is not None:
+        colours[:, : part.vertex_colours.shape[1]] = part.vertex_colours
+    colours *= np.array([*part.colour, part.opacity], np.float32)
+    return colours
+
+
+def _one(group: list[Part]) -> Part:
+    if len(group) == 1:
+        return group[0]
+    colours = None
+    if group[0].vertex_colours is not None:
+        colours = np.concatenate([_coloured(replace(part, colour=WHITE, opacity=1.0)) for part in group])
+    return replace(group[0], shape=join([part.shape for part in group]), vertex_colours=colours)
