@@ -29,7 +29,7 @@ RUN apt-get update && apt-get install -y --no-install-recommends g++ && rm -rf /
 COPY requirements/runtime.lock requirements/
 RUN python -m venv /opt/phasestack \
  && /opt/phasestack/bin/pip install --no-cache-dir -r requirements/runtime.lock
-COPY pyproject.toml README.md ./
+COPY pyproject.toml README.md LICENSE THIRD_PARTY.md ./
 COPY phasestack phasestack
 COPY runtime runtime
 COPY calib calib

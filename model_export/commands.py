@@ -17,8 +17,8 @@ def require(*modules: str) -> None:
     """Raises MissingPart, naming what to install, where a module of the `export` extra is not there."""
     for module in modules:
         if importlib.util.find_spec(module) is None:
-            what = "tensorboard" if module == "tensorboard" else "torch onnx onnxscript"
-            raise MissingPart(f"{module} is needed here and is not installed: pip install {what}")
+            what = "tensorboard" if module == "tensorboard" else "'phasestack[export]'"
+            raise MissingPart(f"{module} is not installed: pip install {what}")
 
 
 Arch = Annotated[

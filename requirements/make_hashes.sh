@@ -10,7 +10,7 @@ trap 'rm -rf "$work"' EXIT
 export PIP_CONFIG_FILE=/dev/null
 unset PIP_FIND_LINKS PIP_EXTRA_INDEX_URL PIP_INDEX_URL
 for name in runtime test docs; do
-  sed -n 's/^\([A-Za-z0-9._-]*==[^ ]*\).*/\1/p' "$name.lock" > "$work/$name.in"
+  sed -n 's/^\([A-Za-z0-9._-]*==[^\\]*\).*/\1/p' "$name.lock" > "$work/$name.in"
   "$work/venv/bin/pip-compile" --quiet --generate-hashes --allow-unsafe --strip-extras --no-header --no-annotate \
     --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --output-file "$work/$name.out" "$work/$name.in"
   { sed -n '/^#/p' "$name.lock"; cat "$work/$name.out"; } > "$work/$name.lock"

@@ -50,7 +50,7 @@ if [ "${APP:-yes}" != no ]; then
   rm -rf "$DESTDIR$library.new"
   "$python" -m pip install --quiet --root-user-action=ignore --target "$DESTDIR$library.new" -r "$source/requirements/runtime.lock"
   # From a copy: what an earlier build left beside the source would come along, modules that are gone included.
-  (cd "$source" && mkdir "$kept/source" && cp -r pyproject.toml README.md runtime calib model_export "$kept/source")
+  (cd "$source" && mkdir "$kept/source" && cp -r pyproject.toml README.md LICENSE THIRD_PARTY.md phasestack runtime calib model_export "$kept/source")
   "$python" -m pip install --quiet --root-user-action=ignore --no-deps --target "$DESTDIR$library.new" "$kept/source"
 fi
 

@@ -70,8 +70,8 @@ print(numpy.__version__, runtime.__file__)
 """
 
 
-def test_the_wheel_runs_a_program_and_the_demo_in_a_clean_environment(packages: Path, tmp_path: Path) -> None:
-    """Of everything else the newest that the ranges allow: what `pip install` gives to anybody."""
+def test_the_wheel_alone_runs_a_program_and_with_its_extras_the_demo(packages: Path, tmp_path: Path) -> None:
+    """In a clean environment, with the newest that the ranges allow: what `pip install` gives to anybody."""
     venv.create(tmp_path / "clean", with_pip=True)
     python = tmp_path / "clean" / "bin" / "python"
     (wheel,) = packages.glob("*.whl")
@@ -80,5 +80,8 @@ def test_the_wheel_runs_a_program_and_the_demo_in_a_clean_environment(packages: 
     assert version < "2.3" and where.startswith(str(tmp_path))
     assert (tmp_path / "out" / "contact-sheet.png").stat().st_size > 10_000
     command = tmp_path / "clean" / "bin" / "phasestack"
+    refused = subprocess.run([command, "demo"], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert refused.returncode == 2 and "pip install 'phasestack[content]'" in refused.stderr
+    done(python, "-m", "pip", "install", "-q", f"{wheel}[all]", cwd=tmp_path)
     done(command, "demo", "--frames", "12", "--out", "demo", cwd=tmp_path)
     assert {path.name for path in (tmp_path / "demo").iterdir()} >= DEMO_FILES

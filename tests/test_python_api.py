@@ -21,6 +21,7 @@ from runtime.evaluation import solved
 from runtime.optics.stack import PanelStack
 from runtime.report.pairs import Painter, read_pairs
 from tests.test_cli import pair_in, solve_arguments
+from tests.test_extras import BLOCKED, of_extras
 
 STACK = phasestack.Stack(width_m=0.5184, height_m=0.2916, x_m=(-0.06, 0.0, 0.06), width_px=320, height_px=180)
 EYES = ((0.78, -0.03, 0.24), (0.78, 0.03, 0.24))
@@ -106,16 +107,33 @@ def test_the_eyes_of_a_picture_are_found_and_of_none_are_not() -> None:
         phasestack.find_eyes(np.zeros((40, 40)))
 
 
-def test_importing_and_solving_load_neither_torch_nor_opengl_nor_x() -> None:
-    code = (
-        "import sys, numpy as np, phasestack\n"
-        "stack = phasestack.Stack(0.5, 0.3, (-0.06, 0.0, 0.06), 64, 36)\n"
-        "grey = np.full((36, 64, 3), 99, np.uint8)\n"
-        "phasestack.solve(grey, grey, eyes_m=((0.7, -0.03, 0), (0.7, 0.03, 0)), stack=stack, model='sart')\n"
-        "print([name for name in ('torch', 'moderngl', 'glfw', 'usb', 'openni') if name in sys.modules])\n"
-    )
+SMALL_PAIR = """
+import numpy as np, phasestack
+stack = phasestack.Stack(0.5, 0.3, (-0.06, 0.0, 0.06), 64, 36)
+grey = np.full((36, 64, 3), 99, np.uint8)
+result = phasestack.solve(grey, grey, eyes_m=((0.7, -0.03, 0), (0.7, 0.03, 0)), stack=stack)
+"""
+
+
+def test_solving_judging_and_saving_need_no_extra(tmp_path: Path) -> None:
+    """As where the base dependencies alone are installed."""
+    code = BLOCKED.format(packages=sorted(of_extras())) + SMALL_PAIR + f"result.save({str(tmp_path / 'out')!r})\n"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=240)
-    assert done.stdout.strip() == "[]", done.stderr
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "out" / "viewer.html").is_file()
+
+
+def test_a_folder_with_modules_of_our_names_does_not_matter(tmp_path: Path) -> None:
+    (tmp_path / "runtime.py").write_text("its = 'own'")
+    (tmp_path / "calib").mkdir()
+    (tmp_path / "calib" / "__init__.py").touch()
+
+    def done(code: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=240)
+
+    assert done(SMALL_PAIR).returncode == 0
+    taken = done("import runtime\nimport phasestack")
+    assert f"rename yours: {tmp_path / 'runtime.py'}" in taken.stderr
 
 
 @pytest.mark.parametrize(

@@ -166,6 +166,8 @@ class Recorder(logging.Handler):
         self._journal, self._journaled_ns = _Journal(folder), 0
         self._journaling: Job[None] | None = None
         if self._most_ns:
+            import mcap.writer  # noqa: F401 - where it is not installed, the start says so
+
             _find_cut(folder)
             make_room(folder)
         _sweep(folder)

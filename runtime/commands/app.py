@@ -32,7 +32,6 @@ app = typer.Typer(
     help="Realtime runtime of a glasses-free 3D display made of stacked LCD panels.\n\n"
     "Example: phasestack demo --out out/demo",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from runtime.errors import PhasestackError
+from runtime.support.extras import missing_extra
 from runtime.support.plugins import is_plugin, plugin_class
 
 if TYPE_CHECKING:
@@ -108,6 +109,9 @@ def examine(settings: Settings) -> list[Row]:
         except PhasestackError as error:
             rows.append(Row(name, "fail", str(error)))
         except Exception as error:  # a doctor that dies of what it looks for helps nobody
+            if missing := missing_extra(error):
+                rows.append(Row(name, "fail", str(missing)))
+                continue
             rows.append(Row(name, "fail", f"{type(error).__name__}: {error}", "a fault of phasestack: report it"))
     return rows
 

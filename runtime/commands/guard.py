@@ -74,7 +74,9 @@ def _code_of(app: Any) -> int:
 def _reported(error: BaseException) -> int:
     """The exit code of what a command was ended by, told in one line."""
     from runtime.errors import PhasestackError, TransientError, one_line
+    from runtime.support.extras import missing_extra
 
+    error = missing_extra(error) or error
     if isinstance(error, KeyboardInterrupt):
         return INTERRUPTED
     if isinstance(error, BrokenPipeError):
@@ -98,9 +100,10 @@ def _say(line: str) -> None:
     with contextlib.suppress(OSError, ValueError):  # where nobody reads stderr either, the exit code has to do
         print(line, file=sys.stderr, flush=True)
     if "NOTIFY_SOCKET" in os.environ:  # what `phasestack status` tells of a service that has failed
-        import sdnotify
+        with contextlib.suppress(ImportError):
+            import sdnotify
 
-        sdnotify.SystemdNotifier().notify(f"STATUS={line}")
+            sdnotify.SystemdNotifier().notify(f"STATUS={line}")
 
 
 def _flushed(code: int) -> int:

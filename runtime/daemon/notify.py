@@ -6,8 +6,6 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
-import sdnotify
-
 from runtime.clock import Clock
 from runtime.records import State
 
@@ -24,6 +22,8 @@ class Notifier:
         self._clock = clock
         self._channel: Any = None
         if "NOTIFY_SOCKET" in os.environ:  # sdnotify leaves a socket open where there is nobody to tell
+            import sdnotify
+
             self._channel = sdnotify.SystemdNotifier()
         if self._channel is not None and self._channel.socket is not None:
             self._channel.socket.setblocking(False)

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from runtime.errors import MissingPart, SensorLost
+from runtime.support.extras import missing_extra
 
 LIBRARY_FOLDERS = (
     "/usr/lib/x86_64-linux-gnu",
@@ -47,8 +48,8 @@ def load(folder: str = "") -> Any:
     global _loaded
     try:
         from openni import openni2
-    except ImportError:
-        raise MissingPart("the Python package `openni` is not installed") from None
+    except ImportError as error:
+        raise missing_extra(error) or error from None
     with _lock:
         if _loaded:
             return openni2

@@ -192,7 +192,7 @@ class Recording:
                 raise InputError(self.path, "", "is not an MCAP recording")
             file.seek(0)
             yield from _mcap_records(file, source=self.path, max_bytes=LIMITS.chunk_bytes)
-        except InputError:
+        except (InputError, ImportError):
             raise
         except OSError as error:
             raise InputError(self.path, "", f"cannot be read ({error.strerror})") from None

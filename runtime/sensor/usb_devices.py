@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from runtime.errors import MissingPart, SensorLost
+from runtime.support.extras import missing_extra
 
 UDEV_RULE = "70-phasestack-sensors.rules"
 SPEEDS = {1: "low speed (1.5 Mbit/s)", 2: "full speed (12 Mbit/s)", 3: "high speed, USB 2 (480 Mbit/s)"}
@@ -80,8 +81,10 @@ def _described(device: Any, known: KnownDevice) -> UsbDevice:
 
 def find_devices(backend: Any = None) -> list[UsbDevice]:
     """All known devices, in the order of bus and address. Raises MissingPart without libusb."""
-    import usb.core
-
+    try:
+        import usb.core
+    except ImportError as error:
+        raise missing_extra(error) or error from None
     try:
         devices: Iterable[Any] = usb.core.find(find_all=True, backend=backend)
         pairs = [(device, _BY_ID.get((device.idVendor, device.idProduct))) for device in devices]

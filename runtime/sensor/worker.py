@@ -17,6 +17,7 @@ from runtime.records import SensorFrame
 from runtime.sensor.base import Capabilities, Sensor
 from runtime.sensor.samples import FindEyes, Samples, finder, searched
 from runtime.support.background import begin, patience_s
+from runtime.support.extras import missing_extra
 
 TIMEOUTS_TO_REOPEN = 2  # in a row, without an error: then the sensor is reopened
 REOPEN_AFTER_S, REOPEN_AFTER_MAX_S = 0.25, 0.5  # the wait before a lost sensor is opened again doubles up to the second
@@ -207,6 +208,10 @@ class SensorWorker(Samples):
             except TransientError as error:
                 self._set(attempt, SensorState.LOST, str(error))
             except BaseException as error:
+                if missing := missing_extra(error):
+                    self.error = missing
+                    self._set(attempt, SensorState.FAILED, str(missing))
+                    return
                 # An SDK's own exception, or its `sys.exit()`, must not end the daemon: what is broken may come back.
                 log.exception("sensor")
                 self._set(attempt, SensorState.LOST, f"{type(error).__name__}: {error}")

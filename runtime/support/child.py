@@ -27,6 +27,7 @@ from typing import Any, TypeVar
 
 from runtime.errors import PASSING, InputError, PhasestackError, TransientError, one_line
 from runtime.support import progress
+from runtime.support.extras import missing_extra
 from runtime.support.untrusted_input import LIMITS, MIB
 
 MEMORY_MAX = 4 << 30  # of data; what a scene at every limit takes
@@ -51,7 +52,8 @@ def in_child(
     ours, theirs = Pipe()
     memory = os.memfd_create("result")
     command = [sys.executable, "-P", "-m", __name__, str(theirs.fileno()), str(memory)]
-    environment = os.environ | ONE_THREAD | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    places = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, sys.path)])  # ours before a namesake
+    environment = os.environ | ONE_THREAD | {"PYTHONPATH": places}
     try:
         child = subprocess.Popen(
             command,
@@ -165,6 +167,9 @@ def main(channel: Connection, memory: int) -> None:
     except PhasestackError as error:
         channel.send(("refused", error, _passing(error)))
     except Exception as error:
+        if missing := missing_extra(error):
+            channel.send(("refused", missing, None))
+            return
         problem = one_line(f"cannot be read ({type(error).__name__}: {error})")
         channel.send(("refused", InputError(source, "", problem), None))
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from runtime.errors import MissingPart
 from runtime.records import U8
+from runtime.support.extras import missing_extra
 
 if TYPE_CHECKING:
     import moderngl
@@ -25,7 +26,10 @@ def offscreen_context() -> moderngl.Context:
 
     Use it on one thread only. Raises MissingPart, naming Debian's packages, where EGL can't give OpenGL 3.3.
     """
-    import moderngl
+    try:
+        import moderngl
+    except ImportError as error:
+        raise missing_extra(error) or error from None
 
     if "MESA_SHADER_CACHE_DIR" not in os.environ:  # nothing is left in a home: ours compile in milliseconds
         os.environ["MESA_SHADER_CACHE_DISABLE"] = "true"

@@ -10,6 +10,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from runtime.errors import InputError, one_line
+from runtime.support.extras import missing_extra
 
 PLUGIN = re.compile(r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*:[A-Za-z_]\w*", re.ASCII)
 
@@ -40,6 +41,8 @@ def plugin_class(name: str, base: type, *, field: str) -> Any:
     try:
         found = getattr(importlib.import_module(module), attribute, None)
     except (Exception, SystemExit) as error:  # whatever a module does when it is imported
+        if missing := missing_extra(error):
+            raise missing from None
         problem = one_line(f"{type(error).__name__}: {error}")
         raise InputError(field, "", f"`{module}` cannot be imported from Python's path ({problem})") from error
     if not (isinstance(found, type) and issubclass(found, base)):

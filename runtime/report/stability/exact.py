@@ -6,16 +6,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from mpmath import mp as mp
+from mpmath import mpf as mpf
 
-from runtime.errors import MissingPart
 from runtime.optics.stack import PanelStack
 from runtime.records import F64
-
-try:
-    from mpmath import mp as mp
-    from mpmath import mpf as mpf
-except ImportError:
-    raise MissingPart("mpmath is needed for the references: pip install mpmath") from None
 
 mp.dps = 50
 

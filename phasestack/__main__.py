@@ -1,0 +1,6 @@
+"""`python -m phasestack`: the command `phasestack`."""
+
+from runtime.cli import main
+
+if __name__ == "__main__":
+    main()

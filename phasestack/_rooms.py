@@ -1,0 +1,29 @@
+"""Imports our own `runtime`, `calib` and `model_export`, also where a program's folder has modules of these names.
+
+Raises ImportError where the program has imported another module under one of the names: Python holds one for each.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def _import_ours(name: str) -> None:
+    init = ROOT / name / "__init__.py"
+    loaded = sys.modules.get(name)
+    if loaded is not None:
+        if not loaded.__file__ or Path(loaded.__file__).resolve() != init:
+            raise ImportError(f"phasestack has its own `{name}`; rename yours: {loaded.__file__ or loaded.__path__}")
+        return
+    spec = spec_from_file_location(name, init, submodule_search_locations=[str(init.parent)])
+    assert spec is not None and spec.loader is not None
+    sys.modules[name] = module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+
+
+for _name in ("runtime", "calib", "model_export"):
+    _import_ours(_name)

@@ -1,0 +1,33 @@
+"""Optional packages: which extra of phasestack brings the one that is not installed."""
+
+from __future__ import annotations
+
+import re
+from importlib.metadata import PackageNotFoundError, requires
+
+from runtime.errors import MissingPart
+
+IMPORTED_AS = {"usb": "pyusb"}  # packages whose module has another name
+NOT_TO_RUN = frozenset({"all", "docs", "test"})
+
+
+def missing_extra(error: BaseException) -> MissingPart | None:
+    """What to install for an import that failed; None where no extra brings it: another fault."""
+    if not isinstance(error, ModuleNotFoundError) or not error.name:
+        return None
+    module = error.name.partition(".")[0]
+    package = IMPORTED_AS.get(module, module).replace("_", "-")
+    for extra in _extras_with(package):
+        return MissingPart(f"{package} is not installed: pip install 'phasestack[{extra}]'")
+    return None
+
+
+def _extras_with(package: str) -> list[str]:
+    """Extras that name a package, in pyproject.toml's order."""
+    try:
+        lines = requires("phasestack") or []
+    except PackageNotFoundError:
+        return []
+    wanted = re.compile(rf"{re.escape(package)}\b(?!-).*extra == ['\"]([\w-]+)['\"]", re.IGNORECASE)
+    found = [match[1] for line in lines if (match := wanted.match(line.replace("_", "-")))]
+    return [extra for extra in found if extra not in NOT_TO_RUN]
