@@ -181,3 +181,4 @@ class RefreshAccount:
     photon_ns: int = 0  # the light, from when it was really presented
     true_eyes_m: F64 | None = None  # (2, 3) at the light, where the recording knows them
     stage_ms: dict[str, float] = field(default_factory=dict)  # on the run's clock
+    effort: str | None = None  # of the solution shown: 1/2+1 is half the raster and one step

@@ -122,11 +122,12 @@ def test_the_summary_has_figures_and_null_where_nothing_was_measured(runs: tuple
     summary = summary_of(runs[0])
     assert set(summary["stage_ms"]) == REFRESH_STAGES | SOLVING_STAGES
     assert set(summary["stage_ms"]["render"]) == {"p50", "p95", "p99", "max"}
-    for name in ("psnr_db", "ssim", "carried_db", "carried_db_true_eyes", "psnr_db_true_eyes"):
+    for name in ("live_db", "psnr_db", "ssim", "carried_db", "carried_db_true_eyes", "psnr_db_true_eyes"):
         assert summary[name] is not None, name
+    assert summary["clock"] == "simulated" and summary["view_error_mm"].keys() == {"p50", "p95"}
     assert summary["carried_db"] > 20
     short = summary_of(played(tmp_path / "first", "demo", frames=1))
-    for name in ("psnr_db", "ssim", "carried_db", "fps", "interval_ms", "photon_ms", "overhead_ms"):
+    for name in ("live_db", "view_error_mm", "psnr_db", "carried_db", "fps", "interval_ms", "photon_ms", "overhead_ms"):
         assert short[name] is None, name
 
 
@@ -177,7 +178,8 @@ def test_kept_light_is_what_the_panels_show_with_what_the_judge_needs(runs: tupl
     for frame in kept:
         folder = runs[0] / "light" / str(frame)
         names = {path.name for path in folder.iterdir()}
-        assert names == {*LAYERS, "drawn-left.png", "drawn-right.png", "light.json"}
+        pictures = {f"{name}-{eye}.png" for name in ("drawn", "true") for eye in ("left", "right")}
+        assert names == {*LAYERS, *pictures, "light.json"}
         told = json.loads((folder / "light.json").read_text())
         assert set(told) == {"solved_for_m", "eyes_m", "true_eyes_m", "fov"}
         for name in ("solved_for_m", "eyes_m", "true_eyes_m"):
@@ -247,7 +249,7 @@ def test_real_and_simulated_time_pass_the_same_states(tmp_path: Path) -> None:
     assert set(passed["real"][:-4]) | set(passed["simulated"][:-4]) <= {"flat"}
     real, simulated = summary_of(tmp_path / "real"), summary_of(tmp_path / "simulated")
     assert real["seconds"] == pytest.approx(simulated["seconds"], abs=0.5)
-    assert "fps" in simulated["configured"] and real["configured"] == []
+    assert "fps" in simulated["configured"] and real["configured"] == [] and real["clock"] == "real"
 
 
 def test_the_demo_ends_in_time_and_names_its_simulated_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -30,8 +30,8 @@ import numpy as np
 
 from runtime.clock import NS_PER_MS, NS_PER_S
 from runtime.errors import InputError, Stopped, one_line, without_secrets
-from runtime.frame.observer import line_of
 from runtime.frame.presenter import Presenter, Refresh
+from runtime.frame.refresh_lines import line_of
 from runtime.records import F64, RefreshAccount, SensorFrame
 from runtime.sensor import recording_format as fmt
 from runtime.sensor.recording_format import RecordingHeader

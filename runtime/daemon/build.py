@@ -20,11 +20,13 @@ from runtime.daemon.solver_parts import RunningSolver, SolverMaker
 from runtime.errors import InputError, PanelLost, Stopped
 from runtime.eyes.calibration import load_calibration
 from runtime.eyes.detect import EyeFinder
-from runtime.frame.observer import Output, RunObserver
+from runtime.frame.kept_light import Output
+from runtime.frame.observer import RunObserver
 from runtime.frame.pacing import Pacer
 from runtime.frame.presenter import Presenter, Supervisor
 from runtime.frame.solver_host import SimulatedSolver, SolverHost, total_ns
 from runtime.frame.solver_thread import SolverThread
+from runtime.frame.targets import TargetDrawer
 from runtime.frame.viewer import Viewer
 from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
@@ -47,7 +49,7 @@ SWITCH_INTERVAL_S = 0.0005  # between Python threads: the presenter must not wai
 # Of summary.json: on the simulated clock these follow from what is configured, and nothing was measured.
 SIMULATED_FIGURES = (
     "seconds", "fps", "solutions_per_s", "interval_ms", "photon_ms", "stage_ms", "overhead_ms", "skew_ms",
-    "solution_age_ms",
+    "solution_age_ms", "efforts",
 )  # fmt: skip
 
 
@@ -190,12 +192,12 @@ def build_run(
     if maker.run is None:
         raise Stopped("told to stop while starting")
     in_stack_frame = driver.capabilities.in_stack_frame
+    run_cell = maker.run
+    drawer = TargetDrawer(solver, stack, fov_deg=settings.content.fov_deg, shown_content=lambda: run_cell.state.content)
     observer = RunObserver(
         stack,
-        solver,
-        fov_deg=settings.content.fov_deg,
-        measure=options.measure,
-        evaluate_every=settings.loop.evaluate_every if options.measure else 0,
+        drawer,
+        evaluate_every=settings.loop.evaluate_every if options.measure else None,
         keep_light=options.keep_light,
         output=output,
         on_account=on_account,

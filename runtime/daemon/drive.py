@@ -41,7 +41,7 @@ def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> 
         reason = run.presenter.run(frames=options.frames)
         for sample in run.presenter.samples.recorded_ahead():
             run.observer.sampled(sample)  # the last lights' truth: nothing else is done with it
-        run.observer.finish(patient=host is None or not host.stop_reason())
+        run.observer.finish(lambda: host is not None and bool(host.stop_reason()))
         summary = run.summary() | {"stopped": reason}
         if output is not None:
             last = run.presenter.last
@@ -73,7 +73,11 @@ def print_summary(summary: dict[str, Any], out: Path | None) -> None:
         print("as configured, on the simulated clock (nothing of it was measured):")
         for line in lines_of({name: summary[name] for name in configured}):
             print(f"  {line}")
+    if summary["live_db"] is not None:
+        print(
+            "live_db (light at the true eyes, of what they should see there and then) is the figure to quote for motion"
+        )
     if summary["light_db"] is not None:
-        print("light_db, of pupils at the eyes used and a tracking error of 1 mm, is the figure to quote")
+        print("light_db (pupils at the eyes used, tracking error 1 mm) is the figure to quote for a head at rest")
     if out is not None:
         print(f"see {out}/contact-sheet.png; look into it: {out}/viewer.html")

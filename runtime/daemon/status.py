@@ -19,6 +19,7 @@ from runtime.content.registry import MESHES, PLAYLISTS
 from runtime.content.scenes import SCENES
 from runtime.daemon.build import Run
 from runtime.daemon.commands import PLACING
+from runtime.evaluation.refresh_quality import view_error_mm
 from runtime.frame.presenter import Presenter, Refresh
 from runtime.model.predictor import SHIPPED
 from runtime.optics.retina import seen_by
@@ -93,13 +94,23 @@ def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
         "solution": account.solution,
         # What was solved for an instant after this light has no age yet.
         "solution_age_now_ms": None if account.solution_age_ms is None else max(0.0, account.solution_age_ms),
+        "effort": account.effort,
         "light_db": None if run.observer.moment is None else run.observer.moment.light_db,
+        **run.observer.live(),
+        "view_error_estimated_now_mm": _view_error_now_mm(account),
         "photon_now_ms": (account.photon_ns - account.capture_ns) / NS_PER_MS if account.capture_ns else None,
         "rejected_samples": dict(presenter.viewer.refused),
         "sensor_hz": presenter.viewer.rate_hz if "sensor" not in presenter.missing else None,
         **stats.rates_now(),
         **stats.summary(stale_inputs=presenter.samples.stale_inputs),
     }
+
+
+def _view_error_now_mm(account: RefreshAccount) -> float | None:
+    """Distance from the tracker's eyes to those solved for; None: no viewer, or no solution is shown."""
+    if account.eyes_m is None or account.solved_for_m is None:
+        return None
+    return round(view_error_mm(account.eyes_m, account.solved_for_m), 2)
 
 
 def about(run: Run) -> dict[str, Any]:

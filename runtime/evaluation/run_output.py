@@ -12,6 +12,7 @@ from typing import Any, TextIO
 from runtime.browser.still import viewer_html
 from runtime.errors import InputError
 from runtime.evaluation.contact_sheet import Moment, contact_sheet, headline
+from runtime.evaluation.refresh_quality import Pictures
 from runtime.records import U8
 from runtime.support.artifacts import OutputFolder, to_json, write_json, write_png, write_text
 
@@ -62,22 +63,37 @@ class RunOutput:
         """One line of frames.jsonl. Arrays in it must not be written to afterwards."""
         self._later(lambda: self._line(line))
 
-    def light(self, frame: int, *, layers: U8, drawn: tuple[U8, U8] | None, info: Mapping[str, Any]) -> None:
-        """Write `light/<frame>/`: the panels at one refresh, and what the solution's eyes should see.
+    def light(self, frame: int, *, layers: U8) -> None:
+        """Write the layers of `light/<frame>/`.
 
-        layers: (N, h, w, 3 or 4), aligned; drawn: (h, w, 3) retina pictures, None where there were none; info: what
-        light.json holds. None of these arrays may be written to afterwards.
+        layers: (N, h, w, 3 or 4), as the panels show them; they must not be written to afterwards.
         """
 
         def write() -> None:
-            folder = self._folder.staging / "light" / str(frame)
             for n, layer in enumerate(layers):
-                write_png(folder / f"layer-{n}.png", layer)
-            for eye, picture in zip(("left", "right"), drawn or (), strict=False):
-                write_png(folder / f"drawn-{eye}.png", picture)
-            write_json(folder / "light.json", info)
+                write_png(self._light(frame) / f"layer-{n}.png", layer)
 
         self._later(write)
+
+    def light_targets(
+        self, frame: int, *, info: Mapping[str, Any], drawn: Pictures | None, true: Pictures | None
+    ) -> None:
+        """Write the rest of `light/<frame>/`: light.json as `info`, and retina pictures.
+
+        drawn: what the eyes solved for should see; true: what the true eyes should see. Neither may be written to
+        afterwards.
+        """
+
+        def write() -> None:
+            for name, pictures in (("drawn", drawn), ("true", true)):
+                for eye, picture in zip(("left", "right"), pictures or (), strict=False):
+                    write_png(self._light(frame) / f"{name}-{eye}.png", picture)
+            write_json(self._light(frame) / "light.json", info)
+
+        self._later(write)
+
+    def _light(self, frame: int) -> Path:
+        return self._folder.staging / "light" / str(frame)
 
     def finish(
         self, summary: dict[str, Any], layers: U8 | None, moment: Moment | None = None, *, unseen: str = ""
@@ -151,8 +167,10 @@ class RunOutput:
 def in_one_line(summary: dict[str, Any]) -> str:
     """A run's summary in one line, for its contact sheet."""
     line = f"The run: {summary['presented']} of {summary['frames']} refreshes presented, model {summary['model']}"
+    if summary.get("live_db") is not None:
+        line += f"; live {summary['live_db']:.1f} dB at the true eyes, over {summary['live_frames']} refreshes"
+    if (error := summary.get("view_error_mm")) is not None:
+        line += f"; view error {error['p50']:.1f} mm, 95th percentile {error['p95']:.1f}"
     if summary.get("light_db") is not None:
-        line += f"; light {summary['light_db']:.1f} dB, mean of {summary['quality_frames']} refreshes looked at"
-    if summary.get("carried_db_true_eyes") is not None:
-        line += f"; from where the eyes truly were, one ray a pixel: {summary['carried_db_true_eyes']:.1f} dB"
+        line += f"; light {summary['light_db']:.1f} dB, mean of {summary['quality_frames']} refreshes"
     return line

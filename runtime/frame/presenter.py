@@ -344,6 +344,7 @@ class Presenter:
             skew_ms=report.skew_ms if report is not None else 0.0,
             photon_ns=photon_ns,
             stage_ms=stage_ms,
+            effort=solution.effort.name if solution is not None and solution.effort is not None else None,
         )
 
     def _report(

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from runtime.clock import NS_PER_MS, NS_PER_S
+from runtime.evaluation.refresh_quality import view_error_mm
 from runtime.frame.solver_host import SOLVING_STAGES
 from runtime.records import RefreshAccount, State
 
@@ -57,13 +58,18 @@ class RunStats:
         self._stages = {stage: Quantiles() for stage in STAGES}
         self._interval, self._photon, self._overhead = Quantiles(), Quantiles(), Quantiles()
         self._overhead_run, self._skew, self._age, self._sigma = Quantiles(), Quantiles(), Quantiles(), Quantiles()
+        self._view_error = Quantiles()
+        self._efforts_ns: dict[str, int] = {}
+        self._effort: str | None = None  # that has been on the panels since the last refresh
         self._recent: deque[tuple[int, bool, bool]] = deque(maxlen=NOW_KEPT)  # when, presented, a new solution
 
     def add(self, account: RefreshAccount, *, overhead_ms: float, missed_blanks: int = 0) -> None:
         """One refresh; overhead_ms: its own work on the machine's clock, presenting and waiting left out."""
         now_ns, ran = account.present_ns, account.inference == "ran"
         self._first_ns = now_ns if self._first_ns < 0 else self._first_ns
-        self._last_ns = now_ns
+        if self._effort is not None:
+            self._efforts_ns[self._effort] = self._efforts_ns.get(self._effort, 0) + now_ns - self._last_ns
+        self._last_ns, self._effort = now_ns, account.effort
         self.frames += 1
         self.presented += account.presented
         self.dropped += not account.presented
@@ -88,6 +94,8 @@ class RunStats:
             self._age.add(account.solution_age_ms)
         if account.eye_sigma_mm is not None:
             self._sigma.add(account.eye_sigma_mm)
+        if account.eyes_m is not None and account.solved_for_m is not None:
+            self._view_error.add(view_error_mm(account.eyes_m, account.solved_for_m))
 
     def seconds(self) -> float:
         """From the first refresh to the last."""
@@ -134,6 +142,8 @@ class RunStats:
             "skew_ms": self._skew.of("p50", "p99", "max"),
             "solution_age_ms": self._age.of("p50", "p99"),
             "eye_sigma_mm": self._sigma.of("p50", "p99"),
+            "view_error_estimated_mm": self._view_error.of("p50", "p95"),
+            "efforts": {name: round(ns / NS_PER_S, 3) for name, ns in sorted(self._efforts_ns.items())} or None,
             "missed_blanks": self.missed_blanks,
             "faults": dict(self.faults),
         }

@@ -29,6 +29,14 @@ STACK = PanelStack(0.5, 0.3, (-0.06, 0.0, 0.06), 32, 18)
 EYES = np.array([[0.7, -0.03, 0.05], [0.7, 0.03, 0.05]])
 SUMMARY = {"presented": 3, "frames": 3, "model": "balanced", "provider": "cpu", "psnr_db": 30.0, "ssim": 0.9}
 
+LIVE = {
+    "light_db": 31.0,
+    "quality_frames": 2,
+    "live_db": 22.34,
+    "live_frames": 3,
+    "view_error_mm": {"p50": 4, "p95": 9},
+}
+
 
 def line(frame: int, **more: Any) -> dict[str, Any]:
     """A refresh as a presenter tells it."""
@@ -53,10 +61,11 @@ def test_the_sheet_shows_the_moment_with_the_one_figure_to_quote(
     lines = ("This moment",)
     moment = contact_sheet.Moment(pictures(1)[0], look, 33.25, lines, solution, solved_for_m, pictures(2)[1])
     with RunOutput(tmp_path) as output:
-        output.finish(SUMMARY | {"light_db": 31.0, "quality_frames": 2}, layers, moment)
+        output.finish(SUMMARY | LIVE, layers, moment)
     assert written[0] == "PSNR 33.2 dB at the eyes (pixels as squares, pupil 4 mm, tracking error 1 mm)"
     assert "This moment" in written
     assert any("light 31.0 dB, mean of 2 refreshes" in text for text in written)
+    assert any("live 22.3 dB at the true eyes, over 3 refreshes; view error 4.0 mm, 95" in text for text in written)
     np.testing.assert_array_equal(read_image(tmp_path / "layer-0.png"), layers[0, ..., :3])  # the last frame's
     page = (tmp_path / "viewer.html").read_text(encoding="utf-8")
     scene, urls = (json.loads(re.findall(rf'id="{name}">(.*?)</script>', page)[0]) for name in ("scene", "layers"))
@@ -90,7 +99,8 @@ def test_a_full_disk_abandons_the_files_once_and_the_run_goes_on(
     with RunOutput(tmp_path) as output:
         for frame in range(200):
             output.refresh(line(frame))
-        output.light(0, layers=layers, drawn=drawn, info={})
+        output.light(0, layers=layers)
+        output.light_targets(0, drawn=drawn, true=drawn, info={})
         output.finish(SUMMARY, layers)
     assert "No space left" in output.problem
     assert [record.message for record in caplog.records if "abandoned" in record.message] != []
@@ -105,7 +115,7 @@ def test_where_lines_may_be_dropped_a_slow_disk_delays_nobody(tmp_path: Path, mo
     go_on, layers = threading.Event(), pictures()[0]
     monkeypatch.setattr(run_output, "write_png", lambda *_: go_on.wait(60.0))
     with RunOutput(tmp_path, every_one=False) as output:
-        output.light(0, layers=layers, drawn=None, info={})
+        output.light(0, layers=layers)
         for frame in range(run_output.WAITING + 50):
             output.refresh(line(frame))
         assert output.left_out >= 49

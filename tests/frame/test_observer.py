@@ -1,4 +1,4 @@
-"""Who looks at refreshes: lines that wait for the truth, sampled quality, kept light; null where none was measured."""
+"""What observes refreshes: lines that wait for the truth, sampled and live quality, kept light."""
 
 from __future__ import annotations
 
@@ -10,15 +10,17 @@ import numpy as np
 import pytest
 
 from runtime.clock import NS_PER_MS, NS_PER_S
-from runtime.content.base import ContentSource
+from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.evaluation import refresh_quality
 from runtime.evaluation.displayed import displayed
-from runtime.frame import observer as observer_module
+from runtime.frame import refresh_lines
 from runtime.frame.observer import RunObserver
 from runtime.frame.presenter import Refresh
 from runtime.frame.solver_host import Task
+from runtime.frame.targets import TargetDrawer
 from runtime.model.predictor import Predictor
 from runtime.optics.alignment import align, shown_layers
-from runtime.optics.carried import carried_db
+from runtime.optics.carried import carried_db, light_psnrs_db
 from runtime.plan.drawing import drawn_job, retina_pictures
 from runtime.records import PanelFrame, RefreshAccount, SensorFrame, Solution, State
 from runtime.support.background import wait_for_all
@@ -29,7 +31,8 @@ PERIOD_NS = 20 * NS_PER_MS
 FOV_DEG = 40.0
 CONTRACT = {
     "frame", "capture_ns", "predicted_for_ns", "present_ns", "eyes_m", "eyes_label", "eye_sigma_mm", "state",
-    "solution", "solved_for_m", "solution_age_ms", "true_eyes_m", "inference", "presented", "stage_ms", "skew_ms",
+    "solution", "effort", "solved_for_m", "solution_age_ms", "true_eyes_m", "inference", "presented", "stage_ms",
+    "skew_ms",
 }  # fmt: skip
 
 
@@ -43,8 +46,11 @@ class Kept:
     def refresh(self, line: dict[str, Any]) -> None:
         self.lines.append(line)
 
-    def light(self, frame: int, **what: Any) -> None:
-        self.lights[frame] = what
+    def light(self, frame: int, *, layers: Any) -> None:
+        self.lights[frame] = {"layers": layers}
+
+    def light_targets(self, frame: int, **what: Any) -> None:
+        self.lights[frame] |= what
 
 
 class Drawing(FakeSolver):
@@ -52,10 +58,10 @@ class Drawing(FakeSolver):
 
     def __init__(self, content: Any, *, at_once: bool = True) -> None:
         super().__init__()
-        self.content, self._at_once = content, at_once
+        self.content, self.at_once = content, at_once
 
     def do(self, task: Task) -> None:
-        if self._at_once:
+        if self.at_once:
             task(self)  # type: ignore[arg-type]
         else:
             self.tasks.append(task)
@@ -93,8 +99,8 @@ def looking(
     content: Any, *, solver: Drawing | None = None, simulated: bool = True, **how: Any
 ) -> tuple[RunObserver, Kept]:
     kept = Kept()
-    solver = solver or Drawing(content)
-    return RunObserver(SMALL, solver, fov_deg=FOV_DEG, output=kept, simulated=simulated, **how), kept
+    drawer = TargetDrawer(solver or Drawing(content), SMALL, fov_deg=FOV_DEG)
+    return RunObserver(SMALL, drawer, output=kept, simulated=simulated, **how), kept
 
 
 # --- lines -------------------------------------------------------------------------------------------------------
@@ -141,7 +147,7 @@ def test_what_the_recording_never_said_is_null_and_holds_nothing_up(content: Con
 
 
 def test_lines_that_wait_are_bounded(content: ContentSource, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(observer_module, "WAITING_MAX", 16)
+    monkeypatch.setattr(refresh_lines, "WAITING_MAX", 16)
     observer, kept = looking(content)
     observer.sampled(sample(NS_PER_S))
     for number in range(1, 101):
@@ -158,14 +164,14 @@ def test_nothing_measured_is_null(content: ContentSource, solved: Solution) -> N
     observer.refreshed(refresh(1, solved))
     observer.finish()
     assert observer.summary() == {
-        "light_db": None, "psnr_db": None, "ssim": None, "carried_db": None, "psnr_db_true_eyes": None,
-        "carried_db_true_eyes": None, "quality_frames": 0,
+        "live_db": None, "view_error_mm": None, "light_db": None, "psnr_db": None, "ssim": None, "carried_db": None,
+        "psnr_db_true_eyes": None, "carried_db_true_eyes": None, "quality_frames": 0, "live_frames": 0,
     }  # fmt: skip
     assert observer.moment is None
 
 
 def test_quality_is_measured_at_the_eyes_used_and_at_the_true_ones(content: ContentSource, solved: Solution) -> None:
-    observer, _ = looking(content, measure=True, evaluate_every=1)
+    observer, _ = looking(content, evaluate_every=1)
     used, true = aside(0.015), aside(0.012)
     seen = refresh(1, solved, eyes_m=used)
     observer.sampled(sample(NS_PER_S + PERIOD_NS, y_m=0.012))
@@ -188,7 +194,7 @@ def test_quality_is_measured_at_the_eyes_used_and_at_the_true_ones(content: Cont
 def test_every_so_many_refreshes_are_sampled_while_tracking_and_no_others(
     content: ContentSource, solved: Solution
 ) -> None:
-    observer, _ = looking(content, measure=True, evaluate_every=5)
+    observer, _ = looking(content, evaluate_every=5)
     for number in range(30):
         state = State.TRACKING if number < 15 else State.HOLDING
         observer.refreshed(refresh(number, solved, state=state))
@@ -201,7 +207,7 @@ def test_every_so_many_refreshes_are_sampled_while_tracking_and_no_others(
 def test_unseen_pictures_and_mixtures_with_the_flat_one_are_not_measured(
     content: ContentSource, solved: Solution, change: dict[str, Any]
 ) -> None:
-    observer, _ = looking(content, measure=True, evaluate_every=1)
+    observer, _ = looking(content, evaluate_every=1)
     seen = refresh(1, solved)
     if "flatness" in change:
         seen = replace(seen, frame=replace(seen.frame, flat=solved.layers, flat_version=2, **change))
@@ -213,7 +219,7 @@ def test_unseen_pictures_and_mixtures_with_the_flat_one_are_not_measured(
 
 
 def test_a_short_run_measures_its_last_refresh(content: ContentSource, solved: Solution) -> None:
-    observer, _ = looking(content, measure=True, evaluate_every=50)
+    observer, _ = looking(content, evaluate_every=50)
     observer.refreshed(refresh(1, solved))
     observer.finish()
     assert observer.summary()["quality_frames"] == 1
@@ -222,12 +228,12 @@ def test_a_short_run_measures_its_last_refresh(content: ContentSource, solved: S
 
 def test_the_moment_shown_is_the_last_or_in_real_time_newest_measured(content: ContentSource, solved: Solution) -> None:
     for simulated, shown in ((True, 3), (False, 0)):
-        observer, _ = looking(content, simulated=simulated, measure=True, evaluate_every=1)
+        observer, _ = looking(content, simulated=simulated, evaluate_every=1)
         for number in range(4):
             observer.refreshed(refresh(number, solved, eyes_m=aside(0.001 * number)))
             wait_for_all(120.0 if number == 0 else 0.0)
             if not simulated and number == 0:
-                observer._every = 100
+                observer._sampler._every = 100
         observer.finish()
         assert observer.moment is not None and observer.moment.lines[0].startswith(f"Refresh {shown};")
         np.testing.assert_array_equal(observer.moment.eye_views.eyes_m, aside(0.001 * shown))
@@ -235,9 +241,9 @@ def test_the_moment_shown_is_the_last_or_in_real_time_newest_measured(content: C
 
 def test_who_stops_a_run_waits_for_no_measurement(content: ContentSource, solved: Solution) -> None:
     solver = Drawing(content, at_once=False)  # busy
-    observer, _ = looking(content, solver=solver, simulated=False, measure=True, evaluate_every=50)
+    observer, _ = looking(content, solver=solver, simulated=False, evaluate_every=50)
     observer.refreshed(refresh(1, solved))
-    observer.finish(patient=False)
+    observer.finish(lambda: True)
     assert observer.moment is None and solver.tasks == []
 
 
@@ -245,7 +251,7 @@ def test_in_real_time_one_measurement_runs_at_a_time_and_delays_nothing(
     content: ContentSource, solved: Solution
 ) -> None:
     solver = Drawing(content, at_once=False)
-    observer, _ = looking(content, solver=solver, simulated=False, measure=True, evaluate_every=1)
+    observer, _ = looking(content, solver=solver, simulated=False, evaluate_every=1)
     for number in range(10):
         observer.refreshed(refresh(number, solved))
     assert len(solver.tasks) == 1  # the solver's thread draws when it comes to it
@@ -259,23 +265,120 @@ def test_comparing_is_not_the_presenter_s_nor_the_solver_s_work(
     content: ContentSource, solved: Solution, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     threads = []
-    real = observer_module.displayed
+    real = refresh_quality.displayed
     monkeypatch.setattr(
-        observer_module,
+        refresh_quality,
         "displayed",
         lambda *a, **k: (threads.append(threading.current_thread().name), real(*a, **k))[1],
     )
-    observer, _ = looking(content, simulated=False, measure=True, evaluate_every=1)
+    observer, _ = looking(content, simulated=False, evaluate_every=1)
     observer.refreshed(refresh(0, solved))
     assert wait_for_all(120.0) == 0
     assert threads == ["job quality"]
+
+
+# --- live quality ------------------------------------------------------------------------------------------------
+
+
+def live_db(content: ContentSource, seen: Refresh, true_m: Any, *, time_ns: int = 0) -> float:
+    """The contract's definition, by the function that `solve` measures light with."""
+    pictures = retina_pictures(content, true_m, SMALL, fov_deg=FOV_DEG, time_ns=time_ns)
+    layers = shown_layers(seen.frame)
+    light = light_psnrs_db(layers, pictures, SMALL, eyes_m=true_m, fov_deg=FOV_DEG, sigmas_mm=(0.0,))
+    return light[0.0]
+
+
+def test_live_quality_counts_a_stale_view_where_carried_quality_does_not(
+    content: ContentSource, solved: Solution
+) -> None:
+    figures = []
+    for stale_m in (0.0, 0.05):
+        observer, _ = looking(content, evaluate_every=1)
+        observer.sampled(sample(NS_PER_S + PERIOD_NS, y_m=stale_m))
+        seen = refresh(1, solved, eyes_m=aside(stale_m))  # aligned perfectly
+        observer.refreshed(seen)
+        summary = observer.summary()
+        assert summary["live_db"] == pytest.approx(live_db(content, seen, aside(stale_m)), abs=0.1)
+        assert summary["view_error_mm"]["p50"] == pytest.approx(1000 * stale_m)
+        figures.append(summary)
+    still, stale = figures
+    assert stale["live_db"] < still["live_db"] - 4
+    assert stale["carried_db_true_eyes"] > still["carried_db_true_eyes"] - 1
+
+
+def test_live_quality_is_one_mean_squared_error_in_whatever_state(content: ContentSource, solved: Solution) -> None:
+    observer, _ = looking(content, evaluate_every=1)
+    tracked, held = refresh(0, solved), refresh(1, solved, state=State.HOLDING, eyes_m=aside(0.02))
+    flat = refresh(2, solved, state=State.FLAT)
+    flat = replace(flat, frame=replace(flat.frame, flat=255 - solved.layers, flat_version=2, flatness=0.5))
+    refreshes = [tracked, held, flat, refresh(3, solved)]
+    for seen in refreshes[:3]:
+        observer.sampled(sample(seen.account.photon_ns, y_m=0.004))
+        observer.refreshed(seen)
+    observer.finish()
+    observer.refreshed(refreshes[3])  # nobody knows where the eyes are: not a viewer's
+    decibels = [live_db(content, seen, aside(0.004)) for seen in refreshes[:3]]
+    errors = [10 ** (-each / 10) for each in decibels]
+    assert observer.summary()["live_db"] == pytest.approx(-10 * np.log10(np.mean(errors)), abs=0.1)
+    assert (observer.summary()["live_frames"], observer.summary()["quality_frames"]) == (3, 2)
+    assert observer.live_errors == pytest.approx(dict(enumerate(errors)), rel=0.05)  # fewer rays, 192 pixels across
+
+
+class Moving(ContentSource):
+    """A grey that gets lighter, a code every millisecond."""
+
+    def __init__(self) -> None:
+        self.info = ContentInfo("moving", moving=True, background=None)
+
+    def render(self, view: View, *, time_ns: int) -> Any:
+        return np.full((view.height_px, view.width_px, 4), time_ns // NS_PER_MS % 256, np.uint8)
+
+
+def test_live_targets_are_drawn_for_the_display_time(solved: Solution) -> None:
+    content = Moving()
+    observer, kept = looking(content, evaluate_every=1, keep_light=1)
+    seen = refresh(1, solved)
+    observer.sampled(sample(seen.account.photon_ns))
+    observer.refreshed(seen)
+    observer.finish()
+    now_ns = seen.account.photon_ns
+    assert observer.summary()["live_db"] == pytest.approx(live_db(content, seen, EYES, time_ns=now_ns), abs=0.1)
+    assert np.unique(kept.lights[1]["true"]) == [now_ns // NS_PER_MS % 256]
+    assert np.unique(kept.lights[1]["drawn"]) == [0]  # solved for instant 0
+
+
+def test_the_view_error_covers_every_refresh_with_known_eyes(content: ContentSource, solved: Solution) -> None:
+    observer, _ = looking(content)
+    observer.sampled(sample(NS_PER_S, y_m=0.010))
+    for number in range(101):
+        observer.refreshed(refresh(number, solved if number else None, eyes_m=aside(0.3)))
+    observer.sampled(sample(NS_PER_S + 5 * PERIOD_NS, y_m=0.015))
+    observer.finish()
+    assert observer.summary()["view_error_mm"] == pytest.approx({"p50": 13.0, "p95": 14.8})  # of refreshes 1 to 5
+
+
+def test_pictures_of_a_scene_that_was_replaced_are_not_drawn(content: ContentSource, solved: Solution) -> None:
+    shown: list[Any] = [content]
+    solver, kept = Drawing(content), Kept()
+    drawer = TargetDrawer(solver, SMALL, fov_deg=FOV_DEG, shown_content=lambda: shown[0])
+    observer = RunObserver(SMALL, drawer, evaluate_every=1, keep_light=1, output=kept, simulated=True)
+    observer.sampled(sample(NS_PER_S))
+    observer.refreshed(refresh(1, solved))
+    shown[0] = solver.content = Moving()
+    observer.sampled(sample(NS_PER_S + 3 * PERIOD_NS))
+    observer.refreshed(refresh(2, solved))
+    observer.finish()
+    assert list(observer.live_errors) == [2]
+    assert (kept.lights[1]["true"], kept.lights[1]["drawn"]) == (None, None)
+    assert kept.lights[2]["true"] is not None
 
 
 # --- kept light --------------------------------------------------------------------------------------------------
 
 
 def test_every_nth_refresh_leaves_what_a_judge_needs(content: ContentSource, solved: Solution) -> None:
-    observer, kept = looking(content, keep_light=4)
+    solver = Drawing(content, at_once=False)
+    observer, kept = looking(content, solver=solver, keep_light=4)
     shown = {}
     for number in range(12):
         seen = refresh(number, solved, eyes_m=aside(number / 500))
@@ -283,13 +386,40 @@ def test_every_nth_refresh_leaves_what_a_judge_needs(content: ContentSource, sol
         observer.sampled(sample(seen.account.photon_ns, y_m=number / 400))
         observer.refreshed(seen)
     assert list(kept.lights) == [3, 7, 11]
+    assert solver.tasks == [], "drawing waits for the end of the run"
+    solver.at_once = True
+    observer.finish()
     drawn = retina_pictures(content, EYES, SMALL, fov_deg=FOV_DEG, time_ns=0)
     for number, light in kept.lights.items():
         assert np.array_equal(light["layers"], shown[number])
         assert all(np.array_equal(a, b) for a, b in zip(light["drawn"], drawn, strict=True))
+        true = retina_pictures(content, light["info"]["true_eyes_m"], SMALL, fov_deg=FOV_DEG, time_ns=0)
+        assert all(np.array_equal(a, b) for a, b in zip(light["true"], true, strict=True))
         info = light["info"]
         assert set(info) == {"solved_for_m", "eyes_m", "true_eyes_m", "fov"}
         assert np.array_equal(info["eyes_m"], aside(number / 500))
         assert np.array_equal(info["solved_for_m"], EYES)
         assert info["true_eyes_m"] == pytest.approx(aside(number / 400))
         assert info["fov"] == FOV_DEG
+
+
+def test_a_live_sensor_s_pictures_are_drawn_during_the_run(content: ContentSource, solved: Solution) -> None:
+    observer, kept = looking(content, simulated=False, keep_light=1)
+    observer.refreshed(refresh(1, solved))
+    assert wait_for_all(120.0) == 0
+    assert kept.lights[1]["drawn"] is not None and kept.lights[1]["true"] is None
+    assert kept.lights[1]["info"]["true_eyes_m"] is None
+
+
+def test_who_stops_a_run_waits_for_no_kept_picture(
+    content: ContentSource, solved: Solution, caplog: pytest.LogCaptureFixture
+) -> None:
+    solver = Drawing(content, at_once=False)  # busy
+    observer, kept = looking(content, solver=solver, keep_light=1)
+    for number in range(3):
+        observer.sampled(sample(NS_PER_S + number * PERIOD_NS))
+        observer.refreshed(refresh(number, solved))
+    observer.finish(lambda: True)
+    assert "no pictures for 2 of 3" in caplog.text
+    assert all("layers" in light for light in kept.lights.values())
+    assert kept.lights[2]["info"]["true_eyes_m"] is not None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 from runtime.clock import NS_PER_MS, NS_PER_S
@@ -50,9 +51,22 @@ def test_refreshes_and_solutions_are_counted_apart() -> None:
     assert stats.reuse_saves_ms() == 11.0
 
 
+def test_display_time_is_counted_by_effort() -> None:
+    efforts = [None, "1/2+1", "1/2+1", "1/1+4", None, "1/2+1"]
+    summary = told([account(k, effort=effort) for k, effort in enumerate(efforts)]).summary(stale_inputs=0)
+    assert summary["efforts"] == {"1/1+4": 0.02, "1/2+1": 0.04}  # the last refresh's has only begun
+
+
+def test_the_estimated_view_error_starts_from_the_trackers_eyes() -> None:
+    eyes_m = np.array([[0.6, -0.03, 0.0], [0.6, 0.03, 0.0]])
+    moved = [account(k, eyes_m=eyes_m + np.array([0.0, 0.001 * k, 0.0]), solved_for_m=eyes_m) for k in range(101)]
+    assert told(moved).summary(stale_inputs=0)["view_error_estimated_mm"] == pytest.approx({"p50": 50.0, "p95": 95.0})
+
+
 def test_what_was_not_measured_is_none() -> None:
     summary = told([]).summary(stale_inputs=0)
-    for name in ("fps", "solutions_per_s", "interval_ms", "photon_ms", "overhead_ms", "skew_ms", "solution_age_ms"):
+    for name in ("fps", "solutions_per_s", "interval_ms", "photon_ms", "overhead_ms", "skew_ms", "solution_age_ms",
+                 "efforts", "view_error_estimated_mm"):  # fmt: skip
         assert summary[name] is None, name
     assert set(summary["stage_ms"].values()) == {None}
     assert told([]).rates_now() == {"fps_now": None, "solutions_per_s_now": None}

@@ -40,6 +40,7 @@ const PLOTS = [
   ["refreshes/s", (s) => s.fps_now, 1],
   ["solutions/s", (s) => s.solutions_per_s_now, 1],
   ["solution's age, ms", (s) => age(s.solution_age_now_ms), 1],
+  ["view error (estimated), mm", (s) => s.view_error_estimated_now_mm, 1],
   ["capture to light, ms", (s) => s.photon_now_ms, 1],
   ["eyes known to, mm", (s) => s.eye_sigma_now_mm, 2],
   ["presenting (median), ms", (s) => s.stage_ms?.present?.p50, 2],
@@ -113,6 +114,10 @@ function figures(status) {
     sensor: `${number(status.sensor_hz)} samples/s, ${status.stale_inputs} skipped`,
     "capture to light": status.photon_ms ? `${number(status.photon_ms.p50)} ms (p50), ${number(status.photon_ms.p99)} (p99)` : "–",
     "solution's age": status.solution_age_ms ? `${number(age(status.solution_age_ms.p50))} ms (p50), ${number(age(status.solution_age_ms.p99))} (p99)` : "–",
+    effort: status.effort ?? "–",
+    "view error, estimated": status.view_error_estimated_mm ? `${number(status.view_error_estimated_mm.p50)} mm (p50), ${number(status.view_error_estimated_mm.p95)} (p95)` : "–",
+    ...(status.view_error_mm ? { "view error": `${number(status.view_error_mm.p50)} mm (p50), ${number(status.view_error_mm.p95)} (p95)` } : {}),
+    ...(typeof status.live_db === "number" ? { "live quality": `${number(status.live_db)} dB at the true eyes` } : {}),
     stages: Object.entries(status.stage_ms ?? {}).filter(([, v]) => v).map(([k, v]) => `${k} ${number(v.p50, 2)}`).join(", ") + " ms (p50)",
     "black box": status.blackbox ? `${number(status.blackbox.kept_s, 0)} s kept, ${number(status.blackbox.kept_mib)} MiB; last file: ${status.blackbox.last_file ?? "none"}` : "–",
   };

@@ -1,0 +1,137 @@
+"""Quality of one sampled refresh, at the eyes it was aligned to and, *live*, at the true eyes."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from runtime.evaluation.contact_sheet import Moment
+from runtime.evaluation.displayed import displayed
+from runtime.optics.carried import carried_db, intensities, light_psnrs_db
+from runtime.optics.light import Sampling, squared_error
+from runtime.optics.pupil import TRACKING_SIGMA_MM
+from runtime.optics.quality import psnr_db
+from runtime.optics.stack import PanelStack
+from runtime.records import F64, U8, RefreshAccount
+
+log = logging.getLogger("phasestack.quality")
+
+MEASURED = Sampling(step=2)  # light at the eyes aligned to, of a quarter of the pixels
+# Live, of all of them: a view that is displaced errs at the picture's edges, and a quarter of those is 0.6 dB off.
+LIVE = Sampling()
+FIGURES = ("light_db", "psnr_db", "ssim", "carried_db", "psnr_db_true_eyes", "carried_db_true_eyes")
+Pictures = tuple[U8, U8]  # (h, w, 3) retina pictures of the left and right eye, panel size
+
+
+@dataclass(frozen=True, slots=True)
+class Targets:
+    """What eyes should see; None: not drawn."""
+
+    solved: Pictures | None = None  # the eyes that the solution was computed for, at the instant it was computed for
+    used: Pictures | None = None  # the eyes aligned to, at that same instant
+    true: Pictures | None = None  # the true eyes, at the display time
+
+
+@dataclass(frozen=True, slots=True)
+class RefreshQuality:
+    """What could be measured of one refresh."""
+
+    figures: dict[str, float] = field(default_factory=dict)  # of FIGURES
+    live_error: float | None = None  # mean squared error of light at the true eyes
+    moment: Moment | None = None  # for stills, sheet and viewer
+
+
+def view_error_mm(eyes_m: F64, solved_for_m: F64) -> float:
+    """Distance in millimetres between the midpoints of two pairs of eyes (2, 3)."""
+    return 1000 * float(np.linalg.norm((eyes_m - solved_for_m).mean(axis=0)))
+
+
+def live_error(layers: U8, targets: Pictures, stack: PanelStack, *, eyes_m: F64, fov_deg: float) -> float:
+    """Mean squared error of the light at eyes (2, 3) against what they should see from there.
+
+    layers: (N, H, W, 3 or 4), as the panels show them. Raises ValueError where the eyes see nothing of them.
+    """
+    pictures = [intensities(picture) for picture in targets]
+    return squared_error(layers, pictures, stack, solved_for_m=eyes_m, eyes_m=eyes_m, fov_deg=fov_deg, sampling=LIVE)
+
+
+def measure_refresh(
+    account: RefreshAccount,
+    layers: U8,
+    unaligned: U8 | None,
+    targets: Targets,
+    stack: PanelStack,
+    *,
+    fov_deg: float,
+) -> RefreshQuality:
+    """Measure whatever `targets` were drawn for; eyes that see nothing of the panels are left out.
+
+    account: with its true eyes, where they are known; layers: (N, h, w, 4), as the panels showed them;
+    unaligned: the same before alignment, None where they show no solution alone.
+    """
+    error = None
+    if targets.true is not None and account.true_eyes_m is not None:
+        try:
+            error = live_error(layers, targets.true, stack, eyes_m=account.true_eyes_m, fov_deg=fov_deg)
+        except ValueError as why:
+            log.info("live quality: not measured here (%s)", why)
+    try:
+        moment, figures = _at_aligned_eyes(account, layers, unaligned, targets, stack, fov_deg, error)
+    except ValueError as why:
+        log.info("quality: not measured here (%s)", why)
+        return RefreshQuality(live_error=error)
+    return RefreshQuality(figures, error, moment)
+
+
+def _at_aligned_eyes(
+    account: RefreshAccount,
+    layers: U8,
+    unaligned: U8 | None,
+    targets: Targets,
+    stack: PanelStack,
+    fov_deg: float,
+    error: float | None,
+) -> tuple[Moment | None, dict[str, float]]:
+    eyes_m, solved_for_m, true_m = account.eyes_m, account.solved_for_m, account.true_eyes_m
+    if unaligned is None or eyes_m is None or solved_for_m is None or targets.solved is None or targets.used is None:
+        return None, {}
+
+    def one_ray_db(pictures: Pictures, *, drawn_for_m: F64, seen_from_m: F64) -> float:
+        return carried_db(layers, pictures, stack, solved_for_m=drawn_for_m, eyes_m=seen_from_m, fov_deg=fov_deg)
+
+    views = displayed(layers, targets.used, stack, eyes_m=eyes_m, fov_deg=fov_deg)
+    light = light_psnrs_db(
+        layers,
+        targets.solved,
+        stack,
+        eyes_m=solved_for_m,
+        seen_from_m=eyes_m,
+        sigmas_mm=(TRACKING_SIGMA_MM,),
+        fov_deg=fov_deg,
+        sampling=MEASURED,
+    )
+    light_db = light[TRACKING_SIGMA_MM]
+    values = [light_db, views.quality.psnr_db, views.quality.ssim]
+    values.append(one_ray_db(targets.solved, drawn_for_m=solved_for_m, seen_from_m=eyes_m))
+    if targets.true is not None and true_m is not None:
+        values.append(one_ray_db(targets.true, drawn_for_m=true_m, seen_from_m=true_m))
+        values.append(one_ray_db(targets.solved, drawn_for_m=solved_for_m, seen_from_m=true_m))
+    moment = Moment(layers, views, light_db, _lines(account, error), unaligned, solved_for_m, targets.solved)
+    return moment, dict(zip(FIGURES, values, strict=False))
+
+
+def _lines(account: RefreshAccount, error: float | None) -> tuple[str, ...]:
+    """Where the eyes are in a moment, how well that is known, and how stale the view is."""
+    assert account.eyes_m is not None and account.solved_for_m is not None
+    sigma = "" if account.eye_sigma_mm is None else f", standard deviation {account.eye_sigma_mm:.1f} mm"
+    moved_mm = view_error_mm(account.eyes_m, account.solved_for_m)
+    first = f"Refresh {account.frame}; eyes {account.eyes_label}{sigma}, {moved_mm:.0f} mm from where the layers"
+    lines = [f"{first} were solved for: the outer panels were shifted along"]
+    if error is not None and account.true_eyes_m is not None:
+        stale_mm = view_error_mm(account.true_eyes_m, account.solved_for_m)
+        lines.append(
+            f"Live, at the true eyes: {psnr_db(error):.1f} dB; the layers were solved for eyes {stale_mm:.1f} mm away"
+        )
+    return tuple(lines)

@@ -1,0 +1,116 @@
+"""Kept light: the panels of every N-th refresh, and the pictures that a judge compares them with."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from runtime.evaluation.refresh_quality import Pictures, Targets
+from runtime.frame.presenter import Refresh
+from runtime.frame.targets import TargetDrawer
+from runtime.frame.truth import TrueEyes
+from runtime.optics.alignment import shown_layers
+from runtime.records import F64, U8, RefreshAccount
+from runtime.support import progress
+from runtime.support.background import Job
+
+log = logging.getLogger("phasestack.light")
+
+LOOK_S = 0.1  # between two looks whether the run is to end at once
+WRITTEN_WITHIN_S = 10.0  # the last light
+
+
+class Output(Protocol):
+    """Destination of a run's files."""
+
+    def refresh(self, line: dict[str, Any]) -> None:
+        """Add a line to frames.jsonl."""
+
+    def light(self, frame: int, *, layers: U8) -> None:
+        """Keep what the panels showed at one refresh."""
+
+    def light_targets(self, frame: int, *, info: dict[str, Any], drawn: Pictures | None, true: Pictures | None) -> None:
+        """Keep what eyes should have seen at a refresh whose light was kept."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    account: RefreshAccount
+    solved_for_ns: int
+    content: object | None  # that was the run's at this refresh
+
+
+class KeptLight:
+    """Keeps every `every`-th refresh; 0: none."""
+
+    def __init__(self, every: int, output: Output, drawer: TargetDrawer, truth: TrueEyes, *, simulated: bool) -> None:
+        self._every, self._output, self._drawer, self._truth = every, output, drawer, truth
+        self._simulated = simulated
+        self._job: Job[None] | None = None
+        self._kept: list[_Kept] = []
+
+    def refreshed(self, refresh: Refresh) -> None:
+        """Keep the panels of a refresh whose turn it is; in real time one at a time."""
+        account = refresh.account
+        if not self._every or account.frame % self._every != self._every - 1 or not account.presented:
+            return
+        if self._job is not None and not self._job.done:
+            return
+
+        def keep() -> None:
+            self._output.light(account.frame, layers=shown_layers(refresh.frame))
+
+        if self._simulated:
+            keep()
+        else:
+            self._job = Job("kept light", keep)
+        solved_for_ns = refresh.solution.solved_for_ns if refresh.solution is not None else 0
+        kept = _Kept(account, solved_for_ns, self._drawer.shown_content())
+        if self._truth.is_recorded:
+            self._kept.append(kept)
+        else:  # a live sensor's run ends when it is told to: nothing would be drawn then
+            self._draw(kept, lambda: None)
+
+    def finish(self, stopped: Callable[[], bool]) -> None:
+        """Draw all pictures. stopped: True once somebody waits for the end: the rest is written without."""
+        if self._job is not None:
+            self._job.wait(WRITTEN_WITHIN_S)
+        total = len(self._kept)
+        for done, kept in enumerate(self._kept, start=1):
+            progress.tell("drawing what eyes should have seen", done, total)
+            drawn = threading.Event()
+            self._draw(kept, drawn.set)
+            while not drawn.is_set() and not stopped():
+                drawn.wait(LOOK_S)
+            if stopped() and done < total:
+                log.warning("stopped: no pictures for %d of %d refreshes with kept light", total - done, total)
+                for rest in self._kept[done:]:
+                    self._write(rest, Targets())
+                return
+
+    def _draw(self, kept: _Kept, then: Callable[[], None]) -> None:
+        account, true_m = kept.account, self._truth.at(kept.account.photon_ns)
+        wanted: dict[str, tuple[F64, int]] = {}
+        if account.solved_for_m is not None:
+            wanted["solved"] = account.solved_for_m, kept.solved_for_ns
+        if true_m is not None:
+            wanted["true"] = true_m, account.photon_ns
+
+        def write(targets: Targets | None) -> None:
+            self._write(kept, targets or Targets())
+            then()
+
+        self._drawer.draw(wanted, kept.content, write)
+
+    def _write(self, kept: _Kept, targets: Targets) -> None:
+        account = kept.account
+        info = {
+            "solved_for_m": account.solved_for_m,
+            "eyes_m": account.eyes_m,
+            "true_eyes_m": self._truth.at(account.photon_ns),
+            "fov": self._drawer.fov_deg,
+        }
+        self._output.light_targets(account.frame, info=info, drawn=targets.solved, true=targets.true)

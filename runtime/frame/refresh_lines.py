@@ -1,0 +1,58 @@
+"""Lines of frames.jsonl, and the view error: both wait for the true eyes at a refresh's display time."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from runtime.evaluation.refresh_quality import view_error_mm
+from runtime.frame.stats import Quantiles
+from runtime.frame.truth import TrueEyes
+from runtime.records import RefreshAccount, State
+
+WAITING_MAX = 2048  # refreshes that wait for the truth; older ones are written without
+LINE = (
+    "frame", "capture_ns", "predicted_for_ns", "present_ns", "eyes_m", "eyes_label", "eye_sigma_mm", "state",
+    "solution", "effort", "solved_for_m", "solution_age_ms", "true_eyes_m", "inference", "presented", "stage_ms",
+    "skew_ms",
+)  # fmt: skip
+
+
+class RefreshLines:
+    """Refreshes in their order, each written once its true eyes are known or known to be missing."""
+
+    def __init__(self, truth: TrueEyes, write: Callable[[dict[str, Any]], None] | None) -> None:
+        self._truth, self._write = truth, write
+        self._waiting: deque[RefreshAccount] = deque()
+        self.view_error_mm = Quantiles()  # of refreshes that show a solution to known true eyes
+
+    def add(self, account: RefreshAccount) -> None:
+        """Queue a refresh."""
+        self._waiting.append(account)
+
+    def advance(self) -> None:
+        """Write every refresh that waits no longer."""
+        while self._waiting:
+            photon_ns = self._waiting[0].photon_ns
+            if self._truth.may_come(photon_ns) and len(self._waiting) < WAITING_MAX:
+                return
+            account = replace(self._waiting.popleft(), true_eyes_m=self._truth.at(photon_ns))
+            if account.true_eyes_m is not None and account.solved_for_m is not None:
+                self.view_error_mm.add(view_error_mm(account.true_eyes_m, account.solved_for_m))
+            if self._write is not None:
+                self._write(line_of(account))
+
+
+def line_of(account: RefreshAccount) -> dict[str, Any]:
+    """One line of frames.jsonl (contract 5.2)."""
+    return {name: _plain(getattr(account, name)) for name in LINE}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, float):
+        return round(value, 4)
+    if isinstance(value, dict):
+        return {name: _plain(each) for name, each in value.items()}
+    return str(value) if isinstance(value, State) else value

@@ -1,0 +1,162 @@
+"""Sampled quality: which refreshes are measured, one at a time, once their true eyes are known.
+
+What their eyes should see is drawn on the solver's thread. In real time a thread of its own compares, and while one
+measurement is under way no other begins; in simulated time everything happens at once.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+from queue import Empty, SimpleQueue
+from typing import Any
+
+import numpy as np
+
+from runtime.evaluation.contact_sheet import Moment
+from runtime.evaluation.refresh_quality import FIGURES, RefreshQuality, Targets, measure_refresh
+from runtime.frame.presenter import Refresh
+from runtime.frame.targets import TargetDrawer
+from runtime.frame.truth import TrueEyes
+from runtime.optics.alignment import shown_layers
+from runtime.optics.quality import psnr_db
+from runtime.optics.stack import PanelStack
+from runtime.records import F64, State
+from runtime.support.background import Job
+
+DRAWN_WITHIN_S = 10.0  # the targets of the last refresh, by the solver
+
+
+@dataclass(frozen=True, slots=True)
+class _Sample:
+    refresh: Refresh
+    content: object | None  # that was the run's at this refresh
+
+
+class QualitySampler:
+    """Measures every `every`-th refresh (0: none) and, with `finish`, the last one."""
+
+    def __init__(
+        self,
+        stack: PanelStack,
+        drawer: TargetDrawer,
+        truth: TrueEyes,
+        *,
+        every: int,
+        simulated: bool,
+    ) -> None:
+        self._stack, self._drawer, self._truth = stack, drawer, truth
+        self._every, self._simulated = every, simulated
+        self.measured: dict[str, list[float]] = {}  # of FIGURES, at the sampled refreshes
+        self.live: dict[int, float] = {}  # mean squared error at the true eyes, by refresh
+        self.moment: Moment | None = None  # the newest refresh measured: stills, sheet and viewer are of this one
+        self._waiting: deque[_Sample] = deque()
+        self._job: Job[RefreshQuality] | None = None
+        self._job_frame = 0
+        self._drawing = False
+
+    def refreshed(self, refresh: Refresh) -> None:
+        """Queue a refresh that is a sample; in real time only while nothing else is measured."""
+        is_sample = self._every and refresh.account.frame % self._every == self._every - 1
+        if is_sample and refresh.account.presented and (self._simulated or not self._is_busy):
+            self._waiting.append(_Sample(refresh, self._drawer.shown_content()))
+
+    @property
+    def _is_busy(self) -> bool:
+        return bool(self._waiting) or self._drawing or self._job is not None
+
+    def advance(self) -> None:
+        """Take in what has been measured, and begin what waits no longer for its truth."""
+        if self._job is not None and self._job.done:
+            job, self._job = self._job, None
+            self._take(self._job_frame, job.take())
+        while self._waiting and self._job is None and not self._drawing:
+            if self._truth.may_come(self._waiting[0].refresh.account.photon_ns):
+                return
+            self._begin(self._waiting.popleft())
+
+    def finish(self, last: Refresh) -> None:
+        """Measure the run's last refresh; it counts in the means where nothing else was measured."""
+        queue: SimpleQueue[Targets | None] = SimpleQueue()
+        true_m = self._truth.at(last.account.photon_ns)
+        self._drawer.draw(self._wanted(last, true_m), None, queue.put)
+        try:
+            targets = queue.get(timeout=0.0 if self._simulated else DRAWN_WITHIN_S)
+        except Empty:
+            return
+        quality = self._compared(last, true_m, targets)
+        counts = not self.measured and last.account.state is State.TRACKING
+        self._take(last.account.frame, quality, figures=counts, live=not self.live)
+
+    def _begin(self, sample: _Sample) -> None:
+        refresh, frame = sample.refresh, sample.refresh.account.frame
+        true_m = self._truth.at(refresh.account.photon_ns)
+        wanted = self._wanted(refresh, true_m)
+        if not wanted:
+            return
+
+        def compare(targets: Targets | None) -> None:
+            if self._simulated:
+                self._take(frame, self._compared(refresh, true_m, targets))
+            elif targets is not None:
+                self._job_frame = frame
+                self._job = Job("quality", lambda: self._compared(refresh, true_m, targets))
+            self._drawing = False
+
+        self._drawing = True
+        self._drawer.draw(wanted, sample.content, compare)
+
+    def _wanted(self, refresh: Refresh, true_m: F64 | None) -> dict[str, tuple[F64, int]]:
+        """Which eyes' pictures are compared, and at which instants."""
+        account, solution = refresh.account, refresh.solution
+        wanted: dict[str, tuple[F64, int]] = {}
+        if true_m is not None:
+            wanted["true"] = true_m, account.photon_ns
+        is_tracked = account.state is State.TRACKING and has_picture(refresh) and account.eyes_m is not None
+        if is_tracked and solution is not None and solution.solved_for_m is not None and account.eyes_m is not None:
+            wanted["solved"] = solution.solved_for_m, solution.solved_for_ns
+            wanted["used"] = account.eyes_m, solution.solved_for_ns
+        return wanted
+
+    def _compared(self, refresh: Refresh, true_m: F64 | None, targets: Targets | None) -> RefreshQuality:
+        if targets is None:
+            return RefreshQuality()
+        account = replace(refresh.account, true_eyes_m=true_m)
+        layers, unaligned = shown_layers(refresh.frame), None
+        if targets.used is not None:
+            unaligned = shown_layers(replace(refresh.frame, solved_from_shown=()))
+        return measure_refresh(account, layers, unaligned, targets, self._stack, fov_deg=self._drawer.fov_deg)
+
+    def _take(self, frame: int, quality: RefreshQuality | None, *, figures: bool = True, live: bool = True) -> None:
+        if quality is None:
+            return
+        self.moment = quality.moment or self.moment
+        for name, value in quality.figures.items() if figures else ():
+            self.measured.setdefault(name, []).append(value)
+        if live and quality.live_error is not None:
+            self.live[frame] = quality.live_error
+
+    @property
+    def live_db(self) -> float | None:
+        """Live quality (contract 5.5) of the refreshes measured so far."""
+        return round(psnr_db(float(np.mean(list(self.live.values())))), 3) if self.live else None
+
+    def summary(self) -> dict[str, Any]:
+        """The measured part of summary.json; None where nothing was measured."""
+        means = {
+            name: round(float(np.mean(self.measured[name])), 3) if name in self.measured else None for name in FIGURES
+        }
+        counts = {"quality_frames": len(self.measured.get("psnr_db", [])), "live_frames": len(self.live)}
+        return {"live_db": self.live_db, **means, **counts}
+
+
+def has_picture(refresh: Refresh) -> bool:
+    """True where the panels show a solution for two eyes, and nothing of the flat picture."""
+    solution = refresh.solution
+    return (
+        refresh.account.presented
+        and refresh.frame.flatness == 0.0
+        and solution is not None
+        and solution.solved_for_m is not None
+        and solution.seeing == (True, True)
+    )

@@ -1,0 +1,59 @@
+"""Retina pictures of what eyes should see, drawn on the solver's thread in its GL context."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from typing import Any
+
+from runtime.errors import ContentFailure
+from runtime.evaluation.refresh_quality import Targets
+from runtime.frame.solver_host import SolverHost
+from runtime.optics.stack import PanelStack
+from runtime.plan.drawing import retina_pictures
+from runtime.records import F64
+
+Wanted = Mapping[str, tuple[F64, int]]  # by field of `Targets`: eyes (2, 3), frame `stack`, and an instant
+
+
+class TargetDrawer:
+    """Draws between two steps of the solver."""
+
+    def __init__(
+        self,
+        solver: SolverHost,
+        stack: PanelStack,
+        *,
+        fov_deg: float,
+        shown_content: Callable[[], object | None] = lambda: None,
+    ) -> None:
+        """shown_content: the run's content at present; None: it is never replaced."""
+        self._solver, self._stack, self.fov_deg = solver, stack, fov_deg
+        self.shown_content = shown_content
+
+    def draw(self, wanted: Wanted, content: object | None, then: Callable[[Targets | None], None]) -> None:
+        """Draw, and hand the pictures to `then` on the solver's thread.
+
+        content: the run's at that refresh; None: whatever it is by then. Without pictures: the content has failed (the
+        state says so), or another one has replaced it.
+        """
+
+        def task(parts: Any) -> bool:
+            targets = None
+            try:
+                with suppress(ContentFailure):
+                    if content is None or parts.content is content:
+                        targets = self._drawn(parts.content, wanted)
+            finally:
+                then(targets)
+            return True
+
+        self._solver.do(task)
+
+    def _drawn(self, content: Any, wanted: Wanted) -> Targets:
+        return Targets(
+            **{
+                name: retina_pictures(content, eyes_m, self._stack, fov_deg=self.fov_deg, time_ns=time_ns)
+                for name, (eyes_m, time_ns) in wanted.items()
+            }
+        )

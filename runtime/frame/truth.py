@@ -1,0 +1,54 @@
+"""True eyes at any instant, interpolated between a recording's samples."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from runtime.clock import NS_PER_S
+from runtime.records import F64
+
+GAP_NS = NS_PER_S // 5  # nothing is interpolated across a longer gap
+KEPT = 512  # true positions: eight seconds at 60 Hz
+
+
+class TrueEyes:
+    """The recorded truth at samples' captures, interpolated between them."""
+
+    def __init__(self) -> None:
+        self._known: deque[tuple[int, F64]] = deque(maxlen=KEPT)
+        self._ended = False
+
+    @property
+    def is_recorded(self) -> bool:
+        """True once any sample had true eyes; a live sensor's have none."""
+        return bool(self._known)
+
+    def add(self, capture_ns: int, eyes_m: F64) -> None:
+        """Add a sample's true eyes, (2, 3), frame `stack`."""
+        if not self._known or capture_ns > self._known[-1][0]:
+            self._known.append((capture_ns, eyes_m))
+
+    def end(self) -> None:
+        """Declare that no more samples will come."""
+        self._ended = True
+
+    def may_come(self, time_ns: int) -> bool:
+        """True while an instant's truth is unknown but later samples may give it."""
+        return bool(self._known) and time_ns > self._known[-1][0] and not self._ended
+
+    def at(self, time_ns: int) -> F64 | None:
+        """(2, 3) true eyes at an instant; None: not known."""
+        if not self._known or time_ns > self._known[-1][0]:
+            return None
+        after_ns, after_m = self._known[-1]
+        for before_ns, before_m in reversed(self._known):
+            if before_ns <= time_ns:
+                if before_ns == time_ns:
+                    return before_m
+                if after_ns - before_ns > GAP_NS:
+                    return None
+                weight = (time_ns - before_ns) / (after_ns - before_ns)
+                eyes: F64 = (1 - weight) * before_m + weight * after_m
+                return eyes
+            after_ns, after_m = before_ns, before_m
+        return None
