@@ -79,13 +79,14 @@ class KeptLight:
         if self._job is not None:
             self._job.wait(WRITTEN_WITHIN_S)
         total = len(self._kept)
-        for done, kept in enumerate(self._kept, start=1):
+        for done, kept in enumerate(self._kept):
             progress.tell("drawing what eyes should have seen", done, total)
             drawn = threading.Event()
-            self._draw(kept, drawn.set)
+            if not stopped():
+                self._draw(kept, drawn.set)
             while not drawn.is_set() and not stopped():
                 drawn.wait(LOOK_S)
-            if stopped() and done < total:
+            if not drawn.is_set():
                 log.warning("stopped: no pictures for %d of %d refreshes with kept light", total - done, total)
                 for rest in self._kept[done:]:
                     self._write(rest, Targets())
