@@ -10,6 +10,7 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -18,7 +19,10 @@ import onnxruntime
 from model_export.stress import ORDINARY, Feeds, picture_cases, spectral_cases
 from runtime.errors import InputError, one_line
 from runtime.model.contract import VERSION, Contract, parse_contract
+from runtime.model.network import PictureProposal
+from runtime.model.session import ModelSession
 from runtime.model.targets import FULL
+from runtime.optics.stack import PanelStack
 from runtime.support import untrusted_input
 from runtime.support.progress import tracked
 
@@ -64,7 +68,13 @@ Reference = Callable[[Feeds], Sequence[np.ndarray]]
 
 
 def validate_file(path: Path) -> Report:
-    """Checks of a file. Raises InputError: no ONNX model, or no contract that we know."""
+    """Checks of a file. Raises InputError: no model, no contract that we know, or ports that every command refuses."""
+    session = ModelSession(path)
+    contract = session.contract
+    if contract.input_frame != "chain":
+        height, width = _size(session.input_shapes.get(contract.inputs[0].name, ()), contract)
+        x_m = tuple(0.01 * n for n in range(contract.panels))
+        PictureProposal(session, PanelStack(width / 1000, height / 1000, x_m, width, height), source=path)
     return check_model(untrusted_input.read_bytes(path, most_bytes=FILE_BYTES_MAX), source=str(path))
 
 
@@ -88,12 +98,19 @@ def check_model(data: bytes, *, source: str, reference: Reference | None = None)
     if not all(check.passed for check in checks):
         return Report(source, tuple(checks))
     plain = reference or _run(_session(data, optimised=False))
-    height, width = contract.height_px or SMALL[0], contract.width_px or SMALL[1]
+    height, width = _size(session.get_inputs()[0].shape, contract)
     chain = contract.input_frame == "chain"
     cases = spectral_cases(contract.cell_px) if chain else picture_cases(contract, height, width)
     run = _run(session)
     checks += [_compared(name, run, plain, feeds) for name, feeds in tracked(f"checking {source}", list(cases.items()))]
     return Report(source, tuple(checks))
+
+
+def _size(shape: Sequence[Any], contract: Contract) -> tuple[int, int]:
+    """Height and width of the pictures to check with: the graph's, the contract's, or small ones."""
+    graph, given = (*shape[2:], None, None)[:2], (contract.height_px, contract.width_px)
+    found = [g if isinstance(g, int) else c or s for g, c, s in zip(graph, given, SMALL, strict=True)]
+    return found[0], found[1]
 
 
 def _session(data: bytes, *, optimised: bool) -> onnxruntime.InferenceSession:

@@ -30,7 +30,7 @@ class PictureProposal:
     any_raster = False  # it proposes whole panels of one size
 
     def __init__(self, session: ModelSession, stack: PanelStack, *, source: Path) -> None:
-        """Raises InputError where the model's fixed size is not the panels'."""
+        """Raises InputError where the model's fixed size is not the panels', or its ports do not fit."""
         contract = session.contract
         self.session, self._stack = session, stack
         for given, wanted, name in (
@@ -45,20 +45,22 @@ class PictureProposal:
         self._order = (0, 1) if contract.eye_order == "left-right" else (1, 0)
         channels = len(self._panels) * 2 * 3
         self._input = np.empty((1, channels, stack.height_px, stack.width_px), np.float32)
+        self._answered = [n for n in range(stack.count) if contract.output == "panels" or n != stack.count // 2]
+        self._answer = (1, len(self._answered) * 3, stack.height_px, stack.width_px)
+        feed, answer = contract.inputs[0].name, contract.outputs[0].name
+        session.check_fits(source, {feed: self._input.shape}, {answer: self._answer})
         table = np.arange(256, dtype=np.float32) / np.float32(255)
         self._table = table if contract.input_value == "intensity" else phase_from_intensity(table, contract.branch)
 
     def panels(self, job: Job, geometry: Geometry, watch: Stopwatch) -> dict[int, I16]:
-        contract, count, channel = self.session.contract, self._stack.count, 0
+        contract, channel = self.session.contract, 0
         for n in self._panels:
             for side in self._order:
                 for plane in cv2.split(self._seen(job, n, side))[:3]:
                     self._input[0, channel] = cv2.LUT(plane, self._table)
                     channel += 1
         watch.lap("prepare")
-        answered = [n for n in range(count) if contract.output == "panels" or n != count // 2]
-        shape = (1, len(answered) * 3, self._stack.height_px, self._stack.width_px)
-        name = contract.outputs[0].name
+        name, answered, shape = contract.outputs[0].name, self._answered, self._answer
         answer = self.session.run({contract.inputs[0].name: self._input}, {name: shape})[name]
         if not np.isfinite(answer.sum()):
             raise ModelFailure("the network answered with numbers that are not finite")

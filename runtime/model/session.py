@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,10 @@ PROVIDERS = {
 RECORD_NODES = "session.record_ep_graph_assignment_info"
 NODES_TOLD = 5
 TYPES = {"tensor(float)": np.float32, "tensor(int16)": np.int16}
+NEWER_OPSET = re.compile(r"(Opset) (\d+) is under development.*till opset (\d+)")
+NEWER_IR = re.compile(r"(IR version): (\d+), max supported IR version: (\d+)")
+ERROR_KIND = re.compile(r"^\[ONNXRuntimeError\] : \d+ : \w+ : ")
+SOURCE_PLACE = re.compile(r"/\S+\.(cc|h|cpp):\d+ .*\) ")  # of onnxruntime's own, with the function's name
 Shape = tuple[int, ...]
 
 
@@ -119,6 +124,41 @@ class ModelSession:
             found = {item.name: len(item.shape) for item in items}
             if declared != found:
                 raise InputError(path, f"contract.{field}", f"declares {_named(declared)}, the graph {_named(found)}")
+            for item in items:
+                if item.type not in TYPES:
+                    kind = item.type.removeprefix("tensor(").removesuffix(")")
+                    problem = f"is of {kind}, expected float32: only tensors within the graph may be narrower"
+                    raise InputError(path, f"{field}.{item.name}", problem)
+
+    def check_fits(self, source: Path, feeds: Mapping[str, Shape], answers: Mapping[str, Shape]) -> None:
+        """Raise InputError, naming the port, where the graph does not make such answers of such feeds.
+
+        It is run once where its declared shapes leave that open.
+        """
+        is_open = False
+        for field, items, shapes in (
+            ("inputs", self._session.get_inputs(), feeds),
+            ("outputs", self._session.get_outputs(), answers),
+        ):
+            if len(items) != len(shapes):
+                raise InputError(source, field, f"are {_list(item.name for item in items)}, not {_list(shapes)} alone")
+            for item in items:
+                sizes, expected = item.shape, shapes[item.name]
+                fits = [size == want for size, want in zip(sizes, expected, strict=False) if isinstance(size, int)]
+                if len(sizes) != len(expected) or not all(fits):
+                    raise InputError(source, f"{field}.{item.name}", f"is {_sizes(sizes)}, expected {_sizes(expected)}")
+                is_open |= len(fits) < len(sizes)
+        if not is_open:
+            return
+        try:
+            zeros = {name: np.zeros(shape, np.float32) for name, shape in feeds.items()}
+            made = dict(zip(answers, self._session.run(list(answers), zeros), strict=True))
+        except Exception as error:  # onnxruntime's own hierarchy
+            name, shape = next(iter(feeds.items()))
+            raise InputError(source, f"inputs.{name}", f"of {_sizes(shape)} fails ({_first_line(error)})") from None
+        for name, shape in answers.items():
+            if made[name].shape != shape:
+                raise InputError(source, f"outputs.{name}", f"is {_sizes(made[name].shape)}, expected {_sizes(shape)}")
 
 
 def nodes_elsewhere(session: Any, provider: str) -> tuple[str, ...]:
@@ -149,7 +189,8 @@ def _checked(path: Path, sha256: str) -> bytes:
     except ValueError as error:
         raise InputError(path, "", f"is no ONNX model ({error})") from None
     if external:
-        raise InputError(path, "external_data", "is refused: a model must be one file, with its weights in it")
+        way_out = "onnx.save(onnx.load(NAME), OTHER_NAME) makes one of both"
+        raise InputError(path, "external_data", f"is refused: a model is one file, with its weights in it; {way_out}")
     return data
 
 
@@ -159,7 +200,7 @@ def _opened(path: Path, data: bytes, options: Any, provider: str) -> Any:
     except Exception as error:  # onnxruntime raises its own hierarchy of undocumented exceptions
         if "bad_alloc" in str(error):
             raise MemoryError from error
-        raise InputError(path, "", f"is no model that onnxruntime can load ({_first_line(error)})") from None
+        raise InputError(path, "", _why_not_loaded(error)) from None
 
 
 _tried_out: set[bytes] = set()  # digests of files that onnxruntime loads within its limits
@@ -181,9 +222,32 @@ def _tried_here(path: Path, data: bytes) -> None:
     _opened(path, data, options, "CPUExecutionProvider")
 
 
+def _why_not_loaded(error: Exception) -> str:
+    """What is wrong with a model that onnxruntime does not load, with its own version where it is too old for it."""
+    text = str(error)
+    for found in (NEWER_OPSET.search(text), NEWER_IR.search(text)):
+        if found:
+            what, version, most = found.groups()
+            runtime = f"onnxruntime {onnxruntime().__version__}"
+            remedy = f"export it with at most {most}, or install a newer onnxruntime"
+            return f"has {what.replace('Opset', 'opset')} {version}; {runtime} takes up to {most}: {remedy}"
+    if found := re.search(r"No Op registered for (\S+)", text):
+        return f"has an operator that onnxruntime does not know: {found[1]}"
+    return f"is no model that onnxruntime can load ({_first_line(error)})"
+
+
+def _list(names: Iterable[str]) -> str:
+    return ", ".join(names)
+
+
+def _sizes(shape: Sequence[Any]) -> str:
+    return " x ".join(str(size) for size in shape)
+
+
 def _named(ranks: Mapping[str, int]) -> str:
     return ", ".join(f"{name} ({rank} axes)" for name, rank in ranks.items())
 
 
 def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+    line = (str(error).strip().splitlines() or [type(error).__name__])[0]
+    return SOURCE_PLACE.sub("", ERROR_KIND.sub("", line))[:200]
