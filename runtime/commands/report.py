@@ -10,18 +10,16 @@ import typer
 
 def report(
     out: Annotated[Path, typer.Option(help="folder for index.html, report.json and the plots")] = Path("report"),
-    pairs: Annotated[Path | None, typer.Option(help="folder of case files: pairs of one's own to measure on")] = None,
-    focal: Annotated[bool, typer.Option("--focal", help="focal parallax through the layers as well")] = False,
-    model: Annotated[list[str] | None, typer.Option(help="a further ONNX file to compare; may be repeated")] = None,
-    published: Annotated[str, typer.Option(help="an ONNX file of 640x360, measured beside published figures")] = "",
+    pairs: Annotated[Path | None, typer.Option(help="folder of case files: your own pairs to measure on")] = None,
+    focal: Annotated[bool, typer.Option("--focal", help="measure focal parallax through the layers, too")] = False,
+    model: Annotated[list[str] | None, typer.Option(help="an ONNX file to compare as well; may be repeated")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="quarter-size panels, fewer references: a first look")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
-    """Measure light against run time, in one run on this machine, and write a page of it. Takes minutes.
+    """Measure light against run time on this machine, and write a page about it. Takes minutes.
 
-    The page is there with the first figure and grows: open it, or stop when it shows enough. The published network is
-    compared as `--model FILE.onnx`, or, of 640x360, as `--published FILE.onnx` beside others' figures, once
-    `phasestack export` has made it of its checkpoint.
+    The page exists from the first figure on and grows: open it, or stop when it shows enough. To compare the published
+    network, make it from its checkpoint by `phasestack export`, and name it by `--model FILE.onnx`.
 
     Example: phasestack report --pairs my-pairs --out report
     """
@@ -31,7 +29,7 @@ def report(
 
     parts = ["phasestack report", *([f"--pairs {pairs.name}"] if pairs else []), *(["--focal"] if focal else [])]
     parts += [f"--model {Path(name).name}" for name in model or []]
-    parts += [*([f"--published {Path(published).name}"] if published else []), *(["--quick"] if quick else [])]
+    parts += ["--quick"] if quick else []
     try:
         with status_line("report") as tell:
             record = whole_report(
@@ -39,7 +37,6 @@ def report(
                 pairs=pairs,
                 with_focal=focal,
                 models=model or [],
-                published=published,
                 quick=quick,
                 command=" ".join(parts),
                 progress=tell,

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from runtime.config import ModelSettings, StackGeometry
-from runtime.model.predictor import SHIPPED, load_predictor
+from runtime.model.predictor import load_predictor
 from runtime.report import focal, moving
 from runtime.report.frontier import Method, MethodResult, apart, measure, shipped_and_references
-from runtime.report.literature import SIZE_PX, literature_section
 from runtime.report.page import Page, Section, describe
 from runtime.report.pairs import StillPair, procedural_pairs, read_pairs
 from runtime.report.sections import focal_section, frontier_section, moving_section
 
-LIKE_PUBLISHED = "{}x{}".format(*SIZE_PX)
 QUOTE = "light_db at a tracking error of 1 mm: what both eyes' pupils make of the panels' pixels"
 Progress = Callable[[str], None]
 
@@ -62,45 +59,28 @@ def whole_report(
     pairs: Path | None = None,
     with_focal: bool = False,
     models: Sequence[str] = (),
-    published: str = "",
     quick: bool = False,
     command: str = "phasestack report",
     progress: Progress = lambda name: None,
 ) -> dict[str, Any]:
     """Measure everything into a folder; answers report.json. `quick`: quarter size, fewer references.
 
-    published: an ONNX file of SIZE_PX, measured beside published figures.
     Raises InputError for case files and models with mistakes, before anything is measured.
     """
     cases = read_pairs(pairs) if pairs is not None else []
     stack = StackGeometry().stack()
     if quick:
         stack = replace(stack, width_px=960, height_px=540)
-    small = replace(stack, width_px=SIZE_PX[0], height_px=SIZE_PX[1])
-    like_published = _by_size(cases).get(LIKE_PUBLISHED, [])
-    served = [(name, [*(pair.stack for pair in cases), stack]) for name in models]
-    served += [(published, [pair.stack for pair in like_published] or [small])] if published else []
-    for name, stacks in served:
-        for each in dict.fromkeys(stacks):  # minutes later is too late to refuse it
+    for name in models:
+        for each in dict.fromkeys([*(pair.stack for pair in cases), stack]):  # refuse it now, not minutes later
             load_predictor(name, each, ModelSettings(threads=1)).close()
     page = GrowingPage(out, command, progress)
     methods = shipped_and_references(models, quick=quick)
-    beside: list[MethodResult] = []
     for size, own in _by_size(cases).items():
         title = f"{len(own)} case file{'s' if len(own) > 1 else ''}, {size}"
-        results = _frontier(page, methods, own, title=title, name=f"cases-{size}", key="methods")
-        beside += results if size == LIKE_PUBLISHED else []
-
+        _frontier(page, methods, own, title=title, name=f"cases-{size}", key="methods")
     key = "methods_on_built_in_scenes" if cases else "methods"
     _frontier(page, methods, procedural_pairs(stack), title="built-in scenes", name="scenes", key=key)
-    page.doing(f"beside published figures, {LIKE_PUBLISHED}")
-    missing = [] if beside else [Method(name, "network", name) for name in SHIPPED]
-    missing += [Method(Path(published).stem, "network", published)] if published else []
-    found = measure(missing, like_published or islice(procedural_pairs(small), 1))
-    by_name = {result.name: result for _, result in found}
-    beside += [by_name[method.name] for method in missing if method.name in by_name]
-    page.record["methods_beside_published_figures"] = [result.record() for result in beside]
-    page.put("literature", literature_section(beside))
     _moving(page, quick=quick)
     if with_focal:
         _focal(page)
@@ -117,7 +97,7 @@ def _by_size(cases: Sequence[StillPair]) -> dict[str, list[StillPair]]:
 
 def _frontier(
     page: GrowingPage, methods: Sequence[Method], pairs: Iterable[StillPair], *, title: str, name: str, key: str
-) -> list[MethodResult]:
+) -> None:
     """One section of pairs that share a resolution; `key`: of the record that its methods are added to."""
     title = f"Light against run time: {title}"
     page.doing(f"{title}: drawing")
@@ -127,7 +107,6 @@ def _frontier(
         results[result.name] = result
         page.record[key] = before + [one.record() for one in results.values()]
         page.put(name, frontier_section(list(results.values()), title=title, name=name))
-    return list(results.values())
 
 
 def _moving(page: GrowingPage, *, quick: bool) -> None:
