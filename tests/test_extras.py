@@ -39,7 +39,7 @@ def without(*packages: str, command: list[str]) -> subprocess.CompletedProcess[s
         (["run", "--replay", "demo", "--headless", "--max-speed"], "mcap", "sensors"),
         (["record", "--out", "x.mcap"], "openni", "sensors"),
         (["page"], "uvicorn", "service"),
-        (["stability"], "mpmath", "report"),
+        (["stability"], "scipy", "content"),
         (["identify"], "glfw", "display"),
         (["train", "--arch", "eyereal", "--out", "out"], "torch", "export"),
     ],

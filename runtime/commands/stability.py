@@ -14,16 +14,16 @@ if TYPE_CHECKING:
 
 def stability(
     out: Annotated[Path | None, typer.Option(help="folder for stability.json")] = None,
-    full: Annotated[bool, typer.Option("--full", help="the long cases as well: minutes instead of seconds")] = False,
+    full: Annotated[bool, typer.Option("--full", help="run the long cases, too: minutes instead of seconds")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
     record: Annotated[
         Path | None,
-        typer.Option(help="write what cases come to as their limits: after a model changed"),
+        typer.Option(help="write the errors to a limits file, after a change of a model"),
     ] = None,
 ) -> None:
-    """Try every numerical step on stiff and extreme cases, against references of 50 digits.
+    """Run every numerical step on stiff and extreme cases, and compare it with references.
 
-    No case may be more than 5% worse than recorded. Exits with 1 where a case fails. Needs mpmath: pip install mpmath
+    A case without a reference may be at most 5% worse than recorded. Exits with 1 if a case fails.
 
     Example: phasestack stability --out stability
     """
@@ -63,7 +63,7 @@ def stability(
 
 
 def _fits() -> dict[str, Fit]:
-    """The calibration's solvers, by their rules."""
+    """Return the calibration's solvers by rule."""
     from functools import partial
 
     from calib.robust import fit_robust

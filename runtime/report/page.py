@@ -18,7 +18,7 @@ from runtime.support.artifacts import OutputFolder, write_bytes, write_json, wri
 
 STYLE = ["seaborn-v0_8-whitegrid", {"figure.dpi": 130, "axes.spines.top": False, "axes.spines.right": False}]
 PACKAGES = (
-    "phasestack", "numpy", "scipy", "onnxruntime", "opencv-contrib-python-headless", "moderngl", "matplotlib", "mpmath",
+    "phasestack", "numpy", "scipy", "onnxruntime", "opencv-contrib-python-headless", "moderngl", "matplotlib",
 )  # fmt: skip
 
 

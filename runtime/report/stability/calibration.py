@@ -1,7 +1,4 @@
-"""Calibration (supplement, (15)-(28)) from pairs that hardly determine it.
-
-The pairs are made by a known similarity, which every rule must find.
-"""
+"""Calibration (supplement, (15)-(28)) from pairs of a known similarity that hardly determine it."""
 
 from __future__ import annotations
 
@@ -22,7 +19,7 @@ HALF_TURN = Rotation.from_quat([1, 2, 2, 0]).as_matrix()
 
 
 def cloud(*, aspect: float = 1.0, size_m: float = 0.3, count: int = 27) -> F64:
-    """(n, 3) points spread over `size_m` along one axis and over `aspect` of it along the others."""
+    """Return (n, 3) points within `size_m` along one axis and `aspect` of it along the others."""
     return np.random.default_rng(11).uniform(-1, 1, (count, 3)) * [size_m, size_m * aspect, size_m * aspect]
 
 
@@ -34,18 +31,18 @@ def fitted(
     offset_m: tuple[float, float, float] = (0.1, -0.4, 0.3),
     turn: F64 = TURN,
 ) -> Answer:
-    """Points turned, scaled and shifted: where the found similarity puts them, and its turn.
+    """Compare the similarity fitted to turned, scaled and shifted points.
 
-    The condition is how far the points reach from the origin over the second largest of their extents: that much a
-    relative error of the coordinates, rounding included, can turn the fit.
+    The condition is the points' distance from the origin over the second largest of their extents: the amplification
+    of a relative error of the coordinates, rounding included, to a turn of the fit.
     """
     stack_m = scale * sensor_m @ turn.T + offset_m
-    found = fit(sensor_m, stack_m)
-    if found.shape != (4, 4) or not np.array_equal(found[3], [0, 0, 0, 1]):
+    matrix = fit(sensor_m, stack_m)
+    if matrix.shape != (4, 4) or not np.array_equal(matrix[3], [0, 0, 0, 1]):
         return Answer(math.nan, 0.0, note="no transform")
-    places = sensor_m @ found[:3, :3].T + found[:3, 3]
+    mapped_m = sensor_m @ matrix[:3, :3].T + matrix[:3, 3]
     error = float(
-        max(np.abs(places - stack_m).max() / np.abs(stack_m).max(), np.abs(found[:3, :3] / scale - turn).max())
+        max(np.abs(mapped_m - stack_m).max() / np.abs(stack_m).max(), np.abs(matrix[:3, :3] / scale - turn).max())
     )
     condition = max(
         float(np.abs(p).max() / np.linalg.svd(p - p.mean(0), compute_uv=False)[1] * len(p) ** 0.5)
@@ -55,7 +52,7 @@ def fitted(
 
 
 def trials(fits: Mapping[str, Fit]) -> Iterator[Trial]:
-    """Every case of the calibration; `fits`: the solvers under trial by their rule."""
+    """Yield every case of the calibration. fits: solvers by rule."""
     for rule, solver in fits.items():
         yield Trial(STAGE, f"{rule}: a usual cloud", partial(fitted, solver, cloud()), measure="rad")
     fit = partial(fitted, fits["least-squares"])

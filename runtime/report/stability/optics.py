@@ -1,4 +1,8 @@
-"""Poses, projections and Malus' law at their singularities (supplement, (1)-(14), (40)-(47))."""
+"""Poses, projections and Malus' law at their singularities (supplement, (1)-(14), (40)-(47)).
+
+References are other formulas in extended precision: `np.longdouble` has 64 bits or more here, where the tolerances
+are multiples of a double's rounding.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +17,13 @@ from runtime.optics.malus import intensity_from_phase, jones_intensity, phase_fr
 from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack, relative_scale_shift, stack_from_eye
-from runtime.report.stability import exact
 from runtime.report.stability.trial import EPS64, Answer, Trial
 
 POSE, RPU, PHASE, JONES = "eye pose", "RPU", "phase", "Jones optics"
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 1920, 1080)
 FOV_DEG = 40.0
-PROBES = [(a, b) for a in (0.1, 0.5, 0.9) for b in (0.2, 0.8)]  # places on a panel, as fractions of its size
+PROBES = [(a, b) for a in (0.1, 0.5, 0.9) for b in (0.2, 0.8)]  # positions on a panel, as fractions of its size
+STEP = 1e-10  # relative, of the differences that estimate a condition number
 INTENSITIES = {
     "0": 0.0, "the least subnormal": 5e-324, "1e-300": 1e-300, "1e-16": 1e-16, "1e-8": 1e-8, "1/255": 1 / 255,
     "1/2": 0.5, "254/255": 254 / 255, "1 - 1e-8": 1 - 1e-8, "1 - 1e-12": 1 - 1e-12,
@@ -27,11 +31,50 @@ INTENSITIES = {
 }  # fmt: skip
 
 
+def extended(values: Any) -> Any:
+    """Return numbers in extended precision."""
+    return np.asarray(values, np.longdouble)
+
+
+PI = 4 * np.arctan(extended(1))
+
+
+def farthest(values: Any, reference: Any) -> float:
+    """Return the largest absolute difference from a reference."""
+    return float(np.abs(extended(values) - reference).max())
+
+
+def axes(eye: Any) -> Any:
+    """Return right, up and back of an eye as rows ((10)-(13)); on the vertical axis the limit from +x."""
+    back = eye / np.abs(eye).max()
+    back = back / np.sqrt(back @ back)
+    ground = extended([-eye[1], eye[0], 0]) / max(abs(eye[0]), abs(eye[1]), np.finfo(np.longdouble).tiny)
+    right = ground / np.sqrt(ground @ ground) if ground.any() else extended([0, 1, 0])
+    return np.stack([right, np.cross(back, right), back])
+
+
+def focal_px(width_px: int) -> Any:
+    """Return the focal length of an eye's image."""
+    return width_px / 2 / np.tan(PI * FOV_DEG / 360)
+
+
+def image_position(eye: Any, point: Any, stack: PanelStack) -> Any:
+    """Return the position of a point in the eye's image, pixels (u, v)."""
+    right, up, back = axes(eye) @ (point - eye)
+    return focal_px(stack.width_px) / -back * extended([right, -up]) + extended([stack.width_px, stack.height_px]) / 2
+
+
+def panel_position(eye: Any, image: Any, stack: PanelStack, index: int) -> Any:
+    """Trace the ray through an image position; return where it crosses a panel, pixels (u, v)."""
+    u, v = (image - extended([stack.width_px, stack.height_px]) / 2) / focal_px(stack.width_px)
+    direction = extended([u, -v, -1]) @ axes(eye)
+    _, right, up = eye + (stack.x_m[index] - eye[0]) / direction[0] * direction
+    return extended([right / stack.width_m + 0.5, 0.5 - up / stack.height_m]) * [stack.width_px, stack.height_px]
+
+
 def pose(eye: Sequence[float]) -> Answer:
-    """The rotation against 50 digits; its condition grows as the eye nears the vertical axis."""
-    truth = np.array(exact.axes(exact.vector(eye)), dtype=object).T
-    rotation = stack_from_eye(eye)[:3, :3]
-    error = max(map(exact.distance, rotation.flat, truth.flat))
+    """Compare the rotation; its condition grows as the eye nears the vertical axis."""
+    error = farthest(stack_from_eye(eye)[:3, :3].T, axes(extended(eye)))
     scale = max(map(abs, eye))
     ground = math.hypot(eye[0] / scale, eye[1] / scale)
     condition = math.hypot(*(c / scale for c in eye)) / ground if ground else math.inf
@@ -39,84 +82,70 @@ def pose(eye: Sequence[float]) -> Answer:
 
 
 def gaze(eye: Sequence[float]) -> Answer:
-    """The stack's origin in the middle of the picture, and a point beside it where 50 digits put it."""
-    view: Any = {"width_px": 1920, "height_px": 1080, "fov_deg": FOV_DEG}
-    projection = image_from_stack(eye, **view)
+    """Compare the positions of the stack's origin and of a nearby point in the picture."""
+    projection = image_from_stack(eye, width_px=STACK.width_px, height_px=STACK.height_px, fov_deg=FOV_DEG)
     size, error = max(map(abs, eye)), 0.0
     for point in ((0.0, 0.0, 0.0), (0.125 * size, -0.25 * size, 0.0625 * size)):
         seen = projection @ [*point, 1.0]
-        truth = exact.image_position(exact.vector(eye), exact.vector(point), **view)
-        error = max(error, *map(exact.distance, seen[:2] / seen[2], truth))
-    return Answer(error / 1920, 8 * EPS64)
+        error = max(error, farthest(seen[:2] / seen[2], image_position(extended(eye), extended(point), STACK)))
+    return Answer(error / STACK.width_px, 8 * EPS64)
 
 
 def scale_shift(eye: Sequence[float], to_x_m: float) -> Answer:
-    """From the centre panel to another along an eye's ray."""
+    """Compare the step from the centre panel to another along an eye's ray."""
     scale, shift = relative_scale_shift(eye, from_x_m=0.0, to_x_m=to_x_m)
-    e = exact.vector(eye)
-    truth = exact.hit(e, exact.vector([0, 0.125, -0.0625]) - e, to_x_m)
-    found = np.array([0.125, -0.0625]) * scale + shift
-    size = float(max(abs(truth[1]), abs(truth[2]), abs(e[1]) * abs(to_x_m) / abs(e[0])))
+    e, point = extended(eye), extended([0, 0.125, -0.0625])
+    truth = (point + to_x_m / e[0] * (e - point))[1:]
+    size = float(max(*np.abs(truth), abs(e[1] * to_x_m / e[0])))
     condition = max(1.0, abs(eye[0]) / abs(eye[0] - to_x_m))
-    return Answer(max(map(exact.distance, found, truth[1:])) / size, 8 * EPS64 * condition, condition)
+    error = farthest(np.array([0.125, -0.0625]) * scale + shift, truth) / size
+    return Answer(error, 8 * EPS64 * condition, condition)
 
 
-def at_angle(degrees: float, distance_m: float = 0.6) -> list[float]:
-    """An eye off the +x axis towards +y."""
-    return [distance_m * math.cos(math.radians(degrees)), distance_m * math.sin(math.radians(degrees)), 0.0]
+def followed(eye: Sequence[float], *, index: int = 2, stack: PanelStack = STACK) -> Answer:
+    """Compare M_RPU, at image positions whose rays meet the panel, with ray tracing.
 
-
-def followed(eye: Sequence[float], *, index: int, stack: PanelStack = STACK) -> Answer:
-    """M_RPU of image pixels whose rays meet the panel, against ray tracing with 50 digits.
-
-    Its condition is that of the mapping: how far a relative change of 1 of an image position, or of the eye's
-    own place, moves the position on the panel, in panel widths.
+    The condition is that of the mapping: how far a relative change of 1 of an image position, or of the eye's own,
+    moves the position on the panel, in panel widths.
     """
     view: Any = {"width_px": stack.width_px, "height_px": stack.height_px, "fov_deg": FOV_DEG}
     m = panel_from_image(image_from_stack(eye, **view), stack.panel(index))
-    e, half, error, condition = exact.vector(eye), exact.mpf("0.5"), 0.0, 1.0
-
-    def traced(u: Any, v: Any) -> Any:
-        return np.array(exact.on_panel(e, exact.ray(e, exact.mpf(u), exact.mpf(v), **view), stack, index))
-
+    e, error = extended(eye), 0.0
+    condition = max(1.0, math.hypot(*eye) / abs(eye[0] - stack.x_m[index]))
     for a, b in PROBES:
-        right, up = (exact.mpf(a) - half) * exact.mpf(stack.width_m), (half - exact.mpf(b)) * exact.mpf(stack.height_m)
-        place = np.array([exact.mpf(stack.x_m[index]), right, up])
-        u, v = map(float, exact.image_position(e, place, **view))
-        truth, found = traced(u, v), m @ [u, v, 1.0]
-        error = max(error, *map(exact.distance, found[:2] / found[2], truth))
-        step = 1e-20 * max(abs(u), abs(v), stack.width_px)
-        for du, dv in ((step, 0), (0, step)):
-            slope = float(abs(traced(exact.mpf(u) + du, exact.mpf(v) + dv) - truth).max()) / 1e-20
+        place = extended([stack.x_m[index], (a - 0.5) * stack.width_m, (0.5 - b) * stack.height_m])
+        image = np.asarray(image_position(e, place, stack), float)
+        truth, position = panel_position(e, extended(image), stack, index), m @ [*image, 1.0]
+        error = max(error, farthest(position[:2] / position[2], truth) / stack.width_px)
+        step = STEP * max(*np.abs(image), stack.width_px)
+        for move in ((step, 0), (0, step)):
+            slope = farthest(panel_position(e, extended(image) + move, stack, index), truth) / STEP
             condition = max(condition, slope / stack.width_px)
-    condition = max(condition, math.hypot(*eye) / abs(eye[0] - stack.x_m[index]))
-    relative = error / stack.width_px
-    return Answer(relative, 64 * EPS64 * condition, condition, relative / condition)
+    return Answer(error, 64 * EPS64 * condition, condition, error / condition)
 
 
 def of_intensity(intensity: float, branch: Literal[1, 2]) -> Answer:
-    """The phase of an intensity; its condition goes to infinity towards 1."""
-    root = exact.mp.asin(exact.mp.sqrt(exact.mpf(intensity))) * 2 / exact.mp.pi
+    """Compare the phase of an intensity; its condition goes to infinity towards 1."""
+    root = np.arcsin(np.sqrt(extended(intensity))) * 2 / PI
     truth = root if branch == 1 else 2 - root
-    found = phase_from_intensity(np.array(intensity), branch)
+    phase = phase_from_intensity(np.array(intensity), branch)
     # Relative condition of asin(sqrt(I)); a double spaced eps from 1 bounds it there.
     away = max(1 - intensity, EPS64)
-    condition = max(1.0, math.sqrt(intensity / away) / math.pi / float(max(truth, exact.mpf("1e-30"))))
-    back = abs(float(intensity_from_phase(found)) - intensity)
-    return Answer(exact.distance(found, truth), 4 * EPS64 * condition, condition, back)
+    condition = max(1.0, math.sqrt(intensity / away) / math.pi / max(float(truth), 1e-30))
+    back = abs(float(intensity_from_phase(phase)) - intensity)
+    return Answer(farthest(phase, truth), 4 * EPS64 * condition, condition, back)
 
 
 def product(values: Sequence[float]) -> Answer:
-    """sin² of the summed phase, and the product of the panels' Jones matrices, both against 50 digits."""
-    truth = exact.mp.sin(exact.mp.pi / 2 * sum(exact.mpf(value) for value in values)) ** 2
+    """Compare sin² of the summed phase, and the product of the panels' Jones matrices."""
+    truth = np.sin(PI / 2 * extended(values).sum()) ** 2
     by_sum = float(intensity_from_phase(np.array(math.fsum(values))))
     by_product = jones_intensity([value * math.pi / 2 for value in values])
-    error = max(exact.distance(by_sum, truth), exact.distance(by_product, truth))
-    return Answer(error, 1e-12, max(1.0, math.fsum(values) * math.pi / 2))
+    return Answer(farthest([by_sum, by_product], truth), 1e-12, max(1.0, math.fsum(values) * math.pi / 2))
 
 
 def trials() -> Iterator[Trial]:
-    """Every case of the optics."""
+    """Yield every case of the optics."""
     for power in [*range(1, 13), 100, 300]:
         angle = 10.0**-power
         eye = [0.6 * math.sin(angle) * math.cos(0.7), 0.6 * math.sin(angle) * math.sin(0.7), 0.6 * math.cos(angle)]
@@ -131,20 +160,23 @@ def trials() -> Iterator[Trial]:
             yield Trial(POSE, f"gaze from {distance_m:g} m", partial(gaze, eye), measure="of the width")
             yield Trial(POSE, f"panel to panel from {distance_m:g} m", partial(scale_shift, eye, -0.06))
     yield Trial(POSE, "panel to panel, 1e-9 m before it", partial(scale_shift, [0.06 + 1e-9, 0.2, 0.1], 0.06))
-    cases = {
-        **{f"{angle:g} degrees off axis": followed_at(at_angle(angle)) for angle in (0.0, 45.0, 70.0, 80.0, 85.0)},
-        # Far enough that the eye is still before the front panel; its near edge may be behind the image plane.
-        **{f"{angle:g} degrees off axis at 1 km": followed_at(at_angle(angle, 1e3)) for angle in (89.0, 89.9, 89.99)},
-        **{f"1e-{p} m before the front panel's plane": followed_at([0.06 + 10.0**-p, 0.4, 0]) for p in (1, 3, 5, 7, 9)},
-        "corners behind the eye, 3 cm before an edge": followed_at([0.09, 0.2, 0.0]),
-        "corners behind the eye, 1 mm before a corner": followed_at([0.061, 0.25, 0.14]),
-    }
+
+    # At 1 km the eye is still in front of the front panel; the panel's near edge may be behind the image plane.
+    eyes: dict[str, list[float]] = {
+        f"{degrees:g} degrees off axis" + " at 1 km" * (distance_m > 1):
+            [distance_m * math.cos(math.radians(degrees)), distance_m * math.sin(math.radians(degrees)), 0.0]
+        for distance_m, angles in ((0.6, (0.0, 45.0, 70.0, 80.0, 85.0)), (1e3, (89.0, 89.9, 89.99)))
+        for degrees in angles
+    }  # fmt: skip
+    eyes |= {f"1e-{p} m before the front panel's plane": [0.06 + 10.0**-p, 0.4, 0.0] for p in (1, 3, 5, 7, 9)}
+    eyes["corners behind the eye, 3 cm before an edge"] = [0.09, 0.2, 0.0]
+    eyes["corners behind the eye, 1 mm before a corner"] = [0.061, 0.25, 0.14]
+    for name, eye in eyes.items():
+        yield Trial(RPU, name, partial(followed, eye), measure="of the width")
     for width_m in (1e-6, 1e-3, 1e3, 1e6):
         stack = PanelStack(width_m, width_m * 9 / 16, (-width_m / 9, 0.0, width_m / 9), 1920, 1080)
         eye = [1.2 * width_m, 0.3 * width_m, 0.2 * width_m]
-        cases[f"panels {width_m:g} m wide"] = partial(followed, eye, index=2, stack=stack)
-    for name, run in cases.items():
-        yield Trial(RPU, name, run, measure="of the width")
+        yield Trial(RPU, f"panels {width_m:g} m wide", partial(followed, eye, stack=stack), measure="of the width")
     branches: tuple[Literal[1, 2], ...] = (1, 2)
     for branch in branches:
         for name, intensity in INTENSITIES.items():
@@ -156,8 +188,3 @@ def trials() -> Iterator[Trial]:
     sums |= {"limits and 1e-12 in turn": [1.0, 1e-12] * 4, "sum just below 2": [0.5, 0.5, 1 - EPS64]}
     for name, values in sums.items():
         yield Trial(JONES, name, partial(product, values), measure="intensity")
-
-
-def followed_at(eye: Sequence[float]) -> Any:
-    """The front panel's case from there."""
-    return partial(followed, eye, index=2)

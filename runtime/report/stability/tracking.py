@@ -16,32 +16,32 @@ from runtime.report.stability.trial import Answer, Trial
 STAGE = "tracker"
 EYES_M = np.array([[0.6, -0.031, 0.05], [0.6, 0.032, 0.05]])
 FRAME_NS = NS_PER_S // 30
-TRAVEL_M = np.array([0.02, 0.09, -0.04])  # of the head over a case, where that is long enough
+TRAVEL_M = np.array([0.02, 0.09, -0.04])  # of the head during a case, at most at FASTEST
 FASTEST = 0.3  # m/s
 FLOOR_M = 1e-6
 
 
 def head_m(time_ns: int, *, span_ns: int) -> F64:
-    """(2, 3) left and right eye, frame `stack`, of a head that moves TRAVEL_M in a span."""
+    """Return left and right eye (2, 3), frame `stack`, of a head that moves TRAVEL_M in a span."""
     share = min(1.0, FASTEST * span_ns / NS_PER_S / float(np.linalg.norm(TRAVEL_M)))
     return EYES_M + TRAVEL_M * share * (time_ns / max(span_ns, 1))
 
 
 def still(updates: int) -> Answer:
-    """A head that does not move must not drift, wherever it came to rest."""
+    """Measure the drift of a head that has come to rest."""
     tracker, span_ns = Tracker(), 30 * FRAME_NS
     for index in range(updates):
         eyes = head_m(min(index * FRAME_NS, span_ns), span_ns=span_ns)
         tracker.update(EyePoints(eyes, np.ones(2)), capture_ns=index * FRAME_NS)
-    found = tracker.at((updates - 1) * FRAME_NS).eyes_m
-    assert found is not None
-    return Answer(float(np.abs(found - head_m(span_ns, span_ns=span_ns)).max()), 1e-9, float(updates))
+    eyes_m = tracker.at((updates - 1) * FRAME_NS).eyes_m
+    assert eyes_m is not None
+    return Answer(float(np.abs(eyes_m - head_m(span_ns, span_ns=span_ns)).max()), 1e-9, float(updates))
 
 
 def after(steps_ns: list[int], ahead_ns: int, *, lost: bool = False) -> Answer:
-    """A head sampled at odd intervals: its place so long after the last one.
+    """Measure the predicted position of a head that was sampled at odd intervals.
 
-    lost: it was not seen for so long that nobody can know; then an answer is the mistake.
+    lost: the last sample is too old for a prediction, and an answer would be the error.
     """
     tracker, now_ns, span_ns = Tracker(), 0, sum(map(abs, steps_ns)) + ahead_ns
     for step_ns in (0, *steps_ns):
@@ -49,14 +49,14 @@ def after(steps_ns: list[int], ahead_ns: int, *, lost: bool = False) -> Answer:
         tracker.update(EyePoints(head_m(now_ns, span_ns=span_ns), np.ones(2)), capture_ns=now_ns)
     estimate = tracker.at(now_ns + ahead_ns)
     if lost or estimate.eyes_m is None:
-        right = lost and estimate.eyes_m is None
-        return Answer(0.0 if right else math.inf, 1e-3, note=f"label {estimate.label}")
+        correct = lost and estimate.eyes_m is None
+        return Answer(0.0 if correct else math.inf, 1e-3, note=f"label {estimate.label}")
     error = float(np.abs(estimate.eyes_m - head_m(now_ns + ahead_ns, span_ns=span_ns)).max())
     return Answer(error, 1.0, note=f"label {estimate.label}")
 
 
 def trials(*, full: bool = False) -> Iterator[Trial]:
-    """Every case of the tracker; `full` adds the long one."""
+    """Yield every case of the tracker; `full` adds the long one."""
     for updates in (10_000, *((1_000_000,) if full else ())):
         yield Trial(STAGE, f"{updates} updates of a still head", partial(still, updates), measure="m")
     hour, usual = 3600 * NS_PER_S, [FRAME_NS] * 30

@@ -1,26 +1,28 @@
-"""A trial is one extreme case; running it gives a Case, whatever the code under trial does."""
+"""A trial is one extreme case; running it gives a Case, whatever happens in the code on trial."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from math import inf, nan
 from typing import Literal
 
 from runtime.errors import PhasestackError
 
 Behaviour = Literal["answers", "refuses"]
 EPS64 = 2.0**-52
-WORSE = 1.05  # than recorded a case may be at most
+WORSE = 1.05  # largest accepted ratio of an error to the recorded one
+NO_LIMIT = "no limit is recorded: phasestack stability --record"
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What the code under trial came to, measured against the reference."""
+    """A result, measured against the reference."""
 
     forward_error: float  # of the result, in the trial's measure
-    tolerance: float  # largest forward error that passes, stated before the trial is run
-    condition: float = 1.0  # how much the problem itself enlarges a relative error of its input
+    tolerance: float  # largest forward error that passes, fixed before the trial is run
+    condition: float = 1.0  # amplification by the problem itself of a relative error of its input
     backward_error: float | None = None  # relative change of the input that explains the result; None: the forward one
     note: str = ""
 
@@ -34,19 +36,18 @@ class Trial:
     run: Callable[[], Answer | None]  # None: it answered where it must refuse
     expected: Behaviour = "answers"
     measure: str = "relative"  # unit of the forward error
-    # Where the case is held to what was recorded (`limits`), in addition to the tolerance that the answer states: what
-    # another machine's rounding may add, in the measure.
+    # Set: the recorded error limits the forward error, too. What another machine's rounding may add, in the measure.
     floor: float | None = None
 
     @property
     def key(self) -> str:
-        """What the case is recorded by."""
+        """Name of the case in the file of recorded errors."""
         return f"{self.stage}: {self.name}"
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One extreme case and how it ended: a row of `stability.json`."""
+    """One extreme case with its outcome: an entry of `stability.json`."""
 
     name: str
     stage: str
@@ -61,7 +62,7 @@ class Case:
 
 
 def refusal(stage: str, name: str, call: Callable[[], object]) -> Trial:
-    """A trial that passes when the code refuses, in its own words, to answer."""
+    """Return a trial that passes if the call raises one of the project's own errors."""
 
     def run() -> None:
         call()
@@ -70,46 +71,32 @@ def refusal(stage: str, name: str, call: Callable[[], object]) -> Trial:
 
 
 def settle(trial: Trial, *, limit: float | None = None) -> Case:
-    """Run a trial. Only the project's own errors count as a refusal; nothing escapes.
+    """Run a trial. Nothing escapes, and only the project's own errors count as a refusal.
 
-    limit: the forward error that was recorded of it; a trial that is held to one fails without it.
+    limit: the recorded forward error; a trial with a floor fails without it.
     """
+    behaviour: Behaviour = "answers"
+    answer, is_refusal = None, False
+    note = "it answered where no answer exists"
     try:
         with warnings.catch_warnings():
-            # numpy's complaints about inf and NaN are not how the runtime warns: what comes out is measured.
-            warnings.simplefilter("ignore", RuntimeWarning)
+            warnings.simplefilter("ignore", RuntimeWarning)  # numpy's, about inf and NaN: the result is measured
             answer = trial.run()
-    except (PhasestackError, ValueError) as error:
-        return _unanswered(trial, "refuses", str(error), passed=trial.expected == "refuses")
     except Exception as error:
-        return _unanswered(trial, "refuses", f"{type(error).__name__}: {error}")
+        behaviour, is_refusal = "refuses", isinstance(error, PhasestackError | ValueError)
+        note = str(error) if is_refusal else f"{type(error).__name__}: {error}"
     if answer is None:
-        return _unanswered(trial, "answers", "it answered where no answer exists")
-    if trial.floor is not None:
-        answer = _held_to(answer, limit, trial.floor)
+        passed = is_refusal and trial.expected == "refuses"
+        return Case(trial.name, trial.stage, inf, nan, nan, behaviour, 0.0, passed, trial.measure, note)
+    if trial.floor is not None and limit is None:
+        answer = replace(
+            answer, tolerance=-1.0, note=f"{answer.note} no limit is recorded: phasestack stability --record"
+        )
+    elif trial.floor is not None and limit is not None:
+        answer = replace(answer, tolerance=min(answer.tolerance, WORSE * limit + trial.floor))
+    backward = answer.forward_error if answer.backward_error is None else answer.backward_error
+    passed = trial.expected == "answers" and answer.forward_error <= answer.tolerance  # NaN fails
     return Case(
-        name=trial.name,
-        stage=trial.stage,
-        condition=answer.condition,
-        forward_error=answer.forward_error,
-        backward_error=answer.forward_error if answer.backward_error is None else answer.backward_error,
-        behaviour="answers",
-        tolerance=answer.tolerance,
-        # A NaN compares false with everything: it fails.
-        passed=trial.expected == "answers" and answer.forward_error <= answer.tolerance,
-        measure=trial.measure,
-        note=answer.note,
-    )
-
-
-def _unanswered(trial: Trial, behaviour: Behaviour, note: str, *, passed: bool = False) -> Case:
-    numbers = (float("inf"), float("nan"), float("nan"))
-    return Case(trial.name, trial.stage, *numbers, behaviour, 0.0, passed, trial.measure, note)
-
-
-def _held_to(answer: Answer, limit: float | None, floor: float) -> Answer:
-    """The answer with the tighter of its own tolerance and the recorded limit."""
-    if limit is None:
-        note = "; ".join(filter(None, (answer.note, "no limit is recorded: phasestack stability --record")))
-        return replace(answer, tolerance=-1.0, note=note)
-    return replace(answer, tolerance=min(answer.tolerance, WORSE * limit + floor))
+        trial.name, trial.stage, answer.condition, answer.forward_error, backward, behaviour, answer.tolerance, passed,
+        trial.measure, answer.note.strip(),
+    )  # fmt: skip
