@@ -27,6 +27,7 @@ STRAY = 1.0  # percent of the splats at either end of an axis that do not decide
 FAINT = 0.1  # opacity of a splat that decides nothing
 REACH = 2.0  # standard deviations of a splat that are to be seen
 SAMPLED = 10_000  # points whose neighbours are looked for
+DOTS, MOST_DOTS = 500, 200_000  # of a line, and of all lines together
 FINEST_POINT, LARGEST_POINT = 5e-4, 0.01  # standard deviation of a point, in units of the scene's extent
 FLAT_HARMONIC = 0.28209479177387814  # of degree 0
 COEFFICIENTS = (0, 9, 24, 45)  # f_rest properties: of harmonics to degree 0, 1, 2, 3
@@ -114,8 +115,26 @@ def drawable(path: Path, *, centres: F32, log_scales: F32, quaternions: F32, log
     return Gaussians(centres, covariances_of(np.exp(log_scales), quaternions), opacities, harmonics)
 
 
+def dotted(ends: F32, colours: F32) -> tuple[F32, F32]:
+    """Lines (n, 2, 3) as points (m, 3) along them, with colours (m, 3) between those of their ends (n, 2, 3)."""
+    lengths = np.nan_to_num(np.linalg.norm(np.diff(ends.astype(np.float64), axis=1)[:, 0], axis=1))
+    share = np.minimum(lengths / max(float(lengths.sum()), 1e-30), 1.0)
+    counts = 2 + (share * min(DOTS * len(ends), MOST_DOTS)).astype(np.int64)
+    line = np.repeat(np.arange(len(ends)), counts)
+    first = np.repeat(np.cumsum(counts) - counts, counts)
+    share = ((np.arange(len(line)) - first) / (counts[line] - 1))[:, None].astype(np.float32)
+    along = (values[line, 0] * (1 - share) + values[line, 1] * share for values in (ends, colours))
+    return next(along), next(along)
+
+
 def of_points(places: F32, colours: F32) -> Gaussians:
-    """Points as small round splats, about as large as they lie apart. colours: (n, 3), 0-1."""
+    """Points as small round splats, about as large as they lie apart.
+
+    colours: (n, 3), 0-1; NaN: by where it lies, since one colour for all would show an outline alone.
+    """
+    low, high = np.percentile(places, [1, 99], axis=0)
+    by_place = 0.25 + 0.7 * np.clip((places - low) / np.maximum(high - low, 1e-30), 0, 1)
+    colours = np.where(np.isnan(colours), by_place, colours).astype(np.float32)
     some = places[:: max(1, len(places) // SAMPLED)].astype(np.float64)
     apart = np.median(cKDTree(places).query(some, k=2)[0][:, 1]) if len(places) > 1 else 1.0
     extent = float(np.ptp(np.percentile(places, [1, 99], axis=0), axis=0).max()) or 1.0

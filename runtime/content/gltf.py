@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from runtime.content.base import WHITE
-from runtime.content.gltf_file import COMPRESSED, VERSION_1, WAY_OUT, Array, GltfFile, Read, Table, fractions
+from runtime.content.gaussians import dotted
+from runtime.content.gltf_file import COMPRESSED, WAY_OUT, Array, GltfFile, Read, Table, fractions
 from runtime.content.parts import BLACK, Part, Sampler, Wrap, coded
 from runtime.content.shapes import Shape, flat_normals, placed
 from runtime.errors import InputError, one_line
@@ -17,14 +19,17 @@ from runtime.records import F32, F64
 from runtime.support import progress, untrusted_input
 from runtime.support.untrusted_input import LIMITS
 
-POINTS, TRIANGLES, STRIP, FAN = 0, 4, 5, 6  # of primitives' modes; those between are of lines
+POINTS, LINES, LOOP, LINE_STRIP, TRIANGLES, STRIP, FAN = range(7)  # of primitives' modes
 WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 NEAREST = 9728
+PLACES = {"TRANSLATION": "translation", "ROTATION": "rotation", "SCALE": "scale"}  # of instances
+OWN_PROBLEMS = ("an accessor", "bufferViews[", "a primitive", "a data URI")  # how errors raised here begin
 DRACO = "KHR_draco_mesh_compression"
+INSTANCES = "EXT_mesh_gpu_instancing"
 GLOSSY = "KHR_materials_pbrSpecularGlossiness"
 DRAWN = {
     DRACO, GLOSSY, "KHR_materials_unlit", "KHR_materials_emissive_strength", "KHR_texture_transform",
-    "KHR_mesh_quantization", "EXT_texture_webp", "EXT_texture_avif",
+    "KHR_mesh_quantization", "EXT_texture_webp", "EXT_texture_avif", INSTANCES,
 }  # fmt: skip
 UNSEEN = {"KHR_materials_ior", "KHR_materials_specular", "KHR_materials_variants", "KHR_xmp_json_ld"}
 # What a file may require and is drawn without.
@@ -49,19 +54,16 @@ class GltfScene:
             self._check()
             self._read()
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-            problem = one_line(f"{type(error).__name__}: {error}", most=120)
-            raise InputError(path, "", f"is damaged, or no glTF ({problem})") from None
+            raise InputError(path, "", f"is damaged, or no glTF ({_problem(error)})") from None
 
     def _check(self) -> None:
         file, path = self.file, self.path
-        if str(file.table["asset"]["version"]).startswith("1"):
-            raise InputError(path, "asset.version", VERSION_1)
         for name in file.table.get("extensionsRequired", []):
             if name in COMPRESSED and name != DRACO:
                 raise InputError(path, "extensionsRequired", f"{name}: {COMPRESSED[name]} is not read; {WAY_OUT}")
             if name not in DRAWN | WITHOUT:
                 raise InputError(path, "extensionsRequired", f"{untrusted_input.shown(name)} is not understood")
-        meshes = [node["mesh"] for node in file.all("nodes") if "mesh" in node]
+        meshes = [node["mesh"] for node in file.all("nodes") if "mesh" in node for _ in range(self._instances(node))]
         untrusted_input.within(len(meshes), LIMITS.instances, source=path, field="nodes")
         triangles = [sum(map(self._triangles, mesh["primitives"])) for mesh in file.all("meshes")]
         untrusted_input.within(sum(triangles[index] for index in meshes), LIMITS.triangles, source=path, field="meshes")
@@ -71,6 +73,17 @@ class GltfScene:
         index = primitive.get("indices", primitive["attributes"].get("POSITION"))
         corners = 0 if index is None else self.file.count(index)
         return corners // 3 if primitive.get("mode", TRIANGLES) <= TRIANGLES else corners
+
+    def _instances(self, node: Table) -> int:
+        """How often a node's mesh stands there (EXT_mesh_gpu_instancing)."""
+        own = node.get("extensions", {}).get(INSTANCES, {}).get("attributes", {})
+        return min((self.file.count(index) for name, index in own.items() if name in PLACES), default=1)
+
+    def _instanced(self, node: Table, matrix: F64) -> list[F64]:
+        """4x4 scene_from_mesh of each of them."""
+        own = node.get("extensions", {}).get(INSTANCES, {}).get("attributes", {})
+        read = {PLACES[name]: self.file.accessor(index) for name, index in own.items() if name in PLACES}
+        return [matrix @ _local({name: rows[k] for name, rows in read.items()}) for k in range(self._instances(node))]
 
     def _textures(self) -> Iterator[Table]:
         """Where materials use those that are drawn; others, of normals and the like, are not looked at."""
@@ -86,9 +99,9 @@ class GltfScene:
         for number, (node, matrix) in enumerate(meshes):
             progress.tell(f"{self.path.name}: parts", number, len(meshes))
             mesh: Table = file.item("meshes", node["mesh"])
-            matrices = self._joints(node, world) if "skin" in node else matrix
+            stands = [self._joints(node, world)] if "skin" in node else self._instanced(node, matrix)
             weights: list[float] = node["weights"] if "weights" in node else mesh.get("weights", [])
-            for primitive in mesh["primitives"]:
+            for primitive, matrices in itertools.product(mesh["primitives"], stands):
                 self._add(primitive, weights=weights, matrices=matrices)
         self.left_out |= {"animations"} if file.all("animations") else set()
         self.left_out |= {str(name) for name in file.table.get("extensionsUsed", [])} - DRAWN - UNSEEN - {*COMPRESSED}
@@ -131,12 +144,9 @@ class GltfScene:
             count = file.count(primitive["attributes"]["POSITION"])
             has_index = "indices" in primitive
             corners = file.accessor(primitive["indices"], as_float=False)[:, 0] if has_index else np.arange(count)
-        if POINTS < mode < TRIANGLES:
-            self.left_out.add("lines")
-            return
         faces = _faces(corners, mode)
-        has_normals = "NORMAL" in primitive["attributes"] and mode != POINTS
-        if has_normals or mode == POINTS:
+        has_normals = "NORMAL" in primitive["attributes"] and mode >= TRIANGLES
+        if has_normals or mode < TRIANGLES:
             rows, faces = np.unique(faces, return_inverse=True)  # those of other primitives are left alone
         else:  # flat: every triangle has corners of its own (section 3.7.2.1)
             rows, faces = faces.reshape(-1), np.arange(faces.size).reshape(-1, 3)
@@ -157,15 +167,16 @@ class GltfScene:
         if matrices.ndim == 3:
             matrices = self._skinned(matrices, attribute)
         positions, turned = placed(positions, normals if has_normals else None, matrices)
-        if mode == POINTS:
-            self.points.append((positions, np.ones_like(positions) if colours is None else coded(colours[:, :3])))
+        look, use = self._look(primitive.get("material"))
+        if mode < TRIANGLES:
+            colours = coded(look["colour"] * (np.ones_like(positions) if colours is None else colours[:, :3]))
+            self.points.append((positions, colours) if mode == POINTS else dotted(positions[faces], colours[faces]))
             return
         if turned is None:
             turned = np.repeat(flat_normals(positions[faces]), 3, axis=0)
         if matrices.ndim == 2 and np.linalg.det(matrices[:3, :3]) < 0:
             faces = faces[:, ::-1]
             turned = turned if has_normals else -turned
-        look, use = self._look(primitive.get("material"))
         uv = attribute(f"TEXCOORD_{_coordinates(use)[0]}")
         if uv is None:
             look |= {"picture": None, "glow_picture": None}
@@ -245,6 +256,16 @@ class GltfScene:
         }, use
 
 
+def _problem(error: Exception) -> str:
+    """What is wrong in a file, of what its reading raised."""
+    if isinstance(error, KeyError):
+        return f"{untrusted_input.shown(str(error))} is missing"
+    if isinstance(error, IndexError):
+        return "a reference to what is not there"
+    own = isinstance(error, ValueError) and error.args and str(error.args[0]).startswith(OWN_PROBLEMS)
+    return one_line(str(error), most=120) if own else "a value of a wrong kind"
+
+
 def _local(node: Table) -> F64:
     """4x4 parent_from_node."""
     if "matrix" in node:
@@ -259,10 +280,14 @@ def _local(node: Table) -> F64:
 
 
 def _faces(corners: Array, mode: int) -> Array:
-    """(t, 3) rows of attributes, or (n,) of points (section 3.7.2.1). Raises ValueError: no such mode."""
+    """Rows of attributes: (t, 3) triangles, (n, 2) lines, (n,) points (3.7.2.1). Raises ValueError: no such mode."""
     corners = np.asarray(corners).astype(np.int64)
     if mode == POINTS:
         return corners
+    if mode == LINES:
+        return corners[: len(corners) // 2 * 2].reshape(-1, 2)
+    if mode in (LOOP, LINE_STRIP):
+        return np.column_stack([corners, np.roll(corners, -1)])[: None if mode == LOOP else -1]
     if mode == TRIANGLES:
         return corners[: len(corners) // 3 * 3].reshape(-1, 3)
     number = np.arange(max(len(corners) - 2, 0))

@@ -49,6 +49,8 @@ class GltfFile:
         text, self._binary = (data, b"") if data[:4] != b"glTF" else _chunks(path, data)
         self.path, self._read = path, read
         self.table: Table = untrusted_input.parsed_json(text, source=path, most_depth=LIMITS.depth)
+        if str(self.table["asset"]["version"]).startswith("1"):
+            raise InputError(path, "asset.version", VERSION_1)
         self._buffers: dict[int, bytes] = {}
         self._pictures: dict[int, U8] = {}
         elements = 0

@@ -30,6 +30,7 @@ log = logging.getLogger("phasestack.content")
 
 GLTF = (".glb", ".gltf")
 STL_HEAD, STL_FACET = 84, 50  # bytes of a binary file's head and of each of its triangles
+UNREAD = ("tristrips", "edge")  # elements of a PLY that are not drawn
 LARGEST_COORDINATE = 1e15  # products of three still fit in float32's range
 OFF_COUNTS = re.compile(rb"^\s*[A-Z4n]*OFF\s+(?:#.*\s+)*(\d{1,18})\s+(\d{1,18})")
 
@@ -83,6 +84,8 @@ def load_mesh(path: Path) -> MeshData:
     points: list[tuple[F32, F32]] = []
     left_out: set[str] = set()
     with np.errstate(all="ignore"):  # coordinates beyond any scene overflow; they are refused below
+        if path.suffix.lower() == ".ply":
+            left_out = {name for name, count in read_header(path).counts.items() if count and name in UNREAD}
         if _is_binary_stl(path, data):
             parts = [_binary_stl(data)]
         elif path.suffix.lower() in GLTF:
@@ -96,7 +99,7 @@ def load_mesh(path: Path) -> MeshData:
     untrusted_input.within(triangles, LIMITS.triangles, source=path, field="faces")
     untrusted_input.within(sum(len(place) for place, _ in points), LIMITS.splats, source=path, field="points")
     if parts and points:
-        left_out, points = left_out | {"points"}, []
+        left_out, points = left_out | {"points and lines"}, []
     places = [*(part.shape.positions_m for part in parts), *(place for place, _ in points)]
     _check(path, parts, places, left_out)
     low, high = (np.asarray(end([end(place, 0) for place in places], 0), np.float64) for end in (np.min, np.max))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import io
+import itertools
 import logging
 import re
 from collections.abc import Callable
@@ -15,9 +16,10 @@ import trimesh
 from PIL import Image
 
 from runtime.content.base import WHITE, Colour
+from runtime.content.gaussians import dotted
 from runtime.content.parts import UNCOLOURED, Part
 from runtime.content.shapes import Shape, placed
-from runtime.errors import InputError, one_line
+from runtime.errors import InputError
 from runtime.records import F32, F64, U8
 from runtime.support import progress, untrusted_input
 from runtime.support.picture_header import decoded_picture
@@ -86,11 +88,15 @@ def read_mesh(path: Path, data: bytes, read: Read) -> tuple[list[Part], list[tup
     try:
         scene = trimesh.load_scene(file, file_type=kind, resolver=resolver, process=False)
         found = [(scene.geometry[name], matrix) for matrix, name in map(scene.graph.get, scene.graph.nodes_geometry)]
+        has_faces = any(len(getattr(mesh, "faces", ())) for mesh, _ in found)
+        wires = _wires(file) if isinstance(file, io.StringIO) and not has_faces else None
     except Exception as error:  # loaders raise whatever their parsers do
         if resolver.refused is not None:
             raise resolver.refused from None
-        problem = one_line(str(error), most=120)
-        raise InputError(path, "", f"cannot be read as a mesh ({type(error).__name__}: {problem})") from None
+        why = (
+            "a face names a vertex that is not there" if isinstance(error, IndexError) else "it is damaged, or no mesh"
+        )
+        raise InputError(path, "", f"cannot be read as a mesh: {why}") from None
     if resolver.refused is not None:
         raise resolver.refused
     pictures: dict[int, U8] = {}
@@ -102,12 +108,26 @@ def read_mesh(path: Path, data: bytes, read: Read) -> tuple[list[Part], list[tup
         if mesh.visual.kind == "texture" and not resolver.has_materials:  # the loader's own grey is left out
             mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=mesh.visual.vertex_attributes.get("color"))
         parts.append(_part(mesh, matrix, path, pictures))
-    return parts, points
+    return parts, points if wires is None else [dotted(wires, np.full_like(wires, np.nan))]
 
 
 def _text(data: bytes) -> str:
     """Of an OBJ only names and comments can be other than ASCII, and exporters differ in how they write them."""
     return data.decode("utf-16" if data[:2] in BOMS else "utf-8", errors="replace")
+
+
+def _wires(file: io.StringIO) -> F32 | None:
+    """(n, 2, 3) the lines of an OBJ; None where it has none."""
+    places: list[list[str]] = []
+    ends: list[tuple[int, int]] = []
+    for kind, *words in filter(None, map(str.split, file.getvalue().splitlines())):
+        if kind == "v":
+            places.append(words[:3])
+        elif kind == "l":
+            numbers = [int(word.partition("/")[0]) for word in words]
+            corners = [number - 1 if number > 0 else len(places) + number for number in numbers]
+            ends += itertools.pairwise(corners)
+    return np.array(places, np.float32)[np.array(ends)] if ends else None
 
 
 def _grey() -> bytes:
@@ -121,7 +141,7 @@ def _points(cloud: Any) -> list[tuple[F32, F32]]:
     if not len(places) or places.shape[1:] != (3,) or not hasattr(cloud, "colors"):
         return []
     colours = np.asarray(cloud.colors)
-    return [(places, _unit(colours)[:, :3] if len(colours) == len(places) else np.full_like(places, 0.75))]
+    return [(places, _unit(colours)[:, :3] if len(colours) == len(places) else np.full_like(places, np.nan))]
 
 
 def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8]) -> Part:

@@ -66,9 +66,7 @@ def read_header(path: Path) -> Header:
                 fields += [(name, "list")] if [*counts][-1:] == ["vertex"] else []
             case ["property", kind, name] if kind in TYPES:
                 fields += [(name, TYPES[kind])] if [*counts][-1:] == ["vertex"] else []
-            case [] | ["comment" | "obj_info", *_]:
-                pass
-            case _:
+            case ["format" | "element" | "property", *_]:
                 raise InputError(path, "header", f"not understood: {untrusted_input.shown(line.strip())}")
     if not order or not fields or len({name for name, _ in fields}) < len(fields):
         raise InputError(path, "vertex", "the header has no format, no vertices, or one of their properties twice")

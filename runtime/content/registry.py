@@ -31,6 +31,18 @@ MESHES = (".glb", ".gltf", ".obj", ".off", ".stl")
 PLAYLISTS = (".toml", ".json")
 HARMLESS = {".png": PNG, ".jpg": JPEG, ".jpeg": JPEG}  # stills of their own kind, and of few pixels, are read here
 HARMLESS_PX = 4096 * 4096
+TO_GLTF, TO_PLY = "export it as glTF (.glb), as Blender does", "save it as PLY, as CloudCompare does"
+TO_SPLATS = "convert it: `npx @playcanvas/splat-transform in{} out.ply`"
+OTHER_FILES = {  # by their names: what they are, and the way out
+    **dict.fromkeys((".fbx", ".dae", ".blend", ".3ds", ".x3d", ".wrl", ".abc"), ("a 3D scene", TO_GLTF)),
+    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), ("a USD scene", TO_GLTF)),
+    **dict.fromkeys(
+        (".3mf", ".step", ".stp", ".iges", ".igs"), ("a model of CAD or 3D print", "export it as STL or glTF")
+    ),
+    **dict.fromkeys((".xyz", ".pts", ".pcd", ".las", ".laz", ".e57"), ("a point cloud", TO_PLY)),
+    **dict.fromkeys((".sog", ".ksplat", ".lcc"), ("compressed splats", TO_SPLATS)),
+}
+LFS = b"version https://git-lfs"
 TRIED_PX = (32, 18)  # a picture that a class is asked for before it is shown
 Opener = Callable[..., ContentSource]  # of `context`
 
@@ -91,8 +103,16 @@ def _from_path(file: SceneFile) -> Opener:
     untrusted_input.checked_path(path, source="content", field="file")
     if not path.exists():
         raise InputError(path, "", "is not there")
+    suffix = path.suffix.lower()
+    if suffix in OTHER_FILES and path.is_file():
+        kind, way_out = OTHER_FILES[suffix]
+        raise InputError(path, "", f"is {kind} ({suffix}), which is not read: {way_out.format(suffix)}")
+    if suffix in (*MESHES, ".ply") and path.is_file():
+        with untrusted_input.open_regular(path) as opened:
+            if opened.read(len(LFS)) == LFS:
+                raise InputError(path, "", "is a pointer of Git LFS: fetch the file itself (git lfs pull)")
     progress.tell(f"loading {path.name}", 0)
-    if path.suffix.lower() in PLAYLISTS and not path.is_dir():
+    if suffix in PLAYLISTS and not path.is_dir():
         return _playlist(file)
     return _read(file) if _is_harmless(file) else in_child(_read, file, source=path, seconds=LIMITS.load_s)
 

@@ -18,6 +18,7 @@ from runtime.content.mesh import load_mesh
 from runtime.content.registry import open_content
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
+from runtime.support.untrusted_input import LIMITS
 from tests.content.conftest import panel_view
 from tests.content.gltf_files import SQUARE, SQUARE_FACES, Buffer
 
@@ -184,6 +185,19 @@ def test_a_skin_has_the_pose_of_its_nodes(tmp_path: Path) -> None:
     scenes = [{"nodes": [0, 1]}]
     data = load_mesh(b.write(tmp_path / "a.gltf", primitive, nodes=nodes, skins=skins, scenes=scenes, materials=[{}]))
     assert data.low[0] == -1 and data.high[0] == pytest.approx(1 - 1 + 4)
+
+
+def test_a_node_stands_as_often_as_its_instances_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """EXT_mesh_gpu_instancing."""
+    b = Buffer()
+    own = {"TRANSLATION": b.add([[0, 0, 0], [10, 0, 0], [0, 5, 0]]), "SCALE": b.add([[1, 1, 1], [2, 2, 2], [1, 1, 1]])}
+    nodes = [{"mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": {"attributes": own}}}]
+    path = b.write(tmp_path / "a.gltf", square(b), nodes=nodes, materials=[{}])
+    data = load_mesh(path)
+    assert len(data.parts) == 3 and data.high[:2].tolist() == [12, 6]
+    monkeypatch.setattr(LIMITS, "instances", 2)
+    with pytest.raises(InputError, match="nodes: 3 is over the limit of 2"):
+        load_mesh(path)
 
 
 # Texture coordinates
@@ -400,8 +414,8 @@ def test_what_is_not_drawn_is_said_once_and_in_the_info(
     tables = {"animations": [{}], "extensionsUsed": ["KHR_materials_transmission", "KHR_texture_transform"]}
     path = b.write(tmp_path / "a.gltf", {}, meshes=[{"primitives": [square(b), lines]}], materials=[{}], **tables)
     source = open_content(ContentSettings(scene=str(path)), stack, context)
-    assert source.info.left_out == ("KHR_materials_transmission", "animations", "lines")
-    assert f"{path}: is drawn without KHR_materials_transmission, animations, lines" in caplog.messages
+    assert source.info.left_out == ("KHR_materials_transmission", "animations", "points and lines")
+    assert f"{path}: is drawn without KHR_materials_transmission, animations, points and lines" in caplog.messages
 
 
 def compressed(path: Path, *, required: bool, fallback: bool) -> Path:

@@ -279,6 +279,30 @@ def test_points_are_drawn_in_their_colours(tmp_path: Path, context: Any, stack: 
     assert np.median(seen[..., 0]) > 150 and np.median(seen[..., 1]) < 80
 
 
+@pytest.mark.parametrize("form", ["obj", 1, 2, 3])
+def test_lines_alone_are_drawn(tmp_path: Path, context: Any, stack: PanelStack, form: Any) -> None:
+    """A square's outline: its edges are seen, its middle is not."""
+    path = tmp_path / ("a.obj" if form == "obj" else "a.gltf")
+    if form == "obj":
+        path.write_text("v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nl 1 2 3 4/1\nl -1 1\n")
+    else:
+        b = Buffer()
+        corners = {1: [0, 1, 1, 2, 2, 3, 3, 0], 2: [0, 1, 2, 3], 3: [0, 1, 2, 3, 0]}[form]
+        b.write(path, {"attributes": {"POSITION": b.add(CARD)}, "indices": b.add(corners, np.uint8), "mode": form})
+    covered = source_of(path, context, stack).render(panel_view((0.7, 0, 0), stack.panel(1)), time_ns=0)[..., 3]
+    rows, columns = np.nonzero(covered > 128)
+    side = 0.75 * stack.height_px
+    assert np.ptp(rows) == pytest.approx(side, abs=8) and np.ptp(columns) == pytest.approx(side, abs=8)
+    assert covered[135, 240] == 0 and (covered[rows.min() : rows.max(), columns.min() + 1] > 128).mean() > 0.95
+
+
+def test_strips_of_a_ply_are_said_to_be_left_out(tmp_path: Path) -> None:
+    head = "ply\nformat ascii 1.0\nWritten by somebody\nelement vertex 3\nproperty float x\nproperty float y\n"
+    head += "property float z\nelement tristrips 1\nproperty list int int vertex_indices\nend_header\n"
+    (tmp_path / "a.ply").write_text(head + "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    assert load_mesh(tmp_path / "a.ply").left_out == ("tristrips",)
+
+
 CLOUD = "ply\nformat ascii 1.0\nelement vertex 0\n" + "".join(f"property float {axis}\n" for axis in "xyz")
 CLOUD += "end_header\n"
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"

@@ -314,8 +314,14 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
     "an older version": (gltf(asset={"version": "1.0"}), "asset.version: is 1.0, which is not read; convert it"),
     "an accessor beyond its view": (
         gltf(accessors=[{"bufferView": 0, "componentType": 5126, "count": 99, "type": "VEC3"}] * 2),
-        "is damaged, or no glTF (ValueError: an accessor reaches beyond its buffer view)",
+        "is damaged, or no glTF (an accessor reaches beyond its buffer view)",
     ),
+    "a corner that is not there": (
+        gltf(accessors=[{"componentType": 5126, "count": 1, "type": "VEC3"}, *gltf()["accessors"][1:]]),
+        "is damaged, or no glTF (a reference to what is not there)",
+    ),
+    "a number as a list": (gltf(nodes=7), "is damaged, or no glTF (a value of a wrong kind)"),
+    "an older table": (gltf(asset={"version": "1.0"}, accessors={"a": {}}), "asset.version: is 1.0, which is not read"),
     "a buffer without data": (gltf(buffers=[{"byteLength": 48}]), "buffers[0].uri: is missing"),
 }
 
@@ -332,6 +338,26 @@ def test_a_gltf_is_refused_by_what_it_says_of_itself(tmp_path: Path, name: str) 
     else:  # strange, and bounded
         load_mesh(path)
     assert time.monotonic() - start < HANG_S
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("a.fbx", "is a 3D scene (.fbx), which is not read: export it as glTF (.glb), as Blender does"),
+        ("a.usdz", "is a USD scene (.usdz), which is not read: export it as glTF"),
+        ("a.3mf", "is a model of CAD or 3D print (.3mf), which is not read: export it as STL or glTF"),
+        ("a.xyz", "is a point cloud (.xyz), which is not read: save it as PLY"),
+        (
+            "a.SOG",
+            "is compressed splats (.sog), which is not read: convert it: `npx @playcanvas/splat-",
+        ),
+        ("a.glb", "is a pointer of Git LFS: fetch the file itself (git lfs pull)"),
+        ("a.ply", "is a pointer of Git LFS"),
+    ],
+)
+def test_a_file_of_another_kind_is_called_by_its_name(tmp_path: Path, name: str, told: str) -> None:
+    (tmp_path / name).write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")
+    assert refused(tmp_path / name).startswith(f"{tmp_path / name}: {told}")
 
 
 @pytest.mark.parametrize("suffix", [".gltf", ".glb"])
