@@ -28,6 +28,8 @@ INDEX_SHARE = 1.1  # a file with the indices of its chunks, beside without
 SUMMARY_BYTES = 10_000  # with the schemas
 MAX_S, MAX_BYTES = 600.0, 2 << 30  # a recording ends before it is longer or larger
 MAGIC = b"\x89MCAP0\r\n"
+NEEDED = "one to replay has it and `/eyes` (docs/sensors.md); others are read by a driver of your own"
+ROS1 = " (a bag of ROS 1: `mcap convert` makes one of it)"
 
 SYNCED_WITHIN_S = 30.0  # that closing a file waits for a slow disk
 SYNC_EVERY_NS = 2 * NS_PER_S  # what a power cut takes of a recording at most, on a disk that keeps up
@@ -152,34 +154,45 @@ class Recording:
     def __init__(self, path: Path) -> None:
         """Reads the header and the first sample. Raises InputError, naming the file."""
         self.path, self.is_whole = path, True  # as far as it was read
+        self._written_by = ("", "")  # profile and library
         self.header = self._read_header()
         first = next(self.samples(), None)
         if first is None:
-            raise InputError(path, "", "holds no whole sample")
+            cut_off = "" if self.is_whole else " (it is cut off before the first one ends)"
+            raise InputError(path, "", f"holds no whole sample{cut_off}")
         self.first = first
 
     def _opened(self) -> IO[bytes]:
         return untrusted_input.open_regular(self.path, most_bytes=LIMITS.file_bytes)
 
     def _read_header(self) -> RecordingHeader:
+        """Of the metadata, wherever it stands: tools that mend a recording write it at the end."""
+        foreign = ""
         for topic, record in self._records():
-            if topic:
+            if topic and topic not in fmt.SCHEMAS:
+                foreign = f"topic {untrusted_input.shown(topic)}"
                 break
-            if record.name == fmt.METADATA_NAME:
+            if not topic and record.name == fmt.METADATA_NAME:
                 try:
                     return RecordingHeader.from_metadata(record.metadata)
                 except ValueError as error:
                     raise InputError(self.path, fmt.METADATA_NAME, str(error)) from None
-        raise InputError(self.path, fmt.METADATA_NAME, "is missing: not a recording of phasestack")
+        if not foreign and not self.is_whole:
+            raise InputError(self.path, "", "is an MCAP recording that is cut off before its first sample")
+        by = ", ".join(filter(None, (*self._written_by, foreign)))
+        raise InputError(self.path, fmt.METADATA_NAME, f"is missing from this MCAP recording ({by}): {NEEDED}")
 
     def _records(self) -> Iterator[tuple[str, Any]]:
         """Messages with their topic, and metadata without one, until the end or the break."""
-        from mcap.records import Channel, Message, Metadata
+        from mcap.records import Channel, Header, Message, Metadata
 
         topics: dict[int, str] = {}
         with self._opened() as file:
             for record in self._to_the_break(file):
-                if isinstance(record, Channel):
+                if isinstance(record, Header):
+                    told = (record.profile, record.library)
+                    self._written_by = (untrusted_input.shown(told[0]), untrusted_input.shown(told[1]))
+                elif isinstance(record, Channel):
                     topics[record.id] = record.topic
                 elif isinstance(record, Message):
                     yield topics.get(record.channel_id, "?"), record
@@ -188,8 +201,9 @@ class Recording:
 
     def _to_the_break(self, file: IO[bytes]) -> Iterator[Any]:
         try:
-            if file.read(len(MAGIC)) != MAGIC:
-                raise InputError(self.path, "", "is not an MCAP recording")
+            if (begin := file.read(len(MAGIC))) != MAGIC:
+                problem = "is not an MCAP recording" if begin else "is empty"
+                raise InputError(self.path, "", problem + ROS1 * (begin == b"#ROSBAG "))
             file.seek(0)
             yield from _mcap_records(file, source=self.path, max_bytes=LIMITS.chunk_bytes)
         except (InputError, ImportError):

@@ -165,6 +165,56 @@ def test_a_recording_of_another_program_or_version_is_refused(tmp_path: Path) ->
             Recording(path)
 
 
+def test_another_program_s_recording_is_called_so_with_what_one_must_hold(tmp_path: Path) -> None:
+    from mcap.writer import Writer
+
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2", library="libmcap 0.8.0")
+        writer.add_message(writer.register_channel("/camera/image", "cdr", 0), 1, b"x", 1)
+        writer.finish()
+    told = r"missing from this MCAP recording \(ros2, libmcap 0\.8\.0, topic /camera/image\): .*`/eyes` \(docs/sensors"
+    with pytest.raises(InputError, match=told):
+        Recording(path)
+    for data, told in (
+        (b"", "is empty"),
+        (b"#ROSBAG V2.0\n", "a bag of ROS 1: `mcap convert`"),
+        (b"abc", "is not an MCAP"),
+    ):
+        path.write_bytes(data)
+        with pytest.raises(InputError, match=told):
+            Recording(path)
+
+
+def test_a_recording_with_its_metadata_at_the_end_is_played(tmp_path: Path) -> None:
+    """As tools leave it that mend one."""
+    from mcap.reader import make_reader
+    from mcap.writer import Writer
+
+    path = tmp_path / "mended.mcap"
+    with demo_recording_path().open("rb") as old, path.open("wb") as file:
+        reader, writer = make_reader(old), Writer(file)
+        writer.start(library="mender")
+        channels: dict[str, int] = {}
+        for _, channel, message in reader.iter_messages():
+            if channel.topic not in channels:
+                channels[channel.topic] = writer.register_channel(channel.topic, channel.message_encoding, 0)
+            writer.add_message(channels[channel.topic], message.log_time, message.data, message.publish_time)
+        for metadata in reader.iter_metadata():
+            writer.add_metadata(metadata.name, metadata.metadata)
+        writer.finish()
+    assert [eyes_message(frame) for frame in Recording(path).samples()] == DEMO
+
+
+def test_a_recording_cut_before_its_first_sample_is_called_cut_off(tmp_path: Path) -> None:
+    data = demo_recording_path().read_bytes()
+    for size in (40, 1000):
+        (tmp_path / "a.mcap").write_bytes(data[:size])
+        with pytest.raises(InputError, match="is cut off before"):
+            Recording(tmp_path / "a.mcap")
+
+
 @pytest.mark.parametrize("limit", [30_000, 200_000])
 def test_a_recording_stays_within_its_limits_of_length_and_size(
     tmp_path: Path, limit: int, monkeypatch: pytest.MonkeyPatch
