@@ -8,6 +8,8 @@ import sys
 from enum import Enum, auto
 from typing import Any
 
+from runtime.panels.base import PanelSink
+
 
 class Key(Enum):
     """Keys and their meaning."""
@@ -22,7 +24,7 @@ class Key(Enum):
     QUIT = auto()
 
 
-# What a key means: GLFW's names of it, and its bytes in a terminal.
+# GLFW's names of each key, and its bytes in a terminal.
 _MEANINGS: dict[Key, tuple[str, tuple[bytes, ...]]] = {
     Key.RIGHT: ("RIGHT", (b"\x1b[C",)),
     Key.LEFT: ("LEFT", (b"\x1b[D",)),
@@ -37,7 +39,7 @@ _OF_BYTES = {data: key for key, (_, pieces) in _MEANINGS.items() for data in pie
 
 
 def parse(data: bytes) -> tuple[list[Key], bytes]:
-    """Keys in bytes from a terminal, and the rest: an escape sequence that is not complete yet."""
+    """Return the keys in bytes from a terminal, and an incomplete escape sequence at the end."""
     keys: list[Key] = []
     while data:
         if data[:1] == b"\x1b" and len(data) < 3 and b"\x1b[".startswith(data[:2]):
@@ -50,17 +52,17 @@ def parse(data: bytes) -> tuple[list[Key], bytes]:
 
 
 class TerminalKeys:
-    """Standard input; while keys are asked for a terminal is in character mode. The end of input quits."""
+    """Keys and lines of standard input; a terminal is in character mode between `poll` and `close`."""
 
     def __init__(self, descriptor: int | None = None, *, quit_at_end: bool = True) -> None:
-        """quit_at_end False: without an input (a service, `< /dev/null`) there are no keys, and that is all."""
+        """quit_at_end: the end of input is `QUIT`; False: there are no more keys."""
         self._quit_at_end = quit_at_end
         self._descriptor = _standard_input() if descriptor is None else descriptor
         self._rest = b""
-        self._mode: Any = None  # of the terminal, to go back to
+        self._mode: Any = None  # of the terminal before
 
     def poll(self) -> Key | None:
-        """The next key, or None. Never waits."""
+        """Return the next key, or None. Never waits."""
         if self._mode is None and self._descriptor >= 0 and os.isatty(self._descriptor):
             import termios
             import tty
@@ -79,7 +81,7 @@ class TerminalKeys:
         return None
 
     def line(self) -> str:
-        """The next line, waited for; `q` at the end of input."""
+        """Wait for the next line; `q` at the end of input."""
         self.close()
         data = b""
         while self._descriptor >= 0 and (read := os.read(self._descriptor, 1)) != b"\n":
@@ -89,7 +91,7 @@ class TerminalKeys:
         return data.decode(errors="replace").strip() if self._descriptor >= 0 else "q"
 
     def close(self) -> None:
-        """Give the terminal back. May be called twice."""
+        """Restore the terminal. May be called twice."""
         if self._mode is not None:
             import termios
 
@@ -98,7 +100,7 @@ class TerminalKeys:
 
 
 def _standard_input() -> int:
-    """Its descriptor; -1 where there is none, as in a service."""
+    """Return its descriptor, or -1 without one, as in a service."""
     try:
         return sys.stdin.fileno()
     except (AttributeError, OSError, ValueError):
@@ -106,21 +108,16 @@ def _standard_input() -> int:
 
 
 class WindowKeys:
-    """Keys pressed while a panel's window has the keyboard, as they come with the windows' own events.
+    """Keys pressed in a panel's window, which GLFW delivers when a frame is presented."""
 
-    The windows' events are taken in when a frame is presented; windows that were rebuilt are found again.
-    """
-
-    def __init__(self, sink: Any) -> None:
-        """sink: the panels; those without windows have no keys."""
+    def __init__(self, sink: PanelSink) -> None:
         self._sink = sink
         self._watched: list[Any] = []
         self._pending: list[Key] = []
 
     def poll(self) -> Key | None:
-        """The next key, or None. Never waits. Call it after a frame was presented, on the windows' thread."""
-        # The panels keep their windows to themselves; nothing but their keyboard is wanted of them.
-        handles = [window.handle for window, _ in getattr(self._sink, "_surfaces", ())]
+        """Return the next key, or None. Never waits. Call it after presenting, on the windows' thread."""
+        handles = self._sink.window_handles
         if handles != self._watched:
             self._watch(handles)
         return self._pending.pop(0) if self._pending else None

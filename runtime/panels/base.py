@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import Any
 
 from runtime.records import PanelFrame, PresentReport
 
@@ -17,6 +18,11 @@ class PanelSink(ABC):
     def period_ns(self) -> int | None:
         """Period between vertical blanks of the monitor that sets the pace; None: none, or unknown."""
         return None
+
+    @property
+    def window_handles(self) -> list[Any]:
+        """GLFW handles of the open windows, for their keys."""
+        return []
 
     @abstractmethod
     def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:

@@ -80,6 +80,10 @@ class WindowPanels(PanelSink):
         refresh_hz = self.monitors[0].refresh_hz if self.monitors else 0.0
         return round(NS_PER_S / refresh_hz) if refresh_hz else None
 
+    @property
+    def window_handles(self) -> list[Any]:
+        return [window.handle for window, _ in self._surfaces]
+
     def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
         """Show a frame on every panel at once; an unchanged one stays as it is, where it is still shown.
 

@@ -84,7 +84,7 @@ def test_photographs_from_one_place_are_refused() -> None:
 def test_panels_in_the_reverse_order_are_told(seed: int) -> None:
     panels = [ideal_panel(STACK, index) for index in (2, 1, 0)]
     seen = photographed(STACK, tuple(panels), count=8, noise_px=0.05, random=np.random.default_rng(seed))
-    with pytest.raises(Undetermined, match="reverse of the configuration's order"):
+    with pytest.raises(Undetermined, match="reverse of the configured order"):
         register(seen)
 
 

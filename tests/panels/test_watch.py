@@ -44,7 +44,7 @@ def lost(sink: WindowPanels, *, unchanged: bool = False, within_s: float = 3.0) 
 
 
 def x11_window(sink: WindowPanels, panel: int) -> int:
-    return glfw.get_x11_window(sink._surfaces[panel][0].handle)
+    return glfw.get_x11_window(sink.window_handles[panel])
 
 
 def comes_back(x: XServer, sink: WindowPanels, *monitors: int) -> bool:

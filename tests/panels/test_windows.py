@@ -92,7 +92,7 @@ def test_a_lost_monitor_is_named_and_a_returning_one_used_again(x: XServer, open
 def test_a_closed_window_is_a_lost_panel_and_comes_back(x: XServer, opened: Callable[..., Any]) -> None:
     sink = opened(*BY_CONNECTOR)
     assert presents(sink, 0)
-    x.ask_to_close(glfw.get_x11_window(sink._surfaces[1][0].handle))
+    x.ask_to_close(glfw.get_x11_window(sink.window_handles[1]))
     with pytest.raises(PanelLost, match="closed"):
         for number in range(1, 50):
             sink.present(frame(number))
