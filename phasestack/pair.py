@@ -27,6 +27,7 @@ from runtime.evaluation.solved import PairQuality, SolvedPair
 from runtime.model.predictor import Predictor, load_predictor
 from runtime.model.still import solve_still
 from runtime.optics.cameras import as_cameras, doubts, looking_at_origin
+from runtime.optics.disparity import disparity_doubts
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
@@ -51,6 +52,7 @@ class _Pair:
     eyes_m: F64
     stack: PanelStack
     fov_deg: float
+    is_resampled: bool  # from cameras that were given
 
     def judged(self, layers: U8) -> SolvedPair:
         """What the eyes make of layers."""
@@ -82,12 +84,28 @@ class Result:
 
     @property
     def quality(self) -> PairQuality:
-        """Quality of what the eyes see; measured when first read, which may take longer than solving."""
+        """Quality of what the eyes see; measured when first read, which may take longer than solving.
+
+        Warns where `notes` has a reason for a bad one.
+        """
+        self._warn()
         return self._pair.quality
+
+    @cached_property
+    def notes(self) -> tuple[str, ...]:
+        """Why the eyes see ghosts, where the pictures' disparity is a reason."""
+        asked = self._asked
+        how: Any = {"fov_deg": asked.fov_deg, "parallel": not asked.is_resampled}
+        return tuple(disparity_doubts(asked.pictures, asked.eyes_m, asked.stack, **how))
 
     def measure(self, **how: Unpack[Measuring]) -> PairQuality:
         """Quality at less cost: `measure(sigmas_mm=(1,), every=4)`. Raises ValueError, naming the argument."""
+        self._warn()
         return _measured(self._pair, how)
+
+    def _warn(self) -> None:
+        for note in self.notes:
+            warnings.warn(note, stacklevel=3)
 
     @property
     def seen(self) -> U8:
@@ -101,26 +119,27 @@ class Result:
     @property
     def _line(self) -> str:
         line = f"model {self.model}, solved for a tracking error of {self.eye_sigma_mm:g} mm; "
-        return line + f"one ray a pixel, as published: {self.quality.psnr_db:.1f} dB"
+        return line + f"one ray a pixel, as published: {self._pair.quality.psnr_db:.1f} dB"
 
     def show(self) -> Path:
         """Open the solution's viewer in a browser; answers its file, which stays."""
         path = Path(tempfile.mkdtemp(prefix="phasestack-")) / "viewer.html"
-        path.write_text(self._pair.viewer([self._line]), encoding="utf-8")
+        path.write_text(self._pair.viewer([self._line, *self.notes]), encoding="utf-8")
         webbrowser.open(path.as_uri())
         return path
 
     def _repr_html_(self) -> str:
         """What a notebook shows of it: the viewer."""
-        page = html.escape(self._pair.viewer([self._line]))
+        page = html.escape(self._pair.viewer([self._line, *self.notes]))
         return f'<iframe srcdoc="{page}" style="width: 100%; height: 640px; border: 0"></iframe>'
 
     def save(self, out: str | Path) -> None:
         """Write what `phasestack solve --out` leaves: layers, pictures, contact sheet, viewer, solve.json."""
         with OutputFolder(Path(out)) as folder:
-            self._pair.write(folder.staging, lines=[self._line])
-            told = {"model": self.model, "eye_sigma_mm": self.eye_sigma_mm, "total_ms": round(self.total_ms, 3)}
-            write_json(folder.staging / "solve.json", self.quality.table() | told)
+            self._pair.write(folder.staging, lines=[self._line, *self.notes])
+            told: dict[str, Any] = {"model": self.model, "eye_sigma_mm": self.eye_sigma_mm, "notes": self.notes}
+            told["total_ms"] = round(self.total_ms, 3)
+            write_json(folder.staging / "solve.json", self._pair.quality.table() | told)
 
 
 def solve(
@@ -313,7 +332,7 @@ def _checked(
             raise ValueError(f"cameras: {error}") from None
     for line in doubts(eyes, stack, fov_deg=fov_deg, size=(pictures[0].shape[1], pictures[0].shape[0])):
         warnings.warn(line, stacklevel=3)
-    pair = _Pair(tuple(pictures), eyes, stack, fov_deg)
+    pair = _Pair(tuple(pictures), eyes, stack, fov_deg, is_resampled=cameras is not None)
     black = np.zeros((stack.count, stack.height_px, stack.width_px, 3), np.uint8)
     if not all(seen_by(eye, black, stack, fov_deg=fov_deg, width_px=64, height_px=64).mask.any() for eye in eyes):
         raise ValueError("eyes_m: nothing of the display can be seen from there")

@@ -326,3 +326,27 @@ def test_many_pairs_are_solved_in_turn() -> None:
     assert len(results) == 3 and np.array_equal(results[2].layers, alone.layers)
     with pytest.raises(ValueError, match=r"pairs\[1\]: eyes_m"):
         list(phasestack.solve_each([(picture(), picture(3), EYES), (picture(), picture(3), ())], stack=STACK))
+
+
+def rectified(shift_px: int) -> tuple[np.ndarray, ...]:
+    """Blocks of strong contrast that all stand before the middle panel, as parallel cameras see them."""
+    levels = np.random.default_rng(4).choice([30, 90, 160, 230], (9, 24, 3)).astype(np.uint8)
+    wide = cv2.resize(levels, (480, 180), interpolation=cv2.INTER_NEAREST)
+    return tuple(
+        np.ascontiguousarray(wide[:, start : start + 320]) for start in (80 - shift_px // 2, 80 + shift_px // 2)
+    )
+
+
+def test_a_pair_with_too_much_disparity_is_explained_wherever_its_figure_is(tmp_path: Path) -> None:
+    eyes = ((0.6, -0.0315, 0.0), (0.6, 0.0315, 0.0))
+    good, bad = (phasestack.solve(*rectified(px), eyes_m=eyes, stack=STACK, model="fast") for px in (6, 60))
+    assert good.notes == ()
+    with pytest.warns(UserWarning, match=r"rectified pair .* move the left picture 3\d pixels to the left"):
+        assert bad.measure(sigmas_mm=(1,)).light_db["1"] < good.measure(sigmas_mm=(1,)).light_db["1"] - 6
+    with pytest.warns(UserWarning, match="more disparity than these gaps"):
+        assert bad.quality.light_db["1"] < good.quality.light_db["1"] - 6
+    bad.save(tmp_path)
+    assert "rectified" in json.loads((tmp_path / "solve.json").read_text())["notes"][0]
+    assert "rectified" in (tmp_path / "viewer.html").read_text()
+    moved = [np.roll(picture, shift_px, axis=1) for picture, shift_px in zip(rectified(60), (-30, 30), strict=True)]
+    assert phasestack.solve(*moved, eyes_m=eyes, stack=STACK, model="fast").notes == ()

@@ -23,6 +23,7 @@ from runtime.model.backends import choose
 from runtime.model.predictor import Prediction, load_predictor
 from runtime.model.still import solve_still
 from runtime.optics.cameras import as_cameras, doubts, looking_at_origin
+from runtime.optics.disparity import disparity_doubts
 from runtime.optics.stack import PanelStack
 from runtime.plan.savings import Measured, network_items
 from runtime.records import F64
@@ -133,9 +134,12 @@ def solve_pair(
             except ValueError as error:
                 why = f"{error}: nothing of the display can be seen from there"
                 raise InputError("solve", "--left-eye", why) from None
+            notes = disparity_doubts(pictures, eyes_m, stack, fov_deg=fov_deg, parallel=eyes.cameras is None)
+            for note in notes:
+                typer.echo(f"phasestack: {note}", err=True)
             line = f"{files.name}, model {predictor.name}, solved for a tracking error of "
             line += f"{eye_sigma_mm:g} mm; one ray a pixel, as published: {quality.psnr_db:.1f} dB"
-            seen.write(folder.staging, lines=[line])
+            seen.write(folder.staging, lines=[line, *notes])
             watch.lap("measure and write")
             items = network_items(ContentInfo(files.name), Measured(left_out=done.answer.savings))
             result = quality.table() | {
@@ -147,6 +151,7 @@ def solve_pair(
                 "eye_sigma_mm": eye_sigma_mm,
                 "steps": done.answer.steps + 1,  # the proposal counts
                 "plan": [asdict(item) for item in items],
+                "notes": notes,
                 "wall_s": {part: round(ms / 1e3, 3) for part, ms in watch.stage_ms.items()},
             }
             write_json(folder.staging / "solve.json", result)

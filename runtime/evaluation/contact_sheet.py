@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from textwrap import wrap
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from runtime.records import F64, U8
 
 TILE_WIDTH = 640  # pixels
 MARGIN = 12  # pixels
+LINE_LETTERS = 58  # of a line below the headline, a tile
 HEADLINE, TITLE = 52, 34
 ERROR_GAIN = 8  # that the difference is shown with
 INK = (40, 40, 40)
@@ -59,6 +61,7 @@ def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, line
                 ]
             )
     columns = max(len(row) for row in rows)
+    lines = [part for line in lines for part in wrap(line, LINE_LETTERS * columns)]
     cell = (tile[0] + MARGIN, tile[1] + MARGIN + TITLE)
     head = HEADLINE + TITLE * len(lines)
     sheet = np.full((head + MARGIN + cell[1] * len(rows), MARGIN + cell[0] * columns, 3), PAPER, np.uint8)

@@ -7,6 +7,7 @@ import json
 import math
 import os
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -37,6 +38,7 @@ from runtime.optics.stack import PanelStack  # noqa: E402
 from runtime.optics.views import raster_from_stack  # noqa: E402
 from runtime.support.artifacts import write_png  # noqa: E402
 from runtime.support.picture_file import read_image  # noqa: E402
+from runtime.support.progress import listening  # noqa: E402
 from tests.model_export.golden import EYES as PUBLISHED_EYES  # noqa: E402
 from tests.model_export.golden import picture  # noqa: E402
 from tests.model_export.unservable import FAULTS  # noqa: E402
@@ -133,6 +135,24 @@ def test_training_raises_the_light_that_eyes_get_and_leaves_its_files(tmp_path: 
     before, after = made(SHORT["arch"], SHORT["options"], seed=1), made(SHORT["arch"], SHORT["options"])
     after.net.load_state_dict(table["model"])
     assert _held_out_db(after, [batch], torch.device("cpu")) > _held_out_db(before, [batch], torch.device("cpu")) + 0.5
+
+
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_training_told_to_stop_leaves_its_last_iteration(tmp_path: Path, sent: signal.Signals, code: int) -> None:
+    """Long before the first validation; --resume then ends where one that was never stopped does."""
+    cut, whole, training = tmp_path / "cut", tmp_path / "whole", Training(**SHORT | {"validate_every": 12})
+
+    def stops(what: str, done: int, total: int | None) -> None:
+        if what.startswith("training") and done == 7:
+            signal.raise_signal(sent)
+
+    with pytest.raises(SystemExit) as stopped, listening(stops):
+        run_training(cut, training)
+    assert stopped.value.code == code and load_checkpoint(cut / "checkpoint.pth")["done"] == 7
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    run_training(cut, training, resume=True)
+    run_training(whole, training)
+    assert curve(cut) == curve(whole)
 
 
 def test_a_killed_training_continues_as_if_uninterrupted(tmp_path: Path) -> None:
