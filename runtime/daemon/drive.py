@@ -79,5 +79,7 @@ def print_summary(summary: dict[str, Any], out: Path | None) -> None:
         )
     if summary["light_db"] is not None:
         print("light_db (pupils at the eyes used, tracking error 1 mm) is the figure to quote for a head at rest")
+    if not summary["inferences"]:
+        print("no solution was shown: nobody was seen, or the run ended before the first was ready (--frames)")
     if out is not None:
         print(f"see {out}/contact-sheet.png; look into it: {out}/viewer.html")

@@ -59,7 +59,8 @@ def displayed(
 ) -> EyeViews:
     """What eyes (2, 3), frame `stack`, see of layers (N, H, W, 3 or 4), against a picture for each eye.
 
-    The pictures are `fov_deg` wide. One that has the panels' aspect is compared in their pixels, any other in its own.
+    The pictures are `fov_deg` wide. One that has the panels' aspect is compared in their pixels, any other in its
+    own, at most as many as a panel has.
     similarity: SSIM as well, else it is NaN.
     Raises ValueError for eyes that are not before every panel, or that see nothing of them.
     """
@@ -104,15 +105,18 @@ def sampled_db(
 
 
 def on_panels_raster(picture: Picture, stack: PanelStack) -> Picture:
-    """A picture resampled to the panels' pixels where their aspect agrees, else unchanged.
+    """A picture resampled to the panels' pixels where their aspect agrees, else to no more pixels than they have.
 
-    A picture of another aspect would be stretched, and then no eye is meant to see it.
+    A picture of another aspect keeps it: stretched, no eye is meant to see it. Finer detail than the panels' pixels
+    cannot be shown, and takes time and memory to measure.
     """
     height_px, width_px = picture.shape[:2]
-    if (width_px, height_px) == (stack.width_px, stack.height_px):
-        return picture
+    size = (stack.width_px, stack.height_px)
     if abs(width_px * stack.height_px / stack.width_px - height_px) > 0.5:
+        scale = min(1.0, ((size[0] * size[1]) / (width_px * height_px)) ** 0.5)
+        size = (max(round(width_px * scale), 1), max(round(height_px * scale), 1))
+    if (width_px, height_px) == size:
         return picture
-    resized: Any = cv2.resize(picture, (stack.width_px, stack.height_px), interpolation=cv2.INTER_AREA)
+    resized: Any = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
     result: Picture = resized
     return result
