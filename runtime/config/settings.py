@@ -97,7 +97,9 @@ class StackGeometry(Section):
 class SensorSettings(Section):
     """Sensor that delivers eye positions or images."""
 
-    driver: str = Field("replay", description="replay, openni2, usb-camera, fixed, or your own class: `module:Class`")
+    driver: str = Field(
+        "replay", description="replay, openni2, realsense, usb-camera, fixed, or your own class: `module:Class`"
+    )
     source: str = Field("demo", description="a recording, `demo`, a serial number or a device URI")
     timeout_s: Annotated[float, within(0.001, 600.0, "s")] = Field(
         0.5, description="the sensor counts as stalled after this long without a sample"
@@ -121,7 +123,7 @@ class SensorSettings(Section):
     @classmethod
     def _resolve_source(cls, source: str, info: ValidationInfo) -> str:
         # Other drivers' sources are serial numbers and URIs, with slashes of their own.
-        if info.data.get("driver") == "replay" or source.endswith(".oni"):
+        if info.data.get("driver") == "replay" or source.endswith((".oni", ".bag", ".db3")):
             return path_in(info.context, source, or_name=source == "demo")
         return source
 

@@ -14,6 +14,7 @@ DRIVERS = {  # that come with phasestack
     "replay": "replay:ReplayDriver",
     "fixed": "fixed:FixedDriver",
     "openni2": "openni2:OpenNI2Driver",
+    "realsense": "realsense:RealSenseDriver",
     "usb-camera": "usb_camera:UsbCameraDriver",
 }
 

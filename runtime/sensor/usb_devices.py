@@ -16,7 +16,7 @@ SUPER_SPEED = 4  # libusb's number of USB 3's speed
 
 
 class KnownDevice(NamedTuple):
-    """One USB device, which the driver `openni2` opens."""
+    """One USB device, which the driver `openni2` opens, or `realsense` its own."""
 
     vendor_id: int
     product_id: int
@@ -33,6 +33,11 @@ KNOWN_DEVICES: tuple[KnownDevice, ...] = (
     KnownDevice(0x2BC5, 0x0401, "Orbbec Astra"),
     KnownDevice(0x2BC5, 0x0403, "Orbbec Astra Pro"),
     KnownDevice(0x2BC5, 0x0407, "Orbbec Astra Mini S"),
+    KnownDevice(0x8086, 0x0AD3, "RealSense D415"),
+    KnownDevice(0x8086, 0x0B07, "RealSense D435"),
+    KnownDevice(0x8086, 0x0B3A, "RealSense D435i"),
+    KnownDevice(0x8086, 0x0B5B, "RealSense D405"),
+    KnownDevice(0x8086, 0x0B5C, "RealSense D455"),
 )
 _BY_ID = {(device.vendor_id, device.product_id): device for device in KNOWN_DEVICES}
 

@@ -1,0 +1,178 @@
+"""Driver `realsense`: Intel and RealSense depth cameras by their own SDK, and its recordings.
+
+Proved by recordings played back by the SDK (tests/sensor/test_realsense.py); nobody has tried a camera yet.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from runtime.clock import NS_PER_MS, NS_PER_S, Clock
+from runtime.config import SensorSettings
+from runtime.errors import EndOfRecording, InputError, SensorLost, SensorTimeout
+from runtime.records import U8, U16, Intrinsics, SensorFrame
+from runtime.sensor.base import Capabilities, DeviceClock, Sensor
+
+RATE_HZ = 30
+FILES = (".bag", ".db3")  # the SDK's recordings, older and newer
+STAMP_AGE_NS = NS_PER_S  # a stamp of the host's time that is older, or in the future, is none
+DRAIN_MAX = 32  # frames that are passed over in one call
+COLOURS = {"rgb8": [0, 1, 2], "bgr8": [2, 1, 0], "rgba8": [0, 1, 2], "bgra8": [2, 1, 0]}  # where red, green, blue are
+
+log = logging.getLogger(__name__)
+
+
+class RealSenseDriver(Sensor):
+    """Colour, depth in millimetres aligned to it by the SDK, and the camera's own intrinsics."""
+
+    name = "realsense"
+    capabilities = Capabilities(colour=True, depth=True)
+
+    def __init__(self, settings: SensorSettings, clock: Clock) -> None:
+        """settings.source: `demo` or empty for the only camera, a serial number, or a recording (`FILES`)."""
+        import pyrealsense2
+
+        self._rs, self._settings, self._clock = pyrealsense2, settings, clock
+        self._pipeline: Any = None
+        self._playback: Any = None
+        self._align: Any = None
+        self._times = DeviceClock()
+        self._number, self._sequence = -1, 0
+
+    def open(self) -> None:
+        self.close()
+        rs, config = self._rs, self._rs.config()
+        pipeline = rs.pipeline()
+        source = self._settings.source
+        try:
+            if source.endswith(FILES):
+                if not Path(source).is_file():
+                    raise InputError(source, "", "cannot be read")
+                config.enable_device_from_file(source, repeat_playback=self._settings.loop)
+            else:
+                config.enable_device(self._found())
+                config.enable_stream(rs.stream.depth, rs.format.z16, RATE_HZ)
+                config.enable_stream(rs.stream.color, rs.format.rgb8, RATE_HZ)
+            profile = pipeline.start(config)
+        except RuntimeError as error:
+            raise SensorLost(f"RealSense: {error}") from None
+        self._pipeline = pipeline
+        device, streams = profile.get_device(), {stream.stream_type() for stream in profile.get_streams()}
+        self._playback = device.as_playback() if device.is_playback() else None
+        if not {rs.stream.depth, rs.stream.color} <= streams:
+            self.close()
+            raise SensorLost("RealSense: depth and colour are needed, and one of them is not there")
+        self.serial = device.get_info(rs.camera_info.serial_number)
+        self._align = rs.align(rs.stream.color)
+        self._times, self._number = DeviceClock(), -1
+
+    def _found(self) -> str:
+        """The serial number of the camera that is wanted. Raises SensorLost."""
+        source = self._settings.source
+        wanted = self.serial or ("" if source in ("", "demo", "any") else source)
+        info = self._rs.camera_info.serial_number
+        serials = [device.get_info(info) for device in self._rs.context().query_devices()]
+        fit = [serial for serial in serials if wanted in ("", serial)]
+        if len(fit) > 1:
+            raise SensorLost(f"RealSense cameras {', '.join(fit)}: set sensor.source to one of these serial numbers")
+        if not fit:
+            camera = f"RealSense camera {wanted!r}" if wanted else "RealSense camera"
+            raise SensorLost(f"no {camera} among {len(serials)}")
+        return fit[0]
+
+    def read_newest(self, timeout_s: float) -> SensorFrame:
+        if self._pipeline is None:
+            raise SensorLost("not open")
+        deadline_ns = self._clock.now_ns() + round(timeout_s * NS_PER_S)
+        try:
+            frames = self._next(deadline_ns)
+            for _ in range(DRAIN_MAX):
+                if not (newer := self._pipeline.poll_for_frames()):
+                    break
+                if self._is_new(newer):
+                    self.skipped, frames = self.skipped + 1, newer
+            aligned = self._align.process(frames)
+            depth, colour = aligned.get_depth_frame(), aligned.get_color_frame()
+            if not (depth and colour):
+                raise SensorTimeout("RealSense: depth without colour")
+            return self._frame(depth, colour)
+        except RuntimeError as error:
+            raise SensorLost(f"RealSense: {error}") from None
+
+    def _next(self, deadline_ns: int) -> Any:
+        """The next frames whose depth was not read yet. Raises SensorTimeout, EndOfRecording, RuntimeError."""
+        while True:
+            remaining_ms = max(1, (deadline_ns - self._clock.now_ns()) // NS_PER_MS)
+            done, frames = self._pipeline.try_wait_for_frames(remaining_ms)
+            if done and self._is_new(frames):
+                return frames
+            if not done and self._is_over():
+                raise EndOfRecording(f"{self._settings.source}: no more frames")
+            if self._clock.now_ns() >= deadline_ns:
+                raise SensorTimeout("RealSense: no new frame")
+
+    def _is_over(self) -> bool:
+        playing = self._rs.playback_status.playing
+        return self._playback is not None and not self._settings.loop and self._playback.current_status() != playing
+
+    def _is_new(self, frames: Any) -> bool:
+        """Whether there is a depth picture that was not there before: the SDK pairs one with several of colour."""
+        depth = frames.get_depth_frame()
+        if not depth or not frames.get_color_frame() or depth.get_frame_number() == self._number:
+            return False
+        number = depth.get_frame_number()
+        self._sequence += number - self._number if 0 <= self._number < number else 1
+        self._number = number
+        return True
+
+    def _frame(self, depth: Any, colour: Any) -> SensorFrame:
+        return SensorFrame(
+            sequence=self._sequence,
+            capture_ns=self._capture_ns(depth),
+            colour=_rgb(colour),
+            depth_mm=_millimetres(depth),
+            intrinsics=_intrinsics(colour.profile.as_video_stream_profile().intrinsics),
+        )
+
+    def _capture_ns(self, frame: Any) -> int:
+        """When the depth was taken: the SDK's stamp on the host's clock where it has one, else the device's."""
+        now_ns, stamp_ns = self._clock.now_ns(), round(frame.get_timestamp() * NS_PER_MS)
+        age_ns = time.time_ns() - stamp_ns
+        on_host = frame.get_frame_timestamp_domain() != self._rs.timestamp_domain.hardware_clock
+        if on_host and 0 <= age_ns < STAMP_AGE_NS:
+            return now_ns - age_ns
+        return self._times.host_ns(stamp_ns, arrival_ns=now_ns)
+
+    def close(self) -> None:
+        pipeline, self._pipeline, self._playback = self._pipeline, None, None
+        if pipeline is not None:
+            try:
+                pipeline.stop()
+            except RuntimeError as error:  # of an unplugged camera there is nothing left to stop
+                log.debug("RealSense: closing: %s", error)
+
+
+def _rgb(frame: Any) -> U8:
+    """(h, w, 3), copied. Raises SensorLost for a format that is none of `COLOURS`."""
+    kind = frame.profile.format().name
+    if kind not in COLOURS:
+        raise SensorLost(f"RealSense: colour is {kind}, not {', '.join(COLOURS)}")
+    return np.ascontiguousarray(np.asanyarray(frame.get_data())[..., COLOURS[kind]])
+
+
+def _millimetres(frame: Any) -> U16:
+    """(h, w), copied; 0: no measurement."""
+    raw, unit_mm = np.asanyarray(frame.get_data()), frame.get_units() * 1e3
+    if abs(unit_mm - 1) < 1e-4:
+        return raw.copy()
+    return np.minimum(np.rint(raw * unit_mm), np.iinfo(np.uint16).max).astype(np.uint16)
+
+
+def _intrinsics(camera: Any) -> Intrinsics:
+    """The SDK's pixel centres are at whole numbers."""
+    return Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.ppx + 0.5, camera.ppy + 0.5)
