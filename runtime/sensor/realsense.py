@@ -76,7 +76,7 @@ class RealSenseDriver(Sensor):
         source = self._settings.source
         wanted = self.serial or ("" if source in ("", "demo", "any") else source)
         info = self._rs.camera_info.serial_number
-        serials = [device.get_info(info) for device in self._rs.context().query_devices()]
+        serials: list[str] = [device.get_info(info) for device in self._rs.context().query_devices()]
         fit = [serial for serial in serials if wanted in ("", serial)]
         if len(fit) > 1:
             raise SensorLost(f"RealSense cameras {', '.join(fit)}: set sensor.source to one of these serial numbers")
@@ -142,7 +142,7 @@ class RealSenseDriver(Sensor):
     def _capture_ns(self, frame: Any) -> int:
         """When the depth was taken: the SDK's stamp on the host's clock where it has one, else the device's."""
         now_ns, stamp_ns = self._clock.now_ns(), round(frame.get_timestamp() * NS_PER_MS)
-        age_ns = time.time_ns() - stamp_ns
+        age_ns: int = time.time_ns() - stamp_ns
         on_host = frame.get_frame_timestamp_domain() != self._rs.timestamp_domain.hardware_clock
         if on_host and 0 <= age_ns < STAMP_AGE_NS:
             return now_ns - age_ns
@@ -167,10 +167,12 @@ def _rgb(frame: Any) -> U8:
 
 def _millimetres(frame: Any) -> U16:
     """(h, w), copied; 0: no measurement."""
-    raw, unit_mm = np.asanyarray(frame.get_data()), frame.get_units() * 1e3
+    raw: U16 = np.asanyarray(frame.get_data())
+    unit_mm = float(frame.get_units()) * 1e3
     if abs(unit_mm - 1) < 1e-4:
         return raw.copy()
-    return np.minimum(np.rint(raw * unit_mm), np.iinfo(np.uint16).max).astype(np.uint16)
+    scaled: U16 = np.minimum(np.rint(raw * unit_mm), np.iinfo(np.uint16).max).astype(np.uint16)
+    return scaled
 
 
 def _intrinsics(camera: Any) -> Intrinsics:
