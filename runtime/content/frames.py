@@ -6,6 +6,7 @@ import logging
 from abc import ABC, abstractmethod
 from bisect import bisect_right
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import accumulate
 from pathlib import Path
 
@@ -30,6 +31,7 @@ PICTURES = (
     ".avif", ".heic", ".heif", ".hif",
 )  # fmt: skip
 NOT_READ = (".jxl", ".exr", ".hdr", ".psd", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".svg", ".jp2")
+CAMERA_SET = "such a scene is trained first; its splats (.ply) are drawn, and its folder of pictures as a slideshow"
 TOLD = 3  # files of a folder that are left out and named in the log
 TELL_EVERY = 64  # pictures between two reports of progress
 VIDEO_FRAMES_MAX = 1e8  # that a header may claim: five weeks at 30 a second
@@ -104,7 +106,7 @@ class PictureFiles(Frames):
 
     def _read(self, index: int) -> U8:
         views = read_views(self._paths[index], background=self._background)
-        is_pair = len(views) == 2 and self.layouts[index] != MONO
+        is_pair = len(views) == 2 and self.layouts[index].kind != "mono"
         return np.concatenate(views, axis=1) if is_pair else views[0]
 
 
@@ -175,11 +177,13 @@ class Video(Frames):
 def layout_in(header: Header, path: Path, settings: ContentSettings, folder: Path | None = None) -> Layout:
     """The layout of a picture as it is read: of a file with two views, else as it or its folder is named."""
     layout = layout_of(path, settings)
+    if header.is_around:
+        layout = replace(layout, span_deg=360)
     if len(header.views) == 1:
         return layout if layout != MONO or folder is None else layout_of(folder, settings)
-    if settings.layout == "mono":
-        return MONO
-    return layout if layout.right_first and settings.layout != "auto" else PAIR
+    if settings.layout == "mono" or (layout.right_first and settings.layout != "auto"):
+        return layout
+    return replace(PAIR, span_deg=layout.span_deg)
 
 
 def open_frames(path: Path, settings: ContentSettings) -> Frames:
@@ -190,8 +194,19 @@ def open_frames(path: Path, settings: ContentSettings) -> Frames:
         return Animation(path, settings) if header_of_file(path).is_animated else PictureFiles([path], settings)
     paths = sorted(item for item in path.iterdir() if item.suffix.lower() in (*PICTURES, *NOT_READ))
     if not paths:
-        raise InputError(path, "", "the folder holds no pictures")
+        raise InputError(path, "", _why_none(path))
     return PictureFiles(paths, settings, folder=path)
+
+
+def _why_none(folder: Path) -> str:
+    """What a folder without pictures holds instead, for people."""
+    told = "the folder holds no pictures"
+    if sets := sorted(folder.glob("transforms*.json")):
+        return f"{told} but a camera set, as of a NeRF ({sets[0].name}): {CAMERA_SET}"
+    for inner in sorted(item for item in folder.iterdir() if item.is_dir()):
+        if any(item.suffix.lower() in PICTURES for item in inner.iterdir()):
+            return f"{told}; those in {inner.name} are shown by its own name"
+    return told
 
 
 def read_pair(path: Path, settings: ContentSettings) -> list[U8]:

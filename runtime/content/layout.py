@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from runtime.config import ContentSettings
+from runtime.content.panorama import ahead, is_around
 from runtime.errors import InputError
 from runtime.records import U8
 
@@ -47,9 +48,19 @@ class Layout:
     rows: int = 1
     half: bool = False  # its views are squeezed to half their width or height
     right_first: bool = False  # the right eye's view comes first
+    span_deg: int = 0  # of longitude, of views all around; 0: they are none
     view_aspect: float = 0.0  # of a quilt's views, width over height; 0: as their pixels have it
 
     def views(self, picture: U8) -> list[U8]:
+        """The views; of those all around, what lies ahead. Raises ValueError as `parts` does."""
+        parts = self.parts(picture)
+        height, width = parts[0].shape[:2]
+        squeezed = (1.0, 0.5, 2.0) if len(parts) == 2 else (1.0,)  # whatever its name says: the shape is known
+        if not self.span_deg or not any(is_around(width * by, height, self.span_deg) for by in squeezed):
+            return parts
+        return [ahead(part, self.span_deg) for part in parts]
+
+    def parts(self, picture: U8) -> list[U8]:
         """[left, right], [one], or a quilt's from the leftmost camera to the rightmost.
 
         Raises ValueError for a picture that is smaller than one pixel a view.
@@ -97,7 +108,9 @@ def layout_of(path: Path, settings: ContentSettings) -> Layout:
         return Layout("quilt", columns, rows, view_aspect=aspect)
     kind = named.removeprefix("half-").replace("cross-eyed", "side-by-side")
     columns, rows = {"side-by-side": (2, 1), "top-bottom": (1, 2)}.get(kind, (1, 1))
-    return Layout(kind, columns, rows, half=named.startswith("half-"), right_first=named.endswith("cross-eyed"))
+    span_deg = _span_deg(path) if kind in ("mono", "side-by-side", "top-bottom") else 0
+    is_half = named.startswith("half-") and not span_deg
+    return Layout(kind, columns, rows, half=is_half, right_first=named.endswith("cross-eyed"), span_deg=span_deg)
 
 
 def _named(path: Path) -> str:
@@ -113,6 +126,14 @@ def _named(path: Path) -> str:
             if re.search(rf"(^|.* )({mark}){rest}$", words):
                 return layout
     return "mono"
+
+
+def _span_deg(path: Path) -> int:
+    """360 or 180, where a name says that its views go so far around; what else is called so has another shape."""
+    words = re.split(r"[^a-z0-9]+", path.stem.lower())
+    if {"180", "vr180", "180x180"} & set(words):
+        return 180
+    return 360 * bool({"360", "vr360", "360x180", "equirect", "equirectangular", "photosphere"} & set(words))
 
 
 def hint(picture: U8) -> str:

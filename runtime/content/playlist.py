@@ -16,6 +16,7 @@ from pydantic import Field, field_validator
 from runtime.clock import NS_PER_S
 from runtime.config import ContentSettings, Section, read_table, validated
 from runtime.content.base import ContentInfo, ContentSource, ForwardingSource, View
+from runtime.content.frames import CAMERA_SET
 from runtime.content.placed import FIELDS
 from runtime.errors import InputError
 from runtime.support.plausible import within
@@ -59,7 +60,12 @@ def read_playlist(path: Path, settings: ContentSettings) -> Playlist:
 
     settings: defaults of every entry, except for the placing, which is the whole list's.
     """
-    file = validated(PlaylistFile, read_table(path), source=path)
+    table = read_table(path)
+    if "frames" in table and "show" not in table:
+        raise InputError(path, "frames", f"is a camera set, as of a NeRF: {CAMERA_SET}")
+    if path.suffix.lower() == ".json" and "show" not in table:
+        raise InputError(path, "show", "is missing: a JSON file as scene is a playlist, with its scenes there")
+    file = validated(PlaylistFile, table, source=path)
     common = settings.model_dump(exclude={"scene", "file", *FIELDS})
     entries = []
     for number, own in enumerate(file.show):

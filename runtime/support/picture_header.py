@@ -62,6 +62,7 @@ class Header:
     height_px: int
     views: tuple[int, ...]  # frames: the one that is shown, or the left and the right eye's
     is_animated: bool
+    is_around: bool = False  # a sphere of 360 by 180 degrees, as its XMP says
     warning: str = ""  # what the file promises and does not hold
 
 
@@ -107,7 +108,8 @@ def header_of(coded: bytes | IO[bytes], *, name: str = "") -> Header:
                 width, height = height, width
             is_animated = image.format in ANIMATED and bool(getattr(image, "is_animated", False))
             views, warning = _views(image, is_named_so=name.lower().endswith(".mpo"))
-            return Header(image.format, width, height, views, is_animated, warning)
+            is_around = b"equirectangular" in _xmp(image)
+            return Header(image.format, width, height, views, is_animated, is_around, warning)
     except Exception as error:  # each of Pillow's formats raises its own
         raise ValueError(undecodable(_all(coded), error)) from None
 
@@ -137,6 +139,11 @@ def _views(image: Any, *, is_named_so: bool) -> tuple[tuple[int, ...], str]:
     if image.size != size or image.layers != 3 or any(mark in extra for mark in GAIN_MAP):
         return (0,), ""
     return ((1, 0) if _viewpoint(image) == 1 else (0, 1)), ""
+
+
+def _xmp(image: Any) -> bytes:
+    told = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
+    return told.encode() if isinstance(told, str) else bytes(told)
 
 
 def _size_of(image: Any, frame: int) -> tuple[int, int]:

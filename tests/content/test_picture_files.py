@@ -155,6 +155,72 @@ def test_a_picture_whose_halves_nearly_agree_gets_a_hint(
     assert f"--layout {['top-bottom', 'side-by-side'][axis]}" in caplog.text
 
 
+# All around
+
+
+def around(longitude_deg: float, *, width: int = 720, span_deg: int = 360) -> U8:
+    """An equirectangular view with a green square of ten degrees at a longitude, on red."""
+    picture = solid(RED, width, width * 180 // span_deg)
+    per_degree = width / span_deg
+    at = round((longitude_deg + span_deg / 2) * per_degree)
+    middle, half = picture.shape[0] // 2, round(5 * per_degree)
+    picture[middle - half : middle + half, at - half : at + half] = GREEN
+    return picture
+
+
+def square_px(view: U8) -> tuple[float, int, int]:
+    """Middle column from the view's own, and size, of the green square."""
+    rows, columns = np.nonzero(view[..., 1] > 128)
+    return columns.mean() + 0.5 - view.shape[1] / 2, int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1
+
+
+@pytest.mark.parametrize(
+    "name", ["a_360.png", "a_equirect.jpg", "a_360_TB.png", "a_180_LR.png", "a_180_hsbs.png"]
+)
+def test_of_a_picture_all_around_the_view_ahead_is_shown(tmp_path: Path, name: str) -> None:
+    """Twenty degrees to the right lie at tan(20)/tan(37.5) of the half width."""
+    span_deg = 180 if "180" in name else 360
+    one = around(20, span_deg=span_deg)
+    picture = np.concatenate([one, one], axis=0) if "TB" in name else np.concatenate([one, one], axis=1)
+    if "hsbs" in name:
+        picture = np.ascontiguousarray(picture[:, ::2])
+    Image.fromarray(one if name in ("a_360.png", "a_equirect.jpg") else picture).save(tmp_path / name)
+    for view in views(tmp_path / name):
+        middle, width, height = square_px(view)
+        half = view.shape[1] / 2
+        assert view.shape[1] / view.shape[0] == pytest.approx(16 / 9, rel=0.02)
+        assert middle / half == pytest.approx(np.tan(np.radians(20)) / np.tan(np.radians(37.5)), abs=0.02)
+        assert width / height == pytest.approx(1 / np.cos(np.radians(20)), rel=0.12)
+
+
+def test_a_sphere_is_known_by_its_metadata_and_by_its_shape(tmp_path: Path) -> None:
+    xmp = (
+        b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><GPano:ProjectionType>equirectangular</GPano:ProjectionType></x:xmpmeta>'
+    )
+    Image.fromarray(around(0)).save(tmp_path / "a.jpg", xmp=xmp)
+    assert views(tmp_path / "a.jpg")[0].shape == (84, 150, 3)
+    write_png(tmp_path / "xbox_360.png", solid(RED, 160, 90))
+    assert views(tmp_path / "xbox_360.png")[0].shape == (90, 160, 3)
+
+
+# Sets of pictures with cameras
+
+
+def test_a_camera_set_is_called_so_as_a_file_and_as_a_folder(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    (tmp_path / "transforms_train.json").write_text('{"camera_angle_x": 0.7, "frames": [{"transform_matrix": []}]}')
+    (tmp_path / "train").mkdir()
+    for path in (tmp_path, tmp_path / "transforms_train.json"):
+        with pytest.raises(InputError, match="camera set, as of a NeRF"):
+            opened(path, context, stack)
+    (tmp_path / "transforms_train.json").unlink()
+    write_png(tmp_path / "train" / "0.png", solid(RED))
+    with pytest.raises(InputError, match="holds no pictures; those in train are shown by its own name"):
+        opened(tmp_path, context, stack)
+    (tmp_path / "a.json").write_text('{"name": "something"}')
+    with pytest.raises(InputError, match=r"a\.json: show: is missing: a JSON file as scene is a playlist"):
+        opened(tmp_path / "a.json", context, stack)
+
+
 # Colours
 
 
