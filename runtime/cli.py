@@ -1,10 +1,10 @@
 """Entry point of the script `phasestack`: imported first, so that Ctrl-C exits silently with 130.
 
-Nothing is open or written while commands are imported, so an interrupt needs no unwinding; as an exception it would
-end in a traceback, or be lost where Python drops it. The guard takes over once it stands (`commands.guard`).
+No file is open while commands are imported, so that an interrupt needs no unwinding; as an exception it would end in a
+traceback, or be lost where Python drops it. Then `commands.guard` takes over.
 """
 
-# The interpreter has these two already: `signal` itself would take milliseconds before the handler is there.
+# Both are loaded already; importing `signal` would delay the handler by milliseconds.
 import _signal  # type: ignore[import-not-found]
 import os
 
@@ -13,12 +13,12 @@ def _leave(number: int, frame: object) -> None:
     os._exit(130)
 
 
-if _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler:  # one that is ignored or handled stays so
+if _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler:  # leave an ignored or handled signal alone
     _signal.signal(_signal.SIGINT, _leave)
 
 
 def main() -> None:
-    """Run the command that the arguments name; never returns."""
+    """Run the command named by the arguments; never returns."""
     from runtime.commands.guard import run_guarded
 
     run_guarded(interrupts_leave=_signal.getsignal(_signal.SIGINT) is _leave)

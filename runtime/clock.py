@@ -16,7 +16,7 @@ class Clock(Protocol):
         """Nanoseconds of one monotonic clock; its zero has no meaning."""
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Return at or after the deadline; at once where it has passed."""
+        """Return at or after the deadline, without waiting if it has passed."""
 
 
 class MonotonicClock:
@@ -32,7 +32,7 @@ class MonotonicClock:
 
 
 class SimulatedClock:
-    """A clock that is advanced by hand, for fast replay and tests."""
+    """A clock advanced by hand, for fast replay and tests."""
 
     def __init__(self, start_ns: int = 0) -> None:
         self._now_ns = start_ns
@@ -54,12 +54,12 @@ class Stopwatch:
     """Milliseconds of named stages, each from the end of the one before, on the machine's clock."""
 
     def __init__(self, *stages: str) -> None:
-        """stages: those that are there even if nothing of them happens."""
+        """stages: stages to list even if they never occur."""
         self.stage_ms = dict.fromkeys(stages, 0.0)
         self._last_ns = time.perf_counter_ns()
 
     def lap(self, stage: str) -> float:
-        """What happened since the last lap was `stage`: its milliseconds, which are added to it."""
+        """Add the time since the last lap to a stage, and return it in milliseconds."""
         now_ns = time.perf_counter_ns()
         spent_ms, self._last_ns = (now_ns - self._last_ns) / NS_PER_MS, now_ns
         self.stage_ms[stage] = self.stage_ms.get(stage, 0.0) + spent_ms

@@ -9,16 +9,16 @@ from contextlib import contextmanager
 from pathlib import Path
 
 PART_CHARACTERS_MAX = 300  # of a message: an untrusted name must not fill the screen, nor forge a line of the log
-PROBLEM_CHARACTERS_MAX = 1500  # of what is wrong with a file, all its fields together
+PROBLEM_CHARACTERS_MAX = 1500  # of the problems of a file, all fields together
 _USER_OF_ADDRESS = re.compile(r"""(:/{1,2})[^/\s'"]*@""")  # a path's normal form has one slash
-# The system has none left, or its hardware failed this once.
+# A lack of resources, or a passing failure of the hardware.
 PASSING = frozenset(
     (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.ENOBUFS, errno.EINTR)
 )
 
 
 def without_secrets(text: str) -> str:
-    """Text without the name and password of addresses (before an `@`).
+    """Return the text without user names and passwords of addresses (before an `@`).
 
     >>> without_secrets("rtsp://user:a@b@host/door"), without_secrets("/etc/rtsp:/user:a@host/door")
     ('rtsp://host/door', '/etc/rtsp:/host/door')
@@ -27,7 +27,7 @@ def without_secrets(text: str) -> str:
 
 
 def one_line(text: str, *, most: int = PART_CHARACTERS_MAX) -> str:
-    r"""Text on one printable line, without secrets; the middle of a long one becomes `...`.
+    r"""Return the text on one printable line, without secrets; `...` replaces the middle of a long one.
 
     >>> one_line("a\nb"), one_line("x" * 9, most=7)
     ('a?b', 'xx...xx')
@@ -40,15 +40,15 @@ def one_line(text: str, *, most: int = PART_CHARACTERS_MAX) -> str:
 
 
 class PhasestackError(Exception):
-    """Everything that phasestack raises on purpose."""
+    """Base of all errors that phasestack raises on purpose."""
 
 
 class FatalError(PhasestackError):
-    """Nothing sensible can be done: refuse to start. The CLI prints one line and exits with 2."""
+    """A failure that retrying cannot cure: refuse to start. The CLI prints one line and exits with 2."""
 
 
 class InputError(FatalError):
-    """What a user gave us is wrong. Its text names the file (or option) and the field.
+    """Wrong input from a user. Its text names the file (or option) and the field.
 
     >>> str(InputError("panels.toml", "x_m", "must ascend"))
     'panels.toml: x_m: must ascend'
@@ -64,19 +64,19 @@ class InputError(FatalError):
 
 
 class MissingPart(FatalError):
-    """Something optional is needed here and is not installed; the text names what to install."""
+    """An optional package is needed and not installed; the text names it."""
 
 
 class TransientError(PhasestackError):
-    """It may pass: hold the last good frame, degrade, retry. Never ends the daemon."""
+    """A failure that may pass: hold the last good frame, degrade, retry. Never ends the daemon."""
 
 
 class SensorLost(TransientError):
-    """The sensor is gone, hangs or answers nonsense: close it and reopen it with back-off."""
+    """The sensor is gone, hangs or delivers nonsense: close it and reopen it with back-off."""
 
 
 class SensorTimeout(TransientError):
-    """No new sample came in time; the sensor may still be well."""
+    """No new sample arrived in time; the sensor may still be working."""
 
 
 class EndOfRecording(TransientError):
@@ -92,24 +92,24 @@ class ModelFailure(TransientError):
 
 
 class EyesNotServed(ModelFailure):
-    """The model cannot serve these two eyes: a viewer may move on, an option is refused."""
+    """The model cannot serve these two eyes: wait for a viewer to move, refuse an option."""
 
 
 class ContextLost(TransientError):
-    """The solver's GL context is gone: whatever is in it is made anew, from the settings."""
+    """The solver's GL context is lost: rebuild the solver from the settings."""
 
 
 class PanelLost(TransientError):
-    """A panel's window, monitor or GL context is gone: rebuild it; the loop goes on with none."""
+    """A panel's window, monitor or GL context is lost: rebuild it; the loop continues without."""
 
 
 class Stopped(PhasestackError):
-    """Told to stop before there was anything to stop."""
+    """A request to stop during the start."""
 
 
 @contextmanager
 def retry_advised() -> Iterator[None]:
-    """What may pass becomes a TransientError: exit 75, start again."""
+    """Turn an error that may pass into a TransientError: exit 75, another start may help."""
     try:
         yield
     except Exception as error:
@@ -119,10 +119,9 @@ def retry_advised() -> Iterator[None]:
 
 
 def is_retryable(error: BaseException | None) -> bool:
-    """Whether anything in an exception's chain is the machine's trouble of the moment, and not its input.
+    """True if an exception or its context is a passing failure of the machine, and not of its input.
 
-    Readers turn what the system refuses into an InputError that names the file; the system's own error is still its
-    context.
+    Readers turn a system error into an InputError that names the file; the system error is still its context.
     """
     while error is not None:
         if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno in PASSING):

@@ -211,7 +211,7 @@ class Recorder(logging.Handler):
 
     def _state_changed(self, name: str, reason: str, at_ns: int) -> None:
         self._passed.append({"time_s": round(time.time(), 3), "state": name, "reason": reason})
-        was_well = self._state[0].partition(":")[0] not in ("", "starting", "degraded")  # a slow start is no fault
+        was_well = self._state[0].partition(":")[0] not in ("", "starting", "degraded")  # not during a slow start
         if not name.startswith("degraded") or not was_well or self._fault is not None or not self._most_ns:
             return
         kind = "fault-" + name.partition(": ")[2].replace(", ", "+")
@@ -303,7 +303,7 @@ class Recorder(logging.Handler):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close; after an unexpected error, write what is kept."""
+        """Close; after an unexpected error, write the kept messages."""
         if isinstance(error, Exception) and not isinstance(error, Stopped | InputError) and self._presenter is not None:
             log.error("%s", one_line(f"{type(error).__name__}: {error}"))
             self._fault = (0, "error")
@@ -425,7 +425,7 @@ class _Journal:
 
 
 def _find_cut(folder: Path) -> None:
-    """Rename the journals of a killed run to files of their own."""
+    """Rename the journals of a killed run to separate files."""
     for journal in sorted(folder.glob(f".{PREFIX}{JOURNAL}*{PART}"), key=lambda path: path.stat().st_mtime):
         with suppress(OSError), journal.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -12,21 +12,20 @@ from runtime.support.options import number
 
 app = typer.Typer(
     no_args_is_help=True,
-    help="Tell the running daemon what to do between two of its turns. Exits with 1 where no daemon answers.\n\n"
-    "Example: phasestack ctl scene demo",
+    help="Control the running daemon. Exits with 1 if no daemon answers.\n\nExample: phasestack ctl scene demo",
 )
 
-Config = Annotated[Path | None, typer.Option(help="configuration of the daemon: says where its socket is")]
+Config = Annotated[Path | None, typer.Option(help="configuration of the daemon, which names its socket")]
 
 
 @app.command()
 def scene(
-    name: Annotated[str, typer.Argument(help="what `content.scene` takes; `next`: of the playlist that is shown")],
+    name: Annotated[str, typer.Argument(help="a value of `content.scene`, or `next`: the playlist's next entry")],
     config: Config = None,
 ) -> None:
-    """Show another scene: a built-in one, such as `demo`, or a file or folder (`./NAME`) of this machine.
+    """Show another scene: a built-in one, such as `demo`, or a file or folder (`./NAME`) on this machine.
 
-    The present scene goes on while it is loaded, and stays where it can't be: then this exits with 2 and one line.
+    The present scene is shown while the other one loads. If that fails, it stays, and this exits with 2.
 
     Example: phasestack ctl scene demo
     """
@@ -40,30 +39,28 @@ def scene(
 def place(
     scale: Annotated[float | None, number(0.001, 1000, help="scale factor of the scene")] = None,
     offset: Annotated[
-        tuple[float, float, float] | None, number(-10, 10, "m", help="where it is moved: out, right, up; metres")
+        tuple[float, float, float] | None, number(-10, 10, "m", help="displacement: out, right, up; metres")
     ] = None,
     rotate: Annotated[
         tuple[float, float, float] | None,
-        number(-360, 360, "degrees", help="turns about the axes out, right and up; degrees"),
+        number(-360, 360, "degrees", help="rotation about the axes out, right and up; degrees"),
     ] = None,
-    turntable: Annotated[
-        float | None, number(-600, 600, help="turns a minute about the vertical; 0: it stands")
-    ] = None,
-    reset: Annotated[bool, typer.Option("--reset", help="as the configuration has it")] = False,
+    turntable: Annotated[float | None, number(-600, 600, help="turns per minute about the vertical; 0: none")] = None,
+    reset: Annotated[bool, typer.Option("--reset", help="return to the configured placement")] = False,
     config: Config = None,
 ) -> None:
-    """Move, turn or scale the scene that is shown, at once. What is not named stays as it is.
+    """Move, turn or scale the present scene. Options that are not given stay as they are.
 
-    Another scene stands as the configuration has it again.
+    The next scene is placed as configured.
 
     Example: phasestack ctl place --scale 1.2 --offset 0.01 0 -0.02 --turntable 3
     """
     from runtime.errors import InputError
 
-    given = {"scale": scale, "offset_m": offset, "rotation_deg": rotate, "turntable_per_min": turntable}
-    value = {name: asked for name, asked in given.items() if asked is not None}
+    options = {"scale": scale, "offset_m": offset, "rotation_deg": rotate, "turntable_per_min": turntable}
+    value = {name: option for name, option in options.items() if option is not None}
     if reset == bool(value):
-        raise InputError("ctl place", "", "give --reset alone, or what is to change: --scale, --offset, --rotate, ...")
+        raise InputError("ctl place", "", "use either --reset or one of --scale, --offset, --rotate, --turntable")
     tell({"command": "place", "value": None if reset else value}, config)
 
 
@@ -72,7 +69,7 @@ def model(
     name: Annotated[str, typer.Argument(help="fast, balanced, best, sart or an ONNX file")],
     config: Config = None,
 ) -> None:
-    """Solve with another model; the present one goes on while it is loaded, and stays where it can't be.
+    """Solve with another model. The present one is used while the other loads, and stays if that fails.
 
     Example: phasestack ctl model best
     """
@@ -82,13 +79,13 @@ def model(
 
 
 PLAIN = {
-    "pause": "Freeze the picture as it is, until `resume`.",
+    "pause": "Freeze the picture until `resume`.",
     "resume": "Follow the viewer again, after `pause` or `flat`.",
-    "flat": "Show the flat (2D) picture whoever looks, until `resume`.",
-    "reload": "Read the configuration again; a bad one is refused and the old one stays.\n\n"
-    "Scene, model and place that `ctl` chose stay, but where the file says something new of them.",
-    "blackbox": "Write the last minutes to a file (MCAP), and print its name: eyes, states, times, log.",
-}  # commands that take nothing but where the daemon is
+    "flat": "Show the flat (2D) picture until `resume`.",
+    "reload": "Read the configuration again. A bad one is refused, and the old one stays in force.\n\n"
+    "Scene, model and place chosen by `ctl` stay, unless the file has a new value for them.",
+    "blackbox": "Write the last minutes (eyes, states, times, log) to an MCAP file, and print its name.",
+}  # commands without a value
 
 
 def _add_plain(name: str, meaning: str) -> None:
@@ -102,13 +99,13 @@ for _name, _meaning in PLAIN.items():
 
 
 def tell(request: dict[str, Any], config: Path | None) -> None:
-    """Send one request; prints what holds now. Exits with 1 where no daemon answers, 2 where it refuses."""
-    from runtime.daemon.client import TOLD_WITHIN_S, NotRunning, ask, sockets, unit_advice
+    """Send one request and print the new state. Exits with 1 if no daemon answers, 2 if it refuses."""
+    from runtime.daemon.client import ANSWERED_WITHIN_S, NotRunning, ask, sockets, unit_advice
     from runtime.errors import InputError
     from runtime.support.figures import lines_of
 
     try:
-        answer = ask(sockets(config), request, timeout_s=TOLD_WITHIN_S)
+        answer = ask(sockets(config), request, timeout_s=ANSWERED_WITHIN_S)
     except NotRunning as error:
         typer.echo("; ".join(filter(None, (str(error), unit_advice()))), err=True)
         raise typer.Exit(1) from None
@@ -122,9 +119,9 @@ def status(
     config: Config = None,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout")] = False,
 ) -> None:
-    """Ask the running daemon: its state and why, rates now, eyes and how sure they are, times, faults.
+    """Show the running daemon: state and reason, rates, eyes and their uncertainty, times, faults.
 
-    Exits with 1 where no daemon answers, or its loop has stood still for five seconds.
+    Exits with 1 if no daemon answers, or its loop has hung for five seconds.
 
     Example: phasestack status --json
     """
@@ -139,5 +136,5 @@ def status(
         raise typer.Exit(1) from None
     typer.echo(shown(answer, as_json=as_json))
     if float(answer.get("turn_age_s", 0.0)) > HUNG_AFTER_S:
-        typer.echo(f"the loop has not completed a turn for {answer['turn_age_s']:.0f} s", err=True)
+        typer.echo(f"the display loop has hung for {answer['turn_age_s']:.0f} s", err=True)
         raise typer.Exit(1)

@@ -1,7 +1,7 @@
-"""Around every command: whatever happens in it ends in an exit code and at most one line on stderr.
+"""Guard around every command: any failure ends in an exit code and at most one line on stderr.
 
-0 done, 1 a check has failed, 2 bad usage or input, 70 an error of ours (its whole story is in a file that the line
-names), 75 what may pass, 130 Ctrl-C, 141 nobody reads what is printed.
+0 done, 1 a check has failed, 2 bad usage or input, 70 an error of ours (the line names a file with its traceback),
+75 a failure that may pass, 130 Ctrl-C, 141 stdout was closed.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ import threading
 from types import FrameType
 from typing import Any
 
-INTERRUPTED, BAD_INPUT, OWN_ERROR, MAY_PASS, NOBODY_READS = 130, 2, 70, 75, 141
+INTERRUPTED, BAD_INPUT, OWN_ERROR, MAY_PASS, STDOUT_CLOSED = 130, 2, 70, 75, 141
 
 
 def run_guarded(*, interrupts_leave: bool) -> None:
-    """Run the command named by the arguments; never returns. interrupts_leave: Ctrl-C exited so far."""
+    """Run the command named by the arguments; never returns. interrupts_leave: Ctrl-C exits until now."""
     _fill_standard_descriptors()
     try:
         from runtime.commands.app import app
@@ -34,7 +34,7 @@ def run_guarded(*, interrupts_leave: bool) -> None:
             code = _code_of(app)
     except BaseException as error:
         code = _reported(error)
-    if interrupts_leave:  # a second interrupt finds nothing to unwind
+    if interrupts_leave:  # a second interrupt exits immediately
         signal.signal(signal.SIGINT, lambda number, frame: os._exit(INTERRUPTED))
     code = _flushed(code)
     if _has_hung_thread():
@@ -43,12 +43,12 @@ def run_guarded(*, interrupts_leave: bool) -> None:
         logs.flush()
     else:
         atexit._run_exitfuncs()
-    # Modules are not taken down: that takes time, and where a library's own thread still runs it would end in an abort.
+    # No teardown of modules: it takes time, and would abort if a library's thread is still running.
     os._exit(code)
 
 
 def _interrupted(number: int, frame: FrameType | None) -> None:
-    """While a module is imported Python would drop what is raised, and there is nothing to unwind."""
+    """Raise KeyboardInterrupt, or exit during an import, where Python would drop it."""
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
             os._exit(INTERRUPTED)
@@ -57,7 +57,7 @@ def _interrupted(number: int, frame: FrameType | None) -> None:
 
 
 def _has_hung_thread() -> bool:
-    """Whether a solver's thread (`frame.solver_thread`) or a job (`support.background`) is in a call that hangs."""
+    """True if a solver's thread (`frame.solver_thread`) or a job (`support.background`) still runs."""
     return any(thread.name.startswith(("solver-", "job ")) for thread in threading.enumerate())
 
 
@@ -65,14 +65,14 @@ def _code_of(app: Any) -> int:
     try:
         app()
     except SystemExit as error:
-        if isinstance(error.__context__, BrokenPipeError):  # typer ends them so
-            return NOBODY_READS
+        if isinstance(error.__context__, BrokenPipeError):  # typer turns it into this
+            return STDOUT_CLOSED
         return int(error.code or 0)
     return 0
 
 
 def _reported(error: BaseException) -> int:
-    """The exit code of what a command was ended by, told in one line."""
+    """Print the error that ended a command on one line, and return the exit code."""
     from runtime.errors import PhasestackError, TransientError, one_line
     from runtime.support.extras import missing_extra
 
@@ -80,7 +80,7 @@ def _reported(error: BaseException) -> int:
     if isinstance(error, KeyboardInterrupt):
         return INTERRUPTED
     if isinstance(error, BrokenPipeError):
-        return NOBODY_READS
+        return STDOUT_CLOSED
     if isinstance(error, OSError) and error.errno == errno.ENOSPC:
         _say(f"phasestack: {error.filename or 'output'}: cannot be written ({error.strerror})")
         return BAD_INPUT
@@ -97,9 +97,9 @@ def _reported(error: BaseException) -> int:
 
 
 def _say(line: str) -> None:
-    with contextlib.suppress(OSError, ValueError):  # where nobody reads stderr either, the exit code has to do
+    with contextlib.suppress(OSError, ValueError):  # without stderr there is only the exit code
         print(line, file=sys.stderr, flush=True)
-    if "NOTIFY_SOCKET" in os.environ:  # what `phasestack status` tells of a service that has failed
+    if "NOTIFY_SOCKET" in os.environ:  # `phasestack status` shows it for a failed service
         with contextlib.suppress(ImportError):
             import sdnotify
 
@@ -107,7 +107,7 @@ def _say(line: str) -> None:
 
 
 def _flushed(code: int) -> int:
-    """The exit code once all that was printed is out: Python's own last flush would tell a failure in a traceback."""
+    """Flush stdout and return the exit code; at Python's own last flush, a failure is a traceback."""
     try:
         sys.stdout.flush()
     except OSError as error:
@@ -117,7 +117,7 @@ def _flushed(code: int) -> int:
 
 
 def _fill_standard_descriptors() -> None:
-    """Where stdin, stdout or stderr is closed, it leads nowhere: no file that is opened later takes its place."""
+    """Open /dev/null as stdin, stdout or stderr if closed, so that no later file takes its place."""
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(number, True)
     for name in ("stdout", "stderr"):

@@ -122,7 +122,7 @@ class SensorSettings(Section):
     @field_validator("source")
     @classmethod
     def _resolve_source(cls, source: str, info: ValidationInfo) -> str:
-        # Other drivers' sources are serial numbers and URIs, with slashes of their own.
+        # Other drivers' sources are serial numbers and URIs, which may contain slashes.
         if info.data.get("driver") == "replay" or source.endswith((".oni", ".bag", ".db3")):
             return path_in(info.context, source, or_name=source == "demo")
         return source

@@ -1,4 +1,4 @@
-"""The composition root: builds a run from its settings."""
+"""Composition root: builds a run from its settings."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ from runtime.support.untrusted_input import LIMITS
 
 log = logging.getLogger("phasestack.build")
 
-SWITCH_INTERVAL_S = 0.0005  # between Python threads: the presenter must not wait long for the solver's
+SWITCH_INTERVAL_S = 0.0005  # between Python threads: the presenter must not wait long for the solver
 
-# Of summary.json: on the simulated clock these follow from what is configured, and nothing was measured.
+# Figures of summary.json that a simulated clock takes from the configuration.
 SIMULATED_FIGURES = (
     "seconds", "fps", "solutions_per_s", "interval_ms", "photon_ms", "stage_ms", "overhead_ms", "skew_ms",
     "solution_age_ms", "efforts",
@@ -64,12 +64,12 @@ class RunOptions:
     frames: int | None = None  # refreshes; None: to the end
     out: Path | None = None  # folder for the run's files
     browser: BrowserLink | None = None  # a page shows the panels, and may be the sensor
-    until: Callable[[], str] = str  # why to stop; empty: go on
+    until: Callable[[], str] = str  # reason to stop, or empty
 
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """A run put together from its settings."""
+    """A run built from its settings."""
 
     presenter: Presenter
     observer: RunObserver
@@ -79,18 +79,18 @@ class Run:
 
     @property
     def parts(self) -> RunningSolver:
-        """The solver at present: for the status, and for tests."""
+        """The present solver."""
         assert self.maker.parts is not None
         return self.maker.parts
 
     def plan_items(self) -> list[dict[str, Any]]:
-        """What is left out at present; a saving or a cost that this run did not measure is None."""
+        """Return the present savings; those without measured times or costs have None."""
         solver = self.parts.solver
         known = replace(solver.measured, reuse=Saving(saves_ms=self.presenter.stats.reuse_saves_ms()))
         return [asdict(item) for item in solver.plan_items(known)]
 
     def summary(self) -> dict[str, Any]:
-        """summary.json (contract 5.2)."""
+        """Return summary.json (docs/contracts.md)."""
         return {
             "clock": "simulated" if self.simulated else "real",
             **self.presenter.summary(simulated=self.simulated),
@@ -103,7 +103,7 @@ class Run:
 
 
 def scaled_stack(settings: Settings, scale: float) -> PanelStack:
-    """The configured stack with `scale` times its pixels."""
+    """Return the configured stack with `scale` times its pixels."""
     stack = settings.stack.stack()
     if scale == 1.0:
         return stack
@@ -113,20 +113,20 @@ def scaled_stack(settings: Settings, scale: float) -> PanelStack:
 
 
 class Host(Supervisor):
-    """The owner of a run, asked before its first refresh; then its supervisor. Base: asks for nothing."""
+    """Owner of a run: called during the start, then its supervisor. The base does nothing."""
 
     recorder: Any = None  # another observer, whose `watches` is called before the first refresh
 
     def starting(self, doing: str) -> bool:
-        """Something before the first refresh takes long. False: leave it."""
+        """Report a long step of the start. False: stop."""
         return True
 
     def wait_for_panel(self, why: str) -> bool:
-        """A panel is not there yet. True: try again."""
+        """Wait for a missing panel. True: try again."""
         return False
 
     def watches(self, run: Run) -> None:
-        """The run has been put together."""
+        """Take the complete run, before its first refresh."""
 
 
 def build_run(
@@ -138,9 +138,9 @@ def build_run(
     output: Output | None = None,
     on_account: Callable[[RefreshAccount], None] | None = None,
 ) -> Run:
-    """A run ready for its first refresh; whatever it holds is closed by `cleanup`.
+    """Return a run that is ready for its first refresh; `cleanup` closes all its parts.
 
-    Raises FatalError, PanelLost, Stopped where the host says so.
+    Raises FatalError, PanelLost, and Stopped on the host's request.
     """
     host = host or Host()
     if options.scale != 1.0 and settings.output.kind != "offscreen":
@@ -190,7 +190,7 @@ def build_run(
         cleanup.callback(worker.close)
         worker.start()
     if maker.run is None:
-        raise Stopped("told to stop while starting")
+        raise Stopped("stopped while starting")
     in_stack_frame = driver.capabilities.in_stack_frame
     run_cell = maker.run
     drawer = TargetDrawer(solver, stack, fov_deg=settings.content.fov_deg, shown_content=lambda: run_cell.state.content)
@@ -224,11 +224,11 @@ def build_run(
     if host.recorder is not None:
         host.recorder.watches(presenter, in_stack_frame=in_stack_frame)
     if not simulated:
-        # Looking through all that the libraries have made stops every Python thread for several refreshes.
+        # A collection through the libraries' objects would stop all Python threads for several refreshes.
         gc.collect()
         gc.freeze()
         cleanup.callback(gc.unfreeze)
-        cleanup.enter_context(niceness(PRESENTER_NICENESS))  # this thread's, once all others have been started
+        cleanup.enter_context(niceness(PRESENTER_NICENESS))  # of this thread, after all others were started
     run = Run(presenter, observer, solver, maker, simulated)
     host.watches(run)
     return run

@@ -15,45 +15,45 @@ from typing import Any
 
 from runtime.errors import TransientError
 
-# Where the daemon listens without a configuration: `ServiceSettings().socket`, without loading all settings.
+# `ServiceSettings().socket`, without loading all settings.
 DEFAULT_SOCKET = "/run/phasestack/status.sock"
 UNIT = "phasestack"
 LOOKED_UP_AGAIN_S = {"status": 0.2, "pictures": 0.3, "log": 0.5, "about": 2.0}
-LOOKED_UP_WITHIN_S = 3.0  # an answer that needs no work of the loop: a page shows that the daemon hangs after it
-LOADED_WITHIN_S = 60.0  # the daemon waits so long for a scene or a model to load before it answers a command
-TOLD_WITHIN_S = LOADED_WITHIN_S + 10.0  # a client waits longer for the answer than the daemon does
-HUNG_AFTER_S = 5.0  # a loop that has completed no turn for so long hangs
+LOOKED_UP_WITHIN_S = 3.0  # for an answer without the loop's work; after it, the page shows that the daemon hangs
+LOADED_WITHIN_S = 60.0  # longest wait of the daemon for a scene or model before it answers a command
+ANSWERED_WITHIN_S = LOADED_WITHIN_S + 10.0  # longest wait of a client
+HUNG_AFTER_S = 5.0  # without a completed turn, the loop counts as hanging
 
 
 def user_socket() -> Path | None:
-    """The socket of a daemon that runs in a person's own session; None outside a session."""
+    """Return the socket of a daemon in a user's session; None outside a session."""
     runtime_dir = os.environ.get("XDG_RUNTIME_DIR", "")
     return Path(runtime_dir) / "phasestack" / "status.sock" if runtime_dir else None
 
 
 def candidates(configured: str) -> tuple[Path, ...]:
-    """Where to look, in this order: the configured socket, then the person's own."""
+    """Return the sockets to try, in order: the configured one, then the user's own."""
     own = user_socket()
     return (Path(configured),) if own is None else (Path(configured), own)
 
 
 def sockets(config: Path | None) -> tuple[Path, ...]:
-    """The same by a configuration's file. Raises InputError, naming the file and the field."""
+    """Return the sockets to try for a configuration file. Raises InputError, naming file and field."""
     if config is None:
-        return candidates(DEFAULT_SOCKET)  # without loading all that settings need: a client is started quickly
+        return candidates(DEFAULT_SOCKET)  # without loading the settings: clients start quickly
     from runtime.config import load_settings
 
     return candidates(load_settings(config).service.socket)
 
 
 class NotRunning(TransientError):
-    """No daemon answers at the socket; the text says why and names a remedy."""
+    """No daemon answers at the socket; the text names the reason and a remedy."""
 
-    hangs = False  # there is one, and it has not answered in time
+    hangs = False  # a daemon is there, but has not answered in time
 
 
 def ask(paths: Iterable[Path], request: dict[str, Any], *, timeout_s: float = 10.0) -> dict[str, Any]:
-    """The daemon's answer. Raises NotRunning without one at any path; timeout_s: per step."""
+    """Return the daemon's answer. Raises NotRunning if none answers at any path. timeout_s: per step."""
     problems, hangs = [], False
     for path in paths:
         try:
@@ -67,11 +67,11 @@ def ask(paths: Iterable[Path], request: dict[str, Any], *, timeout_s: float = 10
 
 
 def _exchanged(path: Path, request: dict[str, Any], timeout_s: float) -> dict[str, Any]:
-    """One line there and one back."""
+    """Send one line and read one."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as channel:
         channel.settimeout(timeout_s)
         channel.connect(str(path))
-        with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # turned away: the answer says why
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # refused: the answer gives the reason
             channel.sendall(json.dumps(request).encode() + b"\n")
         with channel.makefile("rb") as answers:
             line = answers.readline()
@@ -86,50 +86,53 @@ def _advice(error: Exception) -> str:
         case FileNotFoundError():
             return "no daemon"
         case PermissionError():
-            return "not permitted (be a member of the service's group)"
+            return "not permitted (join the group phasestack)"
         case ConnectionRefusedError():
-            return "nobody listens (the daemon has died)"
+            return "the daemon has died (its socket is left)"
         case TimeoutError():
             return "no answer in time (the daemon hangs)"
     return str(error) or type(error).__name__
 
 
 def unit_advice() -> str:
-    """The systemd service's condition in its last error's words, with a remedy; empty without one."""
-    wanted = ("LoadState", "ActiveState", "Result", "ExecMainStatus", "StatusText")
+    """Return the systemd unit's state with its last error and a remedy; empty without a unit."""
+    properties = ("LoadState", "ActiveState", "Result", "ExecMainStatus", "StatusText")
     try:
         shown = subprocess.run(
-            ["systemctl", "show", UNIT, f"--property={','.join(wanted)}"], capture_output=True, text=True, timeout=5.0
+            ["systemctl", "show", UNIT, f"--property={','.join(properties)}"],
+            capture_output=True,
+            text=True,
+            timeout=5.0,
         ).stdout
     except (OSError, subprocess.TimeoutExpired):
         return ""
     unit = {name: value for name, _, value in (line.partition("=") for line in shown.splitlines())}
     if unit.get("LoadState") != "loaded":
         return ""
-    why = f"{unit['Result']}, exit status {unit['ExecMainStatus']}: {unit['StatusText'] or 'no word of it'}"
+    why = f"{unit['Result']}, exit status {unit['ExecMainStatus']}: {unit['StatusText'] or 'no message'}"
     match unit["ActiveState"], unit["Result"]:
         case "failed", "start-limit-hit":
-            return f"{UNIT} was started too often: sudo systemctl reset-failed {UNIT}, then sudo systemctl start {UNIT}"
+            return f"{UNIT} failed too often: sudo systemctl reset-failed {UNIT}; sudo systemctl start {UNIT}"
         case "failed", _:
-            return f"{UNIT} has failed ({why}); mend it, then: sudo systemctl restart {UNIT}"
+            return f"{UNIT} has failed ({why}); fix that, then: sudo systemctl restart {UNIT}"
         case "inactive", _:
             return f"{UNIT} is stopped: sudo systemctl start {UNIT}"
         case "activating" | "deactivating", _:
-            return f"{UNIT} is between two starts; why: journalctl -u {UNIT} -n 20"
+            return f"{UNIT} is restarting; for the reason: journalctl -u {UNIT} -n 20"
     return f"{UNIT} is {unit['ActiveState']}: does its configuration name another service.socket (--config)?"
 
 
 class Daemon:
-    """The daemon as seen by the page: answers are cached for all browsers. Thread-safe."""
+    """The page's access to the daemon; answers are cached for all browsers. Thread-safe."""
 
     def __init__(self, sockets: tuple[Path, ...]) -> None:
-        """sockets: where it may listen."""
+        """sockets: paths to try."""
         self._sockets = sockets
         self._locks = {name: threading.Lock() for name in LOOKED_UP_AGAIN_S}
         self._answers: dict[str, tuple[float, dict[str, Any]]] = {}
 
     def look_up(self, name: str) -> dict[str, Any]:
-        """The answer to `status`, `pictures`, `log` or `about`; without a daemon `ok` is False."""
+        """Return the answer to `status`, `pictures`, `log` or `about`; without a daemon `ok` is False."""
         with self._locks[name]:
             asked_s, answer = self._answers.get(name, (float("-inf"), {}))
             if time.monotonic() - asked_s < LOOKED_UP_AGAIN_S[name]:
@@ -139,8 +142,8 @@ class Daemon:
         return answer
 
     def tell(self, command: str, value: Any) -> dict[str, Any]:
-        """Send a command; answers its outcome."""
-        return self._asked({"command": command, "value": value}, timeout_s=TOLD_WITHIN_S)
+        """Send a command and return its outcome."""
+        return self._asked({"command": command, "value": value}, timeout_s=ANSWERED_WITHIN_S)
 
     def _asked(self, request: dict[str, Any], *, timeout_s: float) -> dict[str, Any]:
         try:

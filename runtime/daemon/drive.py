@@ -1,4 +1,4 @@
-"""The common part of `demo` and `run`: drive a loop, show progress, write files and summary."""
+"""Common part of `demo` and `run`: run the loop, show progress, write files and summary."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from runtime.support import progress
 from runtime.support.background import wait_for_all
 from runtime.support.figures import lines_of
 
-JOBS_END_WITHIN_S = 0.5  # what is still loading at the end
-USUAL_M, IPD_M = 0.6, 0.063  # where a viewer would be who was not there
+JOBS_END_WITHIN_S = 0.5  # to wait for jobs at the end
+USUAL_M, IPD_M = 0.6, 0.063  # a usual viewer, if none was seen
 
 
 def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> dict[str, Any]:
-    """Run to the end and answer the summary."""
+    """Run to the end and return the summary."""
     done = 0
 
     def advance(account: RefreshAccount) -> None:
@@ -40,7 +40,7 @@ def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> 
         run = build_run(settings, options, cleanup, host, output=output, on_account=on_account)
         reason = run.presenter.run(frames=options.frames)
         for sample in run.presenter.samples.recorded_ahead():
-            run.observer.sampled(sample)  # the last lights' truth: nothing else is done with it
+            run.observer.sampled(sample)  # true eyes at the last display times
         run.observer.finish(lambda: host is not None and bool(host.stop_reason()))
         summary = run.summary() | {"stopped": reason}
         if output is not None:
@@ -54,23 +54,23 @@ def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> 
 
 
 def _unseen(layers: U8, account: RefreshAccount, run: Run, settings: Settings) -> str:
-    """The last refresh to look into, where nothing was measured."""
+    """Return a viewer page of the last refresh, for a run that measured nothing."""
     stack, is_flat = run.presenter.stack, account.solved_for_m is None
     away_m = max(USUAL_M, stack.x_m[-1] + USUAL_M / 2)
     eyes_m = np.array([[away_m, -IPD_M / 2, 0.0], [away_m, IPD_M / 2, 0.0]])
     eyes_m = eyes_m if account.eyes_m is None else account.eyes_m
-    title = "Nobody was seen: the picture for eyes anywhere" if is_flat else "The last refresh, not measured"
+    title = "Nobody was seen: the flat picture" if is_flat else "The last refresh, not measured"
     fov_deg = settings.content.fov_deg
     return viewer_html(layers, (), stack, eyes_m=eyes_m, fov_deg=fov_deg, title=title, follows=not is_flat)
 
 
 def print_summary(summary: dict[str, Any], out: Path | None) -> None:
-    """For a person: what summary.json holds, what was measured first, and which figure of it to quote."""
+    """Print the summary for a person: measured figures first, and which one to quote."""
     configured = summary["configured"]
     for line in lines_of({name: value for name, value in summary.items() if name not in (*configured, "configured")}):
         print(line)
     if configured:
-        print("as configured, on the simulated clock (nothing of it was measured):")
+        print("on the simulated clock, as configured (not measured):")
         for line in lines_of({name: summary[name] for name in configured}):
             print(f"  {line}")
     if summary["live_db"] is not None:

@@ -10,18 +10,18 @@ from runtime.clock import Clock
 from runtime.records import State
 
 NS_PER_US = 1000
-START_STEP_S = 60.0  # that no step of a start takes, on the slowest machine
-SETTLED_AFTER = 100  # presented refreshes: the first ones compile shaders, seconds each at a twentieth of a core
+START_STEP_S = 60.0  # longest step of a start, on the slowest machine
+SETTLED_AFTER = 100  # presented refreshes: the first ones compile shaders, for seconds each on a slow machine
 
 
 class Notifier:
-    """The supervisor's side of the daemon. Never blocks, never raises."""
+    """The daemon's messages to systemd. Never blocks, never raises."""
 
     def __init__(self, clock: Clock, environment: Mapping[str, str] = os.environ) -> None:
-        """`environment` only says whether and how often the watchdog wants to be fed (sd_watchdog_enabled)."""
+        """environment: has the watchdog's period (sd_watchdog_enabled)."""
         self._clock = clock
         self._channel: Any = None
-        if "NOTIFY_SOCKET" in os.environ:  # sdnotify leaves a socket open where there is nobody to tell
+        if "NOTIFY_SOCKET" in os.environ:  # otherwise sdnotify would leave a socket open
             import sdnotify
 
             self._channel = sdnotify.SystemdNotifier()
@@ -35,25 +35,25 @@ class Notifier:
 
     @property
     def supervised(self) -> bool:
-        """True under a supervisor: wait for what is missing, rather than refuse."""
+        """True under a supervisor: wait for missing parts rather than refuse to start."""
         return self._channel is not None and self._channel.socket is not None
 
     def ready(self) -> None:
-        """Report ready: the first frame is shown, or panels are waited for. Later calls do nothing."""
+        """Report that the first frame is shown, or that panels are awaited. Later calls do nothing."""
         if not self._ready:
             self._ready = True
             self._send("READY=1")
             self.starting()
 
     def status(self, text: str) -> None:
-        """One line for `systemctl status`; sent when it changes."""
+        """Set the line in `systemctl status`; sent when it changes."""
         line = " ".join(text.split())
         if line != self._status:
             self._status = line
             self._send(f"STATUS={line}")
 
     def starting(self) -> None:
-        """Report progress until it runs steadily: extends the start's or the watchdog's time-out."""
+        """Report progress of the start: extends its timeout, or the watchdog's."""
         step_us = round(START_STEP_S * 1e6)
         if not self._ready:
             self._send(f"EXTEND_TIMEOUT_USEC={step_us}")
@@ -62,12 +62,11 @@ class Notifier:
             self._send(f"WATCHDOG_USEC={step_us}\nWATCHDOG=1")
 
     def refreshed(self, state: State, missing: tuple[str, ...], *, presented: bool) -> None:
-        """One refresh is complete: feeds the watchdog, if it was presented.
+        """Feed the watchdog after a presented refresh, at most four times per period.
 
-        The rule: the presenter's clock alone feeds it. A solver that fails or hangs leaves the last solution on the
-        panels, aligned to the eyes, and is made anew by itself: no reason to restart. Where a panel is missing
-        nothing can be presented, and a completed refresh is enough. Before READY the start's own limit
-        watches, until a hundred refreshes after it a longer period. Sent at most four times per watchdog period.
+        The solver does not feed it: while it fails or restarts, the last solution stays on the panels, aligned to the
+        eyes. While a panel is missing, a completed refresh is enough. Before READY the start's own limit applies, and
+        for a hundred refreshes after it a longer period.
         """
         alive = presented or (state is State.DEGRADED and "panel" in missing)
         if not (alive and self._watchdog_ns):
@@ -82,21 +81,21 @@ class Notifier:
             self._send("WATCHDOG=1")
 
     def reloading(self) -> None:
-        """The configuration is being read again; `reloaded` ends it. Silent before the first READY."""
+        """Report that the configuration is being read; `reloaded` ends it. Silent before the first READY."""
         if self._ready:
             self._send(f"RELOADING=1\nMONOTONIC_USEC={self._clock.now_ns() // NS_PER_US}")
 
     def reloaded(self) -> None:
-        """Reading the configuration is over, whether it was taken or refused."""
+        """Report that the new configuration was accepted or refused."""
         if self._ready:
             self._send("READY=1")
 
     def stopping(self, reason: str) -> None:
-        """The daemon is going down on purpose."""
+        """Report that the daemon stops on purpose."""
         self._send(f"STOPPING=1\nSTATUS=stopping: {' '.join(reason.split())}")
 
     def close(self) -> None:
-        """Release the socket. May be called twice."""
+        """Close the socket. May be called twice."""
         if self.supervised:
             self._channel.socket.close()
             self._channel.socket = None
@@ -107,6 +106,6 @@ class Notifier:
 
 
 def watchdog_ns(environment: Mapping[str, str]) -> int:
-    """The watchdog's period; 0 where there is none or it is another process's."""
+    """Return the watchdog's period; 0 without one for this process."""
     ours = int(environment.get("WATCHDOG_PID", os.getpid())) == os.getpid()
     return int(environment.get("WATCHDOG_USEC", "0")) * NS_PER_US if ours else 0

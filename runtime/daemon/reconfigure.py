@@ -1,4 +1,4 @@
-"""A change of settings during a run: loaded beside the solver, taken over between two steps."""
+"""A change of settings during a run: loaded in the background, adopted between two solutions."""
 
 from __future__ import annotations
 
@@ -30,36 +30,36 @@ Ready = tuple[Opener | None, Predictor | None]  # None: stays as it is
 
 
 class Reconfiguration:
-    """One change of settings, all or nothing: it takes effect once everything it needs is loaded.
+    """One change of settings, all or nothing, which takes effect once everything is loaded.
 
-    Begun by whoever asks; `advance` is a task of the solver's thread, until it answers True; then `finished` is
-    set, and `problem` says whether it was refused.
+    A job loads; then `advance`, a task of the solver's thread, adopts the result. The presenter's thread polls
+    `finished`, then reads `problem`.
     """
 
     def __init__(
         self, read: Callable[[], Settings], old: Settings, stack: PanelStack, *, reload_content: bool = False
     ) -> None:
-        """Begins to load; returns at once. read: the other settings, on another thread; may raise InputError.
+        """Start loading. read: the new settings, called by the job; may raise InputError.
 
-        reload_content: read it again, though its settings are the same.
+        reload_content: also if its settings are the same.
         """
         self._read, self._old, self._stack, self._reload_content = read, old, stack, reload_content
         self.settings = old
         self._calibration: Calibration
         self.abandoned = False
         self._begun_s = time.monotonic()
-        self.progress = ""  # what is being made ready, for the status
-        self.problem = ""  # one line, where it can't be done
-        self._taker: RunningSolver | None = None  # that takes it over
+        self.progress = ""  # the present stage of loading, for the status
+        self.problem = ""  # one line if it was refused
+        self._adopter: RunningSolver | None = None  # the solver that adopts it
         self._finished = False
         self._job = Job("reconfiguration", self._make_ready)
 
     def abandon(self) -> None:
-        """It is no longer wanted; nothing of it stays."""
+        """Cancel the change and discard its results."""
         self.abandoned = True
 
     def advance(self, parts: Any) -> bool:
-        """True once it was taken over, refused or abandoned. Uploads to GL: for the solver's thread."""
+        """Adopt loaded parts on the solver's thread. Return True when adopted, refused or abandoned."""
         assert isinstance(parts, RunningSolver)
         if not self._job.done:
             return False
@@ -71,22 +71,22 @@ class Reconfiguration:
                 if predictor is not None:
                     predictor.close()
             else:
-                self._taker = parts
+                self._adopter = parts
                 self._take_over(parts, opener, predictor)
-        Job("memory", give_back)  # what was replaced is large, and nobody waits for it
+        Job("memory", give_back)  # the replaced parts may be large
         self._finished = True
         return True
 
     @property
     def finished(self) -> bool:
-        """True once taken over or refused; also where the solver hangs in it, or it was abandoned."""
-        if not self._finished and self._taker is not None and not self._taker.is_newest:
+        """True once adopted or refused, or if the solver hangs in it or it hangs after being abandoned."""
+        if not self._finished and self._adopter is not None and not self._adopter.is_newest:
             self.problem, self._finished = LEFT_BEHIND, True
         is_stuck = self.abandoned and time.monotonic() - self._begun_s > LIMITS.load_s
         return self._finished or is_stuck
 
     def _make_ready(self) -> Ready:
-        """On the job's thread: all that takes long."""
+        """Load everything that takes long; on the job's thread."""
         opener = predictor = None
         self.settings = settings = self._read()
         file = settings.calibration.file
@@ -96,7 +96,7 @@ class Reconfiguration:
         model = settings.model.name
         with listening(self._listen):
             if has_model and model not in SHIPPED and Path(model).is_file():
-                self.progress = "trying it out"
+                self.progress = "testing the model"
                 in_child(_tried, settings, source=model, seconds=MODEL_S)
             if has_content:
                 self.progress = f"loading {settings.content.scene}"
@@ -113,9 +113,9 @@ class Reconfiguration:
             self.progress = f"{what}: {done} of {total}" if total else f"{what}: {done}" if done else what
 
     def _take_over(self, parts: RunningSolver, opener: Opener | None, predictor: Predictor | None) -> None:
-        """One new state, and what it replaces is closed; where the upload fails, nothing changes."""
+        """Replace the state and close the replaced parts; if the upload fails, keep everything."""
         now, moved = parts.run.state.settings.content, {}
-        if now.scene == self.settings.content.scene:  # another scene stands as the configuration has it
+        if now.scene == self.settings.content.scene:  # another scene is placed as configured
             moved = moved_since(self._old.content, now)
         placed = self.settings.content.model_copy(update=moved)
         settings = self.settings.model_copy(update={"content": placed})
@@ -136,7 +136,7 @@ class Reconfiguration:
             except PhasestackError as error:
                 self.problem = str(error)
                 return
-            except (Exception, SystemExit) as error:  # a GL driver's or a library's own: what is shown goes on
+            except (Exception, SystemExit) as error:  # from a GL driver or a library: the present scene continues
                 self.problem = f"{self.settings.content.scene}: {written(error)}"
                 return
             undo.pop_all()
@@ -147,15 +147,15 @@ class Reconfiguration:
 
 
 def _tried(settings: Settings) -> None:
-    """Load a model of nobody knows whom, and solve with it, where that ends nothing but a child process."""
+    """Load an untrusted model and solve with it, in a child process that it may crash."""
     ready_predictor(settings, settings.stack.stack()).close()
 
 
 def moved_since(before: ContentSettings, now: ContentSettings) -> dict[str, Any]:
-    """Where a scene stands now, in what that has changed."""
+    """Return the settings of a scene's placement that have changed, with their new values."""
     return {key: getattr(now, key) for key in PLACING if getattr(now, key) != getattr(before, key)}
 
 
 def _model_part(settings: Settings) -> Any:
-    """All that decides which predictor there is, but what is asked anew for every solution."""
+    """Return the model settings that need another predictor, without those that each solution reads."""
     return settings.model.model_copy(update={"budget_ms": 0.0, "eye_sigma_mm": "auto"})

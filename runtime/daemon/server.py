@@ -1,4 +1,4 @@
-"""The status and control socket: JSON lines over a local socket of mode 0660, on its own thread."""
+"""Status and control socket: JSON lines over a local socket of mode 0660, on its own thread."""
 
 from __future__ import annotations
 
@@ -30,36 +30,36 @@ from runtime.support.artifacts import to_json
 
 log = logging.getLogger("phasestack.service")
 
-GROUP = "phasestack"  # that may use the socket
-LOOP_ANSWERS_WITHIN_S = 5.0  # a command that the loop has not begun by then is refused
+GROUP = "phasestack"  # members may use the socket
+LOOP_ANSWERS_WITHIN_S = 5.0  # a command not begun by then is refused
 LOOKED_AGAIN_S = 0.1  # between checks whether the client is still connected
-ALONE_WITHIN_S = 2.0  # the folder's lock is waited for: nobody holds it longer who takes a socket over
+LOCKED_WITHIN_S = 2.0  # to wait for the folder's lock, which is only held briefly
 
 
 class SocketInUse(TransientError):
-    """Another phasestack has the socket; the text says which."""
+    """Another phasestack owns the socket; the text names it."""
 
 
 class StatusServer(Listener):
-    """Answers `status` from the last published snapshot, and hands everything else to the loop.
+    """Answers `status` from the last published snapshot, and queues commands for the loop.
 
-    The loop publishes (`publish`) and drains (`commands`); it never waits for a client. Where the loop hangs,
-    `status` still answers, and says for how long no turn was completed.
+    The presenter's loop calls `publish` and takes `commands`, and never waits for a client. `status` also answers when
+    the loop hangs, and gives the age of its last turn.
     """
 
     def __init__(self, path: Path, *, clock: Clock) -> None:
-        """Raises SocketInUse where the socket belongs to a running daemon, InputError where it can't be made."""
+        """Raises SocketInUse if a running daemon owns the socket, InputError if it cannot be created."""
         self.path = path
         self.commands: queue.SimpleQueue[Command] = queue.SimpleQueue()
-        self.lookups: dict[str, Callable[[], dict[str, Any]]] = {}  # answered at once, on the server's thread
+        self.lookups: dict[str, Callable[[], dict[str, Any]]] = {}  # called on the server's thread
         self._clock = clock
         self._started_ns = clock.now_ns()
         self._snapshot: tuple[int, Callable[[], dict[str, Any]]] = (self._started_ns, dict)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with _alone_in(path.parent):
+            with _locked(path.parent):
                 _check_dead(path)
-                # The mode must hold from the first moment, so it is the mask that makes it, not a later chmod.
+                # By the mask, not by chmod: the mode must be right from the first moment.
                 mask = os.umask(0o117)
                 try:
                     super().__init__("status", lambda serve: asyncio.start_unix_server(serve, path, **LIMITED))
@@ -67,33 +67,33 @@ class StatusServer(Listener):
                     os.umask(mask)
                 self._own = path.lstat().st_ino
         except OSError as error:
-            raise InputError("service", "socket", f"{path} can't be made ({error.strerror or error})") from error
+            raise InputError("service", "socket", f"{path} cannot be created ({error.strerror or error})") from error
         try:
-            wanted = grp.getgrnam(GROUP).gr_gid
-            if path.lstat().st_gid != wanted:  # a service's sandbox may refuse even what changes nothing
-                os.chown(path, -1, wanted)
+            group = grp.getgrnam(GROUP).gr_gid
+            if path.lstat().st_gid != group:  # a service's sandbox may refuse even a chown without effect
+                os.chown(path, -1, group)
         except (KeyError, PermissionError):
-            log.info("the status socket is this user's alone: group %s is not there or not ours", GROUP)
+            log.info("only this user can use the status socket: no group %s, or not a member", GROUP)
         self.start()
 
     def publish(self, snapshot: Callable[[], dict[str, Any]]) -> None:
-        """The newest account of the loop, once a turn; called (if ever) on the server's thread.
+        """Replace the snapshot, once a turn; called on the server's thread when a client asks.
 
-        A callable, so that a turn costs nothing where nobody asks: it must only read what no longer changes.
+        A callable, so that a turn without clients costs nothing: it must only read values that no longer change.
         """
         self._snapshot = (self._clock.now_ns(), snapshot)
 
     def close(self) -> None:
-        """Answer what waits, stop, and remove the socket. May be called twice."""
+        """Answer pending requests, stop, and remove the socket. May be called twice."""
         if self._thread is None:
             return
         super().close()
         with contextlib.suppress(OSError):
-            if self.path.lstat().st_ino == self._own:  # where it was deleted, another daemon's may be there
+            if self.path.lstat().st_ino == self._own:  # otherwise it is another daemon's
                 self.path.unlink()
 
     def answer(self, line: bytes) -> dict[str, Any] | Command:
-        """The answer to a request (`ok`; `error` says why not), or a command for the loop."""
+        """Return the answer to a request, or a command for the loop."""
         try:
             request = json.loads(line)
         except (ValueError, RecursionError):
@@ -122,7 +122,7 @@ class StatusServer(Listener):
     # On the server's thread.
 
     async def converse(self, reader: StreamReader, writer: StreamWriter) -> None:
-        """As many requests as the client likes."""
+        """Answer requests until the client disconnects."""
         while line := await self.request(reader, b"\n"):
             await self.send(writer, await self._reply(line, writer))
 
@@ -133,12 +133,12 @@ class StatusServer(Listener):
         try:
             answer = self.answer(line)
         except Exception:
-            log.exception("a request could not be answered")
-            answer = {"ok": False, "error": "the request could not be answered: see the log"}
+            log.exception("request failed")
+            answer = {"ok": False, "error": "the request failed: see the log"}
         if isinstance(answer, Command):
             if _is_gone(writer):
                 raise Refusal("nothing was done")
-            log.info("asked for: %s", answer.name if answer.value is None else f"{answer.name} {answer.value}")
+            log.info("command: %s", answer.name if answer.value is None else f"{answer.name} {answer.value}")
             self.commands.put(answer)
             answer = await _outcome(answer, writer)
         return _line(answer)
@@ -149,7 +149,7 @@ def _line(answer: dict[str, Any]) -> bytes:
 
 
 def _is_gone(writer: StreamWriter) -> bool:
-    """Whether a client has gone; one that only sends no more has not."""
+    """True if a client has disconnected, and not only stopped sending."""
     if writer.is_closing():
         return True
     hung_up = select.poll()
@@ -158,8 +158,7 @@ def _is_gone(writer: StreamWriter) -> bool:
 
 
 async def _outcome(command: Command, writer: StreamWriter) -> dict[str, Any]:
-    """What becomes of a command. One that the loop has not taken in time, or before its asker went, is given up: it is
-    never done."""
+    """Wait for a command's outcome; cancel it if it does not begin in time, or the client is gone."""
     answer = asyncio.wrap_future(command.answer)
     until_s = time.monotonic() + LOOP_ANSWERS_WITHIN_S
     try:
@@ -167,23 +166,23 @@ async def _outcome(command: Command, writer: StreamWriter) -> dict[str, Any]:
         while not done and time.monotonic() < until_s and not _is_gone(writer):
             done, _ = await asyncio.wait({answer}, timeout=min(LOOKED_AGAIN_S, LOOP_ANSWERS_WITHIN_S))
         if not done and command.answer.cancel():
-            problem = f"the loop did not answer within {LOOP_ANSWERS_WITHIN_S:g} s: nothing was done"
+            problem = f"no answer from the display loop within {LOOP_ANSWERS_WITHIN_S:g} s: nothing was done"
             return {"ok": False, "error": problem}
         done, _ = await asyncio.wait({answer}, timeout=LOADED_WITHIN_S)
     except asyncio.CancelledError as stops:
         raise Refusal(stops.args[0] + (": nothing was done" if command.answer.cancel() else "")) from None
     if done:
         return answer.result()
-    return {"ok": True, "note": f"still loading after {LOADED_WITHIN_S:g} s: ask `phasestack status`"}
+    return {"ok": True, "note": f"still loading after {LOADED_WITHIN_S:g} s: see `phasestack status`"}
 
 
 @contextlib.contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
-    """Of several that look for a dead socket and put their own in its place, one at a time."""
+def _locked(folder: Path) -> Iterator[None]:
+    """Lock a folder, so that one daemon at a time replaces a dead socket."""
     opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
-        until_s = time.monotonic() + ALONE_WITHIN_S
-        while time.monotonic() < until_s:  # for ever, where somebody holds it who need not
+        until_s = time.monotonic() + LOCKED_WITHIN_S
+        while time.monotonic() < until_s:  # another program may hold it for ever
             with contextlib.suppress(BlockingIOError):
                 fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
@@ -194,7 +193,7 @@ def _alone_in(folder: Path) -> Iterator[None]:
 
 
 def _check_dead(path: Path) -> None:
-    """Raise InputError where something else than a socket is there, SocketInUse where one is listened to."""
+    """Raise InputError if the path is not a socket, SocketInUse if a daemon listens on it."""
     if not os.path.lexists(path):
         return
     if not stat.S_ISSOCK(path.lstat().st_mode):
@@ -215,10 +214,10 @@ def _check_dead(path: Path) -> None:
 
 
 def open_status_server(settings: ServiceSettings, *, clock: Clock, supervised: bool) -> StatusServer | None:
-    """The socket that the settings name; in a user's session, where that fails, the user's own.
+    """Open the configured socket; in a user's session without permission, the user's own.
 
-    Under a supervisor it is the socket or nothing: raises SocketInUse where another phasestack has it, InputError
-    where it can't be made. A run by hand then goes on without one, and the log says why.
+    Under a supervisor, raises SocketInUse if another phasestack owns it, InputError if it cannot be created. A run by
+    hand logs a warning and continues without one.
     """
     path = Path(settings.socket)
     own = user_socket()

@@ -1,4 +1,4 @@
-"""Signals become flags that the loop reads at its own pace."""
+"""Signals as flags that the loop reads at its own pace."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from runtime.support.background import STOPS_WITHIN_S, ends_by
 
 
 class Signals:
-    """SIGTERM and SIGINT ask to stop, SIGHUP asks to reload. A second SIGINT interrupts whatever runs.
+    """Flags of SIGTERM and SIGINT (stop) and SIGHUP (reload). A second SIGINT raises KeyboardInterrupt.
 
-    A context manager, on the main thread: the handlers before it are back afterwards.
+    A context manager on the main thread, which restores the previous handlers.
     """
 
     def __init__(self) -> None:
-        self.stop = ""  # which signal asked to stop
+        self.stop = ""  # name of the signal that asked to stop
         self._reload = False
         self._previous: dict[signal.Signals, Any] = {}
 
@@ -36,7 +36,7 @@ class Signals:
         ends_by(math.inf)
 
     def take_reload(self) -> bool:
-        """True once for each time (or burst) that a reload was asked for."""
+        """Return True once after one or more reload signals."""
         asked, self._reload = self._reload, False
         return asked
 

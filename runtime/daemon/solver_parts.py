@@ -1,4 +1,4 @@
-"""A solver with its GL context, content and model: what one solver thread makes, uses and releases."""
+"""A solver with its GL context, content and model; one thread creates, uses and releases it."""
 
 from __future__ import annotations
 
@@ -30,34 +30,34 @@ WARM_EYES_M = ((0.6, -0.031, 0.0), (0.6, 0.031, 0.0))
 
 @dataclass(eq=False)
 class RunningSolver:
-    """`SolverParts` of a real run; made and used on one thread."""
+    """`SolverParts` of a real run; created and used on one thread."""
 
     run: RunCell
     solver: Solver
     backend: Choice  # of every model
     context: Any  # current on this thread
-    owns_context: bool  # it is released with the rest
+    owns_context: bool  # and released with the rest
     contexts_lost: Callable[[], int]
     generation: int
-    _held: RunState = field(init=False)  # whose content and model are this solver's to close
+    _owned: RunState = field(init=False)  # its content and model are closed by this solver
 
     def __post_init__(self) -> None:
-        self._held, self._lost_before = self.run.state, self.contexts_lost()
+        self._owned, self._lost_before = self.run.state, self.contexts_lost()
 
     @property
     def is_newest(self) -> bool:
-        """False once another solver has begun: this one changes nothing any more."""
+        """False once another solver has begun; then this one must not change anything."""
         return self.run.generation == self.generation
 
     def replace(self, **changes: Any) -> RunState:
-        """`RunCell.replace` by this solver; raises Stopped where another has begun."""
+        """Call `RunCell.replace` for this solver; raises Stopped if another has begun."""
         before = self.run.replace(self.generation, **changes)
-        self._held = replace(before, **changes)
+        self._owned = replace(before, **changes)
         return before
 
     @property
     def content(self) -> ContentSource:
-        """What is drawn at present."""
+        """The present content."""
         return self.run.state.content
 
     def step(self, request: SolveRequest) -> SolverUpdate:
@@ -65,25 +65,25 @@ class RunningSolver:
             raise ContextLost("the panels have lost their OpenGL context")
         state = self.run.state  # before looking whether it is another solver's
         if not self.is_newest:
-            raise Stopped("it had been left behind")
-        self._held = state
+            raise Stopped("this solver was abandoned")
+        self._owned = state
         return self.solver.step(request, state)
 
     def simulated_stage_ms(self) -> Mapping[str, float]:
         return self.run.state.settings.loop.simulated_stage_ms
 
     def close(self) -> None:
-        state = self.run.state if self.is_newest else self._held
+        state = self.run.state if self.is_newest else self._owned
         own = [leave_context, self.context.release] if self.owns_context else []
         for release in (state.content.close, state.predictor.close, self.backend.backend.close, *own):
             try:
                 release()
-            except Exception as error:  # of a context that is lost there is nothing to release
+            except Exception as error:  # a lost context has nothing to release
                 log.warning("solver: closing it: %s", error)
 
 
 class SolverMaker:
-    """Makes a solver on the calling thread, and again with the present settings after a hang."""
+    """Creates a solver on the calling thread; after a hang, another one with the present settings."""
 
     def __init__(
         self,
@@ -93,16 +93,16 @@ class SolverMaker:
         *,
         contexts_lost: Callable[[], int] = lambda: 0,
     ) -> None:
-        """contexts_lost: by the panels, so far; asked from any thread."""
+        """contexts_lost: number lost by the panels; called on any thread."""
         self._settings, self._stack, self._calibration = settings, stack, calibration
         self.run: RunCell | None = None  # from the first solver on
         self.parts: RunningSolver | None = None  # the newest
-        self._wanted: Wanted = settings.model.backend
+        self._device: Wanted = settings.model.backend
         self._contexts_lost = contexts_lost
-        self._prepared: tuple[ContentSettings, Opener] | None = None  # read, and not made into a source yet
+        self._prepared: tuple[ContentSettings, Opener] | None = None  # content that was read but not yet opened
 
     def __call__(self, *, context: Any = None, simulated: bool = False) -> RunningSolver:
-        """context: shared with the panels; None: the thread's own. Raises FatalError, leaving nothing open."""
+        """context: shared with the panels; None: a new one. Raises FatalError, leaving nothing open."""
         own = context is None
         generation = self.run.begin() if self.run is not None else 0
         settings = self.run.state.settings if self.run is not None else self._settings
@@ -138,25 +138,25 @@ class SolverMaker:
         return parts
 
     def _opener(self, content: ContentSettings) -> Opener:
-        """What the settings name, read; not again where the solver before this one did not come to use it."""
+        """Return the content that was read; the previous solver's if that did not get to open it."""
         prepared = self._prepared
         if prepared is None or prepared[0] != content:
             prepared = self._prepared = content, prepare_content(content, self._stack)
         return prepared[1]
 
     def _chosen(self, predictor: Predictor, context: Any, *, simulated: bool) -> Choice:
-        """The backend; the one that was found before, where a solver is made anew.
+        """Choose the device; a restarted solver keeps the first choice.
 
-        Simulated time has no use for a faster one, and two of its runs are the same to the byte.
+        Simulated time gains nothing from a faster one, and its runs must be identical to the byte.
         """
-        wanted = "cpu" if simulated and self._wanted == "auto" else self._wanted
-        choice = choose(wanted, predictor, lambda: context)
-        self._wanted = "gl" if choice.backend.name == "gl" else "cpu"
+        device = "cpu" if simulated and self._device == "auto" else self._device
+        choice = choose(device, predictor, lambda: context)
+        self._device = "gl" if choice.backend.name == "gl" else "cpu"
         return choice
 
 
 def ready_predictor(settings: Settings, stack: PanelStack) -> Predictor:
-    """The model of the settings, warm. Raises InputError, MissingPart."""
+    """Return the configured model, warmed up. Raises InputError, MissingPart."""
     predictor = load_predictor(settings.model.name, stack, settings.model)
     try:
         predictor.warm_up(np.array(WARM_EYES_M))

@@ -1,4 +1,4 @@
-"""Answers of the socket about a run: status, constant facts, and pictures."""
+"""Answers of the socket about a run: status, constant facts and pictures."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ IN_LIBRARY = {*PICTURES, *VIDEOS, *MESHES, *PLAYLISTS, ".ply"}
 
 
 def placing_in(settings: Settings) -> dict[str, Any]:
-    """What `place` may change, as it is in the settings."""
+    """Return the settings that `place` may change."""
     return settings.content.model_dump(include=set(PLACING))
 
 
 def holds(presenter: Presenter) -> dict[str, Any]:
-    """The operator's present choices: the answer to every command."""
+    """Return the operator's present choices, the answer to every command."""
     state = presenter.run_cell.state
     return {
         "scene": state.settings.content.scene,
@@ -51,7 +51,7 @@ def holds(presenter: Presenter) -> dict[str, Any]:
 
 
 def shown(presenter: Presenter, account: RefreshAccount, link: BrowserLink) -> dict[str, Any]:
-    """Figures of each refresh for a page that shows the panels."""
+    """Return the figures of a refresh for a page that shows the panels."""
     assert presenter.last is not None
     frame, solution = presenter.last.frame, presenter.last.solution
     return {
@@ -70,7 +70,7 @@ def shown(presenter: Presenter, account: RefreshAccount, link: BrowserLink) -> d
 
 
 def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
-    """What `status` answers."""
+    """Return the answer to `status`."""
     presenter = run.presenter
     machine, stats, state = presenter.machine, presenter.stats, presenter.run_cell.state
     return {
@@ -92,7 +92,7 @@ def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
         "eyes_label": account.eyes_label,
         "eye_sigma_now_mm": account.eye_sigma_mm,
         "solution": account.solution,
-        # What was solved for an instant after this light has no age yet.
+        # A solution for an instant after this display time has no age yet.
         "solution_age_now_ms": None if account.solution_age_ms is None else max(0.0, account.solution_age_ms),
         "effort": account.effort,
         "light_db": None if run.observer.moment is None else run.observer.moment.light_db,
@@ -114,7 +114,7 @@ def _view_error_now_mm(account: RefreshAccount) -> float | None:
 
 
 def about(run: Run) -> dict[str, Any]:
-    """Facts that do not change during a run, and the available scenes, for the page."""
+    """Return facts that do not change during a run, and the available scenes, for the page."""
     settings, stack = run.presenter.run_cell.state.settings, run.presenter.stack
     return {
         "version": version(),
@@ -128,9 +128,9 @@ def about(run: Run) -> dict[str, Any]:
 
 
 def library_scenes(settings: ContentSettings) -> tuple[str, ...]:
-    """Full paths of the library folder's scenes, up to the page's limit.
+    """Return the paths of the library folder's scenes, up to the page's limit.
 
-    A name that is not UTF-8 (no setting can hold it) or that can't be printed is left out.
+    Names that are not printable UTF-8 are skipped: no setting can hold them.
     """
     if not settings.library:
         return ()
@@ -144,7 +144,7 @@ def library_scenes(settings: ContentSettings) -> tuple[str, ...]:
 
 
 def pictures(run: Run) -> dict[str, Any]:
-    """The pictures shown now, as JPEGs in base64, for the page."""
+    """Return the pictures shown now, as JPEGs in base64, for the page."""
     refresh = run.presenter.last
     if refresh is None:
         return {"frame": None, "jpegs": {}}
@@ -158,10 +158,10 @@ JPEG_QUALITY = 80  # of the page's small pictures
 
 
 def pictures_of(refresh: Refresh, stack: PanelStack, *, fov_deg: float) -> dict[str, bytes]:
-    """JPEGs of a refresh: `layer-0` (rear) onwards, `seen-left`, `seen-right`; none before the first.
+    """Return JPEGs of a refresh: `layer-0` (rear) onwards, `seen-left`, `seen-right`.
 
-    Layers are as they were solved, made small, and seen from the eyes that they were solved for: what is exact would
-    cost more than a refresh.
+    Layers are those of the solution, reduced, and seen from the eyes solved for: exact ones would take longer than a
+    refresh.
     """
     frame, account = refresh.frame, refresh.account
     is_flat = frame.solved is None or (frame.flat is not None and frame.flatness > 0.5)
@@ -184,7 +184,7 @@ def pictures_of(refresh: Refresh, stack: PanelStack, *, fov_deg: float) -> dict[
 
 
 def _jpeg(image: U8) -> bytes:
-    """Of an (h, w, 3 or 4) picture, without its fourth channel."""
+    """Return an (h, w, 3 or 4) picture as JPEG, without its fourth channel."""
     done, coded = cv2.imencode(".jpg", image[..., 2::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not done:
         raise ValueError("JPEG encoding failed")

@@ -112,7 +112,7 @@ class Daemon(Host):
         return not self._signals.stop
 
     def starting(self, doing: str) -> bool:
-        """Ask systemd for more time, and report what the start is doing."""
+        """Ask systemd for more time, and report the step of the start."""
         self._notifier.starting()
         self._notifier.status(f"starting ({doing})")
         if self._server is not None:

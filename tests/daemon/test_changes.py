@@ -456,4 +456,4 @@ def test_an_address_s_password_appears_in_no_answer_log_or_black_box(
             told += [message.data for *_, message in reader.iter_messages()]
     assert "127.0.0.1:9" in str(told) and "secret" not in str(told)
     formatted = [TextFormat(journald=True).format(record) for record in caplog.records]
-    assert any("asked for: scene rtsp" in line for line in formatted) and "secret" not in str(formatted)
+    assert any("command: scene rtsp" in line for line in formatted) and "secret" not in str(formatted)

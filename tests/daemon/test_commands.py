@@ -72,7 +72,7 @@ def test_a_loop_that_stands_still_is_a_failure(server: StatusServer, clock: Simu
     clock.advance_ns(6 * NS_PER_S)
     result = ask_status(server.path)
     assert result.exit_code == 1
-    assert "has not completed a turn for 6 s" in result.stderr
+    assert "the display loop has hung for 6 s" in result.stderr
 
 
 def test_without_a_daemon_status_fails_with_one_line(tmp_path: Path) -> None:
@@ -86,7 +86,7 @@ def test_without_a_daemon_status_fails_with_one_line(tmp_path: Path) -> None:
     ("state", "result", "told"),
     [
         ("inactive", "success", "is stopped: sudo systemctl start phasestack"),
-        ("failed", "exit-code", "exit status 2: a.toml: stack: no); mend it, then: sudo systemctl restart phasestack"),
+        ("failed", "exit-code", "exit status 2: a.toml: stack: no); fix that, then: sudo systemctl restart phasestack"),
         ("failed", "start-limit-hit", "sudo systemctl reset-failed phasestack"),
         ("activating", "success", "journalctl -u phasestack"),
     ],
@@ -139,5 +139,5 @@ def test_every_command_arrives(
 
 
 def test_a_refusal_is_bad_input(server: StatusServer) -> None:
-    with pytest.raises(InputError, match="place wants an object"):
+    with pytest.raises(InputError, match="place needs an object"):
         ctl.tell({"command": "place", "value": 1e8}, configuration(server.path))

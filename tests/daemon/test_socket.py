@@ -157,7 +157,7 @@ def test_without_a_daemon_the_client_says_what_to_do(path: Path) -> None:
     path.parent.mkdir()
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(str(path))
-    with pytest.raises(NotRunning, match="nobody listens"):
+    with pytest.raises(NotRunning, match="the daemon has died"):
         status(path)
 
 

@@ -38,8 +38,8 @@ def test_a_scene_is_moved_at_once_and_put_back(tmp_path: Path) -> None:
 
 def test_a_place_that_is_none_is_refused_and_the_scene_stays(tmp_path: Path) -> None:
     refusals = [
-        ({"offset": 1}, "value.offset: place knows scale"),
-        ("left", "value: place wants an object"),
+        ({"offset": 1}, "value.offset: place takes scale"),
+        ("left", "value: place needs an object"),
         ({"scale": "large"}, "place: scale:"),
         ({"scale": 1e9}, "place: scale:"),
         ({"offset_m": [0, 0]}, "place: offset_m.2:"),

@@ -141,7 +141,7 @@ def solved(model: str, problem: StiffProblem) -> Answer:
     note = f"no panels leave less than {least:.3g}"
     if residual < 0.8 * least - SOLVE_FLOOR:  # slightly different rows can do with less
         return Answer(math.nan, 1.0, problem.condition(), note=f"{residual:.3g} is impossible: {note}")
-    # Alternating between the eyes leaves all of the difference to one of them; nothing is worse than flat grey.
+    # Alternating between the eyes leaves all of the difference to one of them; flat grey is the worst.
     return Answer(residual, 1.0, problem.condition(), residual - least, note=note)
 
 

@@ -30,7 +30,7 @@ def every_trial(fits: Mapping[str, Fit], *, full: bool) -> Iterator[Trial]:
 def run(
     trials: list[Trial], *, record: Path | None = None, progress: Callable[[int, int], None] = lambda done, of: None
 ) -> list[Case]:
-    """Run every trial. record: write the limits file anew, with their errors."""
+    """Run every trial. record: write the limits file again with their errors."""
     limits: dict[str, float] = json.loads(LIMITS.read_text(encoding="utf-8"))
     cases = []
     for number, trial in enumerate(trials, 1):

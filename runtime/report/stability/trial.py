@@ -1,4 +1,4 @@
-"""A trial is one extreme case; running it gives a Case, whatever happens in the code on trial."""
+"""A trial is one extreme case; running it gives a Case, even if the code on trial crashes."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def refusal(stage: str, name: str, call: Callable[[], object]) -> Trial:
 
 
 def settle(trial: Trial, *, limit: float | None = None) -> Case:
-    """Run a trial. Nothing escapes, and only the project's own errors count as a refusal.
+    """Run a trial. No exception escapes, and only the project's own errors count as a refusal.
 
     limit: the recorded forward error; a trial with a floor fails without it.
     """
