@@ -174,9 +174,7 @@ def square_px(view: U8) -> tuple[float, int, int]:
     return columns.mean() + 0.5 - view.shape[1] / 2, int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1
 
 
-@pytest.mark.parametrize(
-    "name", ["a_360.png", "a_equirect.jpg", "a_360_TB.png", "a_180_LR.png", "a_180_hsbs.png"]
-)
+@pytest.mark.parametrize("name", ["a_360.png", "a_equirect.jpg", "a_360_TB.png", "a_180_LR.png", "a_180_hsbs.png"])
 def test_of_a_picture_all_around_the_view_ahead_is_shown(tmp_path: Path, name: str) -> None:
     """Twenty degrees to the right lie at tan(20)/tan(37.5) of the half width."""
     span_deg = 180 if "180" in name else 360
