@@ -68,7 +68,7 @@ Reference = Callable[[Feeds], Sequence[np.ndarray]]
 
 
 def validate_file(path: Path) -> Report:
-    """Checks of a file. Raises InputError: no model, no contract that we know, or ports that every command refuses."""
+    """Checks of a file. Raises InputError for a file that every command refuses."""
     session = ModelSession(path)
     contract = session.contract
     if contract.input_frame != "chain":

@@ -105,7 +105,7 @@ def sampled_db(
 
 
 def on_panels_raster(picture: Picture, stack: PanelStack) -> Picture:
-    """A picture resampled to the panels' pixels where their aspect agrees, else to no more pixels than they have.
+    """A picture on the panels' pixels where their aspect agrees, else in no more pixels than they have.
 
     A picture of another aspect keeps it: stretched, no eye is meant to see it. Finer detail than the panels' pixels
     cannot be shown, and takes time and memory to measure.

@@ -204,7 +204,7 @@ def test_a_sphere_is_known_by_its_metadata_and_by_its_shape(tmp_path: Path) -> N
 # Sets of pictures with cameras
 
 
-def test_a_camera_set_is_called_so_as_a_file_and_as_a_folder(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+def test_a_camera_set_is_called_so_as_file_and_folder(tmp_path: Path, context: Any, stack: PanelStack) -> None:
     (tmp_path / "transforms_train.json").write_text('{"camera_angle_x": 0.7, "frames": [{"transform_matrix": []}]}')
     (tmp_path / "train").mkdir()
     for path in (tmp_path, tmp_path / "transforms_train.json"):
