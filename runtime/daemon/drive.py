@@ -41,6 +41,8 @@ def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> 
         reason = run.presenter.run(frames=options.frames)
         for sample in run.presenter.samples.recorded_ahead():
             run.observer.sampled(sample)  # true eyes at the last display times
+        if output is not None:
+            output.run_is_over()
         run.observer.finish(lambda: host is not None and bool(host.stop_reason()))
         summary = run.summary() | {"stopped": reason}
         if output is not None:

@@ -1,1 +1,1 @@
-"""What a run came to: displayed quality, the files of a run, the contact sheet."""
+"""Results of a run or a solution: displayed quality, files, the contact sheet."""

@@ -1,4 +1,4 @@
-"""The contact sheet of a run: layers, and for each eye the target, what it sees, and the error."""
+"""Contact sheet of a run: its layers and, for each eye, target, retina image and error."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ TILE_WIDTH = 640  # pixels
 MARGIN = 12  # pixels
 LINE_LETTERS = 58  # of a line below the headline, a tile
 HEADLINE, TITLE = 52, 34
-ERROR_GAIN = 8  # that the difference is shown with
+ERROR_GAIN = 8  # factor on the difference
 INK = (40, 40, 40)
 PAPER = 246
 
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """One refresh of a run, as its sheet shows it; and what its viewer aligns by itself."""
+    """One refresh of a run, for its sheet, and its unaligned solution, for the viewer."""
 
     layers: U8  # (N, h, w, 3 or 4), as the panels showed them: aligned
     eye_views: EyeViews
     light_db: float  # of tracking errors of 1 mm
-    lines: tuple[str, ...]  # where the eyes were, and how well that was known
+    lines: tuple[str, ...]  # position of the eyes and its uncertainty
     solution: U8  # (N, h, w, 3 or 4), before it was aligned
     solved_for_m: F64  # (2, 3) eyes, frame `stack`
-    asked_for: tuple[U8, ...]  # (h, w, 3) what each eye should see there
+    asked_for: tuple[U8, ...]  # (h, w, 3) their targets
 
 
 def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, lines: Sequence[str] = ()) -> U8:
-    """(h, w, 3) RGB: a row of layers; for each eye a row of target, what it sees, and the difference.
+    """(h, w, 3) RGB: a row of layers, and for each eye a row of target, retina image and error.
 
-    headline: the one figure to quote; lines: what stands below it.
+    headline: the figure to quote; lines: written below it.
     """
     height, width = layers.shape[1:3]
     tile = (TILE_WIDTH, round(TILE_WIDTH * height / width))
@@ -78,11 +78,11 @@ def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, line
 
 
 def headline(light_db: float | None) -> str:
-    """The figure to quote, in words."""
+    """Sentence with the figure to quote."""
     if light_db is None or math.isnan(light_db):
         return "the light at these eyes was not measured"
-    told = f"pixels as squares, pupil {PUPIL_MM:g} mm, tracking error {TRACKING_SIGMA_MM:g} mm"
-    return f"PSNR {light_db:.1f} dB at the eyes ({told})"
+    conditions = f"pixels as squares, pupil {PUPIL_MM:g} mm, tracking error {TRACKING_SIGMA_MM:g} mm"
+    return f"PSNR {light_db:.1f} dB at the eyes ({conditions})"
 
 
 def _write(sheet: U8, text: str, *, x: int, y: int, scale: float) -> None:

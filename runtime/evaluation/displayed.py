@@ -22,27 +22,27 @@ from runtime.records import F32, F64, U8
 from runtime.support.artifacts import write_png
 
 Picture = U8 | F32  # (h, w, 3): code values, or intensities in [0, 1]
-SIGMAS_MM = (0.0, 1.0, 2.0)  # of tracking: eyes that are known, a good tracker's, twice that
+SIGMAS_MM = (0.0, 1.0, 2.0)  # tracking errors: none, a good tracker's, twice that
 
 
 @dataclass(frozen=True, slots=True)
 class EyeViews:
-    """What both eyes see of some layers, and what they should."""
+    """Retina images of both eyes through some layers, and their targets."""
 
     seen: tuple[Retina, ...]
     wanted: tuple[Picture, ...]
-    quality: Quality  # exact, at the eyes that the layers were made (or aligned) for
+    quality: Quality  # exact, at the eyes that the layers were solved for or aligned to
     stack: PanelStack
     eyes_m: F64  # (2, 3)
     fov_deg: float
 
     def viewer(self, layers: U8, *, title: str, lines: Sequence[str]) -> str:
-        """The layers to look into from these eyes, in a browser: one HTML page, with `lines` beside it."""
+        """Viewer page of the layers, seen from these eyes; it shows `lines` next to the picture."""
         wanted, eyes_m = [as_codes(intensities(picture)) for picture in self.wanted], np.asarray(self.eyes_m)
         return viewer_html(layers, wanted, self.stack, eyes_m=eyes_m, fov_deg=self.fov_deg, title=title, lines=lines)
 
     def write(self, folder: Path) -> None:
-        """What each eye sees and should see, as pictures."""
+        """Write seen-*.png and wanted-*.png."""
         for eye, retina, target in zip(("left", "right"), self.seen, self.wanted, strict=True):
             write_png(folder / f"seen-{eye}.png", retina.codes())
             write_png(folder / f"wanted-{eye}.png", as_codes(intensities(target)))
@@ -57,12 +57,11 @@ def displayed(
     fov_deg: float,
     similarity: bool = True,
 ) -> EyeViews:
-    """What eyes (2, 3), frame `stack`, see of layers (N, H, W, 3 or 4), against a picture for each eye.
+    """Retina images of eyes (2, 3), frame `stack`, through layers (N, H, W, 3 or 4), with a target for each eye.
 
-    The pictures are `fov_deg` wide. One that has the panels' aspect is compared in their pixels, any other in its
-    own, at most as many as a panel has.
-    similarity: SSIM as well, else it is NaN.
-    Raises ValueError for eyes that are not before every panel, or that see nothing of them.
+    Targets are `fov_deg` wide; those of the panels' aspect are compared at the panels' resolution, others at their own
+    or, if they have more pixels than a panel, reduced to as many. similarity: compute SSIM; otherwise it is NaN.
+    Raises ValueError for eyes behind a panel, or that see no part of the panels.
     """
     wanted = [on_panels_raster(picture, stack) for picture in wanted]
     seen = tuple(
@@ -79,9 +78,8 @@ def expected_db(
 ) -> dict[str, float]:
     """Expected PSNR (docs/contracts.md, Error) by tracking error in millimetres: "0", "1", "2".
 
-    light: of what pupils get of the panels' pixels, else of one ray a pixel; every: which pixels of a row and which
-    rows, of one ray. NaN where such an error would take an eye
-    to where it sees nothing.
+    light: pupils and square pixels, otherwise one ray a pixel of every `every`-th pixel of every `every`-th row. NaN
+    where such an error would move an eye to a place that sees no part of the panels.
     """
     psnrs_db = light_psnrs_db if light else expected_psnrs_db
     values = dict.fromkeys(sigmas_mm, math.nan)
@@ -95,7 +93,7 @@ def expected_db(
 def sampled_db(
     eye_views: EyeViews, layers: U8, *, sigmas_mm: Sequence[float], every: int
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Light as `expected_db` has it, of every `every`-th pixel of every `every`-th row, and its standard error, dB."""
+    """Light, as in `expected_db`, of every `every`-th pixel of every `every`-th row, and its standard error in dB."""
     values = dict.fromkeys(sigmas_mm, (math.nan, math.nan))
     how: Any = {"eyes_m": eye_views.eyes_m, "fov_deg": eye_views.fov_deg, "sigmas_mm": sigmas_mm}
     with contextlib.suppress(ValueError):
@@ -105,10 +103,9 @@ def sampled_db(
 
 
 def on_panels_raster(picture: Picture, stack: PanelStack) -> Picture:
-    """A picture on the panels' pixels where their aspect agrees, else in no more pixels than they have.
+    """A picture at the panels' resolution if their aspect agrees, otherwise with at most as many pixels.
 
-    A picture of another aspect keeps it: stretched, no eye is meant to see it. Finer detail than the panels' pixels
-    cannot be shown, and takes time and memory to measure.
+    Detail finer than the panels' pixels cannot be shown, and takes time and memory to measure.
     """
     height_px, width_px = picture.shape[:2]
     size = (stack.width_px, stack.height_px)

@@ -20,7 +20,7 @@ from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
 
 SECONDS, RATE_HZ, NOISE_MM = 12.0, 30.0, 3.0
-SECONDS_MAX = 3600.0  # of a recording that is made: it is held in memory
+SECONDS_MAX = 3600.0  # most: a synthetic recording is held in memory
 
 
 def write_motion(
@@ -32,7 +32,7 @@ def write_motion(
     rate_hz: float = RATE_HZ,
     noise_mm: float = NOISE_MM,
 ) -> dict[str, Any]:
-    """Answers what was written. `seed`: of the head's path and of the noise; 0 is the benchmark's own.
+    """Write the recording and return its description. `seed`: for path and noise; 0: the benchmark's.
 
     Raises InputError for a motion that is not known, a length out of range, or a file that can't be written.
     """
@@ -54,5 +54,5 @@ def write_motion(
                 points = EyePoints(place, seen.points.confidence)
             if not writer.write(SensorFrame(number, seen.capture_ns, points, true_eyes_m=eyes)):
                 raise InputError(path, "", "the recording would be larger than its limit")
-    told = {"motion": motion, "seed": seed, "rate_hz": rate_hz, "noise_mm": noise_mm}
-    return told | {"file": str(path), "samples": len(observed), "seconds": (len(observed) - 1) / rate_hz}
+    description = {"motion": motion, "seed": seed, "rate_hz": rate_hz, "noise_mm": noise_mm}
+    return description | {"file": str(path), "samples": len(observed), "seconds": (len(observed) - 1) / rate_hz}

@@ -9,7 +9,7 @@ import numpy as np
 
 from runtime.evaluation.contact_sheet import Moment
 from runtime.evaluation.displayed import displayed
-from runtime.optics.carried import carried_db, intensities, light_psnrs_db
+from runtime.optics.carried import PLENTY, carried_db, intensities, light_psnrs_db
 from runtime.optics.light import Sampling, squared_error
 from runtime.optics.pupil import TRACKING_SIGMA_MM
 from runtime.optics.quality import psnr_db
@@ -18,25 +18,25 @@ from runtime.records import F64, U8, RefreshAccount
 
 log = logging.getLogger("phasestack.quality")
 
-MEASURED = Sampling(step=2)  # light at the eyes aligned to, of a quarter of the pixels
-# Live, of all of them: a view that is displaced errs at the picture's edges, and a quarter of those is 0.6 dB off.
-LIVE = Sampling()
+# Sampling of light. A displaced view errs at edges: a quarter of a small picture's pixels is 0.6 dB off.
+ALIGNED, LIVE = Sampling(step=2), Sampling()
+ALIGNED_LARGE, LIVE_LARGE = Sampling(step=4), Sampling(step=2)  # of pictures with `PLENTY` values
 FIGURES = ("light_db", "psnr_db", "ssim", "carried_db", "psnr_db_true_eyes", "carried_db_true_eyes")
 Pictures = tuple[U8, U8]  # (h, w, 3) retina pictures of the left and right eye, panel size
 
 
 @dataclass(frozen=True, slots=True)
 class Targets:
-    """What eyes should see; None: not drawn."""
+    """Target pictures for a refresh; None: not drawn."""
 
-    solved: Pictures | None = None  # the eyes that the solution was computed for, at the instant it was computed for
-    used: Pictures | None = None  # the eyes aligned to, at that same instant
-    true: Pictures | None = None  # the true eyes, at the display time
+    solved: Pictures | None = None  # for the eyes and the instant of the solution
+    used: Pictures | None = None  # for the eyes aligned to, at the solution's instant
+    true: Pictures | None = None  # for the true eyes, at the display time
 
 
 @dataclass(frozen=True, slots=True)
 class RefreshQuality:
-    """What could be measured of one refresh."""
+    """Measurements of one refresh."""
 
     figures: dict[str, float] = field(default_factory=dict)  # of FIGURES
     live_error: float | None = None  # mean squared error of light at the true eyes
@@ -51,10 +51,13 @@ def view_error_mm(eyes_m: F64, solved_for_m: F64) -> float:
 def live_error(layers: U8, targets: Pictures, stack: PanelStack, *, eyes_m: F64, fov_deg: float) -> float:
     """Mean squared error of the light at eyes (2, 3) against what they should see from there.
 
-    layers: (N, H, W, 3 or 4), as the panels show them. Raises ValueError where the eyes see nothing of them.
+    layers: (N, H, W, 3 or 4), as the panels show them. Raises ValueError where the eyes see no part of them.
     """
     pictures = [intensities(picture) for picture in targets]
-    return squared_error(layers, pictures, stack, solved_for_m=eyes_m, eyes_m=eyes_m, fov_deg=fov_deg, sampling=LIVE)
+    sampling = LIVE_LARGE if pictures[0].size > PLENTY else LIVE
+    return squared_error(
+        layers, pictures, stack, solved_for_m=eyes_m, eyes_m=eyes_m, fov_deg=fov_deg, sampling=sampling
+    )
 
 
 def measure_refresh(
@@ -66,7 +69,7 @@ def measure_refresh(
     *,
     fov_deg: float,
 ) -> RefreshQuality:
-    """Measure whatever `targets` were drawn for; eyes that see nothing of the panels are left out.
+    """Measure a refresh as far as its targets were drawn; skip eyes that see no part of the panels.
 
     account: with its true eyes, where they are known; layers: (N, h, w, 4), as the panels showed them;
     unaligned: the same before alignment, None where they show no solution alone.
@@ -110,7 +113,7 @@ def _at_aligned_eyes(
         seen_from_m=eyes_m,
         sigmas_mm=(TRACKING_SIGMA_MM,),
         fov_deg=fov_deg,
-        sampling=MEASURED,
+        sampling=ALIGNED_LARGE if targets.solved[0].size > PLENTY else ALIGNED,
     )
     light_db = light[TRACKING_SIGMA_MM]
     values = [light_db, views.quality.psnr_db, views.quality.ssim]
@@ -123,7 +126,7 @@ def _at_aligned_eyes(
 
 
 def _lines(account: RefreshAccount, error: float | None) -> tuple[str, ...]:
-    """Where the eyes are in a moment, how well that is known, and how stale the view is."""
+    """Lines for the sheet: position of the eyes, its uncertainty, and live quality."""
     assert account.eyes_m is not None and account.solved_for_m is not None
     sigma = "" if account.eye_sigma_mm is None else f", standard deviation {account.eye_sigma_mm:.1f} mm"
     moved_mm = view_error_mm(account.eyes_m, account.solved_for_m)

@@ -1,4 +1,4 @@
-"""The files of a run (docs/contracts.md). A failure to write them does not stop the run."""
+"""Files of a run (docs/contracts.md). A failure to write them does not stop the run."""
 
 from __future__ import annotations
 
@@ -15,31 +15,35 @@ from runtime.evaluation.contact_sheet import Moment, contact_sheet, headline
 from runtime.evaluation.refresh_quality import Pictures
 from runtime.records import U8
 from runtime.support.artifacts import OutputFolder, to_json, write_json, write_png, write_text
+from runtime.support.background import MEASURING_NICENESS, set_niceness
 
 log = logging.getLogger("phasestack.output")
 
-WAITING = 64  # pieces of work that may wait for the disk
+Work = Callable[[], object]
+WAITING = 4096  # most pieces of work queued for the disk: lines of a minute
+WAITING_PICTURES = 4  # most of them with a refresh's pictures, 25 MB at 1080p
 
 
 class RunOutput:
-    """Writes a run's files into a folder; they appear together when it is left without an error.
+    """Writes a run's files into a folder, where they appear together on a clean exit.
 
-    A thread of its own writes, so that no refresh waits for a disk. Where the disk fails on the way (full, gone, not
-    ours any more), the files are abandoned: `problem` holds the reason, one line is logged, and the run goes on.
+    A background thread writes, so that no refresh waits for the disk. If the disk fails during the run (full, gone,
+    permission lost), the files are abandoned: `problem` gives the reason, one line is logged, and the run goes on.
     """
 
     def __init__(self, target: Path, *, every_one: bool = True) -> None:
-        """every_one: wait for a slow disk; otherwise leave out what it cannot take in time."""
+        """every_one: wait for a slow disk; otherwise drop lines and pictures that it is too slow for."""
         self._folder = OutputFolder(target)
         self._target, self._every_one = target, every_one
         self._lines: TextIO | None = None
-        self._work: queue.Queue[Callable[[], None] | None] = queue.Queue(WAITING)
+        self._work: queue.Queue[tuple[Work, Work] | None] = queue.Queue(WAITING)  # work, and what follows in any case
+        self._pictures = threading.BoundedSemaphore(WAITING_PICTURES)
         self._writer = threading.Thread(target=self._write, name="output", daemon=True)
         self.problem = ""  # why the files were abandoned
-        self.left_out = 0  # lines and lights that the disk was too slow for
+        self.left_out = 0  # lines and pictures that the disk was too slow for
 
     def __enter__(self) -> RunOutput:
-        """Raises InputError where the folder can't be written."""
+        """Create the folder. Raises InputError if it can't be written."""
         self._folder.__enter__()
         try:
             self._lines = (self._folder.staging / "frames.jsonl").open("w", encoding="utf-8")
@@ -56,31 +60,31 @@ class RunOutput:
         if self.left_out:
             log.warning("output: the disk was too slow for %d lines or pictures of %s", self.left_out, self._target)
         if self.problem:
-            kind = kind or InputError  # nothing half-written is left
+            kind = kind or InputError  # discards incomplete files
         self._attempt(lambda: self._folder.__exit__(kind, error, trace))
 
     def refresh(self, line: Mapping[str, Any]) -> None:
-        """One line of frames.jsonl. Arrays in it must not be written to afterwards."""
+        """Write a line of frames.jsonl. Its arrays must not be changed afterwards."""
         self._later(lambda: self._line(line))
 
     def light(self, frame: int, *, layers: U8) -> None:
         """Write the layers of `light/<frame>/`.
 
-        layers: (N, h, w, 3 or 4), as the panels show them; they must not be written to afterwards.
+        layers: (N, h, w, 3 or 4), as the panels show them; they must not be changed afterwards.
         """
 
         def write() -> None:
             for n, layer in enumerate(layers):
                 write_png(self._light(frame) / f"layer-{n}.png", layer)
 
-        self._later(write)
+        self._pictures_later(write)
 
     def light_targets(
         self, frame: int, *, info: Mapping[str, Any], drawn: Pictures | None, true: Pictures | None
     ) -> None:
         """Write the rest of `light/<frame>/`: light.json as `info`, and retina pictures.
 
-        drawn: what the eyes solved for should see; true: what the true eyes should see. Neither may be written to
+        drawn: what the eyes solved for should see; true: what the true eyes should see. Neither may be changed
         afterwards.
         """
 
@@ -90,17 +94,21 @@ class RunOutput:
                     write_png(self._light(frame) / f"{name}-{eye}.png", picture)
             write_json(self._light(frame) / "light.json", info)
 
-        self._later(write)
+        self._pictures_later(write)
 
     def _light(self, frame: int) -> Path:
         return self._folder.staging / "light" / str(frame)
+
+    def run_is_over(self) -> None:
+        """Wait for the disk from now on: no refresh depends on it any more."""
+        self._every_one = True
 
     def finish(
         self, summary: dict[str, Any], layers: U8 | None, moment: Moment | None = None, *, unseen: str = ""
     ) -> None:
         """Write the last frame, the summary, and the stills, sheet and viewer of the newest measured refresh.
 
-        unseen: the viewer's page where no two eyes saw anything.
+        unseen: the viewer's page if no refresh was measured.
         """
 
         def write() -> None:
@@ -121,39 +129,52 @@ class RunOutput:
             write_png(folder / "contact-sheet.png", contact_sheet(shown, views, headline=title, lines=lines))
             write_text(folder / "viewer.html", page)
 
-        self._work.put(write)
+        self._work.put((write, lambda: None))
 
-    def _later(self, work: Callable[[], None]) -> None:
+    def _pictures_later(self, work: Work) -> None:
+        """Queue work that holds pictures, within the memory that those may take."""
         if self.problem:
             return
-        if self._every_one:
-            self._work.put(work)
+        if not self._pictures.acquire(blocking=self._every_one):
+            self.left_out += 1
             return
+        if not self._later(work, then=self._pictures.release):
+            self._pictures.release()
+
+    def _later(self, work: Work, *, then: Work = lambda: None) -> bool:
+        """Queue work; False: dropped."""
+        if self.problem:
+            return False
         try:
-            self._work.put_nowait(work)
+            self._work.put((work, then), block=self._every_one)
         except queue.Full:
             self.left_out += 1
+            return False
+        return True
 
     def _write(self) -> None:
-        """The writer's thread: work in its order, until None."""
-        while (work := self._work.get()) is not None:
+        """Body of the writer's thread: do queued work in order, until None."""
+        set_niceness(MEASURING_NICENESS)
+        while (queued := self._work.get()) is not None:
+            work, then = queued
             if not self.problem:
                 self._attempt(work)
+            then()
 
-    def _attempt(self, work: Callable[[], None]) -> None:
+    def _attempt(self, work: Work) -> None:
         try:
             work()
         except (OSError, InputError) as error:
             self._abandon(str(error), trace=False)
-        except Exception as error:  # a mistake of ours in what is only for looking at must not end the run either
+        except Exception as error:  # a bug in these files must not end the run either
             self._abandon(f"{type(error).__name__}: {error}", trace=True)
 
     def _abandon(self, why: str, *, trace: bool) -> None:
         if self.problem:
             return
         self.problem = why
-        log.warning("output: abandoned, nothing new is left in %s: %s", self._target, why, exc_info=trace)
-        self._folder.discard()  # now: it may be what fills the disk
+        log.warning("output: abandoned; nothing new in %s: %s", self._target, why, exc_info=trace)
+        self._folder.discard()  # now: these files may be what fills the disk
 
     def _line(self, line: Mapping[str, Any]) -> None:
         assert self._lines is not None

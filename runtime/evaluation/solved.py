@@ -1,4 +1,4 @@
-"""A solved still pair: the retina images of its layers, their quality, and the files of a result."""
+"""A solved still pair: retina images of its layers, their quality, and the files of a result."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ BySigma = Mapping[str, float]
 
 @dataclass(frozen=True, slots=True)
 class PairQuality:
-    """Quality of what the eyes see (docs/contracts.md, Error), by "0", "1", "2" mm of tracking error.
+    """Quality at the eyes (docs/contracts.md, Error), by tracking error: "0", "1", "2" mm.
 
     NaN where such an error takes an eye to where it sees nothing, and what was not asked for.
     """
@@ -33,7 +33,7 @@ class PairQuality:
     standard_error_db: BySigma = field(default_factory=dict)  # of `light_db`, where it is of a part of the pixels
 
     def table(self) -> dict[str, Any]:
-        """As solve.json has it."""
+        """Entries of solve.json."""
         return {
             "light_db": _rounded(self.light_db),
             "psnr_db": round(self.psnr_db, 3),
@@ -45,7 +45,7 @@ class PairQuality:
 
 @dataclass(frozen=True)
 class SolvedPair:
-    """Layers, what eyes see of them, and the quality; computed on first access.
+    """Layers, retina images and quality, the latter two computed on first access.
 
     Access raises ValueError where an eye sees nothing of the display.
     """
@@ -58,12 +58,12 @@ class SolvedPair:
 
     @cached_property
     def eye_views(self) -> EyeViews:
-        """What the eyes see, and should."""
+        """Retina images of both eyes, and their targets."""
         return displayed(self.layers, self.pictures, self.stack, eyes_m=self.eyes_m, fov_deg=self.fov_deg)
 
     @cached_property
     def quality(self) -> PairQuality:
-        """The measured quality; takes seconds for a large picture."""
+        """Measured quality; takes seconds for a large picture."""
         views = self.eye_views
         light, expected = (expected_db(views, self.layers, light=light) for light in (True, False))
         at_eyes = views.quality
@@ -82,11 +82,11 @@ class SolvedPair:
 
     @property
     def seen(self) -> tuple[U8, ...]:
-        """Per eye (h, w, 3): what it sees; black where it looks past a panel."""
+        """(h, w, 3) retina image of each eye; black where it looks past a panel."""
         return tuple(retina.codes() for retina in self.eye_views.seen)
 
     def viewer(self, lines: Sequence[str]) -> str:
-        """The viewer page of the layers."""
+        """Viewer page of the layers."""
         return self.eye_views.viewer(self.layers, title=headline(self.quality.light_db["1"]), lines=lines)
 
     def write(self, folder: Path, *, lines: Sequence[str]) -> None:

@@ -1,4 +1,4 @@
-"""The one timer of trials: warm up, repeat, take turns; median and p99."""
+"""Timer for trials: warm up, repeat, alternate; median."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Timed(Generic[T]):
-    """What a call took, run by run, and the last run's answer."""
+    """Times of a call, run by run, and its last result."""
 
     answer: T
     times_ms: tuple[float, ...]
@@ -35,9 +35,9 @@ def timed(
     enough_s: float = 0.0,
     slow_s: float = float("inf"),
 ) -> Timed[T]:
-    """Time a warm function: `runs` at least, then more up to `enough_s` or `most` runs.
+    """Time a warm function: at least `runs` times, then until `enough_s` or `most` runs.
 
-    slow_s: where the first takes longer, it counts and is the only run.
+    slow_s: a first run longer than this counts and is the only one.
     """
     answer, took_ms = _timed(call)
     if took_ms >= slow_s * 1e3:
@@ -50,9 +50,9 @@ def timed(
 
 
 def timed_in_turn(ways: Mapping[str, Callable[[], U8]], *, runs: int) -> dict[str, Timed[U8]]:
-    """Several calls that take turns, run by run: what slows the machine slows all of them.
+    """Time several calls alternately, so that other load on the machine slows all of them.
 
-    The first run of each doesn't count. Answers are copies: a call may use its own again.
+    The first run of each is discarded. Answers are copies, as a call may reuse its buffer.
     """
     times: dict[str, list[float]] = {name: [] for name in ways}
     answers: dict[str, U8] = {}

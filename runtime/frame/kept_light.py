@@ -15,12 +15,12 @@ from runtime.frame.truth import TrueEyes
 from runtime.optics.alignment import shown_layers
 from runtime.records import F64, U8, RefreshAccount
 from runtime.support import progress
-from runtime.support.background import Job
+from runtime.support.background import MEASURING_NICENESS, Job
 
 log = logging.getLogger("phasestack.light")
 
-LOOK_S = 0.1  # between two looks whether the run is to end at once
-WRITTEN_WITHIN_S = 10.0  # the last light
+LOOK_S = 0.1  # between checks for a request to stop
+WRITTEN_WITHIN_S = 10.0  # limit on writing the last refresh's layers
 
 
 class Output(Protocol):
@@ -30,17 +30,17 @@ class Output(Protocol):
         """Add a line to frames.jsonl."""
 
     def light(self, frame: int, *, layers: U8) -> None:
-        """Keep what the panels showed at one refresh."""
+        """Write the layers that the panels showed at a refresh."""
 
     def light_targets(self, frame: int, *, info: dict[str, Any], drawn: Pictures | None, true: Pictures | None) -> None:
-        """Keep what eyes should have seen at a refresh whose light was kept."""
+        """Write the targets of a refresh whose light was kept."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Kept:
     account: RefreshAccount
     solved_for_ns: int
-    content: object | None  # that was the run's at this refresh
+    content: object | None  # the run's content at this refresh
 
 
 class KeptLight:
@@ -53,7 +53,7 @@ class KeptLight:
         self._kept: list[_Kept] = []
 
     def refreshed(self, refresh: Refresh) -> None:
-        """Keep the panels of a refresh whose turn it is; in real time one at a time."""
+        """Write the layers of every N-th refresh; in real time one refresh at a time."""
         account = refresh.account
         if not self._every or account.frame % self._every != self._every - 1 or not account.presented:
             return
@@ -66,16 +66,16 @@ class KeptLight:
         if self._simulated:
             keep()
         else:
-            self._job = Job("kept light", keep)
+            self._job = Job("kept light", keep, niceness=MEASURING_NICENESS)
         solved_for_ns = refresh.solution.solved_for_ns if refresh.solution is not None else 0
         kept = _Kept(account, solved_for_ns, self._drawer.shown_content())
         if self._truth.is_recorded:
             self._kept.append(kept)
-        else:  # a live sensor's run ends when it is told to: nothing would be drawn then
+        else:  # a live sensor's run ends by a signal: there is no time to draw afterwards
             self._draw(kept, lambda: None)
 
     def finish(self, stopped: Callable[[], bool]) -> None:
-        """Draw all pictures. stopped: True once somebody waits for the end: the rest is written without."""
+        """Draw all pictures. stopped: True after a request to stop; the rest is then written without pictures."""
         if self._job is not None:
             self._job.wait(WRITTEN_WITHIN_S)
         total = len(self._kept)

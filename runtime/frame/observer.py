@@ -17,7 +17,7 @@ from runtime.records import RefreshAccount, SensorFrame
 
 
 class RunObserver:
-    """Takes in samples and refreshes; `finish` ends it."""
+    """Observer of one run: called with every sample and refresh, then with `finish`."""
 
     def __init__(
         self,
@@ -30,9 +30,9 @@ class RunObserver:
         on_account: Callable[[RefreshAccount], None] | None = None,
         simulated: bool = False,
     ) -> None:
-        """evaluate_every: refreshes from one sample of quality to the next; 0: only the last one; None: none.
+        """evaluate_every: measure quality at every N-th refresh and at the last; 0: at the last alone; None: never.
 
-        keep_light: refreshes from one whose light is kept to the next; 0: none.
+        keep_light: keep the light of every N-th refresh; 0: never.
         """
         self._measures, self._simulated, self._on_account = evaluate_every is not None, simulated, on_account
         self.last: Refresh | None = None
@@ -75,9 +75,9 @@ class RunObserver:
         self._sampler.advance()
 
     def finish(self, stopped: Callable[[], bool] = lambda: False) -> None:
-        """Write and measure what still waits, draw kept light's pictures, and measure the last refresh.
+        """Write and measure everything still queued, draw kept light's pictures, measure the last refresh.
 
-        In real time the last is not measured where another one was. stopped: True once somebody waits for the end.
+        In real time the last is measured only if no other was. stopped: True after a request to stop.
         """
         self.truth.end()
         self._advance()
@@ -89,9 +89,9 @@ class RunObserver:
                 self._sampler.finish(last)
 
     def live(self) -> dict[str, Any]:
-        """Live figures so far (contract 5.5), for the status."""
+        """Live figures (contract 5.5) up to now, for the status."""
         return {"live_db": self._sampler.live_db, "view_error_mm": self._lines.view_error_mm.of("p50", "p95")}
 
     def summary(self) -> dict[str, Any]:
-        """The measured part of summary.json; None where nothing was measured."""
+        """The measured part of summary.json. Figures without a measurement are None."""
         return {**self.live(), **self._sampler.summary()}

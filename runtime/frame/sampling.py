@@ -1,7 +1,7 @@
-"""Sampled quality: which refreshes are measured, one at a time, once their true eyes are known.
+"""Quality of sampled refreshes, measured once their true eyes are known.
 
-What their eyes should see is drawn on the solver's thread. In real time a thread of its own compares, and while one
-measurement is under way no other begins; in simulated time everything happens at once.
+Targets are drawn on the solver's thread. In real time they are compared with the layers on a background thread, one
+refresh at a time: samples that come during a measurement are skipped. On a simulated clock every sample is measured.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from runtime.optics.alignment import shown_layers
 from runtime.optics.quality import psnr_db
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, State
-from runtime.support.background import Job
+from runtime.support.background import MEASURING_NICENESS, Job
 
-DRAWN_WITHIN_S = 10.0  # the targets of the last refresh, by the solver
+DRAWN_WITHIN_S = 10.0  # limit on drawing the last refresh's targets
 
 
 @dataclass(frozen=True, slots=True)
 class _Sample:
     refresh: Refresh
-    content: object | None  # that was the run's at this refresh
+    content: object | None  # the run's content at this refresh
 
 
 class QualitySampler:
@@ -47,16 +47,16 @@ class QualitySampler:
     ) -> None:
         self._stack, self._drawer, self._truth = stack, drawer, truth
         self._every, self._simulated = every, simulated
-        self.measured: dict[str, list[float]] = {}  # of FIGURES, at the sampled refreshes
-        self.live: dict[int, float] = {}  # mean squared error at the true eyes, by refresh
-        self.moment: Moment | None = None  # the newest refresh measured: stills, sheet and viewer are of this one
+        self.measured: dict[str, list[float]] = {}  # FIGURES of the sampled refreshes
+        self.live: dict[int, float] = {}  # mean squared error at the true eyes, by number of the refresh
+        self.moment: Moment | None = None  # the newest refresh measured, for stills, sheet and viewer
         self._waiting: deque[_Sample] = deque()
         self._job: Job[RefreshQuality] | None = None
         self._job_frame = 0
         self._drawing = False
 
     def refreshed(self, refresh: Refresh) -> None:
-        """Queue a refresh that is a sample; in real time only while nothing else is measured."""
+        """Queue a refresh if it is a sample; in real time only while no other is being measured."""
         is_sample = self._every and refresh.account.frame % self._every == self._every - 1
         if is_sample and refresh.account.presented and (self._simulated or not self._is_busy):
             self._waiting.append(_Sample(refresh, self._drawer.shown_content()))
@@ -66,7 +66,7 @@ class QualitySampler:
         return bool(self._waiting) or self._drawing or self._job is not None
 
     def advance(self) -> None:
-        """Take in what has been measured, and begin what waits no longer for its truth."""
+        """Collect a finished measurement, and start those whose true eyes are known by now."""
         if self._job is not None and self._job.done:
             job, self._job = self._job, None
             self._take(self._job_frame, job.take())
@@ -76,7 +76,7 @@ class QualitySampler:
             self._begin(self._waiting.popleft())
 
     def finish(self, last: Refresh) -> None:
-        """Measure the run's last refresh; it counts in the means where nothing else was measured."""
+        """Measure the run's last refresh. It counts in the means only if it is the sole one."""
         queue: SimpleQueue[Targets | None] = SimpleQueue()
         true_m = self._truth.at(last.account.photon_ns)
         self._drawer.draw(self._wanted(last, true_m), None, queue.put)
@@ -100,14 +100,16 @@ class QualitySampler:
                 self._take(frame, self._compared(refresh, true_m, targets))
             elif targets is not None:
                 self._job_frame = frame
-                self._job = Job("quality", lambda: self._compared(refresh, true_m, targets))
+                self._job = Job(
+                    "quality", lambda: self._compared(refresh, true_m, targets), niceness=MEASURING_NICENESS
+                )
             self._drawing = False
 
         self._drawing = True
         self._drawer.draw(wanted, sample.content, compare)
 
     def _wanted(self, refresh: Refresh, true_m: F64 | None) -> dict[str, tuple[F64, int]]:
-        """Which eyes' pictures are compared, and at which instants."""
+        """Eyes and instants that targets are drawn for."""
         account, solution = refresh.account, refresh.solution
         wanted: dict[str, tuple[F64, int]] = {}
         if true_m is not None:
@@ -138,11 +140,11 @@ class QualitySampler:
 
     @property
     def live_db(self) -> float | None:
-        """Live quality (contract 5.5) of the refreshes measured so far."""
+        """Live quality (contract 5.5) over the refreshes already measured."""
         return round(psnr_db(float(np.mean(list(self.live.values())))), 3) if self.live else None
 
     def summary(self) -> dict[str, Any]:
-        """The measured part of summary.json; None where nothing was measured."""
+        """The measured part of summary.json. Figures without a measurement are None."""
         means = {
             name: round(float(np.mean(self.measured[name])), 3) if name in self.measured else None for name in FIGURES
         }

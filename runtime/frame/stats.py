@@ -1,4 +1,4 @@
-"""Statistics of a run in bounded memory; on the run's clock, except for `overhead_ms`."""
+"""Statistics of a run in bounded memory, on the run's clock (`overhead_ms`: on the machine's)."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from runtime.evaluation.refresh_quality import view_error_mm
 from runtime.frame.solver_host import SOLVING_STAGES
 from runtime.records import RefreshAccount, State
 
-WINDOW = 8192  # values at most that quantiles are taken over
-NOW_NS = NS_PER_S  # rates "now" are those of the last second
-NOW_KEPT = 1024  # refreshes that such a second may have
+WINDOW = 8192  # most values that a quantile is computed from
+NOW_NS = NS_PER_S  # window of the present rates: the last second
+NOW_KEPT = 1024  # most refreshes in that window
 STAGES = ("sensor", "track", *SOLVING_STAGES, "present", "wait")
 OVERHEAD_STAGES = ("sensor", "track")
 
 
 class Quantiles:
-    """Quantiles of all values of a run, thinned evenly when there are many; the maximum is exact."""
+    """Quantiles over a whole run; beyond `size` values every second one is dropped. The maximum is exact."""
 
     def __init__(self, size: int = WINDOW) -> None:
         self._values = np.zeros(size)
@@ -48,7 +48,7 @@ class Quantiles:
 
 
 class RunStats:
-    """Counters and quantiles of a run, fed one account a refresh."""
+    """Counters and quantiles of a run, updated once a refresh."""
 
     def __init__(self) -> None:
         self.frames = self.presented = self.dropped = self.solutions = self.missed_blanks = 0
@@ -60,11 +60,11 @@ class RunStats:
         self._overhead_run, self._skew, self._age, self._sigma = Quantiles(), Quantiles(), Quantiles(), Quantiles()
         self._view_error = Quantiles()
         self._efforts_ns: dict[str, int] = {}
-        self._effort: str | None = None  # that has been on the panels since the last refresh
-        self._recent: deque[tuple[int, bool, bool]] = deque(maxlen=NOW_KEPT)  # when, presented, a new solution
+        self._effort: str | None = None  # shown since the last refresh
+        self._recent: deque[tuple[int, bool, bool]] = deque(maxlen=NOW_KEPT)  # time, presented, shows a new solution
 
     def add(self, account: RefreshAccount, *, overhead_ms: float, missed_blanks: int = 0) -> None:
-        """One refresh; overhead_ms: its own work on the machine's clock, presenting and waiting left out."""
+        """Count a refresh. overhead_ms: its work without presenting and waiting, on the machine's clock."""
         now_ns, ran = account.present_ns, account.inference == "ran"
         self._first_ns = now_ns if self._first_ns < 0 else self._first_ns
         if self._effort is not None:
@@ -78,7 +78,7 @@ class RunStats:
         self._recent.append((now_ns, account.presented, ran))
         for stage, spent_ms in account.stage_ms.items():
             self._stages[stage].add(spent_ms)
-        if self.frames > 1:  # the first pays for what is allocated once
+        if self.frames > 1:  # the first one allocates buffers
             self._overhead.add(overhead_ms)
             self._overhead_run.add(sum(account.stage_ms.get(stage, 0.0) for stage in OVERHEAD_STAGES))
         if not account.presented:
@@ -98,7 +98,7 @@ class RunStats:
             self._view_error.add(view_error_mm(account.eyes_m, account.solved_for_m))
 
     def seconds(self) -> float:
-        """From the first refresh to the last."""
+        """Seconds from the first refresh to the last."""
         return (self._last_ns - self._first_ns) / NS_PER_S if self.frames else 0.0
 
     def reuse_saves_ms(self) -> float | None:
@@ -108,7 +108,7 @@ class RunStats:
         return sum(known) if known and self.presented > self.solutions > 0 else None
 
     def rates_now(self) -> dict[str, float | None]:
-        """Refreshes and solutions a second, over the last second; None where too little has happened."""
+        """Refreshes and solutions a second over the last second; None with fewer than two refreshes."""
         newest_first = reversed(tuple(self._recent))
         recent = [*takewhile(lambda entry: entry[0] > self._last_ns - NOW_NS, newest_first)][::-1]
         if len(recent) < 2:
@@ -120,11 +120,11 @@ class RunStats:
         }
 
     def fault(self, part: str) -> None:
-        """A fault that the run lives on with."""
+        """Count a fault that did not end the run."""
         self.faults[part] = self.faults.get(part, 0) + 1
 
     def summary(self, *, stale_inputs: int, simulated: bool = False) -> dict[str, Any]:
-        """The counted part of summary.json (contract 5.2); what was not measured is None."""
+        """The counted part of summary.json (contract 5.2). Figures without a measurement are None."""
         seconds = self.seconds()
         return {
             "frames": self.frames,

@@ -27,15 +27,15 @@ class TargetDrawer:
         fov_deg: float,
         shown_content: Callable[[], object | None] = lambda: None,
     ) -> None:
-        """shown_content: the run's content at present; None: it is never replaced."""
+        """shown_content: returns the run's present content; None: it is never replaced."""
         self._solver, self._stack, self.fov_deg = solver, stack, fov_deg
         self.shown_content = shown_content
 
     def draw(self, wanted: Wanted, content: object | None, then: Callable[[Targets | None], None]) -> None:
         """Draw, and hand the pictures to `then` on the solver's thread.
 
-        content: the run's at that refresh; None: whatever it is by then. Without pictures: the content has failed (the
-        state says so), or another one has replaced it.
+        content: the run's content at that refresh; None: the present one. `then` gets None where drawing failed (the
+        state gives the reason) or the content has been replaced.
         """
 
         def task(parts: Any) -> bool:

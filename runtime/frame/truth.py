@@ -7,8 +7,8 @@ from collections import deque
 from runtime.clock import NS_PER_S
 from runtime.records import F64
 
-GAP_NS = NS_PER_S // 5  # nothing is interpolated across a longer gap
-KEPT = 512  # true positions: eight seconds at 60 Hz
+GAP_NS = NS_PER_S // 5  # longer gaps are not interpolated
+KEPT = 512  # samples: eight seconds at 60 Hz
 
 
 class TrueEyes:

@@ -1,8 +1,9 @@
 """Quality at eyes other than those solved for: carried, expected and light (docs/contracts.md).
 
 The picture that the layers were solved for is carried along on the centre panel: the ray of each of its pixels is
-replaced by the one from the true eye through the same point of that panel. Ghosts and colour fringes
-count as errors; the parallax between nominal and true eye, which no shift of the layers can add, does not.
+replaced by the ray from the true eye through the same point of that panel. Ghosts and colour fringes count as errors.
+The parallax between nominal and true eye, which no shift of the layers can add, does not: a stale view is not counted,
+only live quality counts it (`evaluation.refresh_quality`).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import stack_from_eye
 from runtime.records import F32, F64, U8
 
-PLENTY = 3_000_000  # numbers of a picture
+PLENTY = 3_000_000  # values in a picture that allow sparser sampling
 
 
 def carried_db(
@@ -34,9 +35,9 @@ def carried_db(
 ) -> float:
     """PSNR, one ray a pixel, at eyes (2, 3) of layers solved for other eyes (2, 3).
 
-    layers: (N, H, W, 3 or 4) code values, exactly what the panels show; drawn: an (h, w, 3) picture for each eye of
+    layers: (N, H, W, 3 or 4) code values, exactly as displayed; drawn: an (h, w, 3) picture for each eye of
     `solved_for_m`, as retina pictures of horizontal field of view `fov_deg`, code values or float in [0, 1].
-    Raises ValueError where an eye is not before every panel or they see nothing of them.
+    Raises ValueError for an eye behind a panel, and where the eyes see no part of the panels.
     """
     targets = [intensities(picture) for picture in drawn]
     solved_for, eyes = np.asarray(solved_for_m, np.float64), np.asarray(eyes_m, np.float64)
@@ -61,9 +62,9 @@ def expected_psnrs_db(
 
     For each standard deviation to the right and up, by five points: no error with weight 1/2, two standard deviations
     to either side with 1/8 each, which is exact for second moments. drawn: an (h, w, 3) picture for each of the eyes
-    (2, 3) that the layers were solved for; seen_from_m: (2, 3) their true places, by default the same. Moved eyes are
-    sampled with a quarter of the rays, which is exact to 0.02 dB: every second pixel of every second row of a picture
-    of `PLENTY`, else, for light, two rays instead of four. The other arguments and errors are those of `carried_db`.
+    (2, 3) that the layers were solved for; seen_from_m: (2, 3) their true positions, by default the same. Moved eyes
+    get a quarter of the rays, which is exact to 0.02 dB: in a picture of `PLENTY` every second pixel of every second
+    row, otherwise, for light, two rays instead of four. Other arguments and errors as for `carried_db`.
     """
     how: Any = {"eyes_m": eyes_m, "fov_deg": fov_deg, "sigmas_mm": sigmas_mm, "seen_from_m": seen_from_m}
     found = _expected(squared_error, layers, drawn, stack, sampling=sampling, **how)
@@ -107,9 +108,9 @@ def _expected(
 def light_psnrs_db(
     layers: U8, drawn: Sequence[U8 | F32], stack: PanelStack, *, sampling: Sampling | None = None, **how: Any
 ) -> dict[float, float]:
-    """The same of what pupils get of real pixels (`light`): the figure to quote.
+    """Light quality by tracking error, expected as in `expected_psnrs_db`: the figure to quote.
 
-    Without a sampling, a picture of fewer numbers than `PLENTY` has four times as many rays a pixel.
+    Without a sampling, a picture of fewer values than `PLENTY` gets four times as many rays a pixel.
     """
     if sampling is None:
         sampling = LIGHT if drawn[0].size > PLENTY else LIGHT._replace(rays=2 * LIGHT.rays)
@@ -135,7 +136,7 @@ def _standard_error_db(error: F64) -> float:
 
 
 def intensities(picture: U8 | F32) -> F32:
-    """(h, w, 3) float32 in [0, 1] of a picture: code values, or intensities already."""
+    """(h, w, 3) float32 intensities in [0, 1] of a picture: code values, or intensities already."""
     part = picture[..., :3].astype(np.float32)
     if picture.dtype == np.uint8:
         part /= np.float32(255)

@@ -1,10 +1,10 @@
-"""What eyes see of displayed layers as a mean squared error (docs/contracts.md, Error).
+"""Mean squared error of displayed layers at the eyes (docs/contracts.md, Error).
 
-*Light*, the figure to quote: a panel's pixel is a square of one colour, and an eye makes of a pixel of its picture the
-mean intensity over that pixel and over its pupil, which is focused on the centre panel. It is estimated by two
-independent sets of rays at random places; the mean of the product of both sets' errors is an unbiased estimate of the
-squared error, whereas the mean of one set's squares would contain the variance of its own rays. *One ray*, as published
-evaluations have it: through the pixel's centre and the pupil's, panels sampled bilinearly.
+*Light*, the figure to quote: a panel's pixel is a square of one colour, and a pixel of the eye's picture gets the mean
+intensity over that pixel and over the pupil, which is focused on the centre panel. Two independent sets of random rays
+estimate it. The mean of the product of both sets' errors is an unbiased estimate of the squared error; the mean of one
+set's squares would include the variance of its rays. *One ray*, as in published evaluations: through the centres of
+pixel and pupil, with panels sampled bilinearly.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from runtime.optics.tilt import layer_from_seen, layer_pixels_from_seen
 from runtime.optics.views import stack_from_eye
 from runtime.records import F32, F64, U8
 
-RINGS = 9  # of points, of which each ray of light takes one: 271, as good as a disc
-GROUPS = 10  # of rows, to tell how exact a sampled error is
-TABLE = 16  # entries a code value, of the table that sums along bilinear rays are looked up in
+RINGS = 9  # of points of the pupil, one for each ray: 271 are as good as a disc
+GROUPS = 10  # of rows, for a sampled error's standard error
+TABLE = 16  # entries a code value in the table of intensity, for bilinear rays
 
 
 class Sampling(NamedTuple):
-    """Along which rays the squared error is measured."""
+    """Rays that the squared error is measured along."""
 
-    rays: int = 2  # of light, along and down a pixel, in each of its two sets; 0: one ray, bilinear
-    pupil_mm: float = PUPIL_MM  # diameter, of light; 0: a point
+    rays: int = 2  # across and down a pixel, in each of the two sets; 0: one ray, bilinear
+    pupil_mm: float = PUPIL_MM  # diameter; 0: a point
     step: int = 1  # every `step`-th pixel of every `step`-th row
 
 
@@ -50,7 +50,7 @@ class View(NamedTuple):
     target: F32  # (h, w, 3) intensities
     centre_from_image: F64  # (3, 3) pixels of the centre panel
     panels_from_centre: F64  # (points of the pupil, N, 3, 3) pixels of the panels
-    toward: F64  # (3,) times (u, v, 1): negative for a ray that goes towards the panels
+    toward: F64  # (3,) dot (u, v, 1) is negative for a ray towards the panels
     first_ray: int  # its number
 
 
@@ -67,9 +67,9 @@ def squared_error(
     """Mean squared error at eyes (2, 3) against the pictures of the eyes solved for, carried.
 
     layers: (N, H, W, 3 or 4) code values, rear to front; targets: (h, w, 3) intensities for each eye solved for, of
-    pictures `fov_deg` wide. A pixel counts whose rays all cross every panel half a pixel inside. Of light that is
-    nearly perfect it can be less than 0, by the rays' noise.
-    Raises ValueError for an eye that is not before every panel, or where no pixel counts.
+    pictures `fov_deg` wide. A pixel counts if all its rays cross every panel half a pixel inside. For nearly perfect
+    light the result can be below 0, by the rays' noise.
+    Raises ValueError for an eye behind a panel, or where no pixel counts.
     """
     how: dict[str, Any] = {"solved_for_m": solved_for_m, "eyes_m": eyes_m, "fov_deg": fov_deg, "sampling": sampling}
     total, counted = _sums(layers, targets, stack, parts=4 * len(os.sched_getaffinity(0)), **how).sum(axis=0)
@@ -77,7 +77,7 @@ def squared_error(
 
 
 def group_errors(layers: U8, targets: Sequence[F32], stack: PanelStack, *, sampling: Sampling, **how: Any) -> F64:
-    """(GROUPS + 1,) the mean squared error, then those of interleaved groups of rows: their scatter is its exactness.
+    """(GROUPS + 1,) mean squared error of all rows, then of interleaved groups, whose scatter gives its standard error.
 
     Arguments and errors are those of `squared_error`.
     """
@@ -122,7 +122,7 @@ def _sums(
 
 
 def _squared_error(codes: U8, view: View, table: F32, sampling: Sampling, first: int, last: int) -> tuple[float, int]:
-    """Sum of the squared error over some rows of one eye's picture, and of how many numbers."""
+    """Sum of the squared error over some rows of one eye's picture, and the number of terms."""
     count, height, width, components = codes.shape
     target, table = np.ascontiguousarray(view.target, np.float32), np.ascontiguousarray(table, np.float32)
     matrices = [
@@ -143,7 +143,7 @@ def _squared_error(codes: U8, view: View, table: F32, sampling: Sampling, first:
 def view_of(
     side: int, nominal_m: F64, true_m: F64, target: F32, stack: PanelStack, *, fov_deg: float, pupil_mm: float
 ) -> View:
-    """The rays of one of the eyes. Raises ValueError for one that is not before every panel."""
+    """Rays of one eye. Raises ValueError for an eye behind a panel."""
     height, width = target.shape[:2]
     rays = Rays.of_eye(checked_eye(nominal_m, stack), width_px=width, height_px=height, fov_deg=fov_deg)
     centre = panel_from_image(rays.from_stack, stack.panel(stack.count // 2))
@@ -153,7 +153,7 @@ def view_of(
 
 
 def first_ray(side: int) -> int:
-    """The number of an eye's first ray: no ray is both eyes'."""
+    """Number of an eye's first ray; both eyes' numbers are disjoint."""
     return side << 40
 
 

@@ -1,4 +1,4 @@
-"""Displayed quality (docs/contracts.md): PSNR and SSIM of what an eye sees after clipping and 8 bits."""
+"""Displayed quality (docs/contracts.md): PSNR and SSIM of retina images, after clipping and 8 bits."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HALF_WINDOW = 5  # of SSIM, pixels
 
 @dataclass(frozen=True, slots=True)
 class Quality:
-    """One number each for all eyes together, and each eye's own."""
+    """PSNR and SSIM of both eyes together, and PSNR of each."""
 
     psnr_db: float  # of one mean squared error over all counted pixels, channels and eyes
     ssim: float  # mean over eyes
@@ -39,7 +39,7 @@ def ssim(a: F32, b: F32, mask: Mask) -> float:
     for rows in strips(len(mask)):
         if not mask[rows].any():
             continue
-        # With half a window more at both ends, every row's window is whole; beyond the image it is mirrored.
+        # Half a window more at both ends completes every row's window; outside the image it is mirrored.
         first = max(rows.start - HALF_WINDOW, 0)
         around, inside = slice(first, rows.stop + HALF_WINDOW), slice(rows.start - first, rows.stop - first)
         x, y = a[around], b[around]
@@ -65,7 +65,7 @@ def squared_error(image: F32, target: F32, mask: Mask) -> tuple[float, int]:
 def quality(seen: Sequence[F32], targets: Sequence[F32], masks: Sequence[Mask], *, similarity: bool = True) -> Quality:
     """Pooled displayed quality over eyes. Raises ValueError where no ray of an eye crosses every panel.
 
-    similarity: SSIM as well; otherwise it is NaN.
+    similarity: compute SSIM; otherwise it is NaN.
     """
     errors, weights, per_eye, similarities = 0.0, 0, [], []
     for image, target, mask in zip(seen, targets, masks, strict=True):

@@ -1,4 +1,4 @@
-"""Simulated retinas: what an eye sees through the layers, as a pinhole or with a finite pupil."""
+"""Simulated retinas: images of an eye through the layers, as a pinhole or with a finite pupil."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from runtime.records import F32, F64, U8
 
 Mask = NDArray[np.bool_]
 
-STRIP_ROWS = 32  # of a picture that are worked on together: they fit the cache
+STRIP_ROWS = 32  # of a picture processed together: they fit the cache
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,12 +30,12 @@ class Retina:
     mask: Mask  # (h, w)
 
     def codes(self) -> U8:
-        """(h, w, 3) 8 bits; black where a ray passes beside a panel."""
+        """(h, w, 3) 8-bit code values; black where a ray misses a panel."""
         return np.asarray(as_codes(self.image) * self.mask[..., None], np.uint8)
 
 
 def strips(rows: int) -> Iterator[slice]:
-    """An image's rows, a few at a time: what one step writes is still in the cache for the next."""
+    """Strips of an image's rows, small enough to stay in the cache between two operations."""
     return (slice(start, min(start + STRIP_ROWS, rows)) for start in range(0, rows, STRIP_ROWS))
 
 
@@ -44,7 +44,7 @@ def _planes(layer: NDArray[np.uint8] | F32) -> list[F32]:
 
 
 class _Samples:
-    """Between which pixels positions (h, w) lie, and how near each: the same for every channel."""
+    """Bilinear weights and indices of positions (h, w), shared by all channels."""
 
     def __init__(self, u: F32, v: F32, shape: tuple[int, ...]) -> None:
         height, width = shape[:2]
@@ -72,7 +72,7 @@ class _Samples:
 
 
 def _mix(a: F32, b: F32, weight: F32) -> None:
-    """a + (b - a)·weight, into `a`; `b` is written over."""
+    """Write a + (b - a)·weight to `a`; `b` is overwritten."""
     b -= a
     b *= weight
     a += b
@@ -100,9 +100,9 @@ class Rays:
         return len(self.v), len(self.u)
 
     def on(self, raster: PlaneRaster, rows: slice = slice(None), *, moved: F64 | None = None) -> tuple[F64, F64]:
-        """(h, w) where some rows' rays cross a plane, in its raster's pixels (M_RPU).
+        """(h, w) positions in a raster's pixels where some rows' rays cross its plane (M_RPU).
 
-        moved: (3, 3) of those pixels, what is done to them afterwards.
+        moved: (3, 3) map applied to those pixels afterwards.
         """
         h = panel_from_image(self.from_stack, raster)
         if moved is not None:
@@ -127,7 +127,7 @@ class Rays:
 def panel_positions(
     eye_m: ArrayLike, stack: PanelStack, *, index: int, width_px: int, height_px: int, fov_deg: float
 ) -> tuple[F32, F32]:
-    """Where the rays of an eye's image cross panel `index`: (h, w) u and v in its layer's pixels (M_RPU)."""
+    """(h, w) u and v, in a layer's pixels, where the rays of an eye's image cross panel `index` (M_RPU)."""
     rays = Rays.of_eye(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
     u, v = rays.on(stack.panel(index), moved=_moved(stack, index, np.asarray(eye_m, dtype=np.float64)))
     return u.astype(np.float32), v.astype(np.float32)
@@ -142,11 +142,11 @@ def seen_by(
     width_px: int | None = None,
     height_px: int | None = None,
 ) -> Retina:
-    """What a pinhole eye sees: sin² of the panel values summed along each ray (supplement, (6), (7)).
+    """Image of a pinhole eye: sin² of the panel values summed along each ray (supplement, (6), (7)).
 
     layers: (N, H, W, 3 or 4), rear to front, uint8 code values or float in [0, 1]; a fourth channel is ignored.
     The image has the layers' size by default.
-    Raises ValueError for an eye that is not before every panel.
+    Raises ValueError for an eye behind a panel.
     """
     eye = checked_eye(eye_m, stack)
     width, height = width_px or layers.shape[2], height_px or layers.shape[1]
@@ -158,7 +158,7 @@ def seen_by(
 
 
 def _moved(stack: PanelStack, index: int, eye_m: F64) -> F64 | None:
-    """(3, 3) a layer's pixels from the ideal panel's, as an eye sees them; None where they are the same."""
+    """(3, 3) map from the ideal panel's pixels to a layer's, as an eye sees them; None: identity."""
     if stack.tilt is None:
         return None
     return layer_pixels_from_seen(stack.panel(index), layer_from_seen(stack, index, eye_m))
@@ -175,10 +175,10 @@ def checked_eye(eye_m: ArrayLike, stack: PanelStack) -> F64:
 def through_layers(
     layers: U8 | F32, positions: Callable[[slice], Iterable[tuple[F64, F64]]], mask: Mask, stack: PanelStack
 ) -> Retina:
-    """What rays see, given where they cross each panel.
+    """Image along rays with given positions on each panel.
 
-    positions: for some rows of the image, (h, w) u and v on every panel, rear to front; mask: (h, w) of the rays that
-    may count at all; those count that cross every panel half a pixel inside its edge.
+    positions: returns (h, w) u and v on every panel, rear to front, for some rows of the image; mask: (h, w) rays that
+    may count. Of them, those count that cross every panel half a pixel inside its edge.
     """
     image, counted = np.empty((*mask.shape, 3), np.float32), mask.copy()
     planes = [_planes(layer[..., :3]) for layer in layers]

@@ -1,4 +1,4 @@
-"""The live page's connection: the viewer's eyes in, layers and refreshes out."""
+"""Connection of a live page: the viewer's eyes in, layers and refreshes out."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from runtime.optics.retina import as_codes
 from runtime.records import U8
 from runtime.support.artifacts import to_json
 
-PAGES_MAX = 8  # live pages at once: each is sent its own pictures
+PAGES_MAX = 8  # most live pages: each one is sent its own pictures
 RANGES = {"noise_mm": (0.0, 50.0), "latency_ms": (0.0, 1000.0), "camera_fov_deg": (20.0, 150.0)}
-RANGES |= {"gap_mm": (1.0, 500.0), "camera": (0.0, 1.0)}  # what needs a new start
+RANGES |= {"gap_mm": (1.0, 500.0), "camera": (0.0, 1.0)}  # these need a restart of the loop
 
 
 async def live(socket: WebSocket, link: BrowserLink, *, protocol: str | None) -> None:
-    """One page, from its first message to its last; it is permitted already."""
+    """Serve one authorised page, from its first message to its last."""
     if len(link.news) >= PAGES_MAX:
         await socket.close(1013, "too many pages")
         return
@@ -53,20 +53,17 @@ def _tell(loop: asyncio.AbstractEventLoop, news: asyncio.Event) -> None:
 
 
 class _Page:
-    """What one page has, and what it is sent next: the newest, once what went before has been drawn."""
+    """State of one page. It is sent the newest picture whenever it has drawn the one before."""
 
     def __init__(self, socket: WebSocket, link: BrowserLink) -> None:
         self._socket, self._link = socket, link
         self.news, self._sent = asyncio.Event(), {"solved": 0, "flat": 0}
-        self._under_way = False  # layers that the page has not taken in yet
+        self._under_way = False  # the page has not drawn the layers last sent yet
         self._stack: Any = None
-        self._checks, self._moment = (
-            False,
-            None,
-        )  # it shows a measured moment, not the newest
+        self._checks, self._moment = False, None  # checks: it shows the newest measured refresh instead
 
     async def send(self, me: object) -> None:
-        told: dict[str, Any] = {}
+        sent: dict[str, Any] = {}
         found: Any = None
         while True:
             link, (frame, account) = self._link, self._link.shown
@@ -83,9 +80,9 @@ class _Page:
                 ):
                     if layers is not None and version != self._sent[kind] and not self._under_way:
                         await self._send_layers(kind, layers, version, account.get("solved_for_m"))
-            if account is not told:
-                told = account
-                await self._say({"refresh": told, "viewer": link.is_viewer(me)})
+            if account is not sent:
+                sent = account
+                await self._say({"refresh": sent, "viewer": link.is_viewer(me)})
             if link.found is not found and link.found is not None:
                 found = link.found
                 await self._say({"found": found})
@@ -99,7 +96,7 @@ class _Page:
         await self._socket.send_bytes(pixels)
 
     async def _send_moment(self, moment: Any) -> None:
-        """Layers and, after them, what each eye should see of them, all RGBA."""
+        """Send layers followed by both eyes' targets, all RGBA."""
         views = moment.eye_views
 
         def packed() -> bytes:
@@ -109,7 +106,8 @@ class _Page:
         self._moment, self._under_way = moment, True
         data = await asyncio.to_thread(packed)
         height, width = views.wanted[0].shape[:2]
-        await self._say({"layers": "solved", "solved_for_m": views.eyes_m, "target": [width, height]})
+        size = [moment.layers.shape[2], moment.layers.shape[1]]
+        await self._say({"layers": "solved", "solved_for_m": views.eyes_m, "size": size, "target": [width, height]})
         await self._socket.send_bytes(data)
 
     async def receive(self, me: object) -> None:

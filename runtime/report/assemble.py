@@ -1,4 +1,4 @@
-"""The whole report: what is measured, in which order, and the page and record that grow with it."""
+"""The whole report: measurements in their order, and the page and record that grow with them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from runtime.report.page import Page, Section, describe
 from runtime.report.pairs import StillPair, procedural_pairs, read_pairs
 from runtime.report.sections import focal_section, frontier_section, moving_section
 
-QUOTE = "light_db at a tracking error of 1 mm: what both eyes' pupils make of the panels' pixels"
+QUOTE = "light_db at a tracking error of 1 mm: mean light over both eyes' pupils and pixels; for motion live_db"
 Progress = Callable[[str], None]
 
 
@@ -28,25 +28,25 @@ class GrowingPage:
         self.record: dict[str, Any] = {"machine": describe(), "command": command, "quote": QUOTE, "complete": False}
 
     def doing(self, what: str) -> None:
-        """What is measured now."""
+        """Note the present measurement."""
         self._progress(what)
         self.record["measuring"] = what
 
     def put(self, name: str, section: Section) -> None:
-        """A section as it is now, in place of what it was."""
+        """Add a section, or replace the one of that name."""
         self._sections[name] = section
         self.write()
 
     def finished(self) -> None:
-        """Nothing more will come."""
+        """Mark the report as complete."""
         del self.record["measuring"]
         self.record["complete"] = True
         self.write()
 
     def write(self) -> None:
-        """All there is. Raises InputError."""
+        """Write everything measured until now. Raises InputError."""
         doing = self.record.get("measuring")
-        notes = [f"Not finished: it grows while it is measured. The last that was known: {doing}."] if doing else []
+        notes = [f"Not finished: the page grows with every measurement. Last known step: {doing}."] if doing else []
         sections, machine = list(self._sections.values()), self.record["machine"]
         lead = "Light, at a tracking error of 1 mm, is the figure to quote; higher is better."
         page = Page("Light against run time", lead, sections, machine, self._command, notes)
@@ -63,9 +63,9 @@ def whole_report(
     command: str = "phasestack report",
     progress: Progress = lambda name: None,
 ) -> dict[str, Any]:
-    """Measure everything into a folder; answers report.json. `quick`: quarter size, fewer references.
+    """Measure everything into a folder; return report.json. `quick`: quarter size, fewer references.
 
-    Raises InputError for case files and models with mistakes, before anything is measured.
+    Raises InputError for invalid case files and models, before the first measurement.
     """
     cases = read_pairs(pairs) if pairs is not None else []
     stack = StackGeometry().stack()
@@ -98,7 +98,7 @@ def _by_size(cases: Sequence[StillPair]) -> dict[str, list[StillPair]]:
 def _frontier(
     page: GrowingPage, methods: Sequence[Method], pairs: Iterable[StillPair], *, title: str, name: str, key: str
 ) -> None:
-    """One section of pairs that share a resolution; `key`: of the record that its methods are added to."""
+    """Measure a section of pairs of one resolution; key: list in the record that its methods are added to."""
     title = f"Light against run time: {title}"
     page.doing(f"{title}: drawing")
     before, results = page.record.get(key, []), dict[str, MethodResult]()

@@ -1,4 +1,4 @@
-"""Regression file of the shipped models' time, light and memory, with a yardstick of the machine."""
+"""Regression file: time, light and memory of the shipped models, with a yardstick for the machine."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from runtime.report.page import describe
 from runtime.report.pairs import FOV_DEG, Painter, eyes_at
 
 SIZES = ((960, 540), (1920, 1080))
-WORSE_DB = 0.1  # more than rounding and the order of threads can change
-SLOWER = 0.15  # at least; more where the runs themselves scatter more
-MORE_MEMORY = 0.15  # relative: a change that is reported
-UNSTEADY = 1.3  # times the least yardstick: the machine's speed changed by more than a difference that counts
-SCATTERS = 3.0  # of the medians' own scatter before a difference counts
+WORSE_DB = 0.1  # more than rounding and thread order can change
+SLOWER = 0.15  # at least; more if the runs scatter more
+MORE_MEMORY = 0.15  # relative change that is reported
+UNSTEADY = 1.3  # ratio of the slowest to the fastest yardstick beyond which times are not compared
+SCATTERS = 3.0  # times the medians' scatter: a smaller difference does not count
 
 
 class Entry(BaseModel):
-    """What is compared of one method at one size."""
+    """Compared figures of one method at one size."""
 
     name: str
     width_px: int
@@ -44,7 +44,7 @@ class Entry(BaseModel):
 
 
 class RegressionFile(BaseModel):
-    """What is compared of a regression file."""
+    """Compared part of a regression file."""
 
     version: Literal[2]
     yardstick_ms: PositiveFloat
@@ -52,7 +52,7 @@ class RegressionFile(BaseModel):
     methods: list[Entry]
 
     def too_busy(self) -> str:
-        """Why the times can't be compared: the machine had other things to do. Empty: they can."""
+        """Reason why times can't be compared (other load on the machine); empty: they can."""
         least, most = min(self.yardsticks_ms), max(self.yardsticks_ms)
         if most > UNSTEADY * least:
             return f"the same work took {least:.1f} to {most:.1f} ms while it was measured"
@@ -60,12 +60,12 @@ class RegressionFile(BaseModel):
 
 
 def read(path: Path) -> RegressionFile:
-    """A regression file. Raises InputError, naming file and field, for anything else."""
+    """Read a regression file. Raises InputError with file and field for anything else."""
     return validated(RegressionFile, read_table(path), source=path)
 
 
 def yardstick_ms() -> float:
-    """A fixed piece of work of the same kinds (warp, table, product of matrices): median of nine."""
+    """Median time of nine runs of a fixed workload: warp, look-up table, matrix product."""
     picture = np.random.default_rng(0).integers(0, 256, (1080, 1920, 4), dtype=np.uint8)
     left = np.random.default_rng(1).random((1080, 240), dtype=np.float32)
     right = np.random.default_rng(2).random((240, 1920), dtype=np.float32)
@@ -80,7 +80,7 @@ def yardstick_ms() -> float:
 
 
 def scatter(values: Sequence[float]) -> float:
-    """How far a median of these may be off, relative: 1.4826·MAD·1.25/sqrt(n)."""
+    """Relative standard error of the median: 1.4826·MAD·1.25/sqrt(n)."""
     middle = float(np.median(values))
     deviation = float(np.median(np.abs(np.asarray(values) - middle)))
     relative: float = 1.4826 * 1.2533 * deviation / middle / len(values) ** 0.5
@@ -93,7 +93,7 @@ def measured(
     sizes: Sequence[tuple[int, int]] = SIZES,
     progress: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
-    """The regression file's content. Takes about a minute."""
+    """Measure the content of a regression file; takes about a minute."""
     yardsticks, entries = [yardstick_ms()], []
     methods = [Method(name, "network", name) for name in models]
     for width, height in sizes:
@@ -121,7 +121,7 @@ def _entry(result: MethodResult) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One thing that differs between two files beyond noise."""
+    """One difference between two files, beyond noise."""
 
     what: str
     worse: bool
@@ -131,7 +131,7 @@ class Change:
 def compare(old: RegressionFile, new: RegressionFile) -> list[Change]:
     """Changes between two regression files, with times relative to each file's yardstick.
 
-    Where the machine was too busy in either (`too_busy`) they are not compared at all.
+    Times are not compared if the machine was too busy in either (`too_busy`).
     """
     later = {entry.title: entry for entry in new.methods}
     machine = new.yardstick_ms / old.yardstick_ms

@@ -1,8 +1,8 @@
 """Focal parallax (supplement, 1.4): an eye with a finite pupil focuses through the layers.
 
-A pupil sees the mean of what its points see, and focusing at a distance means that those pictures are laid on each
-other so that they agree there. From a point of the pupil (right, up) the picture is that of a pinhole, shifted by
-focal_px·right/f to the right and focal_px·up/f up, f the distance in focus along the gaze.
+A pupil sees the mean of the pictures of its points. Focusing at a distance shifts those pictures so that they agree
+there: the picture of a pupil's point (right, up) is a pinhole's, shifted by focal_px·right/f to the right and
+focal_px·up/f up, where f is the distance in focus along the gaze.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from runtime.report.pairs import Painter, eyes_at
 WIDTH_PX, HEIGHT_PX, FOV_DEG = 720, 300, 18.0
 PUPIL_M = PUPIL_MM / 1e3
 DISTANCE_M = 0.4
-CARDS_M = (-0.05, 0.0, 0.045)  # where three cards stand, along +x of the stack
-OFFSETS_M = (-0.043, 0.0, 0.040)  # and aside
-PLANES_M = (-0.11, -0.08, -0.05, -0.025, 0.0, 0.022, 0.045, 0.07, 0.095)  # what is focused on
+CARDS_M = (-0.05, 0.0, 0.045)  # x of three cards, frame `stack`
+OFFSETS_M = (-0.043, 0.0, 0.040)  # y of the cards
+PLANES_M = (-0.11, -0.08, -0.05, -0.025, 0.0, 0.022, 0.045, 0.07, 0.095)  # x of the planes in focus
 FLIP = np.diag([1.0, -1.0, -1.0])  # cameras look along +z with y down
 
 
@@ -39,16 +39,16 @@ FLIP = np.diag([1.0, -1.0, -1.0])  # cameras look along +z with y down
 class Slice:
     """One setting of the eye's lens."""
 
-    plane_m: float  # x of the place in focus, straight ahead
+    plane_m: float  # x of the plane in focus
     shown: F32  # (h, w, 3) through the layers
-    true: F32  # (h, w, 3) as the scene itself would look
+    true: F32  # (h, w, 3) of the scene itself
 
 
 @dataclass(frozen=True, slots=True)
 class Accommodation:
-    """Where the eyes converge on a card, and where its picture is sharpest."""
+    """Distances at which the eyes converge on a card and at which its picture is sharpest."""
 
-    card_m: float  # distance from the eye: where the two lines of sight meet
+    card_m: float  # distance from the eye to where the lines of sight meet
     sharpest_shown_m: float
     sharpest_true_m: float
 
@@ -78,7 +78,7 @@ def projection(eye_m: F64, point: F64, *, focus_m: float) -> F64:
 
 
 def card_windows(eye_m: F64) -> list[tuple[slice, slice]]:
-    """Where the cards are in the eye's picture, rows and columns, a little inside their edges."""
+    """Rows and columns of the cards in the eye's picture, a little inside their edges."""
     windows = []
     matrix = projection(eye_m, np.zeros(2), focus_m=DISTANCE_M)
     for x, y in zip(CARDS_M, OFFSETS_M, strict=True):
@@ -90,13 +90,13 @@ def card_windows(eye_m: F64) -> list[tuple[slice, slice]]:
 
 
 def contrast(image: F32, window: tuple[slice, slice]) -> float:
-    """RMS of the brightness gradient in a window: it is largest where the picture is sharp."""
+    """RMS of the brightness gradient in a window: largest where the picture is sharp."""
     grey = image[window].mean(axis=2)
     return float(np.sqrt((np.diff(grey, axis=1) ** 2).mean() + (np.diff(grey, axis=0) ** 2).mean()))
 
 
 def sharpest(distances_m: Sequence[float], values: Sequence[float]) -> float:
-    """The distance at which a parabola through the largest value and its neighbours has its top."""
+    """Distance of the maximum of a parabola through the largest value and its neighbours."""
     best = int(np.argmax(values))
     if not 0 < best < len(values) - 1:
         return distances_m[best]
@@ -138,14 +138,14 @@ def focal_stack(
 
 
 def seen_through(matrix: F64, layers: U8, stack: PanelStack) -> Retina:
-    """What a projection's pinhole sees of the layers, and which rays cross every panel."""
+    """Picture of the layers through a projection, and a mask of the rays that cross every panel."""
     rays = Rays(matrix, np.arange(WIDTH_PX) + np.float64(0.5), (np.arange(HEIGHT_PX) + np.float64(0.5))[:, None])
     panels = [stack.panel(index) for index in range(stack.count)]
     return through_layers(layers, lambda rows: (rays.on(panel, rows) for panel in panels), rays.toward_panels(), stack)
 
 
 def cards_painter(stack: PanelStack) -> Painter:
-    """Three finely textured cards: behind the panels' middle, in it, and before it."""
+    """Painter of three finely textured cards: behind, in and in front of the middle panel."""
     card = shapes.card(0.034, 0.036, repeat=(3.4, 3.6))
     things = tuple(
         Thing(card, "checker", (x, y, 0.0), colour, lit=False)

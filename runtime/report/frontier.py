@@ -33,27 +33,27 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 T = TypeVar("T")
 Kind = Literal["network", "iterative"]
-SHIPPED = ("balanced", "fast", "best")  # the default first: a report's first figure
+SHIPPED = ("balanced", "fast", "best")  # the default first: it is a report's first figure
 SART = (1, 3, 10, 30)
-ENOUGH_S = 2.0  # of timed runs on one pair; slow methods run once
-MOST_RUNS = 25  # timed, of one method on one pair
-FEWEST_RUNS = 3  # timed, unless the first was slow
-SLOW_S = 4.0  # a first run that takes longer counts, and is the only one
-OFF_STEP = 3  # away from the eyes, every third ray of every third row is enough
-QUOTED = "1"  # of `light_db`: a tracking error of 1 mm
+ENOUGH_S = 2.0  # of timed runs for each pair; slow methods run once
+MOST_RUNS = 25  # timed runs of one method on one pair
+FEWEST_RUNS = 3  # timed runs, unless the first is slow
+SLOW_S = 4.0  # a first run longer than this counts and is the only one
+OFF_STEP = 3  # off the eyes, every third ray of every third row is enough
+QUOTED = "1"  # key of `light_db`: tracking error 1 mm
 
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """A way to layers."""
+    """A method that computes layers."""
 
     name: str
     kind: Kind
-    source: str  # what `load_predictor` takes
+    source: str  # argument of `load_predictor`
     iterations: int = 0  # of SART
 
     def opened(self, stack: PanelStack, *, threads: int) -> Predictor:
-        """Ready for pairs on a stack. Raises InputError, MissingPart."""
+        """Load a predictor for a stack. Raises InputError, MissingPart."""
         from runtime.config import ModelSettings
         from runtime.model.predictor import load_predictor
         from runtime.model.sart import SartPredictor
@@ -64,7 +64,7 @@ class Method:
 
 
 def shipped_and_references(models: Sequence[str] = (), *, quick: bool = False) -> list[Method]:
-    """The shipped sizes, further ONNX files, and the iterative reference. `quick` leaves out the slowest."""
+    """The shipped models, further ONNX files, and the iterative reference; `quick`: without the slowest."""
     methods = [Method(name, "network", name) for name in SHIPPED]
     methods += [Method(Path(name).stem, "network", name) for name in models]
     return methods + [Method(f"SART-{n}", "iterative", "sart", n) for n in (SART[:-1] if quick else SART)]
@@ -72,25 +72,25 @@ def shipped_and_references(models: Sequence[str] = (), *, quick: bool = False) -
 
 @dataclass(frozen=True, slots=True)
 class MethodRun:
-    """One method on one pair, as the process that ran it saw it."""
+    """One method on one pair, measured in its process."""
 
     layers: U8
-    run_ms: tuple[float, ...]  # whole predictions: two decoded images to N 8-bit layers
-    memory_mib: float  # the process's peak
+    run_ms: tuple[float, ...]  # whole solutions: two decoded images to N 8-bit layers
+    memory_mib: float  # peak of the process
     parameters: int
     precision: str
 
 
 @dataclass(frozen=True, slots=True)
 class PairResult:
-    """One method on one pair."""
+    """Quality of one method on one pair."""
 
     pair: str
     run_ms: tuple[float, ...]
     memory_mib: float
     quality: PairQuality
     psnr_db_off_eye: dict[str, float]
-    viewer: str = ""  # name of the page that looks into its layers, where one was left
+    viewer: str = ""  # file name of the viewer of its layers, if written
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +106,7 @@ class MethodResult:
     ms_p99: float
     memory_mib: float
     parameters: int
-    light_db: dict[str, float]  # by the tracking's error, millimetres: "0", "1", "2"
+    light_db: dict[str, float]  # by tracking error, millimetres: "0", "1", "2"
     expected_db: dict[str, float]  # the same, one ray a pixel
     psnr_db: float
     ssim: float
@@ -116,20 +116,20 @@ class MethodResult:
 
     @property
     def quoted_db(self) -> float:
-        """The one figure to quote. NaN where such eyes see nothing."""
+        """The figure to quote; NaN where such eyes see no part of the panels."""
         return self.light_db.get(QUOTED, math.nan)
 
     def record(self) -> dict[str, Any]:
-        """As report.json has it."""
+        """Entry of report.json."""
         return asdict(self)
 
 
 def measure(
     methods: Sequence[Method], pairs: Iterable[StillPair], *, threads: int = 2, viewers: Path | None = None
 ) -> Iterator[tuple[str, MethodResult]]:
-    """Results of every method, pair by pair, at one resolution. viewers: folder for the first layers.
+    """Measure every method, pair by pair, at one resolution. viewers: folder for viewers of the first method.
 
-    Yields what was measured last, and its method's result so far. Raises FatalError where one fails.
+    Yields, after each measurement, its name and the method's result up to then. Raises FatalError if one fails.
     """
     found: dict[str, list[PairResult]] = {method.name: [] for method in methods}
     for pair in pairs:
@@ -142,7 +142,7 @@ def measure(
 
 def apart(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
     """Call an importable function in a fresh process with its own memory. Raises FatalError."""
-    # What it prints goes to stderr: stdout may be somebody's JSON.
+    # Its stdout goes to stderr: ours may be JSON.
     with ProcessPoolExecutor(1, get_context("spawn"), initializer=os.dup2, initargs=(2, 1)) as pool:
         try:
             return pool.submit(_called, function, args, kwargs).result()
@@ -153,12 +153,12 @@ def apart(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
 def _called(function: Callable[..., T], args: Any, kwargs: Any) -> T:
     try:
         return function(*args, **kwargs)
-    except PhasestackError as error:  # other classes of ours do not come through a pipe
+    except PhasestackError as error:  # our other classes can't be pickled
         raise FatalError(str(error)) from None
 
 
 def run_method(method: Method, pair: StillPair, threads: int) -> MethodRun:
-    """Open, warm up, time, and note the peak of memory. Runs in a process of its own."""
+    """Load, warm up and time a method, and note the peak of memory; for a separate process."""
     import cv2
 
     from runtime.model.still import solve_still
@@ -178,7 +178,7 @@ def run_method(method: Method, pair: StillPair, threads: int) -> MethodRun:
 
 
 def _forget_peak() -> None:
-    # Not on an older kernel: the peak then includes the start of the interpreter, which is less.
+    # Older kernels refuse: the peak then includes the interpreter's start, which needs less.
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 
@@ -191,7 +191,7 @@ def _peak_mib() -> float:
 def pair_result(pair: StillPair, run: MethodRun, *, viewer: Path | None = None) -> PairResult:
     """Displayed quality (docs/contracts.md, Error): at the eyes, expected, and off the eyes.
 
-    viewer: folder that a page is left in, to look into the layers.
+    viewer: folder for a viewer of the layers.
     """
     at_eyes = SolvedPair(run.layers, pair.images, pair.stack, pair.eyes_m, pair.fov_deg)
     off: dict[str, list[float]] = {}
@@ -199,7 +199,7 @@ def pair_result(pair: StillPair, run: MethodRun, *, viewer: Path | None = None) 
     for view in pair.off:
         place = view.eye_m[None]
         where: Any = {"solved_for_m": place, "eyes_m": place, "fov_deg": pair.fov_deg, "sampling": sampling}
-        with contextlib.suppress(ValueError):  # nothing is seen from there
+        with contextlib.suppress(ValueError):  # that eye sees no part of the panels
             error = squared_error(run.layers, [intensities(view.image)], pair.stack, **where)
             off.setdefault(f"{view.mm:g}mm", []).append(psnr_db(error))
     beside = {name: float(np.mean(values)) for name, values in off.items()}
@@ -234,7 +234,7 @@ def _together(method: Method, pair: StillPair, run: MethodRun, pairs: list[PairR
 
 
 def _means(tables: Sequence[Any]) -> dict[str, float]:
-    """By key, over the tables that have a number there."""
+    """Means by key over the tables that have a finite number there."""
     keys = dict.fromkeys(key for table in tables for key in table)
     found = {key: [table[key] for table in tables if math.isfinite(table.get(key, math.nan))] for key in keys}
     return {key: float(np.mean(values)) for key, values in found.items() if values}

@@ -1,4 +1,4 @@
-"""What a moving viewer sees: simulated runs for every motion and several solver times."""
+"""Live quality for moving viewers: simulated runs for every motion and several solver times."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from runtime.records import U8
 MOTIONS = ("still", "lean", "walk", "stop-and-go")
 SOLVER_MS = (33.0, 150.0)
 SECONDS = 4.0
-SETTLED_S = 1.0  # before it, the tracker has just begun
-EVERY = 11  # refreshes from one sample to the next: no multiple of a solution's refreshes for long
-# How a solver's time is spread over its stages; only their sum matters here.
+SETTLED_S = 1.0  # start of the run that is skipped: the tracker has just begun
+EVERY = 11  # refreshes between samples: not a multiple of a solution's refreshes
+# Shares of a solver's stages in its time; only their sum matters here.
 SHARES = {"render": 0.3, "prepare": 0.2, "inference": 0.1, "finish": 0.4}
 
 
@@ -34,8 +34,8 @@ class Moving:
 
     motion: str
     solver_ms: float
-    live_db: float  # at the true eyes, against what they should see there and then (docs/contracts.md, Error)
-    refreshes: int  # that it was measured at
+    live_db: float  # docs/contracts.md, Error
+    refreshes: int  # measured
     tracker_mm: tuple[float, float]  # p50 and p95, true eyes to those that the tracker predicted
     view_error_mm: tuple[float, float]  # p50 and p95, true eyes to those that the layers were solved for
 
@@ -50,10 +50,10 @@ class Lines:
         self.lines.append(line)
 
     def light(self, frame: int, *, layers: U8) -> None:
-        """Nothing is kept."""
+        """Keep no layers."""
 
     def light_targets(self, frame: int, **targets: Any) -> None:
-        """Nothing is kept."""
+        """Keep no pictures."""
 
 
 def simulated_run(settings: Settings, *, scale: float) -> tuple[list[Mapping[str, Any]], dict[int, float]]:
@@ -67,7 +67,7 @@ def simulated_run(settings: Settings, *, scale: float) -> tuple[list[Mapping[str
 
 
 def settings_for(recording: Path, *, solver_ms: float) -> Settings:
-    """The defaults, on a recording, with a solver that takes so long on the simulated clock."""
+    """Default settings for a recording, with a solver that takes `solver_ms` on the simulated clock."""
     table = Settings().model_dump()
     table["sensor"] |= {"driver": "replay", "source": str(recording), "loop": False}
     table["loop"]["evaluate_every"] = EVERY
@@ -76,7 +76,7 @@ def settings_for(recording: Path, *, solver_ms: float) -> Settings:
 
 
 def moving_run(motion: str, solver_ms: float, *, seconds: float = SECONDS, scale: float = 0.5, seed: int = 1) -> Moving:
-    """Results of one motion with one solver, for its own process. Raises FatalError without any."""
+    """Run one motion with one solver, in a separate process. Raises FatalError without any result."""
     with tempfile.TemporaryDirectory(prefix="phasestack-") as folder:
         recording = Path(folder) / "motion.mcap"
         write_motion(recording, motion, seconds=seconds, seed=seed)
@@ -90,7 +90,7 @@ def moving_run(motion: str, solver_ms: float, *, seconds: float = SECONDS, scale
         for eyes in ("eyes_m", "solved_for_m")
     )
     if not live or not tracked_mm or not stale_mm:
-        raise FatalError(f"the motion {motion} with a solver of {solver_ms:g} ms showed nothing")
+        raise FatalError(f"the motion {motion} with a solver of {solver_ms:g} ms gave no measurement")
     live_db = psnr_db(float(np.mean(live)))
     return Moving(motion, solver_ms, live_db, len(live), _quantiles(tracked_mm), _quantiles(stale_mm))
 

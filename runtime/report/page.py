@@ -1,4 +1,4 @@
-"""Shared by the reports: self-contained HTML pages, the plots' style, the machine's description."""
+"""Self-contained HTML pages of reports, the style of plots, and a description of the machine."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ PACKAGES = (
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """A picture, and what a person should see in it."""
+    """A picture and its caption."""
 
-    name: str  # of its file next to the page, without .png
+    name: str  # file name without .png
     png: bytes
     caption: str
 
@@ -53,7 +53,7 @@ class Section:
     text: Sequence[str] = ()  # paragraphs, plain text
     figures: Sequence[Figure] = ()
     tables: Sequence[Table] = ()
-    links: Sequence[tuple[str, str]] = ()  # what is said, and the file next to the page
+    links: Sequence[tuple[str, str]] = ()  # text, and a file next to the page
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,14 +61,14 @@ class Page:
     """A whole page."""
 
     title: str
-    lead: str  # one sentence: the main result
+    lead: str  # the main result in a sentence
     sections: Sequence[Section]
     machine: Mapping[str, str] = field(default_factory=dict)
-    command: str = ""  # that makes this page again; empty: nothing is said of it
-    notes: Sequence[str] = ()  # what to beware of
+    command: str = ""  # reproduces this page; empty: not shown
+    notes: Sequence[str] = ()  # caveats
 
     def html(self) -> str:
-        """The page. Every text is escaped; no request leaves it."""
+        """HTML of the page: every text escaped, no request to elsewhere."""
         from jinja2 import Environment, StrictUndefined
 
         template = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
@@ -76,11 +76,11 @@ class Page:
         return environment.from_string(template).render(page=self)
 
     def figures(self) -> list[Figure]:
-        """Every picture of the page, in its order."""
+        """All pictures of the page, in order."""
         return [figure for section in self.sections for figure in section.figures]
 
     def write(self, out: Path, *, record: str, data: Any) -> None:
-        """Write index.html, its PNGs and `data` as JSON (`record`) into `out`, all or none.
+        """Write index.html, its PNGs and `data` as the JSON file `record` into `out`, all or none.
 
         Raises InputError.
         """
@@ -92,7 +92,7 @@ class Page:
 
 
 def section_of(title: str, rows: Sequence[Sequence[str]]) -> Section:
-    """A section of one table, whose first row is its headings."""
+    """Section of one table; the first row holds the headings."""
     return Section(title, tables=[Table(rows[0], rows[1:])])
 
 
@@ -107,21 +107,21 @@ def drawing(width_in: float, height_in: float) -> Iterator[Any]:
 
 
 def png(figure: Any) -> bytes:
-    """A figure as PNG, without time stamps: the same data give the same bytes."""
+    """PNG of a figure without time stamps: equal data give equal bytes."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})
     return buffer.getvalue()
 
 
 def describe() -> dict[str, str]:
-    """Names and values, in the order in which a page shows them. What isn't installed is left out."""
+    """Facts of the machine and versions of installed packages, in a page's order."""
     facts = {
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "processor": _processor(),
         "cores": str(len(os.sched_getaffinity(0))),
         "memory": f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.1f} GiB",
         "system": f"{platform.system()} {platform.release()}",
-        "seed": "0",  # of whatever is drawn at random
+        "seed": "0",  # of all random numbers
         "Python": platform.python_version(),
     }
     for name in PACKAGES:

@@ -31,7 +31,7 @@ FOV_DEG = 40.0
 
 @dataclass(frozen=True, slots=True)
 class OffView:
-    """What an eye should see from a place away from its nominal one."""
+    """Target of an eye that is off its nominal position."""
 
     mm: float
     eye_m: F64  # (3,) frame `stack`
@@ -51,7 +51,7 @@ class StillPair:
 
 
 class OffEntry(BaseModel):
-    """What an eye should see from elsewhere, as a case file has it."""
+    """Target of an eye off its nominal position, in a case file."""
 
     mm: Annotated[float, Field(strict=True, ge=0, le=1000 * EYE_MOST_M)]
     eye: Place
@@ -69,9 +69,9 @@ class CaseFile(BaseModel):
 
 
 def read_pairs(folder: Path) -> list[StillPair]:
-    """Every case file in a folder, by name; other JSON is ignored, a case with a mistake is refused.
+    """Read every case file in a folder, in order of names; ignore other JSON.
 
-    Raises InputError, naming file and field; also where the folder holds no case at all.
+    Raises InputError with file and field for an invalid case, and for a folder without any.
     """
     if not folder.is_dir():
         raise InputError(folder, "", "is not a folder")
@@ -94,7 +94,7 @@ def _case(path: Path, table: dict[str, Any]) -> StillPair:
     stack = validated(StackGeometry, size | case.panels, source=f"{path}: panels").stack()
     eyes = np.array(case.eyes)
     if not (eyes[:, 0] > max(stack.x_m)).all():
-        raise InputError(path, "eyes", "must be before every panel")
+        raise InputError(path, "eyes", "must be in front of every panel")
     off = []
     for view in case.off:
         image = read_image(path.parent / view.image)
@@ -105,7 +105,7 @@ def _case(path: Path, table: dict[str, Any]) -> StillPair:
 
 
 def eyes_at(*, distance_m: float, angle_deg: float = 0.0, height_m: float = 0.0, ipd_m: float = 0.063) -> F64:
-    """(2, 3) eyes at a distance from the origin and an angle from +x towards +y, facing the origin."""
+    """(2, 3) eyes that face the origin, at a distance from it and an angle from +x towards +y."""
     angle = math.radians(angle_deg)
     level = math.sqrt(max(distance_m**2 - height_m**2, 0.0))
     middle = np.array([level * math.cos(angle), level * math.sin(angle), height_m])
@@ -114,17 +114,17 @@ def eyes_at(*, distance_m: float, angle_deg: float = 0.0, height_m: float = 0.0,
 
 
 def beside(eye_m: ArrayLike, mm: float) -> list[F64]:
-    """(3,) places `mm` away from an eye: right, up, left, down in its own frame."""
+    """(3,) positions `mm` away from an eye: right, up, left, down in its frame."""
     pose = stack_from_eye(eye_m)
     directions = ((1, 0), (0, 1), (-1, 0), (0, -1))
     return [pose[:3, 3] + mm / 1000 * (right * pose[:3, 0] + up * pose[:3, 1]) for right, up in directions]
 
 
 class Painter:
-    """Pictures of a built-in scene from anywhere. Owns a GL context: one thread, closed at the end."""
+    """Draws a built-in scene from anywhere. Owns a GL context: for one thread, to be closed."""
 
     def __init__(self, scene: str | Scene, stack: PanelStack) -> None:
-        """Raises InputError for an unknown scene, MissingPart without OpenGL."""
+        """Open the scene. Raises InputError for an unknown one, MissingPart without OpenGL."""
         from runtime.content.procedural import ProceduralSource
         from runtime.support.gl import offscreen_context
 
@@ -139,21 +139,21 @@ class Painter:
         self.context.release()
 
     def draw(self, eye_m: ArrayLike, pixels_from_stack: F64, *, width_px: int, height_px: int) -> U8:
-        """(h, w, 4) the scene through any projection."""
+        """(h, w, 4) picture of the scene through any projection."""
         from runtime.content.base import View
 
         eye = np.asarray(eye_m, dtype=np.float64)
         return self.content.render(View(eye, 0, pixels_from_stack, width_px, height_px), time_ns=0).copy()
 
     def image(self, eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg: float = FOV_DEG) -> U8:
-        """(h, w, 3) what an eye that looks at the stack's origin sees."""
+        """(h, w, 3) retina picture of an eye that looks at the stack's origin."""
         projection = image_from_stack(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
         return np.ascontiguousarray(self.draw(eye_m, projection, width_px=width_px, height_px=height_px)[..., :3])
 
     def pair(
         self, name: str, eyes_m: F64, stack: PanelStack, *, fov_deg: float = FOV_DEG, off_mm: Sequence[float] = OFF_MM
     ) -> StillPair:
-        """A pair in the stack's resolution, with the views beside both eyes drawn anew."""
+        """A pair in the stack's resolution, with pictures for positions around both eyes."""
         size = {"width_px": stack.width_px, "height_px": stack.height_px}
         left, right = (self.image(eye, **size, fov_deg=fov_deg) for eye in eyes_m)
         off = tuple(
@@ -173,7 +173,7 @@ PROCEDURAL = (
 
 
 def procedural_pairs(stack: PanelStack) -> Iterator[StillPair]:
-    """The report's own pairs: built-in scenes from three places, with views off the eyes."""
+    """The report's pairs: built-in scenes from three positions, with pictures off the eyes."""
     for scene, name, place in PROCEDURAL:
         with Painter(scene, stack) as painter:
             pair = painter.pair(name, eyes_at(**place), stack)

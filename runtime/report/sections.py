@@ -1,4 +1,4 @@
-"""The report's sections: light against run time, what a moving viewer sees, and focal parallax."""
+"""Sections of the report: light against run time, live quality in motion, and focal parallax."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from runtime.report.moving import Moving
 from runtime.report.page import Figure, Section, Table, drawing, png
 
 KINDS = {"shipped": ("o-", "C0"), "added": ("D", "C2"), "iterative": ("s-", "C1")}
-NAMES = ("behind the panels", "in the middle panel", "before the panels")
+NAMES = ("behind the panels", "in the middle panel", "in front of the panels")
 
 
 def frontier_section(results: Sequence[MethodResult], *, title: str, name: str) -> Section:
-    """The plot and the table of one resolution's methods, as far as they are measured."""
+    """Plot and table of one resolution's methods measured until now."""
     pairs = "; ".join(pair.pair for pair in results[0].pairs)
     text = [
-        f"Every method on {pairs}, in one run. Light, the figure to quote: what pupils of 4 mm make of the panels' "
-        "pixels, which are even boxes, at a tracking error of 1 mm. One ray a pixel, sampled bilinearly, is "
-        "what published evaluations measure. The time is that of a whole solution, from two decoded pictures to 8-bit "
-        "layers. Each method runs in a process of its own; its memory is that process's peak.",
+        f"Every method on {pairs}, in one run. Light is the figure to quote: panel pixels are squares, pupils 4 mm "
+        "wide, the tracking error 1 mm. Published evaluations measure one ray a pixel, sampled bilinearly. The time is "
+        "that of a whole solution, from two decoded pictures to 8-bit layers. Each method runs in a separate process, "
+        "whose peak is its memory.",
     ]
-    links = [(f"Look into {pair.pair}, by {results[0].name}", pair.viewer) for pair in results[0].pairs if pair.viewer]
+    links = [(f"Viewer: {pair.pair}, {results[0].name}", pair.viewer) for pair in results[0].pairs if pair.viewer]
     return Section(title, text, [frontier_plot(results, name=f"frontier-{name}")], [method_table(results)], links)
 
 
 def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
-    """A curve for the shipped sizes and one for the reference; added models stand alone.
+    """One curve for the shipped models and one for the reference; added models as single points.
 
     More steps are to the right. Small dots are single pairs.
     """
@@ -46,7 +46,7 @@ def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
             if len(of_pairs) > len(dots):
                 seen = [(ms, light_db.get(QUOTED, np.nan)) for ms, light_db in of_pairs]
                 axes.scatter(*zip(*seen, strict=True), s=9, color=colour, alpha=0.5, linewidths=0)
-            for result in dots:  # up and to the left of a curve that rises
+            for result in dots:  # above and to the left of a rising curve
                 axes.annotate(result.name, (result.ms_p50, result.quoted_db), xytext=(-5, 6), ha="right", **beside)
         axes.set(xscale="log", xlabel="median time of a whole solution, ms", ylabel="light, dB (tracking error 1 mm)")
         axes.margins(x=0.1, y=0.15)
@@ -54,20 +54,20 @@ def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter("")
         axes.legend()
-    return Figure(name, png(figure), "Times hold for this machine and this hour: compare their ratios.")
+    return Figure(name, png(figure), "Times are of this machine and hour: compare their ratios.")
 
 
 def kind_of(result: MethodResult) -> str:
-    """Which curve it belongs to: a model that was added is no step between the shipped ones."""
+    """Curve of a result; an added model belongs to neither."""
     return "shipped" if result.name in SHIPPED else "added" if result.kind == "network" else result.kind
 
 
 def method_table(results: Sequence[MethodResult]) -> Table:
-    """The numbers, fastest first; times also as multiples of the fastest method's."""
+    """Table of all figures, fastest first, with times also as multiples of the fastest."""
     ordered = sorted(results, key=lambda r: r.ms_p50)
     beside = list(dict.fromkeys(key for result in results for key in result.psnr_db_off_eye))
     headings = ["method", "× fastest", "p50 ms", "p99 ms", "MiB", "parameters", "light 1 mm dB", "0 mm", "2 mm"]
-    headings += ["one ray dB", "SSIM", "worst eye", *(f"{key} beside" for key in beside)]
+    headings += ["one ray dB", "SSIM", "worst eye", *(f"{key} off" for key in beside)]
     rows = []
     for r in ordered:
         seen = [r.light_db.get(key) for key in ("1", "0", "2")] + [r.psnr_db, r.ssim, r.worst_eye_psnr_db]
@@ -99,7 +99,7 @@ def moving_section(found: Sequence[Moving]) -> Section:
 
 
 def moving_plot(found: Sequence[Moving]) -> Figure:
-    """A group of bars a motion, a bar a solver."""
+    """Bars of live quality, grouped by motion, one for each solver time."""
     motions, times = (list(dict.fromkeys(getattr(one, name) for one in found)) for name in ("motion", "solver_ms"))
     with drawing(9.6, 3.6) as figure:
         axes = figure.add_subplot()
@@ -118,7 +118,7 @@ def moving_plot(found: Sequence[Moving]) -> Figure:
 
 
 def focal_section(stack: FocalStack) -> Section:
-    """The whole section."""
+    """Table of distances and the focal slices."""
     headings = ["card", "lines of sight meet at, mm", "sharpest through the layers, mm", "sharpest in truth, mm"]
     rows = []
     for name, card in zip(NAMES, stack.cards, strict=True):
@@ -126,20 +126,17 @@ def focal_section(stack: FocalStack) -> Section:
         conflict = abs(1 / card.card_m - 1 / card.sharpest_shown_m)
         rows.append([name, *(f"{1000 * place:.0f}" for place in places_m), f"{conflict:.3f}"])
     text = [
-        f"Three cards, 5 cm behind, in and 4.5 cm before the middle panel, seen from {DISTANCE_M:g} m by a pupil of "
-        f"{1000 * PUPIL_M:g} mm. The layers ({stack.model}) are solved for two pinhole eyes only; what the rest of the "
-        "pupil sees was no target. On a flat panel every card is sharpest in the panel's plane, wherever it seems "
-        "to stand.",
+        f"Three cards, 5 cm behind, in and 4.5 cm in front of the middle panel, seen from {DISTANCE_M:g} m by a pupil "
+        f"of {1000 * PUPIL_M:g} mm. The layers ({stack.model}) are solved for two pinhole eyes only; the rest of the "
+        "pupil had no target. On a flat panel every card is sharpest in the panel's plane, whatever its depth.",
     ]
-    caption = (
-        "Vergence against accommodation, from the right eye: up to 0.3 dioptres are commonly taken as comfortable."
-    )
+    caption = "Vergence against accommodation, right eye: up to 0.3 dioptres are commonly considered comfortable."
     table = Table([*headings, "conflict, dioptres"], rows, caption)
     return Section("Focal parallax", text, [slice_picture(stack)], [table])
 
 
 def slice_picture(stack: FocalStack) -> Figure:
-    """Shown above true, focused behind, in the middle and before."""
+    """Pictures through the layers above the true ones, focused on each card."""
     chosen = [min(stack.slices, key=lambda s: abs(s.plane_m - x)) for x in CARDS_M]
     with drawing(9.6, 3.1) as figure:
         axes = figure.subplots(2, 3)
@@ -151,5 +148,5 @@ def slice_picture(stack: FocalStack) -> Figure:
             axes[0, column].set_title(f"focused {NAMES[column]}", fontsize=10)
         axes[0, 0].set_ylabel("through the layers")
         axes[1, 0].set_ylabel("true")
-    text = "From left to right the eye's lens focuses on the card behind, in and before the middle panel."
+    text = "From left to right, the eye focuses on the card behind, in and in front of the middle panel."
     return Figure("focal-slices", png(figure), text)

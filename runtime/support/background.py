@@ -18,6 +18,7 @@ log = logging.getLogger("phasestack.background")
 PRESENTER_NICENESS = -10
 SOLVER_NICENESS = 5
 BACKGROUND_NICENESS = 10
+MEASURING_NICENESS = 15  # of measurements and files, which nobody waits for
 STOPS_WITHIN_S = 1.2  # after a stop request; the rest of the two seconds is for calls without a timeout
 T = TypeVar("T")
 
@@ -76,8 +77,8 @@ def raise_if_abandoned() -> None:
 class Job(Generic[T]):
     """A job that starts on construction. `done`, `problem` and `take` never block; a failed start is a problem."""
 
-    def __init__(self, name: str, work: Callable[[], T]) -> None:
-        self._name, self._work = name, work
+    def __init__(self, name: str, work: Callable[[], T], *, niceness: int = BACKGROUND_NICENESS) -> None:
+        self._name, self._work, self._niceness = name, work, niceness
         self._result: T | None = None
         self.done = False
         self.problem = ""  # one line if it failed
@@ -99,7 +100,7 @@ class Job(Generic[T]):
 
     def _run(self) -> None:
         _running.add(threading.current_thread())
-        set_niceness(BACKGROUND_NICENESS)
+        set_niceness(self._niceness)
         try:
             self._result = self._work()
         except PhasestackError as error:
