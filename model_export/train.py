@@ -84,8 +84,14 @@ def run_training(
     curve = curve or [[0, math.nan, _held_out_db(network, unseen, place)]]
 
     def save(number: int) -> None:
-        state = {"model": net.state_dict(), "optimizer": optimizer.state_dict(), "rate": rate.state_dict()}
-        state |= {"done": number, "lights": lights, "curve": curve, "training": training.model_dump()}
+        state: dict[str, Any] = {"model": net.state_dict(), "optimizer": optimizer.state_dict()}
+        state |= {
+            "rate": rate.state_dict(),
+            "done": number,
+            "lights": lights,
+            "curve": curve,
+            "training": training.model_dump(),
+        }
         save_checkpoint(out / "checkpoint.pth", state)
 
     title = f"training {training.arch}, {needs}"
