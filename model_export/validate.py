@@ -1,4 +1,4 @@
-"""Checks of a model file: what the runtime asks of it, then values on ordinary and on stress inputs.
+"""Checks of a model file: the runtime's requirements, then values on ordinary and on stress inputs.
 
 Values are compared with the torch module that an export came from, or, of a file alone, with the same graph run
 without onnxruntime's optimisations: any file that the runtime takes can be checked.
@@ -57,7 +57,7 @@ class Report:
         return json.dumps({"file": self.file, "passed": self.passed, "checks": [asdict(c) for c in self.checks]})
 
     def table(self) -> str:
-        """For a person: what was checked, found, wanted."""
+        """Return a table for people: check, found, wanted."""
         rows = [f"{'ok' if c.passed else 'FAILED':8}{c.name}: {c.found}; wanted: {c.wanted}" for c in self.checks]
         failed = sum(not check.passed for check in self.checks)
         end = f"{failed} of {len(self.checks)} checks failed" if failed else f"all {len(self.checks)} checks passed"
@@ -79,9 +79,9 @@ def validate_file(path: Path) -> Report:
 
 
 def check_model(data: bytes, *, source: str, reference: Reference | None = None) -> Report:
-    """Check a model's bytes against what it was made from or, without that, against its own graph.
+    """Check a model's bytes against its torch source or, without that, against its own graph.
 
-    Raises InputError where the bytes are no ONNX model or carry no contract that we know.
+    Raises InputError where the bytes are not an ONNX model or have no known contract.
     """
     try:
         model = onnx.load_from_string(data)
@@ -140,7 +140,7 @@ def _ports(session: onnxruntime.InferenceSession, contract: Contract) -> list[Ch
 
 
 def _panels(answer: Sequence[np.ndarray]) -> np.ndarray:
-    """What a model answers, as panel values in one row: panels in sixteenths of codes, or one tensor of values."""
+    """Return a model's outputs as panel values in one row: panels in sixteenths of codes, or one tensor of values."""
     if any(part.size == 1 and not np.isfinite(part).all() for part in answer):
         return np.full(1, np.nan, np.float32)
     scale = [1.0 if np.issubdtype(part.dtype, np.floating) else FULL for part in answer]

@@ -17,7 +17,7 @@ from runtime.support.picture_file import rgb_of
 
 LEAST_PX = 16
 SLACK = 1e-3  # a quarter of a code, by which rounding goes over or under
-OVERSHOOT = 0.3  # of what is white, that a sharp resampling goes over or under
+OVERSHOOT = 0.3  # fraction of white by which a sharp resampling overshoots
 
 
 def as_picture(name: str, given: Any) -> Picture:
@@ -46,7 +46,7 @@ def as_picture(name: str, given: Any) -> Picture:
 
 
 def as_array(name: str, given: Any) -> Any:
-    """A numpy array of what is one, or a tensor on any device. Raises ValueError, naming the argument."""
+    """Return an array or a tensor of any device as a numpy array. Raises ValueError, naming the argument."""
     if isinstance(given, str | os.PathLike):
         raise ValueError(f"{name}: is a file's name: read it first, as with PIL.Image.open({os.fspath(given)!r})")
     if hasattr(given, "detach"):  # torch's, with or without a gradient
@@ -111,6 +111,6 @@ def find_eyes(picture: ArrayLike) -> Pupils | None:
     """The foremost viewer's pupils in an (h, w, 3|4) picture, uint8 or float in 0..1; None: nobody.
 
     `eyes_px` is (2, 2): the viewer's left eye first, which is on the right of an unmirrored picture; continuous pixels,
-    centres at half-integers. `sigma_px` says how sure they are. Raises ValueError for what is no picture.
+    centres at half-integers. `sigma_px` is their standard deviation. Raises ValueError for anything but a picture.
     """
     return pupils.find_eyes(as_codes(as_picture("picture", picture)))

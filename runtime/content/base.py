@@ -1,6 +1,6 @@
 """The interface of content sources: the picture of a scene for one eye, in a given raster.
 
-`ContentSource` is the base of scenes of a user's own, too: `scene = "mypackage.tunnel:Tunnel"`. Of its methods only
+`ContentSource` is also the base of user-defined scenes: `scene = "mypackage.tunnel:Tunnel"`. Of its methods only
 `render` must be written; the others are optimisations, whose defaults are right for any scene.
 """
 
@@ -34,7 +34,7 @@ class View:
     pixels_from_stack: F64  # (3, 4) projection; third coordinate: positive before the eye, metres
     width_px: int
     height_px: int
-    display_from_view: F64 | None = None  # 3x3 turn out of a frame that was placed: the lamp stands in the display's
+    display_from_view: F64 | None = None  # 3x3 turn out of a frame that was placed: the lamp is fixed to the display
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +45,8 @@ class ContentInfo:
     moving: bool = False
     grey: bool = False
     background: Colour | None = WHITE  # uniform, behind it; None: none
-    flat_x_m: float | None = None  # all of it lies in this plane of `stack` and looks alike to both eyes
-    left_out: tuple[str, ...] = ()  # what the file holds that is not drawn
+    flat_x_m: float | None = None  # plane of `stack` that contains all of it; both eyes see the same picture
+    left_out: tuple[str, ...] = ()  # content of the file that is not drawn
 
 
 class ContentSource(ABC):
@@ -65,7 +65,7 @@ class ContentSource(ABC):
 
     @abstractmethod
     def render(self, view: View, *, time_ns: int) -> U8:
-        """What the eye sees in the view's raster: (height_px, width_px, 4) RGBA, row 0 at the top.
+        """Return the eye's picture in the view's raster: (height_px, width_px, 4) RGBA, row 0 at the top.
 
         Colour is already composed over the background; alpha is the content's coverage: 0 only where nothing
         but the background shows. The array is the source's own: it holds until the next `render` of the same
@@ -98,7 +98,7 @@ class ContentSource(ABC):
         return None
 
     def skip(self, *, time_ns: int) -> bool:
-        """Go to the next one of a playlist; False: there is none."""
+        """Go to the next one of a playlist; False: there is no other."""
         return False
 
     @property

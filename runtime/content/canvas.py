@@ -1,4 +1,4 @@
-"""Where sources draw: offscreen targets that are kept per size, smoothed edges, RGBA8."""
+"""Offscreen targets for sources, kept per size, with smoothed edges, RGBA8."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class CanvasSource(ContentSource):
 
     def _forget_oldest(self) -> None:
         target = self._targets.pop(next(iter(self._targets)))
-        # moderngl binds the last framebuffer again on later calls: it must not be one that is no more.
+        # moderngl binds the last framebuffer again on later calls: a released one must not be current.
         self.context.detect_framebuffer(0).use()
         for framebuffer in (*target.plain, *([target.smooth] if target.smooth else [])):
             for attachment in (*framebuffer.color_attachments, framebuffer.depth_attachment):
@@ -106,5 +106,5 @@ class CanvasSource(ContentSource):
         return self._targets[size]
 
     def _framebuffer(self, size: tuple[int, int], colour: Any, *, samples: int = 0) -> Any:
-        # Depth in a texture: Mesa keeps a renderbuffer's for good where another context of the group releases it.
+        # Depth in a texture: Mesa never frees a renderbuffer's where another context of the group releases it.
         return self.context.framebuffer([colour], self.context.depth_texture(size, samples=samples))

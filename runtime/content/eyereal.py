@@ -31,7 +31,7 @@ class Pair:
     number: int
     paths: tuple[Path, Path]
     eyes_m: F64  # (2, 3) left, right; frame `stack`
-    looks_at_m: F64  # (3,) the scene's origin, at which both look; the display may stand before or behind it
+    looks_at_m: F64  # (3,) the scene's origin, at which both look; the display may be before or behind it
 
     def image_from_stack(self, side: int, *, width_px: int, height_px: int, fov_deg: float) -> F64:
         """(3, 4) the projection of one of its pictures."""
@@ -47,7 +47,7 @@ def is_data_set(folder: Path) -> bool:
 
 
 def read_folder(folder: Path, preset: str) -> tuple[Pair, ...]:
-    """Every pair, by number. Raises InputError: no pair, half a pair, coordinates that are no eye.
+    """Every pair, by number. Raises InputError: no pair, half a pair, coordinates behind the display.
 
     Names hold the eyes in the scene's digital units. Which of `_0` and `_1` is left follows from their positions;
     `_left` and `_right`, of the set's newer data, must agree with them. preset: the scene's name.

@@ -32,7 +32,7 @@ PICTURES = (
 )  # fmt: skip
 NOT_READ = (".jxl", ".exr", ".hdr", ".psd", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".svg", ".jp2")
 CAMERA_SET = "such a scene is trained first; its splats (.ply) are drawn, and its folder of pictures as a slideshow"
-TOLD = 3  # files of a folder that are left out and named in the log
+TOLD = 3  # skipped files of a folder that the log names
 TELL_EVERY = 64  # pictures between two reports of progress
 VIDEO_FRAMES_MAX = 1e8  # that a header may claim: five weeks at 30 a second
 VIDEO_PROPERTIES = (
@@ -58,7 +58,7 @@ class Frames(ABC):
         return self.layouts[min(index, len(self.layouts) - 1)]
 
     def at(self, time_ns: int) -> int:
-        """Which picture is shown at a time."""
+        """Return the index of the picture shown at a time."""
         return int(time_ns * self.rate_hz / NS_PER_S) % self.count
 
     def close(self) -> None:  # noqa: B027 - most hold nothing
@@ -68,11 +68,11 @@ class Frames(ABC):
 class PictureFiles(Frames):
     """One still picture, or a folder's in the order of their names.
 
-    Two views of one file stand side by side.
+    Two views of one file are returned side by side.
     """
 
     def __init__(self, paths: Sequence[Path], settings: ContentSettings, *, folder: Path | None = None) -> None:
-        """folder: that holds them, where they are a folder's: what can't be shown of it is left out, and logged."""
+        """folder: their folder, if any; its undecodable files are skipped and logged."""
         self._background = settings.background or DARK
         self.layouts, self._paths, refused = [], [], []
         for number, path in enumerate(paths):
@@ -199,7 +199,7 @@ def open_frames(path: Path, settings: ContentSettings) -> Frames:
 
 
 def _why_none(folder: Path) -> str:
-    """What a folder without pictures holds instead, for people."""
+    """Describe a folder without pictures, for an error message."""
     told = "the folder holds no pictures"
     if sets := sorted(folder.glob("transforms*.json")):
         return f"{told} but a camera set, as of a NeRF ({sets[0].name}): {CAMERA_SET}"

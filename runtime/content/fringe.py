@@ -28,7 +28,7 @@ class Edges:
 
 
 def edges_of(shape: Shape) -> Edges:
-    """The edges of a shape. Vertices at the same place count as one, whatever their normals and textures."""
+    """The edges of a shape. Vertices at the same place count as one, with any normals and textures."""
     positions = shape.positions_m.astype(np.float64)
     extent = max(float(np.ptp(positions, axis=0).max()), 1e-9)
     welded = np.unique(np.rint(positions / extent * 1e6).astype(np.int64), axis=0, return_inverse=True)[1].reshape(-1)

@@ -1,4 +1,4 @@
-"""Pictures with a projection of their own, warped into the raster that a view asks for."""
+"""Pictures with a known projection, warped into the raster of a view."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def rgba_from_rgb(rgb: U8) -> U8:
 
 
 def image_from_view(image_from_stack: F64, pixels_from_stack: F64, *, x_m: float) -> F64 | None:
-    """3x3 picture pixels from view pixels through the plane x = x_m; None: the eye lies in it.
+    """3x3 picture pixels from view pixels through the plane x = x_m; None: the eye is in it.
 
     Where picture and view are of the same eye, every plane gives the same matrix; otherwise the plane is where
     the picture hangs.
@@ -42,7 +42,7 @@ def plane_from_pixels(pixels_from_stack: F64, plane: PlaneRaster) -> F64 | None:
 
 
 def reduction(picture_from_view: F64, view: View) -> int:
-    """Number of halvings before a warp, so that a sample stands for about 1.5 pixels at most."""
+    """Number of halvings before a warp, so that a sample covers about 1.5 pixels at most."""
     middle = np.array([view.width_px, view.height_px]) / 2 + np.array([[0, 0], [1, 0], [0, 1]])
     mapped = cv2.perspectiveTransform(middle[None], picture_from_view)[0]
     steps = np.linalg.norm(mapped[1:] - mapped[0], axis=1)
@@ -58,7 +58,7 @@ class WarpedPicture:
         self._out: dict[tuple[int, int, int], U8] = {}
 
     def warped(self, picture_from_view: F64 | None, view: View) -> U8:
-        """(h, w, 4) the picture at each pixel of the view, and the background with alpha 0 beside it.
+        """(h, w, 4) the picture at each pixel of the view, and the background with alpha 0 outside it.
 
         The array is kept and written again by the next call of the same size and side.
         """

@@ -1,4 +1,4 @@
-"""How a picture holds its views: by a setting, by its name, and what its halves look like."""
+"""Arrangement of views in a picture, by setting, file name or similarity of its halves."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from runtime.records import U8
 QUILT = re.compile(r"(?<![a-z0-9])qs([0-9]{1,6})x([0-9]{1,6})(?:a([0-9]*\.?[0-9]+))?(?![0-9])")
 ASPECT_MIN, ASPECT_MAX = 0.05, 20.0  # width over height of one view
 RIGHT_FIRST = (".jps", ".pns")  # by custom, side by side and cross-eyed
-MARKS = {  # words anywhere in a name; a film's stand in the middle
+MARKS = {  # words anywhere in a name, such as the middle of a film's
     "half-side-by-side": "(half|h) ?(sbs|side by side|lr|left right)|sbs h(alf)?",
     "half-top-bottom": "(half|h) ?(tb|tab|over under|top bottom)|(half|h|3d) (ou|hou)|halfou|(ou|tb|tab) half",
     "cross-eyed": "cross ?eyed?|crossview|sbs rl",
@@ -26,17 +26,17 @@ MARKS = {  # words anywhere in a name; a film's stand in the middle
     "anaglyph": "anaglyph",
     "rgbd": "rgbd",
 }
-LAST_MARKS = {  # that mean other things too: only as a name's last words, but for such as 1080p
+LAST_MARKS = {  # ambiguous words: accepted only at the end, before words with digits such as 1080p
     "half-top-bottom": "hou",
     "cross-eyed": "rl|right left",
     "side-by-side": "lr|left right|2x1|parallel",
     "top-bottom": "ou|tb|tab|top bottom|1x2",
 }
-COPY = re.compile(r"( copy)?( ?\([0-9]+\))?$")  # what a browser or a desktop adds to a second download's name
-ALIKE = 0.8  # correlation of a picture's halves from which they may be two views
-SMALL_PX = (64, 48)  # to which halves are brought to be compared
-SHIFT_PX = 6  # of these, that views may be apart
-ROUGH = 6.0  # codes of detail without which halves are alike whatever they are
+COPY = re.compile(r"( copy)?( ?\([0-9]+\))?$")  # suffix added by a browser or desktop to a second download
+ALIKE = 0.8  # correlation above which halves may be two views
+SMALL_PX = (64, 48)  # size of halves for comparison
+SHIFT_PX = 6  # largest shift between views, in these pixels
+ROUGH = 6.0  # standard deviation, codes; smoother halves always agree
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,14 +48,14 @@ class Layout:
     rows: int = 1
     half: bool = False  # its views are squeezed to half their width or height
     right_first: bool = False  # the right eye's view comes first
-    span_deg: int = 0  # of longitude, of views all around; 0: they are none
+    span_deg: int = 0  # longitude covered by equirectangular views; 0: flat views
     view_aspect: float = 0.0  # of a quilt's views, width over height; 0: as their pixels have it
 
     def views(self, picture: U8) -> list[U8]:
-        """The views; of those all around, what lies ahead. Raises ValueError as `parts` does."""
+        """Return the views, with equirectangular ones cropped ahead. Raises ValueError as `parts` does."""
         parts = self.parts(picture)
         height, width = parts[0].shape[:2]
-        squeezed = (1.0, 0.5, 2.0) if len(parts) == 2 else (1.0,)  # whatever its name says: the shape is known
+        squeezed = (1.0, 0.5, 2.0) if len(parts) == 2 else (1.0,)  # with or without such a word in the name
         if not self.span_deg or not any(is_around(width * by, height, self.span_deg) for by in squeezed):
             return parts
         return [ahead(part, self.span_deg) for part in parts]
@@ -114,7 +114,7 @@ def layout_of(path: Path, settings: ContentSettings) -> Layout:
 
 
 def _named(path: Path) -> str:
-    """The layout that the name of a file or folder tells, as `content.layout` has it."""
+    """Return the layout given by a file or folder name, in the syntax of `content.layout`."""
     if path.suffix.lower() in RIGHT_FIRST:
         return "cross-eyed"
     stem = COPY.sub("", path.name if path.is_dir() else path.stem).lower()
@@ -129,7 +129,7 @@ def _named(path: Path) -> str:
 
 
 def _span_deg(path: Path) -> int:
-    """360 or 180, where a name says that its views go so far around; what else is called so has another shape."""
+    """Return 360 or 180 if the name contains such a word; `views` also checks the shape."""
     words = re.split(r"[^a-z0-9]+", path.stem.lower())
     if {"180", "vr180", "180x180"} & set(words):
         return 180
@@ -137,7 +137,7 @@ def _span_deg(path: Path) -> int:
 
 
 def hint(picture: U8) -> str:
-    """The layout that a picture's halves suggest, since they nearly agree; empty where they do not."""
+    """Return the layout suggested by halves that nearly agree, else an empty string."""
     for layout in ("side-by-side", "top-bottom"):
         columns = 2 if layout == "side-by-side" else 1
         if min(picture.shape[0] * columns, picture.shape[1] * (3 - columns)) < 4 * SMALL_PX[0]:
@@ -153,6 +153,6 @@ def hint(picture: U8) -> str:
 
 
 def _detail(view: U8) -> U8:
-    """A view, small and grey, without what is the same over wide areas: any two skies are alike."""
+    """Return a view, small, grey and high-pass filtered: any two skies are alike."""
     small = cv2.cvtColor(cv2.resize(view, SMALL_PX, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
     return np.asarray(small.astype(np.float32) - cv2.GaussianBlur(small, (0, 0), 8).astype(np.float32), np.float32)

@@ -1,4 +1,4 @@
-"""Pictures all around (equirectangular, 360 or 180 degrees): what is seen of them straight ahead."""
+"""Straight-ahead crops of equirectangular pictures of 360 or 180 degrees."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ import numpy as np
 
 from runtime.records import F32, U8
 
-AHEAD_DEG = 75.0  # horizontal view that is cut out: about a display's, and what lies around it
+AHEAD_DEG = 75.0  # horizontal field of view of the crop: a display's and some margin
 SHAPE = 16 / 9  # of it, width over height
 ASPECT_OFF = 0.02  # that a view's aspect may be off
 
 
 def is_around(width: float, height: float, span_deg: int) -> bool:
-    """Whether a view of square pixels has the shape of so many degrees around, and 180 up and down."""
+    """Return True if a view of square pixels has the aspect of span_deg by 180 degrees."""
     return abs(width / height * 180 / span_deg - 1) < ASPECT_OFF
 
 
 def ahead(view: U8, span_deg: int) -> U8:
-    """The middle of an equirectangular view as a pinhole camera sees it, as fine as the view is there."""
+    """Return the middle of an equirectangular view as a pinhole camera sees it, at the view's resolution."""
     u, v = _places(view.shape[1], view.shape[0], span_deg)
     return np.asarray(cv2.remap(view, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
 @lru_cache(maxsize=2)
 def _places(width: int, height: int, span_deg: int) -> tuple[F32, F32]:
-    """Where each pixel ahead lies in a view of this size, in pixels whose centres are whole numbers."""
+    """Return columns and rows in the view for each pixel of the crop, pixel centres at integers."""
     columns = max(round(width * AHEAD_DEG / span_deg), 16)
     rows, half = max(round(columns / SHAPE), 9), np.tan(np.radians(AHEAD_DEG / 2))
     x = ((np.arange(columns) + 0.5) * 2 / columns - 1) * half

@@ -37,7 +37,7 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
     """Open a picture, a video or a folder of pictures. Raises InputError."""
     frames = open_frames(file.path, file.settings)
     make = partial(PicturesSource, frames, file=file)
-    make()  # refuses what is too small
+    make()  # refuses a picture too small for its layout
     return make
 
 
@@ -85,7 +85,7 @@ class PicturesSource(ContentSource):
         self._views, self._at = views, number  # of the picture of this number
 
     def _view_for(self, view: View) -> int:
-        """Which of the pictures an eye gets: its side's, or a quilt's nearest in angle about the vertical."""
+        """Return the index of an eye's view: its side, or a quilt's nearest in angle about the vertical."""
         if len(self._views) <= 2:
             return min(view.side, len(self._views) - 1)
         angle = np.arctan2(view.eye_m[1], view.eye_m[0])

@@ -1,4 +1,4 @@
-"""A scene moved, turned, scaled or on a turntable, whatever draws it: the eye is moved the other way.
+"""A scene moved, turned, scaled or on a turntable, by any source: the eye is moved the other way.
 
 A source never learns of it: a view's projection times the placing is another projection, and the eye seen from the
 scene is another eye.
@@ -23,7 +23,7 @@ NS_PER_MIN = 60 * NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class Placing:
-    """Where a scene stands: p_stack = offset + scale · R · p, R the turntable's turn after the rotation."""
+    """Placement of a scene: p_stack = offset + scale · R · p, R the turntable's turn after the rotation."""
 
     scale: float = 1.0
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # frame `stack`
@@ -32,7 +32,7 @@ class Placing:
 
     def rotation(self, time_ns: int) -> F64:
         """3x3 stack_from_scene turn."""
-        # Whole turns are left out first: a clock that has run for months keeps its fractions.
+        # Whole turns are removed first: a clock that has run for months keeps its fractions.
         period_ns = NS_PER_MIN / self.turntable_per_min if self.turntable_per_min else np.inf
         turntable = rotation_matrix((0.0, 0.0, 360.0 * (time_ns % period_ns) / period_ns), "xyz")
         return turntable @ rotation_matrix(self.rotation_deg, "xyz")
@@ -51,7 +51,7 @@ def placing_of(settings: ContentSettings) -> Placing:
 
 
 def placed_source(source: ContentSource, placing: Placing) -> ContentSource:
-    """The source at its place; one that was placed before is placed anew."""
+    """The source at its place; one that was placed before is placed again."""
     if isinstance(source, PlacedSource):
         source = source.source
     return source if placing == Placing() else PlacedSource(source, placing)
@@ -70,7 +70,7 @@ class PlacedSource(ForwardingSource):
         return _moved(self.source.info, self.placing)
 
     def forwarded(self, view: View, time_ns: int) -> tuple[ContentSource, View, int]:
-        """The same pixels for the same eye, in the scene's frame."""
+        """Return the view of the same eye and pixels in the scene's frame."""
         matrix = self.placing.stack_from_scene(time_ns)
         turn = matrix[:3, :3] / self.placing.scale
         eye = turn.T @ (view.eye_m - matrix[:3, 3]) / self.placing.scale

@@ -1,6 +1,6 @@
-"""A playlist: scenes one after another, each for a time, each with settings of its own.
+"""A playlist: scenes one after another, each with its time and settings.
 
-Every one of them is loaded before the first is shown: what is missing is refused then, and a change takes no time.
+Every one of them is loaded before the first is shown: missing files are refused then, and a change takes no time.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Entry(ContentSettings):
 
 @dataclass(frozen=True, slots=True)
 class Playlist:
-    """A file that was read; nothing of what it names has been opened."""
+    """A parsed playlist file; its scenes are not opened yet."""
 
     path: Path
     repeat: bool
@@ -103,7 +103,7 @@ class PlaylistSource(ForwardingSource):
 
     @property
     def info(self) -> ContentInfo:  # type: ignore[override]
-        """Of the one at present, by the list's name."""
+        """Return the current entry's info, named after the list."""
         index, inner = self._number % len(self._sources), self.source.info
         name = f"{self._list.path.stem}: {inner.name} ({index + 1} of {len(self._sources)})"
         return replace(inner, name=name, moving=True)
@@ -148,7 +148,7 @@ class PlaylistSource(ForwardingSource):
         return since_ns
 
     def _at(self, time_ns: int) -> tuple[int, int]:
-        """Which entry, counted over all rounds, and for how long."""
+        """Return the entry at a time, counted over all rounds, and its age."""
         passed_ns = max(0, time_ns - (time_ns if self._begin_ns is None else self._begin_ns))
         count, round_ns = len(self._ends_ns), self._ends_ns[-1]
         if not self._list.repeat:

@@ -46,7 +46,7 @@ def drawn_scene_from_stack(name: str) -> F64:
     code, matrix = preset_file()["scene"][name]["published"], np.eye(4)
     axes = axes_matrix(out=code["out"], up=code["up"])
     gap = code["thickness_cm"] * code["scale_per_cm"]
-    # The middle panel stands half a gap beyond that code's ground, along `out`; the ground may be in gaps.
+    # The middle panel is half a gap beyond that code's ground, along `out`; the ground may be in gaps.
     middle = gap / 2 + code.get("ground", gap * code.get("ground_coefficient", 0.0))
     matrix[:3, :3] = axes * (code["scale_per_cm"] / CM)
     matrix[:3, 3] = np.array(code.get("shift", (0.0, 0.0, 0.0))) + axes[:, 0] * middle

@@ -49,7 +49,7 @@ class ProceduralSource(TriangleSource):
         background: Colour | None = None,
         parts: Sequence[DrawnPart] | None = None,
     ) -> None:
-        """background: None: the scene's own; parts: `parts_of` the scene, where they were made on another thread."""
+        """background: None: the scene's own; parts: `parts_of` the scene, prepared on another thread."""
         self._scene = SCENES[built_in]() if isinstance(built_in, str) else built_in
         self._scale = stack.height_m / MODELLED_HEIGHT_M
         parts = parts or parts_of(self._scene)

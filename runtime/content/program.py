@@ -1,6 +1,6 @@
 """Scenes drawn by another program (renderer, game, web page) that answers requests for pictures.
 
-The protocol is in docs/programs.md. What comes late, or not at all, leaves the last pictures where they are.
+The protocol is in docs/programs.md. A late or missing answer leaves the last pictures in place.
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ HOST = "127.0.0.1"
 ANSWERED_S = 0.4  # both pictures; later they are late
 GIVEN_UP_S = 2.0  # a late frame is abandoned after this, and another may be requested
 IN_FLIGHT_MAX = 2  # frames that were asked for and are not answered
-HELLO_S = 5.0  # that a program may take to say what it is
+HELLO_S = 5.0  # time limit of a program's greeting
 NEAR_M, FAR_M = 0.05, 100.0
 HEAD = struct.Struct("<II")  # of an answer: the frame, and whose picture (0 left, 1 right)
 SIDES = ("left", "right")
 
 
 class ProgramOptions(Section):
-    """What [content.options] may hold for it."""
+    """Settings of [content.options] for it."""
 
     port: int = Field(0, ge=0, le=65535, description="of the address; 0: any that is free")
 
 
 def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
-    """Listens from now on. Raises InputError where the port is taken."""
+    """Listens from now on. Raises InputError where the port is in use."""
     options = validated(ProgramOptions, file.settings.options, source="content.options")
     size_px = file.stack.width_px * file.stack.height_px
     source = ProgramSource(Programs(options.port, most_bytes=8 * size_px + HEAD.size), background=file.background)
@@ -96,7 +96,7 @@ class Programs:
     """Connections of drawing programs, and their answers. Thread-safe."""
 
     def __init__(self, port: int, *, most_bytes: int) -> None:
-        """Raises InputError where the port is taken."""
+        """Raises InputError where the port is in use."""
         self._token = secrets.token_urlsafe(24)
         self._changed = threading.Condition()
         self._drawing: ServerConnection | None = None  # the newest
@@ -205,14 +205,14 @@ class Programs:
             before.close(1001, "another program draws")
 
     def _take(self, connection: ServerConnection, message: str | bytes) -> None:
-        """One picture. Raises ValueError for what is none."""
+        """One picture. Raises ValueError for anything else."""
         if not isinstance(message, bytes) or len(message) < HEAD.size:
             raise ValueError("it answered with something that is no picture")
         number, side = HEAD.unpack_from(message)
         with self._changed:
             frame = self._frames.get(number)
             if connection is not self._drawing or frame is None:
-                return  # it was given up
+                return  # it was abandoned
             height, width = frame.views[0].height_px, frame.views[0].width_px
             if len(message) - HEAD.size != 4 * width * height:
                 found = len(message) - HEAD.size
@@ -227,7 +227,7 @@ class Programs:
 
 
 class ProgramSource(ContentSource):
-    """What the program that is connected draws, for exactly the eyes that are solved for."""
+    """Pictures of the connected program, for exactly the eyes that are solved for."""
 
     def __init__(self, programs: Programs, *, background: Any) -> None:
         self._programs = programs

@@ -1,4 +1,4 @@
-"""Which source draws what `content.scene` names. Loaders are imported when they are needed."""
+"""Content sources by `content.scene`. Loaders are imported when they are needed."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from runtime.support.untrusted_input import LIMITS
 
 MESHES = (".glb", ".gltf", ".obj", ".off", ".stl")
 PLAYLISTS = (".toml", ".json")
-HARMLESS = {".png": PNG, ".jpg": JPEG, ".jpeg": JPEG}  # stills of their own kind, and of few pixels, are read here
+HARMLESS = {".png": PNG, ".jpg": JPEG, ".jpeg": JPEG}  # small stills of these first bytes are read here
 HARMLESS_PX = 4096 * 4096
 TO_GLTF, TO_PLY = "export it as glTF (.glb), as Blender does", "save it as PLY, as CloudCompare does"
 TO_SPLATS = "convert it: `npx @playcanvas/splat-transform in{} out.ply`"
-OTHER_FILES = {  # by their names: what they are, and the way out
+OTHER_FILES = {  # by their names: format and the way out
     **dict.fromkeys((".fbx", ".dae", ".blend", ".3ds", ".x3d", ".wrl", ".abc"), ("a 3D scene", TO_GLTF)),
     **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), ("a USD scene", TO_GLTF)),
     **dict.fromkeys(
@@ -58,7 +58,7 @@ def open_content(settings: ContentSettings, stack: PanelStack, context: Any) -> 
 def prepare_content(settings: ContentSettings, stack: PanelStack) -> Opener:
     """Read and check `settings.scene`; the result makes the source on the thread with the context.
 
-    This is the slow part and needs no GL: it may run on any thread, and files are read in a process of their own. How
+    This is the slow part and needs no GL: it may run on any thread, and files are read in a child process. How
     far it is goes to `support.progress`. Raises InputError, naming file and field.
     """
     file = SceneFile(Path(settings.scene), settings, stack)
@@ -118,7 +118,7 @@ def _from_path(file: SceneFile) -> Opener:
 
 
 def _is_harmless(file: SceneFile) -> bool:
-    """Whether a file can take neither long nor much memory, by what its header says."""
+    """Return True if a file's header rules out long or memory-hungry decoding."""
     from runtime.content.layout import layout_of
 
     mark = HARMLESS.get(file.path.suffix.lower())
@@ -132,7 +132,7 @@ def _is_harmless(file: SceneFile) -> bool:
 
 
 def _read(file: SceneFile) -> Opener:
-    """By what a path's name and first bytes say; what it answers can be pickled."""
+    """Read a path by its name and first bytes; the result can be pickled."""
     path = file.path
     suffix = path.suffix.lower()
     if path.is_dir():

@@ -1,7 +1,7 @@
 """A picture with depth: colour and a grey depth map side by side, drawn as two surfaces.
 
-The front one is the picture, split where its depth jumps. The other one is what lies behind its edges, made up from
-the colours beside them, so that a viewer who looks past an edge sees neither a hole nor a stretched foreground.
+The front one is the picture, split where its depth jumps. The other one is the background behind its edges, made up
+from the colours next to them, so that a viewer who looks past an edge sees neither a hole nor a stretched foreground.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8
 
 COLUMNS = 320  # of the surface where it is smooth: as fine as depth cameras see, and quick without a graphics card
-FINEST_COLUMNS = 1600  # of the surface beside an edge
+FINEST_COLUMNS = 1600  # of the surface at an edge
 NOMINAL_DISTANCE_M = 0.6  # from here the surface looks like the picture
 TORN_RELATIVE = 0.12  # of the depth range: a larger step between neighbours is an edge, not a slope
 BLURRED_PX = 5  # so wide an edge of the depth map still is one
 MIXED_PX = 2  # to either side of an edge colours are of both sides
 BEHIND_SHARE = 0.1  # of the picture's width: how far behind an edge the background is filled in
-SET_BACK = 0.004  # of the depth range: the made-up surface lies behind the true one where both are
+SET_BACK = 0.004  # of the depth range: offset of the made-up surface behind the true one
 SAMPLES = 4  # a pixel: the split edges are its outlines
 
 Mask = NDArray[np.bool_]
@@ -88,7 +88,7 @@ def sharpened(depth: F32) -> F32:
 
 
 def unmixed(colour: U8, depth: F32) -> U8:
-    """(h, w, 3) colours whose pixels beside a depth edge are replaced from farther inside their side."""
+    """(h, w, 3) colours whose pixels next to a depth edge are replaced from farther inside their side."""
     side = 2 * MIXED_PX + 1
     kernel = np.ones((side, side), np.uint8)
     mixed = cv2.dilate(depth, kernel) - cv2.erode(depth, kernel) > TORN_RELATIVE
@@ -106,7 +106,7 @@ def unmixed(colour: U8, depth: F32) -> U8:
 
 
 def background(depth: F32, colour: U8) -> tuple[F32, U8, Mask]:
-    """(h, w) depth and (h, w, 3) colour of what lies behind edges, and where that is made up.
+    """(h, w) depth and (h, w, 3) colour of the background behind edges, and the mask of invented pixels.
 
     Under the near side it is as the far one is at the nearest edge; a ring of the far side itself belongs to it, so
     that it has no gap there.
@@ -121,7 +121,7 @@ def background(depth: F32, colour: U8) -> tuple[F32, U8, Mask]:
 
 
 def _quads(depth: F32) -> I32:
-    """(n, 4) corners, as indices into the depth map: large where it is smooth, single pixels beside edges."""
+    """(n, 4) corners, as indices into the depth map: large where it is smooth, single pixels at edges."""
     rows, columns = depth.shape
     step = -(-columns // COLUMNS)
     down = np.unique(np.r_[np.arange(0, rows - 1, step), rows - 1])
@@ -169,7 +169,7 @@ def _placed(depth: F32, quads: I32, picture: U8, *, stack: PanelStack, depth_m: 
 
 
 def _edge_to_edge(index: Any, count: int) -> F64:
-    """Pixel centres; the outermost stand for the picture's edge."""
+    """Return pixel centres, with the outermost at the picture's edge."""
     place = index + 0.5
     return np.where(index == 0, 0.0, np.where(index == count - 1, float(count), place))
 

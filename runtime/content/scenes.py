@@ -84,7 +84,7 @@ def _demo(turns_per_s: float = 0.0) -> tuple[Thing, ...]:
 
 
 def _room() -> tuple[Thing, ...]:
-    """A dim room behind the display, wider than it, and things that stand out of it: nearest is the globe."""
+    """A dim room behind the display, wider than it, and objects in front of it: nearest is the globe."""
     wide, high, back = 0.56, 0.34, -0.14
     deep = 0.02 - back
     middle, down = (0.02 + back) / 2, shapes.rotation_about(1, -np.pi / 2)

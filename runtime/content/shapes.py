@@ -38,7 +38,7 @@ class Shape:
     triangles: I32  # (t, 3)
 
     def moved(self, rotation: F64 | None = None, offset_m: ArrayLike = (0.0, 0.0, 0.0)) -> Shape:
-        """The same shape, rotated about its origin and then shifted."""
+        """Return the shape rotated about its origin and then shifted."""
         turn = np.eye(3) if rotation is None else rotation
         positions = self.positions_m @ turn.T + np.asarray(offset_m)
         return Shape(positions.astype(np.float32), (self.normals @ turn.T).astype(np.float32), self.uv, self.triangles)

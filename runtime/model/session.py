@@ -67,7 +67,7 @@ class ModelSession:
             metadata = self._session.get_modelmeta().custom_metadata_map
         except UnicodeDecodeError:
             raise InputError(path, "metadata", "is no UTF-8 text") from None
-        if name not in self._session.get_providers():  # onnxruntime goes on without, and says so to stderr alone
+        if name not in self._session.get_providers():  # onnxruntime continues without it, with a line on stderr only
             raise MissingPart(f"model.provider: {provider} is installed and does not start here: {package}, its driver")
         self.provider: str = provider
         self.fell_back = nodes_elsewhere(self._session, name)  # nodes of the graph that another provider runs
@@ -175,7 +175,7 @@ def nodes_elsewhere(session: Any, provider: str) -> tuple[str, ...]:
 
 
 def told_nodes(names: tuple[str, ...]) -> tuple[str, str]:
-    """How many nodes, and the first of them, for people."""
+    """Return the number of nodes and the names of the first, for people."""
     more = ", ..." if len(names) > NODES_TOLD else ""
     return f"{len(names)} node{'s' * (len(names) != 1)}", ", ".join(names[:NODES_TOLD]) + more
 
@@ -207,8 +207,8 @@ _tried_out: set[bytes] = set()  # digests of files that onnxruntime loads within
 
 
 def _try_out(path: Path, data: bytes) -> None:
-    """Load it in a process that may take so much memory and time: constants of a few bytes are worked out, when a model
-    is loaded, to as many as there is memory for. Raises InputError."""
+    """Load it in a child process with limited memory and time: constants of a few bytes can expand to all
+    memory when a model is loaded. Raises InputError."""
     found = hashlib.sha256(data).digest()
     if found not in _tried_out:
         memory_bytes = MEMORY_MAX + 8 * len(data)
@@ -223,7 +223,7 @@ def _tried_here(path: Path, data: bytes) -> None:
 
 
 def _why_not_loaded(error: Exception) -> str:
-    """What is wrong with a model that onnxruntime does not load, with its own version where it is too old for it."""
+    """Describe why onnxruntime cannot load a model, with both versions where the model is newer."""
     text = str(error)
     for found in (NEWER_OPSET.search(text), NEWER_IR.search(text)):
         if found:

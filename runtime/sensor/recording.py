@@ -24,7 +24,7 @@ from runtime.support.background import Job
 from runtime.support.untrusted_input import LIMITS, MIB
 
 CHUNK_BYTES = 4096  # some 20 eye samples
-INDEX_SHARE = 1.1  # a file with the indices of its chunks, beside without
+INDEX_SHARE = 1.1  # size with chunk indices over size without
 SUMMARY_BYTES = 10_000  # with the schemas
 MAX_S, MAX_BYTES = 600.0, 2 << 30  # a recording ends before it is longer or larger
 MAGIC = b"\x89MCAP0\r\n"
@@ -32,7 +32,7 @@ NEEDED = "one to replay has it and `/eyes` (docs/sensors.md); others are read by
 ROS1 = " (a bag of ROS 1: `mcap convert` makes one of it)"
 
 SYNCED_WITHIN_S = 30.0  # that closing a file waits for a slow disk
-SYNC_EVERY_NS = 2 * NS_PER_S  # what a power cut takes of a recording at most, on a disk that keeps up
+SYNC_EVERY_NS = 2 * NS_PER_S  # most that a power cut loses of a recording, on a disk that keeps up
 
 log = logging.getLogger(__name__)
 
@@ -74,7 +74,7 @@ class RecordingWriter:
         return self._channels[topic]
 
     def write(self, frame: SensorFrame) -> bool:
-        """Append a sample, its images first; False, and nothing is written, where a limit forbids it."""
+        """Append a sample, its images first; False, without writing, where a limit forbids it."""
         at = frame.capture_ns
         messages: list[tuple[str, bytes]] = []
         if self._images and frame.intrinsics is not None and frame.intrinsics != self._intrinsics:
@@ -97,7 +97,8 @@ class RecordingWriter:
             self._on_first()
         if time.monotonic_ns() - self._synced_ns >= SYNC_EVERY_NS and (self._sync is None or self._sync.done):
             self._synced_ns = time.monotonic_ns()
-            self._sync = Job("recording", lambda: os.fsync(self._file.fileno()))  # beside: a slow disk loses no sample
+            # In the background: a slow disk loses no sample.
+            self._sync = Job("recording", lambda: os.fsync(self._file.fileno()))
         return True
 
     def finish(self) -> None:
@@ -112,7 +113,7 @@ class RecordingWriter:
 def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -> Iterator[RecordingWriter]:
     """A writer whose file appears under its name with the first sample, and is kept from then on.
 
-    Until then an older file of that name stays; what a crash leaves is readable up to its last whole chunk.
+    Until then an older file of that name stays; after a crash it is readable up to its last whole chunk.
     One with pictures is its owner's alone. Raises InputError where it can't be written, or another process writes it.
     """
     part, file = path.with_name(f".{path.name}.part"), None
@@ -166,7 +167,7 @@ class Recording:
         return untrusted_input.open_regular(self.path, most_bytes=LIMITS.file_bytes)
 
     def _read_header(self) -> RecordingHeader:
-        """Of the metadata, wherever it stands: tools that mend a recording write it at the end."""
+        """Return the header from the metadata record, which repair tools write at the end."""
         foreign = ""
         for topic, record in self._records():
             if topic and topic not in fmt.SCHEMAS:
@@ -239,7 +240,7 @@ class Recording:
 
 
 def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[Any]:
-    """Records in order, those within chunks too, until the footer: what a chunk unpacks to is not taken on trust.
+    """Records in order, those within chunks too, until the footer: the unpacked size of a chunk is checked.
 
     max_bytes: of one record, and of one chunk unpacked. Raises InputError for a chunk over the limit, and what mcap or
     an unpacker raises for a damaged file.
@@ -256,7 +257,7 @@ def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[
 
 
 def _unpacked(chunk: Any, *, source: Path, max_bytes: int) -> bytes:
-    """A chunk's records as bytes. Raises InputError over the limit, else what the unpacker raises."""
+    """A chunk's records as bytes. Raises InputError over the limit, else the unpacker's exception."""
     says: int = chunk.uncompressed_size
     room = min(says, max_bytes) + 1  # unpackers allocate up to their limit
     data: bytes = chunk.data

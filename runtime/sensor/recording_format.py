@@ -37,7 +37,7 @@ M = TypeVar("M", bound=BaseModel)
 
 
 class Message(BaseModel):
-    """Numbers are finite ones of JSON: no text and no true stands for one."""
+    """Numbers are finite ones of JSON: text and booleans are refused."""
 
     model_config = ConfigDict(strict=True, allow_inf_nan=False)
 
@@ -59,7 +59,7 @@ class EyeSample(Message):
 
 
 class Stamp(Message):
-    """When a picture was taken."""
+    """Capture time of a picture."""
 
     sec: Annotated[int, Field(ge=0, le=NUMBER_MAX // NS_PER_S)]
     nsec: Annotated[int, Field(ge=0, lt=NS_PER_S)]
@@ -118,7 +118,7 @@ SCHEMAS = {topic: message.model_json_schema() for topic, message in MESSAGES.ite
 
 @dataclass(frozen=True, slots=True)
 class RecordingHeader:
-    """What is true of the whole recording."""
+    """Properties of the whole recording."""
 
     driver: str  # name of the driver that delivered it
     serial: str = ""
@@ -126,9 +126,9 @@ class RecordingHeader:
     depth: bool = False
 
     def metadata(self) -> dict[str, str]:
-        """As MCAP metadata: text to text."""
+        """Return MCAP metadata, text to text."""
         flags = {name: str(int(value)) for name, value in asdict(self).items() if isinstance(value, bool)}
-        # `eye_points`: every sample says where the eyes are, or that there is no face.
+        # `eye_points`: every sample says where the eyes are, or the absence of a face.
         texts = {"schema_version": str(SCHEMA_VERSION), "driver": self.driver, "serial": self.serial, "eye_points": "1"}
         return texts | flags
 

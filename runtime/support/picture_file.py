@@ -107,7 +107,7 @@ def rgb_of(image: Any, source: object, *, background: Colour = WHITE) -> U8:
     is_clear = image.has_transparency_data
     behind = np.array([round(value * 255) for value in background], np.uint16)
     result = np.empty((image.height, image.width, 3), np.uint8)
-    for first in range(0, image.height, ROWS_AT_ONCE):  # what is worked out takes several times the picture's memory
+    for first in range(0, image.height, ROWS_AT_ONCE):  # intermediate values take several times the picture's memory
         rows = slice(first, min(first + ROWS_AT_ONCE, image.height))
         part = _eight_bits(image.crop((0, rows.start, image.width, rows.stop)))
         alpha = np.asarray(part.convert("RGBA"))[..., 3:] if is_clear else None
@@ -132,7 +132,7 @@ def _upright(image: Any) -> Any:
 
 
 def _eight_bits(image: Any) -> Any:
-    """Of 16 bits a channel the upper byte."""
+    """Return the upper byte of 16-bit channels."""
     if image.mode == "I":
         return Image.fromarray((np.asarray(image).clip(0, 65535) >> 8).astype(np.uint8))
     if image.mode in DEEP:
@@ -141,7 +141,7 @@ def _eight_bits(image: Any) -> Any:
 
 
 def _to_srgb(profile: bytes, colours: str, source: object) -> Any:
-    """A function from an image in the profile's colours to sRGB; None where they are sRGB, or it is no profile."""
+    """A function from an image in the profile's colours to sRGB; None for sRGB itself or a broken profile."""
     try:
         transform = ImageCms.buildTransform(
             ImageCms.ImageCmsProfile(io.BytesIO(profile)),

@@ -1,4 +1,4 @@
-"""What a picture file says of itself before it is decoded, checked against the limits."""
+"""Headers of picture files, read and checked against the limits before decoding."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from runtime.support.untrusted_input import LIMITS
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 JPEG_END = b"\xff\xd9"
 PNG_DEPTH = slice(24, 25)  # where a PNG has its bits a channel
-CHUNK_BYTES = 12  # of a PNG's part without what it holds: length, kind, checksum
+CHUNK_BYTES = 12  # overhead of a PNG chunk: length, kind, checksum
 SIDE_MAX_PX = 1 << 16  # that a header may claim
 # Pillow's: of EPS it would start Ghostscript. An MPO is a JPEG to it.
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "PPM", "TGA", "AVIF")
@@ -29,11 +29,11 @@ ORIENTATION = 0x0112  # EXIF's tag
 TURNED = (5, 6, 7, 8)  # by a quarter: width and height are exchanged
 MP_ENTRIES, MP_NUMBER = 0xB002, 0xB101  # tags of an MPO: its pictures; which viewpoint one is, from the left
 DISPARITY, UNDEFINED = "Multi-Frame Image: (Disparity)", "Undefined"
-GAIN_MAP = (b"hdrgm", b"21496-1")  # marks of a second picture that is no view, but tells how much brighter the first is
-HEAD_BYTES = 512  # of a file, by which its kind is told
+GAIN_MAP = (b"hdrgm", b"21496-1")  # marks of a gain map, a second picture with the brightness of the first
+HEAD_BYTES = 512  # read to identify a file
 UNDECODED = "is not an image that can be decoded"
 ANOTHER = "save it as PNG, JPEG or AVIF"
-OTHER_KINDS = (  # that are not read: where their mark stands, the mark, name and way out
+OTHER_KINDS = (  # unsupported formats: offset and value of the mark, name, way out
     (0, b"\xff\x0a", "JPEG XL", f"{ANOTHER} (djxl in.jxl out.png)"),
     (4, b"JXL \r\n", "JPEG XL", f"{ANOTHER} (djxl in.jxl out.png)"),
     (0, b"v/1\x01", "OpenEXR", "its values have no range: expose it and save it as PNG"),
@@ -55,15 +55,15 @@ OTHER_KINDS = (  # that are not read: where their mark stands, the mark, name an
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """A picture as its file tells of it."""
+    """Properties of a picture file, without decoding its pixels."""
 
     kind: str  # Pillow's name of the format
     width_px: int
     height_px: int
     views: tuple[int, ...]  # frames: the one that is shown, or the left and the right eye's
     is_animated: bool
-    is_around: bool = False  # a sphere of 360 by 180 degrees, as its XMP says
-    warning: str = ""  # what the file promises and does not hold
+    is_around: bool = False  # its XMP declares a sphere of 360 by 180 degrees
+    warning: str = ""  # missing second view
 
 
 @contextmanager
@@ -97,7 +97,7 @@ def _formats() -> tuple[str, ...]:
 
 
 def header_of(coded: bytes | IO[bytes], *, name: str = "") -> Header:
-    """What the beginning of a coded picture says. Raises ValueError with the problem.
+    """Return the header of a coded picture. Raises ValueError with the problem.
 
     name: of its file: a second picture that an MPO does not call a view is one only where the file is named .mpo.
     """
@@ -115,7 +115,7 @@ def header_of(coded: bytes | IO[bytes], *, name: str = "") -> Header:
 
 
 def _views(image: Any, *, is_named_so: bool) -> tuple[tuple[int, ...], str]:
-    """Frames of the left and the right eye, or the one to show; and what is missing.
+    """Return frames of the left and the right eye, or the one to show, and a warning.
 
     A second picture is an eye's only if the file calls it one, and if it is as large as the first.
     """
@@ -153,10 +153,10 @@ def _size_of(image: Any, frame: int) -> tuple[int, int]:
 
 
 def _viewpoint(image: Any) -> int | None:
-    """The number of a frame's viewpoint in an MPO, 1 the leftmost; None: it is not told."""
+    """The number of a frame's viewpoint in an MPO, 1 the leftmost; None: unknown."""
     from PIL import TiffImagePlugin
 
-    with suppress(Exception):  # a malformed one tells nothing
+    with suppress(Exception):  # a malformed table has no number
         file = io.BytesIO(image.info["mp"])
         table = TiffImagePlugin.ImageFileDirectory_v2(file.read(8))
         file.seek(struct.unpack((">" if file.getvalue()[:1] == b"M" else "<") + "L", file.getvalue()[4:8])[0])
@@ -201,7 +201,7 @@ def undecodable(data: bytes, error: Exception | None = None) -> str:
 
 
 def _promises_more(data: bytes) -> bool:
-    """Whether a WebP, or a box of an AVIF or HEIC, is longer by its own word than the file."""
+    """Return True if a WebP, or a box of an AVIF or HEIC, declares more bytes than the file has."""
     if data[:4] == b"RIFF":
         return 8 + int.from_bytes(data[4:8], "little") > len(data)
     place = 0
@@ -214,9 +214,9 @@ def _promises_more(data: bytes) -> bool:
 
 
 def is_cut_off(coded: bytes) -> bool:
-    """Whether a PNG's parts promise more bytes than there are, or it has no end. False for other formats.
+    """Return True if a PNG's chunks exceed the file, or it has no end; False for other formats.
 
-    OpenCV takes memory for what is promised before it reads: up to 2 GiB for a file of any size.
+    OpenCV allocates the promised size before it reads: up to 2 GiB for a file of any size.
     """
     if not coded.startswith(PNG):
         return False
@@ -230,7 +230,10 @@ def is_cut_off(coded: bytes) -> bool:
 
 
 def _orientation(image: Any) -> int:
-    """By what stands before the pixels: Pillow's own `getexif` unpacks a PNG. Of a TIFF it tells the turned size."""
+    """Return the EXIF orientation stored before the pixels; Pillow already turns a TIFF.
+
+    Pillow's `getexif` would unpack a PNG.
+    """
     from PIL import Image
 
     coded = image.info.get("exif")
@@ -283,7 +286,7 @@ def read_coded(path: Path) -> tuple[bytes, Header]:
 
 
 def header_of_file(path: Path) -> Header:
-    """What a picture file's beginning says. Raises InputError, also for more pixels than the limit."""
+    """Return a picture file's header. Raises InputError, also for more pixels than the limit."""
     with untrusted_input.open_regular(path, most_bytes=LIMITS.file_bytes) as file:
         try:
             header = header_of(file, name=path.name)

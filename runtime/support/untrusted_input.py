@@ -1,7 +1,7 @@
-"""What comes from outside (paths, files, JSON, numbers), read in one place and within limits.
+"""Untrusted input (paths, files, JSON, numbers), read in one place and within limits.
 
-Every reader of untrusted bytes stands on this. What is wrong is an InputError, one line that names the file and the
-field; what is over a limit is told with its figure and the limit.
+Every reader of untrusted bytes uses this module. A fault is an InputError, one line that names the file and the
+field; a value over a limit is reported with the limit.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ MIB = 1 << 20
 
 @dataclass(slots=True)
 class Limits:
-    """What a file from outside may hold: more is refused with its figure, before memory is taken for it."""
+    """Limits for files from outside, checked before memory is allocated."""
 
     file_bytes: int = 1 << 30  # one file of content or of a recording
     pixels: int = 134_217_728  # of one picture; 16384 x 8192
     texture_pixels: int = 134_217_728  # of all pictures of a scene together
     triangles: int = 2_000_000  # of a mesh, all instances together
     splats: int = 3_000_000
-    instances: int = 2000  # times that meshes stand in a glTF scene
+    instances: int = 2000  # placed meshes in a glTF scene
     depth: int = 64  # how deep JSON or a glTF scene may nest
-    load_s: float = 120.0  # loading of one piece of content is given up after this
-    start_s: float = 600.0  # a start is given up where content and model are not ready after this
+    load_s: float = 120.0  # time limit of loading one piece of content
+    start_s: float = 600.0  # time limit of a start: content and model
     recording_s: float = 21_600.0  # length of a recording that is replayed
     chunk_bytes: int = 32 << 20  # one chunk or message of a recording, unpacked
 
@@ -58,7 +58,7 @@ def checked_path(path: str | Path, *, source: str | Path = "", field: str = "") 
 
 
 def is_there(path: str | Path, *, folder: bool = False) -> bool:
-    """Whether something, or a folder, is at a path. Raises InputError where that cannot be asked."""
+    """Return True if something, or a folder, is at a path. Raises InputError where that cannot be asked."""
     checked = checked_path(path)
     try:
         return checked.is_dir() if folder else checked.exists()
@@ -71,7 +71,7 @@ def open_regular(
 ) -> IO[bytes]:
     """An open regular file, for reading. Raises InputError: a folder, FIFO, device, or too large.
 
-    Opening never waits (a FIFO without a writer would), and what was opened is what is checked.
+    Opening never waits (a FIFO without a writer would), and the opened file itself is checked.
     """
     whence = source or str(path)
     checked = checked_path(path, source=source, field=field)
@@ -97,7 +97,7 @@ def read_bytes(path: str | Path, *, most_bytes: int, source: str | Path = "", fi
     with open_regular(path, most_bytes=most_bytes, source=source, field=field) as file:
         try:
             size = min(os.fstat(file.fileno()).st_size, most_bytes)
-            data = file.read(size + 1)  # room for what there is, not for what there may be
+            data = file.read(size + 1)  # allocates the present size, not the limit
             if len(data) > size:  # it grows while it is read
                 data += file.read(most_bytes + 1 - len(data))
         except OSError as error:
@@ -141,7 +141,7 @@ def parsed_json(text: str | bytes, *, source: str | Path, field: str = "", most_
 
 
 def _depth(value: Any) -> int:
-    """How deep lists and objects nest."""
+    """Return the nesting depth of lists and objects."""
     if isinstance(value, dict):
         return 1 + max(map(_depth, value.values()), default=0)
     if isinstance(value, list):
@@ -154,7 +154,7 @@ def _no_constant(name: str) -> float:
 
 
 def _whole(digits: str) -> int | float:
-    # Python refuses more than 4,300 digits with a ValueError of its own, and takes quadratic time below that.
+    # Python refuses more than 4,300 digits with its ValueError, and takes quadratic time below that.
     return int(digits) if len(digits) <= 400 else float(digits)
 
 
