@@ -90,7 +90,7 @@ put 644 ../docs/operation.md /usr/share/doc/phasestack/operation.md
 put 644 ../docs/page.md /usr/share/doc/phasestack/page.md
 put 644 ../docs/blackbox.md /usr/share/doc/phasestack/blackbox.md
 put 644 ../docs/install.md /usr/share/doc/phasestack/install.md
-put 644 ../docs/hardware.md /usr/share/doc/phasestack/hardware.md
+put 644 ../docs/planning.md /usr/share/doc/phasestack/planning.md
 put 644 ../THIRD_PARTY.md /usr/share/doc/phasestack/THIRD_PARTY.md
 # What the operator has written is never replaced.
 [ -e "$DESTDIR/etc/phasestack/phasestack.toml" ] || put 644 phasestack.toml /etc/phasestack/phasestack.toml

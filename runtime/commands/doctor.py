@@ -134,7 +134,7 @@ def sensor(settings: Settings) -> Iterator[Row]:
         driver.open()
         frame = driver.read_newest(CHECK_SENSOR_FOR_S)
     except (SensorLost, SensorTimeout, EndOfRecording) as error:
-        remedy = "docs/sensors.md: a driver of your own" if own else "plug it in; see the rows on USB; docs/hardware.md"
+        remedy = "docs/sensors.md: a driver of your own" if own else "plug it in; see the rows on USB; docs/planning.md"
         yield Row("sensor", "fail", f"{what}: {error or 'no sample'}", remedy)
         return
     finally:
@@ -162,7 +162,7 @@ def usb(settings: Settings) -> Iterator[Row]:
         yield Row("usb", absent, str(error), "install it" if needed else "")
         return
     if not devices:
-        remedy = "plug one in; docs/hardware.md lists them" if needed else ""
+        remedy = "plug one in; docs/planning.md lists them" if needed else ""
         yield Row("usb", absent, "no known depth camera is plugged in", remedy)
     for device in devices:
         problems = device.problems()
