@@ -274,7 +274,7 @@ def test_the_command_takes_the_cameras_that_pictures_were_taken_with(
     assert "beside the panels" in capfd.readouterr().err
     for given, told in (
         (eyes[:4], "are needed"),
-        ([*eyes, "--camera", f"{tmp_path}/cameras.json"], "leave --left-eye"),
+        ([*eyes, "--camera", f"{tmp_path}/cameras.json"], "omit --left-eye"),
     ):
         with pytest.raises(InputError, match=told):
             app([*command, *given], standalone_mode=False)

@@ -1,4 +1,4 @@
-"""`phasestack bench`: the frontier's regression file, and the comparison of two of them."""
+"""`phasestack bench`: the frontier's regression file, and comparison of two files."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ def compare(
     new: Annotated[Path, typer.Argument(help="the later one")],
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
-    """Name what got slower or worse beyond noise. Exits with 1 where anything is named.
+    """List what became slower or worse beyond noise. Exits with 1 if anything did.
 
-    Times are not compared where the machine was too busy in either measurement; that is said.
+    Times are not compared if the machine was too busy during either measurement.
 
     Example: phasestack bench compare old.json new.json
     """
@@ -68,7 +68,7 @@ def compare(
         print(f"machine: {speed:.2f} times the time of the yardstick; solutions are compared net of it")
         for change in sorted(changes, key=lambda change: not change.worse):
             print(f"{'worse ' if change.worse else 'better'} {change.what}: {change.text}")
-        again = ", but for times, which can't be compared: measure again" if busy else ""
+        again = ", except times, which cannot be compared: measure again" if busy else ""
         ends = f"{len(worse)} worse, {len(changes) - len(worse)} better"
         print(ends if changes else f"no change beyond noise{again}")
     if worse:

@@ -15,14 +15,12 @@ LONGEST_S = 45.0  # of working: a slower machine shows fewer refreshes
 
 def demo(
     out: Annotated[Path, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = Path("out/demo"),
-    frames: Annotated[
-        int, typer.Option(min=1, help="refreshes; the whole recording is 600, and takes minutes")
-    ] = FRAMES,
+    frames: Annotated[int, typer.Option(min=1, help="number of refreshes; all 600 take minutes")] = FRAMES,
     as_json: Annotated[bool, typer.Option("--json", help="the summary as one JSON object on stdout")] = False,
 ) -> None:
     """Replay a built-in recording of a moving head through the whole pipeline, without a screen.
 
-    Ends after 45 s at the latest, unless more refreshes are asked for.
+    Ends after 45 s, unless --frames asks for more refreshes.
 
     Example: phasestack demo --out out/demo
     """
@@ -31,7 +29,7 @@ def demo(
     from runtime.daemon.drive import drive, print_summary
 
     class InTime(Host):
-        """Ends a run that is not asked to be long."""
+        """Ends a short demo in time on slow machines."""
 
         def __init__(self) -> None:
             self._ends_s = time.monotonic() + LONGEST_S if frames <= FRAMES else float("inf")

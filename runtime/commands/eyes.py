@@ -1,4 +1,4 @@
-"""`phasestack eyes`: the viewer's pupils in pictures, films, recordings, or before the sensor now."""
+"""`phasestack eyes`: the viewer's pupils in pictures, films, recordings, or in front of the sensor."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ import typer
 
 from runtime.support.options import number
 
-JSON_S = 2.0  # of a sensor that is looked at for one JSON object
+JSON_S = 2.0  # of the sensor, for one JSON object
 
 
 def eyes(
     files: Annotated[
-        list[Path] | None, typer.Argument(help="pictures, films, recordings; without one, the configured sensor, live")
+        list[Path] | None, typer.Argument(help="pictures, films, recordings; none: the configured sensor, live")
     ] = None,
-    config: Annotated[Path | None, typer.Option(help="configuration: the sensor")] = None,
+    config: Annotated[Path | None, typer.Option(help="configuration, for its sensor")] = None,
     sequence: Annotated[
-        bool, typer.Option("--sequence", help="the pictures are successive frames, followed as the daemon does")
+        bool, typer.Option("--sequence", help="follow the pictures as successive frames, as the daemon does")
     ] = False,
-    rate_hz: Annotated[float, number(0.1, 1000, "Hz", help="of such frames, and of films that do not say")] = 30.0,
-    out: Annotated[Path | None, typer.Option(help="folder for overlays, readable by you alone")] = None,
+    rate_hz: Annotated[float, number(0.1, 1000, "Hz", help="rate of such frames, and of films without a rate")] = 30.0,
+    out: Annotated[Path | None, typer.Option(help="folder for overlays, readable only by you")] = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="one JSON object on stdout; of the sensor, what two seconds showed")
+        bool, typer.Option("--json", help="one JSON object on stdout; of the sensor, two seconds")
     ] = False,
 ) -> None:
-    """Find the viewer's pupils, with how sure each is, and draw them.
+    """Find the viewer's pupils with their uncertainty, and draw them.
 
     Example: phasestack eyes me.jpg room.mp4 --out out/eyes
     """

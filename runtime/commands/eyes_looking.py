@@ -1,4 +1,4 @@
-"""The body of `phasestack eyes`: from pictures to rows and overlays."""
+"""Body of `phasestack eyes`: pictures to rows and overlays."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from runtime.support.picture_file import read_image
 
 RECORDING = ".mcap"
 OVERLAY_MIN_PX = 640  # longer side of an overlay, at least
-PRIVATE = 0o600  # a face is its owner's
+PRIVATE = 0o600  # for pictures of faces
 GREEN, RED, WHITE = (60, 220, 60), (230, 60, 60), (255, 255, 255)
 Row = dict[str, Any]
 
 
 class Watcher:
-    """The finder with its clock: a row for every frame."""
+    """Eye finder that returns a row for every frame."""
 
     def __init__(self, settings: Settings) -> None:
-        cv2.setNumThreads(1)  # as beside the display's loop
+        cv2.setNumThreads(1)  # as in the display's loop
         self._finder = EyeFinder(settings)
         self.forget = self._finder.forget
 
@@ -46,7 +46,7 @@ class Watcher:
         ms = 1e3 * (time.perf_counter() - begin)
         pupils, reason = self._finder.pupils, self._finder.reason
         if pupils is not None and frame.intrinsics is None:
-            reason = ""  # nobody asks a picture how far away its people are
+            reason = ""  # a picture without intrinsics has no distances
         if frame.colour is None:
             pupils, reason = None, "this sensor delivers eyes and no pictures" if found else "no eyes in this sample"
         row = {
@@ -65,7 +65,7 @@ class Watcher:
 def look_at_files(
     files: list[Path], settings: Settings, *, sequence: bool, rate_hz: float, out: Path | None
 ) -> list[Row]:
-    """A row for each frame of each file, in order. Raises InputError; then `out` is left unchanged."""
+    """Return a row for each frame of each file, in order. Raises InputError, leaving `out` unchanged."""
     watcher, rows, follows = Watcher(settings), [], False
     with OutputFolder(out) if out is not None else nullcontext() as folder:
         for place, path in enumerate(files):
@@ -83,11 +83,11 @@ def look_at_files(
 
 
 def _frames(path: Path, place: int, rate_hz: float) -> Iterator[SensorFrame]:
-    """A file's pictures. place: of a still picture, in a sequence. Raises InputError."""
+    """Yield a file's pictures. place: a still picture's index in a sequence. Raises InputError."""
     kind = path.suffix.lower()
     if kind == RECORDING:
         for frame in Recording(path).samples():
-            # What was found when it was recorded is not asked: the pictures are looked at anew.
+            # Look at the pictures again, and ignore the recorded eyes.
             yield frame if frame.colour is None else replace(frame, eyes=None)
     elif kind in VIDEOS:
         yield from _filmed(path, rate_hz)
@@ -96,8 +96,8 @@ def _frames(path: Path, place: int, rate_hz: float) -> Iterator[SensorFrame]:
 
 
 def _filmed(path: Path, rate_hz: float) -> Iterator[SensorFrame]:
-    """Raises InputError for what is no film."""
-    with held_back():  # what FFmpeg and OpenCV say of it is one line of ours
+    """Yield a film's pictures. Raises InputError."""
+    with held_back():  # FFmpeg's and OpenCV's messages become one error
         capture = open_film(path)
     try:
         rate = capture.get(cv2.CAP_PROP_FPS)
@@ -116,7 +116,7 @@ def _filmed(path: Path, rate_hz: float) -> Iterator[SensorFrame]:
 
 
 class _Overlays:
-    """A file's overlays, as a picture or a film that is its owner's alone; without a target, nothing."""
+    """Writer of a file's overlays, as a private picture or film; without a target it does nothing."""
 
     def __init__(self, target: Path | None, is_still: bool, rate_hz: float) -> None:
         self._target, self._is_still, self._rate_hz = target, is_still, rate_hz
@@ -146,10 +146,10 @@ class _Overlays:
 
 
 def drawn(picture: U8, pupils: Pupils | None, row: Row) -> U8:
-    """The picture with pupils, face and what is known of them."""
+    """Return the picture with pupils, face and their figures drawn."""
     scale = max(1.0, OVERLAY_MIN_PX / max(picture.shape[:2]))
     canvas = np.asarray(cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC), np.uint8)
-    bits = 4  # of a coordinate behind the point
+    bits = 4  # fractional bits of a coordinate
 
     def place(point: Any) -> tuple[int, int]:
         x, y = np.rint((np.asarray(point) * scale - 0.5) * (1 << bits)).astype(int)
@@ -172,11 +172,11 @@ def drawn(picture: U8, pupils: Pupils | None, row: Row) -> U8:
 
 
 def look_at_sensor(
-    settings: Settings, tell: Callable[[Row], None], *, out: Path | None, seconds: float = np.inf
+    settings: Settings, report: Callable[[Row], None], *, out: Path | None, seconds: float = np.inf
 ) -> None:
-    """Tell of every frame of the configured sensor, for so long, until it ends or Ctrl-C comes.
+    """Report every frame of the configured sensor until the time is up, it ends, or Ctrl-C.
 
-    The newest overlay is left in `out`. Raises InputError, SensorLost.
+    Leaves the newest overlay in `out`. Raises InputError, SensorLost.
     """
     watcher, driver = Watcher(settings), open_sensor(settings.sensor, MonotonicClock())
     end = time.monotonic() + seconds
@@ -189,4 +189,4 @@ def look_at_sensor(
                     frame = driver.read_newest(settings.sensor.timeout_s)
                     row, pupils = watcher.look(frame, settings.sensor.driver, frame.sequence)
                     overlays.add(frame, pupils, row)
-                    tell(row)
+                    report(row)

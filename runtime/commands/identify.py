@@ -1,4 +1,4 @@
-"""`phasestack identify`: shows each panel its own name and which way is up."""
+"""`phasestack identify`: shows on each panel its name and which way is up."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 
 
 def identify(
-    config: Annotated[Path | None, typer.Option(help="configuration; without one, every monitor is shown")] = None,
+    config: Annotated[Path | None, typer.Option(help="configuration; without one, every monitor shows a card")] = None,
 ) -> None:
-    """Show a panel its index, its monitor, an arrow that should point up, colour bars and its edges.
+    """Show on each panel its index, monitor, an arrow that should point up, colour bars and edges.
 
-    Panels stand behind one another: one shows its card, the others are clear; Enter or n goes to the next, p back, q
-    ends. With panels in the configuration they are bound, turned, mirrored and registered as they will be when it
-    runs. Without any, every monitor tells how to name it in the configuration; `phasestack setup` asks for that.
+    One panel at a time shows its card, and the others are clear. Enter or n: the next panel; p: the previous one; q:
+    quit. Configured panels are rotated, mirrored and registered as in a run. Without any, every monitor shows how to
+    name it in the configuration (`phasestack setup` does this for you).
 
-    Exits with 75 where the X server dies.
+    Exits with 75 if the X server dies.
 
     Example: phasestack identify --config phasestack.toml
     """
@@ -54,7 +54,7 @@ def identify(
 
 
 def _bound(settings: Settings) -> tuple[PanelSink, list[U8]]:
-    """The configured panels and their cards. Raises InputError, PanelLost."""
+    """Open the configured panels and return them with their cards. Raises InputError, PanelLost."""
     from runtime.clock import MonotonicClock
     from runtime.panels.card import identity_card
     from runtime.panels.window import WindowPanels
@@ -76,7 +76,7 @@ def _bound(settings: Settings) -> tuple[PanelSink, list[U8]]:
 
 
 def _hold(panels: PanelSink, cards: list[U8], poll: Callable[[], Key | None]) -> None:
-    """Show cards again and again, so that closed windows and lost monitors come back; keys go on to the next."""
+    """Show one card at a time until q; closed windows and lost monitors are opened again."""
     import time
 
     from calib.keys import Key
@@ -84,9 +84,9 @@ def _hold(panels: PanelSink, cards: list[U8], poll: Callable[[], Key | None]) ->
     from runtime.panels.card import alone
     from runtime.records import PanelFrame
 
-    lost, number = "", 0  # of presses, so that each is another frame
+    lost, number = "", 0  # of key presses, so that each is another frame
     shown, layers = 0, alone(cards, 0)
-    typer.echo("one panel at a time (Enter, n: the next; p: the one before; q: done)")
+    typer.echo("one panel at a time (Enter, n: next; p: previous; q: quit)")
     try:
         while True:
             try:

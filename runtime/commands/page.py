@@ -1,4 +1,4 @@
-"""`phasestack page`: the operator's page, outside the daemon."""
+"""`phasestack page`: the operator's page, in its own process."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ DEFAULT_PORT = 8717
 
 
 def page(
-    config: Annotated[Path | None, typer.Option(help="configuration of the daemon: says where its socket is")] = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0: any that is free")] = DEFAULT_PORT,
+    config: Annotated[Path | None, typer.Option(help="configuration of the daemon, which names its socket")] = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0: any free one")] = DEFAULT_PORT,
     token_file: Annotated[
-        Path | None, typer.Option(help="file with the token, made where there is none; default: in the state folder")
+        Path | None, typer.Option(help="file with the token, created if missing; default: in the state folder")
     ] = None,
 ) -> None:
-    """Serve the operator's page: what the running daemon does, live, and its controls.
+    """Serve the operator's page: the running daemon's live state, and its controls.
 
-    The daemon is asked by its socket; where none runs the page says so, and goes on when one is back. A browser must
-    give the token that is in the token file.
+    The page connects to the daemon's socket, and waits for a daemon if none runs. Browsers log in with the token from
+    the token file.
 
     Example: phasestack page --port 8717
     """
@@ -32,10 +32,10 @@ def page(
     from runtime.support.background import BACKGROUND_NICENESS, set_niceness
     from runtime.support.folders import state_folder
 
-    set_niceness(BACKGROUND_NICENESS)  # the display comes first; its threads are started after this
+    set_niceness(BACKGROUND_NICENESS)  # before its threads start: the display has priority
     places = sockets(config)
     path = token_file or state_folder() / "page-token"
-    with retry_advised():  # a full disk may pass: the service is started again
+    with retry_advised():  # such as a full disk
         token = token_of(path)
     served = listening("page", port)
     typer.echo(f"the page is at http://{LOOPBACK}:{served.getsockname()[1]}/ - its token is in {path}", err=True)

@@ -1,4 +1,4 @@
-"""`phasestack plan`: what this scene leaves out, and why."""
+"""`phasestack plan`: the savings for a scene."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ def plan(
     config: Annotated[Path | None, typer.Option(help="TOML file; see `phasestack config`")] = None,
     scene: Annotated[str | None, typer.Option(help="a built-in scene, a file or folder")] = None,
     model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
-    scale: Annotated[float, number(0.05, 2.0, help="panel resolution, times the configured one")] = 1.0,
+    scale: Annotated[float, number(0.05, 2.0, help="scale factor of the panels' pixel counts")] = 1.0,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout")] = False,
 ) -> None:
-    """What this scene leaves out, why, what each saving saves and what it costs, measured here.
+    """List the work that this scene makes unnecessary, the reasons, and measured savings and costs.
 
     Example: phasestack plan --scene sparse
     """

@@ -1,4 +1,4 @@
-"""`phasestack record`: what the sensor sees, into a file that `--replay` plays."""
+"""`phasestack record`: samples of the sensor into a file for `--replay`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from runtime.sensor.worker import SensorWorker
 
 POLL_S = 0.004  # between two looks for samples: a quarter of a 60 Hz sensor's period
-FIRST_SAMPLE_S = 15.0  # that a sensor may take to its first sample
+FIRST_SAMPLE_S = 15.0  # to wait for the first sample
 SUFFIX = ".mcap"
 OVER = ("ended", "failed")
 
@@ -29,32 +29,32 @@ OVER = ("ended", "failed")
 def record(
     out: Annotated[Path, typer.Option(help="recording to write, .mcap")],
     config: Annotated[Path | None, typer.Option(help="TOML file; see `phasestack config`")] = None,
-    images: Annotated[bool, typer.Option("--images", help="colour and depth as well: shows faces")] = False,
+    images: Annotated[
+        bool, typer.Option("--images", help="record colour and depth pictures, too: they show faces")
+    ] = False,
     seconds: Annotated[
         float | None,
-        number(0.1, RECORD_MOST_S, "s", help="stop after this long; default: 600 s or Ctrl-C, with --motion 12 s"),
+        number(0.1, RECORD_MOST_S, "s", help="stop after this long; default: 600 s, with --motion 12 s"),
     ] = None,
-    motion: Annotated[
-        str | None, typer.Option(help="no sensor, but a head that moves: still, lean, nod, walk or stop-and-go")
-    ] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="with --motion: another seed, another path")] = None,
-    rate_hz: Annotated[float | None, number(15, 240, "Hz", help="with --motion: samples a second")] = None,
+    motion: Annotated[str | None, typer.Option(help="simulate a head: still, lean, nod, walk or stop-and-go")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="with --motion: seed of its path")] = None,
+    rate_hz: Annotated[float | None, number(15, 240, "Hz", help="with --motion: samples per second")] = None,
     noise_mm: Annotated[
-        float | None, number(0, 100, "mm", help="with --motion: the sensor's noise, standard deviation an axis")
+        float | None, number(0, 100, "mm", help="with --motion: standard deviation of the sensor's noise per axis")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="what was recorded as one JSON object on stdout")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout")] = False,
 ) -> None:
-    """Record eye positions with their times; pictures only with --images. Ctrl-C ends it properly.
+    """Record eye positions with their times, and pictures with --images. Ctrl-C ends the recording.
 
-    With --motion a head moves as the tracker's benchmark has it: noise, outliers, dropouts, and the true eyes.
+    With --motion: the simulated heads of the tracker's benchmark, with noise, outliers, dropouts and the true eyes.
 
     Example: phasestack record --out lean.mcap --seconds 20
 
     Example: phasestack record --motion walk --seed 3 --rate-hz 60 --out walk.mcap
     """
     _refuse_target(out, motion=motion is not None)
-    made = {"seed": seed, "rate_hz": rate_hz, "noise_mm": noise_mm}
-    meaningless = {"config": config, "images": images or None} if motion is not None else made
+    simulated = {"seed": seed, "rate_hz": rate_hz, "noise_mm": noise_mm}
+    meaningless = {"config": config, "images": images or None} if motion is not None else simulated
     for name, value in meaningless.items():
         if value is not None:
             what = "--motion" if motion is not None else "a sensor"
@@ -62,9 +62,9 @@ def record(
     if motion is not None:
         from runtime.evaluation.motion_recording import write_motion
 
-        given: dict[str, Any] = {**made, "seconds": seconds}
-        told = write_motion(out, motion, **{name: value for name, value in given.items() if value is not None})
-        summary = told | {"holds": ["eyes", "true eyes"], "stopped": "the motion is done"}
+        options: dict[str, Any] = {**simulated, "seconds": seconds}
+        written = write_motion(out, motion, **{name: value for name, value in options.items() if value is not None})
+        summary = written | {"holds": ["eyes", "true eyes"], "stopped": "the motion has ended"}
     else:
         from runtime.config import load_settings
 
@@ -77,9 +77,9 @@ def record(
 
 
 def _refuse_target(out: Path, *, motion: bool) -> None:
-    """Raises InputError for a name that is not a recording's, or one that is taken.
+    """Raise InputError for a name without the suffix, or an existing file.
 
-    A motion may replace a motion, which is made again from its seed; a viewer is not.
+    A simulated motion may be replaced by another: its seed gives it back.
     """
     from runtime.sensor.recording import Recording
     from runtime.support.untrusted_input import checked_path
@@ -97,9 +97,9 @@ def _refuse_target(out: Path, *, motion: bool) -> None:
     try:
         if motion and Recording(out).header.driver == "motion":
             return
-    except InputError:  # something else has the name
+    except InputError:  # no recording
         pass
-    raise InputError(out, "--out", "is there already: take another name, or delete it")
+    raise InputError(out, "--out", "exists already: choose another name, or delete it")
 
 
 def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | None) -> dict[str, Any]:
@@ -135,7 +135,7 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
                     writer = cleanup.enter_context(recording_to(out, header, max_s=max_s))
                 if not writer.write(frame):
                     if frame.capture_ns - first_ns <= max_s * NS_PER_S:
-                        stopped = "it would be larger than 2 GiB"
+                        stopped = "the limit of 2 GiB is reached"
                     break
                 so_far_s = (frame.capture_ns - first_ns) / NS_PER_S
                 holds |= dict.fromkeys(_streams(frame))
@@ -148,25 +148,25 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
                 raise
             stopped = "stopped by hand"
         if writer is None:
-            why = worker.reason or "nothing came"
+            why = worker.reason or "nothing arrived"
             raise worker.error or FatalError(f"sensor {s.driver}: no sample ({worker.state}: {why})")
-    told = {"file": str(out), "samples": writer.count, "seconds": so_far_s, "stopped": stopped}
-    return told | {"holds": list(holds), "skipped": worker.stale_inputs}
+    summary = {"file": str(out), "samples": writer.count, "seconds": so_far_s, "stopped": stopped}
+    return summary | {"holds": list(holds), "skipped": worker.stale_inputs}
 
 
 def _streams(frame: SensorFrame) -> list[str]:
-    """What a sample holds."""
+    """Return the names of the data in a sample."""
     parts = {"eyes": frame.eyes, "true eyes": frame.true_eyes_m, "colour": frame.colour, "depth": frame.depth_mm}
     return [name for name, value in parts.items() if value is not None]
 
 
 def _samples(worker: SensorWorker, limit_s: float) -> Iterator[SensorFrame]:
-    """Samples as they arrive, until the source is over or the time is up, which begins with the first sample."""
+    """Yield samples until the source ends, or for a time that begins with the first sample."""
     import time
 
     deadline_ns, begun = time.monotonic_ns() + round(FIRST_SAMPLE_S * 1e9), False
     while True:
-        is_over = worker.state in OVER  # asked first: its last samples come before it says so
+        is_over = worker.state in OVER  # first: the last samples arrive before this
         frames = worker.take()
         if frames and not begun:
             deadline_ns, begun = frames[0].capture_ns + round(limit_s * 1e9), True

@@ -15,31 +15,31 @@ from runtime.support.options import blame_option, number
 def run(
     config: Annotated[Path | None, typer.Option(help="TOML file; see `phasestack config`")] = None,
     replay: Annotated[
-        str | None, typer.Option(help="a recording, instead of the sensor; `demo` goes on until it is told")
+        str | None, typer.Option(help="recording to play instead of the sensor; `demo` repeats until stopped")
     ] = None,
-    headless: Annotated[bool, typer.Option("--headless", help="offscreen panels, whatever is configured")] = False,
-    frames: Annotated[int | None, typer.Option(min=1, help="stop after so many refreshes")] = None,
+    headless: Annotated[bool, typer.Option("--headless", help="no windows: offscreen panels")] = False,
+    frames: Annotated[int | None, typer.Option(min=1, help="stop after this many refreshes")] = None,
     max_speed: Annotated[
-        bool, typer.Option("--max-speed", help="a recording on a simulated clock, no waiting: reproducible")
+        bool, typer.Option("--max-speed", help="play a recording on a simulated clock: no waiting, reproducible")
     ] = False,
     out: Annotated[Path | None, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = None,
     scene: Annotated[str | None, typer.Option(help="a built-in scene, a file or folder")] = None,
     layout: Annotated[
-        str | None, typer.Option(help="how pictures hold their views, as content.layout has it: side-by-side, ...")
+        str | None, typer.Option(help="arrangement of the views in pictures, a value of content.layout")
     ] = None,
     model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
-    scale: Annotated[float, number(0.05, 2.0, help="pixels of offscreen panels, times the configured")] = 1.0,
+    scale: Annotated[float, number(0.05, 2.0, help="scale factor of the pixel counts of offscreen panels")] = 1.0,
     backend: Annotated[
-        str | None, typer.Option(help="what surrounds the network: auto (the faster one here), cpu or gl")
+        str | None, typer.Option(help="device for everything except the network: auto (the faster one here), cpu or gl")
     ] = None,
     keep_light: Annotated[
-        int, typer.Option(min=0, help="with --out: every so many refreshes leave what the panels show; 0: none")
+        int, typer.Option(min=0, help="with --out: write what the panels show every N refreshes; 0: never")
     ] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="the summary as one JSON object on stdout")] = False,
 ) -> None:
-    """Run the display: eyes in, layers out, until SIGTERM. SIGHUP reads the configuration again.
+    """Run the display until SIGTERM. SIGHUP reads the configuration again.
 
-    Exits with 75 where the X server dies: start it again, and it waits for the server.
+    Exits with 75 if the X server dies: when started again, it waits for the server.
 
     Example: phasestack run --config /etc/phasestack/phasestack.toml
 

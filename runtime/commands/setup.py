@@ -10,19 +10,18 @@ import typer
 
 def setup(
     config: Annotated[
-        Path, typer.Option(help="configuration to write; one that is there is changed, the old one kept")
+        Path, typer.Option(help="configuration to write or change; a copy of the old one is kept")
     ] = Path("phasestack.toml"),
     out: Annotated[Path, typer.Option(help="folder for pairs, calibration, reports and setup.json")] = Path("setup"),
-    photos: Annotated[Path, typer.Option(help="folder in which the photographs will lie")] = Path("photos"),
-    simulate: Annotated[bool, typer.Option("--simulate", help="a display that is not there, to try it out")] = False,
-    seed: Annotated[int, typer.Option(min=0, help="of the simulated display")] = 0,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout, at the end")] = False,
+    photos: Annotated[Path, typer.Option(help="folder for the photographs")] = Path("photos"),
+    simulate: Annotated[bool, typer.Option("--simulate", help="simulate a display, to try the setup")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="seed of the simulated display")] = 0,
+    as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout at the end")] = False,
 ) -> None:
-    """Set a display up: monitors, sizes, registration by photographs, grey curves, sensor, calibration.
+    """Set up a display: monitors, sizes, registration by photographs, grey curves, sensor, calibration.
 
-    It asks in the terminal; where panels show something, keys on their windows count too. Every step can be skipped
-    and repeated; q stops, and the same command goes on there. At the end: the figures of each step, and a
-    configuration that is valid.
+    Answer in the terminal, or by keys on the panels' windows. Every step can be skipped and repeated; q stops, and the
+    same command continues there. The result is a valid configuration and the figures of each step.
 
     Example: phasestack setup --simulate --config try.toml --out try
     """

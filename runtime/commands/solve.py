@@ -13,39 +13,40 @@ from runtime.support.ranges import FOV_RANGE_DEG
 
 def solve(
     left: Annotated[
-        Path, typer.Option(help="picture of a pinhole camera at the left eye that looks at the stack's origin")
+        Path, typer.Option(help="picture of a pinhole camera at the left eye, looking at the stack's origin")
     ],
     panels: Annotated[Path, typer.Option(help="TOML or JSON: width_m, height_m, x_m")],
     out: Annotated[Path, typer.Option(help="folder for the layers")],
-    right: Annotated[Path | None, typer.Option(help="the same of the right eye; without: --left holds both")] = None,
+    right: Annotated[Path | None, typer.Option(help="picture for the right eye; without it, --left holds both")] = None,
     layout: Annotated[
-        str | None, typer.Option(help="how --left holds both, as content.layout has it; without: by its name")
+        str | None,
+        typer.Option(help="arrangement of the views in --left, as content.layout"),
     ] = None,
     left_eye: Annotated[tuple[float, float, float] | None, place(help="left eye, metres, stack frame")] = None,
     right_eye: Annotated[tuple[float, float, float] | None, place(help="right eye, metres")] = None,
     camera: Annotated[
         Path | None,
         typer.Option(
-            help="for pictures taken otherwise, and instead of eyes and --fov: TOML or JSON with `left` and `right`, "
-            "3x4 matrices from metres of the stack's frame to pixels"
+            help="instead of eyes and --fov, for other cameras: TOML or JSON with `left` and `right`, 3x4 matrices "
+            "from metres of the stack's frame to pixels"
         ),
     ] = None,
     fov: Annotated[
-        float, number(*FOV_RANGE_DEG, "degrees", help="the pictures' horizontal field of view, degrees")
+        float, number(*FOV_RANGE_DEG, "degrees", help="horizontal field of view of the pictures, degrees")
     ] = 40.0,
     model: Annotated[str, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = "balanced",
     repeat: Annotated[int, typer.Option(min=1, max=10000, help="timed runs, after the warm-up")] = 1,
     eye_sigma_mm: Annotated[
-        float, number(0, 1000, "mm", help="the tracking's error, mm an axis; 1: a good tracker's; 0: none")
+        float, number(0, 1000, "mm", help="tracking error, mm per axis; 1: a good tracker; 0: none")
     ] = 1.0,
     backend: Annotated[
         str | None,
-        typer.Option(help="what surrounds the network: cpu, gl, or auto: the faster one here, from --repeat 10 on"),
+        typer.Option(help="device for everything except the network: cpu, gl, or auto (measured from --repeat 10 on)"),
     ] = None,
-    no_plan: Annotated[bool, typer.Option("--no-plan", help="leave nothing out, whatever the pictures allow")] = False,
+    no_plan: Annotated[bool, typer.Option("--no-plan", help="skip no work, even if the pictures allow it")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="solve.json's object on stdout")] = False,
 ) -> None:
-    """Solve the layers for two still pictures and two eyes, and measure what the eyes then see.
+    """Solve the layers for two still pictures and two eyes, and measure the pictures that the eyes see.
 
     Example: phasestack solve --left l.png --right r.png --left-eye 0.6 -0.03 0 --right-eye 0.6 0.03 0 --fov 40
     --panels panels.json --out out/solve

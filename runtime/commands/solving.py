@@ -1,4 +1,4 @@
-"""The body of `phasestack solve`."""
+"""Body of `phasestack solve`."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ from runtime.support.gl import offscreen_context
 from runtime.support.picture_file import read_image
 from runtime.support.ranges import SEPARATION_MIN_M
 
-MEASURED_FROM = 10  # runs that are worth a look at which backend is faster
+MEASURED_FROM = 10  # runs from which measuring the backends pays off
 
 
 @dataclass(frozen=True, slots=True)
 class Eyes:
-    """Where the pictures were taken, and how, as the options say it."""
+    """Cameras of the pictures, as given by the options."""
 
     left: tuple[float, ...] | None
     right: tuple[float, ...] | None
@@ -58,11 +58,11 @@ class Files:
         return self.left.name if self.right is None else f"{self.left.name} and {self.right.name}"
 
     def read(self) -> list[Any]:
-        """The left and the right eye's picture. Raises InputError."""
+        """Return the left and the right eye's picture. Raises InputError."""
         if self.right is None:
             return list(read_pair(self.left, with_options(Settings(), layout=self.layout).content))
         if self.layout is not None:
-            raise InputError("solve", "--layout", "is of one file that holds both views: leave --right out")
+            raise InputError("solve", "--layout", "needs one file with both views: omit --right")
         pictures = [read_image(path) for path in (self.left, self.right)]
         if pictures[0].shape != pictures[1].shape:
             sizes = " and ".join(f"{p.shape[1]}x{p.shape[0]}" for p in pictures)
@@ -82,7 +82,7 @@ def solve_pair(
     backend: str | None,
     plan: bool,
 ) -> dict[str, Any]:
-    """Layers, what the eyes see of them, and solve.json (docs/contracts.md). Raises InputError."""
+    """Solve, write the layers and pictures, and return solve.json. Raises InputError."""
     watch = Stopwatch()
     settings = with_options(Settings(), model=model, backend=backend).model
     cv2.setNumThreads(settings.threads)
@@ -95,15 +95,15 @@ def solve_pair(
     with ExitStack() as contexts, ExitStack() as cleanup:
 
         def context() -> Any:
-            made = offscreen_context()
-            contexts.callback(made.release)
-            return made
+            created = offscreen_context()
+            contexts.callback(created.release)
+            return created
 
         predictor = load_predictor(model, stack, settings)
         cleanup.callback(predictor.close)
-        # One solution is sooner made than two backends are measured.
-        wanted = "cpu" if settings.backend == "auto" and repeat < MEASURED_FROM else settings.backend
-        predictor.set_backend(choose(wanted, predictor, context).backend)
+        # A few solutions take less time than measuring two backends.
+        device = "cpu" if settings.backend == "auto" and repeat < MEASURED_FROM else settings.backend
+        predictor.set_backend(choose(device, predictor, context).backend)
         watch.lap("load model")
         inference_ms: list[float] = []
 
@@ -123,8 +123,8 @@ def solve_pair(
 
         try:
             done = timed(solve, runs=repeat)
-        except EyesNotServed as error:  # here they will not move on
-            why = f"{error}: {predictor.name} can't serve them (try --model sart)"
+        except EyesNotServed as error:  # a still pair's eyes do not move
+            why = f"{error}: {predictor.name} cannot serve these eyes (try --model sart)"
             raise InputError("solve", "--left-eye, --right-eye", why) from None
         watch.lap("solve, warm-up included")
         with OutputFolder(out) as folder:
@@ -132,7 +132,7 @@ def solve_pair(
             try:
                 quality = seen.quality
             except ValueError as error:
-                why = f"{error}: nothing of the display can be seen from there"
+                why = f"{error}: the display is not visible from there"
                 raise InputError("solve", "--left-eye", why) from None
             notes = disparity_doubts(pictures, eyes_m, stack, fov_deg=fov_deg, parallel=eyes.cameras is None)
             for note in notes:
@@ -159,13 +159,13 @@ def solve_pair(
 
 
 def taken(pictures: list[Any], eyes: Eyes, stack: PanelStack) -> tuple[list[Any], F64, float]:
-    """Pictures of eyes (2, 3) looking at the stack's origin, with the field of view. Raises InputError."""
+    """Return pictures and eyes (2, 3) that look at the stack's origin, and the field of view."""
     if eyes.cameras is None:
         if eyes.left is None or eyes.right is None:
             raise InputError("solve", "--left-eye, --right-eye", "are needed, metres; or --camera")
         return pictures, checked_eyes(eyes.left, eyes.right, stack), eyes.fov_deg
     if eyes.left is not None or eyes.right is not None:
-        raise InputError("solve", "--camera", "says where the eyes are: leave --left-eye and --right-eye out")
+        raise InputError("solve", "--camera", "gives the eyes: omit --left-eye and --right-eye")
     table = read_table(eyes.cameras)
     try:
         cameras, places_m = as_cameras([table.get("left"), table.get("right")])
@@ -177,7 +177,7 @@ def taken(pictures: list[Any], eyes: Eyes, stack: PanelStack) -> tuple[list[Any]
 
 
 def checked_eyes(left_eye: tuple[float, ...], right_eye: tuple[float, ...], stack: PanelStack) -> F64:
-    """(2, 3) eyes that can be served. Raises InputError, naming the option."""
+    """Return eyes (2, 3) that can be served. Raises InputError, naming the option."""
     for option, eye in (("--left-eye", left_eye), ("--right-eye", right_eye)):
         if eye[0] <= max(stack.x_m):
             raise InputError("solve", option, f"x = {eye[0]:g} m : not in front of the panels (x > {max(stack.x_m):g})")

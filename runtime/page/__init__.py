@@ -1,1 +1,1 @@
-"""The operator's page: a process of its own that asks the running daemon by its socket."""
+"""The operator's page: a separate process that talks to the running daemon over its socket."""

@@ -1,4 +1,4 @@
-"""uvicorn connections with limits, so that idle ones block nobody."""
+"""uvicorn connections with limits, so that idle ones do not block others."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from runtime.daemon.listener import REQUEST_MAX_BYTES, REQUEST_S
 from runtime.errors import InputError
 
 LOOPBACK = "127.0.0.1"
-CONNECTIONS_MAX = 64  # at once; a newer one takes the place of the one that has waited longest
+CONNECTIONS_MAX = 64  # simultaneous ones
 
 
 class LimitedConnection(H11Protocol):
@@ -25,7 +25,7 @@ class LimitedConnection(H11Protocol):
         self._timer: asyncio.TimerHandle = self.loop.call_later(REQUEST_S, self._let_go)
         if len(self.connections) > CONNECTIONS_MAX:
             waiting = [one for one in self.connections if isinstance(one, LimitedConnection) and one.waits]
-            min(waiting, key=lambda one: one.made_s).transport.abort()  # this one, where all others are answered
+            min(waiting, key=lambda one: one.made_s).transport.abort()  # this one, if all others are being answered
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._timer.cancel()
@@ -33,25 +33,25 @@ class LimitedConnection(H11Protocol):
 
     @property
     def waits(self) -> bool:
-        """Whether it is waiting for a request."""
+        """True while it waits for a request."""
         cycle: Any = self.cycle  # None before the first request
         return cycle is None or bool(cycle.response_complete)
 
     def _let_go(self) -> None:
-        if self.waits and self in self.connections:  # it is another protocol's after an upgrade
+        if self.waits and self in self.connections:  # not after an upgrade to another protocol
             self.transport.abort()
 
 
 def listening(command: str, port: int) -> sockets.socket:
-    """A bound socket on loopback. Raises InputError where the port is taken."""
+    """Return a bound socket on loopback. Raises InputError if the port is in use."""
     try:
         return sockets.create_server((LOOPBACK, port))
     except OSError as error:
-        raise InputError(command, "--port", f"{port}: can't be listened on ({error.strerror})") from None
+        raise InputError(command, "--port", f"{port}: cannot listen ({error.strerror})") from None
 
 
 def server_of(application: Any) -> uvicorn.Server:
-    """A uvicorn server for an application, with the limits of all pages."""
+    """Return a uvicorn server for an application, with the limits of all pages."""
     return uvicorn.Server(
         uvicorn.Config(
             application,

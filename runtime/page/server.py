@@ -1,7 +1,7 @@
-"""The page's web application; everything of the daemon needs the token.
+"""Web application of the page; all access to the daemon needs the token.
 
-The token comes with every request: the page's script keeps it (`session.js`), where the browser gives it to no other
-site nor port. There is no cookie, so that no other site's request carries what it needs.
+The page's script stores the token (`session.js`) and sends it with every request. Browsers do not give it to another
+site or port. Without a cookie, another site's request cannot carry it.
 """
 
 from __future__ import annotations
@@ -50,25 +50,25 @@ Handler = Callable[[Request], Awaitable[Response]]
 
 
 class Answer(JSONResponse):
-    """JSON in plain ASCII: a name need not be UTF-8."""
+    """JSON in ASCII: a file name need not be UTF-8."""
 
     def render(self, content: Any) -> bytes:
         return to_json(content).encode()
 
 
 class TooLong(ValueError):
-    """A request's body."""
+    """A request's body is too long."""
 
 
 def application(daemon: Daemon, token: str, *, link: BrowserLink | None = None) -> Starlette:
-    """The application, on loopback.
+    """Return the application, for loopback.
 
-    link: this page is the display itself; the address with the token opens it.
+    link: the page is the display itself, and opens by an address with the token.
     """
 
     def permitted(request: HTTPConnection) -> bool:
-        kind, _, given = request.headers.get("authorization", "").partition(" ")
-        return kind.lower() == "bearer" and same(given.strip(), token)
+        kind, _, key = request.headers.get("authorization", "").partition(" ")
+        return kind.lower() == "bearer" and same(key.strip(), token)
 
     def guarded(handler: Handler) -> Handler:
         async def answer(request: Request) -> Response:
@@ -85,7 +85,7 @@ def application(daemon: Daemon, token: str, *, link: BrowserLink | None = None) 
         return HTMLResponse(_asset("page.html"))
 
     async def connected(socket: WebSocket) -> None:
-        # A browser's script sets no header of a WebSocket, but the protocols that it offers.
+        # A browser's script cannot set headers of a WebSocket, except the protocols offered.
         offered = [one.strip() for one in socket.headers.get("sec-websocket-protocol", "").split(",")]
         if link is None or not (permitted(socket) or any(same(one, token) for one in offered)):
             await socket.close(1008)
@@ -102,20 +102,20 @@ def application(daemon: Daemon, token: str, *, link: BrowserLink | None = None) 
     async def look_up(request: Request) -> Response:
         name = request.path_params["name"]
         if name not in LOOKED_UP_AGAIN_S:
-            return Answer({"ok": False, "error": "there is no such thing to look up"}, 404)
+            return Answer({"ok": False, "error": "unknown lookup"}, 404)
         answer = await run_in_threadpool(daemon.look_up, name)
         return Answer(answer, 200 if answer.get("ok") else 503)
 
     async def do(request: Request) -> Response:
         try:
-            asked = parsed_json(await _body(request), source="the request")
+            command = parsed_json(await _body(request), source="the request")
         except TooLong:
             return Answer({"ok": False, "error": "the request is too long"}, 413)
         except (InputError, ValueError):
-            asked = None
-        if not isinstance(asked, dict) or asked.get("command") not in NAMES:
+            command = None
+        if not isinstance(command, dict) or command.get("command") not in NAMES:
             return Answer({"ok": False, "error": f"command: one of {', '.join(NAMES)}"}, 400)
-        answer = await run_in_threadpool(daemon.tell, asked["command"], asked.get("value"))
+        answer = await run_in_threadpool(daemon.tell, command["command"], command.get("value"))
         code = 200 if answer.get("ok") else 503 if answer.get("running") is False else 409
         return Answer(answer, code)
 
@@ -131,14 +131,14 @@ def application(daemon: Daemon, token: str, *, link: BrowserLink | None = None) 
 
 
 async def _guard(request: Request, handler: Handler) -> Response:
-    """What every answer may load."""
+    """Add the security headers to every answer."""
     answer = await handler(request)
     answer.headers.update(HEADERS)
     return answer
 
 
 async def _body(request: Request) -> bytes:
-    """Raises TooLong; ValueError where the client goes away, or trickles."""
+    """Return a request's body. Raises TooLong, and ValueError if it does not arrive in time."""
     received = b""
     try:
         async with asyncio.timeout(REQUEST_S):

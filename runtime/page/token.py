@@ -1,4 +1,4 @@
-"""The page's token: a file that only its owner reads, made where there is none."""
+"""The page's token, in a file that only its owner can read."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from pathlib import Path
 from runtime.errors import InputError
 
 TOKEN_BYTES = 32  # random bytes of a new token
-LEAST_CHARACTERS = 16  # of a token that somebody wrote: a shorter one can be guessed
-MOST_BYTES = 4096  # that are read of its file
+LEAST_CHARACTERS = 16  # of a hand-written token: a shorter one could be guessed
+MOST_BYTES = 4096  # read from its file
 
 
 def token_of(path: Path) -> str:
-    """The token in a file, which is made where there is none. Raises InputError, naming the file."""
+    """Return the token in a file, created if missing. Raises InputError, naming the file."""
     token, name = secrets.token_urlsafe(TOKEN_BYTES), ""
     try:
         if not os.path.lexists(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            file, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)  # its owner's alone
+            file, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)  # mode 0600
             with os.fdopen(file, "w", encoding="ascii") as opened:
                 opened.write(token + "\n")
-            os.link(name, path)  # whole, or not at all
+            os.link(name, path)  # atomically
             return token
     except FileExistsError:
-        pass  # another was quicker
+        pass  # another process was faster
     except OSError as error:
-        raise InputError(path, "", f"cannot be made ({error.strerror})") from None
+        raise InputError(path, "", f"cannot be created ({error.strerror})") from None
     finally:
         if name:
             Path(name).unlink(missing_ok=True)
@@ -43,19 +43,19 @@ def _read(path: Path) -> str:
     except OSError as error:
         raise InputError(path, "", f"cannot be read ({error.strerror})") from None
     with os.fdopen(file, "rb") as opened:
-        found = os.fstat(opened.fileno())
-        if not stat.S_ISREG(found.st_mode):
+        status = os.fstat(opened.fileno())
+        if not stat.S_ISREG(status.st_mode):
             raise InputError(path, "", "is not a file")
-        if found.st_uid != os.geteuid():
-            raise InputError(path, "", f"belongs to another user (number {found.st_uid}), who knows what is in it")
-        if found.st_mode & 0o077:
-            raise InputError(path, "", f"others may read it (mode {found.st_mode & 0o777:o}): chmod 600, or delete it")
+        if status.st_uid != os.geteuid():
+            raise InputError(path, "", f"belongs to another user (number {status.st_uid}), who knows the token")
+        if status.st_mode & 0o077:
+            raise InputError(path, "", f"others may read it (mode {status.st_mode & 0o777:o}): chmod 600, or delete it")
         token = (opened.read(MOST_BYTES) or b"").decode("ascii", "replace").strip()
     if len(token) < LEAST_CHARACTERS or not token.isprintable() or " " in token:
         raise InputError(path, "", f"holds no token: at least {LEAST_CHARACTERS} characters on one line; or delete it")
     return token
 
 
-def same(given: str, token: str) -> bool:
-    """Constant-time comparison of two tokens."""
-    return hmac.compare_digest(given.encode(), token.encode())
+def same(key: str, token: str) -> bool:
+    """Compare two tokens in constant time."""
+    return hmac.compare_digest(key.encode(), token.encode())

@@ -105,7 +105,7 @@ def test_with_the_token_it_tells_what_the_daemon_tells(page: Page, loop: Loop) -
     assert eventually(lambda: page.look_up("status").get("secret") == "of the daemon")
     assert eventually(lambda: page.look_up("pictures").get("frame") == 7)
     assert eventually(lambda: page.look_up("about").get("scenes") == ["demo"])
-    assert page.look_up("other") == {"ok": False, "error": "there is no such thing to look up"}
+    assert page.look_up("other") == {"ok": False, "error": "unknown lookup"}
 
 
 def test_who_goes_away_while_asking_makes_no_error(tmp_path: Path) -> None:
@@ -135,7 +135,7 @@ def test_wishes_reach_the_daemon_and_its_refusals_the_page(page: Page, loop: Loo
     code, answer = page.tell("scene", "missing")
     assert (code, answer["error"]) == (409, "nobody knows 'missing'")
     code, answer = page.tell("place", "much")
-    assert (code, answer["error"]) == (409, "value: place wants an object of settings, or null for the configured ones")
+    assert (code, answer["error"]) == (409, "value: place needs an object of settings, or null for the configured ones")
     assert loop.told == [("scene", "grey"), ("place", {"scale": 2.0}), ("scene", "missing")]
 
 
@@ -191,7 +191,7 @@ def test_a_disk_that_has_no_room_for_a_token_leaves_none_behind(tmp_path: Path) 
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (8, before[1]))
     try:
-        with pytest.raises(InputError, match="cannot be made"):
+        with pytest.raises(InputError, match="cannot be created"):
             token_of(tmp_path / "token")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)

@@ -104,7 +104,7 @@ def test_a_motion_replaces_only_a_motion_and_a_sensor_replaces_nothing(tmp_path:
         answer = CliRunner().invoke(app, [*arguments, "--out", str(out)])
         if answer.exit_code == 0:
             return out.read_bytes() != before
-        assert isinstance(answer.exception, InputError) and "take another name" in str(answer.exception)
+        assert isinstance(answer.exception, InputError) and "choose another name" in str(answer.exception)
         assert out.read_bytes() == before
         return False
 

@@ -1,4 +1,4 @@
-// The operator's page: asks what is new, draws it, and posts what is wished. Nothing is loaded from elsewhere.
+// The operator's page: polls the daemon, draws its state, and posts commands. It loads only from this server.
 import { drawPlan } from "/display.js";
 import { ask, keep, token } from "/session.js";
 
@@ -29,7 +29,7 @@ function setText(node, text) {
   if (node.textContent !== text) node.textContent = text;
 }
 
-// What is solved for an instant after this light has no age yet.
+// A solution for an instant after this display time has no age yet.
 const age = (value) => (typeof value === "number" ? Math.max(0, value) : value);
 const number = (value, digits = 1) => (value === null || value === undefined ? "–" : Number(value).toFixed(digits));
 const clock = (seconds) => new Date(seconds * 1000).toLocaleTimeString([], { hour12: false });
@@ -42,7 +42,7 @@ const PLOTS = [
   ["solution's age, ms", (s) => age(s.solution_age_now_ms), 1],
   ["view error (estimated), mm", (s) => s.view_error_estimated_now_mm, 1],
   ["capture to light, ms", (s) => s.photon_now_ms, 1],
-  ["eyes known to, mm", (s) => s.eye_sigma_now_mm, 2],
+  ["eyes' uncertainty, mm", (s) => s.eye_sigma_now_mm, 2],
   ["presenting (median), ms", (s) => s.stage_ms?.present?.p50, 2],
 ].map(([title, value, digits]) => {
   const box = html("div");
@@ -69,7 +69,7 @@ function plot(status) {
     const least = Math.min(0, ...known);
     const begin = KEPT - p.values.length;
     const height = (v) => (54 - (52 * (v - least)) / (most - least)).toFixed(1);
-    // A gap where nothing was known.
+    // Gaps for unknown values.
     const steps = p.values.map((v, i) => v === null ? "" : `${i && p.values[i - 1] !== null ? "L" : "M"}${begin + i},${height(v)}`);
     p.curve.setAttribute("d", steps.join(""));
   }
@@ -92,8 +92,8 @@ function sector(low_deg, high_deg) {
 function drawEyes(status) {
   const told = status.eyes_m
     ? status.eyes_m.map((eye, i) => `${i ? "right" : "left"} (${eye.map((v) => v.toFixed(3)).join(", ")}) m`).join(", ") +
-      ` – ${status.eyes_label}, to ${number(status.eye_sigma_now_mm, 2)} mm`
-    : "no viewer is seen";
+      ` – ${status.eyes_label}, ± ${number(status.eye_sigma_now_mm, 2)} mm`
+    : "no viewer";
   setText($("eyes-told"), told);
   if (!about?.stack) return;
   const side = about.viewing_side_deg;
@@ -101,14 +101,14 @@ function drawEyes(status) {
   view($("side"), status, 2, sector(...about.viewing_up_deg));
 }
 
-// Figures, what is left out, faults.
+// Figures, savings, faults.
 
 function figures(status) {
   const rows = {
     scene: status.scene === status.content ? status.scene : `${status.scene} (${status.content})`,
     model: `${status.model} on ${status.provider}`,
     panels: status.panels,
-    "up for": `${Math.floor(status.uptime_s / 3600)} h ${Math.floor((status.uptime_s % 3600) / 60)} min`,
+    "uptime": `${Math.floor(status.uptime_s / 3600)} h ${Math.floor((status.uptime_s % 3600) / 60)} min`,
     refreshes: `${status.presented} presented, ${status.dropped} dropped, ${status.missed_blanks} blanks missed`,
     solutions: `${status.inferences}`,
     sensor: `${number(status.sensor_hz)} samples/s, ${status.stale_inputs} skipped`,
@@ -196,12 +196,12 @@ function pictures(answer) {
 const short = (name) => name.split("/").filter(Boolean).pop() ?? name;
 
 function playlist(told) {
-  const left = told?.left_s === null || told?.left_s === undefined ? "it stays" : `for ${number(told.left_s, 0)} s more`;
+  const left = told?.left_s === null || told?.left_s === undefined ? "no limit" : `for ${number(told.left_s, 0)} s more`;
   setText($("list-told"), told ? `Playlist: ${told.index + 1} of ${told.entries.length} (${short(told.entries[told.index].scene)}), ${left}` : "");
   $("next").hidden = !told;
 }
 
-// Where the scene stands: sent as it is changed.
+// Placement of the scene, sent on every change.
 
 const PLACE = [
   ["p-scale", "scale", null, 1], ["p-turntable", "turntable_per_min", null, 1],
@@ -215,7 +215,7 @@ function placing(told) {
   placed = told;
   for (const [id, name, part, units] of PLACE) {
     const value = (part === null ? told[name] : told[name][part]) * units;
-    // What is being typed, or not sent yet, stays.
+    // Keep values that are being typed or not sent yet.
     if (document.activeElement !== $(id) && !waiting && !sending) $(id).value = Number(value.toFixed(4));
   }
 }
@@ -244,7 +244,7 @@ for (const [id, name, part, units] of PLACE) {
 $("place-form").addEventListener("submit", (event) => event.preventDefault());
 $("place-reset").addEventListener("click", () => tell($("place-reset"), "place", null, $("placed")));
 
-// Asking.
+// Polling.
 
 let loggedIn = Promise.resolve(); // once the token is right
 
@@ -273,7 +273,7 @@ async function lookUp(name) {
 function gone(why, hangs = false) {
   running = false;
   $("gone").hidden = false;
-  setText($("gone"), `${hangs ? "The daemon does not answer." : "No daemon answers."} ${why}`);
+  setText($("gone"), `${hangs ? "The daemon hangs." : "No daemon is running."} ${why}`);
   setText($("state"), hangs ? "hangs" : "no daemon");
   $("state").dataset.state = "gone";
   setText($("reason"), "");
@@ -284,17 +284,17 @@ function gone(why, hangs = false) {
 }
 
 function show(status) {
-  if (!running) { // what failed for want of a daemon has nothing to do with this one
+  if (!running) { // errors about a missing daemon are over
     for (const told of document.querySelectorAll('[data-kind="bad"]')) setText(told, "");
   }
   running = true;
   const hangs = status.turn_age_s > 5;
   $("gone").hidden = !hangs;
-  if (hangs) setText($("gone"), `the daemon's loop has stood still for ${number(status.turn_age_s, 0)} s`);
+  if (hangs) setText($("gone"), `the display loop has hung for ${number(status.turn_age_s, 0)} s`);
   setText($("state"), hangs ? "hangs" : status.state ?? "starting");
   $("state").dataset.state = hangs ? "gone" : (status.state ?? "starting").split(":")[0];
   setText($("reason"), status.reason ?? "");
-  if (status.state === undefined) return; // it answers, and has shown nothing yet
+  if (status.state === undefined) return; // before the first refresh
   document.querySelector('[data-command="pause"]').setAttribute("aria-pressed", String(status.paused));
   document.querySelector('[data-command="flat"]').setAttribute("aria-pressed", String(status.flat_asked));
   for (const [id, value] of [["scene", status.scene], ["model", status.model_asked]]) {
@@ -316,7 +316,7 @@ async function every(ms, work) {
     try {
       await work();
     } catch {
-      gone("Nor does the page's own server: it has stopped, or the network is gone.");
+      gone("The page's server does not answer either: it has stopped, or the network is down.");
       pause = RETRY_MS;
     }
     await new Promise((done) => setTimeout(done, pause));
@@ -354,12 +354,12 @@ every(ABOUT_MS, async () => {
   }
 });
 
-// Telling.
+// Commands.
 
 async function tell(button, command, value = null, where = $("told")) {
   if (button) button.disabled = true;
   where.dataset.kind = "";
-  setText(where, `${command}: asked`);
+  setText(where, `${command}: sent`);
   let done = false;
   try {
     const answer = await ask("/do", {
@@ -373,7 +373,7 @@ async function tell(button, command, value = null, where = $("told")) {
     setText(where, said.ok ? `${command}: done${said.file ? `: ${said.file}` : said.note ? `: ${said.note}` : ""}` : `${command}: ${said.error}`);
   } catch {
     where.dataset.kind = "bad";
-    setText(where, `${command}: the page's own server does not answer`);
+    setText(where, `${command}: the page's server does not answer`);
   } finally {
     if (button) {
       button.disabled = false;

@@ -1,7 +1,7 @@
-// The token that this browser keeps for this address, its port included: no other server is given it.
-const given = new URL(location.href).searchParams.get("token");
-if (given) {
-  localStorage.setItem("token", given);
+// The browser keeps the token for this address and port, and gives it to no other server.
+const key = new URL(location.href).searchParams.get("token");
+if (key) {
+  localStorage.setItem("token", key);
   history.replaceState(null, "", location.pathname);
 }
 export const token = () => localStorage.getItem("token") ?? "";
