@@ -47,6 +47,7 @@ class QualitySampler:
     ) -> None:
         self._stack, self._drawer, self._truth = stack, drawer, truth
         self._every, self._simulated = every, simulated
+        self.only_live = False  # measure live quality without the other figures
         self.measured: dict[str, list[float]] = {}  # FIGURES of the sampled refreshes
         self.live: dict[int, float] = {}  # mean squared error at the true eyes, by number of the refresh
         self.moment: Moment | None = None  # the newest refresh measured, for stills, sheet and viewer
@@ -114,6 +115,8 @@ class QualitySampler:
         wanted: dict[str, tuple[F64, int]] = {}
         if true_m is not None:
             wanted["true"] = true_m, account.photon_ns
+        if self.only_live:
+            return wanted
         is_tracked = account.state is State.TRACKING and has_picture(refresh) and account.eyes_m is not None
         if is_tracked and solution is not None and solution.solved_for_m is not None and account.eyes_m is not None:
             wanted["solved"] = solution.solved_for_m, solution.solved_for_ns

@@ -61,6 +61,7 @@ def simulated_run(settings: Settings, *, scale: float) -> tuple[list[Mapping[str
     output = Lines()
     with ExitStack() as cleanup:
         run = build_run(settings, RunOptions(max_speed=True, measure=True, scale=scale), cleanup, output=output)
+        run.observer.measure_only_live()
         run.presenter.run()
         run.observer.finish()
     return output.lines, run.observer.live_errors
