@@ -1,0 +1,50 @@
+"""Figures of the status in Prometheus's text format, under their names in JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+PREFIX = "phasestack_"
+COUNTERS = ("presented", "dropped", "stale_inputs", "inferences", "missed_blanks")
+TABLES = {"efforts": "effort", "faults": "part", "rejected_samples": "reason"}  # field: label
+TEXTS = ("state", "effort", "model", "scene")
+
+
+def exposition(status: Mapping[str, Any]) -> str:
+    """All numbers of a status; quantiles, tables and texts have labels. Figures without a value are left away."""
+    return "".join(f"{line}\n" for line in _lines(status))
+
+
+def _lines(status: Mapping[str, Any]) -> Iterator[str]:
+    for field, value in status.items():
+        name = PREFIX + field
+        if field in TEXTS and isinstance(value, str):
+            yield f"# TYPE {name} gauge"
+            yield f"{name}{_label(field, value)} 1"
+        elif _is_number(value):
+            yield f"# TYPE {name} {'counter' if field in COUNTERS else 'gauge'}"
+            yield f"{name} {value!r}"
+        elif isinstance(value, dict) and any(_is_number(item) for item in value.values()):
+            yield f"# TYPE {name} gauge"
+            for key, item in value.items():
+                if _is_number(item):
+                    yield f"{name}{_key(field, key)} {item!r}"
+
+
+def _key(field: str, key: str) -> str:
+    """Label of an entry: `p95` is the quantile 0.95, `max` the quantile 1."""
+    if field in TABLES:
+        return _label(TABLES[field], key)
+    if key[:1] == "p" and key[1:].isdigit():
+        return _label("quantile", f"{int(key[1:]) / 100:g}")
+    return _label("quantile", "1") if key == "max" else _label("name", key)
+
+
+def _label(name: str, value: str) -> str:
+    text = value.replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n")
+    return f'{{{name}="{text}"}}'
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
