@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
 from runtime.content.base import View
-from runtime.content.ply import Header, read_vertices
+from runtime.content.ply import Header, read_elements
 from runtime.errors import InputError
 from runtime.records import F32, F64
 
@@ -63,7 +63,7 @@ def load_gaussians(header: Header) -> Gaussians:
 
     Raises InputError: a property missing, none that can be drawn.
     """
-    path, table = header.path, read_vertices(header)
+    path, table = header.path, read_elements(header)["vertex"]
     if not len(table):
         raise InputError(path, "vertex", "there are none")
     names = set(table.dtype.names or ())

@@ -81,15 +81,15 @@ def coded(light: ArrayLike) -> F32:
 def merged(parts: Sequence[Part]) -> list[Part]:
     """The same triangles in fewer parts: one for each look, as long as its outlines can be drawn.
 
-    What has no picture differs by its colour alone, which its vertices take.
+    A part's colour does not tell it apart: its vertices take it.
     """
     alike: dict[tuple[object, ...], list[list[Part]]] = {}
     for part in parts:
-        if part.picture is None and part.glow == BLACK:
+        if part.picture is None or part.vertex_colours is not None or (part.colour, part.opacity) != (WHITE, 1.0):
             part = replace(part, vertex_colours=_coloured(part), colour=WHITE, opacity=1.0)
         look = (
             *(id(picture) for picture in (part.picture, part.glow_picture)),
-            *(part.colour, part.glow, part.opacity, part.cutoff, part.alpha, part.two_sided, part.sampler),
+            *(part.glow, part.cutoff, part.alpha, part.two_sided, part.sampler),
             *(part.lit, part.is_linear, part.vertex_colours is None),
         )
         groups = alike.setdefault(look, [[]])
@@ -111,7 +111,6 @@ def _coloured(part: Part) -> F32:
 def _one(group: list[Part]) -> Part:
     if len(group) == 1:
         return group[0]
-    colours = None
-    if group[0].vertex_colours is not None:
-        colours = np.concatenate([_coloured(replace(part, colour=WHITE, opacity=1.0)) for part in group])
+    held = [part.vertex_colours for part in group if part.vertex_colours is not None]
+    colours = np.concatenate(held) if held else None
     return replace(group[0], shape=join([part.shape for part in group]), vertex_colours=colours)

@@ -1,4 +1,4 @@
-"""The vertices of a PLY file as a table, for splats; what its header promises, for meshes too.
+"""The elements of a PLY file as tables, for splats; what its header promises, for meshes too.
 
 Ours, because plyfile's licence is the GPL, and trimesh gives out no properties but its own.
 """
@@ -25,7 +25,8 @@ TYPES = {
     "double": "f8", "float64": "f8",
 }  # fmt: skip
 ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
-SPLAT_MARKS = {"f_dc_0", "scale_0", "rot_0"}
+PACKED = "packed_position"  # a property of splats in SuperSplat's compressed form
+SPLAT_MARKS = {"f_dc_0", "scale_0", "rot_0", PACKED}
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,14 +36,19 @@ class Header:
     path: Path
     order: str  # a key of ORDERS
     counts: dict[str, int]  # of elements, in the file's order
-    fields: tuple[tuple[str, str], ...]  # name and type of a vertex's properties; `list` is one, too
+    properties: dict[str, list[tuple[str, str]]]  # of each element: name and type; `list` is one, too
     starts_at: int  # bytes before the first element
     size: int  # bytes of the file
 
     @property
     def kind(self) -> str:
         """`splats` or `triangles`: the limit that holds for it."""
-        return "splats" if SPLAT_MARKS & {name for name, _ in self.fields} else "triangles"
+        return "splats" if SPLAT_MARKS & {name for name, _ in self.properties["vertex"]} else "triangles"
+
+    @property
+    def is_packed(self) -> bool:
+        """Whether its splats are in SuperSplat's compressed form."""
+        return PACKED in {name for name, _ in self.properties["vertex"]}
 
 
 def read_header(path: Path) -> Header:
@@ -54,7 +60,7 @@ def read_header(path: Path) -> Header:
     newline = head.find(b"\n", len(text))
     if not head.startswith(b"ply") or not mark or newline < 0:
         raise InputError(path, "header", "no whole PLY header")
-    order, counts, fields = "", dict[str, int](), list[tuple[str, str]]()
+    order, counts, properties = "", dict[str, int](), dict[str, list[tuple[str, str]]]()
     for line in text.decode("latin-1").splitlines()[1:]:
         match line.split():
             case ["format", name, _] if name in ORDERS:
@@ -62,15 +68,17 @@ def read_header(path: Path) -> Header:
             case ["element", name, number]:
                 field = f"element {untrusted_input.shown(name)}"
                 counts[name] = untrusted_input.whole_from_text(number, source=path, field=field)
-            case ["property", "list", _, _, name]:
-                fields += [(name, "list")] if [*counts][-1:] == ["vertex"] else []
-            case ["property", kind, name] if kind in TYPES:
-                fields += [(name, TYPES[kind])] if [*counts][-1:] == ["vertex"] else []
+                fields = properties.setdefault(name, [])
+            case ["property", "list", _, _, name] if properties:
+                fields.append((name, "list"))
+            case ["property", kind, name] if kind in TYPES and properties:
+                fields.append((name, TYPES[kind]))
             case ["format" | "element" | "property", *_]:
                 raise InputError(path, "header", f"not understood: {untrusted_input.shown(line.strip())}")
-    if not order or not fields or len({name for name, _ in fields}) < len(fields):
+    twice = any(len({name for name, _ in fields}) < len(fields) for fields in properties.values())
+    if not order or not properties.get("vertex") or twice:
         raise InputError(path, "vertex", "the header has no format, no vertices, or one of their properties twice")
-    header = Header(path, order, counts, tuple(fields), newline + 1, size)
+    header = Header(path, order, counts, properties, newline + 1, size)
     for name, count in counts.items():
         field, kind = f"element {untrusted_input.shown(name)}", header.kind
         most = getattr(LIMITS, kind) * (3 if kind == "triangles" and name == "vertex" else 1)
@@ -80,17 +88,26 @@ def read_header(path: Path) -> Header:
     return header
 
 
-def read_vertices(header: Header) -> Table:
-    """The vertices as a structured array. Raises InputError: truncated, text, or list properties."""
-    path, count = header.path, header.counts["vertex"]
-    if next(iter(header.counts)) != "vertex" or "list" in {kind for _, kind in header.fields}:
-        raise InputError(path, "vertex", "must stand first, with one number a property")
+def read_elements(header: Header) -> dict[str, Table]:
+    """The elements up to the first with a list, each as a structured array, the vertices among them.
+
+    Raises InputError: truncated, text, or a list before the vertices are over.
+    """
+    path, place, found = header.path, header.starts_at, dict[str, Table]()
     if header.order == "ascii":
         raise InputError(path, "format", "is ascii; splats are read from binary files")
-    dtype = np.dtype([(name, ORDERS[header.order] + kind) for name, kind in header.fields])
-    held = (header.size - header.starts_at) // dtype.itemsize
-    if held < count:
-        raise InputError(path, "vertex", f"the file is cut off: {count} are promised and {max(held, 0)} there")
     with untrusted_input.open_regular(path) as file:
-        file.seek(header.starts_at)
-        return np.frombuffer(file.read(count * dtype.itemsize), dtype)
+        for name, count in header.counts.items():
+            if "list" in {kind for _, kind in header.properties[name]}:
+                break
+            dtype = np.dtype([(field, ORDERS[header.order] + kind) for field, kind in header.properties[name]])
+            held = (header.size - place) // max(dtype.itemsize, 1)
+            if held < count:
+                problem = f"the file is cut off: {count} are promised and {max(held, 0)} there"
+                raise InputError(path, untrusted_input.shown(name), problem)
+            file.seek(place)
+            found[name] = np.frombuffer(file.read(count * dtype.itemsize), dtype)
+            place += count * dtype.itemsize
+    if "vertex" not in found:
+        raise InputError(path, "vertex", "must stand before lists, with one number a property")
+    return found

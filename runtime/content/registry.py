@@ -28,6 +28,7 @@ from runtime.support.plugins import is_plugin, plugin_class, strict
 from runtime.support.untrusted_input import LIMITS
 
 MESHES = (".glb", ".gltf", ".obj", ".off", ".stl")
+SPLATS = (".ply", ".splat")  # a .ply may be a mesh
 PLAYLISTS = (".toml", ".json")
 HARMLESS = {".png": PNG, ".jpg": JPEG, ".jpeg": JPEG}  # small stills of these first bytes are read here
 HARMLESS_PX = 4096 * 4096
@@ -40,7 +41,7 @@ OTHER_FILES = {  # by their names: format and the way out
         (".3mf", ".step", ".stp", ".iges", ".igs"), ("a model of CAD or 3D print", "export it as STL or glTF")
     ),
     **dict.fromkeys((".xyz", ".pts", ".pcd", ".las", ".laz", ".e57"), ("a point cloud", TO_PLY)),
-    **dict.fromkeys((".sog", ".ksplat", ".lcc"), ("compressed splats", TO_SPLATS)),
+    **dict.fromkeys((".spz", ".sog", ".ksplat", ".lcc"), ("compressed splats", TO_SPLATS)),
 }
 LFS = b"version https://git-lfs"
 TRIED_PX = (32, 18)  # a picture that a class is asked for before it is shown
@@ -107,7 +108,7 @@ def _from_path(file: SceneFile) -> Opener:
     if suffix in OTHER_FILES and path.is_file():
         kind, way_out = OTHER_FILES[suffix]
         raise InputError(path, "", f"is {kind} ({suffix}), which is not read: {way_out.format(suffix)}")
-    if suffix in (*MESHES, ".ply") and path.is_file():
+    if suffix in (*MESHES, *SPLATS) and path.is_file():
         with untrusted_input.open_regular(path) as opened:
             if opened.read(len(LFS)) == LFS:
                 raise InputError(path, "", "is a pointer of Git LFS: fetch the file itself (git lfs pull)")
@@ -144,10 +145,11 @@ def _read(file: SceneFile) -> Opener:
         from runtime.content import mesh
 
         return mesh.prepare(file)
-    elif suffix == ".ply":
+    elif suffix in SPLATS:
         from runtime.content import mesh, splat
 
-        return splat.prepare(file) if read_header(path).kind == "splats" else mesh.prepare(file)
+        is_splats = suffix == ".splat" or read_header(path).kind == "splats"
+        return splat.prepare(file) if is_splats else mesh.prepare(file)
     from runtime.content import pictures, rgbd
     from runtime.content.layout import layout_of
 

@@ -12,6 +12,7 @@ import numpy as np
 from runtime.content.base import ContentInfo, View
 from runtime.content.canvas import CanvasSource
 from runtime.content.gaussians import Gaussians, bounds, colours_towards, load_gaussians, moved, seen_splats
+from runtime.content.packed_splats import load_compressed, load_splat
 from runtime.content.placing import SceneFile
 from runtime.content.ply import read_header
 from runtime.optics.rect import PixelRect
@@ -49,7 +50,11 @@ void main() {
 
 def prepare(file: SceneFile) -> Callable[..., SplatSource]:
     """Read the file; the result uploads it to GL. Raises InputError."""
-    gaussians = load_gaussians(read_header(file.path))
+    if file.path.suffix.lower() == ".splat":
+        gaussians = load_splat(file.path)
+    else:
+        header = read_header(file.path)
+        gaussians = load_compressed(header) if header.is_packed else load_gaussians(header)
     matrix = file.placed(*bounds(gaussians), custom=CUSTOM)
     info = ContentInfo(file.path.stem, background=file.background)
     return partial(SplatSource, gaussians, stack_from_scene=matrix, info=info)

@@ -17,7 +17,7 @@ from runtime.content.canvas import CanvasSource
 from runtime.content.fringe import edges_of, ramps, silhouette
 from runtime.content.parts import OPAQUE_FROM, OUTLINED_MAX, Part, Sampler
 from runtime.content.shapes import I32
-from runtime.optics.rect import PixelRect, union
+from runtime.optics.rect import PixelRect
 from runtime.records import F32, F64, U8
 from runtime.support.background import raise_if_abandoned
 from runtime.support.gl import DrawnPicture
@@ -189,6 +189,29 @@ class DrawnPart:
             held.release()
 
 
+class _Look:
+    """The matrices of a place in a view: worked out once for all parts that stand there."""
+
+    def __init__(self, clip_from_part: F64, stack_from_part: F64, view: View) -> None:
+        linear = stack_from_part[:3, :3]
+        self.has_inside = bool(np.linalg.det(linear))  # not squashed flat
+        if self.has_inside:
+            self.eye = np.linalg.solve(stack_from_part, np.append(view.eye_m, 1.0))[:3]
+        if view.display_from_view is not None:
+            linear = view.display_from_view @ linear
+        self.clip_from_part, self._clip = clip_from_part, _gl(clip_from_part)
+        self._normals = _gl(np.linalg.pinv(linear).T * np.cbrt(abs(np.linalg.det(linear))))
+
+    def set(self, program: Any, part: DrawnPart) -> None:
+        """Give a program what it needs for a part."""
+        for name, matrix in (("stack_from_part", self._normals), ("clip_from_part", self._clip)):
+            if name in program:
+                program[name].write(matrix)
+        _set_uniforms(program, colour=part.colour, glow=part.glow, glow_picture=len(part.textures) - 1)
+        for unit, texture in enumerate(part.textures):
+            texture.use(unit)
+
+
 class TriangleSource(CanvasSource):
     """Parts at their places, over a background."""
 
@@ -208,6 +231,7 @@ class TriangleSource(CanvasSource):
         super().__init__(context, info=info, samples=samples)
         self.parts, self.stack_from_parts = list(parts), list(stack_from_parts)
         self._with_ramps = samples == 0
+        self._still: tuple[F64, F64] | None = None
         self._programs: dict[tuple[str, ...], Any] = {}
         self._textures: dict[tuple[int, Sampler], Any] = {}
         for part in self.parts:
@@ -221,37 +245,48 @@ class TriangleSource(CanvasSource):
         return self.stack_from_parts
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect:
-        boxes = []
-        for part, matrix in zip(self.parts, self.places(time_ns), strict=True):
-            points = part.positions.astype(np.float64) if part.is_projected else part.corners_m
-            boxes.append(camera.covered_box(view, points @ matrix[:3, :3].T + matrix[:3, 3], align_px=1))
-        return union(boxes)
+        return camera.covered_box(view, self._around(self.places(time_ns))[0], align_px=1)
+
+    def _around(self, places: Sequence[F64]) -> tuple[F64, F64]:
+        """(n, 3) points around all parts, and (p, 8, 3) corners of each one's box, in the frame `stack`."""
+        if places is self.stack_from_parts and self._still is not None:
+            return self._still
+        points, corners = [], []
+        for part, matrix in zip(self.parts, places, strict=True):
+            corners.append(part.corners_m @ matrix[:3, :3].T + matrix[:3, 3])
+            is_few = part.is_projected
+            points.append(part.positions @ matrix[:3, :3].T + matrix[:3, 3] if is_few else corners[-1])
+        found = np.concatenate(points), np.stack(corners)
+        if places is self.stack_from_parts:
+            self._still = found
+        return found
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
         """Draw the view; the same view and time give the same bytes."""
-        placed = list(zip(self.parts, self.places(time_ns), strict=True))
-        corners = np.stack([part.corners_m @ matrix[:3, :3].T + matrix[:3, 3] for part, matrix in placed])
-        area = union([camera.covered_box(view, part) for part in corners])
+        places = self.places(time_ns)
+        corners = self._around(places)[1]
+        placed = list(zip(self.parts, places, strict=True))
+        area = camera.covered_box(view, corners.reshape(-1, 3))
         # Nearest first: what they hide need not be shaded.
         placed = [placed[index] for index in np.argsort(-corners[..., 0].mean(1), kind="stable")]
 
         def paint() -> None:
             clip = camera.clip_from_stack(view, corners.reshape(-1, 3))
+            looks = {key: _Look(clip @ matrix, matrix, view) for key, matrix in {id(m): m for m in places}.items()}
             self.context.enable_only(self.context.DEPTH_TEST)
             for part, stack_from_part in placed:
-                _set_look(part.surface_program, part, stack_from_part, view)
-                part.surface_program["clip_from_part"].write(_gl(clip @ stack_from_part))
+                looks[id(stack_from_part)].set(part.surface_program, part)
                 least = OPAQUE_FROM if part.is_blended else part.cutoff
                 _set_uniforms(part.surface_program, kept=(least, ANY_ALPHA))
                 part.draw_surface()
             if self._with_ramps:
-                self._draw_outlines(placed, clip, view)
+                self._draw_outlines(placed, looks, view)
             if any(part.is_blended for part in self.parts):
-                self._draw_translucent(placed, clip, view)
+                self._draw_translucent(placed, looks)
 
         return self.drawn(view, area, paint)
 
-    def _draw_translucent(self, placed: list[tuple[DrawnPart, F64]], clip: F64, view: View) -> None:
+    def _draw_translucent(self, placed: list[tuple[DrawnPart, F64]], looks: dict[int, _Look]) -> None:
         """Over what is opaque: the farthest part first, and of each what is turned away first."""
         context, framebuffer = self.context, self.context.fbo
         context.enable_only(context.DEPTH_TEST | context.BLEND | context.CULL_FACE)
@@ -260,8 +295,7 @@ class TriangleSource(CanvasSource):
         framebuffer.depth_mask = False
         for part, stack_from_part in reversed(placed):
             if part.is_blended:
-                _set_look(part.surface_program, part, stack_from_part, view)
-                part.surface_program["clip_from_part"].write(_gl(clip @ stack_from_part))
+                looks[id(stack_from_part)].set(part.surface_program, part)
                 _set_uniforms(part.surface_program, kept=(1 / 255, OPAQUE_FROM))
                 for hidden in ("front", "back") if part.two_sided else ("back",):
                     context.cull_face = hidden
@@ -289,35 +323,23 @@ class TriangleSource(CanvasSource):
             self._textures[key] = texture
         return self._textures[key]
 
-    def _draw_outlines(self, placed: list[tuple[DrawnPart, F64]], clip_from_stack: F64, view: View) -> None:
+    def _draw_outlines(self, placed: list[tuple[DrawnPart, F64]], looks: dict[int, _Look], view: View) -> None:
         context, framebuffer = self.context, self.context.fbo
         context.enable_only(context.DEPTH_TEST | context.BLEND)
         context.blend_func = OVER
         framebuffer.depth_mask = False
         for part, stack_from_part in reversed(placed):
-            if part.edges is None or not np.linalg.det(stack_from_part[:3, :3]):
-                continue  # nor where it was squashed: then it has no inside
-            eye = np.linalg.solve(stack_from_part, np.append(view.eye_m, 1.0))[:3]
-            ends, apex = silhouette(part.edges, eye)
-            clip_from_part = clip_from_stack @ stack_from_part
-            clip = part.positions @ clip_from_part[:, :3].T + clip_from_part[:, 3]
+            look = looks[id(stack_from_part)]
+            if part.edges is None or not look.has_inside:
+                continue
+            ends, apex = silhouette(part.edges, look.eye)
+            clip = part.positions @ look.clip_from_part[:, :3].T + look.clip_from_part[:, 3]
             corners, vertices = ramps(clip, ends, apex, width_px=view.width_px, height_px=view.height_px)
             if len(corners):
-                _set_look(part.outline_program, part, stack_from_part, view)
+                look.set(part.outline_program, part)
                 _set_uniforms(part.outline_program, kept=(part.cutoff, ANY_ALPHA))
                 part.draw_outline(corners, vertices)
         framebuffer.depth_mask = True
-
-
-def _set_look(program: Any, part: DrawnPart, stack_from_part: F64, view: View) -> None:
-    linear = stack_from_part[:3, :3]
-    if view.display_from_view is not None:
-        linear = view.display_from_view @ linear
-    if "stack_from_part" in program:
-        program["stack_from_part"].write(_gl(np.linalg.pinv(linear).T * np.cbrt(abs(np.linalg.det(linear)))))
-    _set_uniforms(program, colour=part.colour, glow=part.glow, glow_picture=len(part.textures) - 1)
-    for unit, texture in enumerate(part.textures):
-        texture.use(unit)
 
 
 def _set_uniforms(program: Any, **values: Any) -> None:

@@ -15,7 +15,7 @@ from runtime.clock import NS_PER_MS
 from runtime.config import ContentSettings, Settings
 from runtime.content.frames import PICTURES
 from runtime.content.presets import preset_names
-from runtime.content.registry import MESHES, PLAYLISTS
+from runtime.content.registry import MESHES, PLAYLISTS, SPLATS
 from runtime.content.scenes import SCENES
 from runtime.daemon.build import Run
 from runtime.daemon.commands import PLACING
@@ -29,7 +29,7 @@ from runtime.support.film import VIDEOS
 from runtime.support.version import version
 
 LIBRARY_MOST, LIBRARY_LOOKED_AT = 200, 2000
-IN_LIBRARY = {*PICTURES, *VIDEOS, *MESHES, *PLAYLISTS, ".ply"}
+IN_LIBRARY = {*PICTURES, *VIDEOS, *MESHES, *PLAYLISTS, *SPLATS}
 
 
 def placing_in(settings: Settings) -> dict[str, Any]:

@@ -388,17 +388,22 @@ def test_a_front_alone_is_seen_through_unless_it_has_two_sides(tmp_path: Path, c
 # Parts, and what is left out
 
 
-def test_parts_that_look_alike_are_drawn_as_one(tmp_path: Path, context: Any, stack: PanelStack) -> None:
-    """Two hundred colours without a picture are one part; what they show is the same."""
+@pytest.mark.parametrize("pictured", [False, True])
+def test_parts_that_look_alike_are_drawn_as_one(
+    tmp_path: Path, context: Any, stack: PanelStack, pictured: bool
+) -> None:
+    """A hundred colours are one part, and still a hundred colours."""
     random = np.random.default_rng(0)
     b = Buffer()
     primitives = [square(b) | {"material": number} for number in range(100)]
     colours = random.uniform(size=(100, 3)).tolist()
-    materials = [{"pbrMetallicRoughness": {"baseColorFactor": [*colour, 1]}} for colour in colours]
+    use = {"baseColorTexture": {"index": 0}} if pictured else {}
+    materials = [{"pbrMetallicRoughness": {"baseColorFactor": [*colour, 1], **use}} for colour in colours]
+    white = {"images": [{"uri": uri_of(np.full((1, 1, 4), 255, np.uint8))}], "textures": [{"source": 0}]}
     nodes = [{"mesh": k, "translation": [3 * (k % 10), 3 * (k // 10), 0]} for k in range(100)]
     meshes = [{"primitives": [primitive]} for primitive in primitives]
     scenes = [{"nodes": [*range(100)]}]
-    path = b.write(tmp_path / "a.gltf", {}, meshes=meshes, nodes=nodes, scenes=scenes, materials=materials)
+    path = b.write(tmp_path / "a.gltf", {}, meshes=meshes, nodes=nodes, scenes=scenes, materials=materials, **white)
     source = open_content(ContentSettings(scene=str(path)), stack, context)
     assert len(load_mesh(path).parts) == 100 and len(source.parts) == 1
     one = source.render(panel_view(EYE, stack.panel(1)), time_ns=0)

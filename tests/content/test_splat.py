@@ -13,12 +13,15 @@ from plyfile import PlyData, PlyElement
 from runtime.config import ContentSettings
 from runtime.content.base import ContentInfo
 from runtime.content.gaussians import Gaussians, harmonic_basis, load_gaussians
+from runtime.content.packed_splats import load_compressed, load_splat
 from runtime.content.placing import SceneFile
 from runtime.content.ply import read_header
+from runtime.content.registry import prepare_content
 from runtime.content.splat import SplatSource, prepare
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from tests.content.conftest import image_view, panel_view
+from tests.content.packed_splat_files import write_compressed, write_splat
 from tests.content.splat_reference import harmonics, render
 
 COUNT = 400
@@ -207,6 +210,42 @@ def test_every_ply_format_gives_the_same_splats(tmp_path: Path, order: str, kind
         assert getattr(found, name) == pytest.approx(getattr(wanted, name), rel=1e-4, abs=1e-6)
 
 
+@pytest.mark.parametrize("form", ["compressed", "compressed with harmonics", "splat"])
+def test_packed_splats_are_those_that_were_packed(tmp_path: Path, form: str) -> None:
+    """To what so few bits hold: places to 1/1000 of a chunk, turns to a hundredth, colours to their code."""
+    table = splat_table(600, degree=2 if "harmonics" in form else 0)
+    if form == "splat":
+        found = load_splat(write_splat(tmp_path / "a.splat", table))
+    else:
+        path = write_compressed(tmp_path / "a.ply", table, harmonics="harmonics" in form)
+        found = load_compressed(read_header(path))
+    wanted = loaded(written(tmp_path, table))
+    assert found.centres == pytest.approx(wanted.centres, abs=4 / 1000)
+    size = wanted.covariances[:, [0, 3, 5]].sum(1, keepdims=True)
+    assert (np.abs(found.covariances - wanted.covariances) / size).max() < 0.04
+    assert found.opacities == pytest.approx(wanted.opacities, abs=0.6 / 255)
+    assert found.harmonics.shape == wanted.harmonics.shape
+    assert found.harmonics == pytest.approx(wanted.harmonics, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "told"),
+    [
+        ("a.splat", lambda data: data[:-1], "is cut off, or no .splat: it has 19199 bytes, no multiple of 32"),
+        ("a.splat", lambda data: b"", "is cut off, or no .splat: it has 0 bytes"),
+        ("a.ply", lambda data: data[:-1], "vertex: the file is cut off: 600 are promised and 599 there"),
+        ("a.ply", lambda data: data.replace(b"element chunk", b"element chumk"), "chunk: is missing"),
+    ],
+)
+def test_a_broken_packed_file_is_one_line(tmp_path: Path, stack: PanelStack, name: str, change: Any, told: str) -> None:
+    write = write_splat if name == "a.splat" else write_compressed
+    path = write(tmp_path / name, splat_table(600, degree=0))
+    path.write_bytes(change(path.read_bytes()))
+    with pytest.raises(InputError) as refused:
+        prepare_content(ContentSettings(scene=str(path)), stack)
+    assert str(refused.value).startswith(f"{path}: {told}")
+
+
 def edited(folder: Path, old: bytes, new: bytes, cut: int = 0) -> Path:
     """A good file with one thing in it changed."""
     path = written(folder, splat_table(20))
@@ -227,7 +266,7 @@ def edited(folder: Path, old: bytes, new: bytes, cut: int = 0) -> Path:
             b"property float x",
             b"property list uchar float x",
             0,
-            "vertex: must stand first, with one number a property",
+            "vertex: must stand before lists, with one number a property",
         ),
         (
             b"property float nx",

@@ -26,6 +26,7 @@ from runtime.config import ContentSettings, Settings, load_settings, load_stack
 from runtime.content.frames import open_frames
 from runtime.content.gaussians import bounds, load_gaussians, of_points
 from runtime.content.mesh import load_mesh
+from runtime.content.packed_splats import load_compressed, load_splat
 from runtime.content.parts import merged
 from runtime.content.placing import SceneFile
 from runtime.content.playlist import read_playlist
@@ -45,8 +46,10 @@ from runtime.sensor.recording_format import RecordingHeader
 from runtime.sensor.replay import ReplayDriver
 from runtime.support.untrusted_input import parsed_json
 from tests.content.gltf_files import Buffer
+from tests.content.packed_splat_files import write_compressed, write_splat
 from tests.content.picture_files import heic_pair, mpo, swapped_profile
 from tests.content.test_gltf import square
+from tests.content.test_splat import splat_table
 from tests.content.test_untrusted_files import PNG_URI, gltf, textured
 from tests.panels.edids import block
 from tests.sensor.taken import taken_until
@@ -279,6 +282,17 @@ def splats() -> list[bytes]:
     return [(head + "".join(f"property float {name}\n" for name in SPLAT) + "end_header\n").encode() + values.tobytes()]
 
 
+def compressed_splats() -> list[bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.ply"
+        return [write_compressed(path, splat_table(20, degree=1), harmonics=has).read_bytes() for has in (False, True)]
+
+
+def small_splats() -> list[bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        return [write_splat(Path(folder) / "a.splat", splat_table(20, degree=0)).read_bytes()]
+
+
 PLACE, LOOK = ["x", "y", "z", "opacity"], ["f_dc_0", "f_dc_1", "f_dc_2"]
 SPLAT = [*PLACE, *LOOK, *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4))]
 PLAYLIST = """
@@ -335,6 +349,8 @@ TARGETS: dict[str, Target] = {
     "points": Target(points, file("a.ply", mesh)),
     "stl": Target(lambda: [box("stl"), box("stl_ascii")], file("a.stl", mesh)),
     "splat": Target(splats, file("a.ply", lambda path: bounds(load_gaussians(read_header(path))))),
+    "compressed": Target(compressed_splats, file("a.ply", lambda path: bounds(load_compressed(read_header(path))))),
+    "dotsplat": Target(small_splats, file("a.splat", lambda path: bounds(load_splat(path)))),
     "playlist": Target(
         lambda: [PLAYLIST.encode(), b'{"show": [{"scene": "flat", "seconds": 3}]}'],
         file("a.toml", lambda path: read_playlist(path, ContentSettings()), json_marks=b"{"),

@@ -1,0 +1,108 @@
+"""Splats as others pack them: SuperSplat's compressed .ply, and .splat, 32 bytes each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logit
+
+from runtime.content.gaussians import COEFFICIENTS, FLAT_HARMONIC, Gaussians, drawable
+from runtime.content.ply import Header, read_elements
+from runtime.errors import InputError
+from runtime.records import F32
+from runtime.support import untrusted_input
+from runtime.support.untrusted_input import LIMITS
+
+CHUNK = 256  # splats that share their bounds
+SPLAT = np.dtype([("place", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("turn", "u1", 4)])
+U32 = NDArray[np.uint32]
+
+
+@np.errstate(all="ignore")
+def load_compressed(header: Header) -> Gaussians:
+    """Read SuperSplat's compressed form: numbers of 8 to 11 bits between the bounds of their chunk.
+
+    Raises InputError: no bounds for all splats, none that can be drawn.
+    """
+    elements = read_elements(header)
+    splats, bounds = elements["vertex"], elements.get("chunk")
+    names = {*(splats.dtype.names or ())}
+    kinds = ("position", "rotation", "scale", "color")
+    if bounds is None or len(bounds) * CHUNK < len(splats) or not {f"packed_{kind}" for kind in kinds} <= names:
+        raise InputError(header.path, "chunk", "is missing, or holds no bounds of all splats")
+    place, turn, scale, colour = (splats[f"packed_{kind}"].astype(np.uint32) for kind in kinds)
+
+    def bounds_of(name: str, axes: str) -> list[F32]:
+        """Two (n, 3): the least and the largest that a splat's chunk holds."""
+        columns = [[f"{end}_{name}{axis}" for axis in axes] for end in ("min", "max")]
+        if missing := {*columns[0], *columns[1]} - {*(bounds.dtype.names or ())}:
+            raise InputError(header.path, "chunk", f"has no {min(missing)}")
+        of = np.arange(len(splats)) // CHUNK
+        return [np.column_stack([bounds[column] for column in wanted])[of] for wanted in columns]
+
+    rgba = _parts(colour, (8, 8, 8, 8))
+    if "min_r" in (bounds.dtype.names or ()):
+        rgba[:, :3] = _between(rgba[:, :3], *bounds_of("", "rgb"))
+    dc = ((rgba[:, :3] - np.float32(0.5)) / np.float32(FLAT_HARMONIC))[:, None]
+    harmonics = dc
+    if fields := elements["sh"].dtype.names if "sh" in elements else ():
+        rest = np.column_stack([elements["sh"][name] for name in fields])
+        if rest.shape[1] not in COEFFICIENTS or len(rest) != len(splats):
+            raise InputError(header.path, "sh", "holds no harmonics of degree 1 to 3 for every splat")
+        higher = (rest.astype(np.float32) * np.float32(8 / 255) - 4).reshape(len(rest), 3, -1)
+        harmonics = np.concatenate([dc, higher.transpose(0, 2, 1)], axis=1)
+    return drawable(
+        header.path,
+        centres=_between(_parts(place, (11, 10, 11)), *bounds_of("", "xyz")),
+        log_scales=_between(_parts(scale, (11, 10, 11)), *bounds_of("scale_", "xyz")),
+        quaternions=_turns(turn),
+        logits=logit(rgba[:, 3]),
+        harmonics=harmonics,
+    )
+
+
+@np.errstate(all="ignore")
+def load_splat(path: Path) -> Gaussians:
+    """Read a .splat: place, deviations, RGBA and turn. Raises InputError: of another length, over a limit."""
+    data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
+    if not data or len(data) % SPLAT.itemsize:
+        problem = f"is cut off, or no .splat: it has {len(data)} bytes, no multiple of {SPLAT.itemsize}"
+        raise InputError(path, "", problem)
+    table = np.frombuffer(data, SPLAT)
+    untrusted_input.within(len(table), LIMITS.splats, source=path, field="splats")
+    rgba = np.asarray(table["colour"], np.float32) / np.float32(255)
+    return drawable(
+        path,
+        centres=table["place"],
+        log_scales=np.log(table["scale"]),
+        quaternions=np.asarray(table["turn"], np.float32) / np.float32(128) - np.float32(1),
+        logits=logit(rgba[:, 3]),
+        harmonics=((rgba[:, :3] - np.float32(0.5)) / np.float32(FLAT_HARMONIC))[:, None],
+    )
+
+
+def _parts(packed: U32, bits: tuple[int, ...]) -> F32:
+    """(n, len(bits)) fractions of the largest number of so many bits, the first in the highest ones."""
+    parts = []
+    for width in reversed(bits):
+        most = (1 << width) - 1
+        parts.append((packed & most) / most)
+        packed = packed >> np.uint32(width)
+    return np.column_stack(parts[::-1]).astype(np.float32)
+
+
+def _between(share: F32, low: F32, high: F32) -> F32:
+    return np.asarray(low * (1 - share) + high * share, np.float32)
+
+
+def _turns(packed: U32) -> F32:
+    """(n, 4) quaternions w, x, y, z: the largest, whose number is in two bits, follows from the three others."""
+    three = (_parts(packed, (10, 10, 10)) - np.float32(0.5)) * np.float32(np.sqrt(2))
+    largest = np.sqrt(np.maximum(1 - (three**2).sum(1), 0))
+    found = np.empty((len(packed), 4), np.float32)
+    for number in range(4):
+        rows = packed >> 30 == number
+        found[rows] = np.insert(three[rows], number, largest[rows], axis=1)
+    return found
