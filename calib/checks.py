@@ -7,7 +7,7 @@ import numpy as np
 from calib.pairs import Pairs
 from calib.robust import fit_robust
 from calib.similarity import Degenerate, Similarity, extents, fit
-from calib.solution import Solution
+from calib.solution import CalibrationSolution
 from runtime.errors import InputError
 from runtime.eyes.calibration import check_similarity
 from runtime.records import F64
@@ -47,7 +47,7 @@ def check_pairs(pairs: Pairs) -> list[str]:
     return ["the viewpoints lie in one plane: enough for the rotation, but mirrored axes would go unnoticed"]
 
 
-def check_solution(pairs: Pairs, solution: Solution, volume_m: F64) -> list[str]:
+def check_solution(pairs: Pairs, solution: CalibrationSolution, volume_m: F64) -> list[str]:
     """Warnings about a solution; `volume_m` (..., 3): the viewing volume. Raises InputError."""
     warnings = []
     check_similarity(solution.similarity.matrix, source=pairs.source)

@@ -14,7 +14,7 @@ from calib.viewpoints import viewing_volume_m
 from runtime.config import CalibrationSettings, read_table, validated
 from runtime.eyes.calibration import Calibration, Lenient, Vector3, load_calibration, similarity_defect
 from runtime.records import F64
-from runtime.report.page import Figure, Page, Section, drawing, png, section_of
+from runtime.report.page import Figure, Page, PageSection, drawing, png, section_of
 from runtime.support.figures import in_words
 
 COLOURS = {"X": "#c0392b", "Y": "#27803b", "Z": "#2260a8"}
@@ -59,7 +59,7 @@ def write_report(file: Path, out: Path, *, viewing: CalibrationSettings) -> dict
     else:
         text = "X, Y and Z error of every calibration point (the EyeReal supplement's figure S5)"
         figure = Figure("residuals", residual_figure(points, limit_m=RESIDUAL_LIMIT_M), text)
-        sections += [Section("Pictures", figures=[figure]), section_of("Points", _point_rows(points))]
+        sections += [PageSection("Pictures", figures=[figure]), section_of("Points", _point_rows(points))]
     if calibration.file.covariance is None:
         notes.append("This file holds no covariance: the error at the eye is not known.")
     lead = "Where the depth camera stands before the stack of panels, and how well that is known."

@@ -9,7 +9,7 @@ import typer
 
 from calib.hardware import SetupHardware
 from calib.keys import TerminalKeys
-from calib.setup_steps import STEPS, Setup, Step, Stopped
+from calib.setup_steps import STEPS, Setup, SetupStep, SetupStopped
 from calib.simulated import SimulatedHardware
 from runtime.config import load_settings
 from runtime.errors import InputError, PhasestackError
@@ -70,7 +70,7 @@ def walk_through(setup: Setup) -> bool:
         setup.say(f"\nStep {number + 1} of {len(STEPS)}: {step.title}\n{step.what}\n({state})")
         try:
             answer = setup.ask("Enter: do it; n: skip, what is done stays; p: the step before", "do it")
-        except Stopped:
+        except SetupStopped:
             return False
         if answer == "p":
             number = max(0, number - 1)
@@ -79,13 +79,13 @@ def walk_through(setup: Setup) -> bool:
     return True
 
 
-def _is_done(setup: Setup, step: Step) -> bool:
+def _is_done(setup: Setup, step: SetupStep) -> bool:
     """Run a step."""
     try:
         figures = step.run(setup)
-    except (Stopped, PhasestackError) as error:
+    except (SetupStopped, PhasestackError) as error:
         stopped = "stopped: what was not finished is not written into the configuration"
-        setup.say(stopped if isinstance(error, Stopped) else f"it did not work: {error}")
+        setup.say(stopped if isinstance(error, SetupStopped) else f"it did not work: {error}")
         return False
     setup.done[step.name] = figures
     write_json(progress_path(setup.config), {"done": setup.done})

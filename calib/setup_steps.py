@@ -36,7 +36,7 @@ ARROWS: dict[Key, Arrow] = {Key.UP: "up", Key.DOWN: "down", Key.LEFT: "left", Ke
 YES_NO = {Key.ACCEPT: True, Key.NEXT: False}
 
 
-class Stopped(Exception):
+class SetupStopped(Exception):
     """The person stops here, to continue another time."""
 
 
@@ -57,16 +57,16 @@ class Setup:
         return load_settings(self.config if untrusted_input.is_there(self.config) else None)
 
     def ask(self, question: str, default: str = "") -> str:
-        """The line that answers a question, `default` for an empty one. Raises Stopped for q."""
+        """The line that answers a question, `default` for an empty one. Raises SetupStopped for q."""
         self.say(f"{question} [{default or 'Enter'}; q: stop]")
         answer = self.line()
         if answer == "q":
-            raise Stopped
+            raise SetupStopped
         return answer or default
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class SetupStep:
     """One step."""
 
     name: str
@@ -89,7 +89,7 @@ def identify(setup: Setup) -> Figures:
         setup.say(f"{monitors[free[0]]} shows its card, the others are clear. {question} ({keys}; q: stop)")
         while (key := hardware.key()) not in answers:
             if key is Key.QUIT:
-                raise Stopped
+                raise SetupStopped
         return answers[key]
 
     while len(tables) < count:
@@ -177,7 +177,7 @@ def grey(setup: Setup) -> Figures:
             break
     if not any(known):
         setup.say("no panel has a curve: gammas stay as they are configured")
-        raise Stopped
+        raise SetupStopped
     which = ", ".join(str(n) for n, has in enumerate(known) if has)
     return {"text": f"of panels {which}, measured to {100 * max(residuals):.2f}%"}
 
@@ -221,7 +221,7 @@ def calibration(setup: Setup) -> Figures:
     count = capture_live(pairs_path, setup.settings, setup.hardware, show=True, say=setup.say)["pairs"]
     if count < MIN_PAIRS:
         setup.say(f"{count} pairs are kept in {pairs_path}; at least {MIN_PAIRS} are needed")
-        raise Stopped
+        raise SetupStopped
     summary = solve_file(pairs_path, target, settings=setup.settings)
     rewrite(setup.config, lambda document: put(document, "calibration", {"file": str(target.resolve())}))
     text = f"{summary['eye_error_mm']:.1f} mm of error expected at the eye, from {summary['pairs']} pairs"
@@ -281,13 +281,25 @@ def gather(config: Path, out: Path) -> list[str]:
 
 
 STEPS = (
-    Step("identify", "Which monitor is which panel", "each panel in turn shows a card; you say what you see", identify),
-    Step("geometry", "Sizes and distances", "how large the panels are, about how far apart, where viewers stand",
-         geometry),
-    Step("registration", "Where the panels truly are", "a dozen photographs of the boards, by hand", registration),
-    Step("grey", "What each panel makes of a grey", "two photographs of a chart, for each panel", grey),
-    Step("sensor", "The depth sensor", "which one sees the viewer's eyes", sensor),
-    Step("calibration", "Where the sensor stands", "you stand where lines fuse, and press Enter: 27 places, or 9 "
-         "(q: enough)", calibration),
-    Step("service", "At every start", "what the service reads is gathered in a folder and, by root, applied", service),
-)  # fmt: skip
+    SetupStep(
+        "identify", "Which monitor is which panel", "each panel in turn shows a card; you say what you see", identify
+    ),
+    SetupStep(
+        "geometry",
+        "Sizes and distances",
+        "how large the panels are, about how far apart, where viewers stand",
+        geometry,
+    ),
+    SetupStep("registration", "Where the panels truly are", "a dozen photographs of the boards, by hand", registration),
+    SetupStep("grey", "What each panel makes of a grey", "two photographs of a chart, for each panel", grey),
+    SetupStep("sensor", "The depth sensor", "which one sees the viewer's eyes", sensor),
+    SetupStep(
+        "calibration",
+        "Where the sensor stands",
+        "you stand where lines fuse, and press Enter: 27 places, or 9 (q: enough)",
+        calibration,
+    ),
+    SetupStep(
+        "service", "At every start", "what the service reads is gathered in a folder and, by root, applied", service
+    ),
+)

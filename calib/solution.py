@@ -23,7 +23,7 @@ MIN_SIGMA = 1e-12  # of the scale's logarithm: exact pairs
 
 
 @dataclass(frozen=True, slots=True)
-class Solution:
+class CalibrationSolution:
     """What a method made of K pairs. Parameters and pivot as in `runtime.eyes.calibration`."""
 
     method: Method
@@ -92,7 +92,9 @@ def design_covariance(stack_m: F64, *, fixed_scale: bool) -> tuple[F64, F64, flo
     return pivot_m, covariance, float(values[0] / values[-1])
 
 
-def solve(sensor_m: F64, stack_m: F64, *, method: Method, known_scale: float = 1.0, reason: str = "") -> Solution:
+def solve(
+    sensor_m: F64, stack_m: F64, *, method: Method, known_scale: float = 1.0, reason: str = ""
+) -> CalibrationSolution:
     """One method's similarity of (K, 3) pairs with all its error figures. Raises `similarity.Degenerate`."""
     used = np.ones(len(sensor_m), bool)
     if method == "robust":
@@ -103,7 +105,7 @@ def solve(sensor_m: F64, stack_m: F64, *, method: Method, known_scale: float = 1
     residual_m = similarity.points(sensor_m) - stack_m
     pivot_m, unit_covariance, condition = design_covariance(stack_m[used], fixed_scale=method == "fixed-scale")
     freedom = 3 * int(used.sum()) - (6 if method == "fixed-scale" else 7)
-    return Solution(
+    return CalibrationSolution(
         method=method,
         similarity=similarity,
         residual_m=residual_m,
@@ -131,7 +133,7 @@ def posterior_scale(fitted: F64 | float, *, sigma: float, freedom: int) -> tuple
     return (1 - chance) * fitted, np.sqrt((1 - chance) * (sigma**2 + chance * np.square(fitted)))
 
 
-def solve_default(sensor_m: F64, stack_m: F64) -> Solution:
+def solve_default(sensor_m: F64, stack_m: F64) -> CalibrationSolution:
     """The method that has the least error at the eye for pairs like these (tests/calib/test_methods.py).
 
     `robust` where pairs are grossly wrong; else `fixed-scale` at the posterior mean of the scale:

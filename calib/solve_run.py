@@ -14,7 +14,7 @@ from calib.checks import check_pairs, check_solution
 from calib.config_file import save
 from calib.pairs import Pairs, read_pairs
 from calib.similarity import Degenerate
-from calib.solution import METHODS, Solution, solve, solve_default
+from calib.solution import METHODS, CalibrationSolution, solve, solve_default
 from calib.viewpoints import viewing_volume_m
 from runtime.config import Settings
 from runtime.errors import InputError
@@ -65,7 +65,7 @@ def solve_file(
     }
 
 
-def _figures(solution: Solution, volume_m: F64) -> dict[str, Any]:
+def _figures(solution: CalibrationSolution, volume_m: F64) -> dict[str, Any]:
     error_m = solution.eye_error_m(volume_m)
     return {
         "method": solution.method,
@@ -80,7 +80,7 @@ def _figures(solution: Solution, volume_m: F64) -> dict[str, Any]:
 
 
 def calibration_text(
-    solution: Solution, pairs: Pairs, settings: Settings, *, warnings: list[str], volume_m: F64
+    solution: CalibrationSolution, pairs: Pairs, settings: Settings, *, warnings: list[str], volume_m: F64
 ) -> str:
     """The TOML of a solution; `runtime.eyes.calibration` reads it, `[data]` is the report's."""
     document = tomlkit.document()

@@ -16,7 +16,7 @@ from runtime.config import ModelSettings, StackGeometry
 from runtime.model.predictor import load_predictor
 from runtime.model.still import solve_still
 from runtime.optics.retina import seen_by
-from runtime.report.pairs import Painter, eyes_at
+from runtime.report.pairs import PairPainter, eyes_at
 from runtime.support.artifacts import write_png
 
 IMAGES = Path(__file__).resolve().parent / "images"
@@ -53,7 +53,7 @@ def optics() -> Figure:
     """The stack from above with both eyes' rays, the layers of a built-in scene, and what each eye sees of them."""
     stack = StackGeometry().stack()
     eyes = eyes_at(distance_m=0.6, height_m=0.05)
-    with Painter("room", stack) as painter:
+    with PairPainter("room", stack) as painter:
         pair = painter.pair("room", eyes, stack, off_mm=())
     predictor = load_predictor("balanced", stack, ModelSettings())
     layers = np.array(solve_still(*pair.images, eyes_m=eyes, fov_deg=FOV_DEG, predictor=predictor).layers[..., :3])
@@ -167,7 +167,7 @@ def clocks() -> Figure:
 def draw_example() -> None:
     """The pictures of `phasestack.example_pair`."""
     stack = replace(StackGeometry().stack(), width_px=640, height_px=360)
-    with Painter(SCENE, stack) as painter:
+    with PairPainter(SCENE, stack) as painter:
         pair = painter.pair(SCENE, np.array(EYES_M), stack, fov_deg=EXAMPLE_FOV_DEG, off_mm=())
     for side, picture in zip(("left", "right"), pair.images, strict=True):
         write_png(IMAGES.parents[1] / "phasestack" / "data" / f"{side}.png", picture)

@@ -28,7 +28,7 @@ from runtime.config import StackGeometry
 from runtime.optics.alignment import align, shown_layers
 from runtime.optics.retina import seen_by
 from runtime.records import PanelFrame
-from runtime.report.pairs import Painter, eyes_at
+from runtime.report.pairs import PairPainter, eyes_at
 from tests.calib.simulator import Camera, camera_from_stack, photograph
 
 DOCS = Path(__file__).resolve().parent
@@ -154,7 +154,7 @@ def look_into(folder: Path) -> None:
     aligned; and the solution's `viewer.html`."""
     stack = replace(StackGeometry().stack(), width_px=640, height_px=360)
     eyes = eyes_at(distance_m=0.65, angle_deg=4, height_m=0.08)
-    with Painter("room", stack) as painter:
+    with PairPainter("room", stack) as painter:
         pair = painter.pair("room", eyes, stack, off_mm=())
     result = phasestack.solve(*pair.images, eyes_m=eyes, stack=stack)
     result.save(folder)

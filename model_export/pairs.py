@@ -34,7 +34,7 @@ PICTURE_FOV_DEG = 40.0  # of the published data set's pictures
 
 
 @dataclass(frozen=True)
-class Pairs(Dataset[dict[str, Tensor]]):
+class TrainingPairs(Dataset[dict[str, Tensor]]):
     """Pairs by number as a network of pictures learns from them: each is made from (seed, number) alone."""
 
     form: Form

@@ -29,7 +29,7 @@ from torch.utils.data import DataLoader
 from model_export.checkpoint import fill, load_checkpoint, save_checkpoint
 from model_export.light import LEAST_ERROR, Views, improved, light, light_db
 from model_export.modules import COLOURS, PANELS, Form, Network, blamed, made, probe
-from model_export.pairs import Pairs, folder_pairs
+from model_export.pairs import TrainingPairs, folder_pairs
 from runtime.config import Section, load_stack
 from runtime.errors import InputError
 from runtime.support.artifacts import write_bytes, write_text
@@ -199,7 +199,7 @@ def _held_out_db(network: Network, batches: list[Batch], device: torch.device) -
     return sum(found) / len(found)
 
 
-def _data(training: Training, form: Form) -> tuple[Pairs, Pairs]:
+def _data(training: Training, form: Form) -> tuple[TrainingPairs, TrainingPairs]:
     """Training and held-out pairs. Raises InputError."""
     how: dict[str, Any] = {"width_px": training.width_px, "height_px": training.height_px}
     stack = load_stack(Path(training.panels), **how) if training.panels else None
@@ -214,12 +214,14 @@ def _data(training: Training, form: Form) -> tuple[Pairs, Pairs]:
     kept = tuple(pair for pair in folder if pair not in held) or folder
     how |= {"form": form, "eye_sigma_mm": training.eye_sigma_mm, "stack": stack, "scene": training.scene}
     return (
-        Pairs(seed=training.seed, count=len(kept) or training.pairs, folder=kept, **how),
-        Pairs(seed=HELD_OUT_SEED, count=len(held) or HELD_OUT, folder=held, **how),
+        TrainingPairs(seed=training.seed, count=len(kept) or training.pairs, folder=kept, **how),
+        TrainingPairs(seed=HELD_OUT_SEED, count=len(held) or HELD_OUT, folder=held, **how),
     )
 
 
-def _loader(pairs: Pairs, training: Training, first: int, last: int, *, batch: int | None = None) -> DataLoader[Batch]:
+def _loader(
+    pairs: TrainingPairs, training: Training, first: int, last: int, *, batch: int | None = None
+) -> DataLoader[Batch]:
     """Iterations `first` to `last`, by number: so one that was stopped goes on where it was."""
     size = batch or training.batch
     workers = min(8, len(os.sched_getaffinity(0)) - 1) if torch.cuda.is_available() else 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import graphlib
 import subprocess
 import sys
@@ -55,3 +56,17 @@ def test_a_command_loads_nothing_heavy_that_it_does_not_use(arguments: list[str]
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120)
     (line,) = [line for line in done.stdout.splitlines() if line.startswith("loaded:")]
     assert set(line.split()[1:]) == set(loads), done.stderr
+
+
+SHARED_NAMES = {"Image", "Result", "View"}  # of the compiled kernels' structures, which are to be renamed
+
+
+def test_a_public_class_name_is_in_one_module() -> None:
+    modules: dict[str, set[str]] = {}
+    for package in ("phasestack", "runtime", "calib", "model_export"):
+        for path in (ROOT / package).rglob("*.py"):
+            for node in ast.parse(path.read_text(encoding="utf-8")).body:
+                if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                    modules.setdefault(node.name, set()).add(str(path.relative_to(ROOT)))
+    shared = {name: paths for name, paths in modules.items() if len(paths) > 1}
+    assert len(modules) > 250 and shared.keys() <= SHARED_NAMES, shared

@@ -19,7 +19,7 @@ from runtime.commands.app import app
 from runtime.errors import InputError
 from runtime.evaluation import solved
 from runtime.optics.stack import PanelStack
-from runtime.report.pairs import Painter, read_pairs
+from runtime.report.pairs import PairPainter, read_pairs
 from tests.test_cli import pair_in, solve_arguments
 from tests.test_extras import BLOCKED, of_extras
 
@@ -287,7 +287,7 @@ def test_a_refusal_of_the_model_names_it_once() -> None:
 
 def test_the_example_pair_shows_its_scene_and_is_a_case(tmp_path: Path) -> None:
     pair = phasestack.example_pair()
-    with Painter("room", pair.stack) as painter:
+    with PairPainter("room", pair.stack) as painter:
         drawn = painter.pair("room", pair.eyes_m, pair.stack, fov_deg=pair.fov_deg, off_mm=())
     for given, image in zip((pair.left, pair.right), drawn.images, strict=True):
         assert np.abs(given.astype(int) - image).mean() < 0.05

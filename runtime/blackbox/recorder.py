@@ -36,7 +36,7 @@ from runtime.records import F64, RefreshAccount, SensorFrame
 from runtime.sensor import recording_format as fmt
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.support.artifacts import put_in_place, to_json
-from runtime.support.background import Job
+from runtime.support.background import BackgroundJob
 from runtime.support.logs import ROOTS
 from runtime.support.version import version
 
@@ -114,7 +114,7 @@ def text_of(record: logging.LogRecord) -> str:
     return one_line(text)
 
 
-class Message(NamedTuple):
+class BlackBoxMessage(NamedTuple):
     """An event, serialised for a file."""
 
     at_ns: int  # on the run's clock: the wall clock may be set back
@@ -128,7 +128,7 @@ class _Pending(NamedTuple):
     """A file to be written."""
 
     kind: str
-    kept: list[Message]
+    kept: list[BlackBoxMessage]
     header: RecordingHeader
     settings: str
     listeners: list[Saved]
@@ -149,7 +149,7 @@ class Recorder(logging.Handler):
         super().__init__()
         self._folder, self._most_ns = folder, round(60 * minutes * NS_PER_S)
         self._kept_lock = threading.Lock()
-        self._kept: deque[Message] = deque()
+        self._kept: deque[BlackBoxMessage] = deque()
         self._bytes = 0
         self._presenter: Presenter | None = None
         self._sensor_from_stack: F64 | None = None
@@ -161,10 +161,10 @@ class Recorder(logging.Handler):
         self._passed: deque[dict[str, Any]] = deque(maxlen=STATES_KEPT)
         self._waiting_lock, self._is_writing = threading.Lock(), False
         self._waiting: deque[_Pending] = deque()  # for the writer
-        self._writer: Job[None] | None = None
+        self._writer: BackgroundJob[None] | None = None
         self._fresh = 0  # newest of the kept messages that are not in the journal yet
         self._journal, self._journaled_ns = _Journal(folder), 0
-        self._journaling: Job[None] | None = None
+        self._journaling: BackgroundJob[None] | None = None
         if self._most_ns:
             import mcap.writer  # noqa: F401 - where it is not installed, the start says so
 
@@ -204,7 +204,7 @@ class Recorder(logging.Handler):
                 fresh = list(islice(reversed(self._kept), self._fresh))[::-1]
                 self._fresh = 0
             work = partial(self._journal.add, fresh, *self._head(), most_ns=self._most_ns)
-            self._journaling = Job("black box's journal", work)  # no refresh waits for a disk
+            self._journaling = BackgroundJob("black box's journal", work)  # no refresh waits for a disk
         if self._fault is not None and at_ns - self._fault[0] >= AFTER_FAULT_NS:
             kind, self._fault = self._fault[1], None
             self.save(kind)
@@ -228,7 +228,7 @@ class Recorder(logging.Handler):
         assert self._presenter is not None
         at_ns = self._presenter.clock.now_ns()
         with self._kept_lock:
-            self._kept.append(Message(at_ns, time.time_ns(), topic, data, sequence & 0xFFFFFFFF))
+            self._kept.append(BlackBoxMessage(at_ns, time.time_ns(), topic, data, sequence & 0xFFFFFFFF))
             self._fresh += 1
             self._bytes += len(data) + OVERHEAD_BYTES
             while self._kept and (self._bytes > BYTES_MAX or at_ns - self._kept[0].at_ns > self._most_ns):
@@ -250,7 +250,7 @@ class Recorder(logging.Handler):
             self._waiting.append(_Pending(kind, kept, header, settings, listeners))
             if self._is_writing:
                 return
-            self._writer = Job("black box", self._write)
+            self._writer = BackgroundJob("black box", self._write)
             self._is_writing = not self._writer.problem
             refused = self._waiting.pop() if self._writer.problem else None
         if refused is not None:
@@ -325,7 +325,7 @@ class Recorder(logging.Handler):
         super().close()
 
 
-def write_file(folder: Path, kind: str, kept: list[Message], header: RecordingHeader, settings: str) -> Path:
+def write_file(folder: Path, kind: str, kept: list[BlackBoxMessage], header: RecordingHeader, settings: str) -> Path:
     """Write a new file atomically, readable only by its owner: it shows who was here. Raises OSError.
 
     Its number is higher than all others in the folder: the wall clock may be set back.
@@ -370,7 +370,7 @@ class _Written:
         self.writer.add_attachment(0, 0, "settings.json", "application/json", settings.encode())
         self._channels: dict[str, int] = {}
 
-    def add(self, messages: list[Message]) -> None:
+    def add(self, messages: list[BlackBoxMessage]) -> None:
         for message in messages:
             topic = message.topic
             if topic not in self._channels:
@@ -389,7 +389,7 @@ class _Journal:
         self._file: IO[bytes] | None = None
         self._written: _Written | None = None
 
-    def add(self, fresh: list[Message], header: RecordingHeader, settings: str, *, most_ns: int) -> None:
+    def add(self, fresh: list[BlackBoxMessage], header: RecordingHeader, settings: str, *, most_ns: int) -> None:
         """Write messages through to the disk. If that fails, the journal ends and the run continues."""
         now_ns = time.monotonic_ns()
         try:

@@ -24,7 +24,7 @@ def page(
 
     Example: phasestack page --port 8717
     """
-    from runtime.daemon.client import Daemon, sockets
+    from runtime.daemon.client import DaemonClient, sockets
     from runtime.errors import retry_advised
     from runtime.page.connections import LOOPBACK, listening, server_of
     from runtime.page.server import application
@@ -39,4 +39,4 @@ def page(
         token = token_of(path)
     served = listening("page", port)
     typer.echo(f"the page is at http://{LOOPBACK}:{served.getsockname()[1]}/ - its token is in {path}", err=True)
-    server_of(application(Daemon(places), token)).run(sockets=[served])
+    server_of(application(DaemonClient(places), token)).run(sockets=[served])

@@ -20,7 +20,7 @@ import typer
 from runtime.browser.link import BrowserLink
 from runtime.config import Settings, changed, load_settings, with_options
 from runtime.daemon.build import RunOptions
-from runtime.daemon.client import Daemon
+from runtime.daemon.client import DaemonClient
 from runtime.daemon.supervise import run_daemon
 from runtime.page.connections import LOOPBACK, listening, server_of
 from runtime.page.server import application
@@ -97,7 +97,7 @@ def _as_wished(settings: Settings, link: BrowserLink) -> Settings:
 def _served(link: BrowserLink, socket: Path, port: int) -> Iterator[str]:
     """The page, in a thread; answers its address, token included."""
     token, served = secrets.token_urlsafe(32), listening("try", port)
-    server = server_of(application(Daemon((socket,)), token, link=link))
+    server = server_of(application(DaemonClient((socket,)), token, link=link))
     sockets: dict[str, Any] = {"sockets": [served]}
     thread = threading.Thread(target=server.run, kwargs=sockets, name="page", daemon=True)
     thread.start()

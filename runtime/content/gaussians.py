@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
 from runtime.content.base import View
-from runtime.content.ply import Header, read_elements
+from runtime.content.ply import PlyHeader, read_elements
 from runtime.errors import InputError
 from runtime.records import F32, F64
 
@@ -58,7 +58,7 @@ class Splats:
     opacities: F32  # (m,)
 
 
-def load_gaussians(header: Header) -> Gaussians:
+def load_gaussians(header: PlyHeader) -> Gaussians:
     """The splats of a file as the reference implementation writes it, without unusable ones.
 
     Raises InputError: a property missing, none that can be drawn.

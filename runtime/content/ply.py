@@ -30,7 +30,7 @@ SPLAT_MARKS = {"f_dc_0", "scale_0", "rot_0", PACKED}
 
 
 @dataclass(frozen=True, slots=True)
-class Header:
+class PlyHeader:
     """The header of a PLY file."""
 
     path: Path
@@ -51,7 +51,7 @@ class Header:
         return PACKED in {name for name, _ in self.properties["vertex"]}
 
 
-def read_header(path: Path) -> Header:
+def read_header(path: Path) -> PlyHeader:
     """Raises InputError: no header, or counts that are over a limit or more than the file has bytes."""
     with untrusted_input.open_regular(path, most_bytes=LIMITS.file_bytes) as file:
         head = file.read(LONGEST_HEADER)
@@ -78,7 +78,7 @@ def read_header(path: Path) -> Header:
     twice = any(len({name for name, _ in fields}) < len(fields) for fields in properties.values())
     if not order or not properties.get("vertex") or twice:
         raise InputError(path, "vertex", "the header has no format, no vertices, or one of their properties twice")
-    header = Header(path, order, counts, properties, newline + 1, size)
+    header = PlyHeader(path, order, counts, properties, newline + 1, size)
     for name, count in counts.items():
         field, kind = f"element {untrusted_input.shown(name)}", header.kind
         most = getattr(LIMITS, kind) * (3 if kind == "triangles" and name == "vertex" else 1)
@@ -88,7 +88,7 @@ def read_header(path: Path) -> Header:
     return header
 
 
-def read_elements(header: Header) -> dict[str, Table]:
+def read_elements(header: PlyHeader) -> dict[str, Table]:
     """The elements up to the first with a list, each as a structured array, the vertices among them.
 
     Raises InputError: truncated, text, or a list before the vertices are over.

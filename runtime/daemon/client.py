@@ -122,7 +122,7 @@ def unit_advice() -> str:
     return f"{UNIT} is {unit['ActiveState']}: does its configuration name another service.socket (--config)?"
 
 
-class Daemon:
+class DaemonClient:
     """The page's access to the daemon; answers are cached for all browsers. Thread-safe."""
 
     def __init__(self, sockets: tuple[Path, ...]) -> None:

@@ -18,7 +18,7 @@ from runtime.eyes.calibration import Calibration, load_calibration
 from runtime.frame.run_state import LEFT_BEHIND
 from runtime.model.predictor import SHIPPED, Predictor
 from runtime.optics.stack import PanelStack
-from runtime.support.background import Job
+from runtime.support.background import BackgroundJob
 from runtime.support.child import in_child
 from runtime.support.crash import written
 from runtime.support.memory import give_back
@@ -52,7 +52,7 @@ class Reconfiguration:
         self.problem = ""  # one line if it was refused
         self._adopter: RunningSolver | None = None  # the solver that adopts it
         self._finished = False
-        self._job = Job("reconfiguration", self._make_ready)
+        self._job = BackgroundJob("reconfiguration", self._make_ready)
 
     def abandon(self) -> None:
         """Cancel the change and discard its results."""
@@ -73,7 +73,7 @@ class Reconfiguration:
             else:
                 self._adopter = parts
                 self._take_over(parts, opener, predictor)
-        Job("memory", give_back)  # the replaced parts may be large
+        BackgroundJob("memory", give_back)  # the replaced parts may be large
         self._finished = True
         return True
 

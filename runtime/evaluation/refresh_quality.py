@@ -26,7 +26,7 @@ Pictures = tuple[U8, U8]  # (h, w, 3) retina pictures of the left and right eye,
 
 
 @dataclass(frozen=True, slots=True)
-class Targets:
+class RefreshTargets:
     """Target pictures for a refresh; None: not drawn."""
 
     solved: Pictures | None = None  # for the eyes and the instant of the solution
@@ -64,7 +64,7 @@ def measure_refresh(
     account: RefreshAccount,
     layers: U8,
     unaligned: U8 | None,
-    targets: Targets,
+    targets: RefreshTargets,
     stack: PanelStack,
     *,
     fov_deg: float,
@@ -92,7 +92,7 @@ def _at_aligned_eyes(
     account: RefreshAccount,
     layers: U8,
     unaligned: U8 | None,
-    targets: Targets,
+    targets: RefreshTargets,
     stack: PanelStack,
     fov_deg: float,
     error: float | None,

@@ -8,14 +8,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from runtime.evaluation.refresh_quality import Pictures, Targets
+from runtime.evaluation.refresh_quality import Pictures, RefreshTargets
 from runtime.frame.presenter import Refresh
 from runtime.frame.targets import TargetDrawer
 from runtime.frame.truth import TrueEyes
 from runtime.optics.alignment import shown_layers
 from runtime.records import F64, U8, RefreshAccount
 from runtime.support import progress
-from runtime.support.background import MEASURING_NICENESS, Job
+from runtime.support.background import MEASURING_NICENESS, BackgroundJob
 
 log = logging.getLogger("phasestack.light")
 
@@ -49,7 +49,7 @@ class KeptLight:
     def __init__(self, every: int, output: Output, drawer: TargetDrawer, truth: TrueEyes, *, simulated: bool) -> None:
         self._every, self._output, self._drawer, self._truth = every, output, drawer, truth
         self._simulated = simulated
-        self._job: Job[None] | None = None
+        self._job: BackgroundJob[None] | None = None
         self._kept: list[_Kept] = []
 
     def refreshed(self, refresh: Refresh) -> None:
@@ -66,7 +66,7 @@ class KeptLight:
         if self._simulated:
             keep()
         else:
-            self._job = Job("kept light", keep, niceness=MEASURING_NICENESS)
+            self._job = BackgroundJob("kept light", keep, niceness=MEASURING_NICENESS)
         solved_for_ns = refresh.solution.solved_for_ns if refresh.solution is not None else 0
         kept = _Kept(account, solved_for_ns, self._drawer.shown_content())
         if self._truth.is_recorded:
@@ -89,7 +89,7 @@ class KeptLight:
             if not drawn.is_set():
                 log.warning("stopped: no pictures for %d of %d refreshes with kept light", total - done, total)
                 for rest in self._kept[done:]:
-                    self._write(rest, Targets())
+                    self._write(rest, RefreshTargets())
                 return
 
     def _draw(self, kept: _Kept, then: Callable[[], None]) -> None:
@@ -100,13 +100,13 @@ class KeptLight:
         if true_m is not None:
             wanted["true"] = true_m, account.photon_ns
 
-        def write(targets: Targets | None) -> None:
-            self._write(kept, targets or Targets())
+        def write(targets: RefreshTargets | None) -> None:
+            self._write(kept, targets or RefreshTargets())
             then()
 
         self._drawer.draw(wanted, kept.content, write)
 
-    def _write(self, kept: _Kept, targets: Targets) -> None:
+    def _write(self, kept: _Kept, targets: RefreshTargets) -> None:
         account = kept.account
         info = {
             "solved_for_m": account.solved_for_m,

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from runtime.evaluation.contact_sheet import Moment
-from runtime.evaluation.refresh_quality import FIGURES, RefreshQuality, Targets, measure_refresh
+from runtime.evaluation.refresh_quality import FIGURES, RefreshQuality, RefreshTargets, measure_refresh
 from runtime.frame.presenter import Refresh
 from runtime.frame.targets import TargetDrawer
 from runtime.frame.truth import TrueEyes
@@ -22,7 +22,7 @@ from runtime.optics.alignment import shown_layers
 from runtime.optics.quality import psnr_db
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, State
-from runtime.support.background import MEASURING_NICENESS, Job
+from runtime.support.background import MEASURING_NICENESS, BackgroundJob
 
 DRAWN_WITHIN_S = 10.0  # limit on drawing the last refresh's targets
 
@@ -52,7 +52,7 @@ class QualitySampler:
         self.live: dict[int, float] = {}  # mean squared error at the true eyes, by number of the refresh
         self.moment: Moment | None = None  # the newest refresh measured, for stills, sheet and viewer
         self._waiting: deque[_Sample] = deque()
-        self._job: Job[RefreshQuality] | None = None
+        self._job: BackgroundJob[RefreshQuality] | None = None
         self._job_frame = 0
         self._drawing = False
 
@@ -78,7 +78,7 @@ class QualitySampler:
 
     def finish(self, last: Refresh) -> None:
         """Measure the run's last refresh. It counts in the means only if it is the sole one."""
-        queue: SimpleQueue[Targets | None] = SimpleQueue()
+        queue: SimpleQueue[RefreshTargets | None] = SimpleQueue()
         true_m = self._truth.at(last.account.photon_ns)
         self._drawer.draw(self._wanted(last, true_m), None, queue.put)
         try:
@@ -96,12 +96,12 @@ class QualitySampler:
         if not wanted:
             return
 
-        def compare(targets: Targets | None) -> None:
+        def compare(targets: RefreshTargets | None) -> None:
             if self._simulated:
                 self._take(frame, self._compared(refresh, true_m, targets))
             elif targets is not None:
                 self._job_frame = frame
-                self._job = Job(
+                self._job = BackgroundJob(
                     "quality", lambda: self._compared(refresh, true_m, targets), niceness=MEASURING_NICENESS
                 )
             self._drawing = False
@@ -123,7 +123,7 @@ class QualitySampler:
             wanted["used"] = account.eyes_m, solution.solved_for_ns
         return wanted
 
-    def _compared(self, refresh: Refresh, true_m: F64 | None, targets: Targets | None) -> RefreshQuality:
+    def _compared(self, refresh: Refresh, true_m: F64 | None, targets: RefreshTargets | None) -> RefreshQuality:
         if targets is None:
             return RefreshQuality()
         account = replace(refresh.account, true_eyes_m=true_m)

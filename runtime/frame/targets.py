@@ -7,13 +7,13 @@ from contextlib import suppress
 from typing import Any
 
 from runtime.errors import ContentFailure
-from runtime.evaluation.refresh_quality import Targets
+from runtime.evaluation.refresh_quality import RefreshTargets
 from runtime.frame.solver_host import SolverHost
 from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import retina_pictures
 from runtime.records import F64
 
-Wanted = Mapping[str, tuple[F64, int]]  # by field of `Targets`: eyes (2, 3), frame `stack`, and an instant
+Wanted = Mapping[str, tuple[F64, int]]  # by field of `RefreshTargets`: eyes (2, 3), frame `stack`, and an instant
 
 
 class TargetDrawer:
@@ -31,7 +31,7 @@ class TargetDrawer:
         self._solver, self._stack, self.fov_deg = solver, stack, fov_deg
         self.shown_content = shown_content
 
-    def draw(self, wanted: Wanted, content: object | None, then: Callable[[Targets | None], None]) -> None:
+    def draw(self, wanted: Wanted, content: object | None, then: Callable[[RefreshTargets | None], None]) -> None:
         """Draw, and hand the pictures to `then` on the solver's thread.
 
         content: the run's content at that refresh; None: the present one. `then` gets None where drawing failed (the
@@ -50,8 +50,8 @@ class TargetDrawer:
 
         self._solver.do(task)
 
-    def _drawn(self, content: Any, wanted: Wanted) -> Targets:
-        return Targets(
+    def _drawn(self, content: Any, wanted: Wanted) -> RefreshTargets:
+        return RefreshTargets(
             **{
                 name: retina_pictures(content, eyes_m, self._stack, fov_deg=self.fov_deg, time_ns=time_ns)
                 for name, (eyes_m, time_ns) in wanted.items()

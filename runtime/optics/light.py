@@ -44,7 +44,7 @@ LIGHT = Sampling()
 ONE_RAY = Sampling(rays=0, pupil_mm=0.0)
 
 
-class View(NamedTuple):
+class LightView(NamedTuple):
     """One eye's picture, and the geometry of its rays."""
 
     target: F32  # (h, w, 3) intensities
@@ -110,7 +110,7 @@ def _sums(
         rows = range(0, len(target), step * -(-len(target) // (parts * step)))
         calls += [(view, first, last) for first, last in zip(rows, [*rows[1:], len(target)], strict=True)]
 
-    def error(call: tuple[View, int, int]) -> tuple[float, int]:
+    def error(call: tuple[LightView, int, int]) -> tuple[float, int]:
         view, first, last = call
         return _squared_error(codes, view, table, sampling, first, last)
 
@@ -121,7 +121,9 @@ def _sums(
     return sums
 
 
-def _squared_error(codes: U8, view: View, table: F32, sampling: Sampling, first: int, last: int) -> tuple[float, int]:
+def _squared_error(
+    codes: U8, view: LightView, table: F32, sampling: Sampling, first: int, last: int
+) -> tuple[float, int]:
     """Sum of the squared error over some rows of one eye's picture, and the number of terms."""
     count, height, width, components = codes.shape
     target, table = np.ascontiguousarray(view.target, np.float32), np.ascontiguousarray(table, np.float32)
@@ -142,14 +144,14 @@ def _squared_error(codes: U8, view: View, table: F32, sampling: Sampling, first:
 
 def view_of(
     side: int, nominal_m: F64, true_m: F64, target: F32, stack: PanelStack, *, fov_deg: float, pupil_mm: float
-) -> View:
+) -> LightView:
     """Rays of one eye. Raises ValueError for an eye behind a panel."""
     height, width = target.shape[:2]
     rays = Rays.of_eye(checked_eye(nominal_m, stack), width_px=width, height_px=height, fov_deg=fov_deg)
     centre = panel_from_image(rays.from_stack, stack.panel(stack.count // 2))
     pupil = pupil_points(pupil_mm / 1e3, rings=RINGS if pupil_mm > 0 else 0)
     ends = [checked_eye(true_m + place, stack) for place in pupil @ stack_from_eye(nominal_m)[:3, :2].T]
-    return View(target, centre, panels_from_centre(np.array(ends), stack), rays.toward(), first_ray(side))
+    return LightView(target, centre, panels_from_centre(np.array(ends), stack), rays.toward(), first_ray(side))
 
 
 def first_ray(side: int) -> int:

@@ -23,7 +23,7 @@ from starlette.websockets import WebSocket
 
 from runtime.browser.link import BrowserLink
 from runtime.browser.still import asset as browser_asset
-from runtime.daemon.client import LOOKED_UP_AGAIN_S, Daemon
+from runtime.daemon.client import LOOKED_UP_AGAIN_S, DaemonClient
 from runtime.daemon.commands import NAMES
 from runtime.daemon.listener import REQUEST_MAX_BYTES, REQUEST_S
 from runtime.errors import InputError
@@ -51,7 +51,7 @@ HEADERS = {
 Handler = Callable[[Request], Awaitable[Response]]
 
 
-class Answer(JSONResponse):
+class JsonAnswer(JSONResponse):
     """JSON in ASCII: a file name need not be UTF-8."""
 
     def render(self, content: Any) -> bytes:
@@ -62,7 +62,7 @@ class TooLong(ValueError):
     """A request's body is too long."""
 
 
-def application(daemon: Daemon, token: str, *, link: BrowserLink | None = None) -> Starlette:
+def application(daemon: DaemonClient, token: str, *, link: BrowserLink | None = None) -> Starlette:
     """Return the application, for loopback.
 
     link: the page is the display itself, and opens by an address with the token.
@@ -75,7 +75,7 @@ def application(daemon: Daemon, token: str, *, link: BrowserLink | None = None) 
     def guarded(handler: Handler) -> Handler:
         async def answer(request: Request) -> Response:
             if not permitted(request):
-                return Answer({"ok": False, "error": "log in first"}, 401, {"WWW-Authenticate": "Bearer"})
+                return JsonAnswer({"ok": False, "error": "log in first"}, 401, {"WWW-Authenticate": "Bearer"})
             return await handler(request)
 
         return answer
@@ -104,9 +104,9 @@ def application(daemon: Daemon, token: str, *, link: BrowserLink | None = None) 
     async def look_up(request: Request) -> Response:
         name = request.path_params["name"]
         if name not in LOOKED_UP_AGAIN_S:
-            return Answer({"ok": False, "error": "unknown lookup"}, 404)
+            return JsonAnswer({"ok": False, "error": "unknown lookup"}, 404)
         answer = await run_in_threadpool(daemon.look_up, name)
-        return Answer(answer, 200 if answer.get("ok") else 503)
+        return JsonAnswer(answer, 200 if answer.get("ok") else 503)
 
     async def metrics(request: Request) -> Response:
         answer = await run_in_threadpool(daemon.look_up, "status")
@@ -118,14 +118,14 @@ def application(daemon: Daemon, token: str, *, link: BrowserLink | None = None) 
         try:
             command = parsed_json(await _body(request), source="the request")
         except TooLong:
-            return Answer({"ok": False, "error": "the request is too long"}, 413)
+            return JsonAnswer({"ok": False, "error": "the request is too long"}, 413)
         except (InputError, ValueError):
             command = None
         if not isinstance(command, dict) or command.get("command") not in NAMES:
-            return Answer({"ok": False, "error": f"command: one of {', '.join(NAMES)}"}, 400)
+            return JsonAnswer({"ok": False, "error": f"command: one of {', '.join(NAMES)}"}, 400)
         answer = await run_in_threadpool(daemon.tell, command["command"], command.get("value"))
         code = 200 if answer.get("ok") else 503 if answer.get("running") is False else 409
-        return Answer(answer, code)
+        return JsonAnswer(answer, code)
 
     routes: list[BaseRoute] = [
         Route("/", index, methods=["GET"]),

@@ -11,7 +11,7 @@ from runtime.config import ModelSettings, StackGeometry
 from runtime.model.predictor import load_predictor
 from runtime.report import focal, moving
 from runtime.report.frontier import Method, MethodResult, apart, measure, shipped_and_references
-from runtime.report.page import Page, Section, describe
+from runtime.report.page import Page, PageSection, describe
 from runtime.report.pairs import StillPair, procedural_pairs, read_pairs
 from runtime.report.sections import focal_section, frontier_section, moving_section
 
@@ -24,7 +24,7 @@ class GrowingPage:
 
     def __init__(self, out: Path, command: str, progress: Progress) -> None:
         self.out, self._command, self._progress = out, command, progress
-        self._sections: dict[str, Section] = {}
+        self._sections: dict[str, PageSection] = {}
         self.record: dict[str, Any] = {"machine": describe(), "command": command, "quote": QUOTE, "complete": False}
 
     def doing(self, what: str) -> None:
@@ -32,7 +32,7 @@ class GrowingPage:
         self._progress(what)
         self.record["measuring"] = what
 
-    def put(self, name: str, section: Section) -> None:
+    def put(self, name: str, section: PageSection) -> None:
         """Add a section, or replace the one of that name."""
         self._sections[name] = section
         self.write()

@@ -15,7 +15,7 @@ from runtime.config import StackGeometry, read_table, validated
 from runtime.evaluation.trials import timed
 from runtime.report.frontier import SHIPPED, Method, MethodResult, measure
 from runtime.report.page import describe
-from runtime.report.pairs import FOV_DEG, Painter, eyes_at
+from runtime.report.pairs import FOV_DEG, PairPainter, eyes_at
 
 SIZES = ((960, 540), (1920, 1080))
 WORSE_DB = 0.1  # more than rounding and thread order can change
@@ -25,7 +25,7 @@ UNSTEADY = 1.3  # ratio of the slowest to the fastest yardstick beyond which tim
 SCATTERS = 3.0  # times the medians' scatter: a smaller difference does not count
 
 
-class Entry(BaseModel):
+class BenchEntry(BaseModel):
     """Compared figures of one method at one size."""
 
     name: str
@@ -49,7 +49,7 @@ class RegressionFile(BaseModel):
     version: Literal[2]
     yardstick_ms: PositiveFloat
     yardsticks_ms: Annotated[list[PositiveFloat], Field(min_length=1)]  # over the whole measurement
-    methods: list[Entry]
+    methods: list[BenchEntry]
 
     def too_busy(self) -> str:
         """Reason why times can't be compared (other load on the machine); empty: they can."""
@@ -98,7 +98,7 @@ def measured(
     methods = [Method(name, "network", name) for name in models]
     for width, height in sizes:
         stack = replace(StackGeometry().stack(), width_px=width, height_px=height)
-        with Painter("demo", stack) as painter:
+        with PairPainter("demo", stack) as painter:
             pair = painter.pair("demo", eyes_at(distance_m=0.6, height_m=0.05), stack, fov_deg=FOV_DEG, off_mm=())
         for done, result in measure(methods, [pair]):
             progress(f"{width}x{height}: {done} is done")
@@ -159,7 +159,7 @@ def _times(name: str, ratio: float, noise: float, of_what: str) -> list[Change]:
     return [Change(name, ratio > 1, f"{ratio:.2f} times {of_what}")] if beyond else []
 
 
-def _gains(before: Entry, after: Entry) -> Iterator[tuple[str, float]]:
+def _gains(before: BenchEntry, after: BenchEntry) -> Iterator[tuple[str, float]]:
     for sigma in sorted(before.light_db.keys() & after.light_db.keys()):
         yield f"of light, at a tracking error of {sigma} mm", after.light_db[sigma] - before.light_db[sigma]
     yield "one ray a pixel", after.psnr_db - before.psnr_db

@@ -24,7 +24,7 @@ from runtime.optics.retina import Rays, Retina, average, pupil_points, through_l
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_camera, raster_from_stack, stack_from_eye
 from runtime.records import F32, F64, U8
-from runtime.report.pairs import Painter, eyes_at
+from runtime.report.pairs import PairPainter, eyes_at
 
 WIDTH_PX, HEIGHT_PX, FOV_DEG = 720, 300, 18.0
 PUPIL_M = PUPIL_MM / 1e3
@@ -105,7 +105,7 @@ def sharpest(distances_m: Sequence[float], values: Sequence[float]) -> float:
 
 
 def focal_stack(
-    painter: Painter, stack: PanelStack, *, model: str, progress: Callable[[int, int], None] = lambda done, of: None
+    painter: PairPainter, stack: PanelStack, *, model: str, progress: Callable[[int, int], None] = lambda done, of: None
 ) -> FocalStack:
     """Solve the layers for two pinhole eyes, then focus the right one at every plane."""
     eyes = eyes_at(distance_m=DISTANCE_M)
@@ -144,11 +144,11 @@ def seen_through(matrix: F64, layers: U8, stack: PanelStack) -> Retina:
     return through_layers(layers, lambda rows: (rays.on(panel, rows) for panel in panels), rays.toward_panels(), stack)
 
 
-def cards_painter(stack: PanelStack) -> Painter:
+def cards_painter(stack: PanelStack) -> PairPainter:
     """Painter of three finely textured cards: behind, in and in front of the middle panel."""
     card = shapes.card(0.034, 0.036, repeat=(3.4, 3.6))
     things = tuple(
         Thing(card, "checker", (x, y, 0.0), colour, lit=False)
         for x, y, colour in zip(CARDS_M, OFFSETS_M, ((1.0, 0.75, 0.7), (0.75, 1.0, 0.75), (0.7, 0.8, 1.0)), strict=True)
     )
-    return Painter(Scene("cards", things), stack)
+    return PairPainter(Scene("cards", things), stack)

@@ -46,7 +46,7 @@ class Table:
 
 
 @dataclass(frozen=True, slots=True)
-class Section:
+class PageSection:
     """A part of the page."""
 
     title: str
@@ -62,7 +62,7 @@ class Page:
 
     title: str
     lead: str  # the main result in a sentence
-    sections: Sequence[Section]
+    sections: Sequence[PageSection]
     machine: Mapping[str, str] = field(default_factory=dict)
     command: str = ""  # reproduces this page; empty: not shown
     notes: Sequence[str] = ()  # caveats
@@ -91,9 +91,9 @@ class Page:
                 write_bytes(folder.staging / f"{figure.name}.png", figure.png)
 
 
-def section_of(title: str, rows: Sequence[Sequence[str]]) -> Section:
+def section_of(title: str, rows: Sequence[Sequence[str]]) -> PageSection:
     """Section of one table; the first row holds the headings."""
-    return Section(title, tables=[Table(rows[0], rows[1:])])
+    return PageSection(title, tables=[Table(rows[0], rows[1:])])
 
 
 @contextmanager

@@ -120,7 +120,7 @@ def beside(eye_m: ArrayLike, mm: float) -> list[F64]:
     return [pose[:3, 3] + mm / 1000 * (right * pose[:3, 0] + up * pose[:3, 1]) for right, up in directions]
 
 
-class Painter:
+class PairPainter:
     """Draws a built-in scene from anywhere. Owns a GL context: for one thread, to be closed."""
 
     def __init__(self, scene: str | Scene, stack: PanelStack) -> None:
@@ -131,7 +131,7 @@ class Painter:
         self.context = offscreen_context()
         self.content = ProceduralSource(scene, stack=stack, context=self.context)
 
-    def __enter__(self) -> Painter:
+    def __enter__(self) -> PairPainter:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -175,6 +175,6 @@ PROCEDURAL = (
 def procedural_pairs(stack: PanelStack) -> Iterator[StillPair]:
     """The report's pairs: built-in scenes from three positions, with pictures off the eyes."""
     for scene, name, place in PROCEDURAL:
-        with Painter(scene, stack) as painter:
+        with PairPainter(scene, stack) as painter:
             pair = painter.pair(name, eyes_at(**place), stack)
         yield pair

@@ -10,13 +10,13 @@ import numpy as np
 from runtime.report.focal import CARDS_M, DISTANCE_M, PUPIL_M, FocalStack
 from runtime.report.frontier import QUOTED, SHIPPED, MethodResult
 from runtime.report.moving import Moving
-from runtime.report.page import Figure, Section, Table, drawing, png
+from runtime.report.page import Figure, PageSection, Table, drawing, png
 
 KINDS = {"shipped": ("o-", "C0"), "added": ("D", "C2"), "iterative": ("s-", "C1")}
 NAMES = ("behind the panels", "in the middle panel", "in front of the panels")
 
 
-def frontier_section(results: Sequence[MethodResult], *, title: str, name: str) -> Section:
+def frontier_section(results: Sequence[MethodResult], *, title: str, name: str) -> PageSection:
     """Plot and table of one resolution's methods measured until now."""
     pairs = "; ".join(pair.pair for pair in results[0].pairs)
     text = [
@@ -26,7 +26,7 @@ def frontier_section(results: Sequence[MethodResult], *, title: str, name: str) 
         "whose peak is its memory.",
     ]
     links = [(f"Viewer: {pair.pair}, {results[0].name}", pair.viewer) for pair in results[0].pairs if pair.viewer]
-    return Section(title, text, [frontier_plot(results, name=f"frontier-{name}")], [method_table(results)], links)
+    return PageSection(title, text, [frontier_plot(results, name=f"frontier-{name}")], [method_table(results)], links)
 
 
 def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
@@ -79,7 +79,7 @@ def method_table(results: Sequence[MethodResult]) -> Table:
     return Table(headings, rows, f"Panels of {size}.")
 
 
-def moving_section(found: Sequence[Moving]) -> Section:
+def moving_section(found: Sequence[Moving]) -> PageSection:
     """Live quality for every motion and solver measured so far, with the view error and the tracker's."""
     text = [
         "A solution takes longer than a refresh, and the head keeps moving. At every refresh the outer panels are "
@@ -95,7 +95,7 @@ def moving_section(found: Sequence[Moving]) -> Section:
         + [f"{mm:.1f}" for mm in (*one.view_error_mm, *one.tracker_mm)]
         for one in found
     ]
-    return Section("What a moving viewer sees", text, [moving_plot(found)], [Table(headings, rows)])
+    return PageSection("What a moving viewer sees", text, [moving_plot(found)], [Table(headings, rows)])
 
 
 def moving_plot(found: Sequence[Moving]) -> Figure:
@@ -117,7 +117,7 @@ def moving_plot(found: Sequence[Moving]) -> Figure:
     return Figure("moving-viewer", png(figure), "Live quality of each run after its first second.")
 
 
-def focal_section(stack: FocalStack) -> Section:
+def focal_section(stack: FocalStack) -> PageSection:
     """Table of distances and the focal slices."""
     headings = ["card", "lines of sight meet at, mm", "sharpest through the layers, mm", "sharpest in truth, mm"]
     rows = []
@@ -132,7 +132,7 @@ def focal_section(stack: FocalStack) -> Section:
     ]
     caption = "Vergence against accommodation, right eye: up to 0.3 dioptres are commonly considered comfortable."
     table = Table([*headings, "conflict, dioptres"], rows, caption)
-    return Section("Focal parallax", text, [slice_picture(stack)], [table])
+    return PageSection("Focal parallax", text, [slice_picture(stack)], [table])
 
 
 def slice_picture(stack: FocalStack) -> Figure:

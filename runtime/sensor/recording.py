@@ -20,7 +20,7 @@ from runtime.sensor import recording_format as fmt
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.support import untrusted_input
 from runtime.support.artifacts import put_in_place
-from runtime.support.background import Job
+from runtime.support.background import BackgroundJob
 from runtime.support.untrusted_input import LIMITS, MIB
 
 CHUNK_BYTES = 4096  # some 20 eye samples
@@ -62,7 +62,7 @@ class RecordingWriter:
         self._channels: dict[str, int] = {}
         self.count = 0
         self._first_ns: int | None = None
-        self._sync: Job[None] | None = None
+        self._sync: BackgroundJob[None] | None = None
         self._synced_ns = time.monotonic_ns()
         self._intrinsics: Intrinsics | None = None
 
@@ -98,7 +98,7 @@ class RecordingWriter:
         if time.monotonic_ns() - self._synced_ns >= SYNC_EVERY_NS and (self._sync is None or self._sync.done):
             self._synced_ns = time.monotonic_ns()
             # In the background: a slow disk loses no sample.
-            self._sync = Job("recording", lambda: os.fsync(self._file.fileno()))
+            self._sync = BackgroundJob("recording", lambda: os.fsync(self._file.fileno()))
         return True
 
     def finish(self) -> None:

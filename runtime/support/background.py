@@ -74,7 +74,7 @@ def raise_if_abandoned() -> None:
         raise ThreadAbandoned
 
 
-class Job(Generic[T]):
+class BackgroundJob(Generic[T]):
     """A job that starts on construction. `done`, `problem` and `take` never block; a failed start is a problem."""
 
     def __init__(self, name: str, work: Callable[[], T], *, niceness: int = BACKGROUND_NICENESS) -> None:

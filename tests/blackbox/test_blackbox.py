@@ -293,12 +293,12 @@ def test_setting_the_clock_back_does_not_age_the_newest_file(tmp_path: Path, mon
 WRITES = """
 import sys
 from pathlib import Path
-from runtime.blackbox.recorder import Message, write_file
+from runtime.blackbox.recorder import BlackBoxMessage, write_file
 from runtime.sensor.recording_format import RecordingHeader
 
 
 def kept():
-    yield Message(1, 1, "/refresh", b'"' + b"x" * 4000000 + b'"', 1)
+    yield BlackBoxMessage(1, 1, "/refresh", b'"' + b"x" * 4000000 + b'"', 1)
     print("writing", flush=True)
     sys.stdin.read()
 

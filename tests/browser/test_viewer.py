@@ -25,7 +25,7 @@ from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack, Tilt
 from runtime.optics.views import image_from_stack
 from runtime.records import SensorFrame
-from runtime.report.pairs import Painter, eyes_at
+from runtime.report.pairs import PairPainter, eyes_at
 from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
 from tests.browser.tracer import Panels, light
@@ -115,7 +115,7 @@ def test_a_picture_is_as_wide_as_what_all_panels_show() -> None:
 
 def pair(stack: phasestack.Stack) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
     eyes = eyes_at(distance_m=0.7, angle_deg=6, height_m=0.1)
-    with Painter("demo", stack) as painter:
+    with PairPainter("demo", stack) as painter:
         size = {"width_px": stack.width_px, "height_px": stack.height_px}
         return eyes, tuple(painter.image(eye, **size) for eye in eyes)
 

@@ -20,7 +20,7 @@ from calib.config_file import put, rewrite
 from calib.grey_chart import grey_charts
 from calib.keys import Key
 from calib.setup_run import progress_path, read_progress, walk_through
-from calib.setup_steps import STEPS, Setup, Stopped, geometry, grey, identify, service
+from calib.setup_steps import STEPS, Setup, SetupStopped, geometry, grey, identify, service
 from calib.simulated import SimulatedHardware
 from calib.viewpoints import grid
 from runtime.config import Settings, load_settings
@@ -156,7 +156,7 @@ def test_sizes_are_typed_and_measured_distances_stay(tmp_path: Path) -> None:
 def test_a_display_that_is_not_there_has_no_photographs_and_says_so(tmp_path: Path) -> None:
     setup = scripted(tmp_path, ["y", "n", "n", "n"])
     setup.hardware._photos = tmp_path / "none"
-    with pytest.raises(Stopped):
+    with pytest.raises(SetupStopped):
         grey(setup)
     assert any("grey-0" in said and "a simulated display has none" in said for said in setup.say.__self__)
 

@@ -16,7 +16,7 @@ from runtime.errors import ContextLost, FatalError, InputError
 from runtime.frame.solver import SolverUpdate
 from runtime.frame.solver_thread import ABANDON_S, ABANDONED_MAX, LATE_S, SolverThread
 from runtime.records import SolveRequest
-from runtime.report.pairs import Painter
+from runtime.report.pairs import PairPainter
 from runtime.support.memory import keep_freed_memory
 from runtime.support.untrusted_input import LIMITS
 from tests.frame.fakes import STACK, FakeParts, aside, solution
@@ -398,7 +398,7 @@ def test_a_stop_ends_a_step_between_two_drawings(shop: Workshop) -> None:
 
     def draws(request: SolveRequest) -> SolverUpdate:
         nonlocal drawn
-        with Painter("demo", STACK) as painter:
+        with PairPainter("demo", STACK) as painter:
             while drawn < 3000:
                 painter.image(aside(0.0)[0], width_px=160, height_px=90)
                 drawn += 1

@@ -25,7 +25,7 @@ from model_export.data import TrainingPair, random_pair  # noqa: E402
 from model_export.export import export_model, picture_file  # noqa: E402
 from model_export.light import Views, improved, light_db  # noqa: E402
 from model_export.modules import Form, made  # noqa: E402
-from model_export.pairs import Pairs, network_input  # noqa: E402
+from model_export.pairs import TrainingPairs, network_input  # noqa: E402
 from model_export.scene import Plane, Scene, draw  # noqa: E402
 from model_export.train import Training, _held_out_db, displayed, run_training  # noqa: E402
 from model_export.validate import validate_file  # noqa: E402
@@ -72,12 +72,12 @@ def test_a_plane_is_drawn_where_the_projection_puts_it() -> None:
 
 
 def test_pairs_of_a_scene_are_the_runtime_s_own_pictures_of_it() -> None:
-    first, again, other = (Pairs(Form(), 3, 96, 54, 1.0, scene="demo").pair(number) for number in (0, 0, 1))
+    first, again, other = (TrainingPairs(Form(), 3, 96, 54, 1.0, scene="demo").pair(number) for number in (0, 0, 1))
     assert np.array_equal(first.images, again.images) and np.array_equal(first.eyes_m, again.eyes_m)
     assert not np.array_equal(first.images[0], first.images[1]) and np.std(first.images) > 20
     assert np.abs(first.eyes_m - other.eyes_m).max() > 0.01 and not np.array_equal(first.images, other.images)
     with pytest.raises(InputError, match="no-such-scene"):
-        Pairs(Form(), 3, 96, 54, 1.0, scene="no-such-scene").pair(0)
+        TrainingPairs(Form(), 3, 96, 54, 1.0, scene="no-such-scene").pair(0)
 
 
 def test_a_network_of_pictures_is_fed_what_the_runtime_feeds_it(tmp_path: Path) -> None:
@@ -130,7 +130,7 @@ def test_training_raises_the_light_that_eyes_get_and_leaves_its_files(tmp_path: 
     table = load_checkpoint(tmp_path / "checkpoint.pth")
     assert table["training"]["options"] == SHORT["options"]
     # Of the very pair, by the exact rays: from where it began to what it learned.
-    pairs = Pairs(Form(), seed=1, width_px=96, height_px=64, eye_sigma_mm=0.0, count=1)
+    pairs = TrainingPairs(Form(), seed=1, width_px=96, height_px=64, eye_sigma_mm=0.0, count=1)
     batch = torch.utils.data.default_collate([pairs[0]])
     before, after = made(SHORT["arch"], SHORT["options"], seed=1), made(SHORT["arch"], SHORT["options"])
     after.net.load_state_dict(table["model"])

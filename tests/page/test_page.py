@@ -19,7 +19,7 @@ import pytest
 
 from runtime.clock import MonotonicClock
 from runtime.commands.page import page as page_command
-from runtime.daemon.client import Daemon
+from runtime.daemon.client import DaemonClient
 from runtime.daemon.server import StatusServer
 from runtime.errors import InputError, TransientError
 from runtime.page.connections import CONNECTIONS_MAX
@@ -131,7 +131,7 @@ def test_who_goes_away_while_asking_makes_no_error(tmp_path: Path) -> None:
     sent: list[Any] = []
 
     async def asked() -> None:
-        app = application(Daemon((tmp_path / "s.sock",)), "t" * 40)
+        app = application(DaemonClient((tmp_path / "s.sock",)), "t" * 40)
         host = b"localhost:8717"
         headers = [(b"host", host), (b"origin", b"http://" + host), (b"authorization", b"Bearer " + b"t" * 40)]
         scope = {"type": "http", "method": "POST", "path": "/do", "headers": headers, "query_string": b""}

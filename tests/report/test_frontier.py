@@ -17,7 +17,7 @@ from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.report.frontier import Method, MethodResult, MethodRun, apart, measure, pair_result, run_method
-from runtime.report.pairs import Painter, StillPair, eyes_at
+from runtime.report.pairs import PairPainter, StillPair, eyes_at
 from tests.model.test_session import saved, shipped
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 192, 108)
@@ -25,7 +25,7 @@ STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 192, 108)
 
 @pytest.fixture(scope="module")
 def pair() -> StillPair:
-    with Painter("demo", STACK) as painter:
+    with PairPainter("demo", STACK) as painter:
         return painter.pair("demo", eyes_at(distance_m=0.6), STACK, off_mm=(2, 6))
 
 

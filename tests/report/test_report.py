@@ -21,7 +21,7 @@ from runtime.report import sections
 from runtime.report.assemble import whole_report
 from runtime.report.frontier import MethodResult, PairResult
 from runtime.report.moving import Moving, moving_run
-from runtime.report.page import Page, Section, Table, describe
+from runtime.report.page import Page, PageSection, Table, describe
 from runtime.report.sections import frontier_section, moving_section
 from tests.report.test_pairs import case_folder
 
@@ -147,7 +147,7 @@ def test_the_page_needs_nothing_from_elsewhere() -> None:
 
 
 def test_texts_are_escaped() -> None:
-    section = Section("<b>title</b>", ["a < b & c"], tables=[Table(["<i>"], [["<script>"]])])
+    section = PageSection("<b>title</b>", ["a < b & c"], tables=[Table(["<i>"], [["<script>"]])])
     html = Page("<x>", "<y>", [section], {"<k>": "<v>"}, "a && b").html()
     for raw in ("<b>title", "<i>", "<x>", "<y>", "<k>", "<v>", "<script>\n</td>"):
         assert raw not in html
