@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import logit
 
 from runtime.content.gaussians import COEFFICIENTS, FLAT_HARMONIC, Gaussians, drawable
-from runtime.content.ply import Header, read_elements
+from runtime.content.ply import PlyHeader, read_elements
 from runtime.errors import InputError
 from runtime.records import F32
 from runtime.support import untrusted_input
@@ -21,7 +21,7 @@ U32 = NDArray[np.uint32]
 
 
 @np.errstate(all="ignore")
-def load_compressed(header: Header) -> Gaussians:
+def load_compressed(header: PlyHeader) -> Gaussians:
     """Read SuperSplat's compressed form: numbers of 8 to 11 bits between the bounds of their chunk.
 
     Raises InputError: no bounds for all splats, none that can be drawn.
