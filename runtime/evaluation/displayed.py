@@ -57,10 +57,11 @@ def displayed(
     fov_deg: float,
     similarity: bool = True,
 ) -> EyeViews:
-    """Retina images of eyes (2, 3), frame `stack`, through layers (N, H, W, 3 or 4), with a target for each eye.
+    """Retina images of eyes (2, 3), frame `stack`, through layers, with a target for each eye.
 
-    Targets are `fov_deg` wide; those of the panels' aspect are compared at the panels' resolution, others at their own
-    or, if they have more pixels than a panel, reduced to as many. similarity: compute SSIM; otherwise it is NaN.
+    layers: (N, H, W, 3 or 4), rear to front. Targets are `fov_deg` wide; those of the panels' aspect are compared at
+    the panels' resolution, others at their own, or reduced to as many pixels as a panel has.
+    similarity: compute SSIM; otherwise it is NaN.
     Raises ValueError for eyes behind a panel, or that see no part of the panels.
     """
     wanted = [on_panels_raster(picture, stack) for picture in wanted]
@@ -93,7 +94,7 @@ def expected_db(
 def sampled_db(
     eye_views: EyeViews, layers: U8, *, sigmas_mm: Sequence[float], every: int
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Light, as in `expected_db`, of every `every`-th pixel of every `every`-th row, and its standard error in dB."""
+    """Light of every `every`-th pixel of every `every`-th row, and its standard error in dB."""
     values = dict.fromkeys(sigmas_mm, (math.nan, math.nan))
     how: Any = {"eyes_m": eye_views.eyes_m, "fov_deg": eye_views.fov_deg, "sigmas_mm": sigmas_mm}
     with contextlib.suppress(ValueError):

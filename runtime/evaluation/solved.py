@@ -70,7 +70,7 @@ class SolvedPair:
         return PairQuality(light, expected, at_eyes.psnr_db, at_eyes.ssim, tuple(at_eyes.eye_psnr_db))
 
     def sampled(self, *, sigmas_mm: Sequence[float], every: int) -> PairQuality:
-        """The light of some tracking errors, of every `every`-th pixel each way, with its standard error; no SSIM."""
+        """Light of every `every`-th pixel each way, with its standard error; no SSIM."""
         how: Any = {"eyes_m": self.eyes_m, "fov_deg": self.fov_deg, "similarity": False}
         views = displayed(self.layers, self.pictures, self.stack, **how)
         if every == 1:

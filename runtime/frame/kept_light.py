@@ -75,7 +75,10 @@ class KeptLight:
             self._draw(kept, lambda: None)
 
     def finish(self, stopped: Callable[[], bool]) -> None:
-        """Draw all pictures. stopped: True after a request to stop; the rest is then written without pictures."""
+        """Draw all pictures.
+
+        stopped: True after a request to stop; the rest is then written without pictures.
+        """
         if self._job is not None:
             self._job.wait(WRITTEN_WITHIN_S)
         total = len(self._kept)

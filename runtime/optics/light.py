@@ -77,7 +77,9 @@ def squared_error(
 
 
 def group_errors(layers: U8, targets: Sequence[F32], stack: PanelStack, *, sampling: Sampling, **how: Any) -> F64:
-    """(GROUPS + 1,) mean squared error of all rows, then of interleaved groups, whose scatter gives its standard error.
+    """(GROUPS + 1,) mean squared error of all rows, then of interleaved groups.
+
+    Their scatter gives its standard error.
 
     Arguments and errors are those of `squared_error`.
     """

@@ -12,7 +12,7 @@ TEXTS = ("state", "effort", "model", "scene")
 
 
 def exposition(status: Mapping[str, Any]) -> str:
-    """All numbers of a status; quantiles, tables and texts have labels. Figures without a value are left away."""
+    """All numbers of a status, with labels for quantiles, tables and texts; nulls are skipped."""
     return "".join(f"{line}\n" for line in _lines(status))
 
 

@@ -127,9 +127,10 @@ class MethodResult:
 def measure(
     methods: Sequence[Method], pairs: Iterable[StillPair], *, threads: int = 2, viewers: Path | None = None
 ) -> Iterator[tuple[str, MethodResult]]:
-    """Measure every method, pair by pair, at one resolution. viewers: folder for viewers of the first method.
+    """Measure every method, pair by pair, at one resolution.
 
-    Yields, after each measurement, its name and the method's result up to then. Raises FatalError if one fails.
+    viewers: folder for viewers of the first method. Yields, after each measurement, its name and the method's result
+    up to then. Raises FatalError if one fails.
     """
     found: dict[str, list[PairResult]] = {method.name: [] for method in methods}
     for pair in pairs:

@@ -125,7 +125,7 @@ def test_where_lines_may_be_dropped_a_slow_disk_delays_nobody(tmp_path: Path, mo
     assert len((tmp_path / "frames.jsonl").read_text().splitlines()) <= run_output.WAITING + 1
 
 
-def test_few_pictures_wait_for_a_slow_disk_and_all_once_the_run_is_over(
+def test_few_pictures_wait_for_a_slow_disk_until_the_run_is_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go_on, layers, most = threading.Event(), pictures()[0], run_output.WAITING_PICTURES
