@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -138,3 +139,37 @@ def test_a_run_that_shows_no_solution_says_so(tmp_path: Path, frames: int, says:
     how = ("--replay", "demo", "--headless", "--max-speed", "--scale", "0.1", "--model", "fast")
     done = phasestack("run", *how, "--frames", str(frames))
     assert done.returncode == 0 and ("no solution was shown" in done.stdout) == says
+
+
+@pytest.mark.parametrize(("name", "layout"), [("pair_sbs.png", None), ("pair.png", "cross-eyed")])
+def test_one_file_that_holds_both_views_is_solved_as_two(pair: Path, name: str, layout: str | None) -> None:
+    left, right = (cv2.imread(str(pair / f"{side}.png")) for side in ("left", "right"))
+    cv2.imwrite(str(pair / name), cv2.hconcat([right, left] if layout else [left, right]))
+    app(solve_arguments(pair, model="fast"), standalone_mode=False)
+    both = json.loads((pair / "out" / "solve.json").read_text())["light_db"]["1"]
+    arguments = solve_arguments(pair, model="fast", left=pair / name)
+    at = arguments.index("--right")
+    app(arguments[:at] + arguments[at + 2 :] + (["--layout", layout] if layout else []), standalone_mode=False)
+    alone = json.loads((pair / "out" / "solve.json").read_text())["light_db"]["1"]
+    assert alone == both
+
+
+def test_one_view_is_refused_and_so_is_a_layout_for_two_files(pair: Path) -> None:
+    arguments = solve_arguments(pair)
+    at = arguments.index("--right")
+    assert "left.png: layout: holds 1 view: give --right, or --layout" in refusal(*arguments[:at], *arguments[at + 2 :])
+    assert "solve: --layout: is of one file" in refusal(*arguments, "--layout", "side-by-side")
+    assert "--layout: layout" in refusal("run", "--replay", "demo", "--headless", "--layout", "sideways")
+
+
+def test_run_shows_a_file_in_the_layout_that_it_is_given(pair: Path, tmp_path: Path) -> None:
+    left, right = (cv2.imread(str(pair / f"{side}.png")) for side in ("left", "right"))
+    cv2.imwrite(str(pair / "pair.png"), cv2.hconcat([left, right]))
+    how = ("--replay", "demo", "--headless", "--max-speed", "--scale", "0.1", "--model", "fast", "--frames", "30")
+    for layout, differ in (("side-by-side", True), ("mono", False)):
+        done = phasestack(
+            "run", *how, "--scene", str(pair / "pair.png"), "--layout", layout, "--out", str(tmp_path / layout)
+        )
+        assert done.returncode == 0, done.stderr
+        seen = [cv2.imread(str(tmp_path / layout / f"wanted-{side}.png")).astype(int) for side in ("left", "right")]
+        assert (abs(seen[0] - seen[1]).mean() > 20) == differ

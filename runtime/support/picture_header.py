@@ -186,6 +186,8 @@ def undecodable(data: bytes, error: Exception | None = None) -> str:
     """Why a picture can't be decoded: its kind, with the way out, or that it is cut off."""
     from PIL import UnidentifiedImageError
 
+    if not data:
+        return "is empty"
     brand = data[8:12] if data[4:8] == b"ftyp" else b""
     if brand in (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1") and "HEIF" not in _formats():
         return f"is HEIC, which the extra `heic` reads (pip install pillow-heif); or {ANOTHER}"
