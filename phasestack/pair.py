@@ -11,7 +11,7 @@ import warnings
 import webbrowser
 from collections.abc import Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from threading import Lock
 from typing import Any, TypedDict, Unpack
@@ -95,8 +95,11 @@ class Result:
     def notes(self) -> tuple[str, ...]:
         """Why the eyes see ghosts, where the pictures' disparity is a reason."""
         asked = self._asked
-        how: Any = {"fov_deg": asked.fov_deg, "parallel": not asked.is_resampled}
-        return tuple(disparity_doubts(asked.pictures, asked.eyes_m, asked.stack, **how))
+        return tuple(
+            disparity_doubts(
+                asked.pictures, asked.eyes_m, asked.stack, fov_deg=asked.fov_deg, parallel=not asked.is_resampled
+            )
+        )
 
     def measure(self, **how: Unpack[Measuring]) -> PairQuality:
         """Quality at less cost: `measure(sigmas_mm=(1,), every=4)`. Raises ValueError, naming the argument."""
@@ -206,14 +209,14 @@ def solve_each(
     ValueError, naming the pair and the argument.
     """
     total = len(pairs) if isinstance(pairs, Sized) else None
-    how: Any = {"stack": stack, "fov_deg": fov_deg, "model": model, "eye_sigma_mm": eye_sigma_mm}
+    solve_one = partial(solve, stack=stack, fov_deg=fov_deg, model=model, eye_sigma_mm=eye_sigma_mm)
     shown = ShownProgress(sys.stderr) if progress else None
     try:
         for number, (left, right, eyes_m) in enumerate(pairs):
             if shown is not None:
                 shown("solving", number, total)
             try:
-                result = solve(left, right, eyes_m=eyes_m, **how)
+                result = solve_one(left, right, eyes_m=eyes_m)
             except ValueError as error:
                 raise ValueError(f"pairs[{number}]: {error}") from None
             yield result

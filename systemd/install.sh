@@ -17,7 +17,7 @@ case "${1:-}" in
   -h | --help) usage; exit 0 ;;
   *) echo "install: unknown argument $1 (see --help)" >&2; exit 2 ;;
 esac
-# Whatever the caller's mask is: the service's user reads what root installs.
+# The service's user must be able to read the installed files.
 umask 022
 here=$(CDPATH='' cd -- "$(dirname -- "$0")" && pwd)
 source=$(dirname -- "$here")
@@ -37,7 +37,7 @@ live=no running=''
 if [ -z "$DESTDIR" ] && [ -d /run/systemd/system ]; then
   live=yes
 fi
-# What is replaced is kept until the new one runs.
+# Replaced files are kept until the new version runs.
 put() {
   [ ! -e "$DESTDIR$3" ] || install -D -m "$1" "$DESTDIR$3" "$kept/tree$3"
   case $2 in /*) from=$2 ;; *) from=$here/$2 ;; esac
@@ -45,16 +45,16 @@ put() {
 }
 
 if [ "${APP:-yes}" != no ]; then
-  # An earlier installation may have made it for root alone.
+  # An earlier installation may have made it readable only by root.
   install -d -m 755 "$DESTDIR/opt/phasestack"
   rm -rf "$DESTDIR$library.new"
   "$python" -m pip install --quiet --root-user-action=ignore --target "$DESTDIR$library.new" -r "$source/requirements/runtime.lock"
-  # From a copy: what an earlier build left beside the source would come along, modules that are gone included.
+  # From a copy, since a build folder left in the source would be installed, with deleted modules.
   (cd "$source" && mkdir "$kept/source" && cp -r pyproject.toml README.md LICENSE THIRD_PARTY.md phasestack runtime calib model_export "$kept/source")
   "$python" -m pip install --quiet --root-user-action=ignore --no-deps --target "$DESTDIR$library.new" "$kept/source"
 fi
 
-# What runs must not load the new program's modules into the old one.
+# A running program must not load modules of the new one.
 if [ "$live" = yes ]; then
   for unit in phasestack-page phasestack phasestack-x; do
     case $(systemctl show --property=ActiveState --value "$unit") in
@@ -92,17 +92,17 @@ put 644 ../docs/blackbox.md /usr/share/doc/phasestack/blackbox.md
 put 644 ../docs/install.md /usr/share/doc/phasestack/install.md
 put 644 ../docs/planning.md /usr/share/doc/phasestack/planning.md
 put 644 ../THIRD_PARTY.md /usr/share/doc/phasestack/THIRD_PARTY.md
-# What the operator has written is never replaced.
+# The operator's configuration is never replaced.
 [ -e "$DESTDIR/etc/phasestack/phasestack.toml" ] || put 644 phasestack.toml /etc/phasestack/phasestack.toml
 
 if [ "$live" = yes ]; then
   systemd-sysusers
   systemd-tmpfiles --create phasestack.conf
-  { udevadm control --reload && udevadm trigger --subsystem-match=usb; } || echo "install: no udev runs here"
+  { udevadm control --reload && udevadm trigger --subsystem-match=usb; } || echo "install: udev is not running"
   systemctl daemon-reload
   # shellcheck disable=SC2086
   if [ -n "$running" ] && ! systemctl start $running; then
-    echo "install: the new one does not start; back to the one before. Why:" >&2
+    echo "install: the new version does not start; the previous one is restored. Reason:" >&2
     systemctl show phasestack --property=StatusText --value >&2
     systemctl stop $running 2>/dev/null || true
     rm -rf "$library.new"

@@ -1,6 +1,6 @@
 #!/bin/sh
-# Debian's packages for the runtime, made from its source; with `test` for the test suite too, with `slow` for its slow
-# tests too. Root: installed. Others: asked for, in one line.
+# Debian's packages for the runtime built from source; with `test` also for the tests, with `slow` for the slow ones.
+# Installs them as root; otherwise prints the command.
 set -u
 runtime="g++ libegl1 libgl1-mesa-dri libgles2 libgl1 libusb-1.0-0 libopenni2-0"
 testing="xvfb xserver-xorg-core xserver-xorg-video-dummy x11-xserver-utils x11-apps imagemagick chromium systemd udev"
@@ -10,7 +10,7 @@ case ${1:-} in
   slow) wanted="$runtime $testing $slow" ;;
   *) wanted=$runtime ;;
 esac
-command -v dpkg-query >/dev/null || { echo "Not Debian: see to it that these are there: $wanted"; exit 0; }
+command -v dpkg-query >/dev/null || { echo "Not Debian: please install the equivalents of: $wanted"; exit 0; }
 missing=""
 for name in $wanted; do
   dpkg-query -W -f='${Status}' "$name" 2>/dev/null | grep -q "install ok installed" || missing="$missing $name"

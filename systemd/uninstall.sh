@@ -1,5 +1,5 @@
 #!/bin/sh
-# Removes what install.sh has put there; `sh systemd/uninstall.sh --help` says how.
+# Removes the files of install.sh; `sh systemd/uninstall.sh --help` says how.
 set -eu
 usage() {
   cat <<'HELP'

@@ -42,13 +42,13 @@ class Watcher:
 
     def look(self, frame: SensorFrame, file: str, number: int | None = None) -> tuple[Row, Pupils | None]:
         begin = time.perf_counter()
-        found = frame.eyes if frame.colour is None else self._finder.find(frame)
+        points = frame.eyes if frame.colour is None else self._finder.find(frame)
         ms = 1e3 * (time.perf_counter() - begin)
         pupils, reason = self._finder.pupils, self._finder.reason
         if pupils is not None and frame.intrinsics is None:
             reason = ""  # a picture without intrinsics has no distances
         if frame.colour is None:
-            pupils, reason = None, "this sensor delivers eyes and no pictures" if found else "no eyes in this sample"
+            pupils, reason = None, "this sensor delivers eyes and no pictures" if points else "no eyes in this sample"
         row = {
             "file": file,
             "frame": number,
@@ -56,7 +56,7 @@ class Watcher:
             "sigma_px": None if pupils is None else pupils.sigma_px,
             "seen": None if pupils is None else pupils.seen,
             "ms": ms,
-            "eyes_m": None if found is None else found.eyes_m.tolist(),
+            "eyes_m": None if points is None else points.eyes_m.tolist(),
             "reason": reason,
         }
         return row, pupils

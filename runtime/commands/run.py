@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -57,8 +57,16 @@ def run(
     def read_settings() -> Settings:
         settings = load_settings(config)
         loop = replay == "demo" and frames is None and out is None and not max_speed
-        given: dict[str, Any] = {"headless": headless, "scene": scene, "model": model, "backend": backend}
-        return with_options(settings, replay=replay, loop=loop, layout=layout, **given)
+        return with_options(
+            settings,
+            replay=replay,
+            loop=loop,
+            headless=headless,
+            scene=scene,
+            layout=layout,
+            model=model,
+            backend=backend,
+        )
 
     options = RunOptions(
         max_speed=max_speed, measure=out is not None, scale=scale, keep_light=keep_light, frames=frames, out=out

@@ -182,7 +182,7 @@ def _locked(folder: Path) -> Iterator[None]:
     opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         until_s = time.monotonic() + LOCKED_WITHIN_S
-        while time.monotonic() < until_s:  # another program may hold it for ever
+        while time.monotonic() < until_s:  # another program may never release it
             with contextlib.suppress(BlockingIOError):
                 fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break

@@ -139,8 +139,8 @@ def library_scenes(settings: ContentSettings) -> tuple[str, ...]:
     except (OSError, ValueError):
         return ()
     entries = [path for path in entries if not path.name.startswith(".") and path.name.isprintable()]
-    found = [str(path) for path in entries if path.suffix.lower() in IN_LIBRARY or path.is_dir()]
-    return tuple(found[:LIBRARY_MOST])
+    scenes = [str(path) for path in entries if path.suffix.lower() in IN_LIBRARY or path.is_dir()]
+    return tuple(scenes[:LIBRARY_MOST])
 
 
 def pictures(run: Run) -> dict[str, Any]:
@@ -175,12 +175,12 @@ def pictures_of(refresh: Refresh, stack: PanelStack, *, fov_deg: float) -> dict[
     parts = (np.ascontiguousarray(layer[part, part]) for layer in shown)
     resized = [cv2.resize(layer, size, interpolation=cv2.INTER_AREA) for layer in parts]
     layers: U8 = np.stack(resized).astype(np.uint8, copy=False)
-    found = {f"layer-{n}": _jpeg(layer) for n, layer in enumerate(layers)}
+    jpegs = {f"layer-{n}": _jpeg(layer) for n, layer in enumerate(layers)}
     for name, eye_m in zip(("seen-left", "seen-right"), () if eyes_m is None else eyes_m, strict=False):
         if eye_m[0] > max(stack.x_m):
             seen = seen_by(eye_m, layers, small, fov_deg=fov_deg)
-            found[name] = _jpeg(np.rint(255 * seen.image * seen.mask[..., None]).astype(np.uint8))
-    return found
+            jpegs[name] = _jpeg(np.rint(255 * seen.image * seen.mask[..., None]).astype(np.uint8))
+    return jpegs
 
 
 def _jpeg(image: U8) -> bytes:

@@ -6,6 +6,7 @@ import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -82,12 +83,17 @@ def expected_db(
     light: pupils and square pixels, otherwise one ray a pixel of every `every`-th pixel of every `every`-th row. NaN
     where such an error would move an eye to a place that sees no part of the panels.
     """
-    psnrs_db = light_psnrs_db if light else expected_psnrs_db
+    psnrs_db = light_psnrs_db if light else partial(expected_psnrs_db, sampling=ONE_RAY._replace(step=every))
     values = dict.fromkeys(sigmas_mm, math.nan)
-    how: Any = {"eyes_m": eye_views.eyes_m, "fov_deg": eye_views.fov_deg, "sigmas_mm": sigmas_mm}
-    how |= {} if light else {"sampling": ONE_RAY._replace(step=every)}
     with contextlib.suppress(ValueError):
-        values |= psnrs_db(layers, eye_views.wanted, eye_views.stack, **how)
+        values |= psnrs_db(
+            layers,
+            eye_views.wanted,
+            eye_views.stack,
+            eyes_m=eye_views.eyes_m,
+            fov_deg=eye_views.fov_deg,
+            sigmas_mm=sigmas_mm,
+        )
     return {f"{sigma_mm:g}": value for sigma_mm, value in values.items()}
 
 
@@ -96,9 +102,16 @@ def sampled_db(
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Light of every `every`-th pixel of every `every`-th row, and its standard error in dB."""
     values = dict.fromkeys(sigmas_mm, (math.nan, math.nan))
-    how: Any = {"eyes_m": eye_views.eyes_m, "fov_deg": eye_views.fov_deg, "sigmas_mm": sigmas_mm}
     with contextlib.suppress(ValueError):
-        values |= sampled_light_db(layers, eye_views.wanted, eye_views.stack, every=every, **how)
+        values |= sampled_light_db(
+            layers,
+            eye_views.wanted,
+            eye_views.stack,
+            every=every,
+            eyes_m=eye_views.eyes_m,
+            fov_deg=eye_views.fov_deg,
+            sigmas_mm=sigmas_mm,
+        )
     light, errors = ({f"{sigma_mm:g}": value[k] for sigma_mm, value in values.items()} for k in (0, 1))
     return light, errors
 

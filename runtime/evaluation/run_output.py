@@ -123,8 +123,15 @@ class RunOutput:
                 shown, title, lines = moment.layers, headline(moment.light_db), [*moment.lines, *lines]
                 moment.eye_views.write(folder)
                 look = moment.eye_views
-                how: Any = {"eyes_m": moment.solved_for_m, "fov_deg": look.fov_deg, "title": title, "lines": lines}
-                page = viewer_html(moment.solution, moment.asked_for, look.stack, **how)
+                page = viewer_html(
+                    moment.solution,
+                    moment.asked_for,
+                    look.stack,
+                    eyes_m=moment.solved_for_m,
+                    fov_deg=look.fov_deg,
+                    title=title,
+                    lines=lines,
+                )
             views = None if moment is None else moment.eye_views
             write_png(folder / "contact-sheet.png", contact_sheet(shown, views, headline=title, lines=lines))
             write_text(folder / "viewer.html", page)

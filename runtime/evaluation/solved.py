@@ -71,8 +71,9 @@ class SolvedPair:
 
     def sampled(self, *, sigmas_mm: Sequence[float], every: int) -> PairQuality:
         """Light of every `every`-th pixel each way, with its standard error; no SSIM."""
-        how: Any = {"eyes_m": self.eyes_m, "fov_deg": self.fov_deg, "similarity": False}
-        views = displayed(self.layers, self.pictures, self.stack, **how)
+        views = displayed(
+            self.layers, self.pictures, self.stack, eyes_m=self.eyes_m, fov_deg=self.fov_deg, similarity=False
+        )
         if every == 1:
             light, errors = expected_db(views, self.layers, light=True, sigmas_mm=sigmas_mm), dict[str, float]()
         else:

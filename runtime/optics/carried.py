@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NotRequired, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -47,28 +47,33 @@ def carried_db(
     return psnr_db(error)
 
 
+class AtEyes(TypedDict):
+    """Eyes of an expected quality."""
+
+    eyes_m: ArrayLike  # (2, 3) that the layers were solved for
+    fov_deg: float  # of the pictures
+    sigmas_mm: Sequence[float]  # tracking errors
+    seen_from_m: NotRequired[ArrayLike | None]  # (2, 3) true positions of the eyes; by default the same
+
+
 def expected_psnrs_db(
     layers: U8,
     drawn: Sequence[U8 | F32],
     stack: PanelStack,
     *,
-    eyes_m: ArrayLike,
-    fov_deg: float,
-    sigmas_mm: Sequence[float],
-    seen_from_m: ArrayLike | None = None,
     sampling: Sampling = ONE_RAY,
+    **at: Unpack[AtEyes],
 ) -> dict[float, float]:
     """PSNR of the carried squared error, expected over normal tracking errors (docs/contracts.md).
 
     For each standard deviation to the right and up, by five points: no error with weight 1/2, two standard deviations
     to either side with 1/8 each, which is exact for second moments. drawn: an (h, w, 3) picture for each of the eyes
-    (2, 3) that the layers were solved for; seen_from_m: (2, 3) their true positions, by default the same. Moved eyes
-    get a quarter of the rays, which is exact to 0.02 dB: in a picture of `PLENTY` every second pixel of every second
-    row, otherwise, for light, two rays instead of four. Other arguments and errors as for `carried_db`.
+    (2, 3) that the layers were solved for. Moved eyes get a quarter of the rays, which is exact to 0.02 dB: in a
+    picture of `PLENTY` every second pixel of every second row, otherwise, for light, two rays instead of four. Other
+    arguments and errors as for `carried_db`.
     """
-    how: Any = {"eyes_m": eyes_m, "fov_deg": fov_deg, "sigmas_mm": sigmas_mm, "seen_from_m": seen_from_m}
-    found = _expected(squared_error, layers, drawn, stack, sampling=sampling, **how)
-    return {sigma_mm: psnr_db(float(error)) for sigma_mm, error in found.items()}
+    errors = _expected(squared_error, layers, drawn, stack, sampling=sampling, **at)
+    return {sigma_mm: psnr_db(float(error)) for sigma_mm, error in errors.items()}
 
 
 def _expected(
@@ -77,20 +82,21 @@ def _expected(
     drawn: Sequence[U8 | F32],
     stack: PanelStack,
     *,
-    sigmas_mm: Sequence[float],
     sampling: Sampling,
-    eyes_m: ArrayLike,
-    **how: Any,
+    **at: Unpack[AtEyes],
 ) -> dict[float, Any]:
     """The expected squared error by tracking error; measured: `squared_error`, or `group_errors`."""
-    seen_from_m = how.pop("seen_from_m", None)
-    eyes = np.asarray(eyes_m, dtype=np.float64)
+    seen_from_m = at.get("seen_from_m")
+    eyes = np.asarray(at["eyes_m"], dtype=np.float64)
     true = eyes if seen_from_m is None else np.asarray(seen_from_m, dtype=np.float64)
     targets = [intensities(picture) for picture in drawn]
     right, up = stack_from_eye(eyes.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
 
     def error(move_m: F64) -> Any:
-        return measured(layers, targets, stack, solved_for_m=eyes, eyes_m=true + move_m, sampling=sampling, **how)
+        moved_m = true + move_m
+        return measured(
+            layers, targets, stack, solved_for_m=eyes, eyes_m=moved_m, fov_deg=at["fov_deg"], sampling=sampling
+        )
 
     unmoved = error(np.zeros(3))
     if targets[0].size > PLENTY * sampling.step**2:
@@ -98,7 +104,7 @@ def _expected(
     elif sampling.rays > LIGHT.rays:
         sampling = LIGHT._replace(pupil_mm=sampling.pupil_mm, step=sampling.step)
     result = {}
-    for sigma_mm in sigmas_mm:
+    for sigma_mm in at["sigmas_mm"]:
         moves = [side * 2e-3 * sigma_mm * axis for axis in (right, up) for side in (-1, 1)]
         moved = sum(error(move) for move in moves) / 8 if sigma_mm > 0 else unmoved / 2
         result[sigma_mm] = unmoved / 2 + moved
@@ -106,7 +112,7 @@ def _expected(
 
 
 def light_psnrs_db(
-    layers: U8, drawn: Sequence[U8 | F32], stack: PanelStack, *, sampling: Sampling | None = None, **how: Any
+    layers: U8, drawn: Sequence[U8 | F32], stack: PanelStack, *, sampling: Sampling | None = None, **at: Unpack[AtEyes]
 ) -> dict[float, float]:
     """Light quality by tracking error, expected as in `expected_psnrs_db`: the figure to quote.
 
@@ -114,18 +120,18 @@ def light_psnrs_db(
     """
     if sampling is None:
         sampling = LIGHT if drawn[0].size > PLENTY else LIGHT._replace(rays=2 * LIGHT.rays)
-    return expected_psnrs_db(layers, drawn, stack, sampling=sampling, **how)
+    return expected_psnrs_db(layers, drawn, stack, sampling=sampling, **at)
 
 
 def sampled_light_db(
-    layers: U8, drawn: Sequence[U8 | F32], stack: PanelStack, *, every: int, **how: Any
+    layers: U8, drawn: Sequence[U8 | F32], stack: PanelStack, *, every: int, **at: Unpack[AtEyes]
 ) -> dict[float, tuple[float, float]]:
     """Light and its standard error, dB, of every `every`-th pixel of every `every`-th row.
 
     The standard error is that of ten interleaved groups of rows. The other arguments are those of `light_psnrs_db`.
     """
-    found = _expected(group_errors, layers, drawn, stack, sampling=LIGHT._replace(step=every), **how)
-    return {sigma_mm: (psnr_db(float(error[0])), _standard_error_db(error)) for sigma_mm, error in found.items()}
+    errors = _expected(group_errors, layers, drawn, stack, sampling=LIGHT._replace(step=every), **at)
+    return {sigma_mm: (psnr_db(float(error[0])), _standard_error_db(error)) for sigma_mm, error in errors.items()}
 
 
 def _standard_error_db(error: F64) -> float:

@@ -13,7 +13,7 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from ctypes import byref
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -71,12 +71,30 @@ def squared_error(
     light the result can be below 0, by the rays' noise.
     Raises ValueError for an eye behind a panel, or where no pixel counts.
     """
-    how: dict[str, Any] = {"solved_for_m": solved_for_m, "eyes_m": eyes_m, "fov_deg": fov_deg, "sampling": sampling}
-    total, counted = _sums(layers, targets, stack, parts=4 * len(os.sched_getaffinity(0)), **how).sum(axis=0)
+    sums = _sums(
+        layers,
+        targets,
+        stack,
+        solved_for_m=solved_for_m,
+        eyes_m=eyes_m,
+        fov_deg=fov_deg,
+        sampling=sampling,
+        parts=4 * len(os.sched_getaffinity(0)),
+    )
+    total, counted = sums.sum(axis=0)
     return float(total / counted)
 
 
-def group_errors(layers: U8, targets: Sequence[F32], stack: PanelStack, *, sampling: Sampling, **how: Any) -> F64:
+def group_errors(
+    layers: U8,
+    targets: Sequence[F32],
+    stack: PanelStack,
+    *,
+    solved_for_m: F64,
+    eyes_m: F64,
+    fov_deg: float,
+    sampling: Sampling,
+) -> F64:
     """(GROUPS + 1,) mean squared error of all rows, then of interleaved groups.
 
     Their scatter gives its standard error.
@@ -84,7 +102,10 @@ def group_errors(layers: U8, targets: Sequence[F32], stack: PanelStack, *, sampl
     Arguments and errors are those of `squared_error`.
     """
     rows = -(-min(len(target) for target in targets) // sampling.step)
-    sums = _sums(layers, targets, stack, parts=rows, sampling=sampling, **how).reshape(len(targets), -1, 2).sum(axis=0)
+    sums = _sums(
+        layers, targets, stack, solved_for_m=solved_for_m, eyes_m=eyes_m, fov_deg=fov_deg, sampling=sampling, parts=rows
+    )
+    sums = sums.reshape(len(targets), -1, 2).sum(axis=0)
     groups = np.array([sums[group::GROUPS].sum(axis=0) for group in range(GROUPS)])
     total, counted = np.concatenate([sums.sum(axis=0)[None], groups]).T
     return np.asarray(total / np.maximum(counted, 1))

@@ -110,13 +110,13 @@ def _frontier(
 
 
 def _moving(page: GrowingPage, *, quick: bool) -> None:
-    found: list[moving.Moving] = []
+    results: list[moving.Moving] = []
     for motion in moving.MOTIONS:
         for solver_ms in moving.SOLVER_MS:
             page.doing(f"what a moving viewer sees: {motion}, {solver_ms:g} ms")
-            found.append(apart(moving.moving_run, motion, solver_ms, scale=0.25 if quick else 0.5))
-            page.record["moving"] = [asdict(one) for one in found]
-            page.put("moving", moving_section(found))
+            results.append(apart(moving.moving_run, motion, solver_ms, scale=0.25 if quick else 0.5))
+            page.record["moving"] = [asdict(one) for one in results]
+            page.put("moving", moving_section(results))
 
 
 def _focal(page: GrowingPage) -> None:

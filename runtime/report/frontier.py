@@ -132,13 +132,13 @@ def measure(
     viewers: folder for viewers of the first method. Yields, after each measurement, its name and the method's result
     up to then. Raises FatalError if one fails.
     """
-    found: dict[str, list[PairResult]] = {method.name: [] for method in methods}
+    results: dict[str, list[PairResult]] = {method.name: [] for method in methods}
     for pair in pairs:
         for method in methods:
             run = apart(run_method, method, replace(pair, off=()), threads)
             viewer = viewers if method is methods[0] else None
-            found[method.name].append(pair_result(pair, run, viewer=viewer))
-            yield f"{method.name}, {pair.name}", _together(method, pair, run, found[method.name])
+            results[method.name].append(pair_result(pair, run, viewer=viewer))
+            yield f"{method.name}, {pair.name}", _together(method, pair, run, results[method.name])
 
 
 def apart(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
@@ -237,5 +237,5 @@ def _together(method: Method, pair: StillPair, run: MethodRun, pairs: list[PairR
 def _means(tables: Sequence[Any]) -> dict[str, float]:
     """Means by key over the tables that have a finite number there."""
     keys = dict.fromkeys(key for table in tables for key in table)
-    found = {key: [table[key] for table in tables if math.isfinite(table.get(key, math.nan))] for key in keys}
-    return {key: float(np.mean(values)) for key, values in found.items() if values}
+    values_of = {key: [table[key] for table in tables if math.isfinite(table.get(key, math.nan))] for key in keys}
+    return {key: float(np.mean(values)) for key, values in values_of.items() if values}
