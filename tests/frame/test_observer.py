@@ -357,6 +357,19 @@ def test_the_view_error_covers_every_refresh_with_known_eyes(content: ContentSou
     assert observer.summary()["view_error_mm"] == pytest.approx({"p50": 13.0, "p95": 14.8})  # of refreshes 1 to 5
 
 
+def test_a_coarse_solution_is_measured_as_the_panels_show_it(content: ContentSource, solved: Solution) -> None:
+    observer, kept = looking(content, evaluate_every=1, keep_light=1)
+    coarse = replace(solved, layers=np.ascontiguousarray(solved.layers[:, ::2, ::2]))
+    seen = refresh(1, coarse, eyes_m=aside(0.01))
+    seen = replace(seen, frame=replace(seen.frame, size_px=(SMALL.width_px, SMALL.height_px)))
+    observer.sampled(sample(seen.account.photon_ns, y_m=0.01))
+    observer.refreshed(seen)
+    assert observer.summary()["live_db"] == pytest.approx(live_db(content, seen, aside(0.01)), abs=0.15)
+    assert observer.moment is not None
+    shape = (SMALL.count, SMALL.height_px, SMALL.width_px, 4)
+    assert kept.lights[1]["layers"].shape == observer.moment.layers.shape == observer.moment.solution.shape == shape
+
+
 def test_pictures_of_a_scene_that_was_replaced_are_not_drawn(content: ContentSource, solved: Solution) -> None:
     shown: list[Any] = [content]
     solver, kept = Drawing(content), Kept()
