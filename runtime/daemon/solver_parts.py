@@ -17,15 +17,13 @@ from runtime.errors import ContextLost, Stopped
 from runtime.eyes.calibration import Calibration
 from runtime.frame.run_state import RunCell, RunState
 from runtime.frame.solver import Solver, SolverUpdate
-from runtime.model.backends import Choice, Wanted, choose
+from runtime.model.backends import EYES_M, Choice, Wanted, choose
 from runtime.model.predictor import Predictor, load_predictor
 from runtime.optics.stack import PanelStack
 from runtime.records import SolveRequest
 from runtime.support.gl import leave_context, offscreen_context
 
 log = logging.getLogger("phasestack.solver")
-
-WARM_EYES_M = ((0.6, -0.031, 0.0), (0.6, 0.031, 0.0))
 
 
 @dataclass(eq=False)
@@ -159,7 +157,7 @@ def ready_predictor(settings: Settings, stack: PanelStack) -> Predictor:
     """Return the configured model, warmed up. Raises InputError, MissingPart."""
     predictor = load_predictor(settings.model.name, stack, settings.model)
     try:
-        predictor.warm_up(np.array(WARM_EYES_M))
+        predictor.warm_up(np.array(EYES_M))
     except BaseException:
         predictor.close()
         raise
