@@ -87,6 +87,7 @@ class RunObserver:
         self._advance()
         if self._kept is not None:
             self._kept.finish(stopped)
+        self._sampler.drain(stopped)
         if self._simulated or (self.moment is None and not stopped()):
             last = self.last
             if last is not None and self._measures and has_picture(last) and last.account.eyes_m is not None:

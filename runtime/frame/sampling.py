@@ -1,12 +1,15 @@
 """Quality of sampled refreshes, measured once their true eyes are known.
 
 Targets are drawn on the solver's thread. In real time they are compared with the layers on a background thread, one
-refresh at a time: samples that come during a measurement are skipped. On a simulated clock every sample is measured.
+refresh at a time, the newest first. Of the samples that come meanwhile a few are held and measured at the end, the
+others are dropped. On a simulated clock every sample is measured, in order.
 """
 
 from __future__ import annotations
 
+import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -24,6 +27,9 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F64, State
 from runtime.support.background import MEASURING_NICENESS, BackgroundJob
 
+HELD_MAX = 3  # samples held in real time, with their layers: 25 MB each at 1080p
+MEASURED_WITHIN_S = 60.0  # limit on measuring the samples held, after the run
+LOOK_S = 0.02  # between checks for their end
 DRAWN_WITHIN_S = 10.0  # limit on drawing the last refresh's targets
 
 
@@ -53,18 +59,31 @@ class QualitySampler:
         self.moment: Moment | None = None  # the newest refresh measured, for stills, sheet and viewer
         self._waiting: deque[_Sample] = deque()
         self._job: BackgroundJob[RefreshQuality] | None = None
-        self._job_frame = 0
+        self._job_frame = self._moment_frame = -1
+        self._samples = 0
         self._drawing = False
 
     def refreshed(self, refresh: Refresh) -> None:
-        """Queue a refresh if it is a sample; in real time only while no other is being measured."""
+        """Queue a refresh if it is a sample; in real time it may take another one's place."""
         is_sample = self._every and refresh.account.frame % self._every == self._every - 1
-        if is_sample and refresh.account.presented and (self._simulated or not self._is_busy):
-            self._waiting.append(_Sample(refresh, self._drawer.shown_content()))
+        if not is_sample or not refresh.account.presented:
+            return
+        self._samples += 1
+        if not self._simulated and len(self._waiting) == HELD_MAX:
+            del self._waiting[self._samples % HELD_MAX]
+        self._waiting.append(_Sample(refresh, self._drawer.shown_content()))
 
     @property
     def _is_busy(self) -> bool:
         return bool(self._waiting) or self._drawing or self._job is not None
+
+    def drain(self, stopped: Callable[[], bool]) -> None:
+        """Measure the samples held, after a run in real time. stopped: True after a request to stop."""
+        ends_s = time.monotonic() + MEASURED_WITHIN_S
+        self.advance()
+        while self._is_busy and not stopped() and time.monotonic() < ends_s:
+            time.sleep(LOOK_S)
+            self.advance()
 
     def advance(self) -> None:
         """Collect a finished measurement, and start those whose true eyes are known by now."""
@@ -72,9 +91,12 @@ class QualitySampler:
             job, self._job = self._job, None
             self._take(self._job_frame, job.take())
         while self._waiting and self._job is None and not self._drawing:
-            if self._truth.may_come(self._waiting[0].refresh.account.photon_ns):
+            first = 0 if self._simulated else -1
+            if self._truth.may_come(self._waiting[first].refresh.account.photon_ns):
                 return
-            self._begin(self._waiting.popleft())
+            sample = self._waiting[first]
+            del self._waiting[first]
+            self._begin(sample)
 
     def finish(self, last: Refresh) -> None:
         """Measure the run's last refresh. It counts in the means only if it is the sole one."""
@@ -135,7 +157,8 @@ class QualitySampler:
     def _take(self, frame: int, quality: RefreshQuality | None, *, figures: bool = True, live: bool = True) -> None:
         if quality is None:
             return
-        self.moment = quality.moment or self.moment
+        if quality.moment is not None and frame > self._moment_frame:
+            self.moment, self._moment_frame = quality.moment, frame
         for name, value in quality.figures.items() if figures else ():
             self.measured.setdefault(name, []).append(value)
         if live and quality.live_error is not None:

@@ -13,7 +13,7 @@ from runtime.clock import NS_PER_MS, NS_PER_S
 from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.evaluation import refresh_quality
 from runtime.evaluation.displayed import displayed
-from runtime.frame import refresh_lines
+from runtime.frame import refresh_lines, sampling
 from runtime.frame.observer import RunObserver
 from runtime.frame.presenter import Refresh
 from runtime.frame.solver_host import Task
@@ -259,6 +259,19 @@ def test_in_real_time_one_measurement_runs_at_a_time_and_delays_nothing(
     assert wait_for_all(120.0) == 0
     observer.refreshed(refresh(10, solved))
     assert observer.summary()["quality_frames"] == 1
+
+
+def test_a_few_samples_that_came_meanwhile_are_measured_at_the_end(content: ContentSource, solved: Solution) -> None:
+    solver = Drawing(content, at_once=False)
+    observer, _ = looking(content, solver=solver, simulated=False, evaluate_every=1)
+    for number in range(10):
+        observer.sampled(sample(NS_PER_S + number * PERIOD_NS))
+        observer.refreshed(refresh(number, solved))
+    assert solver.tasks.pop()(solver) is True  # the first one's
+    solver.at_once = True
+    observer.finish()
+    assert set(observer.live_errors) > {0, 9} and len(observer.live_errors) == 1 + sampling.HELD_MAX
+    assert observer.moment is not None and observer.moment.lines[0].startswith("Refresh 9;")
 
 
 def test_comparing_is_not_the_presenter_s_nor_the_solver_s_work(
