@@ -44,6 +44,16 @@ def test_a_pair_becomes_layers_eye_views_and_quality(tmp_path: Path) -> None:
     assert told["light_db"]["1"] == pytest.approx(light_db["1"], abs=1e-3) and told["model"] == result.model
 
 
+def test_light_of_a_large_picture_is_of_some_pixels_with_its_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: Any = (picture(), picture(3))
+    whole = phasestack.solve(*given, eyes_m=EYES, stack=STACK, model="fast").quality
+    monkeypatch.setattr(solved, "WHOLE_PX", 1000)
+    some = phasestack.solve(*given, eyes_m=EYES, stack=STACK, model="fast").quality
+    for sigma, error_db in some.standard_error_db.items():
+        assert 0 < error_db < 1 and abs(some.light_db[sigma] - whole.light_db[sigma]) < 4 * error_db
+    assert not whole.standard_error_db and (some.psnr_db, some.ssim) == (whole.psnr_db, whole.ssim)
+
+
 def test_it_is_what_the_command_makes(tmp_path: Path) -> None:
     pair = pair_in(tmp_path)
     app(solve_arguments(pair), standalone_mode=False)

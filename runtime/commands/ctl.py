@@ -100,19 +100,29 @@ for _name, _meaning in PLAIN.items():
 
 def tell(request: dict[str, Any], config: Path | None) -> None:
     """Send one request and print the new state. Exits with 1 if no daemon answers, 2 if it refuses."""
-    from runtime.daemon.client import ANSWERED_WITHIN_S, NotRunning, ask, sockets, unit_advice
+    from runtime.daemon.client import ANSWERED_WITHIN_S, NotRunning, ask, sockets
     from runtime.errors import InputError
     from runtime.support.figures import lines_of
 
     try:
         answer = ask(sockets(config), request, timeout_s=ANSWERED_WITHIN_S)
     except NotRunning as error:
-        typer.echo("; ".join(filter(None, (str(error), unit_advice()))), err=True)
+        typer.echo(_advised(error), err=True)
         raise typer.Exit(1) from None
     if not answer.get("ok"):
         raise InputError(f"ctl {request['command']}", "", str(answer.get("error", "refused")))
     answer.pop("ok")
     typer.echo(answer.get("note") or answer.get("file") or "\n".join(lines_of(answer)))
+
+
+def _advised(error: Exception) -> str:
+    """What a client that no daemon answers may do."""
+    from runtime.daemon.client import unit_advice
+
+    advice = unit_advice()
+    if not advice and any(each in str(error) for each in ("no daemon", "has died")):
+        advice = "start one with `phasestack run`; without hardware: `phasestack try`"
+    return "; ".join(filter(None, (str(error), advice)))
 
 
 def status(
@@ -125,13 +135,13 @@ def status(
 
     Example: phasestack status --json
     """
-    from runtime.daemon.client import HUNG_AFTER_S, NotRunning, ask, sockets, unit_advice
+    from runtime.daemon.client import HUNG_AFTER_S, NotRunning, ask, sockets
     from runtime.support.figures import shown
 
     try:
         answer = ask(sockets(config), {"command": "status"})
     except NotRunning as error:
-        problem = "; ".join(filter(None, (str(error), unit_advice())))
+        problem = _advised(error)
         typer.echo(json.dumps({"ok": False, "error": problem}) if as_json else problem, err=not as_json)
         raise typer.Exit(1) from None
     typer.echo(shown(answer, as_json=as_json))

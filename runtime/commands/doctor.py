@@ -21,10 +21,14 @@ from runtime.support.plugins import is_plugin, plugin_class
 
 if TYPE_CHECKING:
     from runtime.config import Settings
+    from runtime.model.base import Predictor
+    from runtime.model.device import SolverBackend
 
 Verdict = Literal["ok", "warn", "fail", "skip"]
 CHECK_SENSOR_FOR_S = 3.0  # so long a sensor may take to its first sample
 SERVICE_CONFIG = Path("/etc/phasestack/phasestack.toml")
+SLOW_MS = 150.0  # of a solution: what a moving viewer loses by it is in docs/performance.md
+MEASURED_MS = 2000.0  # a solution that takes longer is only reckoned
 NO_DEVICE = ("replay", "fixed")  # drivers that need no device
 
 
@@ -232,10 +236,13 @@ def content(settings: Settings) -> Iterator[Row]:
 
 def model(settings: Settings) -> Iterator[Row]:
     """The network loads, its contract fits the stack, and the provider is there."""
+    import cv2
+
     from runtime.model.backends import choose
     from runtime.model.predictor import load_predictor
     from runtime.support.gl import offscreen_context
 
+    cv2.setNumThreads(settings.model.threads or -1)
     predictor = load_predictor(settings.model.name, settings.stack.stack(), settings.model)
     name = predictor.name
     with ExitStack() as cleanup:
@@ -246,11 +253,34 @@ def model(settings: Settings) -> Iterator[Row]:
             return made
 
         choice = choose(settings.model.backend, predictor, context)
+        rate = _rate(predictor, choice.backend, settings)
         predictor.close()
     other = settings.model.name not in name and "/" not in settings.model.name
     remedy = f"{settings.model.name} was asked for and does not fit this stack" if other else ""
     yield Row("model", "warn" if other else "ok", f"{name} on {settings.model.provider}", remedy)
     yield Row("backend", "ok", f"{choice.backend.name} around the network: {choice.why}")
+    yield rate
+
+
+def _rate(predictor: Predictor, backend: SolverBackend, settings: Settings) -> Row:
+    """How often the configured raster can be solved in full; the slowest pictures, those without a plain part."""
+    from dataclasses import replace
+
+    from runtime.model.backends import solution_ms
+
+    stack = predictor.stack
+    raster = f"{stack.width_px}x{stack.height_px}"
+    if predictor.on_panels(stack) is None:
+        return Row("rate", "skip", f"{predictor.name} is not timed")
+    coarse = replace(stack, width_px=max(64, stack.width_px // 4), height_px=max(64, stack.height_px // 4))
+    took_ms, how = 16 * solution_ms(predictor, coarse, backend, runs=3), f"reckoned from {coarse.width_px} columns"
+    if took_ms < MEASURED_MS:
+        took_ms, how = solution_ms(predictor, stack, backend, runs=1), "measured"
+    detail = f"{raster}: {took_ms:.0f} ms a solution in full, {1000 / took_ms:.1f} a second ({how})"
+    if took_ms < SLOW_MS:
+        return Row("rate", "ok", detail)
+    coarser = "coarser rasters and fewer steps are taken in time; " if settings.model.effort == "auto" else ""
+    return Row("rate", "warn", detail, f"{coarser}sharper: a GPU, the model `fast` or fewer pixels (docs/planning.md)")
 
 
 def calibration(settings: Settings) -> Iterator[Row]:

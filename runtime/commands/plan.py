@@ -19,14 +19,14 @@ def plan(
 ) -> None:
     """List the work that this scene makes unnecessary, the reasons, and measured savings and costs.
 
+    It draws and solves the scene some twenty times, on the full raster: seconds at 960x540, minutes at 4K without a GPU
+    (--scale 0.25 is sixteen times as fast).
+
     Example: phasestack plan --scene sparse
     """
-    from rich.console import Console
-
     from runtime.plan.planning import plan_for
     from runtime.support.figures import shown
 
-    status = Console(stderr=True, quiet=as_json).status("measuring with and without the plan")
-    with blame_option("plan", scene=scene, model=model), status:
+    with blame_option("plan", scene=scene, model=model):
         result = plan_for(config, scene=scene, model=model, scale=scale)
     typer.echo(shown(result, as_json=as_json))

@@ -30,6 +30,7 @@ from runtime.records import F64
 from runtime.support.artifacts import OutputFolder, write_json
 from runtime.support.gl import offscreen_context
 from runtime.support.picture_file import read_image
+from runtime.support.progress import tell
 from runtime.support.ranges import SEPARATION_MIN_M
 
 MEASURED_FROM = 10  # runs from which measuring the backends pays off
@@ -108,6 +109,7 @@ def solve_pair(
         inference_ms: list[float] = []
 
         def solve() -> Prediction:
+            tell("solving", len(inference_ms), repeat + 1)  # one is for warming up
             left, right = pictures
             prediction = solve_still(
                 left,
@@ -128,6 +130,7 @@ def solve_pair(
             raise InputError("solve", "--left-eye, --right-eye", why) from None
         watch.lap("solve, warm-up included")
         with OutputFolder(out) as folder:
+            tell("measuring what the eyes see", 0)
             seen = SolvedPair(done.answer.layers, pictures, stack, eyes_m, fov_deg)
             try:
                 quality = seen.quality
@@ -139,6 +142,7 @@ def solve_pair(
                 typer.echo(f"phasestack: {note}", err=True)
             line = f"{files.name}, model {predictor.name}, solved for a tracking error of "
             line += f"{eye_sigma_mm:g} mm; one ray a pixel, as published: {quality.psnr_db:.1f} dB"
+            tell("writing", 0)
             seen.write(folder.staging, lines=[line, *notes])
             watch.lap("measure and write")
             items = network_items(ContentInfo(files.name), Measured(left_out=done.answer.savings))
@@ -155,6 +159,7 @@ def solve_pair(
                 "wall_s": {part: round(ms / 1e3, 3) for part, ms in watch.stage_ms.items()},
             }
             write_json(folder.staging / "solve.json", result)
+            tell("", 0)
     return result
 
 

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from runtime.evaluation.contact_sheet import contact_sheet, headline
-from runtime.evaluation.displayed import EyeViews, Picture, displayed, expected_db, sampled_db
+from runtime.evaluation.displayed import SIGMAS_MM, EyeViews, Picture, displayed, expected_db, sampled_db
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 from runtime.support.artifacts import write_png, write_text
 
 BySigma = Mapping[str, float]
+WHOLE_PX = 1920 * 1200  # of a picture that is measured whole
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +41,7 @@ class PairQuality:
             "expected_db": _rounded(self.expected_db),
             "ssim": round(self.ssim, 4),
             "eye_psnr_db": [round(value, 3) for value in self.eye_psnr_db],
-        }
+        } | ({"standard_error_db": _rounded(self.standard_error_db)} if self.standard_error_db else {})
 
 
 @dataclass(frozen=True)
@@ -63,11 +64,17 @@ class SolvedPair:
 
     @cached_property
     def quality(self) -> PairQuality:
-        """Measured quality; takes seconds for a large picture."""
+        """Measured quality; of pictures larger than `WHOLE_PX` light is of some pixels, with its standard error."""
         views = self.eye_views
-        light, expected = (expected_db(views, self.layers, light=light) for light in (True, False))
-        at_eyes = views.quality
-        return PairQuality(light, expected, at_eyes.psnr_db, at_eyes.ssim, tuple(at_eyes.eye_psnr_db))
+        at_eyes, height_px = views.quality, views.wanted[0].shape[0]
+        every, errors = 1, dict[str, float]()
+        if height_px * views.wanted[0].shape[1] <= WHOLE_PX:
+            light = expected_db(views, self.layers, light=True)
+        else:
+            every = 4 * math.ceil(height_px / 2160)
+            light, errors = sampled_db(views, self.layers, sigmas_mm=SIGMAS_MM, every=every)
+        expected = expected_db(views, self.layers, every=every)
+        return PairQuality(light, expected, at_eyes.psnr_db, at_eyes.ssim, tuple(at_eyes.eye_psnr_db), errors)
 
     def sampled(self, *, sigmas_mm: Sequence[float], every: int) -> PairQuality:
         """Light of every `every`-th pixel each way, with its standard error; no SSIM."""

@@ -76,7 +76,7 @@ def _faster(predictor: Predictor, made: Callable[[], GlBackend]) -> Choice:
         for share, runs in ((FIRST_SHARE, RUNS), (1, 1)):
             width_px, height_px = (max(64, px // share) for px in (predictor.stack.width_px, predictor.stack.height_px))
             stack = replace(predictor.stack, width_px=width_px, height_px=height_px)
-            cpu_ms, gl_ms = (_solution_ms(predictor, stack, backend, runs=runs) for backend in (cpu, gl))
+            cpu_ms, gl_ms = (solution_ms(predictor, stack, backend, runs=runs) for backend in (cpu, gl))
             found = f"{stack.width_px}x{stack.height_px}: cpu {cpu_ms:.1f} ms, gl {gl_ms:.1f} ms"
             if max(cpu_ms, gl_ms) > CLEAR * min(cpu_ms, gl_ms):
                 break
@@ -88,7 +88,7 @@ def _faster(predictor: Predictor, made: Callable[[], GlBackend]) -> Choice:
     return Choice(cpu, f"measured at {found}")
 
 
-def _solution_ms(predictor: Predictor, stack: PanelStack, backend: SolverBackend, *, runs: int) -> float:
+def solution_ms(predictor: Predictor, stack: PanelStack, backend: SolverBackend, *, runs: int) -> float:
     """What one solution takes, the fastest of a few; the first, which compiles and allocates, does not count."""
     solver = predictor.on_panels(stack)
     assert solver is not None

@@ -15,6 +15,7 @@ from runtime.model.predictor import Predictor
 from runtime.plan.drawing import drawn_job, retina_pictures
 from runtime.plan.savings import Measured, Saving
 from runtime.records import F64, U8
+from runtime.support.progress import tell
 
 REPEATS = 5
 MAX_DRIFT_M = 0.001  # of a resting head, before its picture is renewed (`eyes.rest`)
@@ -51,9 +52,15 @@ def measure(predictor: Predictor, content: ContentSource, eyes_m: F64, *, fov_de
         return displayed(layers, targets, stack, eyes_m=at_m, fov_deg=fov_deg, similarity=False).quality.psnr_db
 
     def frames(made: Callable[[], Job]) -> Callable[[], U8]:
-        return lambda: predictor.solve(made()).layers
+        def solved() -> U8:
+            nonlocal count
+            tell("measuring solutions with and without the plan", count, len(ways) * (REPEATS + 1))
+            count += 1
+            return predictor.solve(made()).layers
 
-    stack = predictor.stack
+        return solved
+
+    stack, count = predictor.stack, 0
     job = drawn_job(predictor, content, eyes_m, time_ns=0, trimmed=True)
     left_out = job.savings
     ways: Mapping[str, Callable[[], Job]] = {
@@ -68,6 +75,7 @@ def measure(predictor: Predictor, content: ContentSource, eyes_m: F64, *, fov_de
         name: TrialResult(way.answer, way.times_ms, psnr_db(way.answer, eyes_m))
         for name, way in timed_in_turn(calls, runs=REPEATS).items()
     }
+    tell("", 0)
     without, with_plan = done["without"], done["with"]
     between = done.get("one channel", without)
     drifted_db = psnr_db(with_plan.layers, eyes_m + np.array([0.0, MAX_DRIFT_M, 0.0]))

@@ -79,7 +79,7 @@ def test_without_a_daemon_status_fails_with_one_line(tmp_path: Path) -> None:
     result = ask_status(tmp_path / "none.sock")
     assert result.exit_code == 1
     assert result.stderr.count("\n") == 1
-    assert "no daemon" in result.stderr
+    assert "no daemon; start one with `phasestack run`" in result.stderr
 
 
 @pytest.mark.parametrize(
