@@ -48,7 +48,7 @@ class Gaussians:
 
 @dataclass(frozen=True, slots=True)
 class Splats:
-    """What an eye sees of them: ellipses in pixels, farthest first."""
+    """Their projections for one eye: ellipses in pixels, farthest first."""
 
     index: I64  # (m,) which gaussian
     centres_px: F32  # (m, 2)
@@ -97,7 +97,7 @@ def drawable(path: Path, *, centres: F32, log_scales: F32, quaternions: F32, log
 
     quaternions: (n, 4) w, x, y, z of any length; logits: (n,) of opacities. Raises InputError where none is left.
     """
-    with np.errstate(invalid="ignore"):  # NaN is no less than anything
+    with np.errstate(invalid="ignore"):  # NaN compares as false
         usable = (np.abs(centres) < LARGEST_COORDINATE).all(1) & (quaternions != 0).any(1) & ~np.isnan(logits)
         for values in (quaternions, harmonics.reshape(len(centres), -1)):
             usable &= np.isfinite(values).all(1)
@@ -116,7 +116,7 @@ def drawable(path: Path, *, centres: F32, log_scales: F32, quaternions: F32, log
 
 
 def dotted(ends: F32, colours: F32) -> tuple[F32, F32]:
-    """Lines (n, 2, 3) as points (m, 3) along them, with colours (m, 3) between those of their ends (n, 2, 3)."""
+    """Lines (n, 2, 3) as points (m, 3) along them; colours of ends (n, 2, 3) interpolated."""
     lengths = np.nan_to_num(np.linalg.norm(np.diff(ends.astype(np.float64), axis=1)[:, 0], axis=1))
     share = np.minimum(lengths / max(float(lengths.sum()), 1e-30), 1.0)
     counts = 2 + (share * min(DOTS * len(ends), MOST_DOTS)).astype(np.int64)
@@ -128,9 +128,9 @@ def dotted(ends: F32, colours: F32) -> tuple[F32, F32]:
 
 
 def of_points(places: F32, colours: F32) -> Gaussians:
-    """Points as small round splats, about as large as they lie apart.
+    """Points as small round splats, about the size of their spacing.
 
-    colours: (n, 3), 0-1; NaN: by where it lies, since one colour for all would show an outline alone.
+    colours: (n, 3), 0-1; NaN: by position, since a single colour would show only an outline.
     """
     low, high = np.percentile(places, [1, 99], axis=0)
     by_place = 0.25 + 0.7 * np.clip((places - low) / np.maximum(high - low, 1e-30), 0, 1)
@@ -146,7 +146,7 @@ def of_points(places: F32, colours: F32) -> Gaussians:
 
 
 def bounds(gaussians: Gaussians) -> tuple[F64, F64]:
-    """(3,) corners of the box that holds what is seen of all but strays, to two standard deviations."""
+    """(3,) corners of a box around the visible splats, to two standard deviations, without outliers."""
     seen = gaussians.opacities > FAINT
     seen = seen if seen.any() else np.ones_like(seen)
     centres = gaussians.centres[seen].astype(np.float64)
@@ -165,7 +165,7 @@ def covariances_of(scales: F32, quaternions: F32) -> F32:
 
 
 def moved(gaussians: Gaussians, target_from_source: F64) -> Gaussians:
-    """The same splats in another frame (4x4 similarity); harmonics stay in the file's directions."""
+    """The splats in another frame (4x4 similarity); harmonics stay in the file's directions."""
     linear = target_from_source[:3, :3]
     centres = gaussians.centres @ linear.T + target_from_source[:3, 3]
     full = gaussians.covariances.astype(np.float64)[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)

@@ -32,7 +32,7 @@ DRAWN = {
     "KHR_mesh_quantization", "EXT_texture_webp", "EXT_texture_avif", INSTANCES,
 }  # fmt: skip
 UNSEEN = {"KHR_materials_ior", "KHR_materials_specular", "KHR_materials_variants", "KHR_xmp_json_ld"}
-# What a file may require and is drawn without.
+# A file that requires these is drawn without them.
 WITHOUT = UNSEEN | {
     "KHR_lights_punctual", "KHR_materials_clearcoat", "KHR_materials_sheen", "KHR_materials_transmission",
     "KHR_materials_volume", "KHR_materials_anisotropy", "KHR_materials_iridescence", "KHR_materials_dispersion",
@@ -75,18 +75,18 @@ class GltfScene:
         return corners // 3 if primitive.get("mode", TRIANGLES) <= TRIANGLES else corners
 
     def _instances(self, node: Table) -> int:
-        """How often a node's mesh stands there (EXT_mesh_gpu_instancing)."""
+        """The number of instances of a node's mesh (EXT_mesh_gpu_instancing)."""
         own = node.get("extensions", {}).get(INSTANCES, {}).get("attributes", {})
         return min((self.file.count(index) for name, index in own.items() if name in PLACES), default=1)
 
     def _instanced(self, node: Table, matrix: F64) -> list[F64]:
-        """4x4 scene_from_mesh of each of them."""
+        """4x4 scene_from_mesh of each instance."""
         own = node.get("extensions", {}).get(INSTANCES, {}).get("attributes", {})
         read = {PLACES[name]: self.file.accessor(index) for name, index in own.items() if name in PLACES}
         return [matrix @ _local({name: rows[k] for name, rows in read.items()}) for k in range(self._instances(node))]
 
     def _textures(self) -> Iterator[Table]:
-        """Where materials use those that are drawn; others, of normals and the like, are not looked at."""
+        """The texture references of materials that are drawn: not normal maps and the like."""
         for material in self.file.all("materials"):
             glossy = material.get("extensions", {}).get(GLOSSY, {})
             base = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
@@ -126,7 +126,7 @@ class GltfScene:
         return found
 
     def _joints(self, node: Table, world: dict[int, tuple[Table, F64]]) -> F64:
-        """(j, 4, 4) scene_from_mesh by each of a skin's joints, as its nodes stand (section 3.7.3)."""
+        """(j, 4, 4) scene_from_mesh by each of a skin's joints, with its nodes at rest (section 3.7.3)."""
         skin = self.file.item("skins", node["skin"])
         stand = np.array([world[joint][1] if joint in world else np.eye(4) for joint in skin["joints"]])
         if "inverseBindMatrices" not in skin:
@@ -135,7 +135,10 @@ class GltfScene:
         return np.asarray(stand @ columns[: len(stand)].transpose(0, 2, 1))
 
     def _add(self, primitive: Table, *, weights: list[float], matrices: F64) -> None:
-        """Add what a primitive draws. matrices: 4x4 scene_from_mesh, or one for each joint of its skin."""
+        """Add the triangles, lines or points of a primitive.
+
+        matrices: 4x4 scene_from_mesh, or one for each joint of its skin.
+        """
         file, mode = self.file, primitive.get("mode", TRIANGLES)
         if "POSITION" not in primitive["attributes"]:
             return
@@ -148,7 +151,7 @@ class GltfScene:
         has_normals = "NORMAL" in primitive["attributes"] and mode >= TRIANGLES
         if has_normals or mode < TRIANGLES:
             rows, faces = np.unique(faces, return_inverse=True)  # those of other primitives are left alone
-        else:  # flat: every triangle has corners of its own (section 3.7.2.1)
+        else:  # flat: triangles share no corners (section 3.7.2.1)
             rows, faces = faces.reshape(-1), np.arange(faces.size).reshape(-1, 3)
 
         def attribute(name: str) -> F32 | None:
@@ -213,12 +216,16 @@ class GltfScene:
                 return {}, None
             problem = f"Draco needs `pip install 'phasestack[draco]'`; or {WAY_OUT}"
             raise InputError(self.path, DRACO, problem) from None
-        found = DracoPy.decode(bytes(self.file.view(own["bufferView"])[0]))
-        data = {attribute["unique_id"]: attribute["data"] for attribute in found.attributes}
+        try:
+            data = bytes(self.file.view(own["bufferView"])[0])
+        except InputError as error:
+            raise InputError(self.path, DRACO, error.problem) from None
+        found = DracoPy.decode(data)
+        arrays = {attribute["unique_id"]: attribute["data"] for attribute in found.attributes}
         values = {}
         for name, number in own["attributes"].items():
             accessor = self.file.item("accessors", primitive["attributes"][name])
-            values[name] = fractions(data[number].reshape(len(data[number]), -1), accessor)
+            values[name] = fractions(arrays[number].reshape(len(arrays[number]), -1), accessor)
         return values, np.asarray(found.faces).reshape(-1)
 
     def _look(self, index: int | None) -> tuple[dict[str, Any], Table]:
@@ -257,7 +264,7 @@ class GltfScene:
 
 
 def _problem(error: Exception) -> str:
-    """What is wrong in a file, of what its reading raised."""
+    """The fault of a file, from the error that reading it raised."""
     if isinstance(error, KeyError):
         return f"{untrusted_input.shown(str(error))} is missing"
     if isinstance(error, IndexError):

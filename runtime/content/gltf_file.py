@@ -1,7 +1,7 @@
 """The container of a glTF 2.0 file: its table, buffers, accessors and pictures.
 
-Ours, because what else reads glTF drops what it has no place for (trimesh: samplers, sparse accessors, normalized
-integers), leaves accessors undecoded (pygltflib), or gives out no embedded picture (assimp-py).
+Own code: trimesh drops samplers, sparse accessors and normalized integers, pygltflib does not decode accessors, and
+assimp-py does not return embedded pictures.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from runtime.support.untrusted_input import LIMITS
 
 Table = dict[str, Any]
 Array = NDArray[Any]
-Read = Callable[[str], bytes]  # the file beside it that a URI names
+Read = Callable[[str], bytes]  # a file in its folder, by its URI
 
 ELEMENTS_PER_TRIANGLE = 10  # all accessors together, for the limit on triangles
 LARGEST_TEXTURE_PX = 4096
@@ -65,7 +65,7 @@ class GltfFile:
         return found
 
     def item(self, kind: str, index: int) -> Table:
-        """Raises IndexError for a reference to what is not there, negative ones included."""
+        """Raises IndexError for a missing object, negative indices included."""
         items = self.all(kind)
         return items[range(len(items))[index]]
 
@@ -108,7 +108,7 @@ class GltfFile:
         return np.ndarray((count, *shape), dtype, data, first, (stride, *strides))
 
     def view(self, index: int) -> tuple[memoryview, int]:
-        """A buffer view's bytes, and its stride, 0 where its elements stand side by side."""
+        """A buffer view's bytes, and its stride; 0: its elements are contiguous."""
         view = self.item("bufferViews", index)
         number, first, size = view["buffer"], view.get("byteOffset", 0), view["byteLength"]
         buffer = self._buffer(number)

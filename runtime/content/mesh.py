@@ -40,14 +40,14 @@ class MeshData:
     """A loaded file, in its own coordinates."""
 
     parts: tuple[Part, ...]
-    points: tuple[tuple[F32, F32], ...]  # (n, 3) places and colours, drawn where there are no parts
+    points: tuple[tuple[F32, F32], ...]  # (n, 3) positions and colours, drawn without parts only
     low: F64  # (3,) corner of the box that holds it
     high: F64
     left_out: tuple[str, ...] = ()  # what of it is not drawn
 
     @property
     def facing(self) -> F64:
-        """(3,) the mean normal of its triangles, by area: shorter than 1, and 0 of what is closed."""
+        """(3,) the mean normal of its triangles, by area: length at most 1; 0 if closed."""
         total, area = np.zeros(3), 1e-30
         for part in self.parts:
             for first in range(0, len(part.shape.triangles), AT_ONCE):
@@ -89,12 +89,12 @@ def load_mesh(path: Path) -> MeshData:
         if _is_binary_stl(path, data):
             parts = [_binary_stl(data)]
         elif path.suffix.lower() in GLTF:
-            scene = GltfScene(path, data, beside(path, "uri"))
+            scene = GltfScene(path, data, folder_reader(path, "uri"))
             parts, points, left_out = scene.parts, scene.points, scene.left_out
         else:
             from runtime.content.other_meshes import read_mesh
 
-            parts, points = read_mesh(path, data, beside(path, "texture"))
+            parts, points = read_mesh(path, data, folder_reader(path, "texture"))
     triangles = sum(len(part.shape.triangles) for part in parts)
     untrusted_input.within(triangles, LIMITS.triangles, source=path, field="faces")
     untrusted_input.within(sum(len(place) for place, _ in points), LIMITS.splats, source=path, field="points")
@@ -107,7 +107,7 @@ def load_mesh(path: Path) -> MeshData:
     return MeshData(tuple(parts), tuple(points), low, high, said)
 
 
-def beside(path: Path, field: str) -> Callable[[str], bytes]:
+def folder_reader(path: Path, field: str) -> Callable[[str], bytes]:
     """Reads a file that a mesh names by its URI or path. Raises InputError."""
     held: dict[str, bytes] = {}
 
@@ -121,7 +121,7 @@ def beside(path: Path, field: str) -> Callable[[str], bytes]:
 
 
 def _file_of(uri: str, *, source: Path, field: str) -> Path:
-    """The file beside `source` that a URI names. Raises InputError."""
+    """The file in the folder of `source` that a URI names. Raises InputError."""
     shown = untrusted_input.shown(uri, most=200)
     if "://" in uri or uri.startswith("data:"):
         raise InputError(source, field, f"{shown}: only files beside this one are read")
@@ -158,7 +158,7 @@ def _has_area(shape: Shape) -> bool:
 
 
 def _check_counts(path: Path, data: bytes) -> None:
-    """What a file promises, before its loader takes memory for it. Raises InputError."""
+    """Compare the counts that a file states with the limits, before its loader allocates. Raises InputError."""
     suffix, promised = path.suffix.lower(), 0
     if suffix == ".ply":
         read_header(path)

@@ -32,11 +32,11 @@ LARGEST_TEXTURE_PX = 4096
 # Before a texture's name in an MTL: `-s 1 1 1`, `-blendu off`, `-imfchan r`.
 OPTIONS = re.compile(r"(?:-[a-zA-Z]+(?:\s+(?:on|off|[rgbmlz]|[-+.\d]+(?:[eE][-+]?\d+)?))*\s+)+")
 DRIVE = re.compile(r"[A-Za-z]:.*/")  # a path of somebody else's Windows: the name alone is looked for
-Read = Callable[[str], bytes]  # the file beside it that a name stands for
+Read = Callable[[str], bytes]  # a file in its folder, by its name in the mesh
 
 
-class Beside(trimesh.resolvers.FilePathResolver):
-    """Reads files beside the mesh, and keeps the reason of a refusal, which loaders would skip."""
+class FolderResolver(trimesh.resolvers.FilePathResolver):
+    """Reads files in the mesh's folder, and keeps the reason of a refusal, which loaders would skip."""
 
     def __init__(self, path: Path, read: Read, *, has_materials: bool) -> None:
         super().__init__(str(path))
@@ -66,7 +66,7 @@ class Beside(trimesh.resolvers.FilePathResolver):
         return data
 
     def _named(self, name: str) -> str | None:
-        """The name that a file beside has: without options, Windows' strokes, and in its own letters' case."""
+        """The name of the file in the folder: without options and backslashes, in its own letter case."""
         name = DRIVE.sub("", OPTIONS.sub("", name, count=1).strip().replace("\\", "/"))
         untrusted_input.checked_path(name, source=self._path, field="texture")
         if Path(name).is_absolute() or (self._path.parent / name).exists():
@@ -79,18 +79,20 @@ class Beside(trimesh.resolvers.FilePathResolver):
 
 
 def read_mesh(path: Path, data: bytes, read: Read) -> tuple[list[Part], list[tuple[F32, F32]]]:
-    """Parts, and points (n, 3) with their colours where there are no faces. Raises InputError."""
+    """The file's parts, or points (n, 3) with their colours if it has no faces. Raises InputError."""
     kind = path.suffix.lower().removeprefix(".")
     progress.tell(f"{path.name}: triangles", 0)
     mark = {"obj": b"mtllib", "ply": b"TextureFile"}.get(kind, b"")
-    resolver = Beside(path, read, has_materials=mark in data.replace(b"\0", b"") if data[:2] in BOMS else mark in data)
+    resolver = FolderResolver(
+        path, read, has_materials=mark in data.replace(b"\0", b"") if data[:2] in BOMS else mark in data
+    )
     file = io.StringIO(_text(data)) if kind == "obj" else io.BytesIO(data)
     try:
         scene = trimesh.load_scene(file, file_type=kind, resolver=resolver, process=False)
         found = [(scene.geometry[name], matrix) for matrix, name in map(scene.graph.get, scene.graph.nodes_geometry)]
         has_faces = any(len(getattr(mesh, "faces", ())) for mesh, _ in found)
         wires = _wires(file) if isinstance(file, io.StringIO) and not has_faces else None
-    except Exception as error:  # loaders raise whatever their parsers do
+    except Exception as error:  # loaders raise any error of their parsers
         if resolver.refused is not None:
             raise resolver.refused from None
         why = (
@@ -105,14 +107,14 @@ def read_mesh(path: Path, data: bytes, read: Read) -> tuple[list[Part], list[tup
         if not len(getattr(mesh, "faces", ())):
             points += _points(mesh)
             continue
-        if mesh.visual.kind == "texture" and not resolver.has_materials:  # the loader's own grey is left out
+        if mesh.visual.kind == "texture" and not resolver.has_materials:  # without the loader's own grey
             mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=mesh.visual.vertex_attributes.get("color"))
         parts.append(_part(mesh, matrix, path, pictures))
     return parts, points if wires is None else [dotted(wires, np.full_like(wires, np.nan))]
 
 
 def _text(data: bytes) -> str:
-    """Of an OBJ only names and comments can be other than ASCII, and exporters differ in how they write them."""
+    """The text of an OBJ. Only names and comments can be non-ASCII, and exporters encode them differently."""
     return data.decode("utf-16" if data[:2] in BOMS else "utf-8", errors="replace")
 
 
@@ -145,7 +147,7 @@ def _points(cloud: Any) -> list[tuple[F32, F32]]:
 
 
 def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8]) -> Part:
-    """Of a trimesh: its material, and colours of its faces or vertices; grey where it has none of them."""
+    """A trimesh as a part: its material, or the colours of its faces or vertices; grey without any."""
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(path, "faces", "are no triangles of vertices that are there")
@@ -187,7 +189,7 @@ def _unit(colours: Any) -> F32:
 def _material(material: Any, pictures: dict[int, U8]) -> tuple[U8 | None, Colour, float]:
     """Texture (RGBA), the colour that multiplies it, and the opacity, of a trimesh material.
 
-    A black colour with a texture is taken for white: some exporters write it for the texture alone.
+    A black colour with a texture counts as white: some exporters write it for the texture alone.
     """
     image, diffuse = getattr(material, "image", None), getattr(material, "diffuse", None)
     red, green, blue = _unit(np.ones(3) if diffuse is None else diffuse)[:3].tolist()
@@ -202,7 +204,7 @@ def _material(material: Any, pictures: dict[int, U8]) -> tuple[U8 | None, Colour
 
 
 def _opacity(fields: dict[str, Any]) -> float:
-    """Of an MTL: `d`, or 1 less `tr`; opaque where that is no number, or nothing would be left to see."""
+    """The opacity in an MTL: `d`, or 1 - `Tr`; 1 if that is not a number, or nothing could be seen."""
     for name, sign, start in (("d", 1.0, 0.0), ("tr", -1.0, 1.0)):
         try:
             value = start + sign * float(fields[name][-1])

@@ -65,7 +65,7 @@ def load_compressed(header: PlyHeader) -> Gaussians:
 
 @np.errstate(all="ignore")
 def load_splat(path: Path) -> Gaussians:
-    """Read a .splat: place, deviations, RGBA and turn. Raises InputError: of another length, over a limit."""
+    """Read a .splat: position, scale, RGBA, rotation. Raises InputError: wrong length, over a limit."""
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
     if not data or len(data) % SPLAT.itemsize:
         problem = f"is cut off, or no .splat: it has {len(data)} bytes, no multiple of {SPLAT.itemsize}"
@@ -84,7 +84,7 @@ def load_splat(path: Path) -> Gaussians:
 
 
 def _parts(packed: U32, bits: tuple[int, ...]) -> F32:
-    """(n, len(bits)) fractions of the largest number of so many bits, the first in the highest ones."""
+    """(n, len(bits)) fields of a word as fractions of their largest value, the first in the highest bits."""
     parts = []
     for width in reversed(bits):
         most = (1 << width) - 1

@@ -1,4 +1,4 @@
-"""What is drawn as triangles: shapes and their look, and parts that look alike made one."""
+"""Parts: triangles with one material; merging of parts with equal materials."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from runtime.records import F32, U8
 
 BLACK: Colour = (0.0, 0.0, 0.0)
 UNCOLOURED: Colour = (0.70, 0.74, 0.80)  # of a file without colours
-OPAQUE_FROM = 0.99  # alpha: what covers more hides what is behind it
+OPAQUE_FROM = 0.99  # alpha from which a pixel counts as opaque
 OUTLINED_MAX = 200_000  # triangles of a part; beyond, finding its outline costs more than drawing it
 Wrap = Literal["repeat", "clamp", "mirror"]
 
 
 @dataclass(frozen=True, slots=True)
 class Sampler:
-    """How a picture goes on beyond its edges (across and down), and whether its pixels stay square."""
+    """A texture's wrap modes (across and down), and whether it is magnified without interpolation."""
 
     wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
     nearest: bool = False
@@ -42,9 +42,9 @@ class Part:
     sampler: Sampler = Sampler()
     opacity: float = 1.0
     alpha: Literal["opaque", "mask", "blend"] = "mask"
-    cutoff: float = 0.5  # of a mask: where alpha is less nothing is drawn
-    two_sided: bool = True  # else what is translucent shows its front alone
-    is_linear: bool = False  # colours (not pictures) are linear light, and it is what is multiplied and added
+    cutoff: float = 0.5  # of a mask: pixels with less alpha are discarded
+    two_sided: bool = True  # else back faces of a translucent part are culled
+    is_linear: bool = False  # colours (not pictures) are linear light; products and sums are of linear light
     glow: Colour = BLACK  # its own light, linear, multiplied by its picture
     glow_picture: U8 | None = None
 
@@ -73,15 +73,15 @@ class Part:
 
 
 def coded(light: ArrayLike) -> F32:
-    """Codes of 0-1, as sRGB has them, of linear light."""
+    """sRGB codes in 0-1 of linear light in 0-1."""
     linear = np.clip(np.asarray(light, np.float32), 0.0, 1.0)
     return np.where(linear <= 0.0031308, linear * np.float32(12.92), 1.055 * linear ** np.float32(1 / 2.4) - 0.055)
 
 
 def merged(parts: Sequence[Part]) -> list[Part]:
-    """The same triangles in fewer parts: one for each look, as long as its outlines can be drawn.
+    """The triangles in fewer parts: one for each material, up to the size whose outlines are drawn.
 
-    A part's colour does not tell it apart: its vertices take it.
+    Colours do not separate parts: they become vertex colours.
     """
     alike: dict[tuple[object, ...], list[list[Part]]] = {}
     for part in parts:

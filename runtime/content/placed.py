@@ -90,6 +90,6 @@ class PlacedSource(ForwardingSource):
 
 def _moved(info: ContentInfo, placing: Placing) -> ContentInfo:
     still = not placing.turntable_per_min
-    # Where its planes stay parallel to the panels, and the middle one's is kept.
+    # Only if its plane stays in the middle panel's.
     is_flat = still and placing.rotation_deg[1:] == (0.0, 0.0) and placing.offset_m[0] == 0.0
     return replace(info, moving=info.moving or not still, flat_x_m=info.flat_x_m if is_flat else None)

@@ -17,9 +17,9 @@ log = logging.getLogger("phasestack.content")
 
 FILL = 0.75  # of the display's width and height that a fitted scene takes: its front is seen larger
 DEEPER = 2.0  # times `depth_m`, that a fitted scene may be
-BACK = 0.5  # of a flat surface, as the mean normal has it: what looks away by more is turned around
-FLAT = 0.1  # what is thinner than this share of its other sides is shown from its flat side
-STANDS = 0.2  # of its height: what stands so much higher above 0 along one axis than along another has that one up
+BACK = 0.5  # component of a flat mesh's mean normal away from the viewer that turns it around
+FLAT = 0.1  # a mesh thinner than this fraction of its other sides faces the viewer
+STANDS = 0.2  # of its height: a range that begins higher by this fraction along one axis makes that axis up
 GLTF = (".glb", ".gltf")
 CUSTOMS = {".glb": ("+y", "+z"), ".gltf": ("+y", "+z"), ".obj": ("+y", "+z"), ".stl": ("+z", "-y")}  # up, and forwards
 DARK = (0.12, 0.12, 0.12)  # behind all but the built-in scenes: ghosts are seen on it, brighter and darker ones
@@ -27,7 +27,7 @@ DARK = (0.12, 0.12, 0.12)  # behind all but the built-in scenes: ghosts are seen
 
 @dataclass(frozen=True, slots=True)
 class SceneFile:
-    """What a source is made of."""
+    """A file, the settings that it is shown with, and the display."""
 
     path: Path
     settings: ContentSettings
@@ -43,7 +43,7 @@ class SceneFile:
         """4x4 stack_from_scene of what has these corners: the preset's, else fitted, else its own metres.
 
         custom: its format's axes up and to the viewer; None: by its name. facing: (3,) the mean normal of its surface,
-        by area, of what is turned to the viewer where it is flat.
+        by area; a flat mesh is then turned to the viewer.
         """
         if self.preset:
             return stack_from_preset(self.preset)
@@ -71,18 +71,18 @@ class SceneFile:
 def guessed_axes(low: F64, high: F64) -> tuple[str, str]:
     """The up axis and the one towards the viewer, guessed from an extent: +y and +z, or +z and -y.
 
-    The axis is up along which it stands on 0 or above, and not around it; else the longer one.
+    The up axis is the one whose range begins near 0 or above; if both or neither do, the longer one.
     """
     size = np.maximum(high - low, 1e-30)
-    y, z = np.maximum(low / size + 0.5, 0.0)[1:]  # 0: around the origin; a half: stands on it
+    y, z = np.maximum(low / size + 0.5, 0.0)[1:]  # 0: centred on the origin; 0.5: begins there
     z_is_up = z > y if abs(z - y) > STANDS else size[2] > size[1]
     return ("+z", "-y") if z_is_up else ("+y", "+z")
 
 
 def turned_to_viewer(up: str, out: str, *, size: F64, facing: F64) -> tuple[str, str]:
-    """The same axes; of what is flat those by which its flat side, or its front, faces the viewer.
+    """The axes up and to the viewer, changed for a flat mesh so that its front faces the viewer.
 
-    size: (3,) of the box that holds it. What lies is seen from above, with its near edge below.
+    size: (3,) of its bounding box. A mesh flat along the up axis is seen from above, its near edge at the bottom.
     """
     thinnest = int(size.argmin())
     axis = "xyz"[thinnest]
@@ -103,7 +103,7 @@ def _opposite(axis: str) -> str:
 def fitted(low: F64, high: F64, *, axes: F64, stack: PanelStack, depth_m: tuple[float, float]) -> F64:
     """4x4 stack_from_scene that centres a box and scales it to the display's size and depth.
 
-    What is deeper than `depth_m` (rear, front) begins at its front and reaches behind its rear, where most is hidden.
+    A scene deeper than `depth_m` (rear, front) begins at the front and extends past the rear, where most is hidden.
     low, high: (3,) corners in the scene's coordinates; axes: 3x3 scene_from_stack rotation.
     """
     size = np.abs(axes.T @ (high - low))

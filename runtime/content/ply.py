@@ -47,7 +47,7 @@ class PlyHeader:
 
     @property
     def is_packed(self) -> bool:
-        """Whether its splats are in SuperSplat's compressed form."""
+        """True if its splats are in SuperSplat's compressed form."""
         return PACKED in {name for name, _ in self.properties["vertex"]}
 
 

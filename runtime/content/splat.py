@@ -20,7 +20,7 @@ from runtime.records import F64
 from runtime.support.gl import DrawnPicture
 
 OVER = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA)
-CUSTOM = ("-y", "-z")  # up, and to the viewer, where cameras are as OpenCV has them: the usual trainers' axes
+CUSTOM = ("-y", "-z")  # up, and to the viewer: trainers use OpenCV's camera axes
 FLOATS = 8  # a corner: place in clip space (2), place in standard deviations (2), colour and opacity (4)
 VERTEX = """
 #version 330

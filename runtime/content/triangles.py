@@ -1,6 +1,6 @@
 """Triangles with colours, pictures and one lamp, drawn straight into the pixels that a view asks for.
 
-A part pays only for what it has: without lamp, picture, vertex colours or holes its shader has none of them.
+A part without lamp, picture, vertex colours or holes has a shader without them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from runtime.records import F32, F64, U8
 from runtime.support.background import raise_if_abandoned
 from runtime.support.gl import DrawnPicture
 
-PROJECTED_MAX = 5000  # vertices of a part that are projected to see where it lies; beyond, its box is
+PROJECTED_MAX = 5000  # vertices of a part that are projected to find its extent; beyond, its box is
 DRAWN_AT_ONCE = 20_000  # triangles
 UPLOADED_AT_ONCE = 8 << 20  # bytes
 OUTLINE_BYTES = 6 * (5 + 9) * 4  # two triangles an edge: clip coordinates and coverage, then the attributes
@@ -161,7 +161,7 @@ class DrawnPart:
         """Make its GL objects; programs and textures are the source's, and shared."""
         self.surface_program, self.outline_program, self.textures = surface_program, outline_program, textures
         self._buffer, self._triangles = (_uploaded(context, array) for array in (self.vertices, self.triangles))
-        if self.edges is None and not self.is_projected:  # hundreds of MiB that nobody looks at any more
+        if self.edges is None and not self.is_projected:  # hundreds of MiB that are no longer read
             self.vertices, self.triangles = self.vertices[:0].copy(), self.triangles[:0].copy()
         names = ("in_normal", "in_uv", "in_colour")
         layout = _layout(surface_program, self._buffer, ("in_position", *names), (3, 3, 2, 4))
@@ -184,13 +184,13 @@ class DrawnPart:
         self._outline.render(vertices=len(packed))
 
     def release(self) -> None:
-        """Its GL objects, but for what is shared; a vertex array does not release its buffers."""
+        """Release its GL objects, except shared ones; a vertex array does not release its buffers."""
         for held in (self.surface, self._buffer, self._triangles, self._outline, self._outline_buffer):
             held.release()
 
 
 class _Look:
-    """The matrices of a place in a view: worked out once for all parts that stand there."""
+    """The matrices of a place in a view: computed once for all parts at that place."""
 
     def __init__(self, clip_from_part: F64, stack_from_part: F64, view: View) -> None:
         linear = stack_from_part[:3, :3]
@@ -203,7 +203,7 @@ class _Look:
         self._normals = _gl(np.linalg.pinv(linear).T * np.cbrt(abs(np.linalg.det(linear))))
 
     def set(self, program: Any, part: DrawnPart) -> None:
-        """Give a program what it needs for a part."""
+        """Set a program's uniforms and textures for a part."""
         for name, matrix in (("stack_from_part", self._normals), ("clip_from_part", self._clip)):
             if name in program:
                 program[name].write(matrix)
@@ -241,7 +241,7 @@ class TriangleSource(CanvasSource):
         self.held += [*self.parts, *self._textures.values(), *self._programs.values()]
 
     def places(self, time_ns: int) -> Sequence[F64]:
-        """4x4 stack_from_part of every part, which what moves works out anew."""
+        """4x4 stack_from_part of every part; moving scenes compute it for each time."""
         return self.stack_from_parts
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect:
@@ -267,7 +267,7 @@ class TriangleSource(CanvasSource):
         corners = self._around(places)[1]
         placed = list(zip(self.parts, places, strict=True))
         area = camera.covered_box(view, corners.reshape(-1, 3))
-        # Nearest first: what they hide need not be shaded.
+        # Nearest first: hidden pixels need not be shaded.
         placed = [placed[index] for index in np.argsort(-corners[..., 0].mean(1), kind="stable")]
 
         def paint() -> None:
@@ -287,7 +287,7 @@ class TriangleSource(CanvasSource):
         return self.drawn(view, area, paint)
 
     def _draw_translucent(self, placed: list[tuple[DrawnPart, F64]], looks: dict[int, _Look]) -> None:
-        """Over what is opaque: the farthest part first, and of each what is turned away first."""
+        """Blend translucent parts over the opaque ones: farthest part first, back faces before front faces."""
         context, framebuffer = self.context, self.context.fbo
         context.enable_only(context.DEPTH_TEST | context.BLEND | context.CULL_FACE)
         context.blend_func = OVER
@@ -364,7 +364,7 @@ def _gl(matrix: F64) -> F32:
 
 
 def _layout(program: Any, buffer: Any, names: tuple[str, ...], sizes: tuple[int, ...]) -> tuple[Any, ...]:
-    """A buffer's description for a program; what the compiler left out is skipped."""
+    """A buffer's description for a program, without attributes that the compiler removed."""
     used = [name for name in names if name in program]
     formats = [f"{size}f" if name in used else f"{size * 4}x" for name, size in zip(names, sizes, strict=True)]
     return (buffer, " ".join(formats), *used)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -442,9 +443,14 @@ def compressed(path: Path, *, required: bool, fallback: bool) -> Path:
 
 
 def test_draco_is_decoded(tmp_path: Path, context: Any, stack: PanelStack) -> None:
-    data = load_mesh(compressed(tmp_path / "a.gltf", required=True, fallback=False))
+    path = compressed(tmp_path / "a.gltf", required=True, fallback=False)
+    data = load_mesh(path)
     assert len(data.parts[0].shape.triangles) == 2 and data.left_out == ()
     assert data.low == pytest.approx([-1, -1, 0], abs=1e-3) and data.high == pytest.approx([1, 1, 0], abs=1e-3)
+    table = json.loads(path.read_text())
+    path.write_text(json.dumps(table | {"buffers": [{"uri": "0.bin", "byteLength": 9}]}))
+    with pytest.raises(InputError, match="KHR_draco_mesh_compression: 0.bin is not there"):
+        load_mesh(path)
 
 
 def test_without_its_decoder_draco_is_named_unless_there_is_another_form(

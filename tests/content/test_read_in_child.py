@@ -62,7 +62,7 @@ def written_as(kind: str, folder: Path, context: Any, stack: PanelStack) -> Path
 
 
 @pytest.mark.parametrize(
-    "kind", ["glb", "gltf", "obj", "ply", "stl", "splats", "tif", "depth", "mp4", "a folder", "pairs"]
+    "kind", ["glb", "gltf", "obj", "off", "ply", "stl", "splats", "tif", "depth", "mp4", "a folder", "pairs"]
 )
 def test_what_was_read_there_is_drawn_as_what_is_read_here(
     kind: str, tmp_path: Path, context: Any, stack: PanelStack, monkeypatch: pytest.MonkeyPatch
