@@ -449,7 +449,7 @@ def test_draco_is_decoded(tmp_path: Path, context: Any, stack: PanelStack) -> No
     assert data.low == pytest.approx([-1, -1, 0], abs=1e-3) and data.high == pytest.approx([1, 1, 0], abs=1e-3)
     table = json.loads(path.read_text())
     path.write_text(json.dumps(table | {"buffers": [{"uri": "0.bin", "byteLength": 9}]}))
-    with pytest.raises(InputError, match="KHR_draco_mesh_compression: 0.bin is not there"):
+    with pytest.raises(InputError, match=r"KHR_draco_mesh_compression: 0\.bin is not there"):
         load_mesh(path)
 
 
