@@ -20,8 +20,10 @@ from runtime.config import Settings, with_options
 from runtime.daemon import supervise
 from runtime.daemon.build import RunOptions
 from runtime.daemon.drive import drive
+from runtime.evaluation.run_output import RunOutput
 from runtime.eyes.calibration import demo_sensor_from_stack
 from runtime.eyes.motions import true_eyes
+from runtime.panels.registry import OffscreenPanels
 from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.recording import Recording, recording_to
 from runtime.sensor.recording_format import RecordingHeader
@@ -275,3 +277,14 @@ def test_the_demo_recording_begins_anew_unless_it_is_told_how_long(
         app(["run", "--replay", "demo", "--headless", *more], standalone_mode=False)
     app(["run", "--replay", str(demo_recording_path()), "--headless"], standalone_mode=False)
     assert [settings.sensor.loop for settings in told] == [True, False, False, False, False]
+
+
+def test_the_panels_are_dark_before_what_a_run_leaves_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    order: list[str] = []
+    finish = RunOutput.finish
+    monkeypatch.setattr(OffscreenPanels, "close", lambda panels: order.append("dark"))
+    monkeypatch.setattr(RunOutput, "finish", lambda *given, **how: (order.append("written"), finish(*given, **how)))
+    played(tmp_path / "out", "demo", frames=4)
+    assert order[:2] == ["dark", "written"] and (tmp_path / "out" / "summary.json").is_file()
