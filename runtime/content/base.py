@@ -34,6 +34,7 @@ class View:
     pixels_from_stack: F64  # (3, 4) projection; third coordinate: positive before the eye, metres
     width_px: int
     height_px: int
+    reduction: int = 1  # of the display's rows and columns on this raster: outlines keep the width they have there
     display_from_view: F64 | None = None  # 3x3 turn out of a frame that was placed: the lamp is fixed to the display
 
 

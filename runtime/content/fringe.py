@@ -13,8 +13,6 @@ import numpy as np
 from runtime.content.shapes import I32, Shape
 from runtime.records import F32, F64
 
-RAMP_PX = 1.0
-
 
 @dataclass(frozen=True, slots=True)
 class Edges:
@@ -70,8 +68,8 @@ def silhouette(edges: Edges, eye: F64) -> tuple[I32, I32]:
     return edges.ends[chosen, which], edges.apex[chosen, which]
 
 
-def ramps(clip: F64, ends: I32, apex: I32, *, width_px: int, height_px: int) -> tuple[F32, I32]:
-    """Two triangles along each outline edge: coverage 1 at the edge, 0 one pixel outside.
+def ramps(clip: F64, ends: I32, apex: I32, *, width_px: int, height_px: int, ramp_px: float = 1.0) -> tuple[F32, I32]:
+    """Two triangles along each outline edge: coverage 1 at the edge, 0 so many pixels outside.
 
     clip: (v, 4) clip coordinates of the shape's vertices.
     Returns (k, 6, 5) clip coordinates and coverage, and (k, 6) the vertex whose colour each corner has, of the edges
@@ -89,7 +87,7 @@ def ramps(clip: F64, ends: I32, apex: I32, *, width_px: int, height_px: int) -> 
     along = along[long_enough] / length[long_enough, None]
     outward = np.column_stack([-along[:, 1], along[:, 0]])
     inside = ((pixels[:, 2] - pixels[:, 0]) * outward).sum(1)
-    outward *= np.where(inside > 0, -RAMP_PX, RAMP_PX)[:, None]
+    outward *= np.where(inside > 0, -ramp_px, ramp_px)[:, None]
     corners = np.repeat(points[:, :2], 2, axis=1)
     coverage = np.tile([1.0, 0.0, 1.0, 0.0], (len(points), 1))
     corners[:, 1::2, :2] += (outward / scale)[:, None] * corners[:, 1::2, 3:]

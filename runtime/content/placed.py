@@ -76,7 +76,11 @@ class PlacedSource(ForwardingSource):
         eye = turn.T @ (view.eye_m - matrix[:3, 3]) / self.placing.scale
         lit = turn if view.display_from_view is None else view.display_from_view @ turn
         pixels_from_scene = view.pixels_from_stack @ matrix
-        return self.source, View(eye, view.side, pixels_from_scene, view.width_px, view.height_px, lit), time_ns
+        return (
+            self.source,
+            View(eye, view.side, pixels_from_scene, view.width_px, view.height_px, view.reduction, lit),
+            time_ns,
+        )
 
     def revision(self, *, time_ns: int) -> int:
         return time_ns if self.placing.turntable_per_min else self.source.revision(time_ns=time_ns)

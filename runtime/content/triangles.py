@@ -318,7 +318,7 @@ class TriangleSource(CanvasSource):
             texture = self.context.texture((width, height), 4, np.ascontiguousarray(picture).tobytes())
             texture.build_mipmaps()
             enlarged = self.context.NEAREST if sampler.nearest else self.context.LINEAR
-            texture.filter = (self.context.LINEAR_MIPMAP_NEAREST, enlarged)
+            texture.filter = (self.context.LINEAR_MIPMAP_LINEAR, enlarged)
             texture.repeat_x, texture.repeat_y = (wrap == "repeat" for wrap in sampler.wrap)
             self._textures[key] = texture
         return self._textures[key]
@@ -334,7 +334,8 @@ class TriangleSource(CanvasSource):
                 continue
             ends, apex = silhouette(part.edges, look.eye)
             clip = part.positions @ look.clip_from_part[:, :3].T + look.clip_from_part[:, 3]
-            corners, vertices = ramps(clip, ends, apex, width_px=view.width_px, height_px=view.height_px)
+            size = {"width_px": view.width_px, "height_px": view.height_px}
+            corners, vertices = ramps(clip, ends, apex, **size, ramp_px=1 / view.reduction)
             if len(corners):
                 look.set(part.outline_program, part)
                 _set_uniforms(part.outline_program, kept=(part.cutoff, ANY_ALPHA))

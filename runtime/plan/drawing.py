@@ -18,10 +18,10 @@ from runtime.records import F64, U8
 from runtime.support.gl import DrawnPicture
 
 
-def raster_views(eyes_m: F64, raster: PlaneRaster) -> tuple[View, View]:
-    """Left and right eye's views of one raster; eyes (2, 3), frame `stack`."""
+def raster_views(eyes_m: F64, raster: PlaneRaster, *, reduction: int = 1) -> tuple[View, View]:
+    """Left and right eye's views of one raster, of a reduction of the panels'; eyes (2, 3), frame `stack`."""
     left, right = (
-        View(eye, side, raster_from_stack(eye, raster), raster.width_px, raster.height_px)
+        View(eye, side, raster_from_stack(eye, raster), raster.width_px, raster.height_px, reduction)
         for side, eye in enumerate(eyes_m)
     )
     return left, right
@@ -70,7 +70,7 @@ def drawn_job(
             window = extent_window(extent, colour, eyes_m, stack, before)
     if window is not None:
         raster = window.box.cut(raster)
-    views = raster_views(eyes_m, raster)
+    views = raster_views(eyes_m, raster, reduction=reduction)
     content.expect(views, time_ns=time_ns)
     pictures = [_picture(predictor, content, view, time_ns=time_ns) for view in views]
     job = Job(Targets(stack, eyes_m, drawn_views(pictures, stack, window)), window=window)
