@@ -77,6 +77,7 @@ class Client:
             f"ws://{parts.netloc}/live", additional_headers=given, max_size=None, compression=None
         )
         self.layers: dict[str, bytes] = {}
+        self.sizes: dict[str, list[int]] = {}  # columns and rows; a solution may be coarser than the panels
         self.refresh: dict[str, Any] = {}
         self.stack: dict[str, Any] = {}
 
@@ -91,6 +92,7 @@ class Client:
         message = json.loads(self.socket.recv(30))
         if "layers" in message:
             self.layers[message["layers"]] = self.socket.recv(30)
+            self.sizes[message["layers"]] = message["size"]
             self.socket.send(json.dumps({"drawn": True}))
         self.stack = message.get("stack", self.stack)
         self.refresh = message.get("refresh", self.refresh)
@@ -121,7 +123,10 @@ def test_eyes_go_in_and_layers_come_out_solved_for_them(url: str) -> None:
     with Client(url) as client:
         client.say(eyes=eyes, page_ms=1.0)
         assert client.until(lambda c: "solved" in c.layers and c.refresh["state"] == "tracking")
-        assert len(client.layers["solved"]) == 3 * 180 * 320 * 4 and client.stack["width_px"] == 320
+        width, height = client.sizes["solved"]
+        assert len(client.layers["solved"]) == 3 * width * height * 4 and client.stack["width_px"] == 320
+        assert (width, height) in ((320, 180), (160, 90), (107, 60), (80, 45))
+        assert client.sizes["flat"] == [320, 180]
         assert client.until(
             lambda c: c.refresh["eyes_m"] and np.abs(np.subtract(c.refresh["eyes_m"], eyes)).max() < 1e-3
         )

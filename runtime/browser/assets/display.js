@@ -136,6 +136,12 @@ void main() {
   colour = vec4(code, 1.0);
 }`;
 
+// One layer of a coarse solution, enlarged to the panel's pixels.
+const ENLARGE = `#version 300 es
+precision highp float; precision highp sampler2DArray;
+uniform sampler2DArray layers; uniform int panel; uniform vec2 size; out vec4 colour;
+void main() { colour = texture(layers, vec3(gl_FragCoord.xy / size, panel)); }`;
+
 // What an eye sees: sin² of the summed phases along each ray, averaged over the pixel. Panels' pixels are even boxes. With
 // `rays` a grid of rays; without, exactly: the pixel is cut at every edge of every panel's pixels in it.
 const SEE = `#version 300 es
@@ -244,19 +250,22 @@ export class Display {
     const { width_px: width, height_px: height, x_m } = stack;
     if (Math.max(width, height) > g.getParameter(g.MAX_TEXTURE_SIZE)) throw new Error("the panels have more pixels than this browser's textures");
     this.programs = {};
-    for (const [name, vertex, fragment] of [["show", VERTEX, SHOW], ["see", VERTEX, SEE], ["card", CARD_VERTEX, CARD]])
+    for (const [name, vertex, fragment] of [["show", VERTEX, SHOW], ["enlarge", VERTEX, ENLARGE], ["see", VERTEX, SEE], ["card", CARD_VERTEX, CARD]])
       this.programs[name] = this.#program(vertex, fragment.replace("@PANELS@", x_m.length));
     this.textures = {};
-    for (const name of ["solved", "flat", "shown"]) {
-      const texture = (this.textures[name] = g.createTexture());
-      g.bindTexture(g.TEXTURE_2D_ARRAY, texture);
-      g.texStorage3D(g.TEXTURE_2D_ARRAY, 1, g.RGBA8, width, height, x_m.length);
-      for (const wrap of [g.TEXTURE_WRAP_S, g.TEXTURE_WRAP_T]) g.texParameteri(g.TEXTURE_2D_ARRAY, wrap, g.CLAMP_TO_EDGE);
-      for (const filter of [g.TEXTURE_MIN_FILTER, g.TEXTURE_MAG_FILTER]) g.texParameteri(g.TEXTURE_2D_ARRAY, filter, g.LINEAR);
-    }
+    for (const name of ["solved", "flat", "shown"]) this.textures[name] = this.#layers(width, height);
     this.targets = [null, null];
     this.framebuffer = g.createFramebuffer();
     this.maps = null; // of what `shown` holds; null: nothing yet
+  }
+
+  #layers(width, height) {
+    const g = this.g, texture = g.createTexture();
+    g.bindTexture(g.TEXTURE_2D_ARRAY, texture);
+    g.texStorage3D(g.TEXTURE_2D_ARRAY, 1, g.RGBA8, width, height, this.stack.x_m.length);
+    for (const wrap of [g.TEXTURE_WRAP_S, g.TEXTURE_WRAP_T]) g.texParameteri(g.TEXTURE_2D_ARRAY, wrap, g.CLAMP_TO_EDGE);
+    for (const filter of [g.TEXTURE_MIN_FILTER, g.TEXTURE_MAG_FILTER]) g.texParameteri(g.TEXTURE_2D_ARRAY, filter, g.LINEAR);
+    return texture;
   }
 
   #program(vertex, fragment) {
@@ -286,15 +295,30 @@ export class Display {
     return places;
   }
 
-  // `solved` or `flat`: all layers after each other as RGBA bytes, or a picture for each panel.
-  load(name, layers) {
-    const g = this.g, { width_px: w, height_px: h, x_m } = this.stack;
+  // `solved` or `flat`: all layers after each other as RGBA bytes, or a picture for each panel; of a coarse solution, of its size.
+  load(name, layers, [w, h] = [this.stack.width_px, this.stack.height_px]) {
+    const g = this.g, { width_px: width, height_px: height, x_m } = this.stack, coarse = w !== width || h !== height, key = `${w}x${h}`;
     g.activeTexture(g.TEXTURE0);
-    g.bindTexture(g.TEXTURE_2D_ARRAY, this.textures[name]);
+    if (coarse) this.textures[key] ??= this.#layers(w, h);
+    g.bindTexture(g.TEXTURE_2D_ARRAY, this.textures[coarse ? key : name]);
     g.pixelStorei(g.UNPACK_COLORSPACE_CONVERSION_WEBGL, g.NONE);
     if (layers instanceof Uint8Array) g.texSubImage3D(g.TEXTURE_2D_ARRAY, 0, 0, 0, 0, w, h, x_m.length, g.RGBA, g.UNSIGNED_BYTE, layers);
     else layers.forEach((image, n) => g.texSubImage3D(g.TEXTURE_2D_ARRAY, 0, 0, 0, n, w, h, 1, g.RGBA, g.UNSIGNED_BYTE, image));
+    if (coarse) this.#enlarge(key, name);
     this.maps = null;
+  }
+
+  #enlarge(from, to) {
+    const g = this.g, { width_px: w, height_px: h, x_m } = this.stack, places = this.#use("enlarge", from);
+    g.bindFramebuffer(g.FRAMEBUFFER, this.framebuffer);
+    g.viewport(0, 0, w, h);
+    g.uniform2f(places.size, w, h);
+    x_m.forEach((_, n) => {
+      g.framebufferTextureLayer(g.FRAMEBUFFER, g.COLOR_ATTACHMENT0, this.textures[to], 0, n);
+      g.uniform1i(places.panel, n);
+      g.drawArrays(g.TRIANGLES, 0, 3);
+    });
+    g.bindFramebuffer(g.FRAMEBUFFER, null);
   }
 
   // What an eye should see; null: that is not known.

@@ -176,8 +176,8 @@ function explained({ state, reason }) {
 }
 
 function load(bytes) {
-  const { layers: kind, solved_for_m, target } = pending, { width_px, height_px, x_m } = look.stack, size = 4 * width_px * height_px * x_m.length;
-  look.display.load(kind, new Uint8Array(bytes, 0, size));
+  const { layers: kind, solved_for_m, target, size: [w, h] } = pending, size = 4 * w * h * look.stack.x_m.length;
+  look.display.load(kind, new Uint8Array(bytes, 0, size), [w, h]);
   if (target) {
     const [width, height] = target, length = 4 * width * height;
     look.scene.picture = { width, height };
@@ -243,6 +243,8 @@ function figures(now, asked_ms) {
     "this page draws": drawn.length > 1 && `${drawn.length} pictures a second`,
     "the panels are given": now.fps_now > 0 && `${number(now.fps_now)} refreshes a second`,
     "the solver makes": solves ? `${number(now.solutions_per_s_now)} solutions a second (${now.model})` : now.paused ? "nothing: it is held" : rests && "nothing new while the head rests",
+    "it works at": solves && now.effort && `${now.effort} (raster and steps)`,
+    "the view was drawn for a head": solves && typeof now.view_error_estimated_now_mm === "number" && `${number(now.view_error_estimated_now_mm)} mm from yours`,
     "the newest is": solves && `${number(now.solution_age_now_ms, 0)} ms old`,
     "the eyes are known to": typeof now.eye_sigma_now_mm === "number" && `${number(now.eye_sigma_now_mm, 2)} mm (${now.eyes_label})`,
     "pointer to aligned picture": latencies.length > 20 && `${number(at(0.5), 0)} ms, 99 of 100 within ${number(at(0.99), 0)} ms`,
