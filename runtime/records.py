@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal
@@ -129,7 +130,9 @@ class SolveRequest:
     eyes_label: EyesLabel
     sigma_m: float  # how sure these eyes are: standard deviation of an axis
     flat_wanted: bool  # the flat picture will be needed, or is shown
-    paused: bool = False  # nothing new is made
+    paused: bool = False  # nothing new is solved
+    effort: Effort | None = None  # of a solution for these eyes; None: all that the model has
+    refined_to: Effort | None = None  # continue the newest solution to this where its eyes and pictures are the same
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,6 +150,16 @@ class Effort:
 
 
 @dataclass(frozen=True, slots=True)
+class Measures:
+    """Measurements of a solution and its pictures: squared errors of intensities in 0..1; None: not measured."""
+
+    residual: float | None = None  # of sampled rays against the solution's own pictures
+    detail: Mapping[int, float] = field(default_factory=dict)  # of coarser rasters' pictures, by reduction
+    contrast: float | None = None  # of pictures far apart: half the variance
+    change: tuple[float, float, float] | None = None  # against the pictures before; the head moved by m, s have passed
+
+
+@dataclass(frozen=True, slots=True)
 class Solution:
     """Immutable layers for one pair of eyes, or the flat picture."""
 
@@ -156,8 +169,9 @@ class Solution:
     solved_for_ns: int  # the instant that it is for; its content is of that instant
     seeing: tuple[bool, bool] = (True, True)  # left, right: an eye outside the viewing range is replaced by the other
     eye_sigma_m: float | None = None  # tracking error that it allows for
-    stage_ms: dict[str, float] = field(default_factory=dict)  # render, prepare, inference, finish; the run's clock
+    stage_ms: dict[str, float] = field(default_factory=dict)  # by `SOLVING_STAGES`; the run's clock
     effort: Effort | None = None  # None: flat
+    measures: Measures | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,7 @@ from runtime.frame.kept_light import Output
 from runtime.frame.observer import RunObserver
 from runtime.frame.pacing import Pacer
 from runtime.frame.presenter import Presenter, Supervisor
-from runtime.frame.solver_host import SimulatedSolver, SolverHost, total_ns
+from runtime.frame.solver_host import SimulatedSolver, SolverHost
 from runtime.frame.solver_thread import SolverThread
 from runtime.frame.targets import TargetDrawer
 from runtime.frame.viewer import Viewer
@@ -183,7 +183,7 @@ def build_run(
         cleanup.callback(solver.close)
     else:
         sys.setswitchinterval(SWITCH_INTERVAL_S)
-        solver = thread = SolverThread(maker, clock, first_cost_ns=total_ns(stage_ms))
+        solver = thread = SolverThread(maker, clock)
         cleanup.callback(solver.close)
         thread.wait_ready(lambda: host.starting("loading content and model"), max_s=LIMITS.start_s)
         samples = worker = SensorWorker(make_driver, settings.sensor, clock, make_find)

@@ -15,6 +15,7 @@ from runtime.content.base import ContentSource
 from runtime.content.registry import Opener, prepare_content
 from runtime.errors import ContextLost, Stopped
 from runtime.eyes.calibration import Calibration
+from runtime.frame.effort import Costs, simulated_costs
 from runtime.frame.run_state import RunCell, RunState
 from runtime.frame.solver import Solver, SolverUpdate
 from runtime.model.backends import EYES_M, Choice, Wanted, choose
@@ -67,8 +68,11 @@ class RunningSolver:
         self._owned = state
         return self.solver.step(request, state)
 
-    def simulated_stage_ms(self) -> Mapping[str, float]:
-        return self.run.state.settings.loop.simulated_stage_ms
+    def simulated_costs(self) -> Costs:
+        return simulated_costs(self.run.state.settings.loop.simulated_stage_ms, self.run.state.predictor.reductions)
+
+    def first_costs(self) -> Mapping[int, Mapping[str, float]]:
+        return self.run.state.predictor.warmed_ms
 
     def close(self) -> None:
         state = self.run.state if self.is_newest else self._owned

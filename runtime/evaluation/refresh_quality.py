@@ -19,7 +19,7 @@ from runtime.records import F64, U8, RefreshAccount
 log = logging.getLogger("phasestack.quality")
 
 # Sampling of light. A displaced view errs at edges: a quarter of a small picture's pixels is 0.6 dB off.
-ALIGNED, LIVE = Sampling(step=2), Sampling()
+ALIGNED, LIVE = Sampling(step=2), Sampling(rays=4)
 ALIGNED_LARGE, LIVE_LARGE = Sampling(step=4), Sampling(step=2)  # of pictures with `PLENTY` values
 FIGURES = ("light_db", "psnr_db", "ssim", "carried_db", "psnr_db_true_eyes", "carried_db_true_eyes")
 Pictures = tuple[U8, U8]  # (h, w, 3) retina pictures of the left and right eye, panel size

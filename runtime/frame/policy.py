@@ -11,11 +11,11 @@ from typing import Literal
 
 from runtime.clock import NS_PER_S
 from runtime.plan.savings import Plan, selected_eyes
-from runtime.records import F64, EyesEstimate, SolveRequest
+from runtime.records import F64, Effort, EyesEstimate, SolveRequest
 
 BLEND_S = 0.3  # in which the picture goes over to the flat one, or back
 
-Kind = Literal["solve", "flat", "nothing"]
+Kind = Literal["solve", "refine", "flat", "nothing"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +25,7 @@ class SolutionKey:
     state_version: int
     revision: int  # of the content
     eyes_m: F64 | None  # (2, 3) as they were solved for; None: flat
+    effort: Effort | None = None  # of the solution
     episode: int = 0  # of the flat picture: it keeps its place of drawing as long as it is wanted
 
 
@@ -69,7 +70,11 @@ class FramePolicy:
             self._flat_was_last = True
             return Decision("flat")
         self._flat_was_last = False
-        return Decision("nothing") if eyes_m is None else Decision("solve", eyes_m)
+        if eyes_m is not None:
+            return Decision("solve", eyes_m)
+        if request.eyes_m is not None and solved is not None and _is_more(request.refined_to, solved.effort):
+            return Decision("refine", solved.eyes_m)
+        return Decision("nothing")
 
     def _eyes_to_solve(
         self, request: SolveRequest, plan: Plan | None, *, state_version: int, revision: int, solved: SolutionKey | None
@@ -82,6 +87,13 @@ class FramePolicy:
             return eyes_m
         assert solved.eyes_m is not None
         return None if (solved.eyes_m == eyes_m).all() else eyes_m
+
+
+def _is_more(effort: Effort | None, done: Effort | None) -> bool:
+    """Whether an effort adds to one that has been made: a finer raster, or further steps."""
+    if effort is None or done is None:
+        return False
+    return (-effort.reduction, effort.steps) > (-done.reduction, done.steps)
 
 
 def wants_flat(eyes: EyesEstimate, *, flat_asked: bool, flatness: float) -> bool:

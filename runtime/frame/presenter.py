@@ -16,11 +16,12 @@ import numpy as np
 
 from runtime.clock import NS_PER_MS, Clock, SimulatedClock, Stopwatch
 from runtime.errors import EndOfRecording, PanelLost
+from runtime.frame.aim import Aim
 from runtime.frame.pacing import Pacer
 from runtime.frame.policy import Flatness, wants_flat
 from runtime.frame.run_state import RunCell
 from runtime.frame.solver import SolverUpdate
-from runtime.frame.solver_host import SOLVING_STAGES, SolverHost
+from runtime.frame.solver_host import SHOWN_STAGES, SolverHost
 from runtime.frame.states import Conditions, Lateness, Part, StateMachine
 from runtime.frame.stats import RunStats
 from runtime.frame.viewer import Viewer
@@ -37,7 +38,6 @@ from runtime.records import (
     RefreshAccount,
     SensorFrame,
     Solution,
-    SolveRequest,
     State,
 )
 from runtime.sensor.samples import Samples
@@ -133,6 +133,7 @@ class Presenter:
         self._stage_ms = stage_ms
         self._supervisor, self._observers = supervisor or Supervisor(), observers
         self._adopted = run.state.version
+        self._aim = Aim(viewer, solver, period_ns=pacer.period_ns)
         self.stats = RunStats()
         self.machine = StateMachine(now_ns=clock.now_ns())
         self._lateness = Lateness(pacer.period_ns)
@@ -180,7 +181,15 @@ class Presenter:
         if report is not None and times.simulated:  # presenting has been paid for only now
             report = replace(report, present_ns=self.clock.now_ns())
         photon_ns = self._presented_at(timing, report, woke_ns=woke_ns)
-        self.solver.post(self._request(timing, eyes))
+        request = self._aim.request(
+            timing,
+            eyes,
+            news.solution,
+            self.run_cell.state,
+            flat_wanted=wants_flat(eyes, flat_asked=self.flat_asked, flatness=self._flatness.value),
+            paused=self.paused,
+        )
+        self.solver.post(request)
         self.missing = self._missing(news, lost)
         state = self._judge(eyes, limited, shown=report is not None)
         account = self._account(timing, eyes, news, frame, report, photon_ns, state, times)
@@ -260,27 +269,6 @@ class Presenter:
         blank_ns = report.vblank_ns if report is not None else None
         return self.pacer.presented(timing, woke_ns=woke_ns, done_ns=self.clock.now_ns(), blank_ns=blank_ns)
 
-    def _request(self, timing: FrameTiming, eyes: EyesEstimate) -> SolveRequest:
-        """What to solve next: the eyes in the middle of the time that a solution begun now will be shown.
-
-        It is complete after its cost, first shown half a period later on average, and replaced when the next one is.
-        """
-        cost_ns, period_ns = self.solver.solve_cost_ns, self.pacer.period_ns
-        shown_ns = max(cost_ns, period_ns)
-        middle_ns = timing.photon_ns + cost_ns + (period_ns + shown_ns) // 2
-        then = self.viewer.ahead(middle_ns) if eyes.eyes_m is not None else eyes
-        if then.eyes_m is None:
-            then = eyes
-        return SolveRequest(
-            middle_ns,
-            then.eyes_m,
-            then.label,
-            # A solution is aligned to better known eyes when it is shown: what matters is how sure those are.
-            eyes.sigma_m,
-            wants_flat(eyes, flat_asked=self.flat_asked, flatness=self._flatness.value),
-            self.paused,
-        )
-
     def _missing(self, news: SolverUpdate, lost: str) -> dict[str, str]:
         missing = dict(news.missing)
         if lost:
@@ -324,7 +312,8 @@ class Presenter:
         ran = solution is not None and solution.number != self._shown_solution
         stage_ms = dict(times.stage_ms)
         if solution is not None and ran:
-            stage_ms |= {stage: solution.stage_ms.get(stage, 0.0) for stage in SOLVING_STAGES}
+            stage_ms |= {stage: solution.stage_ms.get(stage, 0.0) for stage in SHOWN_STAGES}
+            stage_ms["finish"] += solution.stage_ms.get("step", 0.0)
         if solution is not None:
             self._shown_solution = solution.number
         return RefreshAccount(

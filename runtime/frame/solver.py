@@ -12,15 +12,18 @@ import numpy as np
 from runtime.clock import NS_PER_MS, Stopwatch
 from runtime.content.base import View
 from runtime.errors import ContentFailure, ContextLost, ModelFailure
+from runtime.frame.meter import SolutionMeter
 from runtime.frame.policy import FramePolicy, SolutionKey
 from runtime.frame.run_state import RunCell, RunState
-from runtime.model.job import SolveWindow
+from runtime.model.geometry import TargetView
+from runtime.model.job import Job, SolveWindow
 from runtime.model.targets import flat_layers
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import raster_from_stack
 from runtime.plan.drawing import drawn_job
 from runtime.plan.savings import Measured, Plan, make_plan, seeing_eyes
-from runtime.records import F64, U8, PlanItem, Solution, SolveRequest
+from runtime.records import F64, U8, Effort, PlanItem, Solution, SolveRequest
+from runtime.support.gl import DrawnPicture
 
 log = logging.getLogger("phasestack.solver")
 
@@ -49,7 +52,9 @@ class Solver:
         self._policy = FramePolicy()
         self._solved: SolutionKey | None = None
         self._flat: SolutionKey | None = None
-        self._window: SolveWindow | None = None  # of the newest solution
+        self._windows: dict[int, SolveWindow | None] = {}  # of the newest solutions, by reduction
+        self._kept: Job | None = None  # with pictures that no later drawing changes; None: it has to be drawn
+        self._meter = SolutionMeter()
         self._middle_m: F64 = np.array(FLAT_EYE_M)
         self._missing: dict[str, str] = {}
 
@@ -75,42 +80,45 @@ class Solver:
         )
         if job.kind == "flat":
             return self._draw_flat(state, revision=revision, time_ns=time_ns)
-        if job.kind == "solve":
-            assert job.eyes_m is not None
-            return self._solve(state, request, job.eyes_m, revision=revision)
+        if job.eyes_m is not None:
+            wanted = request.refined_to if job.kind == "refine" else request.effort
+            effort = wanted or Effort(1, state.predictor.steps)
+            return self._solve(state, request, job.eyes_m, effort, revision=revision)
         if request.eyes_m is not None and not request.paused:
             self._missing = {}  # what there is is what was asked for
         return SolverUpdate(missing=dict(self._missing))
 
-    def _solve(self, state: RunState, request: SolveRequest, eyes_m: F64, *, revision: int) -> SolverUpdate:
+    def _solve(
+        self, state: RunState, request: SolveRequest, eyes_m: F64, effort: Effort, *, revision: int
+    ) -> SolverUpdate:
         settings, watch = state.settings.model, Stopwatch()
         sigma_m = request.sigma_m if settings.eye_sigma_mm == "auto" else settings.eye_sigma_mm / 1e3
         limited = self._timed and settings.budget_ms > 0
         deadline_ns = perf_counter_ns() + round(settings.budget_ms * NS_PER_MS) if limited else None
+        continued = effort.continued_from is not None and self._kept is not None
         try:
-            job = drawn_job(
-                state.predictor,
-                state.content,
-                eyes_m,
-                time_ns=request.time_ns,
-                trimmed=state.settings.plan.enabled,
-                before=self._window,
-            )
+            if continued:
+                assert self._kept is not None
+                job = self._kept
+            else:
+                job = self._drawn(state, request, eyes_m, effort.reduction)
         except ContextLost:  # content and model are in it: the solver's owner makes another
             raise
         except (Exception, SystemExit) as error:
             return SolverUpdate(missing=self._failed("content", error, expected=ContentFailure))
         watch.lap("render")
+        job = replace(job, eye_sigma_m=sigma_m, deadline_ns=deadline_ns, steps=effort.steps, continued=continued)
         try:
-            prediction = state.predictor.solve(replace(job, eye_sigma_m=sigma_m, deadline_ns=deadline_ns), watch)
+            prediction = state.predictor.solve(job, watch)
         except ContextLost:
             raise
         except (Exception, SystemExit) as error:
             return SolverUpdate(missing=self._failed("model", error, expected=ModelFailure))
+        effort = Effort(effort.reduction, prediction.steps, prediction.continued_from)
         self._missing = {}
-        self._window = job.window if job.window is not None and job.window.box.width_px else None
+        self._windows[effort.reduction] = job.window if job.window is not None and job.window.box.width_px else None
         self.measured = replace(self.measured, left_out=prediction.savings)
-        self._solved = SolutionKey(state.version, revision, eyes_m)
+        self._solved = SolutionKey(state.version, revision, eyes_m, effort)
         self._middle_m = eyes_m.mean(axis=0)
         solution = Solution(
             self.run.next_number(),
@@ -120,8 +128,27 @@ class Solver:
             seeing=self.plan.eyes if self.plan is not None else (True, True),
             eye_sigma_m=sigma_m,
             stage_ms=watch.stage_ms,
+            effort=effort,
+            measures=self._meter.measure(job, prediction.layers, effort, time_ns=request.time_ns),
         )
         return SolverUpdate(solution=solution)
+
+    def _drawn(self, state: RunState, request: SolveRequest, eyes_m: F64, reduction: int) -> Job:
+        """Draw the targets. Those of a resting head are kept, for the solution to be continued."""
+        job = drawn_job(
+            state.predictor,
+            state.content,
+            eyes_m,
+            time_ns=request.time_ns,
+            reduction=reduction,
+            trimmed=state.settings.plan.enabled,
+            before=self._windows.get(reduction),
+        )
+        self._kept = None
+        if request.eyes_label == "rested" and not any(isinstance(v.picture, DrawnPicture) for v in job.views):
+            left, right = (TargetView(view.pixels.copy(), view.plane_from_picture) for view in job.views)
+            job = self._kept = replace(job, targets=replace(job.targets, views=(left, right)))
+        return job
 
     def _draw_flat(self, state: RunState, *, revision: int, time_ns: int) -> SolverUpdate:
         watch = Stopwatch()
@@ -139,7 +166,7 @@ class Solver:
         layers: U8 = flat_layers(picture, self.stack)
         if not missing:
             self._missing.pop("content", None)
-            self._flat = SolutionKey(state.version, revision, None, self._policy.episode)
+            self._flat = SolutionKey(state.version, revision, None, episode=self._policy.episode)
         watch.lap("render")
         flat = Solution(self.run.next_number(), layers, None, time_ns, stage_ms=watch.stage_ms)
         return SolverUpdate(flat=flat, missing=missing)

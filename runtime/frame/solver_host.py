@@ -8,12 +8,13 @@ from dataclasses import replace
 from typing import Protocol
 
 from runtime.clock import NS_PER_MS, Clock
+from runtime.frame.effort import Costs
 from runtime.frame.solver import SolverUpdate
 from runtime.records import SolveRequest
 
 FIRST_REQUEST = SolveRequest(0, None, "none", 0.0, flat_wanted=True)  # before the first refresh: the flat picture
-SOLVING_STAGES = ("render", "prepare", "inference", "finish")
-COST_GAIN = 0.2  # of the newest solution in the running mean of what one costs
+
+SHOWN_STAGES = ("render", "prepare", "inference", "finish")  # of a solution in frames.jsonl; steps count as `finish`
 
 
 class SolverParts(Protocol):
@@ -22,8 +23,11 @@ class SolverParts(Protocol):
     def step(self, request: SolveRequest) -> SolverUpdate:
         """One request."""
 
-    def simulated_stage_ms(self) -> Mapping[str, float]:
-        """What each stage costs on a simulated clock at present."""
+    def simulated_costs(self) -> Costs:
+        """What solutions take on a simulated clock at present."""
+
+    def first_costs(self) -> Mapping[int, Mapping[str, float]]:
+        """Stage times by reduction, milliseconds, measured while warming up."""
 
     def close(self) -> None:
         """Release everything that no other solver uses by now, on the thread that made it."""
@@ -35,7 +39,10 @@ Task = Callable[[SolverParts], bool]  # done on the solver's thread between two 
 class SolverHost(ABC):
     """The presenter asks (`post`) and looks (`news`); neither waits."""
 
-    solve_cost_ns: int  # what a solution takes at present, as well as it is known
+    @property
+    @abstractmethod
+    def costs(self) -> Costs:
+        """What solutions take at present."""
 
     @abstractmethod
     def post(self, request: SolveRequest) -> None:
@@ -59,11 +66,6 @@ def taken_in(news: SolverUpdate, step: SolverUpdate) -> SolverUpdate:
     return SolverUpdate(step.solution or news.solution, step.flat or news.flat, step.missing)
 
 
-def total_ns(stage_ms: Mapping[str, float]) -> int:
-    """Nanoseconds of the solver's stages together."""
-    return round(sum(stage_ms.get(stage, 0.0) for stage in SOLVING_STAGES) * NS_PER_MS)
-
-
 class SimulatedSolver(SolverHost):
     """Solves at once and hands over when the simulated clock has passed what the configured stages cost."""
 
@@ -75,7 +77,10 @@ class SimulatedSolver(SolverHost):
         self._idle_since_ns = clock.now_ns()
         self._tasks: list[Task] = []
         self._closed = False
-        self.solve_cost_ns = total_ns(parts.simulated_stage_ms())
+
+    @property
+    def costs(self) -> Costs:
+        return self._parts.simulated_costs()
 
     def post(self, request: SolveRequest) -> None:
         self._advance()
@@ -110,22 +115,20 @@ class SimulatedSolver(SolverHost):
                 return
             (posted_ns, request), self._posted = self._posted, None
             begun_ns = max(posted_ns, self._idle_since_ns)
-            step = self._timed(self._parts.step(request))
-            self._under_way = begun_ns + self._cost_of(step), step
+            step, cost_ns = self._timed(self._parts.step(request))
+            self._under_way = begun_ns + cost_ns, step
 
-    def _timed(self, step: SolverUpdate) -> SolverUpdate:
-        """With the stage times that the configuration says."""
-        stages = dict(self._parts.simulated_stage_ms())
-        self.solve_cost_ns = total_ns(stages)
-        solving = {stage: stages.get(stage, 0.0) for stage in SOLVING_STAGES}
-        solution, flat = step.solution, step.flat
-        if solution is not None:
-            solution = replace(solution, stage_ms=solving)
+    def _timed(self, step: SolverUpdate) -> tuple[SolverUpdate, int]:
+        """A result with the stage times that the configuration says, and their sum in nanoseconds."""
+        solution, flat, costs = step.solution, step.flat, self.costs
+        if solution is not None and solution.effort is not None:
+            effort = solution.effort
+            stages = dict(costs.stages[effort.reduction])
+            stages["step"] = stages.get("step", 0.0) * (effort.steps - (effort.continued_from or 0))
+            if effort.continued_from is not None:
+                stages |= dict.fromkeys(("render", "prepare", "inference"), 0.0)
+            return replace(step, solution=replace(solution, stage_ms=stages)), round(costs.ms(effort) * NS_PER_MS)
         if flat is not None:
-            flat = replace(flat, stage_ms={"render": solving["render"]})
-        return replace(step, solution=solution, flat=flat)
-
-    @staticmethod
-    def _cost_of(step: SolverUpdate) -> int:
-        made = step.solution or step.flat
-        return total_ns(made.stage_ms) if made is not None else 0
+            render_ms = costs.stages[1].get("render", 0.0)
+            return replace(step, flat=replace(flat, stage_ms={"render": render_ms})), round(render_ms * NS_PER_MS)
+        return step, 0

@@ -13,8 +13,9 @@ from dataclasses import replace
 
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock
 from runtime.errors import ContextLost, FatalError, PhasestackError, Stopped, TransientError
+from runtime.frame.effort import CostBook, Costs
 from runtime.frame.solver import SolverUpdate
-from runtime.frame.solver_host import COST_GAIN, FIRST_REQUEST, SolverHost, SolverParts, Task, taken_in, total_ns
+from runtime.frame.solver_host import FIRST_REQUEST, SolverHost, SolverParts, Task, taken_in
 from runtime.records import SolveRequest
 from runtime.support.background import SOLVER_NICENESS, ThreadAbandoned, abandon, begin, patience_s, set_niceness
 from runtime.support.memory import give_back
@@ -41,6 +42,7 @@ class _Attempt:
         self.busy_since_ns = 0  # 0: it waits
         self.is_at_task = False
         self.took_ns: deque[int] = deque(maxlen=LATE_STEPS)  # the last steps
+        self.costs: CostBook | None = None  # of its machine and scene
         self.error: BaseException | None = None
         self.thread: threading.Thread | None = None
 
@@ -53,7 +55,7 @@ class _Attempt:
 class SolverThread(SolverHost):
     """Runs a solver alongside the presenter. `post`, `news` and `watch` never wait."""
 
-    def __init__(self, make: Callable[[], SolverParts], clock: Clock, *, first_cost_ns: int = 0) -> None:
+    def __init__(self, make: Callable[[], SolverParts], clock: Clock) -> None:
         """make: a solver with its own GL context, called on the thread that will use it, again after it hung."""
         self._make, self._clock = make, clock
         self._late_ns, self._abandon_ns = round(LATE_S * NS_PER_S), round(ABANDON_S * NS_PER_S)
@@ -64,7 +66,7 @@ class SolverThread(SolverHost):
         self._closing = threading.Event()
         self._hung: list[_Attempt] = []
         self._is_late = False
-        self.solve_cost_ns = first_cost_ns
+        self._costs: Costs | None = None  # from the first solver on
         self.restarts = 0
         self._attempt = self._begin(1)
 
@@ -81,6 +83,11 @@ class SolverThread(SolverHost):
                 raise FatalError(f"content and model: not ready after {max_s:g} s")
         if self._attempt.error is not None:
             raise self._attempt.error
+
+    @property
+    def costs(self) -> Costs:
+        assert self._costs is not None, "the solver is not ready"
+        return self._costs
 
     def post(self, request: SolveRequest) -> None:
         with self._lock:
@@ -163,6 +170,7 @@ class SolverThread(SolverHost):
         parts: SolverParts | None = None
         try:
             parts = self._make()
+            attempt.costs = CostBook(parts.first_costs())
             first = parts.step(FIRST_REQUEST)
         except BaseException as error:
             if parts is not None:
@@ -173,6 +181,7 @@ class SolverThread(SolverHost):
                 log.exception("solver: it could not be made anew")
             return
         self._publish(attempt, first)
+        self._costs = attempt.costs.costs()
         attempt.busy_since_ns = 0
         attempt.ready.set()
         try:
@@ -207,9 +216,9 @@ class SolverThread(SolverHost):
         attempt.took_ns.append(self._clock.now_ns() - attempt.busy_since_ns)
         attempt.busy_since_ns = 0
         if self._publish(attempt, step) and step.solution is not None:
-            cost_ns = total_ns(step.solution.stage_ms)
-            gain = COST_GAIN if self.solve_cost_ns else 1.0
-            self.solve_cost_ns += round(gain * (cost_ns - self.solve_cost_ns))
+            assert attempt.costs is not None and step.solution.effort is not None
+            attempt.costs.learn(step.solution.effort, step.solution.stage_ms)
+            self._costs = attempt.costs.costs()
 
     def _publish(self, attempt: _Attempt, step: SolverUpdate) -> bool:
         """Take a step into the news; False: it was made by one that has been left behind."""

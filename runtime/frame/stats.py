@@ -10,13 +10,13 @@ import numpy as np
 
 from runtime.clock import NS_PER_MS, NS_PER_S
 from runtime.evaluation.refresh_quality import view_error_mm
-from runtime.frame.solver_host import SOLVING_STAGES
+from runtime.frame.solver_host import SHOWN_STAGES
 from runtime.records import RefreshAccount, State
 
 WINDOW = 8192  # most values that a quantile is computed from
 NOW_NS = NS_PER_S  # window of the present rates: the last second
 NOW_KEPT = 1024  # most refreshes in that window
-STAGES = ("sensor", "track", *SOLVING_STAGES, "present", "wait")
+STAGES = ("sensor", "track", *SHOWN_STAGES, "present", "wait")
 OVERHEAD_STAGES = ("sensor", "track")
 
 
@@ -103,7 +103,7 @@ class RunStats:
 
     def reuse_saves_ms(self) -> float | None:
         """Solver time that a refresh saves by reusing a solution; None before the first one."""
-        medians = [self._stages[stage].of("p50") for stage in SOLVING_STAGES]
+        medians = [self._stages[stage].of("p50") for stage in SHOWN_STAGES]
         known = [median["p50"] for median in medians if median is not None]
         return sum(known) if known and self.presented > self.solutions > 0 else None
 

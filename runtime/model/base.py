@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from runtime.clock import Stopwatch
@@ -15,7 +17,7 @@ if TYPE_CHECKING:
     from runtime.model.device import SolverBackend
 
 
-STAGES = ("prepare", "inference", "finish")  # inference: the network alone
+STAGES = ("prepare", "inference", "finish", "step")  # inference: the network alone; step: all updates of panels
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +28,7 @@ class Prediction:
     stage_ms: dict[str, float] = field(default_factory=dict)  # by STAGES
     savings: Savings = field(default_factory=Savings)
     steps: int = 0  # updates of all panels, of this and of the solutions that it continues
-    continued_from: int = 0  # those of them that the solution before had
+    continued_from: int | None = None  # those of them that the solution before had; None: it was not continued
 
 
 class Predictor(ABC):
@@ -42,6 +44,7 @@ class Predictor(ABC):
     reductions: tuple[int, ...] = (1,)  # rasters it solves on: this many times fewer rows and columns than the display
     steps: int = 0  # updates of all panels that a solution has
     refined_steps: int = 0  # up to which a solution can be continued
+    warmed_ms: Mapping[int, Mapping[str, float]] = MappingProxyType({1: {}})  # stage times of `warm_up`, by reduction
 
     def reads_textures_of(self, context: object) -> bool:
         """Whether `solve` takes pictures that were left in textures of a GL context (`DrawnPicture`)."""
@@ -63,9 +66,13 @@ class Predictor(ABC):
         """
 
     def warm_up(self, eyes_m: F64) -> None:
-        """Solve grey pictures on every raster, so that the first frame does not pay for allocation."""
+        """Solve grey pictures with one step on every raster, so that the first frame does not pay for allocation."""
+        measured = {}
         for reduction in self.reductions:
-            self.solve(grey_job(eyes_m, self.stack.reduced(reduction)))
+            job = replace(grey_job(eyes_m, self.stack.reduced(reduction)), steps=1)
+            self.solve(job)
+            measured[reduction] = self.solve(job).stage_ms
+        self.warmed_ms = measured
 
     def close(self) -> None:  # noqa: B027 - most hold nothing
         """Release threads and sessions. May be called twice."""

@@ -20,8 +20,13 @@ from runtime.model.proposal import Proposal
 from runtime.optics.malus import rest_code
 from runtime.optics.stack import PanelStack
 
-_Done = tuple[int, int]  # steps in all, and those of them that the solution before had
-REDUCTIONS = (1, 2, 4)  # rasters that are solved on: the display's own, and with this many times fewer rows and columns
+_Done = tuple[int, int | None]  # steps in all; those of them that the solution before had, None: it was not continued
+REDUCTIONS = (
+    1,
+    2,
+    3,
+    4,
+)  # rasters that are solved on: the display's own, and with this many times fewer rows and columns
 REFINED_STEPS = 8  # a solution is continued up to this many steps, as many as `best` has
 REFINING = (Step(size=0.8, places="falling"), Step(size=0.8, places="rising"))  # in turn, after the model's own
 
@@ -98,7 +103,7 @@ class StepPredictor(Predictor):
         with state.begin(job, job.targets.visible):
             state.close_middle()
             state.write(buffer, rest_code(job.stack.count))
-        return 0, 0
+        return 0, None
 
     def _solve_window(self, job: Job, state: SolverState, buffer: LayerBuffer, watch: Stopwatch) -> _Done:
         """A window within a background of one colour, or within the flat picture."""
@@ -120,16 +125,18 @@ class StepPredictor(Predictor):
         """Steps from the proposal, or from the panels of the solution before where its rays were the same."""
         before = self._improved
         resumed = job.continued and before is not None and before[1] == job.channels and geometry.is_like(before[0])
-        first = before[2] if before is not None and resumed else 0
-        self._improved, done = None, first
+        first = before[2] if before is not None and resumed else None
+        self._improved, done = None, first or 0
         with state.begin(job, geometry, resumed=resumed):
             if not resumed:
                 self._propose(job, geometry, state, watch)
+            watch.lap("finish")
             while done < (self.steps if job.steps is None else job.steps):
                 if job.deadline_ns is not None and perf_counter_ns() >= job.deadline_ns:
                     break
                 state.step(self._steps[done] if done < self.steps else REFINING[(done - self.steps) % len(REFINING)])
                 done += 1
+            watch.lap("step")
             state.write(buffer, outside)
         self._improved = geometry, job.channels, done
         return done, first

@@ -11,6 +11,7 @@ from runtime.clock import NS_PER_MS, NS_PER_S, SimulatedClock
 from runtime.config import Settings
 from runtime.errors import EndOfRecording, PanelLost
 from runtime.eyes.calibration import load_calibration
+from runtime.frame.effort import Costs, simulated_costs
 from runtime.frame.pacing import Pacer
 from runtime.frame.presenter import Presenter, Refresh
 from runtime.frame.run_state import RunCell
@@ -19,7 +20,7 @@ from runtime.frame.solver_host import SolverHost, Task
 from runtime.frame.viewer import Viewer
 from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
-from runtime.records import EyePoints, PanelFrame, PresentReport, SensorFrame, Solution, SolveRequest
+from runtime.records import Effort, EyePoints, PanelFrame, PresentReport, SensorFrame, Solution, SolveRequest
 from runtime.sensor.samples import Samples
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 32, 18)
@@ -41,7 +42,8 @@ def picture(code: int) -> np.ndarray:
 
 def solution(number: int, eyes_m: Any = EYES, *, time_ns: int = 0, **changes: Any) -> Solution:
     """Layers for a pair of eyes; None: the flat picture."""
-    return Solution(number, picture(number % 256), eyes_m, time_ns, **changes)
+    effort = None if eyes_m is None else Effort()
+    return Solution(number, picture(number % 256), eyes_m, time_ns, **{"effort": effort, **changes})
 
 
 class FakeSamples(Samples):
@@ -80,9 +82,14 @@ class FakeSolver(SolverHost):
 
     def __init__(self, *, cost_ns: int = 20 * NS_PER_MS) -> None:
         self.solve_cost_ns = cost_ns
+        self.reductions: tuple[int, ...] = (1,)
         self.there = SolverUpdate()
         self.requests: list[SolveRequest] = []
         self.tasks: list[Task] = []
+
+    @property
+    def costs(self) -> Costs:
+        return simulated_costs({"inference": self.solve_cost_ns / NS_PER_MS}, self.reductions)
 
     def hand_over(self, *, solved: Solution | None = None, flat: Solution | None = None, **missing: str) -> None:
         self.there = SolverUpdate(solved or self.there.solution, flat or self.there.flat, missing)
@@ -141,8 +148,11 @@ class FakeParts:
         self.asked.append(request)
         return self.behave(request)
 
-    def simulated_stage_ms(self) -> dict[str, float]:
-        return self.stage_ms
+    def simulated_costs(self) -> Costs:
+        return simulated_costs(self.stage_ms, (1,))
+
+    def first_costs(self) -> dict[int, dict[str, float]]:
+        return {1: {}}
 
     def close(self) -> None:
         self.closed += 1
@@ -215,6 +225,7 @@ class Named:
     """Content or a model of which only the name is asked."""
 
     provider = "none"
+    reductions, steps, refined_steps = (1,), 0, 0
 
     def __init__(self, name: str) -> None:
         self.name = name

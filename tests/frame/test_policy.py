@@ -43,7 +43,7 @@ class Told:
         if decision.kind == "solve":
             self.solved = SolutionKey(self.version, self.revision, decision.eyes_m)
         if decision.kind == "flat":
-            self.flat = SolutionKey(self.version, self.revision, None, self.policy.episode)
+            self.flat = SolutionKey(self.version, self.revision, None, episode=self.policy.episode)
         return decision
 
     def kinds(self, *requests: SolveRequest) -> list[str]:

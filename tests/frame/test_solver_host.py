@@ -10,7 +10,7 @@ import pytest
 from runtime.clock import NS_PER_MS, SimulatedClock
 from runtime.frame.solver import SolverUpdate
 from runtime.frame.solver_host import SimulatedSolver
-from runtime.records import SolveRequest
+from runtime.records import Effort, SolveRequest
 from tests.frame.fakes import FakeParts, aside, solution
 
 COST_MS = {"render": 8.0, "prepare": 4.0, "inference": 3.0, "finish": 8.0, "sensor": 100.0, "present": 100.0}
@@ -59,7 +59,7 @@ def test_a_solution_is_handed_over_exactly_when_its_cost_has_passed(
     clock.advance_ns(1)
     made = host.news().solution
     assert made.solved_for_ns == 5
-    assert made.stage_ms == {"render": 8.0, "prepare": 4.0, "inference": 3.0, "finish": 8.0}
+    assert made.stage_ms == {"render": 8.0, "prepare": 4.0, "inference": 3.0, "finish": 8.0, "step": 0.0}
 
 
 def test_a_busy_solver_takes_the_newest_request_next(
@@ -151,4 +151,4 @@ def test_a_cost_that_changes_is_told(host: SimulatedSolver, parts: FakeParts, cl
     host.post(wish(1))
     clock.advance_ns(3 * NS_PER_MS)
     assert host.news().solution is not None
-    assert host.solve_cost_ns == 3 * NS_PER_MS
+    assert host.costs.ms(Effort()) == 3.0

@@ -51,7 +51,7 @@ class Workshop:
         self.gates: list[threading.Event] = []  # of steps that hang
         self.hung: list[threading.Thread] = []  # that are, or were, in such a step
         self.closed: queue.Queue[str] = queue.Queue()  # names of the threads that closed parts
-        self.host = SolverThread(self._make, self.clock, first_cost_ns=7)
+        self.host = SolverThread(self._make, self.clock)
 
     def _make(self) -> FakeParts:
         assert self.open.wait(PATIENCE_S)

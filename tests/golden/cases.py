@@ -41,9 +41,17 @@ class Case:
 
 SMALL: dict[str, dict[str, Any]] = {
     "stack": {"width_px": 96, "height_px": 54},
-    "model": {"name": "balanced", "threads": 1, "backend": "opencv"},
+    "model": {"name": "balanced", "threads": 1, "backend": "opencv", "effort": "full"},
     "loop": {"evaluate_every": 20},
 }
+
+
+SLOW: dict[str, Any] = {
+    "simulated_stage_ms": {
+        "sensor": 0.1, "track": 0.1, "present": 2,
+        "render": 44, "prepare": 40, "inference": 31, "finish": 38, "step": 85,
+    }
+}  # fmt: skip
 
 
 def change_scene(name: str) -> Action:
@@ -124,4 +132,7 @@ CASES = {
         },
         pictures=(50,),
     ),
+    # The effort is chosen, on a slow processor: coarse rasters in motion, refined at rest.
+    "live-lean": Case("lean", {"model": {"effort": "auto"}, "loop": SLOW}, pictures=(48, 70)),
+    "live-rest": Case("loss-and-return", {"model": {"effort": "auto"}, "loop": SLOW}, pictures=(40, 130)),
 }

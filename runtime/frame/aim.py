@@ -1,0 +1,154 @@
+"""What the solver is asked for at each refresh: the eyes in the middle of the next solution's life, and its effort."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from runtime.clock import NS_PER_MS, NS_PER_S
+from runtime.frame.effort import HORIZON_S, EffortChooser, Outlook, candidates
+from runtime.frame.run_state import RunState
+from runtime.frame.solver_host import SolverHost
+from runtime.frame.viewer import Viewer
+from runtime.records import F64, Effort, EyesEstimate, EyesLabel, FrameTiming, Solution, SolveRequest
+
+HORIZON_NS = NS_PER_S // 8  # how far the eyes are predicted at most, beyond the light of this refresh
+SPEED_NS = NS_PER_S // 2  # time constant of the running mean of a head's squared speed
+REQUESTS_KEPT = 256
+WORTH = 0.995  # a solution is refined where that leaves less than this share of the expected error
+
+
+class Aim:
+    """Requests of one run. One thread uses it; it never reads a clock."""
+
+    def __init__(self, viewer: Viewer, solver: SolverHost, *, period_ns: int) -> None:
+        self._viewer, self._solver, self._period_ns = viewer, solver, period_ns
+        self._chooser = EffortChooser()
+        self._rested_ns: int | None = None  # since when the head has been at rest
+        self._expected: dict[int, float] = {}  # by the instant of a request: squared distance from its eyes, m²
+        self._speed2 = 0.0  # (m/s)², running mean
+        self._learned: int | None = None  # number of the newest solution whose measures were taken in
+
+    def request(
+        self,
+        timing: FrameTiming,
+        eyes: EyesEstimate,
+        shown: Solution | None,
+        state: RunState,
+        *,
+        flat_wanted: bool,
+        paused: bool,
+    ) -> SolveRequest:
+        """The next request. eyes: at the display time of this refresh; shown: the newest solution."""
+        self._learn(shown, eyes)
+        predictor, refined = state.predictor, None
+        whole = Effort(1, predictor.steps)
+        effort, expected_m2 = whole, 0.0
+        if eyes.eyes_m is not None and state.settings.model.effort == "auto":
+            outlook, horizon_s = self._outlook(timing, eyes), self._horizon_s(timing, eyes)
+            error = self._shown_error(eyes, shown, time_ns=timing.photon_ns)
+            period_ms = self._period_ns / NS_PER_MS
+            costs = self._solver.costs
+            effort = self._chooser.choose(
+                candidates(predictor.reductions, predictor.steps),
+                costs, outlook, shown_error=error, period_ms=period_ms, horizon_s=horizon_s,
+            )  # fmt: skip
+            if shown is not None and eyes.label == "rested":
+                refined = self._refined(shown, predictor.refined_steps, shown_error=error, horizon_s=horizon_s)
+            cost_ms = costs.ms(effort)
+            expected_m2 = outlook(cost_ms).moved_m2(max(cost_ms, period_ms) / 1e3)
+        cost_ns = round(self._solver.costs.ms(effort) * NS_PER_MS)
+        then_ns, then_m, label = self._eyes_then(timing, eyes, cost_ns=cost_ns)
+        self._expected[then_ns] = expected_m2
+        while len(self._expected) > REQUESTS_KEPT:
+            self._expected.pop(next(iter(self._expected)))
+        # A solution is aligned to better known eyes when it is shown: what matters is how well those are known.
+        return SolveRequest(then_ns, then_m, label, eyes.sigma_m, flat_wanted, paused, effort, refined)
+
+    def _learn(self, shown: Solution | None, eyes: EyesEstimate) -> None:
+        """Take in what the newest solution measured, and how far its eyes are from where the eyes are now."""
+        if shown is None or shown.solved_for_m is None:
+            return
+        expected_m2 = self._expected.get(shown.solved_for_ns, 0.0)
+        if expected_m2 > 0.0 and eyes.eyes_m is not None and eyes.label != "held":
+            found_m2 = float(((shown.solved_for_m - eyes.eyes_m).mean(axis=0) ** 2).sum())
+            self._chooser.foresight.learn(expected_m2=expected_m2, found_m2=found_m2)
+        if shown.number != self._learned and shown.measures is not None and shown.effort is not None:
+            self._learned = shown.number
+            self._chooser.pictures.learn(shown.measures, shown.effort)
+
+    def _middle_ns(self, timing: FrameTiming, cost_ns: int) -> int:
+        """Middle of the time that a solution begun now is shown.
+
+        It is complete after its cost, first shown half a period later on average, and replaced when the next one is.
+        """
+        return timing.photon_ns + cost_ns + (self._period_ns + max(cost_ns, self._period_ns)) // 2
+
+    def _eyes_then(self, timing: FrameTiming, eyes: EyesEstimate, *, cost_ns: int) -> tuple[int, F64 | None, EyesLabel]:
+        """The instant to solve for, and the eyes then: predicted only as far as the tracker knows where they go."""
+        middle_ns = self._middle_ns(timing, cost_ns)
+        reach_ns = min(middle_ns, timing.photon_ns + HORIZON_NS)
+        then = self._viewer.ahead(reach_ns) if eyes.eyes_m is not None else eyes
+        if then.eyes_m is None or eyes.eyes_m is None:
+            return middle_ns, eyes.eyes_m, eyes.label
+        moved_m2 = float(((then.eyes_m - eyes.eyes_m).mean(axis=0) ** 2).sum())
+        share = moved_m2 / (moved_m2 + 2 * then.sigma_m**2) if moved_m2 > 0.0 and then.label != "rested" else 1.0
+        return middle_ns, eyes.eyes_m + share * (then.eyes_m - eyes.eyes_m), then.label
+
+    def _outlook(self, timing: FrameTiming, eyes: EyesEstimate) -> Callable[[float], Outlook]:
+        near = self._viewer.ahead(timing.photon_ns + self._period_ns)
+        far = self._viewer.ahead(timing.photon_ns + HORIZON_NS)
+        if near.eyes_m is None or far.eyes_m is None or eyes.eyes_m is None or far.label == "rested":
+            return lambda cost_ms: Outlook()
+        speed_m_s = self._usual_speed_m_s(float(np.linalg.norm((near.eyes_m - eyes.eyes_m).mean(axis=0))), eyes)
+
+        growth_m = max(far.sigma_m - near.sigma_m, 0.0) / (HORIZON_NS - self._period_ns)
+
+        def outlook(cost_ms: float) -> Outlook:
+            ahead_ns = self._middle_ns(timing, round(cost_ms * NS_PER_MS)) - timing.photon_ns
+            sigma_m = near.sigma_m + growth_m * (ahead_ns - self._period_ns)
+            beyond_s = max(ahead_ns - HORIZON_NS, 0) / NS_PER_S
+            return Outlook(sigma_m, speed_m_s, beyond_s * speed_m_s)
+
+        return outlook
+
+    def _horizon_s(self, timing: FrameTiming, eyes: EyesEstimate) -> float:
+        """How long what the head does is taken to last: a resting one, as long again as it has rested."""
+        if eyes.label != "rested":
+            self._rested_ns = None
+            return HORIZON_S
+        if self._rested_ns is None:
+            self._rested_ns = timing.photon_ns
+        return max(HORIZON_S, (timing.photon_ns - self._rested_ns) / NS_PER_S)
+
+    def _usual_speed_m_s(self, moved_m: float, eyes: EyesEstimate) -> float:
+        """The head's speed, or its root mean square lately: one that turns back, or is lost, does not stay there."""
+        speed_m_s = moved_m * NS_PER_S / self._period_ns
+        if eyes.label != "held":
+            gain = self._period_ns / (self._period_ns + SPEED_NS)
+            self._speed2 += gain * (speed_m_s**2 - self._speed2)
+        return float(max(speed_m_s if eyes.label != "held" else 0.0, self._speed2**0.5))
+
+    def _shown_error(self, eyes: EyesEstimate, shown: Solution | None, *, time_ns: int) -> float:
+        """Expected squared error of what the panels show at an instant."""
+        pictures = self._chooser.pictures
+        if shown is None or shown.effort is None or shown.solved_for_m is None or eyes.eyes_m is None:
+            return pictures.contrast
+        moved_m = float(np.linalg.norm((shown.solved_for_m - eyes.eyes_m).mean(axis=0)))
+        return pictures.own(shown.effort) + pictures.stale(moved_m, (time_ns - shown.solved_for_ns) / NS_PER_S)
+
+    def _refined(self, shown: Solution, most: int, *, shown_error: float, horizon_s: float) -> Effort | None:
+        """How to continue a solution for a resting head: a finer raster, or further steps. None: it is good enough."""
+        done, costs, pictures = shown.effort, self._solver.costs, self._chooser.pictures
+        if done is None:
+            return None
+        efforts = [Effort(by, 0) for by in costs.stages if by < done.reduction]
+        if done.reduction == 1:
+            efforts += [Effort(1, steps, done.steps) for steps in (done.steps + 1, done.steps + 2) if steps <= most]
+        if not efforts:
+            return None
+        mean, horizon = self._chooser.mean_error, {"shown_error": shown_error, "horizon_s": horizon_s}
+        means = {effort: mean(pictures.own(effort), costs.ms(effort), **horizon) for effort in efforts}
+        best = min(means, key=means.__getitem__)
+        return best if means[best] < WORTH * shown_error else None

@@ -1,0 +1,123 @@
+"""Measures solutions on the solver's thread, from samples: how good they are, and how fast their pictures change."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.clock import NS_PER_S
+from runtime.model.geometry import panel_from_middle
+from runtime.model.job import Job
+from runtime.model.solver import REDUCTIONS
+from runtime.records import F32, F64, U8, Effort, Measures
+from runtime.support.gl import DrawnPicture
+
+RAYS = 1024  # of each eye
+SAMPLED = 54, 96  # rows and columns of the grid on which pictures are compared
+BAND_ROWS = 64  # of the two parts of a picture in which detail is measured
+EVERY = 4  # solutions of one effort, between two measurements of residual or detail
+
+
+class SolutionMeter:
+    """Remembers the samples of the pictures before."""
+
+    def __init__(self) -> None:
+        self._before: tuple[tuple[int, ...], F32, F64, int] | None = None  # raster and window, samples, eyes, time
+        self._counts: dict[Effort, int] = {}
+        self._places = np.random.default_rng(1).random((2, RAYS, 2))
+
+    def measure(self, job: Job, layers: U8, effort: Effort, *, time_ns: int) -> Measures | None:
+        """Of one solution; None where its pictures were left in textures."""
+        if any(isinstance(view.picture, DrawnPicture) for view in job.views):
+            return None
+        key = Effort(effort.reduction, effort.steps)
+        count = self._counts.get(key, 0)
+        self._counts[key] = count + 1
+        samples = np.stack([_grid(view.pixels) for view in job.views])
+        box = () if job.window is None else job.window.box.corners
+        raster = (job.stack.width_px, job.stack.height_px, *box)
+        before, self._before = self._before, (raster, samples, job.eyes_m, time_ns)
+        change = None
+        if before is not None and before[0] == raster:
+            moved_m = float(np.linalg.norm((job.eyes_m - before[2]).mean(axis=0)))
+            change = float(((samples - before[1]) ** 2).mean()), moved_m, abs(time_ns - before[3]) / NS_PER_S
+        if count % EVERY:
+            return Measures(change=change)
+        return Measures(
+            residual=sampled_light(layers, job, self._places, boxes=effort.reduction == 1),
+            detail=lost_detail(job.views[0].pixels) if effort.reduction == 1 else {},
+            contrast=float(samples.var(axis=(1, 2)).mean()) / 2,
+            change=change,
+        )
+
+
+def sampled_light(layers: U8, job: Job, places: F64, *, boxes: bool) -> float | None:
+    """Squared error of light in sampled pixels of both pictures; None: no ray counts.
+
+    places: (2, K, 2) in 0..1 of a picture's size, two rays in the same pixels. The mean product of their errors has no
+    bias (docs/contracts.md: light). A ray counts that crosses every panel. Panels' pixels are even boxes; those
+    of a coarse solution, which is enlarged bilinearly, are not. layers: (N, h, w, 4) of the job's stack.
+    """
+    stack, middle = job.stack, job.stack.count // 2
+    rasters = [stack.panel(n) for n in range(stack.count)]
+    products = []
+    for eye_m, view in zip(job.eyes_m, job.views, strict=True):
+        height, width = view.picture.shape[:2]
+        middle_from_picture = rasters[middle].raster_from_plane() @ view.plane_from_picture
+        column, row = (places[0] * (width, height)).astype(int).T
+        target = view.pixels[row, column, :3] / np.float32(255)
+        errors, counts = [], np.ones(len(row), bool)
+        for offset in places % (1 / 64) * 64:  # within a pixel, independent of which
+            at = middle_from_picture @ np.stack([column + offset[:, 0], row + offset[:, 1], np.ones(len(row))])
+            total = np.zeros((len(row), 3), np.float32)
+            for n in range(stack.count):
+                x, y, w = at / at[2] if n == middle else panel_from_middle(stack, rasters, eye_m, n) @ (at / at[2])
+                values, inside = _sampled(layers[n], x / w, y / w, boxes=boxes)
+                total, counts = total + values, counts & inside
+            errors.append(np.sin(np.float32(np.pi / 2 / 255) * total) ** 2 - target)
+        products.append((errors[0] * errors[1])[counts])
+    product = np.concatenate(products)
+    return max(float(product.mean()), 0.0) if product.size else None
+
+
+def lost_detail(picture: U8) -> Mapping[int, float]:
+    """Squared error of a picture (h, w, 3 or 4) on coarser rasters, enlarged bilinearly, by reduction."""
+    height = picture.shape[0]
+    bands = [picture[first : first + BAND_ROWS, :, :3] for first in (height // 3, 2 * height // 3)]
+    return {
+        reduction: float(np.mean([_lost(band, reduction) for band in bands]))
+        for reduction in REDUCTIONS
+        if reduction > 1
+    }
+
+
+def _lost(band: U8, reduction: int) -> float:
+    size = max(1, band.shape[1] // reduction), max(1, band.shape[0] // reduction)
+    coarse = cv2.resize(band, size, interpolation=cv2.INTER_AREA)
+    enlarged = cv2.resize(coarse, band.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+    return cv2.norm(band, enlarged, cv2.NORM_L2SQR) / (band.size * 255.0**2)
+
+
+def _grid(picture: U8) -> F32:
+    """(rows, columns, 3) of a few pixels, in 0..1."""
+    rows, columns = (np.linspace(0, n - 1, min(n, k)).astype(int) for n, k in zip(picture.shape, SAMPLED, strict=False))
+    return np.asarray(picture[rows][:, columns, :3] / np.float32(255), np.float32)
+
+
+def _sampled(layer: U8, x: F64, y: F64, *, boxes: bool) -> tuple[F32, NDArray[np.bool_]]:
+    """(K, 3) of a layer at continuous pixels: even boxes, or bilinear with edges clamped; whether each is on it."""
+    height, width = layer.shape[:2]
+    inside = (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
+    if boxes:
+        u, v = np.clip(x, 0, width - 1).astype(int), np.clip(y, 0, height - 1).astype(int)
+        return np.asarray(layer[v, u, :3], np.float32), inside
+    x, y = np.clip(x - 0.5, 0, width - 1), np.clip(y - 0.5, 0, height - 1)
+    u, v = x.astype(int), y.astype(int)
+    right, down = (x - u)[:, None].astype(np.float32), (y - v)[:, None].astype(np.float32)
+    u1, v1 = np.minimum(u + 1, width - 1), np.minimum(v + 1, height - 1)
+    above = layer[v, u, :3] * (1 - right) + layer[v, u1, :3] * right
+    below = layer[v1, u, :3] * (1 - right) + layer[v1, u1, :3] * right
+    return np.asarray(above * (1 - down) + below * down, np.float32), inside

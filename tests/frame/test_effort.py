@@ -1,0 +1,131 @@
+"""The choice of effort: less work for a head that moves, more for one that rests, by measured costs and errors."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from runtime.frame.effort import (
+    CostBook,
+    Costs,
+    EffortChooser,
+    Foresight,
+    Outlook,
+    PictureStatistics,
+    candidates,
+    simulated_costs,
+)
+from runtime.records import Effort, Measures
+
+STAGE_MS = {"render": 44.0, "prepare": 40.0, "inference": 31.0, "finish": 38.0, "step": 85.0}
+REDUCTIONS = (1, 2, 3, 4)
+PERIOD_MS = 1000 / 60
+
+
+def chosen(speed_m_s: float, *, sigma_m: float = 5e-4, slower: float = 1.0, shown_error: float = 5e-3) -> Effort:
+    costs = simulated_costs({stage: slower * ms for stage, ms in STAGE_MS.items()}, REDUCTIONS)
+    return EffortChooser().choose(
+        candidates(REDUCTIONS, 4),
+        costs,
+        lambda cost_ms: Outlook(sigma_m, speed_m_s, max(cost_ms / 1e3 - 0.1, 0.0) * speed_m_s),
+        shown_error=shown_error,
+        period_ms=PERIOD_MS,
+    )
+
+
+def test_costs_of_the_simulated_clock_follow_the_contract() -> None:
+    costs = simulated_costs(STAGE_MS, REDUCTIONS)
+    assert costs.ms(Effort(1, 0)) == pytest.approx(153.0)
+    assert costs.ms(Effort(1, 4)) == pytest.approx(153.0 + 4 * 85.0)
+    assert costs.ms(Effort(2, 1)) == pytest.approx((153.0 + 85.0) / 4)
+    assert costs.ms(Effort(4, 0)) == pytest.approx(153.0 / 16)
+    assert costs.ms(Effort(1, 6, continued_from=4)) == pytest.approx(38.0 + 2 * 85.0), "nothing is drawn or proposed"
+
+
+@given(st.floats(0.0, 2.0), st.floats(0.0, 2.0))
+def test_a_faster_head_never_gets_a_longer_solution(one: float, other: float) -> None:
+    costs = simulated_costs(STAGE_MS, REDUCTIONS)
+    slow, fast = (costs.ms(chosen(speed)) for speed in sorted((one, other)))
+    assert fast <= slow
+
+
+def test_a_resting_head_gets_the_full_raster_and_a_walking_one_a_coarse_raster_without_steps() -> None:
+    assert chosen(0.0).reduction == 1
+    walking = chosen(1.0)
+    assert walking.reduction > 1 and walking.steps == 0
+
+
+def test_on_a_fast_machine_a_moving_head_gets_the_full_raster() -> None:
+    assert chosen(0.3, slower=0.02).reduction == 1
+    assert chosen(0.3, slower=1.0).reduction > 1
+
+
+def test_what_is_shown_badly_is_answered_quickly() -> None:
+    costs = simulated_costs(STAGE_MS, REDUCTIONS)
+    assert costs.ms(chosen(0.0, shown_error=0.05)) < costs.ms(chosen(0.0, shown_error=1e-3))
+
+
+def test_the_present_effort_is_kept_while_another_is_hardly_better() -> None:
+    """Noise in the head's speed about the point where two efforts are equal does not show as flicker."""
+    costs, chooser, picked = simulated_costs(STAGE_MS, REDUCTIONS), EffortChooser(), set()
+    changes = sorted({speed: chosen(speed) for speed in [k / 500 for k in range(500)]}.items())
+    border = next(b[0] for a, b in pairwise(changes) if a[1] != b[1])
+    for k in range(50):
+        speed = border * (1.0 + 0.02 * math.sin(k))
+        picked.add(
+            chooser.choose(
+                candidates(REDUCTIONS, 4),
+                costs,
+                lambda cost_ms, speed=speed: Outlook(5e-4, speed, max(cost_ms / 1e3 - 0.1, 0.0) * speed),
+                shown_error=5e-3,
+                period_ms=PERIOD_MS,
+            )
+        )
+    assert len(picked) == 1
+
+
+def test_rates_of_change_are_learned_from_successive_pictures() -> None:
+    pictures = PictureStatistics(contrast=0.03)
+    for k in range(200):
+        moved_m, elapsed_s = 1e-3 * (k % 7), 0.02 * (k % 3)
+        y = 80.0 * moved_m**2 + 0.4 * elapsed_s**2
+        pictures.learn(Measures(change=(y / (1 + y / 0.03), moved_m, elapsed_s)), Effort())
+    assert pictures.rate_m2 == pytest.approx(80.0, rel=0.05)
+    assert pictures.rate_s2 == pytest.approx(0.4, rel=0.05)
+
+
+def test_a_residual_counts_for_the_steps_that_it_had() -> None:
+    pictures = PictureStatistics()
+    pictures.learn(Measures(residual=1e-3), Effort(1, 2))
+    assert pictures.own(Effort(1, 2)) == pytest.approx(1e-3)
+    assert pictures.own(Effort(1, 0)) > pictures.own(Effort(1, 4))
+
+
+def test_displacements_are_scaled_to_those_that_come_to_pass() -> None:
+    foresight = Foresight()
+    for _ in range(300):
+        foresight.learn(expected_m2=4e-6, found_m2=1e-6)
+    assert foresight.scale == pytest.approx(0.25, rel=0.01)
+
+
+def test_measured_costs_replace_first_ones_and_scale_those_of_other_rasters() -> None:
+    first = {by: {stage: ms / by**2 for stage, ms in STAGE_MS.items()} for by in REDUCTIONS}
+    book = CostBook(first)
+    assert book.costs().ms(Effort(2, 0)) == pytest.approx(153.0 / 4)
+    for _ in range(60):  # a sparse scene: a third of the time
+        book.learn(Effort(2, 0), {stage: ms / 12 for stage, ms in STAGE_MS.items()})
+    costs = book.costs()
+    assert costs.ms(Effort(2, 0)) == pytest.approx(153.0 / 12)
+    assert costs.ms(Effort(1, 0)) == pytest.approx(153.0 / 3)
+
+
+def test_a_continued_solution_teaches_nothing_of_drawing() -> None:
+    book = CostBook({1: dict(STAGE_MS)})
+    book.learn(Effort(1, 6, continued_from=4), {"render": 0.0, "finish": 38.0, "step": 170.0})
+    costs: Costs = book.costs()
+    assert costs.stages[1]["render"] > 0
+    assert costs.stages[1]["step"] == pytest.approx(85.0)
