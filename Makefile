@@ -27,12 +27,13 @@ test-slow: $(VENV)/.test
 golden: $(VENV)/.test
 	$(BIN)/python -m tests.golden --renew $(GOLDEN_ARGS)
 
-# Style, layers, spelling, shell; `pre-commit install` has them run, with types and secrets, before every commit.
+# Style, layers, spelling, prose, shell; `pre-commit install` has them run, with types and secrets, before every commit.
 lint: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 	$(BIN)/typos
+	$(BIN)/python -m pytest -q tests/test_prose.py
 	$(BIN)/shellcheck .ci/run systemd/*.sh requirements/*.sh docs/*.sh systemd/x-authority systemd/back-off
 
 types: $(VENV)/.test

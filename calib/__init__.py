@@ -1,1 +1,1 @@
-"""Calibration: the sensor's place before the stack, the panels' registration, and their grey curves."""
+"""Calibration: the sensor's pose, the panels' registration, and their grey curves."""

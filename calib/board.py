@@ -1,10 +1,10 @@
-"""Coded calibration boards: marks that identify the panel and the place on it.
+"""Coded calibration boards: marks that identify a panel and a position on it.
 
-A mark is a white square with an ArUco marker inside and a smaller white square at each of its corners: where the
-two touch there is a saddle, which is found to a few hundredths of a pixel whatever the blur and the camera's tone
-curve (it looks the same turned by half a turn). Everything else is black, so that the other panels' marks show
-through: where phase 0 lies on phase v, v is seen. One photograph so shows the marks of all panels at once, and no
-tripod is needed. Marks are scattered: those that cover each other from one place do not from another.
+A mark is a white square with an ArUco marker inside and a smaller white square at each of its corners. Where two
+squares touch there is a saddle point, which is symmetric under half a turn; it is located to a few hundredths of a
+pixel despite blur and the camera's tone curve. The rest of the board is black (phase 0), which lets the other panels'
+marks show through. So one photograph shows the marks of all panels, and no tripod is needed. Marks are scattered, so
+that two that overlap from one viewpoint do not from another.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ TILE = SQUARE + 2 * CORNER
 
 
 def dictionary() -> Any:
-    """The markers' code."""
+    """ArUco dictionary of the markers."""
     return cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_100)
 
 
@@ -48,7 +48,7 @@ class Mark:
 
     @property
     def side_px(self) -> int:
-        """Of the white square."""
+        """Side of the white square."""
         return SQUARE * self.unit_px
 
     @property
@@ -59,15 +59,15 @@ class Mark:
 
     @property
     def marker_px(self) -> F64:
-        """(4, 2) corners of the marker itself, in the same order."""
+        """(4, 2) corners of the marker itself, in the order of `saddles_px`."""
         inset = QUIET * self.unit_px
-        found: F64 = self.saddles_px + inset * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
-        return found
+        corners: F64 = self.saddles_px + inset * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
+        return corners
 
 
 @lru_cache(maxsize=8)
 def marks(stack: PanelStack) -> tuple[Mark, ...]:
-    """Every mark of every panel. Raises InputError for panels that are too many or too small."""
+    """All marks of all panels. Raises InputError for too many or too small panels."""
     if stack.count * PER_PANEL > DICTIONARY_SIZE:
         raise InputError("stack", "x_m", f"boards are for {DICTIONARY_SIZE // PER_PANEL} panels at most")
     unit = max(2, round(min(stack.width_px * 9 / 16, stack.height_px) / BITS_ON_SHORT_SIDE))
@@ -76,18 +76,18 @@ def marks(stack: PanelStack) -> tuple[Mark, ...]:
     room = cell - tile - 2
     if room.min() < 0:
         raise InputError("stack", "width_px", f"boards need panels of at least {ACROSS * tile}x{DOWN * tile} pixels")
-    found = []
-    random = np.random.default_rng(16)  # the board is always the same: photographs are compared with it
+    every = []
+    random = np.random.default_rng(16)  # fixed: photographs are compared with the board
     for panel in range(stack.count):
         for place in range(PER_PANEL):
             corner = np.array([place % ACROSS, place // ACROSS]) * cell + 1 + random.uniform(size=2) * room
             left, top = np.rint(corner).astype(int) + CORNER * unit
-            found.append(Mark(panel * PER_PANEL + place, panel, int(left), int(top), unit))
-    return tuple(found)
+            every.append(Mark(panel * PER_PANEL + place, panel, int(left), int(top), unit))
+    return tuple(every)
 
 
 def board(stack: PanelStack, panel: int) -> U8:
-    """(H, W) what a panel shows, 0 or 255."""
+    """(H, W) board of one panel, 0 or 255."""
     picture = np.zeros((stack.height_px, stack.width_px), np.uint8)
     for mark in marks(stack):
         if mark.panel != panel:
@@ -104,5 +104,5 @@ def board(stack: PanelStack, panel: int) -> U8:
 
 
 def boards(stack: PanelStack) -> U8:
-    """(N, H, W) what all panels show together."""
+    """(N, H, W) boards of all panels."""
     return np.stack([board(stack, index) for index in range(stack.count)])

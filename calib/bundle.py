@@ -31,7 +31,7 @@ MIN_SIGMA_PX = 0.01  # least noise of the points: exact data have no outliers
 NO_FIT_PX = 5.0  # median distance of points beyond which the photographs do not show the configuration
 MAX_STEPS, MAX_DAMPING = 60, 1e8
 # Prior standard deviations for any camera: square pixels, a centred lens, distortion of a few per cent. They are
-# negligible beside twelve photographs.
+# negligible compared with twelve photographs.
 SQUARE_SIGMA, CENTRE_SIGMA, DISTORTION_SIGMAS = 0.003, 0.03, (0.3, 0.5, 0.005, 0.005, 0.5)
 
 

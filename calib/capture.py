@@ -1,4 +1,4 @@
-"""`calibrate capture`: guides a person through the viewpoints and keeps the good pairs."""
+"""`calibrate capture`: guide a person through the viewpoints and store the good pairs."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from runtime.records import F64, EyePoints
 from runtime.sensor.registry import open_sensor
 from runtime.sensor.samples import RecordedSamples
 
-WINDOW_NS = NS_PER_S // 2  # a pair is the median over so long
-MAX_SPREAD_M = 0.010  # eyes that moved or scattered by more meanwhile make no pair
-MIN_SAMPLES = 5  # in the window: of fewer the spread means nothing
+WINDOW_NS = NS_PER_S // 2  # a pair is the median over this window
+MAX_SPREAD_M = 0.010  # largest motion or scatter of the eyes in the window
+MIN_SAMPLES = 5  # in the window, for a meaningful spread
 
 
 def midpoint(eyes: EyePoints | None) -> F64 | None:
-    """(3,) middle of two measured eyes; None where one is missing, uncertain or filled in."""
+    """(3,) midpoint of two measured eyes; None if one is missing, uncertain or filled in."""
     if eyes is None or eyes.completed or eyes.confidence.min() < CONFIDENCE_MIN:
         return None
     middle = eyes.eyes_m.mean(axis=0)
@@ -38,13 +38,13 @@ def midpoint(eyes: EyePoints | None) -> F64 | None:
 
 
 class EyeWindow:
-    """The samples of the last half second before the newest one."""
+    """Samples of the half second up to the newest one."""
 
     def __init__(self) -> None:
-        self._samples: deque[tuple[int, F64]] = deque()  # instant, middle of the eyes
+        self._samples: deque[tuple[int, F64]] = deque()  # capture time, midpoint of the eyes
 
     def add(self, capture_ns: int, eyes: EyePoints | None) -> None:
-        """Take in a sample in frame `sensor`; unusable ones only let time pass."""
+        """Take in a sample in frame `sensor`; unusable ones only advance time."""
         middle = midpoint(eyes)
         if middle is not None:
             self._samples.append((capture_ns, middle))
@@ -52,7 +52,7 @@ class EyeWindow:
             self._samples.popleft()
 
     def measure(self) -> tuple[F64, float] | None:
-        """Median (3,) of the window, frame `sensor`, and robust RMS distance; None: too few samples."""
+        """Median (3,) of the window, frame `sensor`, and robust RMS spread; None: too few samples."""
         if len(self._samples) < MIN_SAMPLES:
             return None
         points = np.array([point for _, point in self._samples])
@@ -62,7 +62,7 @@ class EyeWindow:
 
 
 class Walk:
-    """The person's way through the viewpoints. No clock, no threads."""
+    """State of a person's walk through the viewpoints. No clock, no threads."""
 
     def __init__(
         self,
@@ -72,7 +72,7 @@ class Walk:
         say: Callable[[str], None],
         chart: Callable[[Viewpoint], None] | None = None,
     ) -> None:
-        """chart: None: the person follows the charts elsewhere."""
+        """chart: shows a viewpoint's chart; None: the charts are shown elsewhere."""
         self._file, self._say, self._chart = file, say, chart
         self._left = [v for v in viewpoints if v.name not in file.viewpoints]
         self._window = EyeWindow()
@@ -83,7 +83,7 @@ class Walk:
 
     @property
     def current(self) -> Viewpoint:
-        """The viewpoint that is shown."""
+        """Viewpoint currently shown."""
         return self._left[self._index]
 
     def begin(self) -> None:
@@ -101,7 +101,7 @@ class Walk:
         self._window.add(capture_ns, eyes)
 
     def press(self, key: Key | None) -> None:
-        """Do what a key says; None: nothing was pressed."""
+        """Act on a key; None: no key was pressed."""
         if self.finished:
             return
         match key:
@@ -115,7 +115,7 @@ class Walk:
                 self._go(-1)
 
     def summary(self) -> dict[str, Any]:
-        """What came of it."""
+        """Figures for the command's summary."""
         names = self._file.viewpoints
         return {
             "file": str(self._file.path),
@@ -127,18 +127,18 @@ class Walk:
     def _accept(self) -> None:
         viewpoint, seen = self.current, self._window.measure()
         if seen is None:
-            self._say(f"{viewpoint.name}: not taken: the sensor sees no pair of eyes")
+            self._say(f"{viewpoint.name}: not accepted: the sensor sees no pair of eyes")
             return
         middle_m, spread_m = seen
         spread = f"{spread_m * 1e3:.1f}"
         if spread_m > MAX_SPREAD_M:
-            self._say(f"{viewpoint.name}: not taken: the eyes moved or scattered by {spread} mm: hold still")
+            self._say(f"{viewpoint.name}: not accepted: the eyes moved or scattered by {spread} mm: hold still")
             return
         self._file.accept(
             PairRow.of(middle_m, viewpoint.midpoint_m, viewpoint.name, serial=self._serial, spread_mm=spread)
         )
         self._accepted += 1
-        self._say(f"{viewpoint.name}: taken, spread {spread} mm, {len(self._file)} pairs in all")
+        self._say(f"{viewpoint.name}: accepted, spread {spread} mm, {len(self._file)} pairs in all")
         if self._index + 1 == len(self._left):
             self.finished = True
         else:
@@ -148,7 +148,7 @@ class Walk:
         index = min(max(self._index + step, 0), len(self._left) - 1)
         if index != self._index:
             self._index = index
-            self._window = EyeWindow()  # what was seen before does not belong to what comes
+            self._window = EyeWindow()  # earlier samples belong to the previous viewpoint
             self._announce()
 
     def _announce(self) -> None:
@@ -157,7 +157,7 @@ class Walk:
         if self._chart is not None:
             self._chart(viewpoint)
         self._say(
-            f"{viewpoint.name} ({self._index + 1} of {len(self._left)}): {x * 100:.0f} cm before the display, "
+            f"{viewpoint.name} ({self._index + 1} of {len(self._left)}): {x * 100:.0f} cm in front of the display, "
             f"{abs(y) * 100:.0f} cm to its {'right' if y > 0 else 'left'}, {z * 100:.0f} cm up; "
             f"Enter: fused, n: next, p: previous, q: stop"
         )
@@ -166,7 +166,7 @@ class Walk:
 def capture_live(
     out: Path, settings: Settings, hardware: SetupHardware, *, show: bool, say: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Walk through the viewpoints with a person before the display. Raises InputError, FatalError."""
+    """Walk through the viewpoints with a person in front of the display. Raises InputError, FatalError."""
     file = PairsFile(out)
     say(f"sensor: {hardware.open_sensor(settings)}")
     try:
@@ -186,7 +186,7 @@ def capture_live(
 
 
 def capture_recording(out: Path, settings: Settings, *, source: str) -> dict[str, Any]:
-    """A pair for every sample of a recording that knows its true eyes. Raises InputError."""
+    """Write a pair for every sample of a recording with known true eyes. Raises InputError."""
     chosen = settings.sensor.model_copy(update={"driver": "replay", "source": source, "loop": False})
     samples = RecordedSamples(open_sensor(chosen, SimulatedClock()))
     file, pairs, known = PairsFile(out), [], False
@@ -200,7 +200,7 @@ def capture_recording(out: Path, settings: Settings, *, source: str) -> dict[str
                 name = f"at {frame.capture_ns / NS_PER_S:.3f} s"
                 pairs.append(PairRow.of(middle, frame.true_eyes_m.mean(axis=0), name, serial=samples.serial))
     if not pairs:
-        why = "gives no pair: no usable eyes" if known else "does not know where the eyes truly were"
-        raise InputError(source, "", f"{why}: capture from the live sensor")
+        problem = "gives no pair: no usable eyes" if known else "has no true eye positions"
+        raise InputError(source, "", f"{problem}: capture from the live sensor")
     file.accept(*pairs)
     return {"file": str(out), "pairs": len(file), "accepted": len(pairs)}

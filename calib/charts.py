@@ -1,6 +1,7 @@
 """Calibration charts: black lines at the thirds of each eye's image (EyeReal, 2.3, figure S4).
 
-Layers for both eyes at once: at the viewpoint the lines fuse, single and clean; off it they grow ghosts and stripes.
+One set of layers serves both eyes: at the viewpoint the lines fuse into clean single ones; elsewhere they show ghosts
+and stripes.
 """
 
 from __future__ import annotations
@@ -23,45 +24,45 @@ from runtime.support.progress import tracked
 
 MODEL = "best"
 LINE_PX = 10.0  # width of a line of the chart
-WIDEST_FOV_DEG = 40.0  # horizontal, of the eyes' images, as the published code has it
+WIDEST_FOV_DEG = 40.0  # horizontal, of the eyes' images, as in the published code
 
 
 def chart_fov_deg(viewpoint: Viewpoint, stack: PanelStack) -> float:
-    """Horizontal field of view of a viewpoint's images: as published, or the display's from afar.
+    """Horizontal field of view of a viewpoint's images: the published one, or the display's if that is smaller.
 
-    The lines so stay on the panels wherever the viewer stands.
+    This keeps the lines on the panels at any distance.
     """
     return min(WIDEST_FOV_DEG, float(np.degrees(2 * np.arctan(stack.width_m / 2 / (viewpoint.radius_cm / 100)))))
 
 
 def line_picture(*, width_px: int, height_px: int) -> U8:
-    """(h, w, 3) what an eye should see: lines of 10 pixels at the thirds of width and height."""
+    """(h, w, 3) picture for one eye: lines of 10 pixels at the thirds of width and height."""
     ink = np.maximum(_ink(width_px), _ink(height_px)[:, None])
     return np.repeat(np.rint(255 * (1 - ink)).astype(np.uint8)[..., None], 3, axis=2)
 
 
 def _ink(length_px: int) -> F64:
-    """(length,) share of each pixel that lines at the thirds cover."""
+    """(length,) share of each pixel covered by lines at the thirds."""
     position = np.arange(length_px, dtype=np.float64) + 0.5
     distance = np.minimum(np.abs(position - length_px / 3), np.abs(position - 2 * length_px / 3))
     return np.clip(LINE_PX / 2 - distance + 0.5, 0.0, 1.0)
 
 
 class Charts:
-    """The charts of one stack."""
+    """Charts for one stack."""
 
     def __init__(self, settings: Settings) -> None:
-        """Raises InputError, MissingPart."""
+        """Load the model. Raises InputError, MissingPart."""
         self.stack = settings.stack.stack()
         self.ipd_m = settings.calibration.ipd_m or IPD_M
         self._predictor = load_predictor(MODEL, self.stack, settings.model)
 
     def layers(self, viewpoint: Viewpoint) -> U8:
-        """(N, H, W, 4) layers through which both eyes see the line picture at the viewpoint."""
+        """(N, H, W, 4) layers that show the line picture to both eyes at the viewpoint."""
         picture = line_picture(width_px=self.stack.width_px, height_px=self.stack.height_px)
         eyes_m, fov_deg = viewpoint.eyes_m(self.ipd_m), chart_fov_deg(viewpoint, self.stack)
         prediction = solve_still(picture, picture, eyes_m=eyes_m, fov_deg=fov_deg, predictor=self._predictor)
-        return np.array(prediction.layers)  # a copy: the predictor uses its own again
+        return np.array(prediction.layers)  # a copy: the predictor reuses its array
 
     def close(self) -> None:
         """Release the model."""
@@ -69,7 +70,7 @@ class Charts:
 
 
 def make_charts(out: Path, viewpoints: Sequence[Viewpoint], settings: Settings) -> dict[str, Any]:
-    """Write a PNG for each panel and viewpoint, and `charts.json`. Raises InputError, MissingPart."""
+    """Write a PNG per panel and viewpoint, and `charts.json`. Raises InputError, MissingPart."""
     charts = []
     with OutputFolder(out) as folder, closing(Charts(settings)) as drawn:
         for viewpoint in tracked("charts", viewpoints):

@@ -1,4 +1,4 @@
-"""What pairs can and cannot support: refusals (InputError) and warnings, each in one line."""
+"""Checks of calibration pairs and solutions: refusals (InputError) and warnings, one line each."""
 
 from __future__ import annotations
 
@@ -13,18 +13,19 @@ from runtime.eyes.calibration import check_similarity
 from runtime.records import F64
 
 RESIDUAL_LIMIT_M = 0.05  # the EyeReal supplement's (its figure S5)
-SENSOR_NOISE_FLOOR_M = 0.001  # no depth camera does better on a face
-REFUSE_EYE_ERROR_M = 0.05  # expected at the eye: such a calibration is useless
-WARN_EYE_ERROR_M = 0.01  # expected at the eye: ghosts are visible
+SENSOR_NOISE_FLOOR_M = 0.001  # no depth camera is better on a face
+REFUSE_EYE_ERROR_M = 0.05  # expected error at the eye that makes a calibration useless
+WARN_EYE_ERROR_M = 0.01  # expected error at the eye that causes visible ghosts
 COPLANAR = 0.01  # third extent over the first
-MIRROR_GAIN = 0.5  # mirrored data fit a mirrored sensor this much better at least
-NAMED = 8  # pairs that a message lists
+MIRROR_GAIN = 0.5  # maximum ratio of errors, with the sensor mirrored and not, that means mirrored data
+NAMED = 8  # pairs named in a message
 
 
 def check_pairs(pairs: Pairs) -> list[str]:
-    """Warnings about pairs before they are solved. Raises InputError with the pairs' file.
+    """Warnings about pairs before solving. Raises InputError with the pairs' file.
 
-    Refused: fewer than 3 pairs, coincident, collinear, beyond double precision, mirrored, mixed units.
+    Refused: fewer than 3 pairs; coincident or collinear points; points beyond double precision; mirrored axes; mixed
+    units.
     """
     if _is_mirrored(pairs):
         raise InputError(
@@ -39,7 +40,7 @@ def check_pairs(pairs: Pairs) -> list[str]:
         raise InputError(pairs.source, "pairs", str(error)) from None
     for wrong, side in ((1e-3, "sensor"), (1e3, "stack")):
         if 0.8 < scale / wrong < 1.25:
-            problem = f"units are mixed (scale {scale:.4g}): {side} is in millimetres? Metres are wanted"
+            problem = f"units are mixed (scale {scale:.4g}): {side} seems to be in millimetres; use metres"
             raise InputError(pairs.source, f"{side}_x", problem)
     first, _, third = extents(pairs.stack_m)
     if third > COPLANAR * first:
@@ -93,7 +94,7 @@ def _listed(pairs: Pairs, index: list[int]) -> str:
 
 
 def _is_mirrored(pairs: Pairs) -> bool:
-    """True where the pairs fit a mirrored sensor far better, and its points span space."""
+    """Return True if the points span space and fit a mirrored sensor far better."""
     if len(pairs) < 4 or extents(pairs.stack_m)[2] <= COPLANAR * extents(pairs.stack_m)[0]:
         return False
     straight = _typical_error_m(pairs.sensor_m, pairs.stack_m)

@@ -15,14 +15,14 @@ from runtime.support.ranges import SCALE
 if TYPE_CHECKING:
     from runtime.config import Settings
 
-ConfigOption = Annotated[Path | None, typer.Option(help="configuration TOML; without it the defaults hold")]
+ConfigOption = Annotated[Path | None, typer.Option(help="configuration TOML; default: the built-in defaults")]
 JsonOption = Annotated[bool, typer.Option("--json", help="one JSON object on stdout")]
 
 app = typer.Typer(
     no_args_is_help=True,
-    help="The steps of `phasestack setup` one by one: where the panels really are, how grey they are, and where the "
-    "depth camera stands before them.\n\n"
-    "The order is `panels`, `grey`, `charts`, `capture`, `solve`, `report`.\n\n"
+    help="The steps of `phasestack setup` one by one: the panels' true poses, their grey curves, and the pose of the "
+    "depth camera.\n\n"
+    "Run them in this order: `panels`, `grey`, `charts`, `capture`, `solve`, `report`.\n\n"
     "Example: phasestack calibrate charts --out charts",
 )
 
@@ -32,20 +32,20 @@ def panels(
     out: Annotated[Path | None, typer.Option(help="folder for the registration")] = None,
     photos: Annotated[Path | None, typer.Option(help="folder of 8 to 20 photographs of the boards")] = None,
     show: Annotated[bool, typer.Option("--show", help="show the boards on the panels until Enter or q")] = False,
-    write: Annotated[bool, typer.Option("--write", help="put distances, tilts and homographies into --config")] = False,
+    write: Annotated[bool, typer.Option("--write", help="write distances, tilts and homographies to --config")] = False,
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Find where every panel is from photographs of coded boards, with standard errors.
+    """Measure every panel's pose from photographs of coded boards, with standard errors.
 
-    First --show: take 8 to 20 photographs by hand with one camera, without zooming between them, the display filling
-    most of the picture, the room dim: from the middle, the left, the right, above and below, up to 40 degrees aside,
-    a few with the camera on its side. Then --photos.
+    First --show: in a dim room, take 8 to 20 hand-held photographs with one camera and one zoom setting, the display
+    filling most of the picture: from the middle, the left, the right, above and below, up to 40 degrees off the axis,
+    a few with the camera rotated to portrait. Then --photos.
 
     Example: phasestack calibrate panels --photos photos --config phasestack.toml --write --out registration
     """
     if show == (photos is not None) or (photos is not None and out is None):
-        raise InputError("calibrate panels", "--show", "or --photos with --out: one of them")
+        raise InputError("calibrate panels", "--show", "give either --show, or --photos with --out")
     if write and (config is None or photos is None):
         raise InputError("calibrate panels", "--write", "needs --config and --photos")
     settings = _settings(config)
@@ -66,21 +66,21 @@ def panels(
 @app.command()
 def grey(
     out: Annotated[Path | None, typer.Option(help="the panel's LUT, CSV")] = None,
-    panel: Annotated[int, typer.Option(help="0 is the rear one; the others are clear", min=0)] = 0,
+    panel: Annotated[int, typer.Option(help="0 is the rear panel", min=0)] = 0,
     photos: Annotated[Path | None, typer.Option(help="folder of two or three photographs of the chart")] = None,
     show: Annotated[bool, typer.Option("--show", help="show the chart on the panel until Enter or q")] = False,
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure what one panel makes of a grey, and invert it to the panel's LUT.
+    """Measure one panel's grey curve and write its inverse as a LUT.
 
-    First --show: photograph the chart with any camera from two or three places, exposure locked, the room dark, the
-    whole chart in the picture, nothing cut off. Then --photos.
+    First --show: in a dark room, photograph the chart with any camera from two or three positions, with the exposure
+    locked, the whole chart in the picture and no white clipped. Then --photos.
 
     Example: phasestack calibrate grey --panel 2 --photos photos --out panel-2.csv
     """
     if show == (photos is not None) or (photos is not None and out is None):
-        raise InputError("calibrate grey", "--show", "or --photos with --out: one of them")
+        raise InputError("calibrate grey", "--show", "give either --show, or --photos with --out")
     settings = _settings(config)
     stack = settings.stack.stack()
     if panel >= stack.count:
@@ -119,15 +119,16 @@ def charts(
 def capture(
     out: Annotated[Path, typer.Option(help="CSV of pairs; an existing one is resumed")],
     config: ConfigOption = None,
-    replay: Annotated[str | None, typer.Option(help="a recording instead of the live sensor; `demo`: built in")] = None,
+    replay: Annotated[
+        str | None, typer.Option(help="recording to use instead of the sensor; `demo`: the built-in one")
+    ] = None,
     show: Annotated[bool, typer.Option("--show", help="show each chart on the panels")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Pair each chart's viewpoint with the measured eyes; every accepted pair is saved at once.
+    """Pair each chart's viewpoint with the measured eyes; every accepted pair is saved immediately.
 
-    Live: at each chart move until the lines fuse, then press Enter (n: next, p: previous, whose pair Enter
-    replaces, q: stop).
-    A recording must know its true eyes, as the demo does.
+    Live: at each chart, move until the lines fuse, then press Enter (n: next; p: previous, to replace its pair; q:
+    stop). A recording must contain true eye positions, as the demo does.
 
     Example: phasestack calibrate capture --config /etc/phasestack/phasestack.toml --show --out pairs.csv
     """
@@ -152,15 +153,15 @@ def capture(
 @app.command()
 def solve(
     pairs: Annotated[Path, typer.Option(help="CSV or JSON of sensor_x.., stack_x.. in metres")],
-    out: Annotated[Path, typer.Option(help="calibration TOML; the one it replaces is kept beside it")],
+    out: Annotated[Path, typer.Option(help="calibration TOML; a previous one is kept next to it")],
     method: Annotated[
-        str, typer.Option(help="seed, least-squares, inverse, robust or fixed-scale; without: the best for the pairs")
+        str, typer.Option(help="seed, least-squares, inverse, robust or fixed-scale; default: the best for the pairs")
     ] = "",
     scale: Annotated[float, number(*SCALE, help="the known scale of fixed-scale")] = 1.0,
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Find stack_from_sensor from pairs, with its error at the eye; refuse pairs that cannot support it.
+    """Compute stack_from_sensor from pairs, with its error at the eye; refuse inadequate pairs.
 
     Example: phasestack calibrate solve --pairs pairs.csv --out calibration.toml
     """
@@ -176,7 +177,7 @@ def report(
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show a calibration's figures, and its error at every point.
+    """Write a page with a calibration's figures and a map of its error.
 
     Example: phasestack calibrate report calibration.toml --out report
     """
@@ -193,7 +194,7 @@ def _settings(config: Path | None) -> Settings:
 
 
 def _report(summary: dict[str, Any], as_json: bool) -> None:
-    """Print a command's summary as one JSON object, or a line a field."""
+    """Print a command's summary as one JSON object, or one line per field."""
     from runtime.support.artifacts import to_json
     from runtime.support.figures import shown
 

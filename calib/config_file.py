@@ -1,4 +1,4 @@
-"""Writes to a configuration file: comments and past versions are kept; only valid ones are written."""
+"""Edit a configuration file: keeps comments and past versions, and writes only valid files."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
     from tomlkit import TOMLDocument
 
 
-KEPT_VERSIONS = 20  # of a configuration or a calibration that was replaced
-KEPT_BYTES_MAX = 64 << 20  # of a file of which versions are kept
+KEPT_VERSIONS = 20  # backups of a configuration or calibration
+KEPT_BYTES_MAX = 64 << 20  # largest file that is backed up
 
 
 def save(path: Path, text: str) -> Path | None:
-    """Write a file (or a link's target) atomically, and keep the one it replaces.
+    """Write a file (or a link's target) atomically and keep the version it replaces.
 
-    Answers the kept version's path, which is readable by no more users than the file.
+    Returns the kept version's path; its permissions are those of the file.
     """
     path, kept = path.resolve(), None
     if untrusted_input.is_there(path):
@@ -47,7 +47,7 @@ def _version(path: Path, number: int) -> Path:
 
 
 def read_document(config: Path) -> TOMLDocument:
-    """A configuration; an empty one where the file is not there yet. Raises InputError."""
+    """Read a configuration; empty if the file does not exist yet. Raises InputError."""
     if not untrusted_input.is_there(config):
         return tomlkit.document()
     load_settings(config)
@@ -58,10 +58,7 @@ def read_document(config: Path) -> TOMLDocument:
 
 
 def rewrite(config: Path, change: Callable[[TOMLDocument], None]) -> Path | None:
-    """Change a configuration, where it is valid then, and only then; answers where the past one is kept.
-
-    Raises InputError.
-    """
+    """Change a configuration if the result is valid; returns the path of the kept past version. Raises InputError."""
     document = read_document(config)
     change(document)
     text = tomlkit.dumps(document)
@@ -73,7 +70,7 @@ def rewrite(config: Path, change: Callable[[TOMLDocument], None]) -> Path | None
 
 
 def put(document: TOMLDocument, section: str, values: Mapping[str, Any]) -> None:
-    """Set keys of a table, which is made where there is none."""
+    """Set keys of a table, creating it if missing."""
     table: Any = document.setdefault(section, tomlkit.table())
     for key, value in values.items():
         table[key] = value
@@ -91,22 +88,22 @@ def put_panels(document: TOMLDocument, key: str, values: Mapping[int, Any], *, p
 
 
 def put_monitors(document: TOMLDocument, tables: Sequence[Mapping[str, Any]]) -> None:
-    """Set which monitor is which panel, rear to front, and how it is mounted.
+    """Set each panel's monitor and mounting, rear to front.
 
-    A panel whose monitor and mounting are as they were keeps what else is known of it (registration, grey curve).
+    Panels whose monitor and mounting are unchanged keep their other keys (registration, grey curve).
     """
     output: Any = document.setdefault("output", tomlkit.table())
     past = [dict(table.unwrap()) for table in output.get("panels", ())]
-    found = tomlkit.aot()
+    panels = tomlkit.aot()
     for values in tables:
         same = next((old for old in past if all(old.get(k, _DEFAULTS.get(k)) == v for k, v in values.items())), {})
         table = tomlkit.table()
         for key, value in ({**same, **values}).items():
             table[key] = value
-        found.append(table)
+        panels.append(table)
     if "panels" in output:
         del output["panels"]
-    output["panels"] = found
+    output["panels"] = panels
     if output.get("kind", "offscreen") == "offscreen":
         output["kind"] = "windows"
 

@@ -1,4 +1,4 @@
-"""Saddle points of the boards in a photograph to a few hundredths of a pixel, or its fault."""
+"""Find the boards' saddle points in a photograph, to a few hundredths of a pixel, or report its fault."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from calib.board import MARKER, Mark, dictionary, marks
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 
-DETECTION_PX = 2400  # photographs are searched at this size; corners are found in their own
-MIN_MARKS = 3  # of a panel: twelve points, to place it
-MIN_EXTENT = 0.3  # of a panel: a corner of it says little about the others
-MIN_UNIT_PX = 1.7  # photograph's pixels in one bit of a marker: below this nothing is read reliably
-BLURRED_BITS = 1.1  # an edge that is wider than this many bits is not worth its noise
-MIN_CONTRAST = 0.35  # of a saddle against its mark's own
+DETECTION_PX = 2400  # size at which photographs are searched; corners are located at full resolution
+MIN_MARKS = 3  # per panel: twelve points
+MIN_EXTENT = 0.3  # share of a panel that its marks must span: one corner hardly determines the rest
+MIN_UNIT_PX = 1.7  # photograph's pixels per bit of a marker, for reliable reading
+BLURRED_BITS = 1.1  # maximum width of an edge, in bits of a marker
+MIN_CONTRAST = 0.35  # of a saddle, relative to its mark's
 MIN_DYNAMIC = 24  # code values between black and white
 
 
 @dataclass(frozen=True, slots=True)
 class SeenMarks:
-    """One photograph's saddles."""
+    """Saddles found in one photograph."""
 
     name: str
     width_px: int
     height_px: int
     panel: Any  # (K,) index of the panel
-    panel_px: F64  # (K, 2) where the saddle is on the panel
-    image_px: F64  # (K, 2) where it is in the photograph; pixel centres at whole numbers
-    marks: tuple[int, ...]  # how many of each panel's marks were found
-    fault: str  # why it cannot be used; empty: it can
+    panel_px: F64  # (K, 2) position on the panel
+    image_px: F64  # (K, 2) position in the photograph; pixel centres at whole numbers
+    marks: tuple[int, ...]  # number found, per panel
+    fault: str  # reason why the photograph is unusable; empty: none
 
 
 def _detector() -> Any:
@@ -40,13 +40,13 @@ def _detector() -> Any:
     parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = 11, 43
     parameters.adaptiveThreshWinSizeStep = 16
     parameters.minMarkerPerimeterRate = 0.008
-    parameters.errorCorrectionRate = 0.3  # marks that cover each other must not become others
+    parameters.errorCorrectionRate = 0.3  # low, so that overlapping marks are not read as other ones
     parameters.minDistanceToBorder = 2
     return cv2.aruco.ArucoDetector(dictionary(), parameters)
 
 
 def _markers(picture: U8, known: dict[int, Mark]) -> list[tuple[Mark, F64]]:
-    """Marks whose code is read, with the marker's (4, 2) corners in the picture; a code read twice is not trusted."""
+    """Marks with readable codes and their (4, 2) corners in the picture; codes read twice are dropped."""
     scale = min(2.0, DETECTION_PX / max(picture.shape))
     kind = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=kind)
@@ -62,13 +62,13 @@ def _markers(picture: U8, known: dict[int, Mark]) -> list[tuple[Mark, F64]]:
 
 
 def find_marks(picture: U8, stack: PanelStack, *, name: str) -> SeenMarks:
-    """The saddles of all panels' boards in a grey photograph (h, w)."""
+    """Find the saddles of all panels' boards in a grey photograph (h, w)."""
     known = {mark.number: mark for mark in marks(stack)}
-    found = _markers(picture, known)
+    markers = _markers(picture, known)
     panel, panel_px, image_px, edges = [], [np.zeros((0, 2))], [np.zeros((0, 2))], []
-    unit_px = float(np.median([_unit_px(quad) for _, quad in found])) if found else 0.0
+    unit_px = float(np.median([_unit_px(quad) for _, quad in markers])) if markers else 0.0
     window = int(np.clip(round(1.3 * unit_px), 2, 15))
-    for mark, quad in found:
+    for mark, quad in markers:
         image_from_panel: Any = cv2.findHomography(mark.marker_px, quad)[0]
         if image_from_panel is None:
             continue
@@ -97,22 +97,22 @@ def find_marks(picture: U8, stack: PanelStack, *, name: str) -> SeenMarks:
 
 
 def _mirrored(picture: U8, known: dict[int, Mark], counts: list[int]) -> str:
-    """What is wrong with a picture whose marks are found in its mirror image; empty: nothing."""
+    """Fault of a picture whose marks are found only in its mirror image; empty: none."""
     if min(counts) >= MIN_MARKS:
         return ""
     turned = [mark.panel for mark, _ in _markers(np.ascontiguousarray(picture[:, ::-1]), known)]
     for panel, count in enumerate(counts):
         if count < MIN_MARKS <= turned.count(panel):
             if max(counts) < MIN_MARKS:
-                return "is mirrored (a selfie camera's habit; or the panels' `mirror` is wrong)"
+                return "is mirrored (by a selfie camera, or the panels' `mirror` is wrong)"
             return f"shows panel {panel} mirrored: its `mirror` in the configuration is wrong"
     return ""
 
 
 def _unreadable(counts: list[int], edges: list[float], unit_px: float) -> str:
-    """What is wrong with a picture's sharpness; edges: widths in bits of a marker, of each mark. Empty: nothing."""
+    """Fault in a picture's sharpness; empty: none. edges: width of each mark's edge in bits of a marker."""
     if sum(counts) == 0:
-        return "shows no mark of the board: blurred, too dark, or of something else"
+        return "shows no mark of the board: blurred, too dark, or not of the board"
     edge_bits = float(np.median(edges))
     if edge_bits > BLURRED_BITS:
         return f"is blurred: its edges are {edge_bits * unit_px:.1f} px wide"
@@ -122,26 +122,26 @@ def _unreadable(counts: list[int], edges: list[float], unit_px: float) -> str:
 
 
 def _covered(counts: list[int], places: F64, owners: Any) -> str:
-    """Which panel cannot be placed by a picture; places (K, 2): of its saddles, in widths and heights. Empty: none."""
+    """Fault that keeps a panel from being located; empty: none. places: (K, 2) saddles in panel widths and heights."""
     fewest = min(counts)
     if fewest < MIN_MARKS:
         panel = counts.index(fewest)
-        return f"shows {fewest} marks of panel {panel}, less than {MIN_MARKS}: covered, cut off or too oblique"
+        return f"shows {fewest} marks of panel {panel}, fewer than {MIN_MARKS}: covered, cut off or too oblique"
     for panel in range(len(counts)):
         share = float(np.ptp(places[owners == panel], axis=0).min())
         if share < MIN_EXTENT:
-            return f"is covered or cut off: of panel {panel} {100 * share:.0f}% of its width or height are seen"
+            return f"is covered or cut off: only {100 * share:.0f}% of panel {panel}'s width or height is visible"
     return ""
 
 
 def _unit_px(quad: F64) -> float:
-    """Photograph's pixels in a bit of a marker, along its shorter side."""
+    """Photograph's pixels per bit of a marker, along its shortest side."""
     sides = np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1)
     return float(sides.min()) / MARKER
 
 
 def _refined(picture: U8, guess: F64, quad: F64, *, window: int) -> tuple[Any, F64]:
-    """Saddles to sub-pixels, and which of them look like one: white inside and outside, black to both sides."""
+    """Mask of points that are saddles (white inside and outside, black to both sides), and sub-pixel positions."""
     height, width = picture.shape
     inside = (
         (guess[:, 0] > window + 2) & (guess[:, 0] < width - window - 3)
@@ -165,7 +165,7 @@ def _refined(picture: U8, guess: F64, quad: F64, *, window: int) -> tuple[Any, F
 
 
 def _quarter(out: F64, guess: F64) -> F64:
-    """The other diagonal of each corner: from its two neighbours, so that perspective is followed."""
+    """Other diagonal at each corner, from its two neighbours to account for perspective."""
     following, before = np.roll(guess, -1, axis=0) - guess, np.roll(guess, 1, axis=0) - guess
     return np.asarray((following - before) / 10 * 0.9, dtype=np.float64)
 
@@ -178,7 +178,7 @@ def _samples(picture: U8, points: F64) -> F64:
 
 
 def _edge_px(picture: U8, quad: F64) -> float:
-    """Width of the marker's outer edge, photograph's pixels: contrast over the steepest slope, median of its sides."""
+    """Width of a marker's outer edge in photograph pixels: contrast over steepest slope, median over its sides."""
     widths = []
     centre = quad.mean(axis=0)
     for first, second in zip(quad, np.roll(quad, -1, axis=0), strict=True):

@@ -1,4 +1,4 @@
-"""The panels while a display is set up: layers until other ones come; and a person who looks at them."""
+"""Panels and their keys while a display is set up."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from runtime.panels.registry import open_panels, panel_settings
 from runtime.records import U8, PanelFrame
 from runtime.support.gl import offscreen_context
 
-POLL_NS = 50 * NS_PER_MS  # between two looks for keys
+POLL_NS = 50 * NS_PER_MS  # interval between polls for keys
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class PanelDisplay:
-    """All panels, showing one set of layers until given another, and the keys that are pressed on them."""
+    """All panels, showing one set of layers until the next, and the keys pressed on them."""
 
     def __init__(self, sink: PanelSink) -> None:
         self._sink = sink
@@ -27,16 +27,13 @@ class PanelDisplay:
         self._keys = WindowKeys(sink)
 
     def show(self, layers: U8) -> None:
-        """(N, H, W, 4) layers on all panels. Raises PanelLost."""
+        """Show (N, H, W, 4) layers on all panels. Raises PanelLost."""
         self._layers = layers
         self._number += 1
         self._sink.present(PanelFrame(self._number, layers, self._number))
 
     def key(self) -> Key | None:
-        """The next key, or None. Shows the layers again, which keeps the windows responsive.
-
-        Raises PanelLost.
-        """
+        """Return the next key or None; presents the layers again, to keep windows responsive. Raises PanelLost."""
         if self._layers is not None:
             self.show(self._layers)
         return self._keys.poll()
@@ -47,7 +44,7 @@ class PanelDisplay:
 
 
 def open_display(settings: Settings, *, registered: bool = False, grey_curve: bool = True) -> PanelDisplay:
-    """The configured panels. registered, grey_curve: False for bare panels, to measure them.
+    """Open the configured panels; registered, grey_curve: False to measure them without correction.
 
     Raises InputError, MissingPart, PanelLost.
     """
@@ -58,12 +55,12 @@ def open_display(settings: Settings, *, registered: bool = False, grey_curve: bo
     panels = tuple(panel.model_copy(update=changes) for panel in panel_settings(settings.output, stack.count))
     output = settings.output.model_copy(update={"panels": panels})
     if output.kind == "offscreen":
-        typer.echo("warning: output.kind is offscreen: nobody sees what is shown", err=True)
+        typer.echo("warning: output.kind is offscreen: the charts are not visible", err=True)
     return PanelDisplay(open_panels(output, stack, MonotonicClock(), offscreen_context()))
 
 
 def show_until_key(display: PanelDisplay, layers: U8, title: str) -> None:
-    """(N, H, W, 4) layers until Enter or q. Closes the display. Raises PanelLost."""
+    """Show (N, H, W, 4) layers until Enter or q, then close the display. Raises PanelLost."""
     keys, clock = TerminalKeys(), MonotonicClock()
     try:
         display.show(layers)
@@ -76,5 +73,5 @@ def show_until_key(display: PanelDisplay, layers: U8, title: str) -> None:
 
 
 def grey_layers(pictures: U8) -> U8:
-    """(N, H, W, 4) layers of grey pictures (N, H, W), one for each panel."""
+    """(N, H, W, 4) layers from grey pictures (N, H, W), one per panel."""
     return np.concatenate([np.repeat(pictures[..., None], 3, axis=-1), np.full_like(pictures[..., None], 255)], axis=-1)

@@ -1,11 +1,11 @@
-"""A chart from which any camera measures a panel's grey curve, whatever its own tone curve is.
+"""A chart for measuring a panel's grey curve with a camera of unknown tone curve.
 
-Patches of every grey, many of each and scattered, so that an uneven light is separated from the greys; and patches
-of black and white pixels mixed in known shares, whose light is known however the panel's greys are: they measure the
-camera. The board's marks among them tell where each patch lies in a photograph.
+Patches of each grey are scattered over the chart, to separate uneven light from the greys. Patches of black and white
+pixels in known proportions have a known intensity regardless of the panel's grey curve: they calibrate the camera. The
+board's marks between the patches locate them in a photograph.
 
 Between crossed polarizers, with the other panels at zero, a panel of phase p shows dark + range·sin²(pi/2·p) (EyeReal,
-(4)). That full white is a phase of 1 is assumed: light alone cannot tell a panel that does not reach it.
+(4)). Full white is assumed to be phase 1; intensities cannot reveal a panel that does not reach it.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from runtime.support.artifacts import write_text
 
 GREYS = tuple(round(255 * step / 12) for step in range(13))
 SHARES = tuple(step / 16 for step in (1, 2, 4, 6, 8, 11, 14))  # of white pixels in a mixed patch
-PATCHES_ACROSS = 32  # a panel's width
-MARGIN = 0.15  # of a panel on each side: seen from nearby, its rim has no other panel behind it and no light
+PATCHES_ACROSS = 32  # across a panel's width
+MARGIN = 0.15  # of a panel on each side: from nearby, its rim has no other panel behind it and no light
 INNER = 0.5  # share of a patch's side that is measured
-SAMPLES = 24  # by as many, of a patch
-MIN_MARKS = 4  # of the panel, for the homography of its patches
-FALLS = 0.01  # of the range: a brighter grey that is darker by more is no grey curve
-CLIPPED = 0.02  # share of the white patches' pixels at the camera's limit, above which a photograph is overexposed
-LUT_ROWS = 256  # one for each 8-bit phase
+SAMPLES = 24  # per side of a patch
+MIN_MARKS = 4  # for the homography of a panel's patches
+FALLS = 0.01  # of the range: largest decrease from one grey to the next brighter one
+CLIPPED = 0.02  # share of clipped pixels in the white patches above which a photograph is overexposed
+LUT_ROWS = 256  # one per 8-bit phase
 BAYER = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]])
 
 
@@ -49,15 +49,15 @@ class Patch:
     left_px: int
     top_px: int
     side_px: int
-    grey: int  # 0 to 255; -1: black and white pixels
-    share: float  # of white pixels where they are mixed
+    grey: int  # 0 to 255; -1: mixed black and white pixels
+    share: float  # of white pixels in a mixed patch
 
 
 @lru_cache(maxsize=8)
 def patches(stack: PanelStack, panel: int) -> tuple[Patch, ...]:
-    """The chart's patches between the board's marks: kinds scattered, always the same."""
+    """The chart's patches between the board's marks, their kinds scattered in a fixed order."""
     pitch = stack.width_px // PATCHES_ACROSS
-    side = pitch * 5 // 6 // 8 * 8  # half of it, what is measured, holds the mixing pattern whole
+    side = pitch * 5 // 6 // 8 * 8  # the measured half holds whole periods of the mixing pattern
     free = [
         (left, top)
         for top in range(round(MARGIN * stack.height_px), round((1 - MARGIN) * stack.height_px) - side, pitch)
@@ -66,15 +66,15 @@ def patches(stack: PanelStack, panel: int) -> tuple[Patch, ...]:
     ]
     kinds = [(grey, 0.0) for grey in GREYS] + [(-1, share) for share in SHARES]
     order = np.random.default_rng(panel).permutation(len(free))
-    found = []
+    chart = []
     for number, place in enumerate(order.tolist()):
         (left, top), (grey, share) = free[place], kinds[number % len(kinds)]
-        found.append(Patch(left, top, side, grey, share))
-    return tuple(found)
+        chart.append(Patch(left, top, side, grey, share))
+    return tuple(chart)
 
 
 def _is_covered(stack: PanelStack, panel: int, left: int, top: int, side: int) -> bool:
-    """Whether a square lies on one of the board's marks, or nearly."""
+    """Return True if a square overlaps one of the board's marks or nearly does."""
     for mark in marks(stack):
         gap, tile = 2 * mark.unit_px, TILE * mark.unit_px
         u, v = (place - CORNER * mark.unit_px - gap for place in (mark.left_px, mark.top_px))
@@ -85,7 +85,7 @@ def _is_covered(stack: PanelStack, panel: int, left: int, top: int, side: int) -
 
 
 def grey_chart(stack: PanelStack, panel: int) -> U8:
-    """(H, W) what the panel shows; the others are clear. Not to be resampled, nor sent through a LUT."""
+    """(H, W) chart of the panel, to be shown without resampling or LUT while the others are clear."""
     picture = board(stack, panel)
     for patch in patches(stack, panel):
         area = picture[patch.top_px : patch.top_px + patch.side_px, patch.left_px : patch.left_px + patch.side_px]
@@ -98,7 +98,7 @@ def grey_chart(stack: PanelStack, panel: int) -> U8:
 
 
 def grey_charts(stack: PanelStack, panel: int) -> U8:
-    """(N, H, W) what all panels show: the chart of one, the others clear."""
+    """(N, H, W) pictures of all panels: the chart on one, the others clear."""
     charts = np.zeros((stack.count, stack.height_px, stack.width_px), np.uint8)
     charts[panel] = grey_chart(stack, panel)
     return charts
@@ -108,15 +108,15 @@ def lut_from_photographs(
     out: Path, pictures: Iterable[tuple[str, U8]], stack: PanelStack, *, panel: int, source: str
 ) -> dict[str, Any]:
     """Write a panel's LUT from named photographs (h, w) of its chart. Raises InputError."""
-    found = [histograms(picture, stack, panel, source=f"{source}, {name}") for name, picture in pictures]
-    intensity, residual = measure(found, stack, panel, source=source)
+    measured = [histograms(picture, stack, panel, source=f"{source}, {name}") for name, picture in pictures]
+    intensity, residual = measure(measured, stack, panel, source=source)
     write_lut(out, intensity)
     return {"file": str(out), "grey": GREYS, "intensity": intensity, "residual": residual}
 
 
 def write_lut(out: Path, intensity: F64) -> None:
     """Write a panel's LUT (256 rows of phase and grey, 0 to 1) from intensities (13,) of `GREYS`."""
-    # The root of the intensity is smooth at both ends, of a bare panel and of a monitor with a tone curve of its own.
+    # The root of the intensity is smooth at both ends, for a bare panel and for a monitor with a tone curve.
     root = PchipInterpolator(np.array(GREYS) / 255, np.sqrt(np.maximum.accumulate(intensity)))
     fine, rows = np.linspace(0.0, 1.0, 4097), np.linspace(0.0, 1.0, LUT_ROWS)
     greys = np.interp(rows, phase_from_intensity(np.clip(root(fine), 0.0, 1.0) ** 2, branch=1), fine)
@@ -125,7 +125,7 @@ def write_lut(out: Path, intensity: F64) -> None:
 
 
 def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F64:
-    """(P, 256) shares of the code values in the middle of every patch of a grey photograph (h, w).
+    """(P, 256) histograms of code values in the middle of every patch in a grey photograph (h, w).
 
     Raises InputError.
     """
@@ -136,30 +136,28 @@ def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F6
         raise InputError(source, "", problem)
     image_from_panel, _ = cv2.findHomography(seen.panel_px[mine], seen.image_px[mine], cv2.RANSAC, 8.0)
     step = (np.arange(SAMPLES) + 0.5) / SAMPLES * INNER + (1 - INNER) / 2
-    found = []
+    rows = []
     for patch in patches(stack, panel):
         u, v = np.meshgrid(patch.left_px + step * patch.side_px, patch.top_px + step * patch.side_px)
         places = cv2.perspectiveTransform(np.stack([u, v], axis=-1).reshape(1, -1, 2), image_from_panel)[0]
         column, row = np.rint(places).astype(int).T
         if min(column.min(), row.min()) < 0 or column.max() >= picture.shape[1] or row.max() >= picture.shape[0]:
             raise InputError(source, "", "does not show the whole chart")
-        found.append(np.bincount(picture[row, column], minlength=256) / len(row))
-    counts = np.array(found)
+        rows.append(np.bincount(picture[row, column], minlength=256) / len(row))
+    counts = np.array(rows)
     white = np.array([patch.grey == 255 for patch in patches(stack, panel)])
     if counts[white, 253:].sum(axis=1).mean() > CLIPPED:
-        raise InputError(source, "", "is overexposed: white is cut off; expose less")
+        raise InputError(source, "", "is overexposed: white is clipped; expose less")
     if (counts[white] @ np.arange(256)).mean() < 60:
         raise InputError(source, "", "is too dark: expose more")
     return counts
 
 
 def measure(pictures: list[F64], stack: PanelStack, panel: int, *, source: str) -> tuple[F64, float]:
-    """(13,) intensities of `GREYS`, 0 to 1, from histograms of photographs of one exposure.
+    """(13,) intensities of `GREYS`, 0 to 1, from histograms of equally exposed photographs, and the median residual.
 
-    Also the typical relative residual of a patch.
-
-    Fitted together: the camera's tone curve, each photograph's uneven light (a quadratic of its logarithm), and the
-    greys. Raises InputError where the greys do not ascend.
+    Jointly fits the camera's tone curve, each photograph's uneven light (its logarithm is a quadratic) and the greys.
+    The residual is relative, per patch. Raises InputError if the greys do not ascend.
     """
     chart = patches(stack, panel)
     place = np.array([[p.left_px / stack.width_px - 0.5, p.top_px / stack.height_px - 0.5] for p in chart])
@@ -180,12 +178,12 @@ def measure(pictures: list[F64], stack: PanelStack, panel: int, *, source: str) 
 
     def residuals(x: F64) -> F64:
         response, light, fields, _ = parts(x)
-        found = []
+        relative = []
         for picture, field in zip(pictures, fields, strict=True):
             measured = picture @ response
             expected = np.exp(field[0] + uneven @ field[1:]) * light
-            found.append((measured - expected) / (expected + 0.02))
-        return np.concatenate(found)
+            relative.append((measured - expected) / (expected + 0.02))
+        return np.concatenate(relative)
 
     inner = np.array(GREYS[1:-1]) / 255
     start = np.concatenate([[np.log(2.0), 0.0, 0.0, 0.01], inner**2, np.zeros(6 * photographs)])

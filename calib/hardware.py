@@ -1,4 +1,4 @@
-"""What setting up touches: keys, monitors, panels, a camera, a depth sensor."""
+"""Hardware used by the setup: keys, monitors, panels, a camera, a depth sensor."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ from runtime.sensor.worker import OPEN_TIMEOUT_S, SensorWorker
 
 Poll = Callable[[], Key | None]
 Say = Callable[[str], None]
-Named = tuple[str, U8]  # a photograph (h, w), and what to call it
-Sample = tuple[int, EyePoints | None, str]  # when it was taken, eyes in frame `sensor`, the sensor's serial
-POLL_NS = 20 * NS_PER_MS  # between two looks for keys and samples
-CARD_CHARACTERS = 32  # of a line on a card
+Named = tuple[str, U8]  # name of a photograph, and its pixels (h, w)
+Sample = tuple[int, EyePoints | None, str]  # capture time, eyes in frame `sensor`, the sensor's serial
+POLL_NS = 20 * NS_PER_MS  # interval between polls for keys and samples
+CARD_CHARACTERS = 32  # per line of a card
 
 
 class SetupHardware:
-    """A display, its monitors on X11, its sensor; photographs from a folder; a person at the keys."""
+    """A display with its monitors on X11 and its sensor, photographs in a folder, a person at the keys."""
 
     simulated = False
 
     def __init__(self, keys: Poll, *, photos: Path = Path("photos")) -> None:
-        """keys: of the terminal; those of the panels' windows count besides."""
+        """keys: of the terminal, in addition to those of the panels' windows."""
         self._keys, self._photos = keys, photos
         self._clock = MonotonicClock()
-        self._display: PanelDisplay | None = None  # whatever windows are open: only one owner at a time
+        self._display: PanelDisplay | None = None  # owns the open windows, if any
         self._charts: Charts | None = None
         self._cards: tuple[list[U8], tuple[Monitor, ...]] = ([], ())
         self._worker: SensorWorker | None = None
-        self._frames: list[SensorFrame] = []  # that were taken from the worker and not returned yet
+        self._frames: list[SensorFrame] = []  # received from the worker, not yet returned by `sample`
 
     def poll(self) -> Key | None:
-        """A key that was pressed in the terminal or on a panel's window, which stays alive by being asked."""
+        """Return a key pressed in the terminal or on a panel's window; polling keeps the windows responsive."""
         return self._keys() or (self._display.key() if self._display is not None else None)
 
     def key(self) -> Key:
@@ -60,7 +60,7 @@ class SetupHardware:
         self._clock.sleep_until_ns(self._clock.now_ns() + POLL_NS)
 
     def monitors(self) -> tuple[Monitor, ...]:
-        """The active monitors. Raises InputError."""
+        """Open a window on every active monitor and return the monitors. Raises InputError."""
         self.let_go()
         try:
             panels, cards, monitors = every_monitor()
@@ -70,7 +70,7 @@ class SetupHardware:
         return monitors
 
     def show_card(self, number: int, words: Sequence[str]) -> None:
-        """Monitor `number` shows its identity card with words as it is sent, the others are clear."""
+        """Show an identity card with `words` on monitor `number`, in its own orientation; clear the others."""
         cards, monitors = self._cards
         height, width = cards[number].shape[:2]
         lines = [line for text in words for line in wrap(text, CARD_CHARACTERS)]
@@ -79,9 +79,9 @@ class SetupHardware:
             self._display.show(alone([*cards[:number], card, *cards[number + 1 :]], number))
 
     def photographs(self, settings: Settings, pictures: U8, *, panel: int | None, say: Say) -> Iterator[Named]:
-        """Photographs of what the bare panels show (N, H, W): the boards, or the grey chart of one panel.
+        """Show pictures (N, H, W) on the uncorrected panels, wait for photographs of them and yield those.
 
-        Raises InputError, PanelLost.
+        The pictures are the boards, or for `panel` its grey chart. Raises InputError, PanelLost.
         """
         self.let_go()
         folder = self._photos if panel is None else self._photos / f"grey-{panel}"
@@ -92,13 +92,13 @@ class SetupHardware:
             say(f"put {count} into {folder}, then Enter (q: stop)")
             while (key := self.key()) is not Key.ACCEPT:
                 if key is Key.QUIT:
-                    raise InputError("photographs", "", "stopped before there were any")
+                    raise InputError("photographs", "", "stopped before any were there")
         finally:
             self.let_go()
         return photographs(folder)
 
     def open_sensor(self, settings: Settings) -> str:
-        """Start the sensor and wait for it; returns what it is. Raises InputError."""
+        """Start the sensor and wait for it; returns its name. Raises InputError."""
         self._stop_sensor()
         open_sensor(settings.sensor, self._clock)  # refuses unknown names before anything starts
         worker = SensorWorker(
@@ -124,9 +124,9 @@ class SetupHardware:
         return f"{settings.sensor.driver} {worker.serial}".strip()
 
     def sample(self, standing_at: Viewpoint) -> Sample | None:
-        """The oldest sample that was not returned before, if there is one: slow panels lose none.
+        """Return the next sample in order, if there is one; slow panels lose none.
 
-        standing_at: where the person is asked to stand; a simulated one does.
+        standing_at: where the person was asked to stand, which a simulated person does.
         """
         if self._worker is None:
             return None
@@ -140,19 +140,19 @@ class SetupHardware:
         return frame.capture_ns, frame.eyes, self._worker.serial
 
     def chart(self, settings: Settings) -> Callable[[Viewpoint], None] | None:
-        """What shows a viewpoint's chart while capturing; None: nobody sees any."""
+        """Return a function that shows a viewpoint's chart; None if charts can't be shown."""
         self.let_go()
         charts, display = Charts(settings), open_display(settings, registered=True)
         self._charts, self._display = charts, display
         return lambda viewpoint: display.show(charts.layers(viewpoint))
 
     def close(self) -> None:
-        """Give everything back. May be called twice."""
+        """Release everything. May be called twice."""
         self.let_go()
         self._stop_sensor()
 
     def let_go(self) -> None:
-        """Close whatever windows are open, and the model that draws for them."""
+        """Close open windows and the model that draws for them."""
         for part in (self._display, self._charts):
             if part is not None:
                 part.close()

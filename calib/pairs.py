@@ -1,4 +1,4 @@
-"""Pairs of a measured sensor point and a known stack point: read, checked, stored."""
+"""Pairs of a measured sensor point and a known stack point: read, check, store."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from runtime.records import F64
 from runtime.support import untrusted_input
 from runtime.support.artifacts import write_text
 
-MAX_PAIRS = 1_000_000  # of one file
-MAX_LISTED = 3  # mistakes that a refusal spells out
-MAX_MAGNITUDE = 1e9  # of a number, in whatever unit
+MAX_PAIRS = 1_000_000  # in a file
+MAX_LISTED = 3  # mistakes listed in an error
+MAX_MAGNITUDE = 1e9  # of a coordinate, in any unit
 
 
 def _no_truth_value(value: Any) -> Any:
@@ -39,7 +39,7 @@ Number = Annotated[float, BeforeValidator(_no_truth_value), AfterValidator(_boun
 
 
 class PairRow(BaseModel):
-    """One pair as a row of the file, metres, with the columns that `capture` adds for people."""
+    """One pair as a row of the file, metres, with the informative columns that `capture` adds."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", coerce_numbers_to_str=True)
 
@@ -55,9 +55,12 @@ class PairRow(BaseModel):
 
     @classmethod
     def of(cls, sensor_m: F64, stack_m: F64, viewpoint: str, *, serial: str, spread_mm: str = "") -> PairRow:
-        """The pair of a point (3,) in `sensor` and one in `stack`."""
-        places = dict(zip(COLUMNS, np.concatenate([sensor_m, stack_m]).tolist(), strict=True))
-        return cls(**places, viewpoint=viewpoint, sensor_serial=serial, spread_mm=spread_mm)
+        """Pair of a point (3,) in `sensor` and one in `stack`."""
+        sx, sy, sz, wx, wy, wz = np.concatenate([sensor_m, stack_m]).tolist()
+        return cls(
+            sensor_x=sx, sensor_y=sy, sensor_z=sz, stack_x=wx, stack_y=wy, stack_z=wz,
+            viewpoint=viewpoint, sensor_serial=serial, spread_mm=spread_mm,
+        )  # fmt: skip
 
 
 COLUMNS = tuple(name for name, field in PairRow.model_fields.items() if field.is_required())
@@ -65,22 +68,22 @@ COLUMNS = tuple(name for name, field in PairRow.model_fields.items() if field.is
 
 @dataclass(frozen=True, slots=True)
 class Pairs:
-    """K pairs with a name each, for messages."""
+    """K pairs, with names for messages."""
 
     sensor_m: F64  # (K, 3)
     stack_m: F64  # (K, 3)
     names: tuple[str, ...]
     source: str
-    sensor_serial: str = ""  # of the device that measured all of them; empty: not known
+    sensor_serial: str = ""  # of the device that measured all of them; empty: unknown
 
     def __len__(self) -> int:
         return len(self.names)
 
 
 def read_pairs(path: Path) -> Pairs:
-    """Pairs from CSV (header `COLUMNS`) or JSON (a list of objects, or `{"pairs": [...]}`).
+    """Read pairs from CSV (header `COLUMNS`) or JSON (a list of objects, or `{"pairs": [...]}`).
 
-    Raises InputError, naming the file and every row and column that is wrong.
+    Raises InputError, naming the file and the wrong rows and columns.
     """
     labels, rows = _read_rows(path)
     if len(rows) > MAX_PAIRS:
@@ -96,10 +99,7 @@ def read_pairs(path: Path) -> Pairs:
 
 
 def _read_rows(path: Path) -> tuple[list[str], list[PairRow]]:
-    """Where each pair stands in its file, and the pairs.
-
-    Raises InputError with every row and column that is wrong, the first few spelled out.
-    """
+    """Labels of the pairs (line or number), and the pairs. Raises InputError with the wrong rows and columns."""
     text = untrusted_input.read_text(path)
     if path.suffix.lower() == ".json":
         value = untrusted_input.parsed_json(text, source=path)
@@ -113,21 +113,21 @@ def _read_rows(path: Path) -> tuple[list[str], list[PairRow]]:
         try:
             reader.fieldnames = [name.strip().lower() for name in reader.fieldnames or ()]
             columns = set(reader.fieldnames)
-            # Nothing in a cell: the value is missing.
+            # An empty cell is a missing value.
             read = [(f"line {reader.line_num}", {k: v for k, v in row.items() if k and v}) for row in reader]
         except csv.Error as error:
             raise InputError(path, f"line {reader.line_num}", f"malformed: {error}") from None
         labels, items = [label for label, _ in read], [row for _, row in read]
     missing = [name for name in COLUMNS if name not in columns]
     if missing:
-        raise InputError(path, missing[0], "column is missing (wanted: " + ", ".join(COLUMNS) + ")")
+        raise InputError(path, missing[0], "column is missing (required: " + ", ".join(COLUMNS) + ")")
     try:
         return labels, TypeAdapter(list[PairRow]).validate_python(items)
     except ValidationError as error:
-        wrong = error.errors()
-    listed = [f"{labels[int(one['loc'][0])]}, {one['loc'][1]}: {_problem(one)}" for one in wrong[:MAX_LISTED]]
-    if len(wrong) > MAX_LISTED:
-        listed.append(f"and {len(wrong) - MAX_LISTED} more")
+        mistakes = error.errors()
+    listed = [f"{labels[int(e['loc'][0])]}, {e['loc'][1]}: {_problem(e)}" for e in mistakes[:MAX_LISTED]]
+    if len(mistakes) > MAX_LISTED:
+        listed.append(f"and {len(mistakes) - MAX_LISTED} more")
     raise InputError(path, "", "; ".join(listed))
 
 
@@ -139,16 +139,16 @@ def _problem(error: Any) -> str:
 
 
 def points_of(rows: Iterable[PairRow]) -> tuple[F64, F64]:
-    """(K, 3) in `sensor` and (K, 3) in `stack`."""
+    """(K, 3) points in `sensor` and (K, 3) in `stack`."""
     table = np.array([[getattr(row, name) for name in COLUMNS] for row in rows], dtype=np.float64).reshape(-1, 6)
     return table[:, :3].copy(), table[:, 3:].copy()
 
 
 class PairsFile:
-    """The CSV that capture fills: every accepted pair is on disk, whole, before the next one is measured."""
+    """CSV written during capture: every accepted pair is on disk before the next is measured."""
 
     def __init__(self, path: Path) -> None:
-        """Resume an existing file or begin one. Raises InputError where it exists and holds no pairs."""
+        """Resume an existing file or start one. Raises InputError if it exists but holds no pairs."""
         self.path = path
         self.rows: list[PairRow] = []
         if untrusted_input.is_there(path):
@@ -156,23 +156,23 @@ class PairsFile:
 
     @property
     def viewpoints(self) -> frozenset[str]:
-        """Names of the viewpoints that are already there."""
+        """Names of the viewpoints in the file."""
         return frozenset(row.viewpoint for row in self.rows)
 
     def __len__(self) -> int:
         return len(self.rows)
 
     def accept(self, *pairs: PairRow) -> None:
-        """Add pairs of one sensor; those of the same viewpoints are replaced. On disk when this returns.
+        """Write pairs of one sensor to the file, replacing those of the same viewpoints.
 
-        Raises InputError for pairs of another sensor than those that are there.
+        Raises InputError if the file has pairs of another sensor.
         """
-        serial, taken = pairs[0].sensor_serial, {pair.viewpoint for pair in pairs} - {""}
+        serial, replaced = pairs[0].sensor_serial, {pair.viewpoint for pair in pairs} - {""}
         others = {row.sensor_serial for row in self.rows} - {"", serial}
         if others and serial:
-            problem = f"its pairs are of sensor {min(others)}, this one is of {serial}"
+            problem = f"the file has pairs of sensor {min(others)}; this one is of {serial}"
             raise InputError(self.path, "sensor_serial", problem)
-        self.rows = [row for row in self.rows if row.viewpoint not in taken] + list(pairs)
+        self.rows = [row for row in self.rows if row.viewpoint not in replaced] + list(pairs)
         self._write()
 
     def _write(self) -> None:

@@ -1,4 +1,4 @@
-"""Panels at their true poses, six degrees of freedom each, and how eyes and cameras see them.
+"""Panels at their true poses, with six degrees of freedom each, and their projections to eyes and cameras.
 
 A panel's own frame has its origin at the panel's middle and the axes of `stack`: x out of the screen, y along the
 rows to the viewer's right, z up. Its pixel pitch is the stack's.
@@ -22,55 +22,55 @@ class PlacedPanel:
     """Pose of one panel."""
 
     rotation: F64  # (3, 3) stack_from_panel
-    centre_m: F64  # (3,) its middle, frame `stack`
+    centre_m: F64  # (3,) frame `stack`
 
     @property
     def slope(self) -> F64:
-        """(2,) how much farther out the panel is per metre to the right, and per metre up."""
+        """(2,) increase of x per metre to the right, and per metre up."""
         normal = self.rotation[:, 0]
         return np.asarray(-normal[1:] / normal[0], dtype=np.float64)
 
     @property
     def axis_x_m(self) -> float:
-        """Where the panel's plane meets the stack's axis y = z = 0."""
+        """Intersection of the panel's plane with the stack's axis y = z = 0."""
         normal = self.rotation[:, 0]
         return float(normal @ self.centre_m / normal[0])
 
 
 def through(matrix: F64, points_px: F64) -> F64:
-    """(K, 2) pixels through a 3x3 homography."""
+    """Apply a 3x3 homography to (K, 2) pixels."""
     moved = points_px @ matrix[:, :2].T + matrix[:, 2]
     return moved[:, :2] / moved[:, 2:]
 
 
 def corner_pixels(stack: PanelStack) -> F64:
-    """(4, 2) a panel's corners: (0, 0), (W, 0), (W, H), (0, H)."""
+    """(4, 2) corners of a panel: (0, 0), (W, 0), (W, H), (0, H)."""
     w, h = stack.width_px, stack.height_px
     return np.array([[0, 0], [w, 0], [w, h], [0, h]], dtype=np.float64)
 
 
 def panel_from_pixels(stack: PanelStack) -> F64:
-    """(3, 3): a point (metres, the panel's own frame) from a pixel (u, v, 1)."""
+    """(3, 3) matrix from a pixel (u, v, 1) to a point in the panel's frame, metres."""
     pitch_u, pitch_v = stack.width_m / stack.width_px, stack.height_m / stack.height_px
     return np.array([[0.0, 0.0, 0.0], [pitch_u, 0.0, -stack.width_m / 2], [0.0, -pitch_v, stack.height_m / 2]])
 
 
 def stack_from_pixels(panel: PlacedPanel, stack: PanelStack) -> F64:
-    """(3, 3): a point of `stack` (metres) from a panel's true pixel (u, v, 1)."""
+    """(3, 3) matrix from a true pixel (u, v, 1) of a panel to a point in `stack`, metres."""
     return panel.rotation @ panel_from_pixels(stack) + np.outer(panel.centre_m, HOMOGENEOUS)
 
 
 def ideal_panel(stack: PanelStack, index: int) -> PlacedPanel:
-    """The panel at its nominal pose: parallel to the others, centred on the stack's axis."""
+    """Nominal pose of a panel: parallel to the others, centred on the stack's axis."""
     return PlacedPanel(np.eye(3), np.array([stack.x_m[index], 0.0, 0.0]))
 
 
 def true_from_ideal_seen(panel: PlacedPanel, eye_m: ArrayLike, stack: PanelStack, index: int) -> F64:
-    """(3, 3), last entry 1: the true pixel behind an ideal one, as an eye sees it.
+    """(3, 3) homography from ideal to true pixels as an eye sees them; last entry 1.
 
-    An ideal pixel is where the eye's ray crosses the plane of panel `index` of `stack`; the true one is where it
-    crosses the panel. For a panel that is parallel to the stack and at its x_m the answer is the same for every
-    eye; a tilted one is right only for this eye. Raises ValueError for an eye in the panel's plane.
+    An eye's ray crosses the nominal plane of panel `index` at the ideal pixel and the panel itself at the true one.
+    For a panel parallel to the stack and at its x_m the result does not depend on the eye; for a tilted panel it holds
+    for this eye only. Raises ValueError for an eye in the panel's plane.
     """
     eye = np.outer(np.asarray(eye_m, dtype=np.float64), HOMOGENEOUS)
     seen = stack_from_pixels(panel, stack) - eye

@@ -101,7 +101,7 @@ def residual_figure(points: Points, *, limit_m: float) -> bytes:
 
 
 def _summary(calibration: Calibration, points: Points | None, volume_m: F64) -> dict[str, Any]:
-    """What `report.json` holds, None where it is not known."""
+    """Contents of `report.json`; None for unknown values."""
     found: dict[str, Any] = {
         "method": calibration.file.method,
         "date": str(calibration.file.date),

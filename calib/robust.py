@@ -1,7 +1,7 @@
 """Robust similarities from pairs with gross errors: least trimmed squares, rejection, refit.
 
 Least trimmed squares (Rousseeuw 1984) with concentration steps (FAST-LTS, Rousseeuw & Van Driessen 1999) finds the
-half of the pairs that agree best; what lies outside the noise that this half and its neighbours show is rejected.
+half of the pairs that agree best. Pairs beyond the noise estimated from this half are rejected.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from scipy.stats import chi2
 from calib.similarity import Degenerate, ScaleRule, Similarity, fit, fit_batch
 from runtime.records import F64
 
-STARTS = 120  # random subsets that concentration begins from
-START_PAIRS = 4  # of each subset
-STEPS = 4  # concentration steps of each
-MAX_SCORED = 2000  # of more pairs than these a sample picks the start; the rejection sees them all
-REJECTION_PROBABILITY = 1e-4  # of a good pair, Gaussian noise
+STARTS = 120  # random subsets to start from
+START_PAIRS = 4  # in each subset
+STEPS = 4  # concentration steps from each
+MAX_SCORED = 2000  # with more pairs the starts use a random sample; rejection sees all pairs
+REJECTION_PROBABILITY = 1e-4  # of a good pair with Gaussian noise
 RULE: ScaleRule = "inverse"
-MIN_NOISE = 1e-12  # of the points' extent: exact data reject nothing for their rounding
+MIN_NOISE = 1e-12  # relative to the points' extent: keeps exact data from rejection by rounding errors
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,20 +33,20 @@ class RobustFit:
 
 
 def _residuals(candidate: Similarity, sensor_m: F64, stack_m: F64) -> F64:
-    """(..., K) squared distances in `stack`, m², divided by the scale: no candidate wins by shrinking its points."""
+    """(..., K) squared distances, m², divided by the squared scale, so that shrinking does not win."""
     squared = ((candidate.points(sensor_m) - stack_m) ** 2).sum(-1)
-    found: F64 = squared / np.maximum(candidate.scale[..., None], 1e-300) ** 2
-    return found
+    residuals: F64 = squared / np.maximum(candidate.scale[..., None], 1e-300) ** 2
+    return residuals
 
 
 def _best_half(sensor_m: F64, stack_m: F64, *, random: np.random.Generator) -> NDArray[np.intp]:
-    """Indices of the half of the pairs that agree best: of many starts, each refitted to its own best half."""
+    """Indices of the half of the pairs that agree best, from many starts, each refitted to its best half."""
     count = len(sensor_m)
     keep = min(count, max(3, (count + 5) // 2))
     chosen = np.argsort(random.random((STARTS, count)), axis=1)[:, : min(START_PAIRS, count)]
     for _ in range(1 + STEPS):
-        found = fit_batch(sensor_m[chosen], stack_m[chosen], rule=RULE)
-        squared = np.nan_to_num(_residuals(found, sensor_m, stack_m), nan=np.inf)
+        candidates = fit_batch(sensor_m[chosen], stack_m[chosen], rule=RULE)
+        squared = np.nan_to_num(_residuals(candidates, sensor_m, stack_m), nan=np.inf)
         chosen = np.argpartition(squared, keep - 1, axis=-1)[:, :keep]
     sums = np.take_along_axis(squared, chosen, axis=-1).sum(-1)
     winner = int(np.argmin(sums))
@@ -56,10 +56,9 @@ def _best_half(sensor_m: F64, stack_m: F64, *, random: np.random.Generator) -> N
 
 
 def fit_robust(sensor_m: F64, stack_m: F64) -> RobustFit:
-    """The similarity of the pairs that agree, and which those are; (K, 3) each, K >= 3.
+    """Fit the pairs that agree; (K, 3) each, K >= 3. Deterministic.
 
-    Up to 5 pairs there is nothing to out-vote: all are kept. Deterministic.
-    Raises Degenerate as `fit` does.
+    Up to 5 pairs are too few for a majority: all are kept. Raises Degenerate as `fit` does.
     """
     count = len(sensor_m)
     everything = fit(sensor_m, stack_m, rule=RULE)
@@ -68,14 +67,14 @@ def fit_robust(sensor_m: F64, stack_m: F64) -> RobustFit:
         return RobustFit(everything, np.ones(count, bool))
     random = np.random.default_rng(0)
     scored = random.permutation(count)[:MAX_SCORED] if count > MAX_SCORED else np.arange(count)
-    # Centred and to one size: the batched fits have no polish and no units.
+    # Centred, because the batched fits are not refined.
     half = scored[_best_half(sensor_m[scored] - sensor_m.mean(0), stack_m[scored] - stack_m.mean(0), random=random)]
     limit = float(chi2.ppf(1 - REJECTION_PROBABILITY, 3))
     inlier = np.zeros(count, bool)
     inlier[half] = True
     current = fit(sensor_m[inlier], stack_m[inlier], rule=RULE)
     squared = ((current.points(sensor_m) - stack_m) ** 2).sum(-1)
-    # The median of the squared distances of chi² with three degrees of freedom; small samples look too quiet.
+    # Noise from a quantile of chi² with three degrees of freedom, corrected for its bias in small samples.
     share = len(half) / len(scored)
     noise_m = np.sqrt(np.partition(squared[scored], len(half) - 1)[len(half) - 1] / chi2.ppf(0.999 * share, 3))
     noise_m *= 1 + 5 / max(len(scored) - 3, 1)
@@ -93,6 +92,6 @@ def fit_robust(sensor_m: F64, stack_m: F64) -> RobustFit:
 
 
 def _noise(similarity: Similarity, sensor_m: F64, stack_m: F64, inlier: NDArray[np.bool_]) -> float:
-    """Standard deviation of one coordinate in `stack`, less the seven that the fit took."""
+    """Standard deviation of one coordinate in `stack`, with seven degrees of freedom used by the fit."""
     squared = ((similarity.points(sensor_m) - stack_m) ** 2).sum(-1)[inlier].sum()
     return float(np.sqrt(squared / max(3 * int(inlier.sum()) - 7, 1)))

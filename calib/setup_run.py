@@ -1,4 +1,4 @@
-"""`phasestack setup`: from step to step with a person, resumable, and the figures at the end."""
+"""`phasestack setup`: lead a person through the steps, resumably, and write the figures."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ MAX_PROGRESS_BYTES = 4 << 20  # of setup.json
 
 
 def progress_path(config: Path) -> Path:
-    """The file beside a configuration that records the setup's progress."""
+    """File next to a configuration that records the setup's progress."""
     return config.with_name(f"{config.stem}.setup.json")
 
 
 def read_progress(path: Path) -> dict[str, Any]:
-    """The figures of the steps that are done, by name. Raises InputError."""
+    """Figures of the finished steps, by name. Raises InputError."""
     if not untrusted_input.is_there(path):
         return {}
     try:
-        found = untrusted_input.read_json(path, most_bytes=MAX_PROGRESS_BYTES)
-        done = {step.name: dict(found["done"][step.name]) for step in STEPS if step.name in found["done"]}
+        progress = untrusted_input.read_json(path, most_bytes=MAX_PROGRESS_BYTES)
+        done = {step.name: dict(progress["done"][step.name]) for step in STEPS if step.name in progress["done"]}
     except (InputError, KeyError, TypeError, ValueError):
-        raise InputError(path, "done", "is not what setup wrote: remove the file to begin anew") from None
+        raise InputError(path, "done", "was not written by setup: remove the file to start over") from None
     return done
 
 
 def run_setup(
     config: Path, *, out: Path, photos: Path, simulate: bool, seed: int, to_stderr: bool
 ) -> tuple[dict[str, Any], str]:
-    """Walk through every step; returns the summary and its text. Raises InputError."""
+    """Run the setup; returns the summary and its text. Raises InputError."""
 
     def say(text: str) -> None:
         typer.echo(text, err=to_stderr)
@@ -62,14 +62,14 @@ def run_setup(
 
 
 def walk_through(setup: Setup) -> bool:
-    """Every step until the last, or q. True where the end was reached."""
+    """Run the steps until the last one or q; returns True if the end was reached."""
     number = next((n for n, step in enumerate(STEPS) if step.name not in setup.done), 0)
     while number < len(STEPS):
         step = STEPS[number]
-        state = "done before" if step.name in setup.done else "not done yet"
+        state = "already done" if step.name in setup.done else "not done yet"
         setup.say(f"\nStep {number + 1} of {len(STEPS)}: {step.title}\n{step.what}\n({state})")
         try:
-            answer = setup.ask("Enter: do it; n: skip, what is done stays; p: the step before", "do it")
+            answer = setup.ask("Enter: do it; n: skip (keeps earlier results); p: previous step", "do it")
         except SetupStopped:
             return False
         if answer == "p":
@@ -80,12 +80,12 @@ def walk_through(setup: Setup) -> bool:
 
 
 def _is_done(setup: Setup, step: SetupStep) -> bool:
-    """Run a step."""
+    """Run a step; returns True if it succeeded."""
     try:
         figures = step.run(setup)
     except (SetupStopped, PhasestackError) as error:
-        stopped = "stopped: what was not finished is not written into the configuration"
-        setup.say(stopped if isinstance(error, SetupStopped) else f"it did not work: {error}")
+        stopped = "stopped: unfinished changes were not written to the configuration"
+        setup.say(stopped if isinstance(error, SetupStopped) else f"failed: {error}")
         return False
     setup.done[step.name] = figures
     write_json(progress_path(setup.config), {"done": setup.done})
@@ -94,7 +94,7 @@ def _is_done(setup: Setup, step: SetupStep) -> bool:
 
 
 def summarise(setup: Setup, *, finished: bool) -> tuple[dict[str, Any], str]:
-    """Write the figures, and say what comes next."""
+    """Write the figures; returns the summary and a text that ends with the next commands."""
     missing = [step.name for step in STEPS if step.name not in setup.done]
     summary: dict[str, Any] = {
         "config": str(setup.config),
@@ -109,10 +109,12 @@ def summarise(setup: Setup, *, finished: bool) -> tuple[dict[str, Any], str]:
         write_json(setup.out / "setup.json", summary)
         lines.append(f"{setup.out / 'setup.json'} has the figures; {setup.config} is valid")
         if setup.hardware.simulated:
-            lines.append(f"look: phasestack run --config {setup.config} --replay demo --headless --frames 60 --out run")
+            lines.append(
+                f"try it: phasestack run --config {setup.config} --replay demo --headless --frames 60 --out run"
+            )
         else:
             lines.append(f"try it: phasestack run --config {setup.config}")
             lines.append(f"check it: phasestack doctor --config {setup.config}")
     if missing:
-        lines.append(f"not done: {', '.join(missing)} (the same command goes on there)")
+        lines.append(f"not done: {', '.join(missing)} (run the same command to continue)")
     return summary, "\n".join(lines)

@@ -1,4 +1,4 @@
-"""The steps of `phasestack setup`: what each asks, writes into the configuration, and reports."""
+"""The steps of `phasestack setup`: their questions, changes to the configuration, and reports."""
 
 from __future__ import annotations
 
@@ -31,33 +31,33 @@ from runtime.support.artifacts import OutputFolder, write_bytes, write_text
 Figures = dict[str, Any]
 MIN_PAIRS = 9  # of the 27 viewpoints, before the setup solves
 SERVICE_FOLDER = "/etc/phasestack"
-MAX_BYTES = 64 << 20  # of a file that the service reads
+MAX_BYTES = 64 << 20  # of a file for the service
 ARROWS: dict[Key, Arrow] = {Key.UP: "up", Key.DOWN: "down", Key.LEFT: "left", Key.RIGHT: "right"}
 YES_NO = {Key.ACCEPT: True, Key.NEXT: False}
 
 
 class SetupStopped(Exception):
-    """The person stops here, to continue another time."""
+    """Raised when the person stops, to continue later."""
 
 
 @dataclass
 class Setup:
-    """The state shared by all steps."""
+    """State shared by all steps."""
 
     config: Path
-    out: Path  # folder of reports, and of what the configuration names
+    out: Path  # folder for reports and for files that the configuration names
     hardware: SetupHardware
     say: Say
-    line: Callable[[], str]  # that the person types
+    line: Callable[[], str]  # returns the next line typed
     done: dict[str, Figures] = field(default_factory=dict)  # of earlier steps, by name
 
     @property
     def settings(self) -> Settings:
-        """The configuration as it is now."""
+        """Load the current configuration."""
         return load_settings(self.config if untrusted_input.is_there(self.config) else None)
 
     def ask(self, question: str, default: str = "") -> str:
-        """The line that answers a question, `default` for an empty one. Raises SetupStopped for q."""
+        """Ask a question; returns the line typed, or `default` for an empty one. Raises SetupStopped for q."""
         self.say(f"{question} [{default or 'Enter'}; q: stop]")
         answer = self.line()
         if answer == "q":
@@ -67,21 +67,21 @@ class Setup:
 
 @dataclass(frozen=True, slots=True)
 class SetupStep:
-    """One step."""
+    """One step of the setup."""
 
     name: str
     title: str
-    what: str  # one line for a person
+    what: str  # one line of explanation
     run: Callable[[Setup], Figures]
 
 
 def identify(setup: Setup) -> Figures:
-    """Step 1: which monitor is which panel, and how it is mounted, by a card on one at a time."""
+    """Step 1: assign monitors to panels and find their mounting, showing a card on one at a time."""
     hardware, count = setup.hardware, setup.settings.stack.stack().count
     monitors = hardware.monitors()
     if len(monitors) < count:
         raise InputError(setup.config, "stack.x_m", f"{len(monitors)} monitors for {count} panels")
-    free = list(range(len(monitors)))  # the first of them shows its card
+    free = list(range(len(monitors)))  # the first one shows its card
     tables: list[dict[str, Any]] = []
 
     def ask(question: str, keys: str, answers: Mapping[Key, Any]) -> Any:
@@ -94,36 +94,36 @@ def identify(setup: Setup) -> Figures:
 
     while len(tables) < count:
         place = {0: "the rearmost, at the backlight", count - 1: "the front one"}.get(len(tables), "the next one")
-        if not ask(f"Is it panel {len(tables)}, {place}?", "Enter: yes, n: another monitor", YES_NO):
+        if not ask(f"Is this panel {len(tables)}, {place}?", "Enter: yes, n: try another monitor", YES_NO):
             free.append(free.pop(0))
             continue
         arrow = ask("Which way does its arrow point, seen from the front?", "arrow keys", ARROWS)
-        readable = ask("Does its writing read rightly?", "Enter: yes, n: it is mirrored", YES_NO)
+        readable = ask("Is its writing readable, not mirrored?", "Enter: yes, n: mirrored", YES_NO)
         rotation_deg, mirror = mounting_of(arrow, mirrored=not readable)
-        named = _name_of(monitors[free.pop(0)], monitors)
-        tables.append(named | {"rotation_deg": rotation_deg, "mirror": mirror})
+        name = _name_of(monitors[free.pop(0)], monitors)
+        tables.append(name | {"rotation_deg": rotation_deg, "mirror": mirror})
     rewrite(setup.config, lambda document: put_monitors(document, tables))
-    return {"text": f"{count} bound to their monitors"}
+    return {"text": f"{count} panels assigned to their monitors"}
 
 
 def _name_of(monitor: Monitor, monitors: Sequence[Monitor]) -> dict[str, Any]:
-    """How a configuration names a monitor: by its serial where no other has it, else by its connector."""
+    """Keys that identify a monitor in a configuration: its serial number if unique, else its connector."""
     alone = [m.serial for m in monitors].count(monitor.serial) == 1
     return {"edid_serial": monitor.serial} if monitor.serial and alone else {"connector": monitor.connector}
 
 
 def geometry(setup: Setup) -> Figures:
-    """Size of the panels, their gap, and where viewers stand: about; registration finds the gap exactly."""
+    """Step 2: approximate size and gap of the panels and distance of viewers; registration refines the gap."""
     stack, calibration = setup.settings.stack, setup.settings.calibration
 
     def length_m(question: str, value_m: float, unit_m: float = 1e-3) -> float:
-        """What is typed, in metres; the value as it is, to the digit, for an empty line."""
+        """Ask for a length, in metres; an empty line returns `value_m` unchanged."""
         while True:
             answer = setup.ask(f"{question}, {'mm' if unit_m == 1e-3 else 'm'}", f"{value_m / unit_m:.6g}")
             try:
                 typed = float(answer) * unit_m
             except ValueError:
-                setup.say(f"{answer} is no number")
+                setup.say(f"{answer} is not a number")
                 continue
             return value_m if abs(typed - value_m) < 1e-8 else round(typed, 7)
 
@@ -133,12 +133,12 @@ def geometry(setup: Setup) -> Figures:
     }
     gap_m = (stack.x_m[-1] - stack.x_m[0]) / (len(stack.x_m) - 1)
     typed_m = length_m("from panel to panel", gap_m)
-    if typed_m != gap_m:  # else distances that were measured stay as they are
+    if typed_m != gap_m:  # else keep distances that were measured
         middle = (len(stack.x_m) - 1) / 2
         size["x_m"] = [round((index - middle) * typed_m, 7) for index in range(len(stack.x_m))]
     near_m = length_m("nearest viewer", calibration.viewing_m[0], 1.0)
     far_m = length_m("farthest viewer", calibration.viewing_m[1], 1.0)
-    ipd_m = length_m("eye separation of who will calibrate (an optician's PD; 0: not known)", calibration.ipd_m)
+    ipd_m = length_m("eye separation of the person calibrating (an optician's PD; 0: unknown)", calibration.ipd_m)
 
     def change(document: Any) -> None:
         put(document, "stack", size)
@@ -150,13 +150,13 @@ def geometry(setup: Setup) -> Figures:
 
 
 def registration(setup: Setup) -> Figures:
-    """Where the panels truly are, from photographs of the boards."""
-    rewrite(setup.config, lambda document: None)  # an empty configuration where there was none
+    """Step 3: the panels' true poses, from photographs of the boards."""
+    rewrite(setup.config, lambda document: None)  # creates an empty configuration if there is none
     settings = setup.settings
     pictures = setup.hardware.photographs(settings, boards(settings.stack.stack()), panel=None, say=setup.say)
     summary = register_photos(pictures, "photographs", setup.out / "registration", settings, config=setup.config)
     gaps = ", ".join(f"{gap * 1e3:.2f}" for gap in summary["gap_m"])
-    figures = f"gaps {gaps} mm, from {summary['used']} photographs; what is uncertain is worth"
+    figures = f"gaps {gaps} mm, from {summary['used']} photographs; uncertainty equivalent to"
     return {"text": f"{figures} {summary['eye_error_mm']:.2f} mm at the eye", "notes": summary["notes"]}
 
 
@@ -171,19 +171,19 @@ def grey(setup: Setup) -> Figures:
             try:
                 residuals.append(_measure_grey(setup, number))
             except InputError as error:
-                setup.say(f"it did not work: {error}")
+                setup.say(f"failed: {error}")
                 continue
             known[number] = True
             break
     if not any(known):
-        setup.say("no panel has a curve: gammas stay as they are configured")
+        setup.say("no panel has a curve: the configured gammas stay")
         raise SetupStopped
-    which = ", ".join(str(n) for n, has in enumerate(known) if has)
-    return {"text": f"of panels {which}, measured to {100 * max(residuals):.2f}%"}
+    numbers = ", ".join(str(n) for n, has in enumerate(known) if has)
+    return {"text": f"of panels {numbers}, measured to {100 * max(residuals):.2f}%"}
 
 
 def _measure_grey(setup: Setup, panel: int) -> float:
-    """One panel's LUT into the configuration; returns how far the curve is off, of the range. Raises InputError."""
+    """Measure one panel's LUT and configure it; returns the relative error of the curve. Raises InputError."""
     settings = setup.settings
     stack = settings.stack.stack()
     pictures = setup.hardware.photographs(settings, grey_charts(stack, panel), panel=panel, say=setup.say)
@@ -191,12 +191,12 @@ def _measure_grey(setup: Setup, panel: int) -> float:
     summary = lut_from_photographs(path, pictures, stack, panel=panel, source="photographs")
     rewrite(setup.config, lambda document: put_panels(document, "lut", {panel: str(path)}, panels=stack.count))
     residual = float(summary["residual"])
-    setup.say(f"panel {panel}: taken, measured to {100 * residual:.2f}%")
+    setup.say(f"panel {panel}: accepted, measured to {100 * residual:.2f}%")
     return residual
 
 
 def sensor(setup: Setup) -> Figures:
-    """Which depth sensor sees the viewer; tried at once."""
+    """Step 5: choose the depth sensor and try it."""
     settings = setup.settings
     names = ["replay"] if setup.hardware.simulated else [name for name in DRIVERS if name not in ("replay", "fixed")]
     default = settings.sensor.driver if settings.sensor.driver in names else names[0]
@@ -210,17 +210,17 @@ def sensor(setup: Setup) -> Figures:
             name = setup.hardware.open_sensor(tried)
             break
         except InputError as error:
-            setup.say(f"it does not work: {error}")
+            setup.say(f"failed: {error}")
     rewrite(setup.config, lambda document: put(document, "sensor", update))
     return {"text": name}
 
 
 def calibration(setup: Setup) -> Figures:
-    """Where the sensor stands: a person goes from viewpoint to viewpoint."""
+    """Step 6: the sensor's pose, with a person who goes from viewpoint to viewpoint."""
     pairs_path, target = setup.out / "pairs.csv", setup.out / "calibration.toml"
     count = capture_live(pairs_path, setup.settings, setup.hardware, show=True, say=setup.say)["pairs"]
     if count < MIN_PAIRS:
-        setup.say(f"{count} pairs are kept in {pairs_path}; at least {MIN_PAIRS} are needed")
+        setup.say(f"{pairs_path} has {count} pairs; at least {MIN_PAIRS} are needed")
         raise SetupStopped
     summary = solve_file(pairs_path, target, settings=setup.settings)
     rewrite(setup.config, lambda document: put(document, "calibration", {"file": str(target.resolve())}))
@@ -229,7 +229,7 @@ def calibration(setup: Setup) -> Figures:
 
 
 def service(setup: Setup) -> Figures:
-    """Step 7: a folder with the service's files, and the commands that install it."""
+    """Step 7: gather the service's files in a folder and install them, or give the commands for it."""
     folder = (setup.out / "service").resolve()
     files = gather(setup.config, folder)
     sudo = "" if os.geteuid() == 0 else "sudo "
@@ -238,25 +238,25 @@ def service(setup: Setup) -> Figures:
         f"{sudo}systemctl enable phasestack",
         f"{sudo}systemctl restart phasestack",
     ]
-    told = "; ".join(commands)
+    listed = "; ".join(commands)
     if setup.hardware.simulated or sudo:
-        setup.say("the service reads its own copy of all this; apply it by\n  " + "\n  ".join(commands))
-        return {"text": f"{len(files)} files; apply them by: {told}"}
-    setup.hardware.let_go()  # the panels, which the service wants
+        setup.say("the service has its own copy of these files; install it with\n  " + "\n  ".join(commands))
+        return {"text": f"{len(files)} files; install them with: {listed}"}
+    setup.hardware.let_go()  # the service needs the panels
     for command in commands:
         result = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)
         if result.returncode != 0:
             raise InputError(setup.config, "service", f"{command}: {result.stderr.strip() or 'failed'}")
-    return {"text": f"{len(files)} files, applied: {told} (the files before: *.~1~)"}
+    return {"text": f"{len(files)} files, installed with: {listed} (previous files: *.~1~)"}
 
 
 def gather(config: Path, out: Path) -> list[str]:
-    """Write the configuration with its calibration and grey curves beside it; returns the files' names.
+    """Copy the configuration, its calibration and its grey curves to a folder; returns the files' names.
 
-    Other files that it names stay where they are, named in full. Raises InputError where one cannot be read.
+    Other files stay in place, with absolute paths. Raises InputError if a file cannot be read.
     """
     if not config.exists():
-        raise InputError(config, "", "there is nothing to install yet: the steps before this one")
+        raise InputError(config, "", "does not exist yet: run the earlier steps first")
     settings = load_settings(config)
     document: Any = read_document(config)
     copies: dict[str, bytes] = {}
@@ -281,25 +281,20 @@ def gather(config: Path, out: Path) -> list[str]:
 
 
 STEPS = (
+    SetupStep("identify", "Which monitor is which panel", "one panel after another shows a card to identify", identify),
     SetupStep(
-        "identify", "Which monitor is which panel", "each panel in turn shows a card; you say what you see", identify
+        "geometry", "Sizes and distances", "size of the panels, approximate gap, distance of the viewers", geometry
     ),
     SetupStep(
-        "geometry",
-        "Sizes and distances",
-        "how large the panels are, about how far apart, where viewers stand",
-        geometry,
+        "registration", "The panels' true positions", "a dozen hand-held photographs of the boards", registration
     ),
-    SetupStep("registration", "Where the panels truly are", "a dozen photographs of the boards, by hand", registration),
-    SetupStep("grey", "What each panel makes of a grey", "two photographs of a chart, for each panel", grey),
-    SetupStep("sensor", "The depth sensor", "which one sees the viewer's eyes", sensor),
+    SetupStep("grey", "The panels' grey curves", "two photographs of a chart for each panel", grey),
+    SetupStep("sensor", "The depth sensor", "the sensor that sees the viewer's eyes", sensor),
     SetupStep(
         "calibration",
-        "Where the sensor stands",
-        "you stand where lines fuse, and press Enter: 27 places, or 9 (q: enough)",
+        "The sensor's position",
+        "stand where the lines fuse and press Enter, at 27 viewpoints or at least 9 (q: enough)",
         calibration,
     ),
-    SetupStep(
-        "service", "At every start", "what the service reads is gathered in a folder and, by root, applied", service
-    ),
+    SetupStep("service", "The service", "gathers the service's files in a folder and, as root, installs them", service),
 )

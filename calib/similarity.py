@@ -1,12 +1,12 @@
-"""Closed-form similarities from pairs of points (supplement, (19)-(27)), with three scales.
+"""Closed-form similarities from pairs of points (supplement, (19)-(27)), with a choice of scale rules.
 
-A similarity maps a sensor point c to the stack as  w = s·R·c + t.  Every rule finds the same rotation, the one that
-maximises the correlation of the centred points (Kabsch, Umeyama 1991), and differs in the scale:
+A similarity maps a sensor point c to the stack as  w = s·R·c + t.  All rules give the same rotation, which maximises
+the correlation of the centred points (Kabsch, Umeyama 1991). They differ in the scale:
 
-* `seed`: ratio of the RMS radii (EyeReal, (22)). The geometric mean of the two below, the best of neither objective;
-* `least-squares`: minimises the error in the stack (EyeReal, (20), Umeyama). Noise on the sensor's side shrinks it;
-* `inverse`: minimises the error in the sensor, that is, fitted from stack to sensor and inverted: consistent when
-  the stack's points are known and the sensor's are noisy, as here;
+* `seed`: ratio of the RMS radii (EyeReal, (22)), the geometric mean of the next two;
+* `least-squares`: minimises the error in the stack (EyeReal, (20), Umeyama); biased low by noise in the sensor;
+* `inverse`: minimises the error in the sensor, that is, fitted from stack to sensor and inverted; consistent if the
+  stack's points are known and the sensor's are noisy, as here;
 * a number: the scale is known.
 """
 
@@ -23,12 +23,12 @@ from runtime.records import F64
 
 ScaleRule = Literal["seed", "least-squares", "inverse"] | float
 EPSILON = float(np.finfo(np.float64).eps)
-ROTATION_BOUND_RAD = 1e-6  # refuse where rounding alone could turn the result by more
-POLISH_ABOVE = 1e2  # ratio of the points' two largest extents from which the cross-covariance loses digits
+ROTATION_BOUND_RAD = 1e-6  # refuse points for which rounding alone could rotate the result by more
+POLISH_ABOVE = 1e2  # ratio of the points' two largest extents above which the cross-covariance loses digits
 
 
 class Degenerate(ValueError):
-    """The points do not determine a similarity, or float64 cannot; the text says why."""
+    """The points do not determine a similarity, or not in double precision; the text gives the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class Similarity:
 
 
 def _centred(points: F64) -> tuple[F64, F64]:
-    """Points about their mean, and the mean; two passes, so that a far origin costs no digits."""
+    """Points about their mean, and the mean; two passes keep precision with a distant origin."""
     mean = np.zeros((*points.shape[:-2], 1, 3))
     for _ in range(2):
         mean = mean + (points - mean).mean(axis=-2, keepdims=True)
@@ -73,10 +73,7 @@ def _scale(rule: ScaleRule, *, sensor_power: F64, stack_power: F64, correlation:
 
 
 def fit_batch(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
-    """Similarities of a batch of well-conditioned pairs, without checks.
-
-    sensor_m, stack_m: (..., K, 3). Degenerate members give infinities or NaN.
-    """
+    """Fit a batch of well-conditioned pairs (..., K, 3), without checks; degenerate members give infinities or NaN."""
     sensor, sensor_mean = _centred(sensor_m)
     stack, stack_mean = _centred(stack_m)
     left, values, right = np.linalg.svd(np.swapaxes(sensor, -1, -2) @ stack)
@@ -105,10 +102,10 @@ def extents(points_m: F64) -> F64:
 
 
 def fit(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
-    """The similarity of K >= 3 pairs, (K, 3) each, to the digits that float64 can give.
+    """Fit K >= 3 pairs, (K, 3) each, to full double precision.
 
-    Raises Degenerate: too few, not finite, coincident, collinear, uncorrelated, or so thin or so far away that
-    rounding alone turns the result by more than `ROTATION_BOUND_RAD`. Does not judge measurement noise.
+    Raises Degenerate for points that are too few, not finite, coincident, collinear or uncorrelated, or so thin or so
+    far away that rounding alone rotates the result by more than `ROTATION_BOUND_RAD`. Ignores measurement noise.
     """
     if len(sensor_m) < 3:
         raise Degenerate(f"{len(sensor_m)} pairs: at least 3 are needed")
@@ -116,7 +113,7 @@ def fit(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
         raise Degenerate("not every coordinate is finite")
     _refuse_degenerate("sensor", sensor_m)
     first, second = _refuse_degenerate("stack", stack_m)
-    # Squares of 1e-200 m or 1e200 m would leave float64; powers of two cost no digits.
+    # Scale by powers of two, which is exact: squares of 1e-200 m or 1e200 m would leave float64.
     sensor_unit, stack_unit = (float(np.exp2(np.frexp(np.abs(p).max())[1])) for p in (sensor_m, stack_m))
     unit_rule = rule if isinstance(rule, str) else rule * sensor_unit / stack_unit
     unit_sensor, unit_stack = sensor_m / sensor_unit, stack_m / stack_unit
@@ -134,21 +131,21 @@ def _refuse_degenerate(name: str, points_m: F64) -> tuple[float, float]:
     if first <= 4 * EPSILON * magnitude:
         raise Degenerate(f"the {name} points coincide")
     if second <= 4 * EPSILON * magnitude or second <= 1e-13 * first:
-        raise Degenerate(f"the {name} points lie on one line: the rotation about it is unknown")
+        raise Degenerate(f"the {name} points are on one line: the rotation about it is unknown")
     bound = 4 * EPSILON * magnitude / second  # measured against 50-digit arithmetic: `phasestack stability`
     if bound > ROTATION_BOUND_RAD:
         raise Degenerate(
             f"the {name} points are too thin or too far from the origin for double precision: "
-            f"rounding alone turns the result by up to {bound:.1g} rad"
+            f"rounding alone rotates the result by up to {bound:.1g} rad"
         )
     return float(first), float(second)
 
 
 def _polished(start: Similarity, sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
-    """The same fit for long thin clouds, whose cross-covariance holds the square of their aspect.
+    """Refine the fit of a long thin cloud, for which the cross-covariance squares the aspect ratio.
 
-    In the stack's principal frame the turn about the long axis has a closed form of small numbers only; the rest
-    follows by Gauss-Newton with a QR solver, so that the error grows with the aspect and not with its square.
+    In the stack's principal frame rotation about the long axis has a closed form in small numbers only. Gauss-Newton
+    with a QR solver gives the rest, so that the error grows with the aspect ratio instead of its square.
     """
     sensor, sensor_mean = _centred(sensor_m)
     stack, stack_mean = _centred(stack_m)
@@ -172,7 +169,7 @@ def _polished(start: Similarity, sensor_m: F64, stack_m: F64, *, rule: ScaleRule
         rotation = Rotation.from_rotvec(step).as_matrix() @ rotation
         if np.abs(step).max() < 4 * EPSILON:
             break
-    # One Newton-Schulz step: products of rotations drift from orthogonality by an ulp each.
+    # One Newton-Schulz step restores orthogonality, which each product of rotations loses by an ulp.
     rotation = rotation @ (1.5 * np.eye(3) - 0.5 * rotation.T @ rotation)
     correlation = ((sensor @ rotation.T) * target).sum()
     scale = _scale(rule, sensor_power=(sensor**2).sum(), stack_power=(stack**2).sum(), correlation=correlation)

@@ -19,14 +19,14 @@ from runtime.panels.monitors import Monitor
 from runtime.records import U8, EyePoints
 
 SENSOR_NOISE_M = 0.003  # standard deviation of a coordinate, of a simulated depth camera
-STANDING_M = 0.002  # how exactly a person finds the place where the lines fuse, an axis
-SAMPLES_HERE = 16  # of the sensor, at 30 a second, while the person stands somewhere
+STANDING_M = 0.002  # standard deviation, per axis, of a person's position when the lines seem fused
+SAMPLES_HERE = 16  # sensor samples, at 30 a second, per viewpoint
 
 
 class SimulatedHardware(SetupHardware):
-    """Simulated hardware: shuffled monitors, and a person who goes where asked.
+    """Simulated hardware: shuffled monitors, and a person who stands where asked.
 
-    The depth sensor stands where the built-in recording's does, so that `run` can replay that afterwards.
+    The depth sensor has the pose of the built-in recording's, so that `run` can replay that afterwards.
     """
 
     simulated = True
@@ -36,11 +36,11 @@ class SimulatedHardware(SetupHardware):
     ) -> None:
         super().__init__(keys, photos=photos)
         self._random = random = np.random.default_rng(seed)
-        # Monitor k is panel order[k]; some stand on their heads, some are seen from behind.
+        # Monitor k is panel order[k]; some are upside down, some seen from behind.
         self.order = random.permutation(stack.count).tolist()
         self.mounted = [(int(random.choice([0, 180])), str(random.choice(["none", "horizontal"]))) for _ in self.order]
         self._stack, self._say = stack, say
-        self._seen_ns = self._left = 0  # when the newest sample was taken; samples that are still to come here
+        self._seen_ns = self._left = 0  # capture time of the newest sample; samples left at this viewpoint
         self._here, self._off_m = "", np.zeros(3)
 
     def monitors(self) -> tuple[Monitor, ...]:
@@ -54,7 +54,7 @@ class SimulatedHardware(SetupHardware):
         rotation_deg, mirror = self.mounted[number]
         self._say(
             f"(simulated: it is panel {self.order[number]}; its arrow points {'down' if rotation_deg else 'up'}, its "
-            f"writing {'is mirrored' if mirror != 'none' else 'reads rightly'})"
+            f"writing is {'mirrored' if mirror != 'none' else 'not mirrored'})"
         )
 
     def photographs(self, settings: Settings, pictures: U8, *, panel: int | None, say: Say) -> Iterator[Named]:
@@ -64,7 +64,7 @@ class SimulatedHardware(SetupHardware):
         return photographs(folder)
 
     def open_sensor(self, settings: Settings) -> str:
-        return "a simulated sensor, where the built-in recording's stands"
+        return "a simulated sensor, placed as in the built-in recording"
 
     def sample(self, standing_at: Viewpoint) -> Sample | None:
         if self._here != standing_at.name:

@@ -1,4 +1,4 @@
-"""A calibration with its error: the methods, their residuals and covariance, and which one to trust."""
+"""Calibrations with their errors: the methods, residuals and covariances, and the choice of a method."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from runtime.records import F64
 
 Method = Literal["seed", "least-squares", "inverse", "robust", "fixed-scale"]
 METHODS: tuple[Method, ...] = get_args(Method)
-EXACT_SHARE = 0.8  # of sensors have our metre exactly, for all that pairs can tell
-SCALE_SIGMA = 0.02  # by so much, or more, the metre of the others is off: as likely by 4 to 8% as by 8 to 16%
-FARTHEST = np.log(10.0)  # not by more than a factor of ten: what their prior is normalised for
-MIN_SIGMA = 1e-12  # of the scale's logarithm: exact pairs
+# Prior of the scale: 80 % of sensors are exact as far as pairs can show; the others are off by about 2 % or more, as
+# likely by 4 to 8 % as by 8 to 16 %, and by a factor of ten at most.
+EXACT_SHARE, SCALE_SIGMA, FARTHEST = 0.8, 0.02, np.log(10.0)
+MIN_SIGMA = 1e-12  # of the scale's logarithm, for exact pairs
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationSolution:
-    """What a method made of K pairs. Parameters and pivot as in `runtime.eyes.calibration`."""
+    """One method's result for K pairs. Parameters and pivot are those of `runtime.eyes.calibration`."""
 
     method: Method
     similarity: Similarity
@@ -32,9 +32,9 @@ class CalibrationSolution:
     used: NDArray[np.bool_]  # (K,) False: rejected as an outlier
     noise_m: float  # standard deviation of one coordinate of the used pairs, in `stack`
     pivot_m: F64  # (3,) frame `stack`: the centre of the used pairs
-    unit_covariance: F64  # (7, 7) for noise of 1 m; the scale's row is zero where it is fixed
-    condition: float  # of the design, lengths in units of the pairs' RMS radius
-    reason: str = ""  # why this method was chosen
+    unit_covariance: F64  # (7, 7) for noise of 1 m; the scale's row is zero if it is fixed
+    condition: float  # condition number of the design, lengths in units of the pairs' RMS radius
+    reason: str = ""  # for choosing this method
 
     @property
     def covariance(self) -> F64:
@@ -62,7 +62,7 @@ class CalibrationSolution:
         return float(np.sqrt(self.covariance[6, 6]))
 
     def eye_error_m(self, stack_m: F64, *, noise_m: float | None = None) -> F64:
-        """(...) expected (RMS) error at points (..., 3) in `stack`, for the observed or another noise."""
+        """(...) expected RMS error at points (..., 3) in `stack`, for the observed noise or `noise_m`."""
         jacobian = position_jacobian(stack_m, pivot_m=self.pivot_m)
         covariance = self.unit_covariance * (self.noise_m if noise_m is None else noise_m) ** 2
         spread: F64 = jacobian @ covariance @ np.swapaxes(jacobian, -1, -2)
@@ -70,10 +70,10 @@ class CalibrationSolution:
 
 
 def design_covariance(stack_m: F64, *, fixed_scale: bool) -> tuple[F64, F64, float]:
-    """Pivot (3,), covariance (7, 7) of the parameters for noise of 1 m, and the condition of the design.
+    """Pivot (3,), covariance (7, 7) of the parameters for noise of 1 m, and condition number of the design.
 
-    To first order, for equal and independent noise in every coordinate; on the sensor's side it is the noise times
-    the scale. A design that leaves a parameter free has infinite condition and infinite covariance.
+    First order, for equal and independent noise in every coordinate; noise in the sensor counts times the scale. A
+    design that leaves a parameter undetermined has infinite condition and covariance.
     """
     pivot_m = stack_m.mean(0)
     radius_m = float(np.sqrt(((stack_m - pivot_m) ** 2).sum(-1).mean())) or 1.0
@@ -95,7 +95,7 @@ def design_covariance(stack_m: F64, *, fixed_scale: bool) -> tuple[F64, F64, flo
 def solve(
     sensor_m: F64, stack_m: F64, *, method: Method, known_scale: float = 1.0, reason: str = ""
 ) -> CalibrationSolution:
-    """One method's similarity of (K, 3) pairs with all its error figures. Raises `similarity.Degenerate`."""
+    """Solve (K, 3) pairs by one method, with all error figures. Raises `similarity.Degenerate`."""
     used = np.ones(len(sensor_m), bool)
     if method == "robust":
         robust = fit_robust(sensor_m, stack_m)
@@ -119,25 +119,25 @@ def solve(
 
 
 def posterior_scale(fitted: F64 | float, *, sigma: float, freedom: int) -> tuple[F64, F64]:
-    """Posterior mean and standard deviation of a log scale (...) under two hypotheses (Bayes).
+    """Posterior mean and standard deviation of a log scale (...), averaged over two hypotheses.
 
-    The pairs tell a fitted logarithm with an error estimated by so many degrees of freedom: Student's likelihood. The
-    answer is the mean of both hypotheses' (0, and the fitted one) by their probabilities: no cliff between them, and a
-    sensor that is off by a tenth is not pulled back.
+    The hypotheses are an exact sensor (0) and the fitted value. The fitted value's error `sigma` is estimated with
+    `freedom` degrees of freedom, hence Student's likelihood. Averaging avoids a threshold, and does not pull back a
+    sensor that is off by a tenth.
     """
     sigma = max(sigma, MIN_SIGMA)
     exact = EXACT_SHARE * student.pdf(fitted / sigma, freedom) / sigma
-    # The prior of the others is flat over the likelihood, nearly: its density at the fitted place serves.
+    # The prior of inexact sensors is nearly flat over the likelihood: use its density at the fitted value.
     off = (1 - EXACT_SHARE) / (2 * np.log1p(FARTHEST / SCALE_SIGMA)) / (SCALE_SIGMA + np.abs(fitted))
     chance = exact / (exact + off)
     return (1 - chance) * fitted, np.sqrt((1 - chance) * (sigma**2 + chance * np.square(fitted)))
 
 
 def solve_default(sensor_m: F64, stack_m: F64) -> CalibrationSolution:
-    """The method that has the least error at the eye for pairs like these (tests/calib/test_methods.py).
+    """Solve by the method with the least error at the eye for such pairs (tests/calib/test_methods.py).
 
-    `robust` where pairs are grossly wrong; else `fixed-scale` at the posterior mean of the scale:
-    1 unless the pairs show another. Raises `similarity.Degenerate`.
+    That is `robust` if there are gross errors, else `fixed-scale` at the posterior mean of the scale, which is 1 unless
+    the pairs contradict it. Raises `similarity.Degenerate`.
     """
     robust = solve(sensor_m, stack_m, method="robust")
     rejected = int((~robust.used).sum())
@@ -147,15 +147,15 @@ def solve_default(sensor_m: F64, stack_m: F64) -> CalibrationSolution:
     fitted = float(inverse.similarity.scale)
     mean, spread = posterior_scale(np.log(fitted), sigma=inverse.scale_sigma, freedom=3 * len(sensor_m) - 7)
     scale, sigma = float(np.exp(mean)), float(spread)
-    found = solve(
+    solution = solve(
         sensor_m,
         stack_m,
         method="fixed-scale",
         known_scale=scale,
         reason=f"scale {scale:.5g} ± {sigma * scale:.2g}: fitted {fitted:.5g} ± {inverse.scale_sigma * fitted:.2g}, "
-        f"beforehand 1 or off by some {100 * SCALE_SIGMA:g}%",
+        f"prior 1 or off by about {100 * SCALE_SIGMA:g}%",
     )
-    unit = found.unit_covariance.copy()
+    unit = solution.unit_covariance.copy()
     # About the pairs' centre the scale is independent of rotation and shift.
-    unit[6, 6] = (sigma / found.noise_m) ** 2 if found.noise_m > 0 else 0.0
-    return replace(found, unit_covariance=unit)
+    unit[6, 6] = (sigma / solution.noise_m) ** 2 if solution.noise_m > 0 else 0.0
+    return replace(solution, unit_covariance=unit)

@@ -1,4 +1,4 @@
-"""Calibration viewpoints (EyeReal, 2.3, for any distance) and the viewing volume."""
+"""Calibration viewpoints (EyeReal, 2.3, extended to any distance) and the viewing volume."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from runtime.config import CalibrationSettings
 from runtime.optics.views import stack_from_eye
 from runtime.records import F64
 
-USUAL = CalibrationSettings()  # R 40 to 60 cm, phi 70 to 90 degrees from the vertical, theta 80 to 100 round it
-IPD_M = 0.060  # the paper's, where the configuration names none
+USUAL = CalibrationSettings()  # R 40 to 60 cm, phi 70 to 90 degrees from the vertical, theta 80 to 100 about it
+IPD_M = 0.060  # the paper's, used if the configuration gives none
 
 
 @dataclass(frozen=True, slots=True)
 class Viewpoint:
-    """Where the midpoint of the eyes should be."""
+    """Target position of the midpoint between the eyes."""
 
     radius_cm: int
     phi_deg: int
@@ -33,7 +33,7 @@ class Viewpoint:
         return spherical_m(self.radius_cm / 100, phi_deg=self.phi_deg, theta_deg=self.theta_deg)
 
     def eyes_m(self, ipd_m: float = IPD_M) -> F64:
-        """(2, 3) left and right eye, level, square to the line to the stack's centre; frame `stack`."""
+        """(2, 3) left and right eye, level, perpendicular to the line to the stack's centre; frame `stack`."""
         right = stack_from_eye(self.midpoint_m)[:3, 0]
         return self.midpoint_m + np.outer([-ipd_m / 2, ipd_m / 2], right)
 
@@ -45,13 +45,13 @@ def spherical_m(radius_m: float, *, phi_deg: float, theta_deg: float) -> F64:
 
 
 def viewing_place_m(viewing: CalibrationSettings) -> F64:
-    """(3,) the middle of where viewers stand, frame `stack`: what a registration is exact for."""
+    """(3,) middle of the viewing range, frame `stack`; registration is exact there."""
     up_deg = sum(viewing.viewing_up_deg) / 2
     return spherical_m(sum(viewing.viewing_m) / 2, phi_deg=90 - up_deg, theta_deg=90)
 
 
 def grid(viewing: CalibrationSettings = USUAL) -> tuple[Viewpoint, ...]:
-    """The 27 viewpoints of a viewing range, nearest first; the EyeReal's for the default range."""
+    """The 27 viewpoints of a viewing range, nearest first; EyeReal's for the default range."""
     low_deg, high_deg = viewing.viewing_up_deg
     radii_cm = np.rint(100 * np.linspace(*viewing.viewing_m, 3)).astype(int)
     phi_deg = np.rint(90 - np.linspace(high_deg, low_deg, 3)).astype(int)
@@ -62,9 +62,8 @@ def grid(viewing: CalibrationSettings = USUAL) -> tuple[Viewpoint, ...]:
 def viewing_volume_m(viewing: CalibrationSettings = USUAL) -> F64:
     """(125, 3) points in `stack` that span the viewing volume.
 
-    It exceeds the grid by a quarter of the nearest and half of the farthest distance, 15 degrees sideways, 10 up.
-
-    For the usual range 0.3 to 0.9 m away, 25 degrees to each side.
+    The volume extends the grid to 0.75 times the nearest and 1.5 times the farthest distance, by 15 degrees sideways
+    and 10 up and down: by default 0.3 to 0.9 m away and 25 degrees to each side.
     """
     (near_m, far_m), (low_deg, high_deg) = viewing.viewing_m, viewing.viewing_up_deg
     side_deg = viewing.viewing_side_deg + 15

@@ -1,4 +1,4 @@
-"""Checkpoints: read with weights only (no code of the file is run), written whole or not at all."""
+"""Checkpoints: read as weights only (no code from the file runs), written atomically."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ WIDTH_KEY = "subnets.in_conv.0.weight"
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """The table that a checkpoint holds; it has at least `model`, a table of tensors. Raises InputError.
+    """Read a checkpoint's table, which has at least `model`, a table of tensors. Raises InputError.
 
-    Plain values, tensors, and the `args` of an argparse command line, which is a table of plain values again: the
-    published code saves its own. Nothing else is made, and no code of the file is run.
+    Only plain values, tensors and an `argparse.Namespace` of plain values (saved by the published code) are
+    deserialised; no code from the file runs.
     """
     data = untrusted_input.read_bytes(path, most_bytes=FILE_BYTES_MAX)
     try:
         with torch.serialization.safe_globals([argparse.Namespace]):
             table: dict[str, Any] = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged pickle can raise anything
-        raise InputError(path, "", f"is no checkpoint of plain weights ({one_line(str(error), most=120)})") from None
+        raise InputError(path, "", f"is not a checkpoint of plain weights ({one_line(str(error), most=120)})") from None
     state = table.get("model") if isinstance(table, dict) else None
     if not isinstance(state, Mapping) or not state or not all(isinstance(v, Tensor) for v in state.values()):
         raise InputError(path, "model", 'missing: a checkpoint is {"model": state_dict}')
@@ -38,7 +38,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def eyereal_width(state: Mapping[str, Tensor], *, source: Path) -> int:
-    """The width of the published network that a checkpoint is of. Raises InputError."""
+    """Width of the published network in a checkpoint. Raises InputError."""
     first = state.get(WIDTH_KEY)
     if first is None or first.ndim != 4:
         raise InputError(source, WIDTH_KEY, "missing: not a checkpoint of the published network")
@@ -46,27 +46,27 @@ def eyereal_width(state: Mapping[str, Tensor], *, source: Path) -> int:
 
 
 def fill(net: nn.Module, state: Mapping[str, Tensor], *, source: str | Path, arch: str) -> None:
-    """Load weights, all of them and no others. Raises InputError, naming the first that is amiss."""
-    wanted = net.state_dict()
-    missing = [key for key in wanted if key not in state]
-    # Old checkpoints lack this counter, which plays no part in inference.
+    """Load a network's weights, all of them and no others. Raises InputError, naming the first wrong one."""
+    expected = net.state_dict()
+    missing = [key for key in expected if key not in state]
+    # Old checkpoints lack this counter, which inference does not use.
     missing = [key for key in missing if not key.endswith("num_batches_tracked")]
-    surplus = [key for key in state if key not in wanted]
+    surplus = [key for key in state if key not in expected]
     if missing or surplus:
         problem = [f"{len(missing)} keys of {arch} are missing"] if missing else []
         problem += [f"{len(surplus)} keys are not of {arch}"] if surplus else []
         raise InputError(source, (missing or surplus)[0], "; ".join(problem))
     for key, value in state.items():
-        if value.shape != wanted[key].shape:
-            shapes = f"{tuple(value.shape)}, but {arch} has {tuple(wanted[key].shape)}"
+        if value.shape != expected[key].shape:
+            shapes = f"{tuple(value.shape)}, but {arch} has {tuple(expected[key].shape)}"
             raise InputError(source, key, shapes)
         if not torch.isfinite(value).all():
             raise InputError(source, key, "holds numbers that are not finite")
-    net.load_state_dict({**wanted, **state})
+    net.load_state_dict({**expected, **state})
 
 
 def save_checkpoint(path: Path, table: dict[str, Any]) -> None:
-    """Write a checkpoint atomically; everything in it survives a reading with weights only."""
+    """Write a checkpoint atomically; the table must be readable as weights only."""
     buffer = io.BytesIO()
     torch.save(table, buffer)
     write_bytes(path, buffer.getvalue())

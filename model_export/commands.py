@@ -1,4 +1,4 @@
-"""`phasestack train`, `export` and `validate`: names and options; torch is imported when they run."""
+"""Options of `phasestack train`, `export` and `validate`; torch is imported when they run."""
 
 from __future__ import annotations
 
@@ -14,22 +14,20 @@ from runtime.support.options import number
 
 
 def require(*modules: str) -> None:
-    """Raises MissingPart, naming what to install, where a module of the `export` extra is not there."""
+    """Raise MissingPart with the package to install if a module of the `export` extra is missing."""
     for module in modules:
         if importlib.util.find_spec(module) is None:
-            what = "tensorboard" if module == "tensorboard" else "'phasestack[export]'"
-            raise MissingPart(f"{module} is not installed: pip install {what}")
+            package = "tensorboard" if module == "tensorboard" else "'phasestack[export]'"
+            raise MissingPart(f"{module} is not installed: pip install {package}")
 
 
-Arch = Annotated[
-    str, typer.Option(help="eyereal, unrolled, or module:Class, a torch.nn.Module of your own on Python's path")
-]
+Arch = Annotated[str, typer.Option(help="eyereal, unrolled, or module:Class, your torch.nn.Module on Python's path")]
 Options = Annotated[
     list[str] | None,
     typer.Option(
         "--option",
         metavar="NAME=VALUE",
-        help="of the network's own Options, or steps=N, of the solver after it; repeatable",
+        help="an option of the network, or steps=N for solver steps after it; repeatable",
     ),
 ]
 
@@ -39,25 +37,27 @@ def train(
     arch: Arch,
     option: Options = None,
     data: Annotated[
-        Path | None, typer.Option(help="folder of pairs in EyeReal's form; without: procedural ones")
+        Path | None, typer.Option(help="folder of pairs in EyeReal's format; default: procedural pairs")
     ] = None,
-    scene: Annotated[str, typer.Option(help="a scene or file that the runtime draws, turned, from anywhere")] = "",
-    pairs: Annotated[int, typer.Option(min=0, help="only so many pairs; 0: ever new ones")] = 0,
-    panels: Annotated[Path | None, typer.Option(help="panels to learn for; without: any three even ones")] = None,
-    iterations: Annotated[int, typer.Option(min=1, help="of gradients, in all")] = 2000,
-    batch: Annotated[int, typer.Option(min=1, help="pairs of an iteration")] = 1,
-    learning_rate: Annotated[float, number(1e-8, 1, help="at first; then along a cosine to none")] = 1e-3,
-    width: Annotated[int, typer.Option(min=32, max=8192, help="of the panels and pictures learned from, pixels")] = 480,
-    height: Annotated[int, typer.Option(min=32, max=8192, help="of the same")] = 270,
-    eye_sigma_mm: Annotated[float, number(0, 20, "mm", help="how far eyes are from where they are believed")] = 1.0,
+    scene: Annotated[str, typer.Option(help="scene or file to draw, at random rotations and eye positions")] = "",
+    pairs: Annotated[int, typer.Option(min=0, help="number of different pairs; 0: unlimited")] = 0,
+    panels: Annotated[
+        Path | None, typer.Option(help="configuration of the panels; default: any three evenly spaced ones")
+    ] = None,
+    iterations: Annotated[int, typer.Option(min=1, help="gradient steps in all")] = 2000,
+    batch: Annotated[int, typer.Option(min=1, help="pairs per iteration")] = 1,
+    learning_rate: Annotated[float, number(1e-8, 1, help="initial, with cosine decay to zero")] = 1e-3,
+    width: Annotated[int, typer.Option(min=32, max=8192, help="of panels and pictures in training, pixels")] = 480,
+    height: Annotated[int, typer.Option(min=32, max=8192, help="of panels and pictures in training, pixels")] = 270,
+    eye_sigma_mm: Annotated[float, number(0, 20, "mm", help="standard deviation of the tracking error")] = 1.0,
     seed: Annotated[int, typer.Option(min=0, help="of weights and pairs")] = 1,
-    validate_every: Annotated[int, typer.Option(min=1, help="iterations from point to point of the curve")] = 100,
-    device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="auto: a GPU where torch sees one")] = "auto",
-    resume: Annotated[bool, typer.Option("--resume", help="go on from --out's checkpoint")] = False,
-    tensorboard: Annotated[bool, typer.Option("--tensorboard", help="event files besides")] = False,
+    validate_every: Annotated[int, typer.Option(min=1, help="iterations between points of the curve")] = 100,
+    device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="auto: a GPU if torch finds one")] = "auto",
+    resume: Annotated[bool, typer.Option("--resume", help="continue from --out's checkpoint")] = False,
+    tensorboard: Annotated[bool, typer.Option("--tensorboard", help="also write event files")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="the result as one object on stdout")] = False,
 ) -> None:
-    """Train a network of pictures by gradients, by the light that eyes get of its panels.
+    """Train a picture network by gradient descent on the light that reaches the eyes.
 
     Example: phasestack train --arch my_network:MyNetwork --out out/mine
     """
@@ -87,39 +87,39 @@ def train(
     typer.echo(shown(result, as_json=as_json))
 
 
-def options_of(given: list[str] | None) -> dict[str, Any]:
-    """NAME=VALUE, each value as JSON has it, or a text. Raises InputError."""
-    found: dict[str, Any] = {}
-    for text in given or []:
+def options_of(texts: list[str] | None) -> dict[str, Any]:
+    """Parse NAME=VALUE options, each value as JSON or else as text. Raises InputError."""
+    options: dict[str, Any] = {}
+    for text in texts or []:
         name, equals, value = text.partition("=")
         if not (name and equals):
-            raise InputError("--option", "", f"{text!r} is no NAME=VALUE")
+            raise InputError("--option", "", f"{text!r} is not NAME=VALUE")
         try:
-            found[name] = json.loads(value)
+            options[name] = json.loads(value)
         except ValueError:
-            found[name] = value
-    return found
+            options[name] = value
+    return options
 
 
 def export(
     arch: Annotated[str, typer.Option(help="fast, balanced, best, eyereal, unrolled, or module:Class")],
     out: Annotated[Path, typer.Option(help="the ONNX file")],
     checkpoint: Annotated[
-        Path | None, typer.Option(help="weights: of `phasestack train`, or a published one for eyereal")
+        Path | None, typer.Option(help="weights from `phasestack train`, or published ones for eyereal")
     ] = None,
-    random_init: Annotated[int | None, typer.Option(min=0, help="untrained weights of this seed")] = None,
+    random_init: Annotated[int | None, typer.Option(min=0, help="untrained weights from this seed")] = None,
     width: Annotated[int, typer.Option(help="panels' width in pixels")] = 1920,
     height: Annotated[int, typer.Option(help="panels' height in pixels")] = 1080,
     eye_order: Annotated[
-        Literal["left-right", "right-left"], typer.Option(help="eyereal: the eye that its data had first")
+        Literal["left-right", "right-left"], typer.Option(help="eyereal: order of the eyes in its training data")
     ] = "left-right",
     option: Options = None,
     as_json: Annotated[bool, typer.Option("--json", help="the checks as one object on stdout")] = False,
 ) -> None:
-    """Write a model as ONNX with its contract, if it agrees with torch.
+    """Write a model as ONNX with its contract, if its results agree with torch's.
 
-    Without --checkpoint or --random-init, fast, balanced and best are made from the recipes that ship.
-    Exits with 1 where a check fails.
+    fast, balanced and best are built from their recipes, without --checkpoint or --random-init.
+    Exits with 1 if a check fails.
 
     Example: phasestack export --arch eyereal --checkpoint published.pth --out eyereal.onnx
     """
@@ -148,7 +148,7 @@ def validate(
 ) -> None:
     """Check a model file: contract, names, shapes, and finite values on stress inputs.
 
-    Exits with 1 where a check fails.
+    Exits with 1 if a check fails.
 
     Example: phasestack validate runtime/model/data/balanced.onnx
     """

@@ -12,33 +12,33 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack, stack_from_eye
 from runtime.records import F64, U8
 
-PITCH_WIDTH_M = 0.5184  # of the prototype's panels
-CENTRE = 1  # index of the middle one of three panels
-WIDEST_DEG = 100.0  # horizontal field of view of a training picture
-LEAST_COMMON = 0.4  # of the centre panel's width that both eyes must see through all panels
+PITCH_WIDTH_M = 0.5184  # width of the prototype's panels
+CENTRE = 1  # index of the middle of three panels
+WIDEST_DEG = 100.0  # largest horizontal field of view of a training picture
+LEAST_COMMON = 0.4  # share of the centre panel's size that each eye must see through all panels
 
 
 @dataclass(frozen=True, slots=True)
 class TrainingPair:
-    """Two pictures, and the eyes that should see them."""
+    """Two pictures and the eyes that they are for."""
 
     stack: PanelStack
     eyes_m: F64  # (2, 3) left, right; frame `stack`
-    images: tuple[U8, U8]  # (h, w, 3), each eye's own
-    fov_deg: float  # of both, horizontal
+    images: tuple[U8, U8]  # (h, w, 3) left, right
+    fov_deg: float  # horizontal, of both
 
 
 def random_stack(random: Random, *, width_px: int, height_px: int) -> PanelStack:
-    """Three even panels: the prototype's at a coarser raster, a part of them, or another size."""
+    """Three evenly spaced panels: the prototype's on a coarser raster, a part of them, or another size."""
     width_m = PITCH_WIDTH_M * math.exp(random.uniform(math.log(0.25), math.log(1.6)))
     gap_m = math.exp(random.uniform(math.log(0.005), math.log(0.5)))
-    if random.random() < 0.6:  # what people build
+    if random.random() < 0.6:  # a practical range
         gap_m = random.uniform(0.01, 0.12)
     return PanelStack(width_m, width_m * height_px / width_px, (-gap_m, 0.0, gap_m), width_px, height_px)
 
 
 def random_eyes(random: Random, stack: PanelStack) -> F64:
-    """(2, 3) eyes: 0.1 to 4 m from the centre, at least 0.1 m before the front; head rolled and turned."""
+    """(2, 3) eyes, 0.1 to 4 m from the centre, at least 0.1 m in front of the panels; head rolled and turned."""
     front_m = stack.x_m[-1]
     distance_m = math.exp(random.uniform(math.log(0.1 + front_m), math.log(4.0)))
     if random.random() < 0.5:
@@ -58,7 +58,7 @@ def random_eyes(random: Random, stack: PanelStack) -> F64:
 
 
 def is_served(eyes_m: F64, stack: PanelStack) -> bool:
-    """True where both eyes see enough of the display through all panels for a pair to teach something."""
+    """Return True if both eyes see at least `LEAST_COMMON` of the display through all panels."""
     for eye in eyes_m:
         edges = []
         for x_m in stack.x_m:
@@ -76,19 +76,18 @@ def is_served(eyes_m: F64, stack: PanelStack) -> bool:
 def random_place(
     random: Random, *, width_px: int, height_px: int, stack: PanelStack | None = None
 ) -> tuple[PanelStack, F64]:
-    """Panels, those given or random ones, and eyes (2, 3) that see enough through them."""
-    given = stack
+    """Panels (`stack`, or random ones) and random eyes (2, 3) that see enough of them."""
     while True:
-        stack = given or random_stack(random, width_px=width_px, height_px=height_px)
-        eyes = random_eyes(random, stack)
-        if is_served(eyes, stack):
-            return stack, eyes
+        panels = stack or random_stack(random, width_px=width_px, height_px=height_px)
+        eyes = random_eyes(random, panels)
+        if is_served(eyes, panels):
+            return panels, eyes
 
 
 def random_pair(
     random: Random, *, width_px: int, height_px: int, stack: PanelStack | None = None, fov_deg: float = 0.0
 ) -> TrainingPair:
-    """One random training pair, for given or random panels; fov_deg 0: as wide as the panels."""
+    """Random training pair for `stack` or random panels; fov_deg 0: as wide as the panels."""
     stack, eyes = random_place(random, width_px=width_px, height_px=height_px, stack=stack)
     scene = random_scene(random, stack, eyes.mean(axis=0))
     fov_deg = fov_deg or filling_fov_deg(stack, eyes.mean(axis=0))
@@ -98,6 +97,6 @@ def random_pair(
 
 
 def filling_fov_deg(stack: PanelStack, eye_m: F64) -> float:
-    """The horizontal field of view that the panels fill as seen from before them, WIDEST_DEG at most."""
+    """Horizontal field of view of the panels from an eye's distance, at most WIDEST_DEG."""
     distance_m = float(np.linalg.norm(eye_m))
     return min(WIDEST_DEG, math.degrees(2 * math.atan(stack.width_m / 2 / distance_m)))

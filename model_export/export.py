@@ -1,4 +1,4 @@
-"""`phasestack export`: weights to a checked ONNX file."""
+"""`phasestack export`: write weights to an ONNX file and check it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from model_export import eyereal, network
 from model_export.checkpoint import FILE_BYTES_MAX, eyereal_width, fill, load_checkpoint
 from model_export.eyereal import LEAST_PX, OFFSET
-from model_export.modules import PANELS, Network, blamed, check_known, check_static, made, probe
+from model_export.modules import PANELS, Network, blamed, check_known, check_static, make_network, probe
 from model_export.network import SpectralSolver
 from model_export.onnx_files import picture_bytes, ports, spectral_bytes, with_contract
 from model_export.recipe import DESIGN_RANGE, Recipe, read_recipe
@@ -40,7 +40,7 @@ def export_model(
     eye_order: EyeOrder = "left-right",
     options: dict[str, Any] | None = None,
 ) -> Report:
-    """Make, check, and write where every check passed. Raises InputError."""
+    """Build a model, check it, and write it if all checks pass. Raises InputError."""
     check_known(arch, *SHIPPED)
     if checkpoint is not None and random_init is not None:
         raise InputError("export", "--random-init", "and --checkpoint exclude one another")
@@ -55,7 +55,7 @@ def export_model(
     else:
         if checkpoint is not None or random_init is not None:
             raise InputError(
-                "export", "--arch", f"{arch} is made from its recipe, without --checkpoint or --random-init"
+                "export", "--arch", f"{arch} is built from its recipe, without --checkpoint or --random-init"
             )
         data, module = spectral_model(arch)
     report = check_model(data, source=str(out), reference=in_torch(module))
@@ -65,7 +65,7 @@ def export_model(
 
 
 def in_torch(module: nn.Module) -> Reference:
-    """A module as a reference of its export."""
+    """Wrap a module as the reference for its export."""
 
     def run(feeds: Feeds) -> Sequence[np.ndarray]:
         with torch.no_grad():
@@ -76,14 +76,14 @@ def in_torch(module: nn.Module) -> Reference:
 
 
 def spectral_model(name: str) -> tuple[bytes, nn.Module]:
-    """One of the shipped family, from its recipe."""
+    """Build a shipped model from its recipe."""
     recipe = read_recipe(name)
     net = SpectralSolver(recipe.cell_px).eval()
     return spectral_file(net, recipe), net
 
 
 def spectral_file(net: SpectralSolver, recipe: Recipe) -> bytes:
-    """The ONNX file of a recipe's network, with its contract."""
+    """Export a recipe's network as ONNX with its contract."""
     contract = Contract(
         version=2,
         arch="spectral",
@@ -112,14 +112,14 @@ def spectral_file(net: SpectralSolver, recipe: Recipe) -> bytes:
 def picture_network(
     arch: str, checkpoint: Path | None, random_init: int | None, options: dict[str, Any]
 ) -> tuple[Network, str]:
-    """A picture network with a checkpoint's weights or untrained, and its source's digest.
+    """Picture network with a checkpoint's weights or untrained, and a digest of their source.
 
-    A checkpoint of `phasestack train` knows the network's options, and it must be of that network.
+    A checkpoint of `phasestack train` contains the network's options, and must be of network `arch`.
     """
     if checkpoint is None:
         if random_init is None:
             raise InputError("export", "--checkpoint", f"or --random-init is needed: {arch}'s weights aren't shipped")
-        network = made(arch, options, seed=random_init)
+        network = make_network(arch, options, seed=random_init)
         return network, hashlib.sha256(f"{arch} {network.options} random {random_init}".encode()).hexdigest()
     table = load_checkpoint(checkpoint)
     trained = table.get("training")
@@ -129,7 +129,7 @@ def picture_network(
         options = {**trained.get("options", {}), **options}
     elif arch == "eyereal":
         options = {"width": eyereal_width(table["model"], source=checkpoint), **options}
-    network = made(arch, options)
+    network = make_network(arch, options)
     fill(network.net, table["model"], source=checkpoint, arch=arch)
     data = untrusted_input.read_bytes(checkpoint, most_bytes=FILE_BYTES_MAX)
     return network, hashlib.sha256(data).hexdigest()
@@ -138,7 +138,7 @@ def picture_network(
 def picture_file(
     network: Network, origin: str, *, width_px: int, height_px: int, eye_order: EyeOrder = "left-right"
 ) -> bytes:
-    """The ONNX file of a network of pictures, of one size. Raises InputError where it can't be one."""
+    """Export a picture network as ONNX for one size. Raises InputError if that is impossible."""
     form, net, size = network.form, network.net.eval(), {"width_px": width_px, "height_px": height_px}
     probe(network, **size)
     check_static(network, **size)

@@ -1,4 +1,4 @@
-"""The published network (EyeReal's U-Net), exactly, so that its checkpoints import by their own keys."""
+"""The published network (EyeReal's U-Net), with its parameter names, so that its checkpoints load."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from runtime.config import Section
 PICTURE_FOV_DEG = 40.0  # horizontal; the published code feeds black outside it
 OFFSET = 0.2  # the published code shows sigmoid(y) - 0.2, clipped at the panel
 INPUT, OUTPUT = "eyes", "panels"
-LEAST_PX = 32  # five halvings
-NORM_MOMENTUM = 0.02  # of running means: batches are of one pair, and torch's 0.1 would average ten
+LEAST_PX = 32  # for five halvings
+NORM_MOMENTUM = 0.02  # of running means; batches have one pair, of which torch's 0.1 would average only ten
 
 
 def _block(channels: int, middle: int, out: int) -> nn.Sequential:
@@ -30,7 +30,7 @@ def _block(channels: int, middle: int, out: int) -> nn.Sequential:
 
 
 class Up(nn.Module):
-    """Twice the size (aligned corners), padded to the skip's, beside it, and a block."""
+    """Upsample by two (aligned corners), pad to the skip's size, concatenate, and apply a block."""
 
     def __init__(self, channels: int, out: int) -> None:
         super().__init__()
@@ -74,17 +74,17 @@ class UNet(nn.Module):
 
 
 class EyeRealNet(nn.Module):
-    """Eyes' pictures on every panel's pixels to panel values.
+    """Maps the eyes' pictures, warped to every panel's pixels, to panel values.
 
-    Channels in: panel-major, then eye, then RGB, intensities in [0, 1]. Out: panel-major, then RGB; in
-    [-0.2, 0.8], as published: the panel clips what is negative.
+    Input channels: panel-major, then eye, then RGB, intensities in [0, 1]. Output channels: panel-major, then RGB, in
+    [-0.2, 0.8], as published; the panel clips negative values.
     """
 
     input_frame, input_value, output = "panel", "intensity", "panels"
     picture_fov_deg = PICTURE_FOV_DEG
 
     class Options(Section):
-        """What its size is."""
+        """Size of the network."""
 
         width: Annotated[int, Field(ge=1, le=256)] = Field(32, description="channels of its first layer")
 

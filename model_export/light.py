@@ -1,7 +1,7 @@
-"""Differentiable light in plain torch: what eyes see of the panels, and the step.
+"""Differentiable light and solver step in plain torch.
 
-This is the reference that the runtime's kernels are held to, and what networks are trained through. Equations are those
-of docs/mathematics.md, "A step".
+The runtime's kernels are tested against this reference, and networks are trained through it. Equations are those of
+docs/mathematics.md, "A step".
 
 *Light.* Panel n shows x_n in [0, 1]; along a ray s = sum of x_n, and I = sin²(pi/2·s) = (1 - Re exp(i·pi·s))/2. A pixel
 of an eye's picture is a bundle of rays. Within it the panels' values are nearly independent, so that
@@ -9,18 +9,19 @@ of an eye's picture is a bundle of rays. Within it the panels' values are nearly
     E[exp(i·pi·s)] = Z = prod_n z_n,   z_n = sum_q w_nq·exp(i·pi·x_nq)                                        (L1)
     I = (1 - Re Z)/2                                                                                          (L2)
 
-with w_nq the part of the bundle on panel n that pixel q covers: for a bundle as wide as a pixel, bilinear weights.
+with w_nq the share of the bundle on panel n that pixel q covers: bilinear weights, for a bundle as wide as a pixel.
 
-*A step.* With T what an eye should see and e = I - T (0 where a ray misses a panel), the squared error's derivative to
-a common change of all of a panel's pixels that a bundle crosses, and a bound of its curvature, are sums over all sets:
+*A step.* With target T and residual e = I - T (0 if a ray misses a panel), the derivative of the squared error with
+respect to a common change of all pixels of a panel that a bundle crosses, and a bound on its curvature, are sums over
+all sets:
 
     g_q = sum w·e·Im Z            (pi/2 times it is the derivative of sum e²/2)                               (L3)
     D_q = sum w·(Im Z)²                                                                                       (L4)
     x' = clip(y - size·2/(pi·N)·g/max(D, floor·E), 0, 1),     y' = x' + momentum·(x' - x)                   (L5)
 
-for N panels and E ray sets. The sums over rays through a panel's pixel (the transpose of bilinear sampling) are taken
-as one bilinear sample of the rays' values, through the inverse homography: the same where a ray's pixel and a panel's
-are equally large, elsewhere the same but for a factor that g and D share. A picture's edge goes on for two pixels.
+for N panels and E ray sets. The sum over rays through a panel's pixel (the transpose of bilinear sampling) is computed
+as one bilinear sample of the rays' values through the inverse homography. Both agree if a ray's pixel and a panel's
+have equal size, and otherwise differ by a factor common to g and D. Pictures are clamped to the edge for two pixels.
 """
 
 from __future__ import annotations
@@ -42,18 +43,18 @@ from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
 
-NEAR_PX = 0.5  # a ray counts that is at least so far inside every panel
-BESIDE_PX = 2.0  # a picture's edge goes on: its outermost bundles cover panels' pixels there
-SIZE = 0.8  # of a few steps from panels that a learned network proposes; larger ones overshoot from poor ones
+NEAR_PX = 0.5  # rays count if they are at least this far inside every panel
+BESIDE_PX = 2.0  # border bundles are extended this many pixels beyond the picture (clamp to edge)
+SIZE = 0.8  # of steps after a learned network; larger ones overshoot from poor starts
 MOMENTUM, FLOOR = 0.7, 0.1
-LEAST_ERROR = 1e-6  # squared: beyond 60 dB nothing is won
+LEAST_ERROR = 1e-6  # squared; caps the PSNR at 60 dB
 
 
 @dataclass(frozen=True, slots=True)
 class Views:
-    """E sets of rays, left and right eye in turn, one of each for every place that the head may be at."""
+    """E sets of rays, alternating left and right eye, one pair per position of the head."""
 
-    panels_from_rays: Tensor  # (E, N, 3, 3) float64: a panel's pixels from the rays' raster, centres at halves
+    panels_from_rays: Tensor  # (E, N, 3, 3) float64, from the rays' raster to panel pixels, centres at halves
     width_px: int  # of the rays' raster
     height_px: int
 
@@ -68,10 +69,10 @@ class Views:
         fov_deg: float | None,
         places_m: ArrayLike = ((0.0, 0.0, 0.0),),
     ) -> Views:
-        """Rays of a picture's pixels (`fov_deg` wide), or without one of the centre panel's pixels.
+        """Rays through the pixels of a picture `fov_deg` wide, or through the centre panel's pixels if that is None.
 
-        eyes_m: (2, 3) left, right, frame `stack`; places_m: what is added to both, a picture's rays then being those
-        through the same points of the centre panel. Raises ValueError for an eye in the centre panel's plane.
+        eyes_m: (2, 3) left, right, frame `stack`; places_m: displacements of both eyes, whose rays pass through the
+        same points of the centre panel. Raises ValueError for an eye in the centre panel's plane.
         """
         sets = []
         for place in np.asarray(places_m, np.float64):
@@ -85,9 +86,9 @@ class Views:
 
 
 def light(panels: Tensor, views: Views) -> tuple[Tensor, Tensor]:
-    """Intensities (E, C, h, w) of panels (N, C, H, W), and which rays count (E, 1, h, w).
+    """Intensities (E, C, h, w) of panels (N, C, H, W) by (L1) and (L2), and a mask of the rays that count (E, 1, h, w).
 
-    (L1) and (L2). Differentiable with respect to the panels; on their device, in their type.
+    Differentiable with respect to the panels; on their device, in their dtype.
     """
     bundles, counts = _bundles(panels, views)
     return torch.stack([(1 - reduce(torch.mul, z).real) / 2 for z in bundles]), counts
@@ -96,26 +97,25 @@ def light(panels: Tensor, views: Views) -> tuple[Tensor, Tensor]:
 def traced(
     panels: Tensor, views: Views, *, rays: int = 2, random: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Intensities by rays x rays random rays a pixel, noisy but unbiased; and where all of them count."""
+    """Intensities from rays x rays random rays per pixel, noisy but unbiased, and a mask of where all of them count."""
     size, angle = (views.height_px, views.width_px), torch.pi * panels
     total, counts = torch.zeros((), dtype=panels.dtype, device=panels.device), torch.tensor(True, device=panels.device)
     for stratum in range(rays * rays):
         at = torch.tensor([stratum % rays, stratum // rays])[:, None, None]
         within = (torch.rand(2, *size, generator=random, dtype=torch.float64) + at) / rays
-        found = [_sample(angle, matrices, size, near_px=NEAR_PX, within=within) for matrices in views.panels_from_rays]
-        sums = torch.stack([values.sum(dim=0) for values, _ in found])
+        samples = [_sample(angle, m, size, near_px=NEAR_PX, within=within) for m in views.panels_from_rays]
+        sums = torch.stack([values.sum(dim=0) for values, _ in samples])
         total = total + (1 - torch.cos(sums)) / (2 * rays * rays)
-        counts = counts & torch.stack([inside.all(dim=0) for _, inside in found])
+        counts = counts & torch.stack([inside.all(dim=0) for _, inside in samples])
     return total, counts
 
 
 def light_db(
     panels: Tensor, targets: Tensor, views: Views, *, rays: int = 3, random: torch.Generator | None = None
 ) -> float:
-    """PSNR of the light that eyes, as points, get of panels, against targets (E, C, h, w).
+    """PSNR of the light that reaches point eyes from panels, against targets (E, C, h, w).
 
-    Two sets of rays err independently of each other: the mean of the product of both errors is the squared error,
-    without bias.
+    The errors of two independent sets of rays are multiplied, so that the mean is an unbiased squared error.
     """
     (a, in_a), (b, in_b) = (traced(panels, views, rays=rays, random=random) for _ in range(2))
     counts = in_a & in_b
@@ -135,8 +135,8 @@ def step(
 ) -> tuple[Tensor, Tensor]:
     """One step (L5): x' and y' from panels x and their extrapolation y, both (N, C, H, W).
 
-    targets: (2, C, h, w) what the left and the right eye should see. Where the views have fewer rows, places take turns
-    from row to row of them.
+    targets: (2, C, h, w) of the left and the right eye. If the views have fewer rows, head positions alternate from row
+    to row of the targets.
     """
     sets, turns = len(views.panels_from_rays), targets.shape[-2] // views.height_px
     back, size_px = torch.linalg.inv(views.panels_from_rays), y.shape[-2:]
@@ -146,14 +146,14 @@ def step(
         whole, turn = reduce(torch.mul, z), e // 2 if turns > 1 else 0
         error = (1 - whole.real) / 2 - targets[e % 2][:, turn::turns][:, : views.height_px]
         rays = torch.cat([error * whole.imag, whole.imag.square()]) * counts[e]
-        found = _sample(rays.expand(len(y), -1, -1, -1), back[e], size_px, near_px=-BESIDE_PX)[0].chunk(2, dim=1)
-        gradient, bound = gradient + found[0], bound + found[1]
+        g, d = _sample(rays.expand(len(y), -1, -1, -1), back[e], size_px, near_px=-BESIDE_PX)[0].chunk(2, dim=1)
+        gradient, bound = gradient + g, bound + d
     new = (y - size * 2 / (torch.pi * len(y)) * gradient / bound.clamp(min=floor * sets)).clamp(0, 1)
     return new, new + momentum * (new - x)
 
 
 def improved(panels: Tensor, targets: Tensor, views: Views, sizes: Sequence[Any], momenta: Sequence[Any]) -> Tensor:
-    """Panels after one step of each size."""
+    """Apply one step of each size to the panels."""
     x = y = panels
     for size, momentum in zip(sizes, momenta, strict=True):
         x, y = step(x, y, targets, views, size=size, momentum=momentum)
@@ -166,12 +166,12 @@ def _phasors(panels: Tensor) -> Tensor:
 
 
 def _bundles(panels: Tensor, views: Views) -> tuple[list[Tensor], Tensor]:
-    """z_n of every ray set, (N, C, h, w) complex each, and which rays count, (E, 1, h, w)."""
+    """z_n of every ray set, (N, C, h, w) complex each, and a mask of the rays that count (E, 1, h, w)."""
     parts = torch.view_as_real(_phasors(panels)).movedim(-1, 1).flatten(1, 2)  # (N, 2C, H, W)
     bundles, counts = [], []
     for matrices in views.panels_from_rays:
-        found, inside = _sample(parts, matrices, (views.height_px, views.width_px), near_px=NEAR_PX)
-        bundles.append(torch.complex(*found.chunk(2, dim=1)))
+        values, inside = _sample(parts, matrices, (views.height_px, views.width_px), near_px=NEAR_PX)
+        bundles.append(torch.complex(*values.chunk(2, dim=1)))
         counts.append(inside.all(dim=0))
     return bundles, torch.stack(counts)
 
@@ -179,10 +179,10 @@ def _bundles(panels: Tensor, views: Views) -> tuple[list[Tensor], Tensor]:
 def _sample(
     images: Tensor, matrices: Tensor, size: Sequence[int], *, near_px: float, within: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Samples (N, K, h, w) of images (N, K, H, W), each at its homography (N, 3, 3) of the result's pixels.
+    """Sample images (N, K, H, W) to (N, K, h, w) through homographies (N, 3, 3) from the result's pixels.
 
-    Bilinear at the pixels' middles; of the nearest pixel `within` (2, h, w) them, columns and rows in [0, 1]. Zero
-    where that is not `near_px` inside an image: the second result, (N, 1, h, w), says where it is.
+    Bilinear at pixel centres, or nearest at positions `within` (2, h, w) the pixels, columns and rows in [0, 1].
+    Samples not `near_px` inside an image are zero; the second result, (N, 1, h, w), is the mask of those inside.
     """
     height, width = images.shape[-2:]
     to: dict[str, Any] = {"dtype": torch.float64, "device": images.device}
@@ -195,5 +195,5 @@ def _sample(
     inside = ((at >= margin) & (at <= 1 - margin)).all(dim=-1) & (w > 0)
     grid = torch.where(inside[..., None], 2 * at - 1, 0.0).to(images.dtype)
     mode = "bilinear" if within is None else "nearest"
-    found = functional.grid_sample(images, grid, mode, padding_mode="border", align_corners=False)
-    return found * inside[:, None], inside[:, None]
+    samples = functional.grid_sample(images, grid, mode, padding_mode="border", align_corners=False)
+    return samples * inside[:, None], inside[:, None]

@@ -1,4 +1,4 @@
-"""Networks of pictures: the published one, and any `torch.nn.Module` that is named `module:Class`."""
+"""Picture networks: the published one, and any `torch.nn.Module` given as `module:Class`."""
 
 from __future__ import annotations
 
@@ -24,35 +24,35 @@ from runtime.support.plugins import is_plugin, plugin_class, strict
 
 KNOWN = {"eyereal": "model_export.eyereal:EyeRealNet", "unrolled": "model_export.unrolled:Unrolled"}
 PANELS, COLOURS = 3, 3
-STEPS_MOST = 64  # that a contract may have
+STEPS_MOST = 64  # in a contract
 
 
 class Form(Section):
-    """What a network of pictures takes and gives: class attributes of these names, or what stands here."""
+    """Input and output format of a picture network, from class attributes of these names, or the defaults."""
 
     input_frame: Literal["centre", "panel"] = Field(
         "centre", description="both eyes' pictures on the centre panel's pixels, or on those of every panel"
     )
     input_value: Literal["intensity", "phase"] = "intensity"
     output: Literal["panels"] = "panels"
-    branch: Literal[1, 2] = Field(1, description="of phases: their sums lie in [0, 1] or in [1, 2]")
+    branch: Literal[1, 2] = Field(1, description="of phases: their sums are in [0, 1] or in [1, 2]")
     picture_fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
-        0.0, description="it sees pictures so wide, black beside them; 0: whatever is drawn"
+        0.0, description="horizontal field of view of its pictures, black outside; 0: that of the content"
     )
 
     steps: Annotated[int, Field(ge=0, le=STEPS_MOST)] = Field(
-        0, description="of the solver after it, in training and when it is served"
+        0, description="solver steps after it, in training and at runtime"
     )
 
     @property
     def channels(self) -> int:
-        """Of the input: panel-major, then eye, then RGB."""
+        """Number of input channels: panel-major, then eye, then RGB."""
         return (PANELS if self.input_frame == "panel" else 1) * 2 * COLOURS
 
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """A module that was made, and what it says of itself."""
+    """An instance of a module, with its format and options."""
 
     arch: str
     net: nn.Module
@@ -60,7 +60,7 @@ class Network:
     options: dict[str, Any]
 
     def steps(self) -> tuple[Sequence[Any], Sequence[Any]]:
-        """Sizes and momenta of the solver's steps after it: those that the module learned, or one size."""
+        """Sizes and momenta of the solver's steps after it: learned by the module, or constant."""
         learned = [getattr(self.net, name, None) for name in ("step_sizes", "step_momenta")]
         if isinstance(learned[0], Tensor) and isinstance(learned[1], Tensor):
             return list(learned[0].clamp(1e-3, 3)), list(learned[1].clamp(0, 0.99))
@@ -77,26 +77,26 @@ def blamed(arch: str, field: str) -> Iterator[None]:
     except PhasestackError:
         raise
     except (Exception, SystemExit) as error:
-        said = str(error).strip().partition("\n")[0]
-        raise InputError(arch, field, f"{type(error).__name__}: {said}" if said else type(error).__name__) from error
+        text = str(error).strip().partition("\n")[0]
+        raise InputError(arch, field, f"{type(error).__name__}: {text}" if text else type(error).__name__) from error
 
 
 def check_known(arch: str, *others: str) -> None:
-    """Raises InputError for what is neither a network's name nor `module:Class`."""
+    """Raise InputError unless `arch` is a network's name or `module:Class`."""
     if not is_plugin(arch) and arch not in (*others, *KNOWN):
         raise InputError("--arch", "", f"{arch!r} is neither {', '.join([*others, *KNOWN])} nor module:Class")
 
 
-def made(arch: str, options: dict[str, Any], *, seed: int = 0) -> Network:
-    """A network initialised by a seed. Raises InputError: no such class, or bad attributes."""
+def make_network(arch: str, options: dict[str, Any], *, seed: int = 0) -> Network:
+    """Create a network with weights from a seed. Raises InputError: no such class, or bad attributes."""
     check_known(arch)
     kind = plugin_class(KNOWN.get(arch, arch), nn.Module, field="--arch")
-    said = {name: getattr(kind, name) for name in Form.model_fields if hasattr(kind, name)}
-    own = strict(getattr(kind, "Options", Section))
-    said |= {name: options[name] for name in {"steps"} & set(options)}
-    form = validated(Form, said, source=arch)
-    options = {name: value for name, value in options.items() if name != "steps" or name in own.model_fields}
-    options = validated(own, options, source=f"{arch}: --option").model_dump()
+    attributes = {name: getattr(kind, name) for name in Form.model_fields if hasattr(kind, name)}
+    schema = strict(getattr(kind, "Options", Section))
+    attributes |= {name: options[name] for name in {"steps"} & set(options)}
+    form = validated(Form, attributes, source=arch)
+    options = {name: value for name, value in options.items() if name != "steps" or name in schema.model_fields}
+    options = validated(schema, options, source=f"{arch}: --option").model_dump()
     torch.manual_seed(seed)
     with blamed(arch, "__init__"):
         net = kind(**options)
@@ -104,40 +104,40 @@ def made(arch: str, options: dict[str, Any], *, seed: int = 0) -> Network:
 
 
 def probe(network: Network, *, width_px: int, height_px: int) -> None:
-    """Raises InputError where it does not answer a picture of that size with panels, or as values decide."""
+    """Raise InputError unless the network maps a picture of that size to finite panels of the right shape."""
     arch, form = network.arch, network.form
     example = torch.rand(1, form.channels, height_px, width_px, generator=torch.Generator().manual_seed(1))
-    given, wanted = tuple(example.shape), (1, PANELS * COLOURS, height_px, width_px)
-    with torch.no_grad(), blamed(arch, f"forward, of {given}"):
+    expected = (1, PANELS * COLOURS, height_px, width_px)
+    with torch.no_grad(), blamed(arch, f"forward, of {tuple(example.shape)}"):
         answer = network.net.eval()(example)
     if not isinstance(answer, Tensor):
-        raise InputError(arch, "forward", f"answers with {type(answer).__name__}; one tensor is needed")
-    found = tuple(answer.shape)
-    for axis, found_, wanted_ in zip(("batch", "channels", "height", "width"), found, wanted, strict=False):
-        if found_ != wanted_ or len(found) != len(wanted):
-            problem = f"answers {found}, where {wanted} is needed: {axis}"
+        raise InputError(arch, "forward", f"returns {type(answer).__name__}; one tensor is needed")
+    shape = tuple(answer.shape)
+    for axis, size, needed in zip(("batch", "channels", "height", "width"), shape, expected, strict=False):
+        if size != needed or len(shape) != len(expected):
+            problem = f"returns {shape}, where {expected} is needed: {axis}"
             raise InputError(arch, "forward", f"{problem} ({PANELS} panels of {COLOURS} colours)")
     if answer.dtype != torch.float32:
-        raise InputError(arch, "forward", f"answers with {answer.dtype}; torch.float32 is needed")
+        raise InputError(arch, "forward", f"returns {answer.dtype}; torch.float32 is needed")
     if not torch.isfinite(answer).all():
-        raise InputError(arch, "forward", "answers with numbers that are not finite")
+        raise InputError(arch, "forward", "returns numbers that are not finite")
 
 
 def check_static(network: Network, *, width_px: int, height_px: int) -> None:
-    """Raises InputError where values decide what the module does: no graph holds that."""
+    """Raise InputError if the module branches on values, which a graph can't represent."""
     example = torch.zeros(1, network.form.channels, height_px, width_px)
     try:
-        with quiet(), redirect_stderr(StringIO()), torch.no_grad():  # it prints the graph of what it can't follow
+        with quiet(), redirect_stderr(StringIO()), torch.no_grad():  # torch prints graphs that it can't trace
             torch.export.export(network.net.eval(), (example,), strict=False)
-    except Exception as error:  # what it can't follow it tells in many ways: the exporter itself will tell of the rest
+    except Exception as error:  # other failures are reported by the exporter itself
         if "data-dependent" in str(error).lower():
-            problem = "branches on the values of its input: a graph can't (use torch.where)"
+            problem = "branches on the values of its input, which a graph can't (use torch.where)"
             raise InputError(network.arch, "forward", problem) from None
 
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Exporters advise developers of models, not users of this command; from C++ they print graphs."""
+    """Suppress the exporter's warnings, meant for its developers, and graphs printed from C++."""
     sys.stdout.flush()
     level, output = logging.root.manager.disable, os.dup(1)
     with Path(os.devnull).open("wb") as nothing:

@@ -10,21 +10,22 @@ from torch.nn import functional
 
 INPUTS = ("left", "right", "waves", "shifted_waves", "spectrum", "modes_in", "eye_sigma_px")
 OUTPUTS = ("rear", "front", "check")
-BLOCK_ROWS = 8  # rows that are transformed together; the raster has whole blocks
-FULL = 255 * 16  # one panel's range in the units of inputs and outputs: sixteenths of an 8-bit code
-BOX = 0.5  # every outer panel starts in the middle of its range, and can go so far from there
-IN_SCALE = 64  # codes in the waves' unit on the way in: in codes they would be too large for half precision
+BLOCK_ROWS = 8  # rows transformed together; the raster has whole blocks
+FULL = 255 * 16  # one panel's range in the unit of inputs and outputs, sixteenths of an 8-bit code
+BOX = 0.5  # outer panels start in the middle of their range and may change by this much
+IN_SCALE = 64  # codes per unit of the transformed inputs, which would overflow half precision in codes
 
 
 class SpectralSolver(nn.Module):
-    """What both outer panels must carry, from each eye's residual, chain by chain.
+    """Computes both outer panels from the eyes' residuals, chain by chain.
 
-    With front = h + g and rear = h - g about the middle of their range, s columns the parallax of half the eyes'
-    separation on either panel, e the centre panel's own, and a frequency w along the eyes' line, the eyes' difference
-    is D = 4i·(sin(ws)cos(we)·g + cos(ws)sin(we)·h). Eyes that err by c columns and r rows (standard deviations) move
-    both panels' pictures in opposite directions: m = exp(-(c²w² + r²v²)/2) is what is left of a wave in the mean, and
-    what is not left is noise. The least squares of the expected error are closed-form for every frequency (`gains`).
-    Frequencies are those of the chain times those of a block of `BLOCK_ROWS` rows and one cell's columns.
+    Let front = h + g and rear = h - g about the middle of their range, s the parallax in columns of half the eyes'
+    separation on either panel, e that of the centre panel, and w a frequency along the eyes' line. The difference of
+    the eyes' pictures is D = 4i·(sin(ws)cos(we)·g + cos(ws)sin(we)·h). A tracking error with standard deviations of c
+    columns and r rows moves the panels' pictures in opposite directions. It attenuates the mean of a wave to
+    m = exp(-(c²w² + r²v²)/2) and turns the rest into noise. The expected squared error has a closed-form minimum for
+    every frequency (`gains`). Frequencies combine those of the chain with those of a block of `BLOCK_ROWS` rows and
+    one cell's columns.
     """
 
     def __init__(self, cell_px: int = 4) -> None:
@@ -38,32 +39,32 @@ class SpectralSolver(nn.Module):
         self.w: Tensor
         self.v: Tensor
         self.register_buffer("columns", columns, persistent=False)
-        # Difference and sum along with the block's rows: of the eyes on the way in, of g and h on the way out.
+        # Combine the block's row transform with difference and sum: of the eyes on input, of g and h on output.
         into = torch.cat([torch.cat([-rows, rows], dim=1), torch.cat([rows, rows], dim=1)]) / IN_SCALE
         back = rows.transpose(0, 1) * FULL
         out = torch.stack([torch.cat([-back, back], dim=1), torch.cat([back, back], dim=1)])
         self.register_buffer("rows_in", into, persistent=False)
         self.register_buffer("rows_out", out, persistent=False)
-        # Patterns row by row of the block, then column by column of the cell.
+        # Patterns: rows of the block, then columns of the cell.
         self.register_buffer("w", w.repeat(BLOCK_ROWS), persistent=False)
         self.register_buffer("v", v.repeat_interleave(2 * cell_px), persistent=False)
-        self.log_floor = nn.Parameter(torch.log(torch.tensor([0.01, 0.2])))  # λ of g and of h
-        self.log_rough = nn.Parameter(torch.log(torch.tensor([0.05, 0.2])))  # and how they grow with w²
-        self.log_sigma_scale = nn.Parameter(torch.zeros(2))  # of eye_sigma_px along the line, and across it
+        self.log_floor = nn.Parameter(torch.log(torch.tensor([0.01, 0.2])))  # regularisation λ of g and of h
+        self.log_rough = nn.Parameter(torch.log(torch.tensor([0.05, 0.2])))  # its growth with w²
+        self.log_sigma_scale = nn.Parameter(torch.zeros(2))  # factor on eye_sigma_px along the line and across it
 
     def gains(self, spectrum: Tensor, eye_sigma_px: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(patterns, cells + 1) each: numerator and denominator of g without h's share, and h's gain."""
         scale = torch.exp(self.log_sigma_scale)
-        # A mode of the chain in a pattern of the block is two waves, its frequency beside the pattern's either way.
-        beside = 2 * torch.asin(torch.clamp(spectrum / 4, 0, 1))[None] / (2 * self.cell_px)
+        # A mode of the chain times a pattern of the block is two waves, at the pattern's frequency ± `offset`.
+        offset = 2 * torch.asin(torch.clamp(spectrum / 4, 0, 1))[None] / (2 * self.cell_px)
         pattern = self.w[:, None]
-        along2 = (eye_sigma_px[0] * scale[0]) ** 2 * (pattern * pattern + beside * beside)
+        along2 = (eye_sigma_px[0] * scale[0]) ** 2 * (pattern * pattern + offset * offset)
         across = (eye_sigma_px[1] * scale[1] * self.v)[:, None]
         m2 = torch.exp(-(along2 + across * across))
         s2 = (spectrum * spectrum)[None]  # 16 sin²(ws)
         c2 = 16 - s2
         cos_2ws = 1 - s2 / 8
-        cos_2we = torch.cos(2 * pattern * eye_sigma_px[2]) * torch.cos(2 * beside * eye_sigma_px[2])
+        cos_2we = torch.cos(2 * pattern * eye_sigma_px[2]) * torch.cos(2 * offset * eye_sigma_px[2])
         alpha2, beta2 = m2 * s2 * (1 + cos_2we) / 2, m2 * c2 * (1 - cos_2we) / 2
         floor = torch.exp(self.log_floor)[:, None, None] + torch.exp(self.log_rough)[:, None, None] * pattern * pattern
         noise, crossed = 8 * (1 - m2), 8 * cos_2ws * (m2 - m2 * m2)
@@ -74,23 +75,23 @@ class SpectralSolver(nn.Module):
         return share * m * spectrum[None], share * alpha2 + cost_g, gain_h
 
     def forward(self, *feeds: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Rear and front panel (rows, cells + 1, 2K·C) in 16-bit codes, from one parallax before column 0.
+        """Rear and front panel (rows, cells + 1, 2K·C) in 16-bit codes, starting one parallax before column 0.
 
-        Also one number that is finite if every intermediate is.
+        The third result is finite if all intermediate numbers are.
 
         feeds: `INPUTS`. left, right (rows, cells, 2K·C), 16-bit codes: each eye's residual along its rays through the
         raster; waves (cells + 1, cells + 1) V, shifted_waves Ũ, spectrum (cells + 1,) s and modes_in
         (cells + 1, cells) U^T (`runtime.model.chain.chain_modes`); eye_sigma_px (3,): c columns, r rows, e columns.
         """
         rear, front, check = self._solved(feeds, added=0.5)
-        # Nothing is below zero once it is clamped, and a cast cuts off what follows the point: the half makes it round.
+        # The cast truncates; the added half makes it round, since values are clamped to be non-negative.
         codes = (_by_rows(torch.clamp(x, 0, FULL + 0.5), like=feeds[0]).to(torch.int16) for x in (rear, front))
         return (*codes, check)  # type: ignore[return-value]
 
     def _solved(self, feeds: tuple[Tensor, ...], *, added: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Rear and front panel (1, block's rows, all else), codes with a number added to them, and the check.
+        """Rear and front panel (1, block's rows, all else) in codes plus `added`, and the check.
 
-        A row of a cell stays in one piece from end to end, those of all blocks beside each other: moving it is cheap,
+        A cell's row stays contiguous throughout, with the rows of all blocks next to each other: so copies are cheap,
         and the products with the rows' and the chain's matrices are few and large.
         """
         left, right, waves, shifted_waves, spectrum, modes_in, eye_sigma_px = feeds
@@ -105,17 +106,17 @@ class SpectralSolver(nn.Module):
         both = self._in_columns(both, torch.cat([numerator / denominator, gain_h]), channels)
         both = both.reshape(2, BLOCK_ROWS, both.shape[1], -1)
         both = torch.matmul(torch.stack([waves, shifted_waves])[:, None], both).reshape(1, rows, -1)
-        # As a convolution, a product with a matrix adds and clamps while its numbers are at hand.
+        # Written as a convolution, the matrix product is fused with the addition and the clamp.
         rear, front = (functional.conv1d(both, out[..., None], bias) for out in self.rows_out)
         return rear, front, _size(both)
 
     def _in_columns(self, x: Tensor, gains: Tensor, channels: int) -> Tensor:
-        """x (n rows' waves, modes, blocks, 2K·C), each of the columns' waves in it times its gain (n·2K, modes).
+        """Scale each of the columns' waves in x (n rows' waves, modes, blocks, 2K·C) by its gain (n·2K, modes).
 
-        By one matrix for every wave of the rows and mode: to the columns' waves, times the gains, and back.
+        Uses one matrix per mode and wave of the rows: transform to the columns' waves, scale, transform back.
         """
         count, modes, _, row = x.shape
-        # For each of the columns' waves, what leaves of a cell's row only its part along it.
+        # Projections of a cell's row on each of the columns' waves.
         parts = self.columns[:, :, None, None, None] * self.columns[:, None, None, :, None]
         parts = (parts * _same(channels, like=parts)).reshape(2 * self.cell_px, -1)
         matrices = torch.matmul(gains.reshape(count, -1, modes).transpose(1, 2), parts)
@@ -123,30 +124,30 @@ class SpectralSolver(nn.Module):
 
 
 def _same(channels: int, *, like: Tensor) -> Tensor:
-    """(C, 1, C): 1 where both are one channel, else 0."""
+    """(C, 1, C) identity over channels."""
     one = torch.arange(channels, device=like.device)
     return (one[:, None, None] == one).to(torch.float32)
 
 
 def _by_block_rows(image: Tensor) -> Tensor:
-    """(rows, cells, 2K·C) to (block's rows, cells, blocks, 2K·C)."""
+    """Rearrange (rows, cells, 2K·C) to (block's rows, cells, blocks, 2K·C)."""
     return image.reshape(-1, BLOCK_ROWS, *image.shape[1:]).permute(1, 2, 0, 3)
 
 
 def _by_rows(x: Tensor, *, like: Tensor) -> Tensor:
-    """The other way round, from (block's rows, all else), for one cell more than an input has."""
+    """Invert `_by_block_rows`, from (block's rows, all else), for one cell more than the input `like`."""
     cells, row = like.shape[1] + 1, like.shape[2]
     return x.reshape(BLOCK_ROWS, cells, -1, row).permute(2, 0, 1, 3).reshape(-1, cells, row)
 
 
 def _size(x: Tensor) -> Tensor:
-    """(1,): finite where all of x is, and small enough to be so after matrices of moderate numbers."""
-    size: Tensor = torch.linalg.vector_norm(x)  # squares grow too large long before what is worked out of them does
+    """(1,) norm of x: finite if x is, with a margin for later products with moderate matrices."""
+    size: Tensor = torch.linalg.vector_norm(x)  # its squares overflow long before later results would
     return size.reshape(1)
 
 
 def _fourier(size: int) -> tuple[Tensor, Tensor]:
-    """Orthonormal real Fourier basis (size, size), a row a wave, and each wave's frequency in radians a sample."""
+    """Orthonormal real Fourier basis (size, size), a wave per row, and the waves' frequencies in radians per sample."""
     at = torch.arange(size, dtype=torch.float64)
     rows, w = [torch.ones(size, dtype=torch.float64) / math.sqrt(size)], [0.0]
     for k in range(1, (size + 1) // 2):
@@ -160,7 +161,7 @@ def _fourier(size: int) -> tuple[Tensor, Tensor]:
 
 
 def _cosines(size: int) -> tuple[Tensor, Tensor]:
-    """Orthonormal cosine basis (size, size), a row a wave, and each wave's frequency in radians a sample."""
+    """Orthonormal cosine basis (size, size), a wave per row, and the waves' frequencies in radians per sample."""
     k, at = torch.arange(size, dtype=torch.float64)[:, None], torch.arange(size, dtype=torch.float64) + 0.5
     basis = torch.cos(math.pi * k * at / size) * math.sqrt(2 / size)
     basis[0] /= math.sqrt(2)

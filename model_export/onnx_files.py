@@ -1,4 +1,4 @@
-"""torch modules to ONNX bytes, with the contract in them."""
+"""Convert torch modules to ONNX bytes with the contract in them."""
 
 from __future__ import annotations
 
@@ -34,29 +34,29 @@ FIXED = {"one", "channels", "eye_sigmas"}
 
 
 def spectral_bytes(net: nn.Module, *, cell_px: int) -> bytes:
-    """The solver along the eyes' line: rows, cells and columns are whatever a pose asks for."""
+    """Export the spectral solver, with variable numbers of rows, cells and columns."""
     sides = (torch.zeros(16, 8, 6 * cell_px, dtype=torch.int16),) * 2
     modes = tuple(torch.from_numpy(part) for part in chain_modes(8))
     return _exported(net, (*sides, *modes, torch.ones(3)), network.INPUTS, network.OUTPUTS, CELL_AXES, folded=False)
 
 
 def ports(names: Sequence[str]) -> tuple[Port, ...]:
-    """Inputs or outputs as a contract declares them."""
+    """Declare inputs or outputs for a contract."""
     return tuple(Port(name=name, axes=(CELL_AXES | PICTURE_AXES)[name]) for name in names)
 
 
 def picture_bytes(net: nn.Module, *, channels: int, width_px: int, height_px: int) -> bytes:
-    """A network of pictures, of one size."""
+    """Export a picture network for one size."""
     return _exported(net, (torch.zeros(1, channels, height_px, width_px),), (eyereal.INPUT,), (eyereal.OUTPUT,), {})
 
 
 def with_contract(data: bytes, contract: Contract) -> bytes:
-    """The same model with the metadata entry that the runtime asks for."""
+    """Add the contract to a model as the metadata entry that the runtime reads."""
     model = onnx.load_from_string(data)
     del model.metadata_props[:]
     known = digest(model.SerializeToString(deterministic=True))
     contract = contract.model_copy(update={"graph_sha256": known})
-    # Only a network of whole pictures has a view of its own; the others' contracts don't speak of one.
+    # Only a picture network may have a fixed field of view; other contracts omit it.
     text = contract.model_dump_json(exclude=None if contract.picture_fov_deg else {"picture_fov_deg"})
     onnx.helper.set_model_props(model, {METADATA_KEY: text})
     return bytes(model.SerializeToString(deterministic=True))
@@ -71,7 +71,7 @@ def _exported(
     *,
     folded: bool = True,
 ) -> bytes:
-    """folded: constants are worked out; else every weight keeps its name (onnxruntime folds as it loads)."""
+    """Export a module; folded: fold constants, else keep every weight's name (onnxruntime folds on loading)."""
     buffer = io.BytesIO()
     with quiet(), torch.no_grad():
         torch.onnx.export(

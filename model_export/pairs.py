@@ -1,4 +1,4 @@
-"""Training pairs of a picture network: its input, the targets, and the true eyes."""
+"""Training pairs for picture networks: input, targets and true eyes."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ from runtime.records import F32, F64, U8
 from runtime.support.gl import offscreen_context
 from runtime.support.picture_file import read_image
 
-PICTURE_FOV_DEG = 40.0  # of the published data set's pictures
+PICTURE_FOV_DEG = 40.0  # of pictures in the published data set
 
 
 @dataclass(frozen=True)
 class TrainingPairs(Dataset[dict[str, Tensor]]):
-    """Pairs by number as a network of pictures learns from them: each is made from (seed, number) alone."""
+    """Dataset for training a picture network; each pair depends only on (seed, number)."""
 
     form: Form
     seed: int
     width_px: int
     height_px: int
     eye_sigma_mm: float
-    count: int = 0  # so many, again and again; 0: ever new ones
-    stack: PanelStack | None = None  # None: random ones
-    folder: tuple[Pair, ...] = ()  # pictures; none: procedural pairs
-    scene: str = ""  # that the runtime draws, turned about the vertical, instead
+    count: int = 0  # number of different pairs, repeated; 0: unlimited
+    stack: PanelStack | None = None  # None: random panels
+    folder: tuple[Pair, ...] = ()  # pictures to use; empty: procedural pairs
+    scene: str = ""  # drawn by the runtime instead, rotated about the vertical
 
     def __getitem__(self, number: int) -> dict[str, Tensor]:
-        """The network's input, the targets, and the rays of the eyes believed and of the true ones."""
+        """Network input, targets, and rays of the estimated and of the true eyes."""
         pair = self.pair(number)
         random = np.random.default_rng([self.seed, number, 1])
         pose = stack_from_eye(pair.eyes_m.mean(axis=0))
@@ -71,7 +71,7 @@ class TrainingPairs(Dataset[dict[str, Tensor]]):
         return self.count
 
     def pair(self, number: int) -> TrainingPair:
-        """The pictures and eyes of a number."""
+        """Pictures and eyes of pair `number`."""
         if self.folder:
             pair = self.folder[number % len(self.folder)]
             return photographed(
@@ -83,7 +83,7 @@ class TrainingPairs(Dataset[dict[str, Tensor]]):
         return random_pair(random, **self._size, stack=self.stack, fov_deg=self.form.picture_fov_deg)
 
     def _drawn(self, random: np.random.Generator) -> TrainingPair:
-        """The scene at an instant, turned about the vertical, for eyes anywhere before the panels."""
+        """Draw the scene at a random time and rotation about the vertical, for random eyes."""
         width_px, height_px = self.width_px, self.height_px
         stack, eyes_m = random_place(random, **self._size, stack=self.stack or prototype(**self._size))
         fov_deg = self.form.picture_fov_deg or filling_fov_deg(stack, eyes_m.mean(axis=0))
@@ -99,27 +99,27 @@ class TrainingPairs(Dataset[dict[str, Tensor]]):
 
 @lru_cache(maxsize=2)
 def opened(scene: str, stack: PanelStack, _process: int) -> ContentSource:
-    """What draws a scene in this process, on its only thread. Raises InputError."""
+    """Open a scene for drawing in this process, on its only thread. Raises InputError."""
     return open_content(ContentSettings(scene=scene), stack, offscreen_context())
 
 
 def folder_pairs(folder: Path) -> tuple[Pair, ...]:
-    """Pairs of a folder in the published data set's form, named after its scene. Raises InputError."""
+    """Read a folder in the published data set's format, named after its scene. Raises InputError."""
     name = next((name for name in preset_names() if name in folder.resolve().name), "")
     if not name:
-        raise InputError(folder, "name", f"holds none of {', '.join(preset_names())}")
+        raise InputError(folder, "name", f"contains none of {', '.join(preset_names())}")
     if not folder.is_dir():
-        raise InputError(folder, "", "is no folder")
+        raise InputError(folder, "", "is not a folder")
     return read_folder(folder, name)
 
 
 def prototype(*, width_px: int, height_px: int) -> PanelStack:
-    """The panels that the published pictures were made for."""
+    """Panels that the published pictures were rendered for."""
     return PanelStack(PITCH_WIDTH_M, PITCH_WIDTH_M * 9 / 16, (-0.06, 0.0, 0.06), width_px, height_px)
 
 
 def photographed(pair: Pair, stack: PanelStack, fov_deg: float) -> TrainingPair:
-    """A pair of a folder at the panels' raster, turned so that the eyes look at the display's middle."""
+    """Resample a folder's pair to the panels' raster, as seen by eyes that look at the display's middle."""
     size, images = {"width_px": stack.width_px, "height_px": stack.height_px}, []
     for side, eye_m in enumerate(pair.eyes_m):
         size_px = stack.width_px, stack.height_px
@@ -131,7 +131,7 @@ def photographed(pair: Pair, stack: PanelStack, fov_deg: float) -> TrainingPair:
 
 
 def network_input(pair: TrainingPair, form: Form) -> F32:
-    """(channels, H, W) what the runtime feeds a network of pictures: panel-major, then eye, then RGB."""
+    """(channels, H, W) input of a picture network as the runtime feeds it: panel-major, then eye, then RGB."""
     stack, table = pair.stack, np.arange(256, dtype=np.float32) / np.float32(255)
     if form.input_value == "phase":
         table = phase_from_intensity(table, form.branch)
@@ -147,7 +147,7 @@ def network_input(pair: TrainingPair, form: Form) -> F32:
 
 
 def _warped(picture: U8, picture_from_raster: F64, stack: PanelStack, border: int) -> U8:
-    """A picture on a raster of the panels' pixels, bilinear; OpenCV puts pixel centres at integers."""
+    """Resample a picture bilinearly to the panels' pixels; OpenCV puts pixel centres at integers."""
     to_centres = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
     matrix = np.linalg.inv(to_centres) @ picture_from_raster @ to_centres
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP

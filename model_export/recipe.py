@@ -1,4 +1,4 @@
-"""Recipes: how the models that ship are made. One small JSON file each."""
+"""Recipes of the shipped models, one small JSON file each."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DESIGN_RANGE = TrainedFor(
 
 
 class Recipe(Section):
-    """A model of the spectral family: its network in closed form, and the steps after it."""
+    """A model of the spectral family: a closed-form network and the steps after it."""
 
     name: str
     arch: Literal["spectral"] = "spectral"
@@ -29,15 +29,15 @@ class Recipe(Section):
     steps: Steps = ()
 
     def canonical(self) -> bytes:
-        """The same bytes for the same recipe."""
+        """Canonical JSON, equal for equal recipes."""
         return json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":")).encode()
 
     def sha256(self) -> str:
-        """What the contract carries."""
+        """Digest for the contract."""
         return hashlib.sha256(self.canonical()).hexdigest()
 
 
 def read_recipe(name: str) -> Recipe:
-    """The recipe of a model that ships. Raises InputError."""
+    """Read the recipe of a shipped model. Raises InputError."""
     path = RECIPES / f"{name}.json"
     return validated(Recipe, dict(untrusted_input.read_json(path)), source=path)

@@ -1,4 +1,4 @@
-"""Scenes of textured cards with exact geometry, drawn from any eye straight into a raster."""
+"""Scenes of textured cards with exact geometry, drawn from any eye directly to a raster."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import numpy as np
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8
 
-FINER = 2  # drawn so many times finer and averaged: edges and details are not jagged
-TEXELS = (24, 768)  # of a texture's side
+FINER = 2  # supersampling factor, for antialiasing
+TEXELS = (24, 768)  # range of a texture's side
 Random = np.random.Generator
 
 
 @dataclass(frozen=True, slots=True)
 class Plane:
-    """A textured parallelogram. Texture (u, v) in [0, 1]² lies at corner + u·across + v·down."""
+    """A textured parallelogram. Texture (u, v) in [0, 1]² is at corner + u·across + v·down."""
 
     texture: U8  # (h, w, 4) RGBA
     corner_m: F64  # (3,) frame `stack`
@@ -30,14 +30,14 @@ Scene = tuple[Plane, ...]
 
 
 def draw(scene: Scene, projection: F64, *, width_px: int, height_px: int) -> U8:
-    """(h, w, 3) a scene through a 3x4 projection, frame `stack` to pixels.
+    """Draw a scene, (h, w, 3), through a 3x4 projection from `stack` to pixels.
 
-    The nearest plane wins, by its exact depth in every pixel; half-transparent edges let through what was drawn
-    before. What lies behind the eye is not seen.
+    The nearest plane wins, by its exact depth in each pixel; half-transparent edges blend with planes drawn earlier.
+    Nothing behind the eye is drawn.
     """
     width, height = width_px * FINER, height_px * FINER
     picture = np.zeros((height, width, 3), np.float32)
-    nearness = np.zeros((height, width), np.float32)  # 1 over the distance: what lies behind the eye has less
+    nearness = np.zeros((height, width), np.float32)  # 1 over the distance; negative behind the eye
     for plane in scene:
         on_raster = (
             np.diag([FINER, FINER, 1.0])
@@ -52,12 +52,12 @@ def draw(scene: Scene, projection: F64, *, width_px: int, height_px: int) -> U8:
 
 
 def _part(raster_from_plane: F64, width: int, height: int) -> tuple[slice, slice] | None:
-    """(rows, columns) of a raster that a plane's unit square can cover; None: none, or it is seen from its edge."""
+    """(rows, columns) of a raster that a plane's unit square can cover; None: none, or the plane is edge-on."""
     corners = raster_from_plane @ np.array([[0, 1, 1, 0], [0, 0, 1, 1], [1, 1, 1, 1]], dtype=np.float64)
     area = np.linalg.det(raster_from_plane)
     if not np.isfinite(area) or abs(area) < 1e-12 or (corners[2] <= 0).all():
         return None
-    if (corners[2] <= 0).any():  # it reaches behind the eye: anywhere
+    if (corners[2] <= 0).any():  # it reaches behind the eye, so may cover any pixel
         return slice(0, height), slice(0, width)
     u, v = corners[:2] / corners[2]
     left, right = max(0, math.floor(u.min()) - 1), min(width, math.ceil(u.max()) + 1)
@@ -66,7 +66,7 @@ def _part(raster_from_plane: F64, width: int, height: int) -> tuple[slice, slice
 
 
 def _draw_plane(texture: U8, raster_from_plane: F64, part: tuple[slice, slice], picture: F32, nearness: F32) -> None:
-    """One plane over what is there, where it is nearer."""
+    """Draw one plane where it is nearer than the picture."""
     rows, columns = part
     left, top = columns.start, rows.start
     height, width = texture.shape[:2]
@@ -76,7 +76,7 @@ def _draw_plane(texture: U8, raster_from_plane: F64, part: tuple[slice, slice], 
     drawn = cv2.warpPerspective(texture, shifted, (columns.stop - left, rows.stop - top), flags=cv2.INTER_LINEAR)
     inverse = np.linalg.inv(raster_from_plane)
     u, v = np.arange(left, columns.stop) + 0.5, np.arange(top, rows.stop)[:, None] + 0.5
-    # The third coordinate of a pixel taken back on to the plane is 1 over its distance along the projection's axis.
+    # The third coordinate of a pixel mapped back to the plane is 1 over its distance along the projection's axis.
     near = (inverse[2, 0] * u + inverse[2, 1] * v + inverse[2, 2]).astype(np.float32)
     alpha = drawn[..., 3].astype(np.float32) * np.float32(1 / 255)
     alpha *= near >= nearness[part]
@@ -85,23 +85,23 @@ def _draw_plane(texture: U8, raster_from_plane: F64, part: tuple[slice, slice], 
 
 
 def _shift(right: float, down: float) -> F64:
-    """(3, 3) of pixels."""
+    """(3, 3) translation by pixels."""
     return np.array([[1.0, 0.0, right], [0.0, 1.0, down], [0.0, 0.0, 1.0]])
 
 
 def random_scene(random: Random, stack: PanelStack, middle_m: F64) -> Scene:
-    """A backdrop, and cards at many depths around the panels, for a viewer about `middle_m`."""
+    """Random backdrop and cards at many depths around the panels, for a viewer near `middle_m`."""
     centre_m = stack.x_m[1]
     distance_m = middle_m[0] - centre_m
     deep_m = (stack.x_m[-1] - centre_m) * math.exp(random.uniform(math.log(0.3), math.log(6.0)))
     rear_m, front_m = -deep_m, min(deep_m, 0.35 * distance_m)
     panel_m, pixel_m = np.array([stack.width_m, stack.height_m]), stack.width_m / stack.width_px / FINER
-    # Most of the world is not saturated.
+    # Most real pictures are not saturated.
     contrast, level = (1.0, 0.0) if random.random() < 0.4 else (random.uniform(0.15, 0.8), random.uniform(-0.25, 0.25))
     tones = np.clip(np.rint((np.arange(256) - 127.5) * contrast + 127.5 + 255 * level), 0, 255).astype(np.uint8)
 
     def card(x_m: float, size_m: F64, aside: F64, *, slant: float, see_through: bool) -> Plane:
-        """aside: where on the centre panel its middle is seen, of the panel's size."""
+        """aside: position of its middle as seen on the centre panel, in panel sizes."""
         share = (x_m - centre_m) / distance_m
         middle = aside * panel_m * (1 - share) + middle_m[1:] * share
         turns = random.uniform(-slant, slant, 2)
@@ -125,7 +125,7 @@ def random_scene(random: Random, stack: PanelStack, middle_m: F64) -> Scene:
 
 
 def _texture(random: Random, width: int, height: int, tones: U8, *, see_through: bool) -> U8:
-    """(height, width, 4) noise whose power falls with frequency, or discs and boxes; see_through: lines of it alone."""
+    """(height, width, 4) noise with power falling with frequency, or discs and boxes; see_through: only on lines."""
     picture = np.full((height, width, 4), 255, np.uint8)
     if random.random() < 0.5:
         fu, fv = np.fft.rfftfreq(width), np.fft.fftfreq(height)[:, None]

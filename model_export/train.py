@@ -1,7 +1,7 @@
 """`phasestack train`: gradient training of a picture network, with light as the loss.
 
-AdamW, the learning rate along a cosine. Pair number k and every random number of iteration k follow from (seed, k), so
-that a training that was stopped goes on as if it had not been.
+AdamW with cosine decay of the learning rate. Pair k and all random numbers of iteration k depend only on (seed, k), so
+a resumed training gives the same result as an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ from torch.utils.data import DataLoader
 
 from model_export.checkpoint import fill, load_checkpoint, save_checkpoint
 from model_export.light import LEAST_ERROR, Views, improved, light, light_db
-from model_export.modules import COLOURS, PANELS, Form, Network, blamed, made, probe
+from model_export.modules import COLOURS, PANELS, Form, Network, blamed, make_network, probe
 from model_export.pairs import TrainingPairs, folder_pairs
 from runtime.config import Section, load_stack
 from runtime.errors import InputError
 from runtime.support.artifacts import write_bytes, write_text
 from runtime.support.progress import progress_bar
 
-HELD_OUT_SEED = 9_000_001  # of the validation pairs: no training seed reaches it
-HELD_OUT, HELD_OUT_SHARE = 6, 8  # procedural pairs; one in so many of a folder's
-FIRST_SAVED = 10  # iterations: a training that ends early has something to resume
-SMALL_PX = 30_000  # of a batch: one thread is faster (17 s for 24 at 160x90)
+HELD_OUT_SEED = 9_000_001  # of the validation pairs; training seeds are smaller
+HELD_OUT, HELD_OUT_SHARE = 6, 8  # number of procedural validation pairs; one in this many of a folder's pairs
+FIRST_SAVED = 10  # iteration of the first checkpoint, so that a short training can be resumed
+SMALL_PX = 30_000  # pixels in a batch up to which one thread is faster (17 s instead of 24 at 160x90)
 COLUMNS = ("iteration", "light_db", "held_out_light_db")
 Device = Literal["auto", "cpu", "cuda"]
 Batch = dict[str, Tensor]
 
 
 class Training(Section):
-    """All that decides what a training finds; a checkpoint holds it."""
+    """Everything that determines a training's result; stored in checkpoints."""
 
     arch: str
     options: Annotated[dict[str, Any], Field(default_factory=dict)]
@@ -66,9 +66,9 @@ class Training(Section):
 def run_training(
     out: Path, training: Training, *, device: Device = "auto", resume: bool = False, tensorboard: bool = False
 ) -> dict[str, Any]:
-    """Train; checkpoint, curve and its picture are written as it goes. Raises InputError."""
+    """Train, writing checkpoint, curve and its plot along the way. Raises InputError."""
     place, start = _placed(device), time.monotonic()
-    network = made(training.arch, training.options, seed=training.seed)
+    network = make_network(training.arch, training.options, seed=training.seed)
     probe(network, width_px=training.width_px, height_px=training.height_px)
     pairs, held_out = _data(training, network.form)
     net = network.net.to(place)
@@ -103,7 +103,7 @@ def run_training(
                 optimizer.zero_grad(set_to_none=True)
                 loss.backward()  # type: ignore[no-untyped-call]
             if not torch.isfinite(loss):
-                raise InputError(training.arch, f"iteration {number}", "its light is no number")
+                raise InputError(training.arch, f"iteration {number}", "its light is not finite")
             nn.utils.clip_grad_norm_(net.parameters(), 1.0)
             optimizer.step()
             rate.step()
@@ -111,8 +111,10 @@ def run_training(
             progress(number, training.iterations)
             if stop:
                 save(number)
-                told = f"train: stopped after iteration {number} of {training.iterations}: --resume goes on from there"
-                print(told, file=sys.stderr)
+                line = (
+                    f"train: stopped after iteration {number} of {training.iterations}: --resume continues from there"
+                )
+                print(line, file=sys.stderr)
                 raise SystemExit(128 + stop[0])
             if number % training.validate_every and number != training.iterations:
                 if number == FIRST_SAVED:
@@ -131,14 +133,14 @@ def run_training(
         "needs": needs,
         "start_db": round(curve[0][2], 3),
         "held_out_db": round(curve[-1][2], 3),
-        "held_out_pairs": "the pair that it learned from" if pairs.folder == held_out.folder != () else held_out.count,
+        "held_out_pairs": "the training pair" if pairs.folder == held_out.folder != () else held_out.count,
         "checkpoint": str(out / "checkpoint.pth"),
     }
 
 
 @contextlib.contextmanager
 def _signals() -> Iterator[list[int]]:
-    """The signals to stop that came, SIGINT or SIGTERM, for an iteration to end first; a second one stops at once."""
+    """Yield a list that receives SIGINT or SIGTERM, to stop after the iteration; a second signal stops immediately."""
     came: list[int] = []
 
     def take(number: int, frame: FrameType | None) -> None:
@@ -158,13 +160,13 @@ def _signals() -> Iterator[list[int]]:
 
 
 def displayed(panels: Tensor) -> Tensor:
-    """Panel values as they are shown, clipped and in 8 bits, whose gradient passes straight through."""
+    """Clip and quantise panel values to 8 bits, with a straight-through gradient."""
     codes = (panels.clamp(0, 1) * 255).round() / 255
     return panels + (codes - panels).detach()
 
 
 def _loss(network: Network, batch: Batch) -> Tensor:
-    """Minus the mean light in dB: each pair counts alike, however hard."""
+    """Minus the mean light in dB, which weighs easy and hard pairs equally."""
     with torch.autocast(batch["input"].device.type, torch.bfloat16, enabled=batch["input"].is_cuda):
         answer = network.net.train()(batch["input"])
     losses = []
@@ -177,7 +179,7 @@ def _loss(network: Network, batch: Batch) -> Tensor:
 
 
 def _shown(network: Network, answer: Tensor, batch: Batch) -> Iterator[Tensor]:
-    """What the panels show of each pair: the network's answer, and the solver's steps for the eyes believed."""
+    """Yield each pair's displayed panels: the network's output after the solver's steps for the estimated eyes."""
     for panels, targets, matrices in zip(displayed(answer.float()), batch["targets"], batch["believed"], strict=True):
         views = Views(matrices, targets.shape[-1], targets.shape[-2])
         x = panels.reshape(PANELS, COLOURS, *panels.shape[1:])
@@ -186,8 +188,8 @@ def _shown(network: Network, answer: Tensor, batch: Batch) -> Iterator[Tensor]:
 
 @torch.no_grad()
 def _held_out_db(network: Network, batches: list[Batch], device: torch.device) -> float:
-    """Mean light of pairs that no iteration saw, of real pixels by random rays, without bias."""
-    found = []
+    """Mean light of the held-out pairs, estimated without bias by random rays through square pixels."""
+    lights_db = []
     for number, batch in enumerate(_on(batch, device) for batch in batches):
         with blamed(network.arch, "validation"):
             answer = network.net.eval()(batch["input"])
@@ -195,34 +197,34 @@ def _held_out_db(network: Network, batches: list[Batch], device: torch.device) -
         targets = batch["targets"][0]
         views = Views(batch["views"][0], targets.shape[-1], targets.shape[-2])
         random = torch.Generator().manual_seed(number)
-        found.append(light_db(panels, targets, views, rays=1, random=random))
-    return sum(found) / len(found)
+        lights_db.append(light_db(panels, targets, views, rays=1, random=random))
+    return sum(lights_db) / len(lights_db)
 
 
 def _data(training: Training, form: Form) -> tuple[TrainingPairs, TrainingPairs]:
     """Training and held-out pairs. Raises InputError."""
-    how: dict[str, Any] = {"width_px": training.width_px, "height_px": training.height_px}
-    stack = load_stack(Path(training.panels), **how) if training.panels else None
+    width_px, height_px = training.width_px, training.height_px
+    stack = load_stack(Path(training.panels), width_px=width_px, height_px=height_px) if training.panels else None
     if stack is not None:
-        stack = replace(stack, **how)
+        stack = replace(stack, width_px=width_px, height_px=height_px)
         if stack.count != PANELS:
-            raise InputError(training.panels, "x_m", f"has {stack.count} panels; networks of pictures serve {PANELS}")
+            raise InputError(training.panels, "x_m", f"has {stack.count} panels; picture networks need {PANELS}")
     if training.data and training.scene:
         raise InputError("train", "--data", "and --scene exclude one another")
     folder = folder_pairs(Path(training.data)) if training.data else ()
     held = folder[::-HELD_OUT_SHARE] if len(folder) > 1 else folder
     kept = tuple(pair for pair in folder if pair not in held) or folder
-    how |= {"form": form, "eye_sigma_mm": training.eye_sigma_mm, "stack": stack, "scene": training.scene}
-    return (
-        TrainingPairs(seed=training.seed, count=len(kept) or training.pairs, folder=kept, **how),
-        TrainingPairs(seed=HELD_OUT_SEED, count=len(held) or HELD_OUT, folder=held, **how),
-    )
+    learned = TrainingPairs(
+        form=form, seed=training.seed, width_px=width_px, height_px=height_px, eye_sigma_mm=training.eye_sigma_mm,
+        count=len(kept) or training.pairs, stack=stack, folder=kept, scene=training.scene,
+    )  # fmt: skip
+    return learned, replace(learned, seed=HELD_OUT_SEED, count=len(held) or HELD_OUT, folder=held)
 
 
 def _loader(
     pairs: TrainingPairs, training: Training, first: int, last: int, *, batch: int | None = None
 ) -> DataLoader[Batch]:
-    """Iterations `first` to `last`, by number: so one that was stopped goes on where it was."""
+    """Load the batches of iterations `first` to `last`, which depend only on their numbers."""
     size = batch or training.batch
     workers = min(8, len(os.sched_getaffinity(0)) - 1) if torch.cuda.is_available() else 0
     return DataLoader(pairs, size, sampler=range(first * size, last * size), num_workers=workers)
@@ -230,7 +232,7 @@ def _loader(
 
 def _placed(device: Device) -> torch.device:
     if device == "cuda" and not torch.cuda.is_available():
-        raise InputError("train", "--device", "cuda: torch sees none here")
+        raise InputError("train", "--device", "cuda: torch finds none here")
     return torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
 
 
@@ -239,7 +241,7 @@ def _on(batch: Batch, device: torch.device) -> Batch:
 
 
 def _needs(network: Network, batches: DataLoader[Batch], device: torch.device) -> str:
-    """What an iteration needs of memory, in words, by one forward. Raises InputError as soon as there is less."""
+    """Memory needed by an iteration, as text, measured by one forward pass. Raises InputError if there is less."""
     free = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else _free_bytes()
     weights = 4 * sum(p.numel() * p.element_size() for p in network.net.parameters())  # with gradient and two moments
     kept: dict[int, int] = {}
@@ -247,7 +249,7 @@ def _needs(network: Network, batches: DataLoader[Batch], device: torch.device) -
     def keep(tensor: Tensor) -> Tensor:
         kept[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
         if weights + sum(kept.values()) > free:
-            problem = f"needs more than the {_gib(free)} that are free: a smaller --width, --height or --batch"
+            problem = f"needs more than the {_gib(free)} available: reduce --width, --height or --batch"
             raise InputError(network.arch, "memory", problem)
         return tensor
 
@@ -255,7 +257,7 @@ def _needs(network: Network, batches: DataLoader[Batch], device: torch.device) -
     with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor), blamed(network.arch, "forward"):
         loss = _loss(network, _on(next(iter(batches)), device))
     del loss
-    network.net.load_state_dict(state)  # what a batch changes of running statistics
+    network.net.load_state_dict(state)  # restores running statistics changed by the batch
     return f"{_gib(weights + sum(kept.values()))} of memory of {_gib(free)} free"
 
 
@@ -274,8 +276,9 @@ def _gib(size: int) -> str:
 def _resumed(
     out: Path, training: Training, network: Network, *parts: Any
 ) -> tuple[int, list[list[float]], list[float]]:
-    """Iterations done, the curve so far, and the lights since its last point; weights, optimizer and learning rate are
-    set as they were. Raises InputError.
+    """Restore weights, optimizer and rate; returns iterations done, the curve, and lights since its last point.
+
+    Raises InputError.
     """
     path = out / "checkpoint.pth"
     table = load_checkpoint(path)
@@ -284,7 +287,7 @@ def _resumed(
         raise InputError(path, "training", "missing: not a checkpoint of phasestack train")
     for name, value in now.items():
         if was.get(name) != value:
-            raise InputError(path, name, f"was {was.get(name)!r}, and {value!r} was asked for: the same to resume")
+            raise InputError(path, name, f"was {was.get(name)!r}, now {value!r}: to resume it must be the same")
     fill(network.net, table["model"], source=path, arch=training.arch)
     with blamed(str(path), "optimizer"):
         for part, name in zip(parts, ("optimizer", "rate"), strict=True):
@@ -295,19 +298,19 @@ def _resumed(
 
 @contextlib.contextmanager
 def _board(out: Path, done: int, *, asked: bool) -> Iterator[Callable[[list[float]], None]]:
-    """Where points of the curve go besides: TensorBoard's event files, by torch's writer, if asked."""
+    """Yield a function that adds points of the curve to TensorBoard's event files, if asked for."""
     if not asked:
         yield lambda point: None
         return
-    from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415 - needs a package that only this needs
+    from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415 - an optional package
 
     with SummaryWriter(str(out / "tensorboard"), purge_step=done + 1) as writer:
 
-        def told(point: list[float]) -> None:
+        def add(point: list[float]) -> None:
             for name, value in zip(COLUMNS[1:], point[1:], strict=True):
                 writer.add_scalar(name, value, int(point[0]))
 
-        yield told
+        yield add
 
 
 def _row(point: list[float]) -> str:
@@ -315,12 +318,12 @@ def _row(point: list[float]) -> str:
 
 
 def _drawn(curve: list[list[float]], title: str) -> bytes:
-    """The curve as a picture."""
+    """Plot the curve as a PNG."""
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.add_subplot(title=title, xlabel="iterations", ylabel="light, dB")
     numbers, learned, held_out = zip(*curve, strict=True)
-    axes.plot(numbers, learned, label="of the pairs learned from (by the model of light)")
-    axes.plot(numbers, held_out, "o-", label="held out (by rays)")
+    axes.plot(numbers, learned, label="training pairs (model of light)")
+    axes.plot(numbers, held_out, "o-", label="held-out pairs (random rays)")
     axes.legend()
     axes.grid(alpha=0.3)
     buffer = io.BytesIO()

@@ -1,4 +1,4 @@
-"""The solver's steps as a network that one can train: their sizes and momenta are its weights."""
+"""The solver's steps as a trainable network: their sizes and momenta are its weights."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from runtime.config import Section
 
 
 class Unrolled(nn.Module):
-    """Panels that share the mean of both pictures evenly; training goes through the steps after them."""
+    """Starts from panels that share the mean of both pictures evenly; training optimises the steps that follow."""
 
     class Options(Section):
-        """How deep it is."""
+        """Number of steps and their initial size."""
 
         steps: Annotated[int, Field(ge=1, le=64)] = 4
         size: Annotated[float, Field(gt=0, le=3)] = Field(SIZE, description="of every step, before training")
@@ -27,7 +27,7 @@ class Unrolled(nn.Module):
         self.step_momenta = nn.Parameter(torch.full((steps,), MOMENTUM))
 
     def forward(self, eyes: Tensor) -> Tensor:
-        """(n, 6, h, w) intensities -> (n, 9, h, w): a third each of the sum in [1, 2] that gives their mean."""
+        """(n, 6, h, w) intensities -> (n, 9, h, w): a third of the phase sum, in [1, 2], of the pictures' mean."""
         mean = (eyes[:, :3] + eyes[:, 3:]) / 2
         phase = torch.asin(mean.clamp(0, 1).sqrt()) * (2 / torch.pi)
         return ((2 - phase) / 3).repeat(1, 3, 1, 1)

@@ -92,7 +92,7 @@ def test_pictures_are_codes_or_intensities_with_or_without_transparency() -> Non
         ({"fov_deg": "40"}, "fov_deg: is '40', not a number"),
         ({"model": 3}, "model: is 3"),
         ({"cameras": np.zeros((2, 4, 4))}, "cameras: must be two 3x4 matrices"),
-        ({"cameras": np.zeros((2, 3, 4))}, "cameras: are no cameras"),
+        ({"cameras": np.zeros((2, 3, 4))}, "cameras: are not cameras"),
         ({"cameras": [phasestack.camera(eye, width_px=320, height_px=180) for eye in EYES[::-1]]}, "cameras: stand at"),
         ({"fov_deg": 190.0}, "fov_deg"),
         ({"eye_sigma_mm": float("nan")}, "eye_sigma_mm"),
@@ -211,7 +211,7 @@ def test_pictures_of_parallel_cameras_are_solved_for_what_they_are() -> None:
     solved = phasestack.solve(*pictures, cameras=cameras, stack=STACK, model="fast")
     assert solved.quality.psnr_db > 30 and truth_db(cameras=cameras) > 30
     assert abs(solved.quality.psnr_db - truth_db(cameras=cameras)) < 2.8  # of 53
-    with pytest.warns(UserWarning, match="beside the panels"):
+    with pytest.warns(UserWarning, match="outside the panels"):
         assert truth_db(eyes_m=eyes_m, fov_deg=62) < 20
 
 
@@ -245,7 +245,7 @@ def test_anybody_s_layers_are_evaluated_as_ours_are() -> None:
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        ({"fov_deg": 70}, "beside the panels"),
+        ({"fov_deg": 70}, "outside the panels"),
         ({"eyes_m": EYES[::-1]}, "exchanged"),
         ({"fov_deg": 0.7}, "looks like radians"),
     ],
@@ -281,7 +281,7 @@ def test_the_command_takes_the_cameras_that_pictures_were_taken_with(
     assert capfd.readouterr().err == ""
     eyes = ["--left-eye", *map(str, eyes_m[0]), "--right-eye", *map(str, eyes_m[1])]
     app([*command, *eyes, "--fov", "62"], standalone_mode=False)
-    assert "beside the panels" in capfd.readouterr().err
+    assert "outside the panels" in capfd.readouterr().err
     for given, told in (
         (eyes[:4], "are needed"),
         ([*eyes, "--camera", f"{tmp_path}/cameras.json"], "omit --left-eye"),

@@ -1,8 +1,8 @@
-"""The calibration from the sensor's frame to the stack's: load, check, apply, and its error.
+"""The calibration from the sensor's frame to the stack's: load, check, apply, and estimate its error.
 
-Parameters of a calibration, about a pivot w0 (the pairs' centre, in `stack`) where they are nearly uncorrelated:
-rotation vector (3, rad, about the axes of `stack`), shift (3, m) and log scale (1). A small change d of them moves
-a point w by  d_rot × (w - w0) + d_shift + d_scale·(w - w0).
+Its seven parameters are a rotation vector (3, rad, about the axes of `stack`), a shift (3, m) and a log scale (1),
+about a pivot w0 (the pairs' centre, in `stack`), which makes them nearly uncorrelated. A small change d moves a point
+w by  d_rot × (w - w0) + d_shift + d_scale·(w - w0).
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from runtime.records import F64, EyePoints
 DEMO_FILE = Path(__file__).parent / "data" / "demo-calibration.toml"
 SIMILARITY_TOLERANCE = 1e-3  # relative; printed matrices of four digits pass, sheared ones do not
 PLAUSIBLE_SCALE = (0.8, 1.25)  # both frames are in metres
-SCALE = (5e-4, 2e3)  # beyond: not even millimetres on one side
-NEAR_M, MAX_DISTANCE_M = 5.0, 20.0  # of the sensor from the display: farther is odd; no sensor sees a face from there
+SCALE = (5e-4, 2e3)  # wide enough for millimetres on one side; anything outside is an error
+NEAR_M, MAX_DISTANCE_M = 5.0, 20.0  # sensor to display: warn beyond the first, refuse beyond the second
 
 Number = Annotated[float, Field(strict=True, ge=-MOST, le=MOST)]  # "1.0" and true are not numbers
 Row4 = tuple[Number, Number, Number, Number]
@@ -33,19 +33,19 @@ Row7 = tuple[Number, Number, Number, Number, Number, Number, Number]
 
 
 class Lenient(Section):
-    """A table in which keys of other programs and later versions are left alone."""
+    """A table that ignores unknown keys, of other programs or later versions."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
 
 class Residuals(Lenient):
-    """`[residuals]`: how well the pairs fit the matrix, metres, in `stack`."""
+    """`[residuals]`: fit of the pairs to the matrix, metres, in `stack`."""
 
     rms_m: Annotated[float, Field(ge=0)]
 
 
 class CovarianceTable(Lenient):
-    """`[covariance]`: of the parameters in the module's text."""
+    """`[covariance]` of the seven parameters."""
 
     pivot_m: Vector3
     matrix: tuple[Row7, Row7, Row7, Row7, Row7, Row7, Row7]
@@ -58,7 +58,7 @@ class CalibrationFile(Lenient):
     units: Literal["m"] = "m"
     method: str = ""
     date: str | datetime.date = ""
-    sensor_serial: str = ""  # empty: of no particular device
+    sensor_serial: str = ""  # empty: any device
     condition: Annotated[float, Field(ge=0)] | None = None
     residuals: Residuals | None = None
     covariance: CovarianceTable | None = None
@@ -66,16 +66,16 @@ class CalibrationFile(Lenient):
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """A similarity from `sensor` to `stack`, where it comes from, and how good it is."""
+    """A similarity from `sensor` to `stack`, its source and its warnings."""
 
     stack_from_sensor: F64  # (4, 4) [sR t; 0 1]
-    file: CalibrationFile  # all that it holds
+    file: CalibrationFile
     source: str  # the file's name, for messages
-    warnings: tuple[str, ...]  # what a person should know before trusting it
+    warnings: tuple[str, ...]  # lines for the user
 
     @property
     def scale(self) -> float:
-        """Metres of `stack` for each metre of `sensor`."""
+        """Metres of `stack` per metre of `sensor`."""
         return float(np.cbrt(np.linalg.det(self.stack_from_sensor[:3, :3])))
 
     def points(self, sensor_m: ArrayLike) -> F64:
@@ -84,7 +84,7 @@ class Calibration:
         return points @ self.stack_from_sensor[:3, :3].T + self.stack_from_sensor[:3, 3]
 
     def apply(self, eyes: EyePoints) -> EyePoints:
-        """The same eyes in `stack`; `eyes` are in `sensor`."""
+        """Transform eyes from `sensor` to `stack`."""
         turn, covariance = self.stack_from_sensor[:3, :3], eyes.covariance_m2
         return replace(
             eyes,
@@ -93,10 +93,7 @@ class Calibration:
         )
 
     def position_error_m(self, stack_m: ArrayLike) -> F64 | None:
-        """(...) RMS error, m, of points (..., 3) in `stack` that the calibration alone causes.
-
-        None where that is not known.
-        """
+        """(...) RMS error, m, of points (..., 3) in `stack` due to the calibration alone; None if unknown."""
         if self.file.covariance is None:
             return None
         jacobian = position_jacobian(stack_m, pivot_m=self.file.covariance.pivot_m)
@@ -105,16 +102,16 @@ class Calibration:
         return error_m
 
     def serial_warning(self, serial: str) -> str:
-        """One line where a sensor is not the one that was calibrated, else an empty text."""
-        own = self.file.sensor_serial
-        if not own or serial == own:
+        """One-line warning if the sensor is not the calibrated one; empty otherwise."""
+        calibrated = self.file.sensor_serial
+        if not calibrated or serial == calibrated:
             return ""
-        found = f"the sensor is {serial}" if serial else "the sensor reports no serial"
-        return f"{self.source}: calibrated for sensor {own}, but {found}: calibrate again"
+        actual = f"the sensor is {serial}" if serial else "the sensor reports no serial"
+        return f"{self.source}: calibrated for sensor {calibrated}, but {actual}: calibrate again"
 
 
 def position_jacobian(stack_m: ArrayLike, *, pivot_m: ArrayLike) -> F64:
-    """(..., 3, 7) derivative of points (..., 3) in `stack` by a calibration's parameters about its pivot."""
+    """(..., 3, 7) derivative of points (..., 3) in `stack` by the seven parameters about the pivot."""
     arm = np.asarray(stack_m, dtype=np.float64) - np.asarray(pivot_m, dtype=np.float64)
     jacobian = np.zeros((*arm.shape, 7))
     jacobian[..., 0, 1], jacobian[..., 0, 2] = arm[..., 2], -arm[..., 1]
@@ -139,9 +136,9 @@ def similarity_defect(matrix: ArrayLike) -> float:
 
 
 def check_similarity(matrix: F64, *, source: str | Path) -> None:
-    """Raise InputError, naming the field, for a 4x4 that is no similarity a display can have.
+    """Raise InputError, naming the field, unless a 4x4 is a plausible similarity.
 
-    Its determinant must be positive, its scale within `SCALE`, and the sensor within `MAX_DISTANCE_M`.
+    The determinant must be positive, the scale within `SCALE`, and the sensor within `MAX_DISTANCE_M`.
     """
     name = "stack_from_sensor"
     if not np.abs(matrix).max() <= MOST:
@@ -157,9 +154,9 @@ def check_similarity(matrix: F64, *, source: str | Path) -> None:
     volume = float(np.linalg.det(matrix[:3, :3] / largest))
     if volume <= 0.0:
         raise InputError(source, name, "mirrors space (determinant not positive): check the axes' directions")
-    scale = largest * float(np.cbrt(volume))  # of the matrix itself the determinant may leave float64
+    scale = largest * float(np.cbrt(volume))  # the matrix's own determinant may overflow
     if not SCALE[0] <= scale <= SCALE[1]:
-        raise InputError(source, name, f"has scale {scale:.3g}: both frames are in metres, it is about 1")
+        raise InputError(source, name, f"has scale {scale:.3g}: with both frames in metres it must be about 1")
     distance_m = float(np.linalg.norm(matrix[:3, 3]))
     if distance_m > MAX_DISTANCE_M:
         problem = f"puts the sensor {distance_m:.4g} m from the display; at most {MAX_DISTANCE_M:g} m"
@@ -167,24 +164,26 @@ def check_similarity(matrix: F64, *, source: str | Path) -> None:
 
 
 def _warnings(matrix: F64, source: str) -> tuple[str, ...]:
-    found = []
+    warnings = []
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     if not PLAUSIBLE_SCALE[0] <= scale <= PLAUSIBLE_SCALE[1]:
         reason = "are both frames in metres?"
         if 800 < scale < 1250 or 0.0008 < scale < 0.00125:
-            reason = "millimetres on one side, it seems"
-        found.append(f"{source}: stack_from_sensor: scale {scale:.6g} is far from 1: {reason}")
+            reason = "one side seems to be in millimetres"
+        warnings.append(f"{source}: stack_from_sensor: scale {scale:.6g} is far from 1: {reason}")
     distance_m = float(np.linalg.norm(matrix[:3, 3]))
     if distance_m > NEAR_M:
-        found.append(f"{source}: stack_from_sensor: the sensor is {distance_m:.3g} m from the display: is that so?")
-    return tuple(found)
+        warnings.append(
+            f"{source}: stack_from_sensor: the sensor is {distance_m:.3g} m from the display: is that right?"
+        )
+    return tuple(warnings)
 
 
 def load_calibration(path: Path | None) -> Calibration:
-    """A calibration file, checked; None: the built-in one of the demo recording.
+    """Load and check a calibration file; None: the built-in one of the demo recording.
 
-    Raises InputError, naming file and field: missing, malformed, wrong shape, not finite, not a similarity,
-    mirrored. A scale far from 1 only warns: `Calibration.warnings`.
+    Raises InputError, naming file and field, if it is missing, malformed, of the wrong shape, not finite, not a
+    similarity, or mirrored. A scale far from 1 only warns (`Calibration.warnings`).
     """
     file = DEMO_FILE if path is None else path
     table = read_table(file)
@@ -198,7 +197,7 @@ def load_calibration(path: Path | None) -> Calibration:
 
 
 def demo_stack_from_sensor() -> F64:
-    """4x4 rigid transform of the demo's sensor, which looks along +x, tilted down by 10 degrees."""
+    """4x4 rigid transform of the demo's sensor, which looks along +x and 10 degrees down."""
     return load_calibration(None).stack_from_sensor
 
 

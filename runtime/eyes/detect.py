@@ -1,4 +1,4 @@
-"""Eyes from a sensor's pictures: the viewer's pupils, their distance, and the covariance."""
+"""Eye positions from a sensor's pictures: the viewer's pupils, their distance, and the covariance."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from runtime.eyes.face_depth import EyeDepths, FaceDepth
 from runtime.eyes.pupils import SIDES, PupilFinder, Pupils
 from runtime.records import F64, EyePoints, Intrinsics, SensorFrame
 
-# Of one pupil's sigma that the middle between both has: what they err by to the side differs, upwards it is the same.
+# Sigma of the midpoint over that of one pupil: sideways errors of the two are nearly independent, vertical ones shared.
 MIDDLE_SIDEWAYS, MIDDLE_UP = 0.55, 1.1
 RANGE_MAX_M = 4.0  # a face farther away is not a viewer's
-LOCK_NS = NS_PER_S  # a viewer not seen for so long (another person walks past) makes way for another
-FILLED_IN_CONFIDENCE = 0.4  # of an eye that was not seen
+LOCK_NS = NS_PER_S  # a viewer unseen for this long is replaced; shorter gaps happen when another person walks past
+FILLED_IN_CONFIDENCE = 0.4  # of an eye that was hidden
 
 log = logging.getLogger(__name__)
 
 
 class EyeFinder:
-    """Finder of one viewer's eyes. `choice`: how the viewer was chosen; `reason`: why there are none."""
+    """Finds one viewer's eyes. `choice`: how the viewer was chosen; `reason`: why the last frame gave no eyes."""
 
     def __init__(self, settings: Settings | None = None) -> None:
-        """settings: of `calibration` the viewer's eye distance."""
+        """Use the viewer's eye distance from `settings.calibration`, if it is known."""
         settings = settings or Settings()
         self._new_depth = partial(FaceDepth, eye_distance_m=settings.calibration.ipd_m)
         self._finder = PupilFinder(lock_ns=LOCK_NS)
         self._depth, self._viewer = self._new_depth(), 0
         self.reason = ""
-        self.pupils: Pupils | None = None  # of the last frame, whether their distance is known or not
+        self.pupils: Pupils | None = None  # of the last frame, even if their distance is unknown
 
     def forget(self) -> None:
-        """The next frame is the first."""
+        """Reset: treat the next frame as the first."""
         self._finder.forget()
 
     @property
@@ -45,7 +45,7 @@ class EyeFinder:
     def find(self, frame: SensorFrame) -> EyePoints | None:
         """The viewer's eyes in the `sensor` frame, or None with the reason in `reason`.
 
-        Needs colour and intrinsics, and depth registered to them where the sensor has it.
+        Needs colour and intrinsics; depth, if the sensor has it, must be registered to colour.
         """
         self.pupils = None
         if frame.colour is None:
@@ -57,17 +57,17 @@ class EyeFinder:
             self._depth, self._viewer = self._new_depth(), self._finder.viewer
         self.reason = self._finder.reason
         if pupils is None or frame.intrinsics is None:
-            self.reason = self.reason or "a camera without intrinsics: nothing is known of the eyes' distance"
+            self.reason = self.reason or "the camera has no intrinsics: the eyes' distance is unknown"
             return None
         scale = np.ones(2)
         if frame.depth_mm is not None:  # registered pictures may differ in size
             scale = np.array(frame.depth_mm.shape[::-1]) / np.array(frame.colour.shape[1::-1])
         depths = self._depth.at(pupils, frame.depth_mm, frame.intrinsics, scale)
         if frame.depth_mm is not None and not self._depth.has_measured:
-            self.reason = "no depth of a person's size on the face"
+            self.reason = "the depth on the face does not fit a person's size"
             return None
         if depths.eyes_m.mean() > RANGE_MAX_M:
-            self.reason = f"the face is {depths.eyes_m.mean():.1f} m away: beyond {RANGE_MAX_M:g} m, no viewer's"
+            self.reason = f"the face is {depths.eyes_m.mean():.1f} m away, beyond {RANGE_MAX_M:g} m"
             return None
         return _eye_points(pupils, depths, frame.intrinsics)
 
@@ -85,12 +85,12 @@ def _eye_points(pupils: Pupils, depths: EyeDepths, intrinsics: Intrinsics) -> Ey
     return EyePoints(eyes, confidence, pupils.hidden, spread)
 
 
-def covariance(place: F64, line: F64, sideways_m: float, up_m: float, along_m: float) -> F64:
-    """(3, 3) m², of a place unsure by these standard deviations: across its line of sight, and along it.
+def covariance(point: F64, line: F64, sideways_m: float, up_m: float, along_m: float) -> F64:
+    """(3, 3) m², from standard deviations across and along the line of sight to a point.
 
-    line: (3,) between the eyes, which is sideways but for what of it is along the sight.
+    line: (3,) between the eyes; its component across the line of sight is the sideways direction.
     """
-    sight = place / np.linalg.norm(place)
+    sight = point / np.linalg.norm(point)
     sideways = line - (line @ sight) * sight
     sideways = sideways / np.linalg.norm(sideways)
     axes = np.column_stack([sideways, np.cross(sight, sideways), sight])

@@ -1,10 +1,11 @@
 """Interacting multiple models (Blom and Bar-Shalom 1988): Kalman filters of different agility.
 
-Each model has Singer's acceleration (1970): it fades with a time constant and is renewed by noise of its own strength.
-A still head wants a heavy filter, a hasty one a light filter, and which it is changes in a tenth of a second. The noise
-of a measurement is a covariance matrix: a camera knows right and up twenty times as well as depth.
+Each model uses Singer's acceleration (1970): it decays with a time constant and is driven by noise, whose strength
+differs between models. A still head needs heavy filtering, a fast one light filtering, and heads change between these
+within a tenth of a second. Measurement noise is a covariance matrix: a camera measures right and up twenty times as
+precisely as depth.
 
-A state is nine numbers, position, velocity, acceleration, each along x, y, z; metres and seconds.
+A state has nine numbers: position, velocity and acceleration, each along x, y, z; metres and seconds.
 """
 
 from __future__ import annotations
@@ -18,36 +19,36 @@ import numpy as np
 
 from runtime.records import F64
 
-FADE_S = 0.25  # time constant with which an acceleration fades
+FADE_S = 0.25  # time constant of an acceleration's decay
 ROUNDING = 1e-12  # of a covariance's trace: (10 nm)² of a head's (1 cm)²
-WEIGHT_FLOOR = 1e-6  # of a filter's probability: a filter that is ruled out can come back
+WEIGHT_FLOOR = 1e-6  # minimum probability of a model, so that it can recover
 _NODES, _SHARES = np.polynomial.legendre.leggauss(10)
 _AXES = np.eye(3)
 
 
 class Belief(NamedTuple):
-    """Belief of every motion model: states, covariances, probabilities."""
+    """States, covariances and probabilities of all motion models."""
 
     state: F64  # (models, 9)
     covariance: F64  # (models, 9, 9)
-    weight: F64  # (models,) how much each is believed; they add up to one
+    weight: F64  # (models,) probabilities; they add up to one
 
 
 def _response(times_s: F64) -> F64:
-    """(3, n) what an acceleration of one at time 0 has become: position, velocity, acceleration."""
+    """(3, n) position, velocity and acceleration that a unit acceleration at time 0 has led to."""
     x = times_s / FADE_S
     gone = -np.expm1(-x)
     return np.array([FADE_S**2 * (x - gone), FADE_S * gone, 1 - gone])
 
 
 def _of_each_axis(matrix: F64) -> F64:
-    """(9, 9) the same (3, 3) for x, y and z: Kronecker's product with one."""
+    """(9, 9) matrix that applies a (3, 3) to x, y and z alike: its Kronecker product with the identity."""
     return (matrix[:, None, :, None] * _AXES[:, None, :]).reshape(9, 9)
 
 
 @lru_cache(maxsize=8)
 def _transition(dt_s: float) -> F64:
-    """(9, 9) the state after dt_s from the state now."""
+    """(9, 9) matrix from the current state to the state after dt_s."""
     step = np.eye(3)
     step[0, 1] = dt_s
     step[:, 2] = _response(np.array([dt_s]))[:, 0]
@@ -56,18 +57,18 @@ def _transition(dt_s: float) -> F64:
 
 @lru_cache(maxsize=8)
 def _noise(dt_s: float) -> F64:
-    """(9, 9) covariance that accelerations of one m/s² (standard deviation) add in dt_s.
+    """(9, 9) covariance that acceleration noise of 1 m/s² (standard deviation) adds in dt_s.
 
-    Gauss and Legendre's sum of what arrives from every moment: never negative, where the closed form cancels.
+    Integrated by Gauss-Legendre quadrature, which stays positive where the closed form cancels.
     """
     response = _response(dt_s * (_NODES + 1) / 2)
     return _of_each_axis((response * (_SHARES * dt_s / FADE_S)) @ response.T)
 
 
 def started(place: F64, *, noise: F64, speed: float, acceleration: Sequence[float]) -> Belief:
-    """Belief after a first measurement (3,) with covariance (3, 3): at rest.
+    """Belief after a first measurement (3,) with covariance (3, 3), with zero mean velocity.
 
-    speed: m/s; acceleration: m/s², one for each model: standard deviations of an axis.
+    speed, m/s, and acceleration, m/s², one for each model, are standard deviations per axis.
     """
     count = len(acceleration)
     state, covariance = np.zeros((count, 9)), np.zeros((count, 9, 9))
@@ -81,7 +82,7 @@ def started(place: F64, *, noise: F64, speed: float, acceleration: Sequence[floa
 def predicted(belief: Belief, dt_s: float, *, acceleration: Sequence[float], stay_s: float) -> Belief:
     """Belief predicted dt_s >= 0 ahead: models mix, then move. stay_s: mean time in one model."""
     count = len(belief.weight)
-    leave = -math.expm1(-dt_s / stay_s) / count  # evenly, to stay among them
+    leave = -math.expm1(-dt_s / stay_s) / count  # to each model with equal probability, this one included
     change = np.full((count, count), leave) + (1 - count * leave) * np.eye(count)
     shares = belief.weight[:, None] * change
     weight = shares.sum(0)
@@ -102,14 +103,14 @@ def surprise(belief: Belief, measured: F64, *, noise: F64) -> float:
 
 
 def _total(belief: Belief, noise: F64) -> F64:
-    """(n, 3, 3) a measurement's covariance; not singular where jumps of metres leave it to rounding."""
+    """(n, 3, 3) covariance of the innovation, kept from becoming singular by rounding after jumps of metres."""
     total = belief.covariance[:, :3, :3] + noise
     spread: F64 = np.trace(total, axis1=1, axis2=2)[:, None, None] * ROUNDING
     return np.asarray(total + spread * np.eye(3), np.float64)
 
 
 def _chi2(off: F64, covariance: F64) -> F64:
-    """(n,) squared lengths of vectors (n, 3) in units of their variances (n, 3, 3)."""
+    """(n,) squared Mahalanobis lengths of vectors (n, 3) with covariances (n, 3, 3)."""
     result: F64 = (off * np.linalg.solve(covariance, off[..., None])[..., 0]).sum(1)
     return result
 
@@ -121,7 +122,7 @@ def corrected(belief: Belief, measured: F64, *, noise: F64) -> Belief:
     off = measured - belief.state[:, :3]
     likely = -0.5 * (_chi2(off, total) + np.linalg.slogdet(total)[1])
     weight = belief.weight * np.exp(likely - likely.max()) + WEIGHT_FLOOR
-    # Joseph's form: rounding hardly turns a variance negative.
+    # Joseph's form keeps variances positive under rounding.
     keep = np.repeat(np.eye(9)[None], len(weight), axis=0)
     keep[:, :, :3] -= gain
     covariance = keep @ belief.covariance @ keep.transpose(0, 2, 1) + gain @ noise @ gain.transpose(0, 2, 1)
@@ -130,7 +131,7 @@ def corrected(belief: Belief, measured: F64, *, noise: F64) -> Belief:
 
 
 def _positive(covariance: F64) -> F64:
-    """(n, 9, 9) as it is; where jumps of metres, which no head makes, leave it to rounding, the nearest that is one."""
+    """(n, 9, 9) the covariance, with eigenvalues raised to be positive if rounding (after jumps of metres) broke it."""
     try:
         np.linalg.cholesky(covariance)
     except np.linalg.LinAlgError:
@@ -142,13 +143,13 @@ def _positive(covariance: F64) -> F64:
 
 
 def ahead(belief: Belief, dt_s: float) -> F64:
-    """(3,) position predicted ahead: the mean over the models, weighted by their probability."""
-    place: F64 = _transition(dt_s)[:3] @ (belief.weight @ belief.state)
-    return place
+    """(3,) position predicted dt_s ahead: the mean over the models, weighted by their probability."""
+    position: F64 = _transition(dt_s)[:3] @ (belief.weight @ belief.state)
+    return position
 
 
 def spread(belief: Belief, dt_s: float, *, acceleration: Sequence[float], about: F64) -> F64:
-    """(3, 3) mean square, m², of the predicted position's distance from a place (3,)."""
+    """(3, 3) second moment, m², of the predicted position about a point (3,)."""
     step = _transition(dt_s)[:3]
     added = np.square(acceleration)[:, None, None] * _noise(dt_s)[:3, :3]
     apart = belief.state @ step.T - about

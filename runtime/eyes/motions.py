@@ -1,4 +1,4 @@
-"""Simulated head motions and a depth camera's samples of them, for the benchmark and tests."""
+"""Simulated head motions and a depth camera's samples of them, for benchmarks and tests."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from runtime.clock import NS_PER_S
 from runtime.records import F64, EyePoints
 
 IPD_M = 0.063
-DROPOUT_S = 0.2  # of every lost face
+DROPOUT_S = 0.2  # length of every dropout
 NECK_TO_EYES_M = np.array([-0.09, 0.0, 0.14])  # forward (towards the display), aside, up
 
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What arrives at the tracker."""
+    """A sample as the tracker receives it."""
 
     capture_ns: int
     points: EyePoints | None  # frame `stack`
@@ -27,7 +27,7 @@ Motion = Callable[[F64], tuple[F64, F64]]  # times (n,) s -> neck (n, 3) m, fram
 
 
 def minimum_jerk(times_s: F64, *, knots_s: F64, values: F64) -> F64:
-    """Point-to-point movements at rest in each knot (Flash and Hogan 1985); values (k, ...)."""
+    """Point-to-point movements that stop at each knot (Flash and Hogan 1985); values (k, ...)."""
     index = np.clip(np.searchsorted(knots_s, times_s, side="right") - 1, 0, len(knots_s) - 2)
     s = np.clip((times_s - knots_s[index]) / (knots_s[index + 1] - knots_s[index]), 0, 1)
     blend = s**3 * (10 + s * (6 * s - 15))
@@ -35,7 +35,7 @@ def minimum_jerk(times_s: F64, *, knots_s: F64, values: F64) -> F64:
 
 
 def _still(times_s: F64) -> tuple[F64, F64]:
-    """A seated head: breathing and sway of some millimetres."""
+    """A seated head: breathing and sway of a few millimetres."""
     sway = [0.0015 * np.sin(1.7 * times_s), 0.002 * np.sin(0.9 * times_s + 1), 0.0015 * np.sin(1.6 * times_s)]
     return np.stack(sway, 1), np.zeros_like(times_s)
 
@@ -56,7 +56,7 @@ def _nod(times_s: F64) -> tuple[F64, F64]:
 
 
 def _walk(times_s: F64) -> tuple[F64, F64]:
-    """To and fro past the display, 2.4 m at up to 1 m/s, with the bob of steps at 1.9 Hz."""
+    """Back and forth in front of the display, 2.4 m at up to 1 m/s, bobbing with steps at 1.9 Hz."""
     knots = np.arange(0.0, times_s.max() + 4.0, 3.5)
     side = minimum_jerk(times_s, knots_s=knots, values=np.where(np.arange(len(knots)) % 2, 1.0, -1.0))
     bob = 0.02 * np.sin(2 * np.pi * 1.9 * times_s)
@@ -65,7 +65,7 @@ def _walk(times_s: F64) -> tuple[F64, F64]:
 
 
 def _stop_and_go(times_s: F64) -> tuple[F64, F64]:
-    """Quick moves of 10 to 30 cm in half a second to a second, between pauses of as long."""
+    """Quick moves of 10 to 30 cm in half a second to a second, separated by similar pauses."""
     random = np.random.default_rng(7)
     knots, places, place = [0.0], [np.zeros(3)], np.zeros(3)
     while knots[-1] <= times_s.max():
@@ -89,7 +89,7 @@ MOTIONS: dict[str, Motion] = {
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """One viewer's variation of a motion: phase, speed, extent and first direction."""
+    """One viewer's variation of a motion: phase, speed, extent and initial direction."""
 
     start_s: float = 0.0
     pace: float = 1.0
@@ -101,7 +101,7 @@ BENCHMARK_PATH = Path()
 
 
 def path_of(seed: int) -> Path:
-    """Another path for each seed, of the same kind; 0: the benchmark's own."""
+    """Random path for a seed; seed 0 is the benchmark's path."""
     if seed == 0:
         return BENCHMARK_PATH
     random = np.random.default_rng([seed, 0x70617468])
@@ -118,7 +118,7 @@ def true_eyes(motion: str, times_s: F64, *, distance_m: float = 0.6, path: Path 
     c, s = np.cos(pitch), np.sin(pitch)
     middle = neck + np.stack([forward * c + up * s, np.zeros_like(c), up * c - forward * s], 1)
     middle += np.array([distance_m - forward, 0.0, -up])
-    # The head turns towards the display, and tilts into a lean.
+    # The head turns towards the display and tilts into a lean.
     yaw, roll = np.arctan2(middle[:, 1], middle[:, 0]), -0.6 * neck[:, 1]
     across = [-np.sin(yaw) * np.cos(roll), np.cos(yaw) * np.cos(roll), np.sin(roll)]
     half = IPD_M / 2 * np.stack(across, 1)
@@ -136,9 +136,9 @@ def observe(
     seed: int = 1,
     path: Path = BENCHMARK_PATH,
 ) -> list[Observation]:
-    """What a sensor delivers of a motion; `seed` is of its noise.
+    """Simulate a sensor's samples of a motion; `seed` selects the noise.
 
-    Outliers put one eye or both 4 to 20 cm off; no dropouts where 0 s.
+    Outliers put one eye or both 4 to 20 cm off; `dropout_every_s` of 0 disables dropouts.
     """
     random = np.random.default_rng([seed, *motion.encode(), round(rate_hz)])
     times_s = np.arange(round(seconds * rate_hz)) / rate_hz

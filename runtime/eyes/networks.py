@@ -1,7 +1,7 @@
-"""The three networks that see a face, and the square crops of a picture that they look at.
+"""The three networks for faces, and the square crops that are their input.
 
-Pixels are continuous, the centre of a picture's first pixel is (0.5, 0.5). *Left* is the viewer's own left, which is
-on the right of an unmirrored picture; it comes first. The models' origin is in `docs/sensors.md`.
+Pixels are continuous: the centre of the first one is (0.5, 0.5). *Left* is the viewer's own left, on the right of an
+unmirrored picture; it comes first. `docs/sensors.md` gives the models' origin.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from runtime.records import F32, F64, U8
 from runtime.support.onnx_runtime import onnxruntime
 
 MODELS = Path(str(files("runtime.eyes") / "models"))
-STRIDES = (8, 16, 32)  # pixels a cell of YuNet's three grids
-OVERLAP_MAX = 0.3  # of two boxes of YuNet's, intersection over union: more is one face twice
-CROP_BLUR = 0.45  # standard deviation, in the crop's pixels, that keeps a shrunk picture from aliasing
+STRIDES = (8, 16, 32)  # pixels per cell of YuNet's three grids
+OVERLAP_MAX = 0.3  # intersection over union of two of YuNet's boxes; above, they are the same face
+CROP_BLUR = 0.45  # standard deviation of the anti-aliasing filter, in the crop's pixels
 
 
 def load_network(name: str) -> Any:
-    """An onnxruntime session on one thread, outside the display's loop. name: a file in `models`.
+    """Load an onnxruntime session with one thread and warm it up: a first run is several times slower.
 
-    It has run once, as the first run is several times as slow as the others.
+    name: a file in `models`.
     """
     ort = onnxruntime()
     options = ort.SessionOptions()
@@ -40,7 +40,7 @@ def load_network(name: str) -> Any:
 
 
 def transformed(matrix: F64, points: F64) -> F64:
-    """(n, 2) points by an affine (2, 3) matrix."""
+    """Apply an affine (2, 3) matrix to (n, 2) points."""
     result: F64 = points @ matrix[:, :2].T + matrix[:, 2]
     return result
 
@@ -51,8 +51,8 @@ def inverse(matrix: F64) -> F64:
 
 
 def resampled(picture: U8, size: tuple[int, int], crop_from_picture: F64) -> U8:
-    """A picture warped by an affine (2, 3) of continuous pixels, antialiased, edges repeated."""
-    ratio = 1 / np.sqrt(abs(np.linalg.det(crop_from_picture[:, :2])))  # picture's pixels a crop's
+    """Warp a picture by an affine (2, 3) of continuous pixels, antialiased, clamped to the edge."""
+    ratio = 1 / np.sqrt(abs(np.linalg.det(crop_from_picture[:, :2])))  # picture pixels per crop pixel
     corners = np.array([[0, 0], [size[0], 0], [0, size[1]], [size[0], size[1]]], np.float64)
     seen = transformed(inverse(crop_from_picture), corners)
     height, width = picture.shape[:2]
@@ -69,20 +69,20 @@ def resampled(picture: U8, size: tuple[int, int], crop_from_picture: F64) -> U8:
 
 @dataclass(frozen=True, slots=True)
 class Square:
-    """A square of a picture, turned with the face in it."""
+    """A square region of a picture, rotated with the face in it."""
 
     centre: F64  # (2,) px
     side: float  # px
-    angle: float  # radians, of its lower edge, clockwise on the screen
+    angle: float  # of its lower edge, radians clockwise on the screen
 
     def picture_from_crop(self, size: int, *, mirrored: bool = False) -> F64:
-        """(2, 3): continuous pixels of a crop of `size` pixels to those of the picture."""
+        """(2, 3) matrix from continuous pixels of a crop of `size` pixels to those of the picture."""
         c, s = np.cos(self.angle) * self.side / size, np.sin(self.angle) * self.side / size
         matrix = np.array([[-c if mirrored else c, -s], [-s if mirrored else s, c]])
         return np.column_stack([matrix, self.centre - matrix @ [size / 2, size / 2]])
 
     def crop(self, picture: U8, size: int, *, mirrored: bool = False) -> tuple[F32, F64]:
-        """(1, size, size, 3) values 0 to 1, and `picture_from_crop`."""
+        """(1, size, size, 3) crop with values in [0, 1], and its `picture_from_crop`."""
         matrix = self.picture_from_crop(size, mirrored=mirrored)
         pixels = resampled(picture, (size, size), inverse(matrix))
         return np.divide(pixels[None], 255, dtype=np.float32), matrix
@@ -90,7 +90,7 @@ class Square:
 
 @dataclass(frozen=True, slots=True)
 class FoundFace:
-    """A face as YuNet sees it."""
+    """A face found by YuNet."""
 
     score: float  # 0 to 1
     box: F64  # (4,) x, y, width, height, px
@@ -98,11 +98,11 @@ class FoundFace:
 
     @property
     def size(self) -> float:
-        """Side of a square as large as the box, px."""
+        """Side of a square with the box's area, px."""
         return float(np.sqrt(self.box[2] * self.box[3]))
 
     def square(self) -> Square:
-        """The square that the mesh network is given."""
+        """Input region for the mesh network."""
         eyes, mouth = self.points[:2].mean(axis=0), self.points[3:].mean(axis=0)
         line = self.points[1] - self.points[0]
         size = max(np.linalg.norm(line), 0.95 * np.linalg.norm(mouth - eyes))
@@ -110,13 +110,13 @@ class FoundFace:
 
 
 class FaceNetwork:
-    """YuNet: faces anywhere in a picture."""
+    """YuNet: finds faces anywhere in a picture."""
 
     def __init__(self) -> None:
         self._session = load_network("yunet.onnx")
 
     def find(self, picture: U8, *, longest_px: int, score_min: float) -> list[FoundFace]:
-        """Faces in an (h, w, 3) RGB picture that is looked at `longest_px` wide or high, surest first."""
+        """Faces in an (h, w, 3) RGB picture, reduced to at most `longest_px` on its longer side, best score first."""
         height, width = picture.shape[:2]
         scale = min(1.0, longest_px / max(height, width))
         small = picture
@@ -126,13 +126,13 @@ class FaceNetwork:
         rows, columns = small.shape[:2]
         padded = np.zeros((1, 3, -(-rows // 32) * 32, -(-columns // 32) * 32), np.float32)
         padded[0, :, :rows, :columns] = small[:, :, ::-1].transpose(2, 0, 1)
-        found = self._decoded(self._session.run(None, {"input": padded}), padded.shape[3], score_min)
+        faces = self._decoded(self._session.run(None, {"input": padded}), padded.shape[3], score_min)
         ratio = np.array([width / columns, height / rows])
-        return [FoundFace(one.score, one.box * np.tile(ratio, 2), (one.points + 0.5) * ratio) for one in found]
+        return [FoundFace(face.score, face.box * np.tile(ratio, 2), (face.points + 0.5) * ratio) for face in faces]
 
     @staticmethod
     def _decoded(outputs: list[F32], width: int, score_min: float) -> list[FoundFace]:
-        """The grids' cells that hold a face; of those that overlap, the surest."""
+        """Decode the grids' cells with a face; among overlapping ones keep the best score."""
         faces = []
         for level, stride in enumerate(STRIDES):
             classes, objects, boxes, points = (outputs[kind * len(STRIDES) + level][0] for kind in range(4))
@@ -149,7 +149,7 @@ class FaceNetwork:
 
 
 class MeshNetwork:
-    """468 points of a face that lies in a square of the picture. Numbers of points are MediaPipe's."""
+    """Finds 468 points of the face in a square of the picture, numbered as in MediaPipe."""
 
     SIZE = 192
 
@@ -157,7 +157,7 @@ class MeshNetwork:
         self._session = load_network("face_mesh.onnx")
 
     def points(self, picture: U8, square: Square) -> tuple[F64, float]:
-        """(468, 3) px: x, y, and z as far as x is long, away from the camera; and how surely this is a face."""
+        """(468, 3) x, y and z in px, z away from the camera; and the probability that this is a face."""
         crop, matrix = square.crop(picture, self.SIZE)
         mesh, presence = self._session.run(None, {"input_1": crop})
         points = mesh.reshape(468, 3).astype(np.float64)
@@ -166,7 +166,7 @@ class MeshNetwork:
 
 
 class IrisNetwork:
-    """The iris in a square around an eye: trained for the eye on a picture's left, the other is mirrored."""
+    """Finds the iris in a square around an eye. Trained on the eye on a picture's left; the other one is mirrored."""
 
     SIZE = 64
 
@@ -174,7 +174,7 @@ class IrisNetwork:
         self._session = load_network("iris.onnx")
 
     def points(self, picture: U8, square: Square, *, is_left: bool) -> tuple[F64, F64]:
-        """(5, 2) px: the iris' centre and four places on its edge; (16, 2) the lids' edges, lower one first."""
+        """(5, 2) px: the iris's centre and four points on its edge; (16, 2) px: the edges of the lids, lower first."""
         crop, matrix = square.crop(picture, self.SIZE, mirrored=is_left)
         names = ["output_iris", "output_eyes_contours_and_brows"]
         iris, lids = self._session.run(names, {"input_1": crop})

@@ -1,6 +1,6 @@
-"""Reasons why two points cannot be a viewer's eyes: exchanged, millimetres, behind the display.
+"""Reasons why two points cannot be a viewer's eyes: exchanged, in millimetres, behind the display.
 
-Pure of time and of clocks; eyes are in frame `stack` (+x out of the screen, +y the viewer's right, +z up), metres.
+Uses no clock. Eyes are in frame `stack` (+x out of the screen, +y the viewer's right, +z up), metres.
 """
 
 from __future__ import annotations
@@ -20,28 +20,28 @@ BEHIND = "not in front of the panels"
 TOO_DISTANT = "too distant for a viewer"
 EXCHANGED = "left and right exchanged"
 
-IPD_MIN_M, IPD_MAX_M = 0.050, 0.078  # how far apart a person's eyes are
+IPD_MIN_M, IPD_MAX_M = 0.050, 0.078  # a person's eye separation
 WINDOW = 30  # samples: a second of a common depth camera
 SAMPLES_MIN = 10  # before any reason is reported
-TELL_SHARE = 0.5  # of the window, for one reason
-UNIT_SLACK = 1.25  # a separation of 40 to 94 units is one in millimetres: people's is 50 to 75 mm
+WARNING_SHARE = 0.5  # of the window, refused for one reason, that raises a warning
+UNIT_SLACK = 1.25  # a separation of 40 to 98 must be in millimetres
 DISTANT_M = 20.0  # from the display: no sensor sees a face from there
-UPSIDE_DOWN_COSINE = -0.5  # a head rolled by more than 120 degrees is an exchange of its eyes
+UPSIDE_DOWN_COSINE = -0.5  # a roll of more than 120 degrees means exchanged eyes
 
 MISTAKES = (NOT_NEWER, NOT_A_NUMBER, MILLIMETRES, TOO_CLOSE, TOO_FAR_APART, BEHIND, TOO_DISTANT, EXCHANGED)
 _HINTS = {
-    NOT_NEWER: "the driver must say when each was captured",
+    NOT_NEWER: "the driver must report each sample's capture time",
     MILLIMETRES: "the driver must deliver metres",
-    EXCHANGED: "`left` is the viewer's own left; or the calibration is of a mirrored picture",
-    BEHIND: "calibrate again, or the calibration is another sensor's",
-    TOO_DISTANT: "calibrate again, or the calibration is another sensor's",
+    EXCHANGED: "`left` must be the viewer's own left, and the camera's picture must not be mirrored",
+    BEHIND: "calibrate again; the calibration may be for another sensor",
+    TOO_DISTANT: "calibrate again; the calibration may be for another sensor",
 }
 
 
 def reason_against(eyes_m: F64, *, in_front_m: float = 0.0) -> str:
-    """Why (2, 3) points can't be a viewer's eyes; empty: they can. in_front_m: least x of an eye.
+    """Reason why (2, 3) points can't be a viewer's eyes; empty if they can. in_front_m: minimum x of an eye.
 
-    An exchange shows in the line from left to right: across the line of sight, level, it points to the viewer's right.
+    Eyes count as exchanged if the line from left to right points to the viewer's left.
     """
     (lx, ly, lz), (rx, ry, rz) = eyes_m.tolist()
     if not all(map(math.isfinite, (lx, ly, lz, rx, ry, rz))):
@@ -56,26 +56,26 @@ def reason_against(eyes_m: F64, *, in_front_m: float = 0.0) -> str:
         return TOO_DISTANT
     if min(lx, rx) <= in_front_m:
         return BEHIND
-    # Up x the direction to the eyes is the viewer's right: (-my, mx, 0), for a viewer who looks at the display.
+    # For a viewer who faces the display, right is up × the direction to the eyes: (-my, mx, 0).
     towards_right = (-my * (rx - lx) + mx * (ry - ly)) / math.hypot(mx, my) / apart_m
     return EXCHANGED if towards_right < UPSIDE_DOWN_COSINE else ""
 
 
 class RefusalWatch:
-    """Counts refused samples by reason, and warns once where one reason applies to most samples."""
+    """Counts refused samples by reason; warns once if one reason applies to most samples."""
 
     def __init__(self) -> None:
         self._last: deque[str] = deque(maxlen=WINDOW)
         self._counts: Counter[str] = Counter()
-        self.warning = ""  # what is wrong at present; empty: nothing
+        self.warning = ""  # current problem; empty: none
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Refused samples, by reason; each once."""
+        """Number of refused samples by reason."""
         return self._counts
 
     def update(self, reason: str) -> str:
-        """Count a sample's refusal (empty: accepted). Answers a line to log when the state changes."""
+        """Count a sample's refusal (empty: accepted). Returns a line to log when the warning changes."""
         self._last.append(reason if reason in MISTAKES else "")
         if reason:
             self._counts[reason] += 1
@@ -83,11 +83,11 @@ class RefusalWatch:
             return ""
         commonest, count = Counter(filter(None, self._last)).most_common(1)[0] if any(self._last) else ("", 0)
         before = self.warning
-        if count > TELL_SHARE * len(self._last):
+        if count > WARNING_SHARE * len(self._last):
             hint = f": {_HINTS[commonest]}" if commonest in _HINTS else ""
             self.warning = f"sensor: the eyes are {commonest}{hint}"
             return self.warning if self.warning != before else ""
-        if before and count < TELL_SHARE / 2 * len(self._last):
+        if before and count < WARNING_SHARE / 2 * len(self._last):
             self.warning = ""
             return "sensor: the eyes are plausible again"
         return ""

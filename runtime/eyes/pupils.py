@@ -1,4 +1,4 @@
-"""One viewer's pupils in pictures: found, followed, and kept apart from other people's."""
+"""Find and follow one viewer's pupils in pictures, ignoring other people's."""
 
 from __future__ import annotations
 
@@ -17,38 +17,38 @@ Seen = Literal["found", "followed", "filled in"]
 Side = Literal["", "left", "right"]
 SIDES: tuple[Side, Side] = ("left", "right")
 
-LEVELS_PX = (320, 640)  # longer side of the picture that is searched; the finer one where the first shows nobody
-SCORE_MIN = 0.8  # of a face found: in the dark and 1.5 m away people come to 0.85, most dogs to less
-PRESENCE_FOUND, PRESENCE_FOLLOWED = 0.9, 0.5  # of a face in the mesh's crop
-CANDIDATES_MAX = 4  # faces that are looked at to find the viewer among them
-FARTHEST_OUT = 0.7  # of its size a face at the picture's edge is worth less when a viewer is chosen
+LEVELS_PX = (320, 640)  # longer side of the picture searched; the finer one if the first shows no face
+SCORE_MIN = 0.8  # of a face found: people in the dark 1.5 m away score 0.85, most dogs less than this
+PRESENCE_FOUND, PRESENCE_FOLLOWED = 0.9, 0.5  # minimum probability of a face in the mesh's crop
+CANDIDATES_MAX = 4  # faces examined when looking for the viewer
+FARTHEST_OUT = 0.7  # relative penalty of a face in the picture's corner when a viewer is chosen
 CORNERS = ((362, 263), (33, 133))  # of the left and the right eye, in the mesh
-EYE_SQUARE = 2.7  # side of what the iris network looks at, in widths of the eye: the surest of 1.8 to 3.1
-FACE_SQUARE = 1.5  # side of what the mesh looks at, in sizes of the face
-MOVED_FAR = 0.35  # eye distances from one picture to the next: the mesh then looks again where the face is
+EYE_SQUARE = 2.7  # side of the iris network's input, in widths of the eye: the most accurate of 1.8 to 3.1
+FACE_SQUARE = 1.5  # side of the mesh network's input, in sizes of the face
+MOVED_FAR = 0.35  # eye distances between pictures beyond which the mesh network runs again at the new position
 
-# An iris measures 11.7 mm, eyes are 50 to 75 mm apart: a dog's or a monkey's do not look so.
-IRIS_RANGE = (0.12, 0.33)  # diameter in eye distances; a turned head's are nearer to each other
+# An iris measures 11.7 mm and eyes are 50 to 75 mm apart, which excludes dogs and monkeys.
+IRIS_RANGE = (0.12, 0.33)  # diameter in eye distances; turning the head shortens the distance
 IRIS_RATIO_MAX = 1.4  # of the larger to the smaller one
-# The upper lid hides a part of the iris, and the network answers with the middle of what is left: too low, by this
-# share of the eye distance (0.6 mm), whatever the camera and its distance. Fitted to all 51 faces that are measured;
-# fitted to random halves of them it leaves the other half 0.61 to 0.67 mm of error up to 1 m.
+# The upper lid hides part of the iris and the network returns the centre of the visible rest: too low by this share of
+# the eye distance (0.6 mm), independent of camera and distance. Fitted to all 51 faces measured; fitted to random
+# halves of them, the error on the other half is 0.61 to 0.67 mm up to 1 m.
 TOO_LOW = 0.0093
-OPEN_MIN = 0.12  # height of an open eye in its widths: below, a blink hides the iris
+OPEN_MIN = 0.12  # height of an open eye over its width; in a blink it is less, and the iris is hidden
 
-PULL = 0.1  # fraction of the way to the networks' estimate by which a pupil is corrected in each picture
-# Further from it than the first (eye distances) the eyes turned: they are followed by as much of the way at the second.
+PULL = 0.1  # share of the distance to the networks' estimate that each picture corrects
+# Gaze changes: the gain rises by GAZE_PULL as the distance goes from GAZE_FROM to GAZE_FULL eye distances.
 GAZE_FROM, GAZE_FULL, GAZE_PULL = 0.02, 0.06, 0.6
-# Eyes turn together: where one alone seems to, by more eye distances, it is hidden (a hand, hair), and the network
-# makes it up. It is then carried along with the face, for so many pictures at most.
+# Eyes turn together. If one seems to turn alone by more than this (eye distances) it is hidden by a hand or hair, and
+# the network invents it; it then moves with the face for at most CARRIED_MAX pictures.
 APART_MAX, CARRIED_MAX = 0.06, 30
 
-SAME_LOOKS = 0.75  # correlation of two looks at one person, at least; 19 of 20 other people come to less
-SAME_LOOKS_FOLLOWED = 0.6  # the same, of a face that is where the viewer's was a moment ago
-LOOKS_PULL = 0.05  # how fast the memory of a viewer's looks changes with light and turn
+SAME_LOOKS = 0.75  # minimum correlation of two looks at one person; 19 of 20 other people score less
+SAME_LOOKS_FOLLOWED = 0.6  # the minimum for a face where the viewer's was a moment ago
+LOOKS_PULL = 0.05  # rate at which the stored looks adapt to light and turns
 
-# Standard deviation of a pupil along an axis: what people's eyes differ from what the networks learnt, in eye
-# distances, and what a picture's pixels allow, px; per picture, beside that, the share of a surprise that stays.
+# Standard deviation of a pupil along an axis: people's spread about the networks' mean (eye distances),
+# pixel noise (px), and the share of a surprise in one picture that remains.
 SIGMA_PERSON, SIGMA_PICTURE_PX, SIGMA_SURPRISE = 0.0088, 0.14, 0.5
 
 
@@ -61,8 +61,8 @@ class Pupils:
     mesh_px: F64  # (468, 3) the face; z in the same pixels, away from the camera
     iris_px: float  # mean diameter of the irises
     seen: Seen
-    hidden: Side  # the eye that was filled in from the rest of the face
-    certainty: float  # that this is a face, 0 to 1
+    hidden: Side  # the eye filled in from the rest of the face
+    certainty: float  # probability that this is a face
 
     @property
     def eye_distance_px(self) -> float:
@@ -77,7 +77,7 @@ class _Look:
     presence: float
     eyes: F64  # (2, 2) px
     iris: F64  # (2,) diameters, px
-    openness: F64  # (2,) heights of the eyes in their widths
+    openness: F64  # (2,) heights of the eyes over their widths
     looks: F64  # (468,) grey values at the mesh's points, of mean 0 and length 1
 
     @property
@@ -85,36 +85,36 @@ class _Look:
         return float(np.linalg.norm(self.eyes[0] - self.eyes[1]))
 
     def are_human(self) -> bool:
-        """Whether the irises are as large as a person's, and both."""
+        """Return True if both irises have the size of a person's."""
         sizes = self.iris / self.eye_distance
         in_range = IRIS_RANGE[0] < sizes.min() and sizes.max() < IRIS_RANGE[1]
         return bool(in_range and sizes.max() < IRIS_RATIO_MAX * sizes.min())
 
 
 class PupilFinder:
-    """Finds and keeps one viewer. `reason`: why the last picture gave nothing; `choice`: who it is."""
+    """Finds and follows one viewer. `reason`: why the last picture gave no pupils; `choice`: how they were chosen."""
 
     def __init__(self, *, lock_ns: int = 0) -> None:
-        """lock_ns: a viewer not seen for this long makes way for another."""
+        """lock_ns: a viewer not seen for longer may be replaced by another."""
         self._faces, self._meshes, self._irises = FaceNetwork(), MeshNetwork(), IrisNetwork()
         self._flow, self._lock_ns = FaceFlow(), lock_ns
         self.viewer = 0  # counts up with every new one
         self.forget()
 
     def forget(self) -> None:
-        """The next picture is the first."""
-        self._looks: F64 | None = None  # of the viewer, whether followed or not
-        self._last: _Look | None = None  # of the picture before, where the viewer was in it
-        self._eyes = np.zeros((2, 2))  # px, as answered for the picture before
-        self._steps = self._carried = 0  # pictures that went into them; since when one of them was not seen
+        """Reset: treat the next picture as the first."""
+        self._looks: F64 | None = None  # of the viewer, also while unseen
+        self._last: _Look | None = None  # at the viewer in the previous picture
+        self._eyes = np.zeros((2, 2))  # px, returned for the previous picture
+        self._steps = self._carried = 0  # pictures averaged in `_eyes`; consecutive ones with a hidden eye
         self._seen_ns = 0
-        self.reason, self.choice = "", "nobody yet"
+        self.reason, self.choice = "", "no viewer yet"
 
     def find(self, picture: U8, *, time_ns: int = 0) -> Pupils | None:
         """The viewer's pupils in an (h, w, 3) RGB picture, or None with the reason in `reason`."""
         if self._looks is not None and time_ns - self._seen_ns > self._lock_ns:
             self.forget()
-            self.choice = "nobody: the viewer left"
+            self.choice = "none: the viewer left"
         look, seen = self._follow(picture), "followed"
         if look is None:
             look, seen = self._search(picture), "found"
@@ -126,7 +126,7 @@ class PupilFinder:
         return self._steadied(picture, look, "followed" if seen == "followed" else "found")
 
     def _follow(self, picture: U8) -> _Look | None:
-        """The viewer, where the face was in the picture before."""
+        """Look for the viewer at the previous picture's position."""
         if self._last is None or self._looks is None:
             return None
         last = self._last
@@ -139,14 +139,14 @@ class PupilFinder:
         return look if look.looks @ self._looks > SAME_LOOKS_FOLLOWED else None
 
     def _search(self, picture: U8) -> _Look | None:
-        """The viewer anywhere in the picture, or, where nobody is remembered, a new one."""
-        found: list[FoundFace] = []
+        """Look for the viewer anywhere in the picture, or choose a new one if none is remembered."""
+        faces: list[FoundFace] = []
         for longest_px in LEVELS_PX:
-            found = found or self._faces.find(picture, longest_px=longest_px, score_min=SCORE_MIN)
+            faces = faces or self._faces.find(picture, longest_px=longest_px, score_min=SCORE_MIN)
         self.reason = "no face"
         middle = np.array(picture.shape[1::-1]) / 2
-        found.sort(key=lambda face: -_worth(face, middle))
-        for face in found[:CANDIDATES_MAX]:
+        faces.sort(key=lambda face: -_worth(face, middle))
+        for face in faces[:CANDIDATES_MAX]:
             mesh, presence = self._meshes.points(picture, face.square())
             if presence > PRESENCE_FOUND:
                 mesh, presence = self._meshes.points(picture, _square_of(mesh))
@@ -156,7 +156,7 @@ class PupilFinder:
             if not look.are_human():
                 self.reason = "a face without a person's eyes"
             elif self._looks is None:
-                self.choice = f"locked on the foremost of {len(found)} face(s)"
+                self.choice = f"locked on the foremost of {len(faces)} face(s)"
                 self.viewer += 1
                 return look
             elif look.looks @ self._looks > SAME_LOOKS:
@@ -180,7 +180,7 @@ class PupilFinder:
         return _Look(mesh, presence, eyes, iris, openness, _looks(picture, mesh, float(np.linalg.norm(line))))
 
     def _steadied(self, picture: U8, look: _Look, seen: Seen) -> Pupils:
-        """The networks' pupils, carried along from the picture before where there is one."""
+        """Steady the networks' pupils by moving those of the previous picture, if any, with the face."""
         eyes, surprise, hidden = look.eyes.copy(), np.zeros(2), np.zeros(2, bool)
         last = self._last if self._steps else None
         if last is not None:
@@ -216,13 +216,13 @@ class PupilFinder:
 
 
 def _worth(face: FoundFace, middle: F64) -> float:
-    """What a face counts as the viewer's: its size, less where it is far from the picture's middle."""
+    """Score of a face as the viewer's: its size, reduced towards the picture's edges."""
     away = np.abs(face.box[:2] + face.box[2:] / 2 - middle) / middle
     return face.size * (1 - FARTHEST_OUT * float(np.linalg.norm(away) / np.sqrt(2)))
 
 
 def _square_of(mesh: F64) -> Square:
-    """The square that the mesh network looks at, from a mesh."""
+    """Input region for the mesh network, from a mesh."""
     line = mesh[CORNERS[0][1], :2] - mesh[CORNERS[1][0], :2]
     angle = float(np.arctan2(line[1], line[0]))
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -232,7 +232,7 @@ def _square_of(mesh: F64) -> Square:
 
 
 def _looks(picture: U8, mesh: F64, eye_distance: float) -> F64:
-    """(468,) grey values at the mesh's points, of mean 0 and length 1: one person's look much alike in every light."""
+    """(468,) grey values at the mesh's points, mean 0 and length 1: similar for one person in any light."""
     margin = max(2, round(eye_distance / 4))
     height, width = picture.shape[:2]
     x0, y0 = np.clip(mesh[:, :2].min(axis=0).astype(int) - margin, 0, [width - 1, height - 1])
@@ -248,10 +248,10 @@ def _looks(picture: U8, mesh: F64, eye_distance: float) -> F64:
 
 
 def _similarity(last: F64, mesh: F64) -> F64:
-    """(2, 3): how the eyes' corners moved."""
+    """(2, 3) similarity that moves the corners of the eyes."""
     corners = np.ravel(CORNERS)
-    found, _ = cv2.estimateAffinePartial2D(last[corners, :2], mesh[corners, :2], method=cv2.LMEDS)
-    return np.eye(2, 3) if found is None else np.asarray(found, np.float64)
+    matrix, _ = cv2.estimateAffinePartial2D(last[corners, :2], mesh[corners, :2], method=cv2.LMEDS)
+    return np.eye(2, 3) if matrix is None else np.asarray(matrix, np.float64)
 
 
 @cache
@@ -260,7 +260,7 @@ def _still_finder() -> PupilFinder:
 
 
 def find_eyes(picture: U8) -> Pupils | None:
-    """The foremost viewer's pupils in an (h, w, 3) uint8 RGB picture; None where there is nobody."""
+    """The foremost viewer's pupils in an (h, w, 3) uint8 RGB picture; None if there is no viewer."""
     finder = _still_finder()
     finder.forget()
     return finder.find(picture)

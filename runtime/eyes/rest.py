@@ -1,7 +1,7 @@
 """Detection of a head at rest, from the accepted samples.
 
-What the tracker predicts jitters by several times the sensor's noise, since the noise of the speed is multiplied by
-the horizon. A head at rest has no speed: the median of its samples is where it is, and the picture need not follow.
+The tracker's predictions jitter by several times the sensor's noise, because the horizon multiplies the noise of the
+speed. A head at rest has no speed: the median of its samples is its position, and the picture can stand still.
 """
 
 from __future__ import annotations
@@ -11,39 +11,39 @@ import numpy as np
 from runtime.clock import NS_PER_S
 from runtime.records import F64
 
-REST_NS = NS_PER_S  # a head that has stood for so long rests
-LOST_NS = NS_PER_S  # after a longer gap nothing is known
-DRIFT_NS = 3 * NS_PER_S  # drift is measured by the median of so much
-EVERY = 8  # samples, noise and drift are looked at: neither changes quickly
-FEWEST = 8  # samples that anything is concluded from
+REST_NS = NS_PER_S  # a head that has not moved for this long is at rest
+LOST_NS = NS_PER_S  # a longer gap between samples resets the detector
+DRIFT_NS = 3 * NS_PER_S  # length of the median that measures drift
+EVERY = 8  # samples between measurements of noise and drift, which change slowly
+FEWEST = 8  # samples needed for any conclusion
 KEPT = 256  # samples of a resting head
-GRACE_M = 0.0005  # of every test, for sensors without noise
-NOISE_MAX_M = 0.005  # what scatters by more is no resting head's, whatever the sensor: it could never be seen to leave
-# In standard deviations of one sample; each is exceeded by white noise once in hours at 60 samples a second.
-SINGLE = 4.5  # two samples in a row, the same way off
+GRACE_M = 0.0005  # added to every threshold, for sensors without noise
+NOISE_MAX_M = 0.005  # with more noise than this no head counts as resting: a departure would go unnoticed
+# In standard deviations of one sample; white noise at 60 samples a second exceeds each once in hours.
+SINGLE = 4.5  # two consecutive samples, off in the same direction
 MEDIAN_OF_FIVE = 2.6  # of the newest five samples
 HALVES = 4.5  # of the difference of two halves' means, over the root of their length
 MAD_TO_SIGMA = 1.4826  # standard deviation of normal noise over its median absolute deviation
-MEDIAN_EFFICIENCY = 1.25  # a median is a quarter less sure than a mean
-LEVER_M = 0.15  # of a display of half a metre: root mean square of a point's distance from its middle
-NEAREST_M = 0.1  # from the display; nearer eyes count as so near
+MEDIAN_EFFICIENCY = 1.25  # standard deviation of a median over that of a mean
+LEVER_M = 0.15  # RMS distance of a point from the middle, for a display of half a metre
+NEAREST_M = 0.1  # nearest distance from the display; smaller ones are raised to it
 
 
 class RestWatch:
     """Detects a resting head and its position from accepted samples. Single thread, no clock."""
 
     def __init__(self, *, max_drift_m: float) -> None:
-        """max_drift_m: drift of a resting head, beyond the noise, that updates its position."""
+        """max_drift_m: drift beyond the noise that updates a resting head's position."""
         self._max_drift_m = max_drift_m
         self._times = np.zeros(2 * KEPT, np.int64)
         self._eyes = np.zeros((2 * KEPT, 2, 3))
         self._count = 0
-        self.place: F64 | None = None  # (2, 3) the resting eyes, the same array as long as they rest; None: they move
+        self.place: F64 | None = None  # (2, 3) the resting eyes, one array per rest; None: they move
         self.noise_m = np.zeros(6)  # standard deviation of one sample, as `_shifts` measures it
-        self.sigma_m = 0.0  # how sure `place` is: standard deviation of an axis, with the drift that it may have made
+        self.sigma_m = 0.0  # standard deviation of `place` along an axis, undetected drift included
 
     def update(self, eyes_m: F64, *, capture_ns: int) -> None:
-        """One sample (2, 3), frame `stack`."""
+        """Add one sample (2, 3), frame `stack`."""
         if self._count and not 0 < capture_ns - self._times[self._count - 1] < LOST_NS:
             self.forget()
         self._append(eyes_m, capture_ns)
@@ -58,14 +58,14 @@ class RestWatch:
             if self._stands():
                 self._settle(capture_ns - REST_NS)
         elif self._left(self.place):
-            # Samples from before the motion do not help to find its end.
+            # Samples from before the motion don't help to detect its end.
             self._keep_last(2)
             self.place = None
         elif slow_checks and self._drifted(self.place):
             self._settle(capture_ns - DRIFT_NS)
 
     def forget(self) -> None:
-        """The face was lost, or the clock jumped."""
+        """Reset after a lost face or a clock jump."""
         self._count, self.place = 0, None
 
     def _append(self, eyes_m: F64, capture_ns: int) -> None:
@@ -81,7 +81,7 @@ class RestWatch:
         self._count = count
 
     def _since(self, time_ns: int) -> F64:
-        """(n, 2, 3) the samples from then on; more, where a slow machine has seen but a few since."""
+        """(n, 2, 3) samples from `time_ns` on, and earlier ones if there are fewer than `FEWEST`."""
         first = min(int(np.searchsorted(self._times[: self._count], time_ns)), self._count - FEWEST)
         return self._eyes[first : self._count]
 
@@ -89,13 +89,13 @@ class RestWatch:
         recent = self._since(since_ns)
         self.place = np.median(recent, axis=0)
         noise_m = float(self.noise_m.max())
-        unsure_m = MEDIAN_EFFICIENCY * noise_m / len(recent) ** 0.5
-        # What drifts is renewed beyond this (`_drifted`), even below it.
+        median_sigma_m = MEDIAN_EFFICIENCY * noise_m / len(recent) ** 0.5
+        # Drift up to this goes uncorrected (`_drifted`).
         drift_m = self._max_drift_m + 2 * MEDIAN_EFFICIENCY * noise_m * (4 / max(len(recent), FEWEST)) ** 0.5
-        self.sigma_m = float(np.hypot(unsure_m, drift_m / 2**0.5))  # it drifts one way longer than the other
+        self.sigma_m = float(np.hypot(median_sigma_m, drift_m / 2**0.5))  # drift mostly goes in one direction
 
     def _measure_noise(self) -> None:
-        """From how far each sample lies off the line between its neighbours: an even motion does not count."""
+        """Measure noise by each sample's distance from the line between its neighbours, immune to even motion."""
         first = max(0, self._count - KEPT // 2)
         times, shifts = self._times[first : self._count], _shifts(self._eyes[first : self._count], self._eyes[first])
         later = ((times[1:-1] - times[:-2]) / (times[2:] - times[:-2]))[:, None]  # neighbours may be missing
@@ -105,7 +105,7 @@ class RestWatch:
         self.noise_m = np.tile([max(right, up), max(right, up), deep], 2)
 
     def _stands(self) -> bool:
-        """The two halves of the last second agree, and so does the newest moment."""
+        """Return True if the two halves of the last second agree, and the newest samples with them."""
         now_ns = int(self._times[self._count - 1])
         if now_ns - self._times[0] < REST_NS:
             return False
@@ -113,19 +113,19 @@ class RestWatch:
         half = len(recent) // 2
         shifts = _shifts(recent, recent[-1])
         before, after = np.median(shifts[:half], axis=0), np.median(shifts[half:], axis=0)
-        unsure_m = HALVES * MEDIAN_EFFICIENCY * self.noise_m * (2 / half) ** 0.5
-        if (np.abs(after - before) > unsure_m + GRACE_M).any():
+        limit_m = HALVES * MEDIAN_EFFICIENCY * self.noise_m * (2 / half) ** 0.5 + GRACE_M
+        if (np.abs(after - before) > limit_m).any():
             return False
         return not self._left(np.median(recent, axis=0))
 
     def _left(self, place: F64) -> bool:
-        """The newest samples are further off than noise can be."""
+        """Return True if the newest samples are farther off than noise explains."""
         shifts = _shifts(self._eyes[self._count - 5 : self._count], place)
         if (np.abs(np.median(shifts, axis=0)) > MEDIAN_OF_FIVE * self.noise_m + GRACE_M).any():
             return True
         last, newest = shifts[-2:]
         reach = SINGLE * self.noise_m + GRACE_M
-        # Outliers lie anywhere: two in a row must be off the same way.
+        # Outliers are off in any direction: two consecutive samples must agree on theirs.
         together = np.minimum(last, newest) > reach
         opposite = np.maximum(last, newest) < -reach
         return bool((together | opposite).any())
@@ -136,15 +136,15 @@ class RestWatch:
             return False
         recent = self._since(now_ns - DRIFT_NS)
         shift = _shifts(np.median(recent, axis=0)[None], place)[0]
-        # The place itself is the median of a third as many.
-        unsure_m = MEDIAN_EFFICIENCY * self.noise_m * (4 / len(recent)) ** 0.5
-        return bool((np.abs(shift) > self._max_drift_m + 2 * unsure_m).any())
+        # `place` itself is the median of a third as many samples.
+        shift_sigma_m = MEDIAN_EFFICIENCY * self.noise_m * (4 / len(recent)) ** 0.5
+        return bool((np.abs(shift) > self._max_drift_m + 2 * shift_sigma_m).any())
 
 
 def _shifts(eyes_m: F64, place: F64) -> F64:
-    """(n, 6) how far samples (n, 2, 3) lie from a place (2, 3) as the display shows it, metres at the eyes.
+    """(n, 6) displacements of samples (n, 2, 3) from a place (2, 3) by their effect on the display, metres at the eyes.
 
-    Of each eye: right and up, seen from the display's middle, and what its distance does to points off the middle.
+    For each eye: right and up, seen from the display's middle, and the effect of its distance on points off the middle.
     """
     away = eyes_m - place
     distance = np.maximum(place[:, :1], NEAREST_M)

@@ -1,4 +1,4 @@
-"""The tracker: gating, filtering, history and prediction of the eyes, each estimate labelled."""
+"""The tracker: gating, filtering, history and prediction of the eyes."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from runtime.eyes.plausibility import NOT_NEWER, reason_against
 from runtime.records import F64, EyePoints, EyesEstimate, EyesLabel
 
 HISTORY = 256  # filtered samples kept: four seconds at 60 Hz
-CONFIDENCE_MIN = 0.3  # less certain samples (a blink) are not used
-CHI2_GATE = 21.1  # of three axes: one honest sample in 10 000 is refused
-CHI2_DOUBT = 11.3  # one honest sample in 100: it is taken back where the next two fit better without it
-ACCELERATION = (0.05, 0.4, 2.0)  # m/s², standard deviations: of a calm, a moving and a hasty head
-STAY_S = 1.0  # how long a head keeps being calm, moving or hasty, on average
+CONFIDENCE_MIN = 0.3  # less certain samples (a blink) are refused
+CHI2_GATE = 21.1  # of three axes: refuses one good sample in 10 000
+CHI2_DOUBT = 11.3  # 1 % gate: a sample beyond it is rolled back if the next two fit better without it
+ACCELERATION = (0.05, 0.4, 2.0)  # m/s², standard deviations for a calm, a moving and a fast head
+STAY_S = 1.0  # mean time that a head stays calm, moving or fast
 TURN_ACCELERATION = (0.03, 0.4)  # m/s², of half the line between the eyes: hardly turning, and shaking the head
-FIRST_SPEED = 0.3  # m/s, of a head that was just found
-REACH_SPEED, REACH_ACCELERATION = 2.0, 30.0  # m/s, m/s²: no head is faster, or sets off faster
-KEEP_S = 0.4  # after a longer gap nothing of a head's motion is left
-ANOTHER_AFTER_S = 0.5  # a viewer who was not seen for so long makes way for another, and after hold_s at once
-LOSS_S = 0.2  # without any sample for so long the eyes are held, not predicted
-HORIZON_S = 0.2  # never predict further ahead than this
-DECAY_S = 0.06  # time constant with which a lost head comes to rest
-REVIVE_S = 0.06  # in which the picture slides to eyes that were lost and found
-CLOCK_RESET_NS = NS_PER_S  # a capture this far in the past is a clock that was set back, not a late sample
-COMPLETED_NOISE = 2.0  # an eye that was filled in is this much less certain
+FIRST_SPEED = 0.3  # m/s, standard deviation for a head just found
+REACH_SPEED, REACH_ACCELERATION = 2.0, 30.0  # m/s, m/s²: limits of a head's motion
+KEEP_S = 0.4  # a longer gap discards a head's motion
+ANOTHER_AFTER_S = 0.5  # a viewer unseen for this long, or for hold_s if that is shorter, is replaced by another
+LOSS_S = 0.2  # after this long without a sample the eyes are held, not predicted
+HORIZON_S = 0.2  # longest prediction
+DECAY_S = 0.06  # time constant of a lost head's slowing to rest
+REVIVE_S = 0.06  # duration of the blend to eyes that were lost and found
+CLOCK_RESET_NS = NS_PER_S  # a capture this far in the past means a clock set back, not a late sample
+COMPLETED_NOISE = 2.0  # factor on the standard deviation of a pair with a filled-in eye
 NOISE_FLOOR_M = 2e-5  # smaller covariances from a driver are raised to this: no sensor measures a pupil better
-ESTABLISHED = 3  # samples of a head; one of fewer may have been a mistake
-SIGMA_AHEAD_S = 1.0  # how sure a guess is, is not predicted further ahead
-NEAREST_M = 0.1  # from the display; nearer eyes count as so near, for what their depth matters
-PANEL_M = (0.5184, 0.2916)  # width and height by default
+ESTABLISHED = 3  # samples of a head; fewer may have been a mistake
+SIGMA_AHEAD_S = 1.0  # uncertainty is not extrapolated beyond this horizon
+NEAREST_M = 0.1  # nearest distance from the display when weighing depth errors
+PANEL_M = (0.5184, 0.2916)  # default width and height
 NO_JUMP = np.zeros((2, 3))
 
 UNCERTAIN = "uncertain"
@@ -45,12 +45,12 @@ ELSEWHERE = "elsewhere than the viewer"
 
 
 class _Head(NamedTuple):
-    """One head's motion, as it is known from its newest sample."""
+    """One head's motion after its newest sample."""
 
     capture_ns: int
     middle: imm.Belief  # between the eyes, frame `stack`
     half: imm.Belief  # from the middle to the right eye
-    samples: int  # that it is known from
+    samples: int  # taken in so far
     surprise: float  # of the newest (chi²)
 
     def age_s(self, time_ns: int) -> float:
@@ -63,21 +63,21 @@ class _Head(NamedTuple):
 
 
 class _Sample(NamedTuple):
-    """A measurement that may be a person's."""
+    """A measurement that passed the plausibility checks."""
 
     capture_ns: int
     middle_m: F64  # (3,)
     half_m: F64  # (3,)
-    noise_m2: F64  # (3, 3) of the middle, and of half the line between the eyes
+    noise_m2: F64  # (3, 3) covariance of the middle, and of `half_m`
 
     def begun(self) -> _Head:
-        """A head of which nothing else is known."""
+        """Start a head from this sample alone."""
         middle = imm.started(self.middle_m, noise=self.noise_m2, speed=FIRST_SPEED, acceleration=ACCELERATION)
         half = imm.started(self.half_m, noise=self.noise_m2, speed=FIRST_SPEED / 3, acceleration=TURN_ACCELERATION)
         return _Head(self.capture_ns, middle, half, 1, 0.0)
 
     def continued(self, head: _Head) -> _Head | None:
-        """The head with this sample taken in; None where it can't be that head's."""
+        """Update a head with this sample; None if the sample can't be of that head."""
         age_s = head.age_s(self.capture_ns)
         if age_s > KEEP_S:
             return None
@@ -98,7 +98,7 @@ class _Sample(NamedTuple):
         )
 
     def is_within_reach_of(self, head: _Head) -> bool:
-        """Whether that head can have come here since it was seen."""
+        """Return True if a head can have moved here since its newest sample."""
         age_s = head.age_s(self.capture_ns)
         reach_m = min(REACH_SPEED * age_s, REACH_ACCELERATION * age_s**2 / 2)
         noise_m = math.sqrt(np.trace(self.noise_m2 + head.middle.covariance[0, :3, :3]))
@@ -111,11 +111,11 @@ class _Shown:
     """The viewer's head after a sample, and the jump that is being hidden."""
 
     head: _Head
-    jump_m: F64  # (2, 3) from here back to what was shown last, at `jump_ns`; fades from then on
+    jump_m: F64  # (2, 3) from the measured eyes back to those last shown, at `jump_ns`; decays afterwards
     jump_ns: int
 
     def eyes_m(self, ahead_s: float, time_ns: int) -> F64:
-        """(2, 3) as served for an instant, predicted `ahead_s` seconds ahead."""
+        """(2, 3) eyes shown at `time_ns`, predicted `ahead_s` seconds ahead."""
         eyes = self.head.eyes_m(ahead_s)
         if self.jump_m is not NO_JUMP:
             fraction = min(max((time_ns - self.jump_ns) / NS_PER_S / REVIVE_S, 0.0), 1.0)
@@ -124,17 +124,17 @@ class _Shown:
 
 
 class _Other(NamedTuple):
-    """A head that is elsewhere than the viewer's."""
+    """A head at another position than the viewer's."""
 
     head: _Head
-    may_be_viewer: bool  # who can have got there since they were seen
+    may_be_viewer: bool  # the viewer can have moved there
 
 
 class Tracker:
-    """One viewer's eyes. `update` takes samples as they come; `at` answers for any instant.
+    """Tracks one viewer's eyes. `update` takes samples as they arrive; `at` returns the eyes at any time.
 
-    The first person seen is the viewer, for as long as they are seen. Eyes that return after a loss take over from
-    the last served position and are blended to the measured one; between two people nothing is blended.
+    The first person seen is the viewer for as long as they are seen. When eyes return after a loss, the output moves
+    smoothly from the last position shown to the measured one; a change to another person is abrupt.
     """
 
     def __init__(
@@ -144,21 +144,21 @@ class Tracker:
         panel_m: tuple[float, float] = PANEL_M,
         in_front_m: float = 0.0,
     ) -> None:
-        """panel_m: width and height, by which an error in depth counts; in_front_m: no viewer's x is less."""
+        """panel_m: width and height, which weigh an error in depth; in_front_m: minimum x of a viewer's eye."""
         self.settings = settings or TrackerSettings()
         self._panel_m, self._in_front_m = panel_m, in_front_m
         self._history: deque[_Shown] = deque(maxlen=HISTORY)
         self._other: _Other | None = None
         self._lost_ns: int | None = None
         self._newest_ns = -1
-        self._asked_ns = 0  # the latest instant that `at` answered for: what was shown last
+        self._asked_ns = 0  # latest time that `at` was called for: that of the last picture shown
 
     def update(self, points: EyePoints | None, *, capture_ns: int) -> str:
-        """Take in a sample in the `stack` frame; None: the sensor looked and saw no face.
+        """Take in a sample in the `stack` frame; None: the sensor saw no face.
 
-        Answers why the sample is refused, or an empty text: it is old, uncertain (a blink), can't be a person's, or
-        lies elsewhere than the viewer. Where the viewer can just have got to, the second sample in a row is believed;
-        another person's only once the viewer is gone.
+        Returns the reason for a refusal, else an empty text. Samples are refused if they are old, uncertain (a blink),
+        implausible for a person, or away from the viewer. The second consecutive sample at a position that the viewer
+        can have reached is accepted; another person's only once the viewer is gone.
         """
         if capture_ns <= self._newest_ns:
             if self._newest_ns - capture_ns < CLOCK_RESET_NS:
@@ -182,7 +182,7 @@ class Tracker:
         self._newest_ns, self._asked_ns = -1, 0
 
     def _noise(self, points: EyePoints) -> F64:
-        """(3, 3) covariance of the middle between the eyes, m²: the driver's, held to what can be, or the settings'."""
+        """(3, 3) covariance of the middle between the eyes, m²: the driver's, with a floor, or the settings'."""
         noise: F64 = self.settings.noise_m**2 / 2 * np.eye(3)
         if points.covariance_m2 is not None and np.isfinite(points.covariance_m2).all():
             variances, axes = np.linalg.eigh((points.covariance_m2 + points.covariance_m2.T) / 2)
@@ -211,7 +211,7 @@ class Tracker:
         if other.may_be_viewer and (self._lost_ns is not None or is_second):
             self._follow(other.head, is_return=True)
         elif is_second and last.head.surprise > CHI2_DOUBT and (head := sample.continued(self._history[-2].head)):
-            self._history.pop()  # it was a mistake: two fit better without it
+            self._history.pop()  # a mistake: the last two samples fit better without it
             self._follow(head, is_return=True)
         elif age_s > min(ANOTHER_AFTER_S, self.settings.hold_s) or (is_second and last.head.samples < ESTABLISHED):
             self._history.clear()
@@ -222,7 +222,7 @@ class Tracker:
         return ""
 
     def _follow(self, head: _Head, *, is_return: bool = False) -> None:
-        """From now on this is the viewer's; is_return: after a loss, or where nobody expected them."""
+        """Make `head` the viewer's. is_return: after a loss or a jump, so blend from the last position shown."""
         jump_m, jump_ns = (self._history[-1].jump_m, self._history[-1].jump_ns) if self._history else (NO_JUMP, 0)
         if is_return:
             jump_ns = max(self._asked_ns, head.capture_ns)
@@ -234,18 +234,18 @@ class Tracker:
             self._other = None
 
     def ahead(self, time_ns: int) -> EyesEstimate:
-        """As `at`, for an instant that is not (yet) shown: what `at` answers later does not depend on it."""
+        """Estimate as `at` does, for a time that is not (yet) shown, without affecting later calls of `at`."""
         asked_ns = self._asked_ns
         estimate = self.at(time_ns)
         self._asked_ns = asked_ns
         return estimate
 
     def at(self, time_ns: int) -> EyesEstimate:
-        """Where the eyes are at an instant of the samples' clock that is shown.
+        """Eyes at a display time, on the samples' clock.
 
-        exact: a sample was taken then; interpolated: between two samples; predicted: after the newest, at
-        most `HORIZON_S` ahead; held: the face is lost, the eyes drift to rest; none: never seen, lost
-        for longer than `hold_s`, or forgotten.
+        Labels: exact, a sample was taken then; interpolated, between two samples; predicted, after the newest by at
+        most `HORIZON_S`; held, the face is lost and the eyes slow to rest; none, never seen, lost for longer than
+        `hold_s`, or forgotten.
         """
         if not self._history or time_ns < self._history[0].head.capture_ns:
             return EyesEstimate(time_ns, 0, None, "none")
@@ -277,7 +277,7 @@ class Tracker:
         return self._estimate(time_ns, after.head, eyes_m, "interpolated")
 
     def _estimate(self, time_ns: int, head: _Head, eyes_m: F64, label: EyesLabel) -> EyesEstimate:
-        """How far off the served eyes are, by what the head can have done since its newest sample."""
+        """Add the standard deviation of `eyes_m`, from how the head can have moved since its newest sample."""
         age_s = min(max(head.age_s(time_ns), 0.0), SIGMA_AHEAD_S)
         middle_m, half_m = (eyes_m[0] + eyes_m[1]) / 2, (eyes_m[1] - eyes_m[0]) / 2
         if label in ("exact", "interpolated"):
@@ -289,10 +289,10 @@ class Tracker:
 
 
 def sideways_sigma_m(error_m2: F64, eye_m: F64, *, panel_m: tuple[float, float]) -> float:
-    """The sideways standard deviation that does as much harm as an eye's (3, 3) covariance.
+    """Sideways standard deviation with the same effect on the picture as an eye's (3, 3) covariance.
 
-    An eye that is d nearer than it is believed sees a point of the display through the other panels as one that is
-    d·u/x farther from the point's foot, u: the distance from there, x: the eye's. The mean square over the display.
+    For a point of the display at distance u from the foot of the eye's perpendicular, an eye at distance x that is d
+    nearer than estimated acts like one displaced sideways by d·u/x; averaged as a mean square over the display.
     """
     x, y, z = max(float(eye_m[0]), NEAREST_M), float(eye_m[1]), float(eye_m[2])
     lever2 = (y * y + z * z + (panel_m[0] ** 2 + panel_m[1] ** 2) / 12) / (x * x)

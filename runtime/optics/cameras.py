@@ -1,4 +1,4 @@
-"""Pictures of cameras at the eyes' places, resampled as if they looked at the stack's origin."""
+"""Camera pictures taken at the eyes' positions, resampled as if the cameras looked at the stack's origin."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import stack_from_eye
 from runtime.records import F32, F64, U8
 
-BESIDE_MOST = 1 / 3  # of a picture, beside the panels, that passes without a word
+OUTSIDE_MOST = 1 / 3  # share of a picture outside the panels; more raises a doubt
 LEAST_PX = 16  # side of a resampled picture
-EXACT = 1e-6  # of a focal length: cameras that differ by less are the same
-DIGITS = 9  # of metres and degrees: what a camera was made from is found again
+EXACT = 1e-6  # of the focal length: cameras that differ by less are equal
+DIGITS = 9  # of metres and degrees: recovers the values that a camera matrix was built from
 NAMES = ("left", "right")
 Picture = U8 | F32  # (h, w, 3)
 
 
-def as_cameras(given: Any) -> tuple[F64, F64]:
+def as_cameras(matrices: Any) -> tuple[F64, F64]:
     """(2, 3, 4) right-handed projections from `stack` to pixels, and the (2, 3) camera positions.
 
-    Raises ValueError.
+    Raises ValueError for anything but two invertible 3x4 matrices.
     """
     try:
-        cameras = np.asarray(given, np.float64)
+        cameras = np.asarray(matrices, np.float64)
     except (TypeError, ValueError):
         cameras = np.empty(0)
     if cameras.shape != (2, 3, 4) or not np.isfinite(cameras).all():
         raise ValueError("must be two 3x4 matrices, left and right, from metres of the stack's frame to pixels")
     turns = np.linalg.det(cameras[:, :, :3])
     if not (np.abs(turns) > 0).all():
-        raise ValueError("are no cameras at a place: their left 3x3 parts have no inverse")
-    cameras = cameras * np.sign(turns)[:, None, None]  # the third coordinate is positive before the camera
+        raise ValueError("are not cameras with a position: their left 3x3 parts have no inverse")
+    cameras = cameras * np.sign(turns)[:, None, None]  # positive third coordinate in front of the camera
     places_m = -np.linalg.solve(cameras[:, :, :3], cameras[:, :, 3:])[..., 0]
     return cameras, np.asarray(np.round(places_m, DIGITS), np.float64)
 
@@ -45,21 +45,21 @@ def as_cameras(given: Any) -> tuple[F64, F64]:
 def looking_at_origin(
     pictures: Sequence[Picture], cameras: F64, eyes_m: F64, stack: PanelStack
 ) -> tuple[list[Picture], float]:
-    """Resample cameras' (2, 3, 4) pictures as if their eyes (2, 3) looked at the stack's origin.
+    """Resample the pictures of `cameras` (2, 3, 4) as if the eyes (2, 3) looked at the stack's origin.
 
-    Answers the (h, w, 3) pictures and their horizontal field of view in degrees.
-
-    They are as wide and as high as the panels are seen, where both given pictures show that; sampled cubically, unless
-    the cameras look at the origin already. Raises ValueError where a picture does not show the stack's middle.
+    Returns the (h, w, 3) pictures and their horizontal field of view in degrees. They extend over the panels as far as
+    both originals do. Sampling is bicubic; pictures that look at the origin already are returned unchanged. Raises
+    ValueError if a picture does not show the stack's middle.
     """
     height, width = pictures[0].shape[:2]
     turns = [np.diag([1.0, -1.0, -1.0]) @ stack_from_eye(eye_m)[:3, :3].T for eye_m in eyes_m]
-    # A picture's pixel from a direction (x, y, 1) of the eye that looks at the origin.
-    given = [camera[:, :3] @ turn.T for camera, turn in zip(cameras, turns, strict=True)]
-    given = [matrix / matrix[2, 2] for matrix in given]
-    middle = given[0][0, 0] * np.eye(3) + [[0, 0, width / 2], [0, 0, height / 2], [0, 0, 1 - given[0][0, 0]]]
-    if all(np.abs(matrix - middle).max() < EXACT * width for matrix in given):
-        return list(pictures), round(2 * math.degrees(math.atan(width / 2 / given[0][0, 0])), DIGITS)
+    # Pixels of the pictures from directions (x, y, 1) of eyes that look at the origin.
+    pixels_from_gaze = [camera[:, :3] @ turn.T for camera, turn in zip(cameras, turns, strict=True)]
+    pixels_from_gaze = [matrix / matrix[2, 2] for matrix in pixels_from_gaze]
+    focal_px = pixels_from_gaze[0][0, 0]
+    centred = np.array([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]])
+    if all(np.abs(matrix - centred).max() < EXACT * width for matrix in pixels_from_gaze):
+        return list(pictures), round(2 * math.degrees(math.atan(width / 2 / focal_px)), DIGITS)
     corners_m = np.array([(x, y, z) for x in stack.x_m for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
     corners_m *= (1.0, stack.width_m, stack.height_m)
     extent = np.zeros(2)
@@ -68,24 +68,24 @@ def looking_at_origin(
         extent = np.maximum(extent, np.abs(seen[:, :2] / seen[:, 2:]).max(0))
 
     def shown(share: F64) -> bool:
-        return all(_within(matrix, share * extent, width, height) for matrix in given)
+        return all(_within(matrix, share * extent, width, height) for matrix in pixels_from_gaze)
 
-    for name, matrix in zip(NAMES, given, strict=True):
+    for name, matrix in zip(NAMES, pixels_from_gaze, strict=True):
         if not _within(matrix, np.zeros(2), width, height):
-            raise ValueError(f"the {name} one's picture does not show the middle of the stack")
+            raise ValueError(f"the {name} picture does not show the middle of the stack")
     both = _most(lambda share: shown(np.array([share, share])))
     share = np.array([both, both])
     share[0] = _most(lambda wider: shown(np.array([wider, share[1]])), least=both)
     share[1] = _most(lambda higher: shown(np.array([share[0], higher])), least=both)
     half = share * extent
-    focal_px = max(math.sqrt(abs(np.linalg.det(_slope(matrix)))) for matrix in given)
+    focal_px = max(math.sqrt(abs(np.linalg.det(_slope(matrix)))) for matrix in pixels_from_gaze)
     size = [max(LEAST_PX, round(2 * focal_px * side)) for side in half]
     focal_px = size[0] / 2 / half[0]
     direction = np.array([[1, 0, 0.5 - size[0] / 2], [0, 1, 0.5 - size[1] / 2], [0, 0, focal_px]]) / focal_px
-    centres = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])  # OpenCV's pixels have them at whole numbers
+    centres = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])  # OpenCV's pixel centres are whole numbers
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
     turned: list[Picture] = []
-    for picture, matrix in zip(pictures, given, strict=True):
+    for picture, matrix in zip(pictures, pixels_from_gaze, strict=True):
         warped: Any = cv2.warpPerspective(
             picture, centres @ matrix @ direction, size, flags=flags, borderMode=cv2.BORDER_REPLICATE
         )
@@ -94,7 +94,7 @@ def looking_at_origin(
 
 
 def _within(matrix: F64, half: F64, width: int, height: int) -> bool:
-    """Whether a picture shows directions up to `half` to all sides."""
+    """Return True if a picture shows directions up to `half` on every side."""
     corners = np.array([(x * half[0], y * half[1], 1.0) for x in (-1, 1) for y in (-1, 1)]) @ matrix.T
     if not (corners[:, 2] > 0).all():
         return False
@@ -103,7 +103,7 @@ def _within(matrix: F64, half: F64, width: int, height: int) -> bool:
 
 
 def _most(holds: Any, least: float = 0.0) -> float:
-    """The largest number from `least` to 1 for which it holds, as for all below."""
+    """Largest number from `least` to 1 for which the monotonic condition `holds`."""
     most = 1.0
     if holds(most):
         return most
@@ -114,17 +114,17 @@ def _most(holds: Any, least: float = 0.0) -> float:
 
 
 def _slope(matrix: F64) -> F64:
-    """(2, 2) pixels for a change of direction, straight ahead."""
+    """(2, 2) derivative of pixels by direction, straight ahead."""
     return np.asarray(matrix[:2, :2] - np.outer(matrix[:2, 2], matrix[2, :2]))
 
 
 def doubts(eyes_m: ArrayLike, stack: PanelStack, *, fov_deg: float, size: tuple[int, int]) -> list[str]:
     """Probable mistakes in eyes and picture sizes (width, height), one line each, naming the argument."""
-    eyes, told = np.asarray(eyes_m, np.float64), []
+    eyes, warnings = np.asarray(eyes_m, np.float64), []
     if fov_deg <= math.pi:
-        told.append(f"fov_deg: {fov_deg:g} degrees looks like radians (of {math.degrees(fov_deg):.1f} degrees)")
+        warnings.append(f"fov_deg: {fov_deg:g} degrees looks like radians (of {math.degrees(fov_deg):.1f} degrees)")
     if (eyes[1] - eyes[0]) @ stack_from_eye(eyes.mean(0))[:3, 0] < 0:
-        told.append("eyes_m: the left eye is to the right of the right one, as the viewer sees it: exchanged?")
+        warnings.append("eyes_m: the left eye is to the viewer's right of the right one: exchanged?")
     width_px, height_px = 64, max(2, round(64 * size[1] / size[0]))
     shares = []
     for eye in eyes:
@@ -132,9 +132,9 @@ def doubts(eyes_m: ArrayLike, stack: PanelStack, *, fov_deg: float, size: tuple[
         u, v = rays.on(stack.panel(stack.count // 2))
         inside = rays.toward_panels() & (u > 0) & (u < stack.width_px) & (v > 0) & (v < stack.height_px)
         shares.append(float(inside.mean()))
-    if 1 - min(shares) > BESIDE_MOST:
-        told.append(
-            f"fov_deg: {1 - min(shares):.0%} of a picture {fov_deg:g} degrees wide that looks at the stack's origin "
-            "lies beside the panels: was it taken so, or is there a camera to be given with it?"
+    if 1 - min(shares) > OUTSIDE_MOST:
+        warnings.append(
+            f"fov_deg: {1 - min(shares):.0%} of a picture {fov_deg:g} degrees wide, aimed at the stack's origin, "
+            "is outside the panels: if the camera was aimed elsewhere, pass its matrix"
         )
-    return told
+    return warnings

@@ -33,7 +33,7 @@ def carried_db(
     eyes_m: ArrayLike,
     fov_deg: float,
 ) -> float:
-    """PSNR, one ray a pixel, at eyes (2, 3) of layers solved for other eyes (2, 3).
+    """PSNR, with one ray per pixel, at eyes (2, 3) of layers solved for other eyes (2, 3).
 
     layers: (N, H, W, 3 or 4) code values, exactly as displayed; drawn: an (h, w, 3) picture for each eye of
     `solved_for_m`, as retina pictures of horizontal field of view `fov_deg`, code values or float in [0, 1].
@@ -85,7 +85,7 @@ def _expected(
     sampling: Sampling,
     **at: Unpack[AtEyes],
 ) -> dict[float, Any]:
-    """The expected squared error by tracking error; measured: `squared_error`, or `group_errors`."""
+    """Expected squared error by tracking error; measured: `squared_error` or `group_errors`."""
     seen_from_m = at.get("seen_from_m")
     eyes = np.asarray(at["eyes_m"], dtype=np.float64)
     true = eyes if seen_from_m is None else np.asarray(seen_from_m, dtype=np.float64)
@@ -126,16 +126,16 @@ def light_psnrs_db(
 def sampled_light_db(
     layers: U8, drawn: Sequence[U8 | F32], stack: PanelStack, *, every: int, **at: Unpack[AtEyes]
 ) -> dict[float, tuple[float, float]]:
-    """Light and its standard error, dB, of every `every`-th pixel of every `every`-th row.
+    """Light and its standard error, dB, from every `every`-th pixel of every `every`-th row.
 
-    The standard error is that of ten interleaved groups of rows. The other arguments are those of `light_psnrs_db`.
+    The standard error comes from ten interleaved groups of rows. The other arguments are those of `light_psnrs_db`.
     """
     errors = _expected(group_errors, layers, drawn, stack, sampling=LIGHT._replace(step=every), **at)
     return {sigma_mm: (psnr_db(float(error[0])), _standard_error_db(error)) for sigma_mm, error in errors.items()}
 
 
 def _standard_error_db(error: F64) -> float:
-    """error: (1 + groups,) mean squared error, and that of each group."""
+    """Standard error, dB; error: (1 + groups,) mean squared error of all rows, and of each group."""
     groups = error[1:]
     relative = float(np.std(groups, ddof=1)) / len(groups) ** 0.5 / max(float(error[0]), 1e-12)
     return float(10 / math.log(10) * relative)

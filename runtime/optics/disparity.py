@@ -1,4 +1,4 @@
-"""The disparity of a pair of pictures, against what a stack's gaps can show."""
+"""Disparity of a pair of pictures, compared with the range that a stack's gaps can show."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from runtime.optics.views import image_from_stack
 from runtime.records import F32, F64, U8
 
 WIDTH_PX = 256  # of the middle panel's raster that pictures are matched on
-REACH_PX = WIDTH_PX // 4  # largest disparity that is looked for, either way
-# Of the outer panels' own disparity. Blocks of strong contrast keep 35 dB of 38 at 2, 30 at 3, 26 at 4 (light, 1 mm).
+REACH_PX = WIDTH_PX // 4  # largest disparity searched, in either direction
+# Times the outer panels' disparity. Blocks of strong contrast keep 35 dB of 38 at 2, 30 at 3, 26 at 4 (light, 1 mm).
 SHOWN_MOST = 2.5
-TOO_MUCH = 0.1  # share of a picture beyond it that is reported
-ROLLED, TURNED = 0.05, 0.2  # rise and depth of the line of the eyes: beyond them, rows do not correspond
-LEAST_MATCHED = 0.1  # share of the panel
+TOO_MUCH = 0.1  # share of a picture beyond `SHOWN_MOST` that is reported
+ROLLED, TURNED = 0.05, 0.2  # slopes of the line between the eyes up to which picture rows correspond
+LEAST_MATCHED = 0.1  # share of the panel that must be matched
 
 
 def disparities_m(pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, *, fov_deg: float) -> F64:
-    """(n,) horizontal disparities, metres on the middle panel, of what both eyes' (h, w, 3) pictures have in common.
+    """(n,) horizontal disparities, metres on the middle panel, of points matched in both eyes' (h, w, 3) pictures.
 
-    Positive: farther right for the left eye, as what stands before that panel. Pictures are `fov_deg` wide and look at
-    the stack's origin. Empty for eyes whose line is not level, or not parallel to the panels.
+    Positive for points in front of that panel, which are farther right for the left eye. Pictures are `fov_deg` wide
+    and look at the stack's origin. Empty if the line between the eyes is not level or not parallel to the panels.
     """
     line = eyes_m[1] - eyes_m[0]
     if line[1] <= 0 or abs(line[2]) > ROLLED * line[1] or abs(line[0]) > TURNED * line[1]:

@@ -45,7 +45,7 @@ ONE_RAY = Sampling(rays=0, pupil_mm=0.0)
 
 
 class LightView(NamedTuple):
-    """One eye's picture, and the geometry of its rays."""
+    """One eye's picture and the geometry of its rays."""
 
     target: F32  # (h, w, 3) intensities
     centre_from_image: F64  # (3, 3) pixels of the centre panel
@@ -64,7 +64,7 @@ def squared_error(
     fov_deg: float,
     sampling: Sampling,
 ) -> float:
-    """Mean squared error at eyes (2, 3) against the pictures of the eyes solved for, carried.
+    """Mean squared error at eyes (2, 3) against the carried pictures of the eyes solved for.
 
     layers: (N, H, W, 3 or 4) code values, rear to front; targets: (h, w, 3) intensities for each eye solved for, of
     pictures `fov_deg` wide. A pixel counts if all its rays cross every panel half a pixel inside. For nearly perfect
@@ -122,7 +122,7 @@ def _sums(
     sampling: Sampling,
     parts: int,
 ) -> F64:
-    """(eyes x parts, 2) the sum of the squared error and the number of its terms, by consecutive parts of the rows."""
+    """(eyes x parts, 2) sum of the squared error and number of its terms, by consecutive parts of the rows."""
     cores, step = len(os.sched_getaffinity(0)), sampling.step
     codes = np.ascontiguousarray(layers)
     fine = 1 if sampling.rays else TABLE
@@ -153,7 +153,7 @@ def _squared_error(
     matrices = [
         np.ascontiguousarray(x, np.float64) for x in (view.centre_from_image, view.panels_from_centre, view.toward)
     ]
-    given = kernels.View(
+    view_arrays = kernels.View(
         layers=codes.ctypes.data, panels=count, height=height, width=width, components=components,
         target=target.ctypes.data, rows=target.shape[0], columns=target.shape[1],
         centre_from_image=matrices[0].ctypes.data, panels_from_centre=matrices[1].ctypes.data,
@@ -161,7 +161,7 @@ def _squared_error(
         points=len(view.panels_from_centre), rays=sampling.rays, step=sampling.step,
     )  # fmt: skip
     result = kernels.Result()
-    kernels.library().squared_error(byref(given), first, last, byref(result))
+    kernels.library().squared_error(byref(view_arrays), first, last, byref(result))
     return result.total, result.counted
 
 

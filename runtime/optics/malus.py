@@ -12,22 +12,22 @@ from runtime.records import F64
 HALF_PI = np.pi / 2
 Branch = Literal[1, 2]
 T = TypeVar("T", bound=np.floating[Any])
-# Values of panels at rest, before anything is asked of them: their sum is in the middle of one of sin²'s slopes.
+# Panel values at rest, before any solving: their sum is in the middle of one of sin²'s slopes.
 REST = {2: 0.75, 3: 0.5, 4: 0.375, 5: 0.5}
 
 
 def rest_value(panels: int) -> float:
-    """What each of so many panels shows at rest, in [0, 1]."""
+    """Value in [0, 1] that each of `panels` panels shows at rest."""
     return REST.get(panels, 1.5 / panels)
 
 
 def rest_code(panels: int) -> int:
-    """The same as an 8-bit code."""
+    """`rest_value` as an 8-bit code."""
     return int(rest_value(panels) * 255 + 0.5)
 
 
 def jones_rotator(angle_rad: float) -> F64:
-    """2x2 Jones matrix R(-phi) of a panel that turns the polarization counter-clockwise ((2), (3))."""
+    """2x2 Jones matrix R(-phi) of a panel that rotates the polarization counter-clockwise ((2), (3))."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([[c, -s], [s, c]])
 
@@ -41,18 +41,15 @@ def jones_intensity(angles_rad: ArrayLike) -> float:
 
 
 def intensity_from_phase(phase: NDArray[T]) -> NDArray[T]:
-    """Intensity sin²(π/2·phase) for the sum of the panel values along a ray (equation (7)).
-
-    Single precision stays single.
-    """
+    """Intensity sin²(π/2·phase) for the sum of the panel values along a ray (equation (7)); keeps the dtype."""
     result: NDArray[T] = np.sin(phase * HALF_PI) ** 2
     return result
 
 
 def phase_from_intensity(intensity: NDArray[T], branch: Branch = 2) -> NDArray[T]:
-    """(...) the phase sum (units of pi/2) whose sin² is `intensity`, which is clipped to [0, 1].
+    """(...) phase sum (units of pi/2) whose sin² is `intensity`, clipped to [0, 1].
 
-    Branch 1 lies in [0, 1], branch 2 in [1, 2]: with three panels it keeps the outer ones far from their limits.
+    Branch 1 is in [0, 1], branch 2 in [1, 2]; with three panels branch 2 keeps the outer ones far from their limits.
     """
     root = np.arcsin(np.sqrt(np.clip(intensity, 0.0, 1.0))) / HALF_PI
     result: NDArray[T] = root if branch == 1 else 2 - root

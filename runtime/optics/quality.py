@@ -11,7 +11,7 @@ import numpy as np
 from runtime.optics.retina import Mask, strips
 from runtime.records import F32
 
-HALF_WINDOW = 5  # of SSIM, pixels
+HALF_WINDOW = 5  # half width of SSIM's window, pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ def squared_error(image: F32, target: F32, mask: Mask) -> tuple[float, int]:
 
 
 def quality(seen: Sequence[F32], targets: Sequence[F32], masks: Sequence[Mask], *, similarity: bool = True) -> Quality:
-    """Pooled displayed quality over eyes. Raises ValueError where no ray of an eye crosses every panel.
+    """Pooled displayed quality over eyes. Raises ValueError if no ray of an eye crosses every panel.
 
     similarity: compute SSIM; otherwise it is NaN.
     """

@@ -1,4 +1,4 @@
-"""A rectangle of whole pixels: what is drawn, solved or shown of a raster."""
+"""Rectangles of whole pixels: the region of a raster that is drawn, solved or shown."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from runtime.optics.stack import PlaneRaster
 
 @dataclass(frozen=True, slots=True)
 class PixelRect:
-    """Pixels [u0, u1) x [v0, v1) of a raster, u right, v down; empty if an end is not past its start."""
+    """Pixels [u0, u1) x [v0, v1) of a raster, u right, v down; empty if an end does not exceed its start."""
 
     u0: int
     v0: int
@@ -31,11 +31,11 @@ class PixelRect:
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """Rows and columns, to index an image."""
+        """Row and column slices, to index an image."""
         return slice(self.v0, self.v1), slice(self.u0, self.u1)
 
     def beside(self, *, width_px: int, height_px: int) -> list[PixelRect]:
-        """All pixels of a raster but for these: up to four boxes."""
+        """All other pixels of a raster, as up to four boxes."""
         if not self.width_px or not self.height_px:
             return [PixelRect(0, 0, width_px, height_px)]
         boxes = (
@@ -47,11 +47,11 @@ class PixelRect:
         return [box for box in boxes if box.width_px and box.height_px]
 
     def in_rows(self, rows: int) -> list[PixelRect]:
-        """Boxes of at most `rows` rows that cover the same pixels."""
+        """Split into boxes of at most `rows` rows."""
         return [PixelRect(self.u0, v, self.u1, min(v + rows, self.v1)) for v in range(self.v0, self.v1, rows)]
 
     def cut(self, raster: PlaneRaster) -> PlaneRaster:
-        """The part of a raster."""
+        """Crop a raster to this box."""
         return replace(
             raster,
             left_m=raster.left_m + self.u0 * raster.pitch_u_m,
@@ -62,7 +62,7 @@ class PixelRect:
 
 
 def union(boxes: Sequence[PixelRect]) -> PixelRect:
-    """The smallest box around those that aren't empty; empty where all are."""
+    """Smallest box around all non-empty boxes; empty if there are none."""
     filled = [box for box in boxes if box.width_px and box.height_px]
     if not filled:
         return PixelRect(0, 0, 0, 0)

@@ -24,7 +24,7 @@ STRIP_ROWS = 32  # of a picture processed together: they fit the cache
 
 @dataclass(frozen=True, slots=True)
 class Retina:
-    """An eye's image: intensities and which of its rays cross every panel half a pixel inside its edge."""
+    """An eye's image, and a mask of rays that cross every panel at least half a pixel inside its edge."""
 
     image: F32  # (h, w, 3) in [0, 1]
     mask: Mask  # (h, w)
@@ -48,7 +48,7 @@ class _Samples:
 
     def __init__(self, u: F32, v: F32, shape: tuple[int, ...]) -> None:
         height, width = shape[:2]
-        # fmax and fmin, since a ray that never meets the panel has no position: NaN would make an index out of range.
+        # fmax and fmin ignore NaN, the position of a ray that never meets the panel.
         x = np.fmin(np.fmax(u - np.float32(0.5), np.float32(0)), np.float32(width - 1))
         y = np.fmin(np.fmax(v - np.float32(0.5), np.float32(0)), np.float32(height - 1))
         self._corner = np.empty((*x.shape, 2), np.int16)
@@ -60,7 +60,7 @@ class _Samples:
     def of(self, plane: F32) -> F32:
         """(h, w) samples of (H, W)."""
         right, below = self._right, self._below
-        no_second_map: Any = None  # OpenCV's own stubs forget that there may be none
+        no_second_map: Any = None  # valid, but missing from OpenCV's stubs
         top, top_right, bottom, bottom_right = (
             np.asarray(cv2.remap(part, self._corner, no_second_map, cv2.INTER_NEAREST), np.float32)
             for part in (plane, plane[:, right], plane[below], plane[below, right])
@@ -113,13 +113,13 @@ class Rays:
             return (h[0, 0] * u + h[0, 1] * v + h[0, 2]) / weight, (h[1, 0] * u + h[1, 1] * v + h[1, 2]) / weight
 
     def toward_panels(self) -> Mask:
-        """(h, w) True where the ray goes towards the panels (not away behind the eye)."""
+        """(h, w) True if the ray goes towards the panels, not away behind the eye."""
         toward = self.toward()
         result: Mask = toward[0] * self.u + toward[1] * self.v + toward[2] < 0.0
         return result
 
     def toward(self) -> F64:
-        """(3,) coefficients of a ray's x for (u, v, 1): negative towards the panels."""
+        """(3,) coefficients of a ray's x component for (u, v, 1): negative towards the panels."""
         # A ray's direction is the inverse of the projection's left part times (u, v, 1).
         return np.asarray(np.linalg.inv(self.from_stack[:, :3])[0])
 
@@ -165,7 +165,7 @@ def _moved(stack: PanelStack, index: int, eye_m: F64) -> F64 | None:
 
 
 def checked_eye(eye_m: ArrayLike, stack: PanelStack) -> F64:
-    """(3,) an eye in front of every panel. Raises ValueError for any other."""
+    """(3,) eye as float64. Raises ValueError unless it is in front of every panel."""
     eye = np.asarray(eye_m, dtype=np.float64)
     if not np.isfinite(eye).all() or eye[0] <= max(stack.x_m):
         raise ValueError("the eye must be in front of every panel")
@@ -196,7 +196,7 @@ def through_layers(
 
 
 def as_codes(image: F32) -> U8:
-    """(...) 8-bit code values of intensities, clipped to [0, 1]."""
+    """(...) 8-bit code values from intensities, clipped to [0, 1]."""
     return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
@@ -211,12 +211,12 @@ def pupil_points(diameter_m: float, rings: int = 2) -> F64:
 
 
 def average(images: Iterable[F32]) -> F32:
-    """(h, w, C) mean of images: a finite pupil averages what its points see (section 1.4)."""
+    """(h, w, C) mean of images, as seen by a finite pupil (section 1.4)."""
     total: F32 | None = None
     count = 0
     for image in images:
         total = image.copy() if total is None else total + image
         count += 1
     if total is None:
-        raise ValueError("a pupil without points sees nothing")
+        raise ValueError("a pupil needs at least one point")
     return total / np.float32(count)

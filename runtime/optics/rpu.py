@@ -1,6 +1,6 @@
 """Reverse perspective uniform: panel pixels from an eye's image pixels (supplement, (40)-(47)).
 
-Its misprints are listed and mended in docs/mathematics.md.
+The supplement's misprints are listed and corrected in docs/mathematics.md.
 """
 
 from __future__ import annotations
@@ -15,17 +15,16 @@ from runtime.records import F64
 def panel_from_image(image_from_stack: F64, raster: PlaneRaster) -> F64:
     """M_RPU (equation (47)): 3x3 panel pixels from image pixels, the inverse homography.
 
-    Built without a numerical inverse: the ray of an image pixel is cut with the panel's plane, so that it
-    stays exact at grazing angles. Scaled so that its largest entry is 1.
+    The adjugate replaces a numerical inverse, which keeps it exact at grazing angles. Its largest entry is scaled to 1.
     Raises ValueError for an eye in the panel's plane.
     """
     h = image_from_raster(image_from_stack, raster)
     adjugate = np.array([np.cross(h[:, 1], h[:, 2]), np.cross(h[:, 2], h[:, 0]), np.cross(h[:, 0], h[:, 1])])
     scale = np.abs(adjugate).max()
-    # Below this the determinant is rounding error of the terms that h's last column was added up from.
+    # Below this the determinant is only rounding error of the terms summed in h's last column.
     terms = np.abs(image_from_stack) @ np.abs([raster.x_m, raster.left_m, raster.top_m, 1.0])
     noise = 64 * np.finfo(np.float64).eps * float(terms @ np.abs(adjugate[2]))
     if not np.isfinite(scale) or scale == 0.0 or abs(adjugate[2] @ h[:, 2]) <= noise:
-        raise ValueError("the eye lies in the panel's plane: its view of the panel is singular")
+        raise ValueError("the eye is in the panel's plane: its view of the panel is singular")
     result: F64 = adjugate / scale
     return result

@@ -1,4 +1,4 @@
-"""The stack of panels and rasters on planes parallel to them."""
+"""The stack of panels, and rasters on planes parallel to them."""
 
 from __future__ import annotations
 
@@ -8,15 +8,14 @@ import numpy as np
 
 from runtime.records import F64
 
-UNEVEN_MOST = 0.15  # of the mean gap, between the largest and the smallest: docs/models.md
+UNEVEN_MOST = 0.15  # largest minus smallest gap over the mean gap (docs/models.md)
 
 
 @dataclass(frozen=True, slots=True)
 class PlaneRaster:
     """A pixel grid on a plane x = x_m of the `stack` frame, rows along -z, columns along +y.
 
-    Pixel (u, v), continuous with centres at half-integers, lies at y = left_m + u·pitch_u_m,
-    z = top_m - v·pitch_v_m.
+    Pixel (u, v), continuous with centres at half-integers, is at y = left_m + u·pitch_u_m, z = top_m - v·pitch_v_m.
     """
 
     x_m: float
@@ -50,7 +49,7 @@ class PlaneRaster:
 class Tilt:
     """Slopes of panels that are not quite parallel, and the eye position they are registered from."""
 
-    depth: tuple[tuple[float, float, float], ...]  # per panel (d, r, u): it stands d + r·y + u·z before its x_m, metres
+    depth: tuple[tuple[float, float, float], ...]  # per panel (d, r, u): d + r·y + u·z metres before its x_m
     seen_from_m: tuple[float, float, float]  # frame `stack`
 
 
@@ -76,14 +75,14 @@ class PanelStack:
         return bool(gaps.size == 0 or np.ptp(gaps) <= UNEVEN_MOST * gaps.mean())
 
     def reduced(self, reduction: int) -> PanelStack:
-        """The same panels in `reduction` times fewer rows and columns, at least one."""
+        """Divide the numbers of rows and columns by `reduction`, to at least one."""
         if reduction == 1:
             return self
         width_px, height_px = (max(1, round(px / reduction)) for px in (self.width_px, self.height_px))
         return replace(self, width_px=width_px, height_px=height_px)
 
     def transposed(self) -> PanelStack:
-        """The panels with rows for columns: what was down (-z) is to the right (+y), what was right is down."""
+        """Exchange rows and columns: down (-z) becomes right (+y), and right becomes down."""
         tilt = self.tilt
         if tilt is not None:
             x, y, z = tilt.seen_from_m

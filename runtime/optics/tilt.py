@@ -1,10 +1,10 @@
-"""Tilted panels: where on a layer an eye sees what it would see on the ideal panel.
+"""Tilted panels: homographies from the ideal panel's points to those of a layer, for one eye.
 
-Registration by photographs puts every pixel of a layer where an eye at `seen_from_m` sees it on the ideal panel
-(parallel, at its x_m). Another eye, also the other one of the same head, sees a tilted panel's pixels elsewhere: its
-ray crosses the tilted plane, and the line from `seen_from_m` through that point crosses the ideal one at the layer's
-pixel. Both are projections between planes, so that together they are a homography; for eyes as far away as
-`seen_from_m` it is affine.
+Registration by photographs places every pixel of a layer where an eye at `seen_from_m` sees it on the ideal panel
+(parallel, at its x_m). From any other position, the second eye's included, a tilted panel's pixels appear displaced.
+The eye's ray meets the tilted plane in a point; the line from `seen_from_m` through that point meets the ideal plane
+at the layer's pixel. Both are projections between planes, so their composition is a homography. It is affine for eyes
+at the distance of `seen_from_m`.
 """
 
 from __future__ import annotations
@@ -17,28 +17,25 @@ from runtime.optics.stack import PanelStack, PlaneRaster, Tilt
 from runtime.records import F64
 
 Triple = tuple[float, float, float]
-UNSEEN_PX = 0.05  # of a panel's pixels: what moves less is left out
+UNSEEN_PX = 0.05  # displacements below this, in panel pixels, are ignored
 
 
 def layer_from_seen(stack: PanelStack, index: int, eye_m: F64) -> F64:
-    """3x3 from (y, z, 1) of the ideal panel to the layer's, as seen by an eye (3,).
-
-    The identity where the stack has no tilt.
-    """
+    """3x3 from (y, z, 1) on the ideal panel to the layer's, as seen by an eye (3,); the identity without tilt."""
     if stack.tilt is None or not any(stack.tilt.depth[index]):
         return np.eye(3)
     return _projected(stack.tilt.depth[index], stack.tilt.seen_from_m, _triple(eye_m), stack.x_m[index])
 
 
 def layer_pixels_from_seen(raster: PlaneRaster, layer_from_seen_m: F64) -> F64:
-    """The same 3x3 in a raster's pixels."""
+    """Convert `layer_from_seen` from metres to a raster's pixels."""
     return raster.raster_from_plane() @ layer_from_seen_m @ raster.plane_from_raster()
 
 
 def coarse_layer_from_seen(stack: PanelStack, index: int, eye_m: F64) -> F64:
-    """`layer_from_seen`, to `UNSEEN_PX` at the panel's corners and as simple as that allows.
+    """Simplest approximation of `layer_from_seen` within `UNSEEN_PX` at the panel's corners.
 
-    Simplest first: the identity, a scale and a shift (fast to resample), affine, a homography.
+    Tried in order: identity, scale and shift (fast to resample), affine, homography.
     """
     if stack.tilt is None or not any(stack.tilt.depth[index]):
         return np.eye(3)
@@ -51,8 +48,8 @@ def coarse_layer_from_seen(stack: PanelStack, index: int, eye_m: F64) -> F64:
     )
 
 
-def _triple(place_m: F64) -> Triple:
-    x, y, z = map(float, place_m)
+def _triple(point_m: F64) -> Triple:
+    x, y, z = map(float, point_m)
     return x, y, z
 
 
@@ -63,7 +60,7 @@ def _projected(
     eye: tuple[float, float, float],
     x_m: float,
 ) -> F64:
-    """From the ideal plane along an eye's rays to the tilted plane, and back along those of `seen_from`."""
+    """Project the ideal plane to the tilted one along the eye's rays, and back along those of `seen_from`."""
     offset_m, right, up = depth
     normal, far = np.array([1.0, -right, -up]), x_m + offset_m
     origin, place = np.array(seen_from), np.array(eye)
@@ -72,8 +69,8 @@ def _projected(
     ray = ideal - np.outer(place, [0.0, 0.0, 1.0])
     point = np.outer(place, weight) + ray * (far - normal @ place)  # times weight
     ahead = point[0] - origin[0] * weight
-    beside = np.outer(origin[1:], ahead) + (point[1:] - np.outer(origin[1:], weight)) * (x_m - origin[0])
-    matrix = np.vstack([beside, ahead])
+    sideways = np.outer(origin[1:], ahead) + (point[1:] - np.outer(origin[1:], weight)) * (x_m - origin[0])
+    matrix = np.vstack([sideways, ahead])
     return np.asarray(matrix / matrix[2, 2], dtype=np.float64)
 
 

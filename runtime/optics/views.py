@@ -15,9 +15,9 @@ def stack_from_eye(eye_m: ArrayLike) -> F64:
     """4x4 pose of an eye that looks at the stack's origin (EyeReal supplement, (10)-(14)).
 
     Axes: x right and parallel to the ground, y up, z from the scene towards the eye. On the vertical
-    axis, where the limits differ, the limit from +x is taken: r_x = +y.
+    axis, where the limits differ, use the limit from +x: r_x = +y.
 
-    Raises ValueError for an eye at the origin or that is not finite.
+    Raises ValueError for an eye that is at the origin or not finite.
     """
     eye = np.asarray(eye_m, dtype=np.float64)
     scale = float(np.abs(eye).max())
@@ -55,10 +55,10 @@ def image_from_stack(eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg
 
 
 def raster_from_stack(eye_m: ArrayLike, raster: PlaneRaster) -> F64:
-    """3x4 projection of `stack` points, seen from an eye, on to a plane's pixels.
+    """3x4 projection of `stack` points, seen from an eye, onto a plane's pixels.
 
-    A homography after a pinhole projection is another projection: this is M_RPU · `image_from_stack` for
-    whatever image the eye has. The third coordinate is the eye's distance from the point along x, in metres.
+    Equals M_RPU · `image_from_stack` for any image of the eye. The third coordinate is the eye's distance from the
+    point along x, in metres.
     """
     eye = np.asarray(eye_m, dtype=np.float64)
     depth = raster.x_m - eye[0]
@@ -80,9 +80,9 @@ def image_from_raster(image_from_stack: F64, raster: PlaneRaster) -> F64:
 
 
 def relative_scale_shift(eye_m: ArrayLike, *, from_x_m: float, to_x_m: float) -> tuple[float, F64]:
-    """Where the ray from an eye through (y, z) on one plane crosses a parallel one: q = p·scale + shift.
+    """Scale and (2,) shift (y, z) in metres that map a point p of one plane to a parallel one along an eye's ray.
 
-    Returns the scale and the (2,) shift in metres (y, z). Raises ValueError where the eye is in the first plane.
+    The ray through p crosses the other plane at p·scale + shift. Raises ValueError for an eye in the first plane.
     """
     eye = np.asarray(eye_m, dtype=np.float64)
     distance_m = eye[0] - from_x_m

@@ -1,1 +1,1 @@
-"""Sinks of panel values: offscreen and windows, the presentation shader, monitors."""
+"""Sinks for panel values (offscreen, windows), the presentation shader, and monitors."""

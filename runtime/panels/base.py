@@ -12,11 +12,11 @@ class PanelSink(ABC):
     """A sink for all panels of the stack; a frame is shown on all of them or on none."""
 
     name: str
-    contexts_lost = 0  # so far: with the panels' GL context others on the same GPU are gone, too
+    contexts_lost = 0  # GL contexts lost since the start; after a GPU reset every other context is lost as well
 
     @property
     def period_ns(self) -> int | None:
-        """Period between vertical blanks of the monitor that sets the pace; None: none, or unknown."""
+        """Interval between vertical blanks of the monitor that sets the pace; None: no such monitor, or unknown."""
         return None
 
     @property
@@ -28,12 +28,12 @@ class PanelSink(ABC):
     def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
         """Show a frame on every panel: its solution aligned, then mixed with its flat picture.
 
-        The frame's arrays stay as they are until another frame has been presented: a sink may read them as late as
-        that. unchanged: the caller vouches that this shows what the frame before did: panels that still show it
-        upload, draw and swap nothing, so that a picture without a viewer costs next to nothing.
-        Raises PanelLost: rebuilt by a later call, the loop goes on.
+        The frame's arrays must not change until another frame has been presented; a sink may read them until then.
+        unchanged: the caller guarantees that the frame shows the same picture as the previous one. Panels that still
+        show it skip upload, drawing and swap, so a picture without a viewer costs almost nothing.
+        Raises PanelLost; a later call rebuilds the panels.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Release windows and contexts. May be called twice; never raises."""
+        """Release windows and contexts. Never raises; may be called twice."""

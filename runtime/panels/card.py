@@ -18,8 +18,8 @@ FONT = cv2.FONT_HERSHEY_SIMPLEX
 def identity_card(width_px: int, height_px: int, *, title: str, lines: Sequence[str]) -> U8:
     """(height_px, width_px, 4) upright card: title, lines, an arrow up, colour bars, grey steps.
 
-    A line of one pixel runs along every edge: where one is missing, the panel is cropped or misaligned. Words keep
-    off the edges: before a front panel's rim, seen from nearby, no panel behind it lets light through.
+    A line of one pixel runs along every edge: if one is missing, the panel is cropped or misaligned. Text stays away
+    from the edges, where nearby viewers see a front panel's rim with no lit panel behind it.
     """
     card = np.empty((height_px, width_px, 4), np.uint8)
     card[:] = PAPER
@@ -67,7 +67,7 @@ def _arrow(card: U8, *, x_px: int, top: int, bottom: int, unit: float) -> None:
 
 
 def _text(card: U8, text: str, *, x_px: int, y_px: int, height: float, room: float) -> None:
-    # OpenCV's Hershey fonts know ASCII only.
+    # OpenCV's Hershey fonts are ASCII only.
     plain = text.encode("ascii", "replace").decode()
     (full, tall), _ = cv2.getTextSize(plain, FONT, 1.0, 1)
     scale = min(height / tall, room / max(full, 1))

@@ -1,4 +1,4 @@
-"""GLFW on X11: the monitors, and windows whose contexts share one root. Main thread only."""
+"""GLFW on X11: monitors, and windows whose contexts share objects with one root. Main thread only."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ log = logging.getLogger("phasestack.panels")
 
 glfw: Any = _glfw  # its stubs are wrong about bytes, None and pointers
 
-# GLFW's own answer to an error is a Python warning; here every error has someone who catches it.
+# By default the binding turns errors into warnings; here all are caught.
 glfw.ERROR_REPORTING = "exception"
 
 
 @cache
 def gl_function(name: str) -> int:
-    """Where an OpenGL function is, the same in every context; 0: there is none.
+    """Address of an OpenGL function, equal for all contexts; 0 if there is none.
 
-    Kept: moderngl never lets go of the numbers that it is given, 20 KiB a context.
+    Cached, because moderngl keeps references to all of them, 20 KiB per context.
     """
     return int(glfw.get_proc_address(name) or 0)
 
 
 class WindowContext:
-    """What moderngl needs to know of a GLFW window: where its functions are, and how it becomes current."""
+    """Adapter from a GLFW window to moderngl: loads functions and makes the context current."""
 
     def __init__(self, window: Any) -> None:
         self._window = window
@@ -52,7 +52,7 @@ class WindowContext:
         """Leave the context current."""
 
     def release(self) -> None:
-        """The window owns its context."""
+        """Do nothing: the window owns its context."""
 
 
 @dataclass(eq=False)
@@ -61,10 +61,10 @@ class Window:
 
     handle: Any
     context: moderngl.Context
-    faults: list[str] = field(default_factory=list)  # what its callback saw: closed
+    faults: list[str] = field(default_factory=list)  # from its callback: closed
 
     def make_current(self) -> None:
-        """Its context on this thread."""
+        """Make its context current on this thread."""
         glfw.make_context_current(self.handle)
 
 
@@ -72,21 +72,21 @@ watch: xlib.ServerWatch | None = None  # of the process's connection
 
 
 def _connect() -> None:
-    """Have GLFW's connection to the X server, and EGL's display of it, for the process's life.
+    """Connect GLFW to the X server, for the life of the process. Raises PanelLost, MissingPart.
 
-    A thread that draws may have a context of that display current when the panels lose theirs; once GLFW had closed it,
-    Mesa would work on freed memory. Raises PanelLost, MissingPart.
+    A drawing thread may still have a context of that EGL display current when the panels lose theirs. If GLFW closed
+    the display then, Mesa would use freed memory.
     """
     global watch
     if watch is not None:
-        glfw.poll_events()  # what monitors there are by now
+        glfw.poll_events()  # updates the list of monitors
         return
     try:
         if glfw.platform_supported(glfw.PLATFORM_X11):
             glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_X11)
         glfw.init()
     except glfw.GLFWError as error:
-        raise PanelLost(f"no X server: {_text(error)} (DISPLAY and XAUTHORITY say where)") from None
+        raise PanelLost(f"no X server: {_text(error)} (set by DISPLAY and XAUTHORITY)") from None
     if glfw.get_platform() != glfw.PLATFORM_X11:
         raise MissingPart("GLFW without X11: only X11 can put a window on a chosen monitor")
     xlib.take_over_errors()
@@ -96,11 +96,11 @@ def _connect() -> None:
 class Display:
     """Windows on the X server, with a hidden root window whose objects all others share.
 
-    No window outlives `close`. The X server's death ends the process (xlib.take_over_errors says why).
+    No window outlives `close`. The X server's death ends the process (see `xlib.take_over_errors`).
     """
 
     def __init__(self) -> None:
-        """Raises PanelLost (no X server, or none that lets us in: it may come), MissingPart (no X11 library)."""
+        """Connect. Raises PanelLost (no X server, or access denied; may be temporary), MissingPart (no X11 library)."""
         self.faults: list[str] = []
         self._windows: list[Window] = []
         self._outputs: dict[str, int] = {}
@@ -109,9 +109,9 @@ class Display:
 
     @property
     def root(self) -> Window:
-        """The hidden window, made when it is first asked for: looking for monitors needs no OpenGL.
+        """The hidden window, created on first use, because listing monitors needs no OpenGL.
 
-        Raises PanelLost where the X server offers none.
+        Raises PanelLost if the X server has no OpenGL.
         """
         if not self._windows:
             _hints()
@@ -123,13 +123,13 @@ class Display:
         return self._windows[0]
 
     def monitors(self) -> tuple[Monitor, ...]:
-        """The active monitors, from left to right."""
+        """Active monitors, from left to right."""
         return in_order([monitor for monitor, _ in self._pairs()])
 
     def fullscreen_window(self, monitor: Monitor, *, title: str) -> Window:
-        """A borderless window over a whole monitor. Its context is current afterwards. Raises PanelLost."""
+        """Open a borderless window on a whole monitor and make its context current. Raises PanelLost."""
         share = self.root.handle
-        handles = {found.connector: handle for found, handle in self._pairs()}
+        handles = {connected.connector: handle for connected, handle in self._pairs()}
         if monitor.connector not in handles:
             raise PanelLost(f"{monitor.connector} has gone")
         glfw.window_hint(glfw.VISIBLE, True)
@@ -137,7 +137,7 @@ class Display:
         return self._adopt(handle)
 
     def poll(self) -> str:
-        """Take in what the X server says. Answers what makes the windows useless; empty: nothing."""
+        """Process X events; returns faults that make the windows useless, empty if there are none."""
         glfw.poll_events()
         faults = self.faults + [fault for window in self._windows for fault in window.faults]
         return "; ".join(faults)
@@ -175,12 +175,12 @@ class Display:
         return window
 
     def output_state(self, connector: str) -> xlib.OutputState | None:
-        """The mode and monitor of an output now; None: it is off or gone."""
+        """Current mode and monitor of an output; None if it is off or gone."""
         output = self._outputs.get(connector)
         return xlib.output_state(_pointer(), output) if output else None
 
     def window_state(self, window: Window) -> tuple[bool, Rectangle] | None:
-        """Whether a window and all above it are mapped, and where it is now; None: somebody destroyed it."""
+        """Return if a window and its ancestors are mapped, and its position; None if it was destroyed."""
         refused = xlib.refusals()
         place = Rectangle(*glfw.get_window_pos(window.handle), *glfw.get_window_size(window.handle))
         is_viewable = bool(glfw.get_window_attrib(window.handle, glfw.VISIBLE))
@@ -216,20 +216,20 @@ class Display:
 
     @property
     def has_windows(self) -> bool:
-        """Whether there are any but the hidden root."""
+        """True if there are windows besides the hidden root."""
         return len(self._windows) > 1
 
 
 def connected_monitors() -> tuple[Monitor, ...]:
-    """The active monitors, from left to right. Raises PanelLost (no X server, no monitor), MissingPart."""
+    """Active monitors, from left to right. Raises PanelLost (no X server, no monitor), MissingPart."""
     display = Display()
     try:
-        found = display.monitors()
+        monitors = display.monitors()
     finally:
         display.close()
-    if not found:
+    if not monitors:
         raise PanelLost("the X server has no active monitor")
-    return found
+    return monitors
 
 
 def _attach(handle: Any) -> moderngl.Context:
@@ -239,7 +239,7 @@ def _attach(handle: Any) -> moderngl.Context:
 
 def _hints() -> None:
     glfw.default_window_hints()
-    # EGL, as the offscreen context has: a thread can't have contexts of GLX and of EGL in turn.
+    # EGL, as for the offscreen context: a thread can't switch between GLX and EGL contexts.
     glfw.window_hint(glfw.CONTEXT_CREATION_API, glfw.EGL_CONTEXT_API)
     glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, MINIMUM_VERSION // 100)
     glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, MINIMUM_VERSION // 10 % 10)

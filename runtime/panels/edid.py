@@ -1,4 +1,4 @@
-"""A monitor's own account of itself (VESA E-EDID 1.3/1.4, base block)."""
+"""Parse a monitor's EDID (VESA E-EDID 1.3/1.4, base block)."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ SERIAL_TAG, NAME_TAG = 0xFF, 0xFC
 
 @dataclass(frozen=True, slots=True)
 class Edid:
-    """Maker, model and serials of a monitor; a serial is empty if the maker gave none."""
+    """Maker, model and serial number of a monitor; the serial is empty if the maker gave none."""
 
     maker: str  # three letters
-    serial: str  # the serial as text, or else the number of the header; unique only together with the model
+    serial: str  # text descriptor, else the header's number; unique only together with the model
     name: str
 
 
 def parse(data: bytes) -> Edid | None:
-    """The base block of an EDID; None where it is not one (length, header or checksum)."""
+    """Parse the base block of an EDID; None if length, header or checksum is wrong."""
     block = data[:BLOCK_BYTES]
     if len(block) < BLOCK_BYTES or not block.startswith(HEADER) or sum(block) % 256:
         return None
@@ -29,7 +29,7 @@ def parse(data: bytes) -> Edid | None:
     number = int.from_bytes(block[12:16], "little")
     return Edid(
         maker=maker,
-        # 0 and 0x01010101 are what makers write who did not give a number.
+        # Makers write 0 or 0x01010101 instead of a number.
         serial=_text(block, SERIAL_TAG) or (str(number) if number not in (0, 0x01010101) else ""),
         name=_text(block, NAME_TAG),
     )

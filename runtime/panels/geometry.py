@@ -1,4 +1,4 @@
-"""From a monitor's pixels back to a layer's pixels: registration, mirroring, mounting."""
+"""Map a monitor's pixels to a layer's pixels: registration, mirroring, mounting."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from runtime.records import F64
 
 
 def panel_size_px(*, screen_width_px: int, screen_height_px: int, rotation_deg: int) -> tuple[int, int]:
-    """Columns and rows of a panel as the viewer sees it, from those of its monitor."""
+    """Columns and rows of a panel as the viewer sees it."""
     if rotation_deg in (90, 270):
         return screen_height_px, screen_width_px
     return screen_width_px, screen_height_px
 
 
 def panel_from_screen(*, screen_width_px: int, screen_height_px: int, rotation_deg: int, mirror: str) -> F64:
-    """3x3: the viewer's panel pixels from the monitor's own, both continuous, top left origin, v down.
+    """3x3 from a monitor's pixels to panel pixels as the viewer sees them, both continuous, top left origin, v down.
 
-    A monitor that is turned by `rotation_deg` counter-clockwise, seen from the front, is shown its picture turned
-    clockwise. Mirroring is of the viewer's picture, before it is turned.
+    A monitor mounted `rotation_deg` counter-clockwise, seen from the front, gets its picture rotated clockwise.
+    Mirroring applies to the viewer's picture, before the rotation.
     """
     width, height = float(screen_width_px), float(screen_height_px)
     turned = {
@@ -52,9 +52,9 @@ def layer_from_screen(
     mirror: str,
     homography: Sequence[Sequence[float]],
 ) -> F64:
-    """3x3: layer pixels from the monitor's pixels, up to scale.
+    """3x3 from the monitor's pixels to layer pixels, up to scale.
 
-    homography: true panel pixels from ideal ones, in the panel's own pixels, whatever the layers' resolution.
+    homography: from ideal to true pixels at the panel's resolution, independent of the layers'.
     Raises ValueError for a singular homography.
     """
     columns, rows = panel_size_px(
@@ -72,7 +72,7 @@ def layer_from_screen(
 
 
 def permutes_pixels(matrix: F64) -> bool:
-    """True where a 3x3 takes every pixel centre to a pixel centre, so that no interpolation is wanted."""
+    """Return True if a 3x3 maps pixel centres to pixel centres, so that no interpolation is needed."""
     if matrix[2, 2] == 0.0:
         return False
     m = matrix / matrix[2, 2]
@@ -90,10 +90,7 @@ DIRECTIONS: dict[Arrow, tuple[int, int]] = {"up": (0, -1), "down": (0, 1), "left
 
 
 def mounting_of(arrow: Arrow, *, mirrored: bool) -> tuple[int, str]:
-    """`rotation_deg` and `mirror` of a panel, from where its card's arrow points.
-
-    mirrored: its writing reads the wrong way round.
-    """
+    """`rotation_deg` and `mirror` of a panel, from the direction of its card's arrow and its mirrored writing."""
     mirror = "horizontal" if mirrored else "none"
     for rotation_deg in ROTATIONS:
         seen = panel_from_screen(screen_width_px=1, screen_height_px=1, rotation_deg=rotation_deg, mirror=mirror)

@@ -1,4 +1,4 @@
-"""Grey curves: the grey level that makes a panel turn the light by a given angle."""
+"""Grey curves: the grey level for each phase of a panel."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ COLUMNS = ("phase", "red", "green", "blue")
 def measured_curve(path: Path) -> F32:
     """(256, 3) grey from a CSV with columns phase, red, green, blue (or phase, grey), all in [0, 1].
 
-    Rows may be at any phases, ascending, at least two; between them it is linear, beyond them constant.
+    Needs at least two rows with ascending phases; the curve is linear between them and constant beyond them.
     Raises InputError, naming the file and the row or column.
     """
     lines = [line for line in untrusted_input.read_text(path).splitlines() if line.strip() and line[0] != "#"]
@@ -31,20 +31,20 @@ def measured_curve(path: Path) -> F32:
     except ValueError as error:
         raise InputError(path, "rows", str(error)) from None
     if not np.isfinite(table).all() or table.min() < 0.0 or table.max() > 1.0:
-        raise InputError(path, "values", "must lie in [0, 1]")
+        raise InputError(path, "values", "must be in [0, 1]")
     if (np.diff(table[:, 0]) <= 0.0).any():
         raise InputError(path, "phase", "must ascend")
-    wanted = np.linspace(0.0, 1.0, ENTRIES)
+    phases = np.linspace(0.0, 1.0, ENTRIES)
     greys = table[:, 1:] if table.shape[1] == 4 else np.repeat(table[:, 1:2], 3, axis=1)
-    return np.stack([np.interp(wanted, table[:, 0], greys[:, channel]) for channel in range(3)], axis=1).astype(
+    return np.stack([np.interp(phases, table[:, 0], greys[:, channel]) for channel in range(3)], axis=1).astype(
         np.float32
     )
 
 
 def curve(*, lut: str, gamma: float) -> F32:
-    """(256, 3) grey in [0, 1] for each 8-bit phase and channel: measured, or by gamma.
+    """(256, 3) grey in [0, 1] for each 8-bit phase and channel: measured, or for a phase of grey^gamma.
 
-    A panel's phase is then grey^gamma. Raises InputError.
+    Raises InputError.
     """
     if lut:
         return measured_curve(Path(lut))

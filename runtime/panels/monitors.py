@@ -1,5 +1,7 @@
-"""Which monitor is which panel: by EDID serial, else connector, never by a guess; and whether
-their modes fit the stack: phases must reach the panel's pixels as they are, at one rate."""
+"""Assign monitors to panels, by EDID serial or connector, and check their modes and rates.
+
+Nothing is guessed, and nothing may rescale: phases must reach the panels' pixels unchanged, at one refresh rate.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ REFRESH_TOLERANCE_HZ = 0.05  # 59.94 and 60 Hz drift apart by a frame in 17 s
 
 
 class Rectangle(NamedTuple):
-    """A part of the X screen, pixels, from its top left corner."""
+    """A region of the X screen, pixels from its top left corner."""
 
     x_px: int
     y_px: int
@@ -28,10 +30,10 @@ class Rectangle(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Monitor:
-    """One monitor of the X screen, active."""
+    """One active monitor of the X screen."""
 
     connector: str
-    serial: str  # EDID's; empty where it has none
+    serial: str  # EDID's; empty if it has none
     model: str
     x_px: int  # of its top left corner on the X screen
     y_px: int
@@ -41,12 +43,12 @@ class Monitor:
 
     @property
     def place(self) -> Rectangle:
-        """The part of the X screen that it shows."""
+        """Region of the X screen that it shows."""
         return Rectangle(self.x_px, self.y_px, self.width_px, self.height_px)
 
     @property
     def setting(self) -> str:
-        """The settings in `[[output.panels]]` that identify it."""
+        """Line for `[[output.panels]]` that identifies it."""
         return f'edid_serial = "{self.serial}"' if self.serial else f'connector = "{self.connector}"'
 
     def __str__(self) -> str:
@@ -56,18 +58,18 @@ class Monitor:
 
 
 def in_order(monitors: Sequence[Monitor]) -> tuple[Monitor, ...]:
-    """Monitors sorted from left to right, then from top to bottom."""
+    """Sort monitors from left to right, then from top to bottom."""
     return tuple(sorted(monitors, key=lambda monitor: (monitor.x_px, monitor.y_px, monitor.connector)))
 
 
 def bind(panels: Sequence[PanelSettings], monitors: Sequence[Monitor]) -> tuple[Monitor, ...]:
     """The monitor of each panel, rear to front.
 
-    What a panel names first decides: a serial that is not there is not made up for by a connector. What it
-    names beyond that must agree, and tells apart what is alike otherwise.
+    A monitor must match both serial and connector if a panel gives both. Two monitors with equal serials are told
+    apart by their connectors.
 
-    Raises InputError for a panel that names nothing (and with it no wait can help), PanelLost where a panel's
-    monitor is missing, ambiguous, or another panel's too; the text names panel, criterion and what is there.
+    Raises InputError for a panel without either, since waiting can't help; PanelLost if a panel's monitor is missing,
+    ambiguous or also another panel's. The message names the panel, the criteria and the monitors found.
     """
     ordered = in_order(monitors)
     bound: list[Monitor] = []
@@ -80,29 +82,29 @@ def bind(panels: Sequence[PanelSettings], monitors: Sequence[Monitor]) -> tuple[
 
 
 def _find(number: int, panel: PanelSettings, monitors: tuple[Monitor, ...]) -> Monitor:
-    wanted: list[str] = []
-    left = list(monitors)
+    criteria: list[str] = []
+    matches = list(monitors)
     if panel.edid_serial:
-        wanted.append(f"EDID serial {panel.edid_serial}")
-        left = [monitor for monitor in left if monitor.serial == panel.edid_serial]
+        criteria.append(f"EDID serial {panel.edid_serial}")
+        matches = [monitor for monitor in matches if monitor.serial == panel.edid_serial]
     if panel.connector:
-        wanted.append(f"connector {panel.connector}")
-        left = [monitor for monitor in left if monitor.connector == panel.connector]
-    if not wanted:
+        criteria.append(f"connector {panel.connector}")
+        matches = [monitor for monitor in matches if monitor.connector == panel.connector]
+    if not criteria:
         raise InputError(
             "output", f"panels.{number}", "names no monitor: set edid_serial or connector (`phasestack identify`)"
         )
-    if len(left) == 1:
-        return left[0]
-    there = "; ".join(str(monitor) for monitor in monitors) or "none"
-    problem = "no monitor" if not left else f"{len(left)} monitors"
-    raise PanelLost(f"panel {number}: {problem} with {' and '.join(wanted)} (there are: {there})")
+    if len(matches) == 1:
+        return matches[0]
+    connected = "; ".join(str(monitor) for monitor in monitors) or "none"
+    problem = "no monitor" if not matches else f"{len(matches)} monitors"
+    raise PanelLost(f"panel {number}: {problem} with {' and '.join(criteria)} (connected: {connected})")
 
 
 def check_modes(panels: Sequence[PanelSettings], monitors: Sequence[Monitor], *, width_px: int, height_px: int) -> None:
-    """Raise PanelLost where a monitor's mode has other pixels than the stack.
+    """Raise PanelLost if a monitor's mode and the stack differ in resolution.
 
-    A phase between two pixels' phases is none that was solved for: a rescaled layer shows neither eye its picture.
+    Rescaling mixes the phases of neighbouring pixels, which destroys both eyes' pictures.
     """
     for number, (panel, monitor) in enumerate(zip(panels, monitors, strict=True)):
         columns, rows = panel_size_px(
@@ -117,10 +119,10 @@ def check_modes(panels: Sequence[PanelSettings], monitors: Sequence[Monitor], *,
 
 
 def refresh_difference(monitors: Sequence[Monitor]) -> str:
-    """One line if the panels' monitors refresh at different rates, else empty; rate 0 is unknown."""
+    """One-line warning if the panels' monitors refresh at different rates, else empty; rate 0 is unknown."""
     known = [monitor for monitor in monitors if monitor.refresh_hz > 0]
     rates = [monitor.refresh_hz for monitor in known]
     if not rates or max(rates) - min(rates) <= REFRESH_TOLERANCE_HZ:
         return ""
     each = ", ".join(f"{monitor.connector} {monitor.refresh_hz:.2f} Hz" for monitor in known)
-    return f"the panels refresh at different rates ({each}): a frame is not on all of them at once"
+    return f"the panels refresh at different rates ({each}): frames do not change on all of them together"

@@ -1,4 +1,4 @@
-"""The panels that the settings name, and panels without a screen for replay and tests."""
+"""Open the configured panels; panels without a screen, for replay and tests."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class OffscreenPanels(PanelSink):
-    """Panels without a screen: frames are accepted and not drawn."""
+    """Panels without a screen: accepts frames without drawing them."""
 
     name = "offscreen"
 
@@ -27,11 +27,11 @@ class OffscreenPanels(PanelSink):
         return PresentReport(frame.number, self._clock.now_ns(), 0.0)
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing."""
 
 
 class BrowserPanels(PanelSink):
-    """Panels in a page, which aligns and draws them itself at its own rate."""
+    """Panels in a web page, which aligns and draws them at its own rate."""
 
     name = "browser"
 
@@ -47,14 +47,14 @@ class BrowserPanels(PanelSink):
 
 
 def panel_settings(settings: OutputSettings, count: int) -> tuple[PanelSettings, ...]:
-    """One table a panel: as configured, or defaults where none is."""
+    """One table per panel: as configured, or defaults if there are none."""
     return settings.panels or tuple(PanelSettings() for _ in range(count))
 
 
 def open_panels(settings: OutputSettings, stack: PanelStack, clock: Clock, context: moderngl.Context) -> PanelSink:
-    """The sink of `[output]`; `context` is current again after each of its methods.
+    """Open the sink configured in `[output]`; `context` is current again after each of its methods.
 
-    Raises InputError (settings that don't fit), PanelLost (a monitor is not there yet: wait and retry).
+    Raises InputError (unsuitable settings), PanelLost (a monitor is not there yet: wait and retry).
     """
     if settings.kind != "offscreen":
         from runtime.panels.window import WindowPanels

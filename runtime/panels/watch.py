@@ -1,8 +1,8 @@
-"""Watches whether windows and monitors are still as bound, by one question to X at a time.
+"""Check that windows and monitors are still as bound, with one query to X at a time.
 
-GLFW reports monitors that come and go and of windows that are asked to close or become another size. It doesn't
-report a window that somebody destroyed, unmapped or moved, nor a monitor that got another place or mode: what is shown
-then is on the wrong panel, or on none, and every swap succeeds.
+GLFW reports monitors that come and go, and windows that are closed or resized. It does not report a window that was
+destroyed, unmapped or moved from outside, or a monitor whose position or mode changed. In these cases a picture is on
+the wrong panel or on none, although every swap succeeds.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from runtime.panels import xlib
 from runtime.panels.display import Display, Window
 from runtime.panels.monitors import Monitor
 
-EVERY_NS = NS_PER_S  # a round of all questions
-REFRESH_TOLERANCE = 1e-3  # of a monitor's rate
+EVERY_NS = NS_PER_S  # for one round of all queries
+REFRESH_TOLERANCE = 1e-3  # relative
 
 
 class PlacementWatch:
-    """Every window and every monitor is looked at once in EVERY_NS, one of them a call.
+    """Checks one window or monitor per call, each once in EVERY_NS.
 
-    All at once where the X server has refused a request since the last look: something has gone.
+    If the X server has refused a request since the last call, something has gone: then it checks all of them.
     """
 
     def __init__(self, display: Display, monitors: Sequence[Monitor], windows: Sequence[Window], clock: Clock) -> None:
-        """monitors: as bound, with their windows, one per panel. Nothing is asked in the first EVERY_NS."""
+        """monitors, windows: as bound, one per panel. The first query is after EVERY_NS."""
         self._display, self._clock = display, clock
-        # Against what was there when it was bound; what came between binding and here differs from the monitor.
+        # EDIDs to compare with; a change of place or mode since binding shows as a difference from the monitor.
         self._states = [display.output_state(monitor.connector) for monitor in monitors]
         self._monitors, self._windows = monitors, windows
         self._questions: list[Callable[[], str]] = [
@@ -40,10 +40,10 @@ class PlacementWatch:
         self._refusals = xlib.refusals()
 
     def look(self) -> str:
-        """What is wrong, with which panel; empty: nothing, or no question was due."""
+        """Return faults, naming the panel; empty if there are none or no query was due."""
         if xlib.refusals() != self._refusals:
             faults = [fault for fault in (question() for question in self._questions) if fault]
-            self._refusals = xlib.refusals()  # after the questions: those about what has gone are refused too
+            self._refusals = xlib.refusals()  # read after the queries, which may be refused too
             return "; ".join(faults)
         now_ns = self._clock.now_ns()
         if now_ns < self._due_ns:
@@ -54,24 +54,24 @@ class PlacementWatch:
         return question()
 
     def _window_fault(self, panel: int) -> str:
-        state, wanted = self._display.window_state(self._windows[panel]), self._monitors[panel].place
+        state, bound = self._display.window_state(self._windows[panel]), self._monitors[panel].place
         if state is None:
             return f"panel {panel}: the window was destroyed"
         is_viewable, place = state
         if not is_viewable:
             return f"panel {panel}: the window was unmapped"
-        return "" if place == wanted else f"panel {panel}: the window is {place}, not {wanted}"
+        return "" if place == bound else f"panel {panel}: the window is {place}, not {bound}"
 
     def _monitor_fault(self, panel: int) -> str:
         monitor, then = self._monitors[panel], self._states[panel]
         now = self._display.output_state(monitor.connector)
-        whose = f"panel {panel}: {monitor.connector}"
+        subject = f"panel {panel}: {monitor.connector}"
         if now is None:
-            return f"{whose} shows nothing any more"
+            return f"{subject} was switched off or disconnected"
         if now.place != monitor.place:
-            return f"{whose} became {now.place}, it was {monitor.place}"
+            return f"{subject} changed from {monitor.place} to {now.place}"
         if monitor.refresh_hz and abs(now.refresh_hz / monitor.refresh_hz - 1.0) > REFRESH_TOLERANCE:
-            return f"{whose} shows {now.refresh_hz:.3f} frames a second, it was {monitor.refresh_hz:.3f}"
+            return f"{subject} changed from {monitor.refresh_hz:.3f} to {now.refresh_hz:.3f} Hz"
         if then is not None and now.edid != then.edid:
-            return f"{whose} has another monitor"
+            return f"{subject} has another monitor"
         return ""

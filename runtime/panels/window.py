@@ -23,25 +23,24 @@ from runtime.support.gl import offscreen_context
 
 log = logging.getLogger("phasestack.panels")
 
-RETRY_NS = NS_PER_S // 2  # between attempts to open what was lost
-LOOK_NS = 5 * NS_PER_S  # between looks at monitors that X has not said anything about
+RETRY_NS = NS_PER_S // 2  # between attempts to reopen lost panels
+LOOK_NS = 5 * NS_PER_S  # between looks for monitors without a notification from X
 
 
 class WindowPanels(PanelSink):
     """All panels of the stack on X11 monitors.
 
-    `present` uploads a new solution once into textures that all windows share, draws every window, aligned, and waits
-    for the drawing, and only then swaps them, one directly after the other: a fault before the first swap leaves
-    the old frame on all. Only the first window waits for its vertical blank: N windows that each waited in
-    turn would divide the rate by N. `skew_ms` is the time between the first and the last return from a swap;
-    what it can't know is how far the monitors' own blanks lie apart.
+    `present` uploads a new solution once, to textures shared by all windows. It draws all windows, aligned, waits for
+    the GPU, then swaps them in immediate succession: a fault before the first swap leaves the old frame on all panels.
+    Only the first window waits for its vertical blank, because N waiting windows would divide the rate by N. `skew_ms`
+    is the time between the first and the last return from a swap; it does not include the phase between the monitors'
+    blanks.
 
-    Once a second every window and monitor is compared with what was bound (a question a refresh, some 0.1 ms).
-    Where a monitor, a window or the context is lost or became another, every window is closed, `present` raises
-    PanelLost, and a later `present` builds it anew: half a second later, or as soon as X says that a missing
-    monitor is there. A hidden window's context, which all share, stays unless it is what was lost. The death of the X
-    server ends the process with exit status 75, to be started again.
-    Uses GLFW, so: one thread, the main one. The `content` context is current again after every call.
+    Once a second every window and monitor is compared with its state at binding (one query per refresh, about 0.1 ms).
+    If a monitor, window or context is lost or has changed, all windows are closed and `present` raises PanelLost. A
+    later `present` reopens them, after half a second or when X reports a monitor. The shared context of a hidden
+    window survives unless it was lost itself. If the X server dies, the process ends with exit status 75 and must be
+    restarted. GLFW requires the main thread. The `content` context is current again after every call.
     """
 
     name = "windows"
@@ -50,20 +49,21 @@ class WindowPanels(PanelSink):
         self, panels: tuple[PanelSettings, ...], stack: PanelStack, clock: Clock, content: moderngl.Context, *,
         any_shape: bool = False,
     ) -> None:  # fmt: skip
-        """any_shape: fill monitors whose mode is not the stack's (identify), rather than refuse them.
+        """any_shape: fill monitors in modes other than the stack's (for `identify`) instead of refusing them.
 
-        Raises InputError (settings), PanelLost (a panel is missing or ambiguous, no X server: it may come).
+        Raises InputError (settings); PanelLost (a panel is missing or ambiguous, or there is no X server; both may be
+        temporary).
         """
         self._any_shape = any_shape
         self._panels, self._stack = panels, stack
         self._clock, self._content = clock, content
         self._display: Display | None = None
-        self._surfaces: list[tuple[Window, Painter]] = []  # of each panel
+        self._surfaces: list[tuple[Window, Painter]] = []  # one per panel
         self._textures: FrameTextures | None = None
         self._watch: PlacementWatch | None = None
         self._retry_ns, self._lost = 0, ""
-        self._shown = False  # these windows show the frame before
-        self._away = False  # another context than content's may be current
+        self._shown = False  # the windows show the previous frame
+        self._away = False  # a context other than `content` may be current
         self._context_lost = False
         self.monitors: tuple[Monitor, ...] = ()
         try:
@@ -76,7 +76,7 @@ class WindowPanels(PanelSink):
 
     @property
     def period_ns(self) -> int | None:
-        """Of the first panel's monitor: the one whose vertical blank is waited for."""
+        """Refresh period of the first panel's monitor, whose vertical blank paces the swaps."""
         refresh_hz = self.monitors[0].refresh_hz if self.monitors else 0.0
         return round(NS_PER_S / refresh_hz) if refresh_hz else None
 
@@ -85,10 +85,7 @@ class WindowPanels(PanelSink):
         return [window.handle for window, _ in self._surfaces]
 
     def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
-        """Show a frame on every panel at once; an unchanged one stays as it is, where it is still shown.
-
-        Raises PanelLost.
-        """
+        """Show a frame on all panels; does nothing for an unchanged frame that is still shown. Raises PanelLost."""
         if not self._surfaces and not self._may_try():
             raise PanelLost(self._lost)
         try:
@@ -120,7 +117,7 @@ class WindowPanels(PanelSink):
         if any(textures.lacks(frame)):
             display.root.make_current()
             textures.upload(frame)
-            # Another context may use what this one has uploaded only after this one is known to be done.
+            # Other contexts may use the upload only once it is finished.
             display.root.context.finish()
         for panel, (window, painter) in enumerate(self._surfaces):
             self._draw(panel, window, painter, textures, frame)
@@ -150,7 +147,7 @@ class WindowPanels(PanelSink):
         return self._clock.now_ns()
 
     def _may_try(self) -> bool:
-        """Whether it is time to look for the panels again: now and then, or at once where a monitor came or went."""
+        """Return True if it is time to reopen the panels: after a delay, or when a monitor came or went."""
         display = self._display
         if display is not None and display.poll():
             display.faults.clear()
@@ -177,7 +174,7 @@ class WindowPanels(PanelSink):
         self._watch = PlacementWatch(display, self.monitors, [window for window, _ in self._surfaces], self._clock)
 
     def _retreat(self) -> None:
-        """After a failure: keep the connection, and where it is sound the context that all windows share."""
+        """Close the windows after a failure; keep the connection and, if intact, the shared context."""
         if self._display is None or self._context_lost:
             self._drop()
         elif self._display.has_windows:
@@ -214,7 +211,7 @@ class WindowPanels(PanelSink):
                 log.exception("closing the display")
 
     def _forget(self) -> None:
-        """There are no windows any more; they are made again after a while."""
+        """Clear the state of closed windows and schedule reopening."""
         self._surfaces, self._textures, self._watch, self._shown = [], None, None, False
         self._retry_ns = self._clock.now_ns() + RETRY_NS
 
@@ -231,18 +228,18 @@ def _error(context: moderngl.Context) -> str:
 
 
 def _reset_status() -> str:
-    """What the driver says of a lost context (GPU reset); empty where all is well or it can't say."""
+    """Driver's report of a lost context (GPU reset); empty if there is none or it is not supported."""
     address = gl_function("glGetGraphicsResetStatus")
     status: int = ctypes.CFUNCTYPE(ctypes.c_uint)(address)() if address else 0
     return f"was reset (0x{status:x})" if status else ""
 
 
 def every_monitor() -> tuple[WindowPanels, list[U8], tuple[Monitor, ...]]:
-    """Windows on all monitors whatever they are, their cards, and what they are called. Raises PanelLost."""
+    """Open windows on all monitors; returns them, the identity cards and the monitors. Raises PanelLost."""
     monitors = connected_monitors()
     width, height = max(m.width_px for m in monitors), max(m.height_px for m in monitors)
     bound = tuple(PanelSettings(connector=monitor.connector) for monitor in monitors)
-    # Only for this picture: monitors of any shape, each filled.
+    # A nominal stack: the cards fill monitors of any shape.
     stack = PanelStack(1.0, 1.0, tuple(0.01 * index for index in range(len(monitors))), width, height)
     panels = WindowPanels(bound, stack, MonotonicClock(), offscreen_context(), any_shape=True)
     cards = []

@@ -1,6 +1,6 @@
-"""The little of Xlib and RandR that GLFW does not offer: what outputs send, and X's errors.
+"""Functions of Xlib and RandR that GLFW lacks: state of outputs, and X errors.
 
-Bound by ctypes to libraries that GLFW needs anyway. By default Xlib ends the process on any error.
+Bound by ctypes to libraries that GLFW requires anyway. By default Xlib ends the process on any error.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ log = logging.getLogger("phasestack.panels")
 
 ErrorHandler = ctypes.CFUNCTYPE(c_int, c_void_p, c_void_p)
 IOErrorHandler = ctypes.CFUNCTYPE(c_int, c_void_p)
-SERVER_DIED = 75  # sysexits.h: a temporary failure, try again
+SERVER_DIED = 75  # EX_TEMPFAIL of sysexits.h
 
 
 class _Mode(ctypes.Structure):
@@ -76,7 +76,7 @@ class _Crtc(ctypes.Structure):
 
 @dataclass(frozen=True, slots=True)
 class OutputState:
-    """What one output of the graphics card sends, and to which monitor."""
+    """Mode of one output of the graphics card, and its monitor."""
 
     place: Rectangle
     refresh_hz: float  # 0: unknown
@@ -107,11 +107,11 @@ def _libraries() -> tuple[ctypes.CDLL, ctypes.CDLL]:
     return x11, randr
 
 
-_refused = 0  # requests, in this process
+_refused = 0  # requests refused in this process
 
 
 def refusals() -> int:
-    """How many requests the X server has refused so far: another number says that something has gone."""
+    """Number of requests refused by the X server; an increase means that a window or monitor has gone."""
     return _refused
 
 
@@ -123,7 +123,7 @@ def _note_error(_display: int, _event: int) -> int:
 
 
 def _end(_display: int = 0) -> int:
-    log.critical("the X server died: ending with exit status %d, to be started again", SERVER_DIED)
+    log.critical("the X server died: exiting with status %d for a restart", SERVER_DIED)
     for handler in (*logging.getLogger("phasestack").handlers, *logging.getLogger().handlers):
         handler.flush()
     os._exit(SERVER_DIED)
@@ -135,10 +135,10 @@ _IO_ERROR_HANDLER = IOErrorHandler(_end)
 
 
 def take_over_errors() -> None:
-    """From now on a refused X request (a monitor that vanished meanwhile) is logged, and no more.
+    """Install error handlers: a refused X request (for example about an unplugged monitor) is only logged.
 
-    The server's death ends the process, at once and with a line of its own: nothing that Xlib, EGL and GLFW hold
-    can be used or even released afterwards (they hang or crash, as tried), and it may come in the middle of a call.
+    The server's death ends the process immediately, with a line in the log. It may happen in the middle of a call, and
+    afterwards Xlib, EGL and GLFW hang or crash even when releasing their objects.
     """
     x11 = _libraries()[0]
     x11.XSetErrorHandler(_ERROR_HANDLER)
@@ -146,13 +146,13 @@ def take_over_errors() -> None:
 
 
 class ServerWatch:
-    """Notices the server's death while the main thread is in a call that would never return.
+    """Detects the server's death while the main thread is in a call that never returns.
 
-    Mesa's software renderer spins for ever in a swap whose connection broke, and Xlib never hears of it.
+    Mesa's software renderer loops forever in a swap after the connection broke, and Xlib does not notice.
     """
 
     def __init__(self, display: int) -> None:
-        """`display` is an open Display pointer; stop watching before it is closed."""
+        """display: an open Display pointer; call `stop` before closing it."""
         x11 = _libraries()[0]
         x11.XConnectionNumber.argtypes = [c_void_p]
         self._connection: int = x11.XConnectionNumber(display)
@@ -161,7 +161,7 @@ class ServerWatch:
         self._thread.start()
 
     def stop(self) -> None:
-        """The connection is about to be closed on purpose."""
+        """Stop watching, before closing the connection deliberately."""
         os.write(self._stop_writing, b".")
         self._thread.join()
         os.close(self._stop_reading)
@@ -169,7 +169,7 @@ class ServerWatch:
 
     def _watch(self) -> None:
         poll = select.poll()
-        poll.register(self._connection, 0)  # hanging up is always reported; what comes in is not our business
+        poll.register(self._connection, 0)  # reports only hang-ups, not input
         poll.register(self._stop_reading, select.POLLIN)
         for file, _ in poll.poll():
             if file == self._connection:
@@ -177,7 +177,7 @@ class ServerWatch:
 
 
 def output_state(display: int, output: int) -> OutputState | None:
-    """What an output sends now; None: nothing, or there is no such output any more. Four round trips."""
+    """Current state of an output; None if it is off or gone. Four round trips."""
     x11, randr = _libraries()
     resources = randr.XRRGetScreenResourcesCurrent(display, x11.XDefaultRootWindow(display))
     if not resources:
@@ -192,13 +192,13 @@ def output_state(display: int, output: int) -> OutputState | None:
             return None
         place = state.contents
         refresh_hz = {mode.id: _refresh_hz(mode) for mode in resources.contents.modes[: resources.contents.nmode]}
-        answer = OutputState(
+        output_now = OutputState(
             Rectangle(place.x, place.y, place.width, place.height),
             refresh_hz.get(place.mode, 0.0),
             _property(x11, randr, display, output, x11.XInternAtom(display, b"EDID", 0)),
         )
         randr.XRRFreeCrtcInfo(state)
-        return answer
+        return output_now
     finally:
         randr.XRRFreeScreenResources(resources)
 

@@ -1,4 +1,4 @@
-"""The driver contract: open, capabilities, read the newest, close; and a device's clock."""
+"""The driver interface (open, capabilities, read the newest, close), and device clocks."""
 
 from __future__ import annotations
 
@@ -14,53 +14,54 @@ from runtime.config import Section
 from runtime.errors import SensorTimeout
 from runtime.records import SensorFrame
 
-ARRIVED_MAX = 1024  # samples in one answer: who was away for long gets them in several
-WINDOW_NS = 5_000_000_000  # of a device's clock
+ARRIVED_MAX = 1024  # samples returned at once; the rest follow in later calls
+WINDOW_NS = 5_000_000_000  # for estimating a device clock's offset
 
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:
-    """What a sensor delivers."""
+    """Kinds of data that a sensor delivers."""
 
     colour: bool = False
     depth: bool = False
-    eye_points: bool = False  # it finds the eyes itself: no detector is needed
+    eye_points: bool = False  # it finds the eyes itself, without our detector
     in_stack_frame: bool = False  # its eye points are in frame `stack` already: no calibration is applied
-    may_pause: bool = False  # silence is its own (a recording's gap), as are samples that never change: no fault
+    may_pause: bool = False  # gaps and constant samples are no fault (a recording)
 
 
 class Sensor(ABC):
     """One depth sensor, eye tracker or recording.
 
-    A constructor only keeps its settings; `open` acquires and cleans up after itself when it fails.
-    One thread uses a driver; that thread may be abandoned when an SDK hangs.
+    A constructor only stores settings; `open` acquires the device and cleans up after itself if it fails. One thread
+    uses a driver; that thread may be abandoned if an SDK hangs.
 
-    A class of the user's own is named by `sensor.driver = "module:Class"` and made as `Class(options, clock=clock)`:
-    `options` is what `Options` makes of `[sensor.options]`, `clock` the run's clock, which its captures are times of.
+    A user's class is configured by `sensor.driver = "module:Class"` and constructed as `Class(options, clock=clock)`,
+    with `options` an `Options` validated from `[sensor.options]` and `clock` the run's clock, on which capture times
+    must be.
     """
 
-    Options: ClassVar[type[BaseModel]] = Section  # of a class of the user's own: what [sensor.options] may hold
+    Options: ClassVar[type[BaseModel]] = Section  # of a user's class: the schema of [sensor.options]
 
     name: str
     capabilities: Capabilities
-    serial: str = ""  # known after `open`, empty where the device has none; set before: `open` takes that device only
-    skipped: int = 0  # samples that arrived and that `read_newest` passed over for a newer one
+    serial: str = ""  # known after `open`; empty if the device has none. If set before, `open` takes only that device
+    skipped: int = 0  # samples that `read_newest` skipped for a newer one
 
     @abstractmethod
     def open(self) -> None:
-        """Acquire the device. Raises SensorLost (not there, retry), FatalError (never will be)."""
+        """Acquire the device. Raises SensorLost (not there; retry), FatalError (don't retry)."""
 
     @abstractmethod
     def read_newest(self, timeout_s: float) -> SensorFrame:
-        """The newest frame not yet read, with its capture time; waits for one, at most `timeout_s`.
+        """Return the newest unread frame, with its capture time; waits up to `timeout_s` for one.
 
         Raises SensorTimeout (nothing new), SensorLost (close and reopen), EndOfRecording.
         """
 
     def read_arrived(self, timeout_s: float) -> list[SensorFrame]:
-        """All frames that have arrived and were not read, oldest first; waits for one, at most `timeout_s`.
+        """Return all unread frames, oldest first (by default only the newest); waits up to `timeout_s` for one.
 
-        Raises as `read_newest` does. A driver that keeps only the newest answers with that one.
+        Raises as `read_newest` does.
         """
         return [self.read_newest(timeout_s)]
 
@@ -79,24 +80,24 @@ class Sensor(ABC):
 
 
 class SteppedSensor(Sensor):
-    """A driver that also delivers sample after sample without waiting, for runs on a simulated clock.
+    """A driver that can also deliver every sample without waiting, for runs on a simulated clock.
 
-    What it reads by its own clock is what has arrived by then.
+    `read_newest` and `read_arrived` return what has arrived by its clock.
     """
 
     _clock: Clock
 
     @abstractmethod
     def next_sample(self) -> SensorFrame:
-        """The next sample, in order, none left out, at once. Raises EndOfRecording, SensorLost."""
+        """Return the next sample in order, immediately. Raises EndOfRecording, SensorLost."""
 
     @abstractmethod
     def peek(self) -> SensorFrame | None:
-        """What `next_sample` will deliver, or None where nothing is left. Raises SensorLost."""
+        """Return the sample that `next_sample` will deliver, or None at the end. Raises SensorLost."""
 
     @abstractmethod
     def available_ns(self, frame: SensorFrame) -> int:
-        """When a sample arrives, on the run's clock: the caller lets its clock pass until then."""
+        """Arrival time of a sample on the run's clock, until which the caller advances its clock."""
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
         *overtaken, newest = self.read_arrived(timeout_s)
@@ -115,10 +116,10 @@ class SteppedSensor(Sensor):
         return following is not None and self.available_ns(following) <= now_ns
 
     def _first_due(self, timeout_s: float) -> SensorFrame:
-        """The oldest unread sample, once it is available. Raises SensorTimeout, EndOfRecording, SensorLost."""
+        """Return the oldest unread sample once available. Raises SensorTimeout, EndOfRecording, SensorLost."""
         following = self.peek()
         if following is None:
-            return self.next_sample()  # it raises the reason
+            return self.next_sample()  # raises EndOfRecording
         due_ns = self.available_ns(following)
         deadline_ns = self._clock.now_ns() + round(timeout_s * NS_PER_S)
         self._clock.sleep_until_ns(min(due_ns, deadline_ns))
@@ -128,19 +129,19 @@ class SteppedSensor(Sensor):
 
 
 class DeviceClock:
-    """A device's time on the host's clock: the quickest delivery of the last seconds gives the offset.
+    """Converts a device's time to the host's clock, with the offset from the fastest recent delivery.
 
-    Every delivery is late by some delay; the least delay of a window is close to the least there is, and
-    taking a fresh window every few seconds follows the drift between two quartzes.
+    Every delivery has some delay, whose minimum over a window is nearly constant. A new window every few seconds
+    follows the drift between the two clocks.
     """
 
     def __init__(self) -> None:
         self._start_ns = 0
-        self._offsets: list[int] = []  # least of the window before, least of this one
+        self._offsets: list[int] = []  # minimum of the previous window, and of this one
         self._last_ns: int | None = None
 
     def host_ns(self, device_ns: int, *, arrival_ns: int) -> int:
-        """When, on the host's clock, the device said `device_ns`; never after the arrival."""
+        """Convert a device's time to the host's clock; never later than the arrival."""
         offset = arrival_ns - device_ns
         if self._last_ns is None or device_ns < self._last_ns:  # first, or the device was restarted
             self._offsets, self._start_ns = [offset], arrival_ns

@@ -1,4 +1,4 @@
-"""Driver `browser`: a page's pointer as the head, with noise and latency; or its camera."""
+"""Driver `browser`: a web page's pointer as the head, with noise and latency, or its camera."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from runtime.records import EyePoints, Intrinsics, SensorFrame
 from runtime.sensor.base import Capabilities, DeviceClock, Sensor
 
 AGAIN_NS = NS_PER_S // 30  # a page reports eyes when they move; between reports the last position is repeated
-SILENT_NS = 5 * NS_PER_S  # without a word from a page nobody is seen
-LEAST_SIGMA_M = 5e-5  # that a sample states; without simulated noise a covariance would be singular
+SILENT_NS = 5 * NS_PER_S  # after this long without a message from a page there is no viewer
+LEAST_SIGMA_M = 5e-5  # floor that keeps the covariance of noise-free samples from being singular
 PICTURE_MAX_PX = 2048  # longer side of a page's camera picture
 
 
 class BrowserEyes(Sensor):
-    """Samples as pages send them, and between them the last one again."""
+    """Delivers samples as pages send them, and repeats the last one between them."""
 
     name = "browser"
     capabilities = Capabilities(eye_points=True, in_stack_frame=True, may_pause=True)
@@ -30,7 +30,7 @@ class BrowserEyes(Sensor):
     def __init__(self, link: BrowserLink, clock: Clock) -> None:
         self._link, self._clock = link, clock
         self._random = np.random.default_rng(0)
-        self._waiting: deque[tuple[int, SensorFrame]] | None = None  # when each is there
+        self._waiting: deque[tuple[int, SensorFrame]] | None = None  # with arrival times
         self._times, self._heard_ns, self._sampled_ns, self._count = DeviceClock(), 0, 0, 0
         self._last, self._captured_ns = SeenEyes(None, 0.0), 0
 
@@ -69,7 +69,7 @@ class BrowserEyes(Sensor):
     def _take(self, capture_ns: int, now_ns: int) -> None:
         assert self._waiting is not None
         self._sampled_ns = now_ns
-        self._captured_ns = capture_ns = max(capture_ns, self._captured_ns + 1)  # one that came slowly is no older
+        self._captured_ns = capture_ns = max(capture_ns, self._captured_ns + 1)  # keep captures in order
         self._count += 1
         points, eyes_m = None, self._last.eyes_m
         if eyes_m is not None:
@@ -84,7 +84,7 @@ class BrowserEyes(Sensor):
 
 
 class BrowserCamera(Sensor):
-    """Pictures of a page's own camera. No depth: how far away eyes are follows from their distance."""
+    """Delivers pictures of a page's camera. Without depth, the eyes' separation gives their distance."""
 
     name = "browser"
     capabilities = Capabilities(colour=True)
@@ -97,15 +97,15 @@ class BrowserCamera(Sensor):
         self._times = DeviceClock()
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
-        found = self._link.picture(timeout_s)
-        if found is None:
-            raise SensorTimeout("the page sends no picture of its camera")
-        coded, page_ms = found
+        message = self._link.picture(timeout_s)
+        if message is None:
+            raise SensorTimeout("the page sends no camera picture")
+        coded, page_ms = message
         capture_ns = self._times.host_ns(round(page_ms * NS_PER_MS), arrival_ns=self._clock.now_ns())
         self._link.captured(capture_ns, page_ms)
         picture: Any = cv2.imdecode(np.frombuffer(coded, np.uint8), cv2.IMREAD_COLOR)
         if picture is None or max(picture.shape) > PICTURE_MAX_PX:
-            raise SensorTimeout("the page sends what is no picture of a camera")
+            raise SensorTimeout("the page sends an invalid camera picture")
         self._number += 1
         self._captured_ns = max(capture_ns, self._captured_ns + 1)
         height, width = picture.shape[:2]
@@ -115,4 +115,4 @@ class BrowserCamera(Sensor):
         return SensorFrame(self._number, self._captured_ns, colour=colour, intrinsics=intrinsics)
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing."""

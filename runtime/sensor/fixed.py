@@ -14,15 +14,15 @@ PERIOD_NS = NS_PER_S // 30
 
 
 class FixedDriver(SteppedSensor):
-    """Thirty samples a second of one pair of eyes in the `stack` frame."""
+    """Delivers one pair of eyes in the `stack` frame, thirty times a second."""
 
     name = "fixed"
     capabilities = Capabilities(eye_points=True, in_stack_frame=True, may_pause=True)
 
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
-        """Raises InputError without eyes in the settings."""
+        """Raise InputError if the settings have no eyes."""
         if settings.fixed_eyes_m is None:
-            raise InputError("sensor", "fixed_eyes_m", "is needed by the driver `fixed`")
+            raise InputError("sensor", "fixed_eyes_m", "is required by the driver `fixed`")
         self._eyes = EyePoints(np.array(settings.fixed_eyes_m, dtype=np.float64), np.ones(2))
         self._clock = clock
         self._start_ns: int | None = None

@@ -23,10 +23,10 @@ from runtime.sensor.openni2_library import load
 
 SERIAL_PROPERTY = 3  # ONI_DEVICE_PROPERTY_SERIAL_NUMBER
 DEPTH_1_MM, DEPTH_100_UM, RGB888, GRAY8 = 100, 101, 200, 202
-PAIR_APART_US = 40_000  # depth and colour of one instant are no further apart: a period of a camera without sync
-PAIR_WAIT_S = 0.02  # that a depth picture waits for its colour
-THREADS_STOP_S = 0.5  # fifteen periods of a file's threads: on a busy machine three were too few (crashes)
-DRAIN_MAX = 32  # frames that are passed over in one call: a queue can't keep us
+PAIR_APART_US = 40_000  # largest time between depth and colour of a pair: a period of an unsynchronised camera
+PAIR_WAIT_S = 0.02  # how long a depth picture waits for its colour
+THREADS_STOP_S = 0.5  # fifteen periods of a file's threads; three caused crashes on a busy machine
+DRAIN_MAX = 32  # frames skipped in one call, so that a fast source can't block it
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -41,18 +41,18 @@ class _Picture(NamedTuple):
 
 
 class OpenNI2Driver(Sensor):
-    """Depth in millimetres and colour, registered by the camera where it can.
+    """Delivers depth in millimetres, registered to colour if the camera supports that, and colour.
 
-    The library is called on a thread that outlives whoever reads (`_PersistentThread`).
+    The library is called on a thread that outlives the calling one (`_PersistentThread`).
     """
 
     name = "openni2"
     capabilities = Capabilities(colour=True, depth=True)
 
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
-        """settings.source: `demo` or empty for the only camera, a serial number, a device URI, or a .oni."""
+        """settings.source: `demo` or empty for the only camera, a serial number, a device URI, or a .oni file."""
         self._settings, self._clock = settings, clock
-        self._thread: _PersistentThread | None = None  # while it is open
+        self._thread: _PersistentThread | None = None  # while open
         self._openni: Any = None
         self._device: Any = None
         self._streams: dict[str, Any] = {}
@@ -80,7 +80,7 @@ class OpenNI2Driver(Sensor):
             self._start_streams()
         except SensorLost:
             raise
-        except Exception as error:  # the package raises its own, ctypes' and plain AssertionError
+        except Exception as error:  # the package raises its own errors, ctypes' and AssertionError
             raise SensorLost(f"OpenNI2: {_text(error)}") from None
 
     def _find_device(self) -> Any:
@@ -89,25 +89,25 @@ class OpenNI2Driver(Sensor):
             return openni.Device(source.encode())
         uris = openni.Device.enumerate_uris()
         wanted = self.serial or ("" if source in ("", "demo", "any") else source)
-        found = []
+        matches = []
         for uri in uris:
             device = openni.Device(uri)
             if wanted and wanted not in (_serial(device), uri.decode(errors="replace")):
                 device.close()
                 continue
-            found.append(device)
-        if len(found) == 1:
-            return found[0]
-        for device in found:
+            matches.append(device)
+        if len(matches) == 1:
+            return matches[0]
+        for device in matches:
             device.close()
-        if found:
-            raise SensorLost(f"{len(found)} OpenNI2 cameras fit: set sensor.source to one's serial number")
+        if matches:
+            raise SensorLost(f"{len(matches)} OpenNI2 cameras match: set sensor.source to a serial number")
         raise SensorLost(f"no OpenNI2 camera {wanted!r} among {len(uris)}" if wanted else "no OpenNI2 camera found")
 
     def _start_streams(self) -> None:
         device, openni = self._device, self._openni
-        made = {"depth": device.create_depth_stream(), "colour": device.create_color_stream()}
-        self._streams = {kind: stream for kind, stream in made.items() if stream is not None}
+        streams = {"depth": device.create_depth_stream(), "colour": device.create_color_stream()}
+        self._streams = {kind: stream for kind, stream in streams.items() if stream is not None}
         if not self._streams:
             raise SensorLost("the camera has neither depth nor colour")
         both = len(self._streams) == 2
@@ -115,7 +115,7 @@ class OpenNI2Driver(Sensor):
         if both and device.is_image_registration_mode_supported(mode):
             device.set_image_registration_mode(mode)
         elif both and not device.is_file():
-            log.warning("OpenNI2: this camera does not register depth to colour; eyes are off by their parallax")
+            log.warning("OpenNI2: this camera does not register depth to colour; parallax will displace the eyes")
         for stream in self._streams.values():
             if stream.is_property_supported(7):  # mirroring
                 stream.set_mirroring_enabled(False)
@@ -128,10 +128,10 @@ class OpenNI2Driver(Sensor):
         self._times, self._newest, self._index = DeviceClock(), {}, 0
 
     def _read_intrinsics(self, stream: Any) -> Intrinsics | None:
-        """A pinhole from the field of view, centred; None where neither camera nor settings know it."""
+        """Centred pinhole from the field of view of the camera or else the settings; None if unknown."""
         mode = stream.video_mode
         width, height = mode.resolutionX, mode.resolutionY
-        try:  # files have the property, yet say that they don't
+        try:  # files have the property but deny it
             fov_x, fov_y = stream.get_horizontal_fov(), stream.get_vertical_fov()
         except Exception:
             fov_x = fov_y = 0.0
@@ -182,16 +182,16 @@ class OpenNI2Driver(Sensor):
         return "depth" if "depth" in self._streams else "colour"
 
     def _lacks_colour(self) -> bool:
-        """Whether the colour picture of the newest depth may still come."""
+        """Return True if the colour picture for the newest depth may still arrive."""
         colour = self._newest.get("colour")
         return "colour" in self._streams and (
             colour is None or self._newest[self._main].time_us - colour.time_us > PAIR_APART_US
         )
 
     def _take(self, timeout_s: float) -> bool:
-        """Copy one frame of whichever stream has one; False where none came in time."""
+        """Copy one frame of any stream that has one; returns False if none arrived in time."""
         try:
-            # 0 would be "no wait", which the library takes for an error on some devices.
+            # The library reports an error for a wait of 0 on some devices.
             stream = self._openni.wait_for_any_stream(list(self._streams.values()), max(timeout_s, 0.001))
             if stream is None:
                 return False
@@ -222,7 +222,7 @@ class OpenNI2Driver(Sensor):
         for stream in streams.values():
             _quietly(stream.stop)
         if streams and self._settings.source.endswith(".oni"):
-            # Their threads are told to stop but not waited for: without a pause they write to freed memory.
+            # The library does not wait for a file's threads to stop: without a pause they write to freed memory.
             time.sleep(THREADS_STOP_S)
         for handle in (*streams.values(), device):
             if handle is not None:
@@ -230,7 +230,7 @@ class OpenNI2Driver(Sensor):
 
 
 def _quietly(call: Callable[[], object]) -> None:
-    """Call what may fail on an unplugged camera, of which there is nothing left to stop or close."""
+    """Call a function that may fail on an unplugged camera, and log its error."""
     try:
         call()
     except Exception as error:
@@ -238,7 +238,7 @@ def _quietly(call: Callable[[], object]) -> None:
 
 
 def _serial(device: Any) -> str:
-    """The serial number, where the device has one."""
+    """Serial number of a device; empty if it has none."""
     import ctypes
 
     if not device.is_property_supported(SERIAL_PROPERTY):
@@ -248,13 +248,13 @@ def _serial(device: Any) -> str:
 
 
 def _text(error: Exception) -> str:
-    """The library's own words, without the package's wrapping."""
+    """Library's error message, without the package's wrapping."""
     words = error.args[1] if len(error.args) > 1 else str(error) or type(error).__name__
     return words.decode(errors="replace").strip() if isinstance(words, bytes) else str(words)
 
 
 def _pixels(frame: Any) -> U8 | U16:
-    """A frame's pixels, copied: depth as (h, w) uint16 mm, colour as (h, w, 3) RGB. Raises ValueError."""
+    """Copy a frame's pixels: depth as (h, w) uint16 mm, colour as (h, w, 3) RGB. Raises ValueError."""
     pixel_format, height, width = frame.videoMode.pixelFormat.value, frame.height, frame.width
     data = np.frombuffer(frame.get_buffer_as_uint8(), np.uint8)
     kinds = {DEPTH_1_MM: (2, 1), DEPTH_100_UM: (2, 1), RGB888: (1, 3), GRAY8: (1, 1)}
@@ -262,7 +262,7 @@ def _pixels(frame: Any) -> U8 | U16:
         raise ValueError(f"pixel format {pixel_format} is not supported")
     size, channels = kinds[pixel_format]
     if data.size < height * frame.stride or frame.stride < width * size * channels:
-        raise ValueError("a frame is shorter than its size says")
+        raise ValueError("a frame has fewer bytes than its size requires")
     rows = data[: height * frame.stride].reshape(height, frame.stride)[:, : width * size * channels]
     if size == 2:
         depth = np.ascontiguousarray(rows).view("<u2").astype(np.uint16)
@@ -273,40 +273,39 @@ def _pixels(frame: Any) -> U8 | U16:
 
 
 class _PersistentThread:
-    """Calls on a thread that lives as long as the process, one at a time; whoever calls waits for it.
+    """Runs calls one at a time on a thread that lives as long as the process; callers wait for the result.
 
-    OpenNI2 asks, on its way out, after every thread that called it: of one that has ended and whose stack the system
-    took back, that is a crash. A `ThreadPoolExecutor`'s would not do: Python ends them before that, and waits for one
-    that hangs in a call.
+    At exit OpenNI2 accesses every thread that called it, and crashes if one has ended and its stack was freed. Threads
+    of a `ThreadPoolExecutor` won't do: Python ends them earlier, and waits for one that hangs in a call.
     """
 
     def __init__(self, name: str) -> None:
-        self._asked: queue.SimpleQueue[tuple[Future[Any], Callable[[], Any]]] = queue.SimpleQueue()
+        self._calls: queue.SimpleQueue[tuple[Future[Any], Callable[[], Any]]] = queue.SimpleQueue()
         threading.Thread(target=self._run, name=name, daemon=True).start()
 
     def __call__(self, call: Callable[[], T]) -> T:
-        """The answer; raises what the call raises."""
-        answer: Future[T] = Future()
-        self._asked.put((answer, call))
-        return answer.result()
+        """Run a call and return its result or raise its exception."""
+        outcome: Future[T] = Future()
+        self._calls.put((outcome, call))
+        return outcome.result()
 
     def _run(self) -> None:
         while True:
-            answer, call = self._asked.get()
+            outcome, call = self._calls.get()
             try:
-                answer.set_result(call())
-            except BaseException as error:  # it belongs to who asked
-                answer.set_exception(error)
-            del answer, call  # nothing of the last call is kept until the next
+                outcome.set_result(call())
+            except BaseException as error:  # raised by the caller
+                outcome.set_exception(error)
+            del outcome, call  # so that nothing stays alive until the next call
 
 
 def _borrowed(name: str) -> _PersistentThread:
-    """A thread that nobody uses; one that hangs in a call is never given back, and another is made."""
+    """Take an idle thread, or start one; a thread that hangs is never returned."""
     with _lock:
         return _idle.pop() if _idle else _PersistentThread(name)
 
 
 def _give_back(thread: _PersistentThread) -> None:
-    """For the next one who asks."""
+    """Return a thread for reuse."""
     with _lock:
         _idle.append(thread)

@@ -1,8 +1,8 @@
-"""Finds and loads libOpenNI2 with the drivers that a source needs.
+"""Find and load libOpenNI2 with its drivers.
 
-The `openni` package wants a folder with `libOpenNI2.so` and `OpenNI2/Drivers/`, which distributions install under
-other names; a folder of links serves. Drivers are pinned in memory: some leave threads running when their device is
-closed, which crash the process when the library unmaps their code on its way out.
+The `openni` package expects a folder with `libOpenNI2.so` and `OpenNI2/Drivers/`. Distributions install them under
+other names, so a folder of links is created. Drivers are pinned in memory, because some leave threads running after
+closing a device, which would crash the process when the library unloads their code.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ LIBRARY_FOLDERS = (
     "/usr/lib",
     "/usr/local/lib",
 )
-DUMMY = "DummyDevice"  # sample code, whose device is there beside every camera
+DUMMY = "DummyDevice"  # sample driver, which would add a device to every camera
 INSTALL = "OpenNI2 is not installed (Debian: apt install libopenni2-0), or set sensor.openni2_folder"
 
 _lock = threading.Lock()
@@ -34,17 +34,17 @@ _loaded = False
 
 
 def find_library(folder: str = "") -> tuple[Path, Path]:
-    """The library's file and the folder of its drivers. Raises MissingPart where there are none."""
+    """Find the library's file and the folder of its drivers. Raises MissingPart."""
     for place in (folder,) if folder else LIBRARY_FOLDERS:
         drivers = Path(place) / "OpenNI2" / "Drivers"
         for library in sorted(Path(place).glob("libOpenNI2.so*")):
             if drivers.is_dir():
                 return library, drivers
-    raise MissingPart(f"{folder}: holds no libOpenNI2.so beside OpenNI2/Drivers" if folder else INSTALL)
+    raise MissingPart(f"{folder}: has no libOpenNI2.so next to OpenNI2/Drivers" if folder else INSTALL)
 
 
 def load(folder: str = "") -> Any:
-    """The `openni.openni2` module with its library loaded. Raises MissingPart, SensorLost."""
+    """Import `openni.openni2` with its library loaded. Raises MissingPart, SensorLost."""
     global _loaded
     try:
         from openni import openni2

@@ -1,6 +1,6 @@
-"""Driver `realsense`: Intel and RealSense depth cameras by their own SDK, and its recordings.
+"""Driver `realsense`: RealSense depth cameras through their SDK, and the SDK's recordings.
 
-Proved by recordings played back by the SDK (tests/sensor/test_realsense.py); nobody has tried a camera yet.
+Tested with recordings played back by the SDK (tests/sensor/test_realsense.py), not yet with a camera.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from runtime.sensor.base import Capabilities, DeviceClock, Sensor
 
 RATE_HZ = 30
 FILES = (".bag", ".db3")  # the SDK's recordings, older and newer
-STAMP_AGE_NS = NS_PER_S  # a stamp of the host's time that is older, or in the future, is none
-DRAIN_MAX = 32  # frames that are passed over in one call
-COLOURS = {"rgb8": [0, 1, 2], "bgr8": [2, 1, 0], "rgba8": [0, 1, 2], "bgra8": [2, 1, 0]}  # where red, green, blue are
+STAMP_AGE_NS = NS_PER_S  # older timestamps on the host's clock, and future ones, are ignored
+DRAIN_MAX = 32  # frames skipped in one call
+COLOURS = {"rgb8": [0, 1, 2], "bgr8": [2, 1, 0], "rgba8": [0, 1, 2], "bgra8": [2, 1, 0]}  # indices of R, G and B
 
 log = logging.getLogger(__name__)
 
 
 class RealSenseDriver(Sensor):
-    """Colour, depth in millimetres aligned to it by the SDK, and the camera's own intrinsics."""
+    """Delivers colour, depth in millimetres aligned to it by the SDK, and the camera's intrinsics."""
 
     name = "realsense"
     capabilities = Capabilities(colour=True, depth=True)
@@ -55,7 +55,7 @@ class RealSenseDriver(Sensor):
                     raise InputError(source, "", "cannot be read")
                 config.enable_device_from_file(source, repeat_playback=self._settings.loop)
             else:
-                config.enable_device(self._found())
+                config.enable_device(self._serial_to_open())
                 config.enable_stream(rs.stream.depth, rs.format.z16, RATE_HZ)
                 config.enable_stream(rs.stream.color, rs.format.rgb8, RATE_HZ)
             profile = pipeline.start(config)
@@ -66,24 +66,25 @@ class RealSenseDriver(Sensor):
         self._playback = device.as_playback() if device.is_playback() else None
         if not {rs.stream.depth, rs.stream.color} <= streams:
             self.close()
-            raise SensorLost("RealSense: depth and colour are needed, and one of them is not there")
+            raise SensorLost("RealSense: depth and colour are both required, and one is missing")
         self.serial = device.get_info(rs.camera_info.serial_number)
         self._align = rs.align(rs.stream.color)
         self._times, self._number = DeviceClock(), -1
 
-    def _found(self) -> str:
-        """The serial number of the camera that is wanted. Raises SensorLost."""
+    def _serial_to_open(self) -> str:
+        """Serial number of the configured camera, or of the only one. Raises SensorLost."""
         source = self._settings.source
-        wanted = self.serial or ("" if source in ("", "demo", "any") else source)
+        configured = self.serial or ("" if source in ("", "demo", "any") else source)
         info = self._rs.camera_info.serial_number
         serials: list[str] = [device.get_info(info) for device in self._rs.context().query_devices()]
-        fit = [serial for serial in serials if wanted in ("", serial)]
-        if len(fit) > 1:
-            raise SensorLost(f"RealSense cameras {', '.join(fit)}: set sensor.source to one of these serial numbers")
-        if not fit:
-            camera = f"RealSense camera {wanted!r}" if wanted else "RealSense camera"
+        matches = [serial for serial in serials if configured in ("", serial)]
+        if len(matches) > 1:
+            choices = ", ".join(matches)
+            raise SensorLost(f"RealSense cameras {choices}: set sensor.source to one of these serial numbers")
+        if not matches:
+            camera = f"RealSense camera {configured!r}" if configured else "RealSense camera"
             raise SensorLost(f"no {camera} among {len(serials)}")
-        return fit[0]
+        return matches[0]
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
         if self._pipeline is None:
@@ -105,7 +106,7 @@ class RealSenseDriver(Sensor):
             raise SensorLost(f"RealSense: {error}") from None
 
     def _next(self, deadline_ns: int) -> Any:
-        """The next frames whose depth was not read yet. Raises SensorTimeout, EndOfRecording, RuntimeError."""
+        """Wait for frames with an unread depth picture. Raises SensorTimeout, EndOfRecording, RuntimeError."""
         while True:
             remaining_ms = max(1, (deadline_ns - self._clock.now_ns()) // NS_PER_MS)
             done, frames = self._pipeline.try_wait_for_frames(remaining_ms)
@@ -121,7 +122,7 @@ class RealSenseDriver(Sensor):
         return self._playback is not None and not self._settings.loop and self._playback.current_status() != playing
 
     def _is_new(self, frames: Any) -> bool:
-        """Whether there is a depth picture that was not there before: the SDK pairs one with several of colour."""
+        """Return True for a new depth picture; the SDK pairs the same one with several colour pictures."""
         depth = frames.get_depth_frame()
         if not depth or not frames.get_color_frame() or depth.get_frame_number() == self._number:
             return False
@@ -140,7 +141,7 @@ class RealSenseDriver(Sensor):
         )
 
     def _capture_ns(self, frame: Any) -> int:
-        """When the depth was taken: the SDK's stamp on the host's clock where it has one, else the device's."""
+        """Capture time of the depth picture, from the SDK's timestamp on the host's clock or else the device's."""
         now_ns, stamp_ns = self._clock.now_ns(), round(frame.get_timestamp() * NS_PER_MS)
         age_ns: int = time.time_ns() - stamp_ns
         on_host = frame.get_frame_timestamp_domain() != self._rs.timestamp_domain.hardware_clock
@@ -153,12 +154,12 @@ class RealSenseDriver(Sensor):
         if pipeline is not None:
             try:
                 pipeline.stop()
-            except RuntimeError as error:  # of an unplugged camera there is nothing left to stop
+            except RuntimeError as error:  # an unplugged camera
                 log.debug("RealSense: closing: %s", error)
 
 
 def _rgb(frame: Any) -> U8:
-    """(h, w, 3), copied. Raises SensorLost for a format that is none of `COLOURS`."""
+    """Copy as (h, w, 3) RGB. Raises SensorLost for a format not in `COLOURS`."""
     kind = frame.profile.format().name
     if kind not in COLOURS:
         raise SensorLost(f"RealSense: colour is {kind}, not {', '.join(COLOURS)}")
@@ -166,7 +167,7 @@ def _rgb(frame: Any) -> U8:
 
 
 def _millimetres(frame: Any) -> U16:
-    """(h, w), copied; 0: no measurement."""
+    """Copy as (h, w) millimetres; 0: no measurement."""
     raw: U16 = np.asanyarray(frame.get_data())
     unit_mm = float(frame.get_units()) * 1e3
     if abs(unit_mm - 1) < 1e-4:
@@ -176,5 +177,5 @@ def _millimetres(frame: Any) -> U16:
 
 
 def _intrinsics(camera: Any) -> Intrinsics:
-    """The SDK's pixel centres are at whole numbers."""
+    """Convert intrinsics; the SDK's pixel centres are whole numbers, ours half-integers."""
     return Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.ppx + 0.5, camera.ppy + 0.5)

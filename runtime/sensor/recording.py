@@ -1,4 +1,4 @@
-"""Recordings in MCAP with small chunks: a crash loses one at most, and the rest can be opened."""
+"""Recordings in MCAP with small chunks: a crash loses at most one, and the rest stays readable."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 
 
 class RecordingWriter:
-    """Writes samples to an open binary file. `write` answers False once a limit is reached."""
+    """Writes samples to an open binary file. `write` returns False once a limit is reached."""
 
     def __init__(
         self,
@@ -53,7 +53,7 @@ class RecordingWriter:
 
         self._file, self._max_ns, self._on_first = file, round(max_s * NS_PER_S), on_first
         self._images = header.colour or header.depth
-        # Eye points alone are so few that plain bytes, the same with every version of a library, are worth more.
+        # Eye points alone are small; uncompressed, their bytes don't depend on a library's version.
         compression = CompressionType.LZ4 if self._images else CompressionType.NONE
         index = IndexType.CHUNK | IndexType.METADATA
         self._writer: Any = Writer(file, chunk_size=CHUNK_BYTES, compression=compression, index_types=index)
@@ -111,7 +111,7 @@ class RecordingWriter:
 
 @contextmanager
 def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -> Iterator[RecordingWriter]:
-    """A writer whose file appears under its name with the first sample, and is kept from then on.
+    """Open a writer whose file appears under its name, replacing an older one, with the first sample.
 
     Until then an older file of that name stays; after a crash it is readable up to its last whole chunk.
     One with pictures is its owner's alone. Raises InputError where it can't be written, or another process writes it.
@@ -144,17 +144,17 @@ def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -
                 else:
                     part.unlink(missing_ok=True)
     except OSError as error:
-        if error.filename is None and error.errno is not None:  # of writing to an open file: a full disk
+        if error.filename is None and error.errno is not None:  # from writing, such as a full disk
             raise InputError(path, "", f"cannot be written ({error.strerror})") from None
         raise
 
 
 class Recording:
-    """An opened recording. Samples are read lazily: images do not pile up in memory."""
+    """An open recording. Samples are read lazily, so that images do not fill the memory."""
 
     def __init__(self, path: Path) -> None:
-        """Reads the header and the first sample. Raises InputError, naming the file."""
-        self.path, self.is_whole = path, True  # as far as it was read
+        """Read the header and the first sample. Raises InputError, naming the file."""
+        self.path, self.is_whole = path, True  # whole as far as it was read
         self._written_by = ("", "")  # profile and library
         self.header = self._read_header()
         first = next(self.samples(), None)
@@ -184,15 +184,14 @@ class Recording:
         raise InputError(self.path, fmt.METADATA_NAME, f"is missing from this MCAP recording ({by}): {NEEDED}")
 
     def _records(self) -> Iterator[tuple[str, Any]]:
-        """Messages with their topic, and metadata without one, until the end or the break."""
+        """Yield messages with their topic, and metadata with an empty one, up to the end or a damaged record."""
         from mcap.records import Channel, Header, Message, Metadata
 
         topics: dict[int, str] = {}
         with self._opened() as file:
             for record in self._to_the_break(file):
                 if isinstance(record, Header):
-                    told = (record.profile, record.library)
-                    self._written_by = (untrusted_input.shown(told[0]), untrusted_input.shown(told[1]))
+                    self._written_by = (untrusted_input.shown(record.profile), untrusted_input.shown(record.library))
                 elif isinstance(record, Channel):
                     topics[record.id] = record.topic
                 elif isinstance(record, Message):
@@ -211,17 +210,14 @@ class Recording:
             raise
         except OSError as error:
             raise InputError(self.path, "", f"cannot be read ({error.strerror})") from None
-        except Exception as error:  # mcap, lz4 and zstandard each raise their own for a broken file
+        except Exception as error:  # mcap, lz4 and zstandard have their own errors for a damaged file
             if self.is_whole:
-                why = str(error) or type(error).__name__
-                log.warning("%s: is cut off or damaged; it is read up to there (%s)", self.path, why)
+                problem = str(error) or type(error).__name__
+                log.warning("%s: is truncated or damaged; reading the intact part (%s)", self.path, problem)
             self.is_whole = False
 
     def samples(self) -> Iterator[SensorFrame]:
-        """All complete samples in recorded order. Raises InputError for a foreign one.
-
-        A message of eye points completes a sample.
-        """
+        """Yield all complete samples in order; a message with eye points completes one. Raises InputError."""
         parts: dict[str, Any] = {}
         intrinsics: Intrinsics | None = None
         for topic, message in self._records():
@@ -242,8 +238,8 @@ class Recording:
 def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[Any]:
     """Records in order, those within chunks too, until the footer: the unpacked size of a chunk is checked.
 
-    max_bytes: of one record, and of one chunk unpacked. Raises InputError for a chunk over the limit, and what mcap or
-    an unpacker raises for a damaged file.
+    max_bytes: limit for a record, and for an unpacked chunk. Raises InputError for a chunk over the limit, and errors
+    of mcap or a decompressor for a damaged file.
     """
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader, breakup_chunk
@@ -258,8 +254,8 @@ def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[
 
 def _unpacked(chunk: Any, *, source: Path, max_bytes: int) -> bytes:
     """A chunk's records as bytes. Raises InputError over the limit, else the unpacker's exception."""
-    says: int = chunk.uncompressed_size
-    room = min(says, max_bytes) + 1  # unpackers allocate up to their limit
+    declared: int = chunk.uncompressed_size
+    room = min(declared, max_bytes) + 1  # unpackers allocate up to their limit
     data: bytes = chunk.data
     if chunk.compression == "lz4":
         import lz4.frame
@@ -271,8 +267,8 @@ def _unpacked(chunk: Any, *, source: Path, max_bytes: int) -> bytes:
         with zstandard.ZstdDecompressor(max_window_size=max(1024, max_bytes)).stream_reader(data) as stream:
             data = stream.read(room)
     if len(data) > max_bytes:
-        told = f"a chunk of {len(chunk.data)} bytes unpacks to {max(says, len(data)) / MIB:.1f} MiB"
-        raise InputError(source, "", f"{told}; at most {max_bytes / MIB:g}")
-    if len(data) != says:
-        raise ValueError(f"a chunk does not unpack to the {says} bytes that it says")
+        size = f"a chunk of {len(chunk.data)} bytes unpacks to {max(declared, len(data)) / MIB:.1f} MiB"
+        raise InputError(source, "", f"{size}; at most {max_bytes / MIB:g}")
+    if len(data) != declared:
+        raise ValueError(f"a chunk does not unpack to the declared {declared} bytes")
     return data

@@ -18,17 +18,17 @@ from runtime.support.picture_header import is_cut_off, picture_size
 SCHEMA_VERSION = 1
 METADATA_NAME = "phasestack.recording"
 EYES_TOPIC, COLOUR_TOPIC, DEPTH_TOPIC, CALIBRATION_TOPIC = "/eyes", "/colour", "/depth", "/camera"
-POSITION_DIGITS = 7  # a tenth of a micrometre: four digits below the best sensor's noise
+POSITION_DIGITS = 7  # 0.1 µm, far below any sensor's noise
 JPEG_QUALITY = 92  # of recorded colour pictures
 NUMBER_MAX = 1 << 62  # as a time, 146 years: sums and differences of two still fit 64 bits
-COORDINATE_MAX_M = 1e6  # beyond any sensor's range in any unit; plausibility is the tracker's business
-IMAGE_SIDE_MAX_PX = 1 << 15  # of a recorded picture: beyond any camera's
+COORDINATE_MAX_M = 1e6  # beyond any sensor's range in any unit; the tracker judges plausibility
+IMAGE_SIDE_MAX_PX = 1 << 15  # larger than any camera's pictures
 
 Count = Annotated[int, Field(ge=0, le=NUMBER_MAX)]
 Unit = Annotated[float, Field(ge=0, le=1)]
 Side = Annotated[int, Field(ge=1, le=IMAGE_SIDE_MAX_PX)]
 Coordinate = Annotated[float, Field(ge=-COORDINATE_MAX_M, le=COORDINATE_MAX_M)]
-Point = tuple[Coordinate | None, Coordinate | None, Coordinate | None]  # null: this one was not measured
+Point = tuple[Coordinate | None, Coordinate | None, Coordinate | None]  # null: not measured
 Square = Annotated[float, Field(ge=-(COORDINATE_MAX_M**2), le=COORDINATE_MAX_M**2)]
 Row = tuple[Square, Square, Square]
 Bytes = Annotated[str, Field(json_schema_extra={"contentEncoding": "base64"})]
@@ -134,7 +134,7 @@ class RecordingHeader:
 
     @classmethod
     def from_metadata(cls, metadata: dict[str, str]) -> RecordingHeader:
-        """Back from `metadata`. Raises ValueError for a version that is not ours."""
+        """Invert `metadata`. Raises ValueError for another version."""
         version = metadata.get("schema_version", "missing")
         if version != str(SCHEMA_VERSION):
             raise ValueError(f"schema version {version}; this program reads {SCHEMA_VERSION}")
@@ -143,7 +143,7 @@ class RecordingHeader:
 
 
 def _read(kind: type[M], data: bytes) -> M:
-    """A message. Raises ValueError, in one line that names the field."""
+    """Parse a message. Raises ValueError, in one line that names the field."""
     try:
         return kind.model_validate_json(data)
     except ValidationError as error:
@@ -162,7 +162,7 @@ def _array(points: tuple[Point, Point] | None) -> F64 | None:
 
 
 def eyes_message(frame: SensorFrame) -> bytes:
-    """A sample's eye points as JSON; coordinates that are not finite become null."""
+    """Encode a sample's eye points as JSON; coordinates that are not finite become null."""
     record: dict[str, Any] = {"sequence": frame.sequence, "capture_ns": frame.capture_ns}
     record["eyes_m"] = _points(frame.eyes.eyes_m if frame.eyes else None)
     if frame.eyes is not None:
@@ -177,24 +177,24 @@ def eyes_message(frame: SensorFrame) -> bytes:
 
 
 def frame_from_eyes_message(data: bytes) -> SensorFrame:
-    """Back from `eyes_message`. Raises ValueError where the message is not one."""
+    """Decode `eyes_message`. Raises ValueError for another message."""
     sample = _read(EyeSample, data)
     eyes_m, covariance_m2 = _array(sample.eyes_m), sample.covariance_m2
     eyes = None
     if eyes_m is not None:
-        known = None if covariance_m2 is None else np.array(covariance_m2)
-        eyes = EyePoints(eyes_m, np.array(sample.confidence), sample.completed, known)
+        covariance = None if covariance_m2 is None else np.array(covariance_m2)
+        eyes = EyePoints(eyes_m, np.array(sample.confidence), sample.completed, covariance)
     return SensorFrame(sample.sequence, sample.capture_ns, eyes, true_eyes_m=_array(sample.true_eyes_m))
 
 
 def _stamped(capture_ns: int, **values: Any) -> bytes:
-    """A message of pictures."""
+    """Encode a picture message."""
     seconds, nanoseconds = divmod(capture_ns, NS_PER_S)
     return json.dumps({"timestamp": {"sec": seconds, "nsec": nanoseconds}, "frame_id": "sensor"} | values).encode()
 
 
 def colour_message(colour: U8, *, capture_ns: int) -> bytes:
-    """(h, w, 3) RGB as a JPEG in JSON."""
+    """Encode (h, w, 3) RGB as a JPEG in JSON."""
     done, jpeg = cv2.imencode(".jpg", colour[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not done:
         raise ValueError("JPEG encoding failed")
@@ -202,7 +202,7 @@ def colour_message(colour: U8, *, capture_ns: int) -> bytes:
 
 
 def colour_from_message(data: bytes, *, max_pixels: int = 1 << 26) -> U8:
-    """(h, w, 3) back from `colour_message` (JPEG is lossy). Raises ValueError."""
+    """Decode `colour_message` to (h, w, 3); JPEG is lossy. Raises ValueError."""
     coded = base64.b64decode(_read(ColourImage, data).data)
     width, height = picture_size(coded)
     if max(width, height) > IMAGE_SIDE_MAX_PX or width * height > max_pixels:
@@ -214,14 +214,14 @@ def colour_from_message(data: bytes, *, max_pixels: int = 1 << 26) -> U8:
 
 
 def depth_message(depth_mm: U16, *, capture_ns: int) -> bytes:
-    """(h, w) depth as raw 16-bit little-endian numbers in JSON."""
+    """Encode (h, w) depth as raw 16-bit little-endian numbers in JSON."""
     height, width = depth_mm.shape
     raw = base64.b64encode(np.ascontiguousarray(depth_mm, dtype="<u2").tobytes()).decode()
     return _stamped(capture_ns, width=width, height=height, encoding="16UC1", step=2 * width, data=raw)
 
 
 def depth_from_message(data: bytes) -> U16:
-    """(h, w) millimetres back from `depth_message`, exactly. Raises ValueError."""
+    """Decode `depth_message` to (h, w) millimetres, exactly. Raises ValueError."""
     image = _read(DepthImage, data)
     raw = base64.b64decode(image.data)
     if len(raw) != 2 * image.width * image.height:
@@ -230,7 +230,7 @@ def depth_from_message(data: bytes) -> U16:
 
 
 def calibration_message(intrinsics: Intrinsics, *, capture_ns: int) -> bytes:
-    """Pinhole intrinsics without distortion; Foxglove's pixel centres are integers, ours half-integers."""
+    """Encode pinhole intrinsics without distortion; Foxglove's pixel centres are integers, ours half-integers."""
     i = intrinsics
     matrix = [i.fx_px, 0.0, i.cx_px - 0.5, 0.0, i.fy_px, i.cy_px - 0.5, 0.0, 0.0, 1.0]
     projection = [*matrix[:3], 0.0, *matrix[3:6], 0.0, *matrix[6:], 0.0]
@@ -240,7 +240,7 @@ def calibration_message(intrinsics: Intrinsics, *, capture_ns: int) -> bytes:
 
 
 def intrinsics_from_message(data: bytes) -> Intrinsics:
-    """Back from `calibration_message`. Raises ValueError."""
+    """Decode `calibration_message`. Raises ValueError."""
     camera = _read(Camera, data)
     k = camera.K
     if k[0] <= 0 or k[4] <= 0:

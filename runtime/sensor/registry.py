@@ -1,4 +1,4 @@
-"""Drivers by name. A driver's module, and so its SDK, is imported only when it is used."""
+"""Drivers by name. A driver's module and its SDK are imported only when used."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from runtime.support.crash import written
 from runtime.support.plausible import nearest
 from runtime.support.plugins import is_plugin, plugin_class, strict
 
-DRIVERS = {  # that come with phasestack
+DRIVERS = {  # included in phasestack
     "replay": "replay:ReplayDriver",
     "fixed": "fixed:FixedDriver",
     "openni2": "openni2:OpenNI2Driver",
@@ -20,18 +20,16 @@ DRIVERS = {  # that come with phasestack
 
 
 def open_sensor(settings: SensorSettings, clock: Clock, *, latency_ms: float = 0.0) -> Sensor:
-    """The configured driver, not yet opened: one of ours, or a class of the user's own (`module:Class`).
+    """Create the configured driver, unopened: an included one, or a user's class (`module:Class`).
 
-    latency_ms: from capture to arrival, of what is only replayed.
-
-    Raises InputError for a name that nobody knows or options that the class refuses, MissingPart for an SDK that is
-    not installed.
+    latency_ms: from capture to arrival, for replay. Raises InputError for an unknown name or options that the class
+    refuses, MissingPart for an SDK that is not installed.
     """
     name = settings.driver
     if is_plugin(name):
         return _plugin(name, settings, clock)
     if name not in DRIVERS:
-        known = f"{', '.join(DRIVERS)}, or a class of yours: module:Class"
+        known = f"{', '.join(DRIVERS)}, or your own class: module:Class"
         raise InputError("sensor", "driver", f"unknown: {name!r}{nearest(name, DRIVERS)}; known: {known}")
     driver = plugin_class(f"runtime.sensor.{DRIVERS[name]}", Sensor, field="sensor.driver")
     replayed = {"loop": settings.loop, "latency_ms": latency_ms}

@@ -1,4 +1,4 @@
-"""Driver `replay`: a recording as if it were a sensor, at its own pace or as fast as it is read."""
+"""Driver `replay`: plays a recording like a sensor, in real time or as fast as it is read."""
 
 from __future__ import annotations
 
@@ -19,17 +19,15 @@ log = logging.getLogger(__name__)
 
 
 def demo_recording_path() -> Path:
-    """The built-in recording, shipped with the package."""
+    """Path of the built-in recording."""
     return Path(str(files("runtime.sensor") / "data" / "demo.mcap"))
 
 
 class ReplayDriver(SteppedSensor):
-    """Recorded times are shifted on to the run's clock: the first sample is captured at `open`.
+    """Plays a recording with its rates and gaps, shifted to the run's clock: the first sample is captured at `open`.
 
-    Any rate and any gap is played as it was recorded. A sample that is no later than the one before it is not
-    delivered, and the first one is logged.
-
-    A sample arrives at its capture and the latency.
+    A sample arrives at its capture time plus the latency. Samples not later than their predecessor are skipped, and the
+    first of these is logged.
     """
 
     name = "replay"
@@ -51,7 +49,7 @@ class ReplayDriver(SteppedSensor):
         self._next: SensorFrame | None = None
 
     def open(self) -> None:
-        """Raises InputError where the file is not a recording."""
+        """Open the recording. Raises InputError if the file is not a recording."""
         recording = Recording(self.path)
         header = recording.header
         self.serial = header.serial
@@ -60,13 +58,13 @@ class ReplayDriver(SteppedSensor):
         self._next = next(self._frames, None)
 
     def _ordered(self, recording: Recording) -> Iterator[SensorFrame]:
-        """Samples, each later than the one before it. Raises InputError for too long a recording."""
-        last_ns, told = -1, False
+        """Yield samples with increasing capture times. Raises InputError for too long a recording."""
+        last_ns, is_logged = -1, False
         for number, frame in enumerate(recording.samples()):
             if frame.capture_ns <= last_ns:
-                if not told:
-                    log.warning("%s: samples no later than the one before are left out: %d", self.path, frame.sequence)
-                told = True
+                if not is_logged:
+                    log.warning("%s: skipping samples not later than the one before: %d", self.path, frame.sequence)
+                is_logged = True
                 continue
             seconds = (frame.capture_ns - recording.first.capture_ns) / NS_PER_S
             if seconds > LIMITS.recording_s:
@@ -76,7 +74,7 @@ class ReplayDriver(SteppedSensor):
             yield frame
 
     def _shifted(self, recording: Recording) -> Iterator[SensorFrame]:
-        """Samples on the run's clock; when looped, the next round follows at the recording's own interval."""
+        """Yield samples on the run's clock; a loop starts over after the recording's last interval."""
         last_ns = interval_ns = sequence_shift = last_sequence = shift_ns = 0
         is_first_round = True
         while True:

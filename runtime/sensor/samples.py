@@ -1,4 +1,4 @@
-"""The source of samples: a sensor thread in real time, or a recording on the simulated clock."""
+"""Sources of samples: a sensor thread in real time, or a recording on the simulated clock."""
 
 from __future__ import annotations
 
@@ -12,39 +12,39 @@ from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.base import Sensor, SteppedSensor
 
 FindEyes = Callable[[SensorFrame], EyePoints | None]
-AHEAD_NS = NS_PER_S // 10  # more than from a sample to the display time of a refresh that used it
+AHEAD_NS = NS_PER_S // 10  # longer than the time from a sample to the display of a refresh that used it
 
 
 class Samples(ABC):
-    """The presenter's view of the sensor; nothing here waits or lets time pass."""
+    """The presenter's interface to the sensor. No method waits."""
 
-    stale_inputs: int  # samples that a newer one overtook before they were looked at
-    serial: str  # the sensor's, where it is known
+    stale_inputs: int  # samples superseded by a newer one before use
+    serial: str  # the sensor's, if known
 
     @abstractmethod
     def arrived(self, now_ns: int) -> list[SensorFrame]:
-        """Samples that have arrived and were not given yet, in order. Raises EndOfRecording, FatalError."""
+        """Return samples that arrived since the last call, in order. Raises EndOfRecording, FatalError."""
 
     def fault(self) -> str:
-        """Why there is no sensor now; empty while all is well."""
+        """Reason why there is no working sensor; empty if there is one."""
         return ""
 
     def recorded_ahead(self) -> list[SensorFrame]:
-        """Samples of the next moment that a recording already holds, for what is known afterwards; else []."""
+        """Samples of a recording just after the last refresh, for evaluating it; [] for a live sensor."""
         return []
 
     @abstractmethod
     def close(self) -> None:
-        """Let the sensor go. May be called twice."""
+        """Release the sensor. May be called twice."""
 
 
 def finder(sensor: Sensor, make_find: Callable[[], FindEyes] | None) -> FindEyes | None:
-    """What finds eyes in the pictures of an open sensor; None where it delivers eyes itself."""
+    """Create the eye finder for an open sensor; None if it delivers eyes itself."""
     return None if sensor.capabilities.eye_points or make_find is None else make_find()
 
 
 def searched(frame: SensorFrame, find: FindEyes | None, *, keep_images: bool = False) -> SensorFrame:
-    """A sample with the eyes found in its pictures, which are then dropped unless `keep_images`."""
+    """Find the eyes in a sample's pictures, which are then dropped unless `keep_images`."""
     if find is not None:
         frame = replace(frame, eyes=find(frame))
     return frame if keep_images else replace(frame, colour=None, depth_mm=None)
@@ -54,7 +54,7 @@ class RecordedSamples(Samples):
     """A recording on the simulated clock: each sample arrives at its capture plus the configured latency."""
 
     def __init__(self, driver: Sensor) -> None:
-        """Raises InputError where the driver can't be stepped, or the recording can't be read."""
+        """Raise InputError if the driver can't be stepped or the recording can't be read."""
         if not isinstance(driver, SteppedSensor):
             raise InputError("run", "--max-speed", f"needs a recording, not the sensor {driver.name}")
         self._driver = driver

@@ -1,4 +1,4 @@
-"""Driver `usb-camera`: a webcam by V4L2, without depth: distance from the eyes' separation."""
+"""Driver `usb-camera`: a webcam through V4L2. Without depth, the eyes' separation gives their distance."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from runtime.records import Intrinsics, SensorFrame
 from runtime.sensor.base import Capabilities, Sensor
 from runtime.support.film import open_film
 
-WAITED_NS = 3 * NS_PER_MS  # a picture that comes sooner lay in the driver's queue, and a newer one may
-QUEUE_MAX = 8  # pictures that one read takes out of the driver's queue at most
-STAMP_AGE_NS = NS_PER_S  # a picture's stamp that is older, or in the future, is none
-STREAMS = ("rtsp", "rtsps", "http", "https")  # what else FFmpeg takes for an address may listen, or open other files
+WAITED_NS = 3 * NS_PER_MS  # a picture that arrives sooner was queued in the driver, and newer ones may be too
+QUEUE_MAX = 8  # most pictures taken from the driver's queue in one read
+STAMP_AGE_NS = NS_PER_S  # older timestamps, and future ones, are ignored
+STREAMS = ("rtsp", "rtsps", "http", "https")  # FFmpeg's other protocols may listen or open other files
 
 
 class UsbCameraDriver(Sensor):
-    """The newest picture, dated by the kernel when its light had come in."""
+    """Delivers the newest picture, with the kernel's timestamp of the end of exposure."""
 
     name = "usb-camera"
     capabilities = Capabilities(colour=True)
 
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
-        """settings.source: empty or `demo`: the first camera; a number, a device, or an address of `STREAMS`.
+        """settings.source: empty or `demo` (the first camera), a number, a device, a file, or a URL of `STREAMS`.
 
-        Raises InputError for another address, or without a field of view, which no webcam reports.
+        Raises InputError for another URL, or without a field of view, which no webcam reports.
         """
         if not settings.fov_deg:
-            raise InputError("sensor", "fov_deg", "is needed by usb-camera: the picture's horizontal angle, degrees")
+            raise InputError("sensor", "fov_deg", "is required by usb-camera: horizontal field of view, degrees")
         source = settings.source if settings.source != "demo" else ""
         protocol = re.match(r"([\w+.-]+):", source)
         if protocol is not None and protocol[1] not in STREAMS:
-            raise InputError("sensor", "source", f"{protocol[1]}: is no camera's address: {', '.join(STREAMS)} are")
+            raise InputError("sensor", "source", f"{protocol[1]}: is not supported; use {', '.join(STREAMS)}")
         self._source = f"/dev/video{source or 0}" if re.fullmatch(r"\d*", source) else source
         self._fov, self._clock = radians(settings.fov_deg), clock
         self._capture: Any = None
@@ -57,7 +57,7 @@ class UsbCameraDriver(Sensor):
         if not capture.isOpened():
             capture.release()
             raise SensorLost(
-                f"{self._source}: cannot be opened (another program has it, or no permission: group video)"
+                f"{self._source}: cannot be opened (used by another program, or no permission: group video)"
             )
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         self._capture = capture
@@ -72,7 +72,7 @@ class UsbCameraDriver(Sensor):
             raise SensorLost("not open")
         for _ in range(QUEUE_MAX):
             begin_ns = self._clock.now_ns()
-            if not self._capture.grab():  # waits for the next one; the worker's own time-out knows of one that hangs
+            if not self._capture.grab():  # blocks until the next one; the worker's timeout handles a hang
                 raise SensorLost(f"{self._source}: delivers no more pictures")
             self._number += 1
             now_ns = self._clock.now_ns()
@@ -81,7 +81,7 @@ class UsbCameraDriver(Sensor):
             self.skipped += 1
         done, bgr = self._capture.retrieve()
         if not done:
-            raise SensorLost(f"{self._source}: a picture that can't be decoded")
+            raise SensorLost(f"{self._source}: sent a picture that can't be decoded")
         stamp_ns = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * NS_PER_MS)
         is_stamp = self._is_device and 0 <= now_ns - stamp_ns < STAMP_AGE_NS
         height, width = bgr.shape[:2]

@@ -1,4 +1,4 @@
-"""USB depth cameras that are known, as `doctor` reports them."""
+"""Known USB depth cameras, as reported by `doctor`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SUPER_SPEED = 4  # libusb's number of USB 3's speed
 
 
 class KnownDevice(NamedTuple):
-    """One USB device, which the driver `openni2` opens, or `realsense` its own."""
+    """One USB device, opened by the driver `openni2` or `realsense`."""
 
     vendor_id: int
     product_id: int
@@ -44,12 +44,12 @@ _BY_ID = {(device.vendor_id, device.product_id): device for device in KNOWN_DEVI
 
 @dataclass(frozen=True, slots=True)
 class UsbDevice:
-    """A known device that is plugged in."""
+    """A known device that is connected."""
 
     known: KnownDevice
     bus: int
     address: int
-    serial: str  # empty: has none, or may not be read
+    serial: str  # empty: none, or not readable
     speed: int  # libusb's number, 0: unknown
     is_accessible: bool
 
@@ -61,13 +61,13 @@ class UsbDevice:
         return f"{self.known.name} ({self.usb_id}, {SPEEDS.get(self.speed, 'unknown')})"
 
     def problems(self) -> list[str]:
-        """What stands in the way of using it, each with its remedy."""
-        found = []
+        """Problems that prevent its use, each with its remedy."""
+        problems = []
         if self.known.needs_usb3 and 0 < self.speed < SUPER_SPEED:
-            found.append(f"is on {SPEEDS[self.speed]} and needs USB 3: use a blue port, and its own cable")
+            problems.append(f"is on {SPEEDS[self.speed]} and needs USB 3: use a blue port and the original cable")
         if not self.is_accessible:
-            found.append(f"may not be opened: install the udev rule {UDEV_RULE} and plug it in again")
-        return found
+            problems.append(f"permission denied: install the udev rule {UDEV_RULE} and plug it in again")
+        return problems
 
 
 def _described(device: Any, known: KnownDevice) -> UsbDevice:
@@ -78,14 +78,14 @@ def _described(device: Any, known: KnownDevice) -> UsbDevice:
     try:
         serial = device.serial_number or ""
     except (usb.core.USBError, NotImplementedError, ValueError):
-        accessible = False  # pyusb says ValueError ("no langid") where strings may not be read
+        accessible = False  # pyusb raises ValueError ("no langid") without permission to read strings
     finally:
-        usb.util.dispose_resources(device)  # reading the serial opened it
+        usb.util.dispose_resources(device)  # which reading the serial opened
     return UsbDevice(known, device.bus or 0, device.address or 0, serial, device.speed or 0, accessible)
 
 
 def find_devices(backend: Any = None) -> list[UsbDevice]:
-    """All known devices, in the order of bus and address. Raises MissingPart without libusb."""
+    """Find all known devices, ordered by bus and address. Raises MissingPart without libusb."""
     try:
         import usb.core
     except ImportError as error:
@@ -97,5 +97,5 @@ def find_devices(backend: Any = None) -> list[UsbDevice]:
         raise MissingPart("libusb is not installed (Debian: apt install libusb-1.0-0)") from None
     except usb.core.USBError as error:
         raise SensorLost(f"the USB bus cannot be listed: {error}") from None
-    found = [_described(device, known) for device, known in pairs if known is not None]
-    return sorted(found, key=lambda d: (d.bus, d.address))
+    connected = [_described(device, known) for device, known in pairs if known is not None]
+    return sorted(connected, key=lambda d: (d.bus, d.address))

@@ -1,4 +1,4 @@
-"""The sensor's thread: samples wait in a bounded queue, and a hanging SDK is abandoned."""
+"""The sensor's thread: queues samples, reopens lost sensors, and abandons hung SDK calls."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ from runtime.sensor.samples import FindEyes, Samples, finder, searched
 from runtime.support.background import begin, patience_s
 from runtime.support.extras import missing_extra
 
-TIMEOUTS_TO_REOPEN = 2  # in a row, without an error: then the sensor is reopened
-REOPEN_AFTER_S, REOPEN_AFTER_MAX_S = 0.25, 0.5  # the wait before a lost sensor is opened again doubles up to the second
-OPEN_TIMEOUT_S = 10.0  # an SDK that takes longer to open is given up and opened anew
-HANG_MARGIN_S = 0.5  # beyond its time-out that a read may take before its thread counts as hung
-ABANDONED_MAX = 8  # hung threads that are left behind; with more, the sensor is given up
-QUEUE_MAX = 1024  # samples that wait to be read: four seconds of the fastest sensor
-PICTURES_MAX = 8  # the same of samples that carry pictures
-AHEAD_NS = NS_PER_S // 1000  # a capture time later than its arrival by more than this is not of this machine's clock
-BEHIND_NS = 60 * NS_PER_S  # nor is one earlier by more than this
-FROZEN_NS = 2 * NS_PER_S  # no sensor that is well delivers the same picture or eye points for so long: it has noise
-LOOKED_AT = slice(None, None, 4)  # rows and columns of a picture
+TIMEOUTS_TO_REOPEN = 2  # consecutive timeouts without an error after which the sensor is reopened
+REOPEN_AFTER_S, REOPEN_AFTER_MAX_S = 0.25, 0.5  # the wait before reopening a lost sensor doubles up to the second
+OPEN_TIMEOUT_S = 10.0  # an attempt to open that takes longer is abandoned and repeated
+HANG_MARGIN_S = 0.5  # time beyond its timeout after which a read counts as hung
+ABANDONED_MAX = 8  # abandoned threads; with more, the sensor is given up
+QUEUE_MAX = 1024  # queued samples: four seconds of the fastest sensor
+PICTURES_MAX = 8  # queued samples with pictures
+AHEAD_NS = NS_PER_S // 1000  # a capture later than its arrival by more is on another clock
+BEHIND_NS = 60 * NS_PER_S  # as is one earlier by more
+FROZEN_NS = 2 * NS_PER_S  # identical pictures or eye points for this long are a fault: real ones have noise
+COMPARED = slice(None, None, 4)  # rows and columns of a picture compared
 
 log = logging.getLogger(__name__)
 
 
 class SensorState(StrEnum):
-    """What the sensor is doing."""
+    """State of the sensor."""
 
     OPENING = "opening"
     RUNNING = "running"
-    STALLED = "stalled"  # open, but nothing new comes
+    STALLED = "stalled"  # open, but without new samples
     LOST = "lost"  # closed; reopened with back-off
-    HUNG = "hung"  # a call into the SDK does not return; a fresh attempt follows
-    ENDED = "ended"  # a recording is over
-    FAILED = "failed"  # fatal: not tried again
+    HUNG = "hung"  # a call into the SDK does not return; a new attempt follows
+    ENDED = "ended"  # the recording is over
+    FAILED = "failed"  # fatal: no retry
     STOPPED = "stopped"
 
 
@@ -51,7 +51,7 @@ class _Attempt:
     """One thread with one driver. Once `abandoned`, its results are ignored."""
 
     def __init__(self, number: int, run: Callable[[_Attempt], None], *, wait_s: float, deadline_ns: int) -> None:
-        """Raises TransientError: no thread at present."""
+        """Start the thread. Raises TransientError if there is none at present."""
         self.number, self.abandoned = number, threading.Event()
         self.wait_s, self.deadline_ns = wait_s, deadline_ns
         self.received = 0
@@ -59,7 +59,7 @@ class _Attempt:
 
 
 class SensorWorker(Samples):
-    """Runs a driver in a thread of its own. No method blocks, `close` but for its time-out."""
+    """Runs a driver in its own thread. No method blocks except `close`, up to its timeout."""
 
     def __init__(
         self,
@@ -70,7 +70,7 @@ class SensorWorker(Samples):
         *,
         keep_images: bool = False,
     ) -> None:
-        """make_driver: a new unopened driver at each call; make_find: an eye finder, for drivers without."""
+        """make_driver: creates an unopened driver; make_find: creates an eye finder, for drivers without eye points."""
         self._make, self._settings, self._clock = make_driver, settings, clock
         self._make_find, self._keep_images = make_find, keep_images
         self._lock, self._watching = threading.Lock(), threading.Lock()
@@ -78,16 +78,16 @@ class SensorWorker(Samples):
         self._attempt: _Attempt | None = None
         self._hung: list[_Attempt] = []
         self._state, self.reason = SensorState.STOPPED, ""
-        self._was_well = False  # a sample was once what it should be
-        self._delivered: dict[str, tuple[int, int]] = {}  # the newest one's checksum, and since when it is the same
-        self._untimely = ""  # what was wrong with the newest stamp that was
-        self._skipped = 0  # samples that a newer one overtook, but those that the driver at hand counts
+        self._was_well = False  # there was a valid sample
+        self._delivered: dict[str, tuple[int, int]] = {}  # checksum of the newest data, and when it last changed
+        self._untimely = ""  # fault of the latest wrong timestamp
+        self._skipped = 0  # samples superseded by a newer one, without those counted by the current driver
         self._driver: Sensor | None = None
-        self.serial = ""  # of the device, once it was open; it is reopened by this
+        self.serial = ""  # of the device once opened; used to reopen the same one
         self.error: FatalError | None = None
 
     def start(self) -> None:
-        """Begin, in the background."""
+        """Start in the background."""
         self._state = SensorState.OPENING
         self._begin(0.0)
 
@@ -97,7 +97,7 @@ class SensorWorker(Samples):
         self._attempt = _Attempt(number, self._run, wait_s=wait_s, deadline_ns=deadline_ns)
 
     def take(self) -> list[SensorFrame]:
-        """All samples that arrived and were not read yet, oldest first."""
+        """Return all unread samples, oldest first."""
         self._watch()
         with self._lock:
             frames = list(self._queue)
@@ -122,7 +122,7 @@ class SensorWorker(Samples):
 
     @property
     def state(self) -> SensorState:
-        """What the sensor is doing; `reason` says why."""
+        """State of the sensor; `reason` has the reason."""
         self._watch()
         return self._state
 
@@ -132,11 +132,11 @@ class SensorWorker(Samples):
 
     @property
     def capabilities(self) -> Capabilities | None:
-        """Of the driver, once it was open."""
+        """Capabilities of the driver once opened."""
         return self._driver.capabilities if self._driver else None
 
     def close(self, timeout_s: float = 1.0) -> None:
-        """Close the driver; where that takes longer than the time-out, leave it behind."""
+        """Close the driver, or abandon it after the timeout."""
         attempt, self._attempt = self._attempt, None
         if attempt is not None:
             attempt.abandoned.set()
@@ -144,19 +144,19 @@ class SensorWorker(Samples):
         self._state, self.reason = SensorState.STOPPED, ""
 
     def _watch(self) -> None:
-        """Leave a thread behind that is in one call for too long, and begin another."""
+        """Abandon a thread whose call takes too long, and start another."""
         if not self._watching.acquire(blocking=False):
-            return  # another thread is at it
+            return  # another thread is doing it
         try:
-            self._leave_behind(self._attempt)
+            self._abandon_if_hung(self._attempt)
         finally:
             self._watching.release()
 
-    def _leave_behind(self, attempt: _Attempt | None) -> None:
+    def _abandon_if_hung(self, attempt: _Attempt | None) -> None:
         if attempt is None or self._clock.now_ns() <= attempt.deadline_ns or not attempt.thread.is_alive():
             return
         self._hung = [a for a in self._hung if a.thread.is_alive()]
-        reason = f"a call into the sensor's driver does not return ({len(self._hung) + 1} left behind)"
+        reason = f"a call into the sensor's driver does not return ({len(self._hung) + 1} abandoned)"
         if not attempt.abandoned.is_set():
             log.warning("sensor: %s", reason)
             self._set(attempt, SensorState.HUNG, reason)
@@ -164,7 +164,7 @@ class SensorWorker(Samples):
             self._account(self._driver)
             self._hung.append(attempt)
         if len(self._hung) <= ABANDONED_MAX:
-            with suppress(TransientError):  # no thread at present: tried again at the next look
+            with suppress(TransientError):  # no thread at present: the next `_watch` retries
                 self._begin(REOPEN_AFTER_S)
 
     def _set(self, attempt: _Attempt, state: SensorState, reason: str) -> None:
@@ -175,7 +175,7 @@ class SensorWorker(Samples):
                 self._state, self.reason = state, reason
 
     def _account(self, driver: Sensor | None) -> None:
-        """Keep a driver's count when it goes."""
+        """Keep the count of a driver that is about to be discarded."""
         with self._lock:
             if driver is not None and driver is self._driver:
                 self._skipped += driver.skipped
@@ -204,7 +204,7 @@ class SensorWorker(Samples):
                         self.error = error
                     self._set(attempt, SensorState.FAILED, str(error))
                     return
-                self._set(attempt, SensorState.LOST, str(error))  # no descriptor, no memory: there may be later
+                self._set(attempt, SensorState.LOST, str(error))  # no descriptor or memory: may be temporary
             except TransientError as error:
                 self._set(attempt, SensorState.LOST, str(error))
             except BaseException as error:
@@ -212,7 +212,7 @@ class SensorWorker(Samples):
                     self.error = missing
                     self._set(attempt, SensorState.FAILED, str(missing))
                     return
-                # An SDK's own exception, or its `sys.exit()`, must not end the daemon: what is broken may come back.
+                # An SDK's exception or `sys.exit()` must not end the daemon: it may recover.
                 log.exception("sensor")
                 self._set(attempt, SensorState.LOST, f"{type(error).__name__}: {error}")
             finally:
@@ -230,7 +230,7 @@ class SensorWorker(Samples):
         try:
             driver.close()
         except BaseException:
-            log.exception("sensor: closing it")
+            log.exception("sensor: closing")
         self._account(driver)
 
     def _receive(self, attempt: _Attempt, driver: Sensor) -> None:
@@ -252,7 +252,7 @@ class SensorWorker(Samples):
                 timeouts += 1
                 self._set(attempt, SensorState.STALLED, str(error))
                 if timeouts >= TIMEOUTS_TO_REOPEN:
-                    raise SensorLost(f"nothing new for {timeouts * s.timeout_s:g} s") from error
+                    raise SensorLost(f"no new samples for {timeouts * s.timeout_s:g} s") from error
                 continue
             timeouts, now_ns = 0, self._clock.now_ns()
             if not (frames := self._timely(frames, now_ns)):
@@ -261,8 +261,8 @@ class SensorWorker(Samples):
                 continue
             well_ns, self._was_well = now_ns, True
             if not driver.capabilities.may_pause:
-                self._look_at(frames[-1], now_ns)
-            overtaken = 0 if find is None else len(frames) - 1  # a search takes a camera's period: only the newest
+                self._check_changing(frames[-1], now_ns)
+            overtaken = 0 if find is None else len(frames) - 1  # finding eyes takes a camera's period: only the newest
             frames = [searched(frame, find, keep_images=self._keep_images) for frame in frames[overtaken:]]
             attempt.received += 1
             with self._lock:
@@ -275,37 +275,37 @@ class SensorWorker(Samples):
                 self._set(attempt, SensorState.RUNNING, "")
 
     def _timely(self, frames: list[SensorFrame], now_ns: int) -> list[SensorFrame]:
-        """Frames with a plausible capture time. Raises FatalError where no frame ever had one."""
+        """Filter frames with plausible capture times. Raises FatalError if none ever had one."""
         timely = [frame for frame in frames if -AHEAD_NS <= now_ns - frame.capture_ns <= BEHIND_NS]
         if len(timely) < len(frames):
             ahead_s = (frames[-1].capture_ns - now_ns) / NS_PER_S
-            self._untimely = f"captures are stamped {ahead_s:+.3f} s from now, not by the run's clock"
+            self._untimely = f"capture times are {ahead_s:+.3f} s from now: not on the run's clock"
             if not self._was_well:
                 raise FatalError(self._untimely)
             with self._lock:
                 self._skipped += len(frames) - len(timely)
         return timely
 
-    def _look_at(self, frame: SensorFrame, now_ns: int) -> None:
-        """Raises SensorLost where a picture, or where the eyes are, never changes.
+    def _check_changing(self, frame: SensorFrame, now_ns: int) -> None:
+        """Raise SensorLost if a picture or the eyes have not changed for `FROZEN_NS`.
 
-        Nobody before a tracker, and a depth picture without a measurement, may last.
+        Missing eye points and depth pictures without measurements may last.
         """
-        looked_at = {
-            "picture has": None if frame.colour is None else frame.colour[LOOKED_AT, LOOKED_AT],
-            "depth picture has": None if frame.depth_mm is None else frame.depth_mm[LOOKED_AT, LOOKED_AT],
+        compared = {
+            "picture has": None if frame.colour is None else frame.colour[COMPARED, COMPARED],
+            "depth picture has": None if frame.depth_mm is None else frame.depth_mm[COMPARED, COMPARED],
             "eye points have": None if frame.eyes is None else frame.eyes.eyes_m,
         }
-        for what, array in looked_at.items():
+        for subject, array in compared.items():
             checksum = 0 if array is None else zlib.crc32(array.tobytes())
-            before, since_ns = self._delivered.get(what, (0, 0))
-            if array is None or checksum != before or (what.startswith("depth") and not array.any()):
-                self._delivered[what] = checksum, now_ns
+            before, since_ns = self._delivered.get(subject, (0, 0))
+            if array is None or checksum != before or (subject.startswith("depth") and not array.any()):
+                self._delivered[subject] = checksum, now_ns
             elif now_ns - since_ns > FROZEN_NS:
-                raise SensorLost(f"its {what} not changed for {FROZEN_NS / NS_PER_S:g} s")
+                raise SensorLost(f"its {subject} not changed for {FROZEN_NS / NS_PER_S:g} s")
 
     def _keep(self, frame: SensorFrame) -> None:
-        """Let a sample wait to be read; where too many wait, the oldest goes."""
+        """Queue a sample, dropping the oldest ones if the queue is full."""
         most = QUEUE_MAX if frame.colour is None and frame.depth_mm is None else PICTURES_MAX
         while len(self._queue) >= most:
             self._queue.popleft()

@@ -1,1 +1,1 @@
-"""Shared tools: atomic files, untrusted input, background jobs, GL contexts, logs."""
+"""Shared utilities: atomic files, untrusted input, background jobs, GL contexts, logs."""

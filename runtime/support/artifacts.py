@@ -1,4 +1,4 @@
-"""Files written atomically: under a temporary name, synced and renamed; and pictures."""
+"""Write files and pictures atomically: under a temporary name, synced and renamed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ STAGING = ".phasestack-staging-"
 
 
 def sync(path: Path) -> None:
-    """Sync a file's data or a folder's names to disk, against power cuts. Raises OSError."""
+    """Sync a file's data or a folder's entries to disk. Raises OSError."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -35,7 +35,7 @@ def sync(path: Path) -> None:
 
 
 def put_in_place(part: Path, path: Path) -> None:
-    """Rename a file to its name for good. Raises OSError."""
+    """Rename a finished file to its final name and sync both. Raises OSError."""
     sync(part)
     part.replace(path)
     sync(path.parent)
@@ -44,7 +44,7 @@ def put_in_place(part: Path, path: Path) -> None:
 def write_bytes(path: Path, data: bytes, *, like: Path | None = None) -> None:
     """Write a file atomically, creating its parents. Raises InputError.
 
-    like: the file whose owner and readers it has; None: the one that it replaces, where there is one.
+    like: file whose owner and mode to copy; None: the file replaced, if there is one.
     """
     like = like or path
     try:
@@ -59,16 +59,16 @@ def write_bytes(path: Path, data: bytes, *, like: Path | None = None) -> None:
         with os.fdopen(handle, "wb") as file:
             file.write(data)
         if before is not None:
-            with suppress(PermissionError):  # somebody else's: it becomes ours
+            with suppress(PermissionError):  # another user's file becomes ours
                 os.chown(name, before.st_uid, before.st_gid)
         Path(name).chmod(0o644 if before is None else stat.S_IMODE(before.st_mode))
-        if any(part.startswith(STAGING) for part in path.parts):  # an OutputFolder has it on the disk at its end
+        if any(part.startswith(STAGING) for part in path.parts):  # OutputFolder syncs at its end
             Path(name).replace(path)
         else:
             put_in_place(Path(name), path)
     except BaseException as error:
         Path(name).unlink(missing_ok=True)
-        if isinstance(error, OSError):  # a full or failing disk
+        if isinstance(error, OSError):  # a full or failing disk, for example
             raise InputError(path, "", f"cannot be written ({error.strerror})") from None
         raise
 
@@ -79,18 +79,18 @@ def write_text(path: Path, text: str) -> None:
 
 
 def to_json(value: Any) -> str:
-    """JSON text; arrays become lists, non-finite numbers null (JSON has none)."""
+    """Format as JSON; arrays become lists, non-finite numbers null."""
     try:
         return json.dumps(value, allow_nan=False, default=_listed)
-    except (ValueError, TypeError):  # there is such a number somewhere, or a key that is no text
+    except (ValueError, TypeError):  # a non-finite number, or a key that is not a string
         return json.dumps(_finite(value), allow_nan=False)
 
 
 def _listed(item: Any) -> Any:
-    """What the encoder itself does not know."""
+    """Convert objects unknown to the encoder."""
     if isinstance(item, np.ndarray | np.generic):
         return item.tolist()
-    raise TypeError(f"{type(item).__name__} is nothing that JSON has")
+    raise TypeError(f"{type(item).__name__} can't be written as JSON")
 
 
 def _finite(item: Any) -> Any:
@@ -104,12 +104,12 @@ def _finite(item: Any) -> Any:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file atomically, one object, readable."""
+    """Write an indented JSON file atomically."""
     write_text(path, json.dumps(json.loads(to_json(value)), indent=1) + "\n")
 
 
 def png_bytes(image: U8) -> bytes:
-    """An (h, w, 3 or 4) RGB(A) or (h, w) grey image as PNG; alpha is dropped."""
+    """Encode an (h, w, 3 or 4) RGB(A) or (h, w) grey image as PNG, without alpha."""
     import cv2
 
     bgr = image if image.ndim == 2 else np.ascontiguousarray(image[..., 2::-1])
@@ -120,16 +120,15 @@ def png_bytes(image: U8) -> bytes:
 
 
 def write_png(path: Path, image: U8) -> None:
-    """Write a PNG atomically; alpha is dropped."""
+    """Write a PNG atomically, without alpha."""
     write_bytes(path, png_bytes(image))
 
 
 class OutputFolder:
     """A folder whose new files appear together at the end, or not at all.
 
-    Used as a context manager: write into `staging`; on success every file is renamed into `target`,
-    replacing those of the same names; on an error nothing new is left. What a killed process left staged is cleared
-    away by the next one that writes here.
+    A context manager: write to `staging`. On success all files are renamed into `target`, replacing those of the same
+    names; on an error no new file remains. The next writer removes what a killed process left staged.
     """
 
     def __init__(self, target: Path) -> None:
@@ -142,7 +141,7 @@ class OutputFolder:
             _sweep(self.target)
             self.staging = Path(tempfile.mkdtemp(prefix=STAGING, dir=self.target))
             self._held = os.open(self.staging, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-            fcntl.flock(self._held, fcntl.LOCK_EX)  # for as long as this process lives
+            fcntl.flock(self._held, fcntl.LOCK_EX)  # held until this process ends
         except OSError as error:
             raise InputError(self.target, "", f"cannot be written ({error.strerror})") from None
         return self
@@ -160,14 +159,14 @@ class OutputFolder:
         for folder in self._made:
             if folder.is_dir() and not any(folder.iterdir()):
                 folder.rmdir()
-        if isinstance(error, InputError) and error.source.startswith(str(self.staging)):  # a name that nobody gave
+        if isinstance(error, InputError) and error.source.startswith(str(self.staging)):  # name the final file instead
             file = self.target / Path(error.source).relative_to(self.staging)
             raise InputError(file, error.field, error.problem) from None
         if isinstance(error, OSError) and str(error.filename or "").startswith(str(self.staging)):
             raise InputError(self.target, "", f"cannot be written ({error.strerror})") from None
 
     def _put_in_place(self) -> None:
-        """Rename every staged file. Raises InputError, with nothing replaced, where something is in the way of one."""
+        """Rename all staged files. Raises InputError before replacing any if something is in the way."""
         files = sorted(path for path in self.staging.rglob("*") if path.is_file())
         places = {path: self.target / path.relative_to(self.staging) for path in files}
         for place in places.values():
@@ -184,7 +183,7 @@ class OutputFolder:
             raise InputError(self.target, "", f"cannot be written ({error.strerror})") from None
 
     def discard(self) -> None:
-        """Remove what was staged so far, before the end."""
+        """Remove the staged files."""
         shutil.rmtree(self.staging, ignore_errors=True)
         if self._held >= 0:
             os.close(self._held)
@@ -192,45 +191,45 @@ class OutputFolder:
 
 
 def _sweep(target: Path) -> None:
-    """What killed processes left staged: nobody holds it any more, in whichever namespace they were."""
-    for left in target.glob(f"{STAGING}*"):
+    """Remove staging folders of killed processes: those that are not locked, which works across namespaces."""
+    for stale in target.glob(f"{STAGING}*"):
         with suppress(OSError):
-            opened = os.open(left, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+            opened = os.open(stale, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
             try:
                 fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                shutil.rmtree(left, ignore_errors=True)
+                shutil.rmtree(stale, ignore_errors=True)
             finally:
                 os.close(opened)
 
 
 def _check_free(place: Path, *, within: Path) -> None:
-    """Raise InputError where a folder is in a file's place, or a file in that of a folder it needs."""
+    """Raise InputError if a folder is in a file's place, or a file in the place of a folder it needs."""
     for folder in place.parents:
         if folder == within:
             break
         if folder.exists() and not folder.is_dir():
-            raise InputError(folder, "", "is no folder: it is in the way of an output")
+            raise InputError(folder, "", "is not a folder, and is in the way of an output")
     if place.is_dir():
-        raise InputError(place, "", "is a folder: it is in the way of an output")
+        raise InputError(place, "", "is a folder, and is in the way of an output")
 
 
 @dataclass(slots=True)
 class Held:
-    """What was written, once the block is left."""
+    """Output captured by `held_back`, available after its block."""
 
     text: str = ""
 
     @property
     def first_line(self) -> str:
-        """Empty where there is none."""
+        """First non-empty line; empty if there is none."""
         return next((line.strip() for line in self.text.splitlines() if line.strip()), "")
 
 
 @contextmanager
 def held_back() -> Iterator[Held]:
-    """Hold back what this block's libraries write to the file descriptor of stderr.
+    """Capture what libraries write to stderr's file descriptor within the block.
 
-    Only where this is the sole thread: the descriptor is the whole process's, and another's lines would be held too.
+    Does nothing if other threads run, because the descriptor belongs to the whole process.
     """
     held = Held()
     if threading.active_count() > 1:

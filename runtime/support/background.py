@@ -18,7 +18,7 @@ log = logging.getLogger("phasestack.background")
 PRESENTER_NICENESS = -10
 SOLVER_NICENESS = 5
 BACKGROUND_NICENESS = 10
-MEASURING_NICENESS = 15  # of measurements and files, which nobody waits for
+MEASURING_NICENESS = 15  # of measurements and files, which are not urgent
 STOPS_WITHIN_S = 1.2  # after a stop request; the rest of the two seconds is for calls without a timeout
 T = TypeVar("T")
 

@@ -1,7 +1,7 @@
-"""Work on untrusted files in a process of its own, limited in memory and time, that can be killed.
+"""Process untrusted files in a child process with limits on memory and time.
 
-Parsers hold Python's lock, and a small file may make them take all memory. The arrays of a result come back in memory
-that both processes have mapped; progress, warnings and refusals are as if the work had been done here.
+Parsers hold Python's lock, and a small file may make them use all memory. A result's arrays return in shared memory;
+progress, log lines and errors are forwarded as if the work ran in this process.
 """
 
 from __future__ import annotations
@@ -30,30 +30,30 @@ from runtime.support import progress
 from runtime.support.extras import missing_extra
 from runtime.support.untrusted_input import LIMITS, MIB
 
-MEMORY_MAX = 4 << 30  # of data; what a scene at every limit takes
-LOOK_S = 0.05  # between two looks at whether it is still wanted
-ALIGNED = 64  # bytes, of an array's place
+MEMORY_MAX = 4 << 30  # bytes of data; enough for a scene at every limit
+LOOK_S = 0.05  # interval between checks for cancellation
+ALIGNED = 64  # bytes; alignment of an array
 PR_SET_PDEATHSIG = 1  # prctl.h of Linux
-SMALL = 1 << 16  # bytes of an array that is copied
+SMALL = 1 << 16  # bytes; smaller arrays are copied
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1")
 T = TypeVar("T")
 
 
 def in_child(
-    work: Callable[..., T], *given: Any, source: str | Path, seconds: float, memory_bytes: int | None = None
+    work: Callable[..., T], *args: Any, source: str | Path, seconds: float, memory_bytes: int | None = None
 ) -> T:
-    """What `work`, a function of a module, answers to `given`.
+    """Call `work(*args)`, a module's function, in a child process and return its result.
 
-    memory_bytes: that it may take; None: `MEMORY_MAX`. It is ended where the progress's listener raises. Raises what
-    `work` raises on purpose; InputError, naming `source`, where it is over a limit, fails or ends the process;
-    TransientError where no process can be started.
+    memory_bytes: limit; None: `MEMORY_MAX`. The child is killed if the progress listener raises. Raises phasestack's
+    errors from `work`; InputError, naming `source`, if it exceeds a limit, fails or ends the process; TransientError
+    if no process can be started.
     """
     memory_bytes = memory_bytes or MEMORY_MAX
     ours, theirs = Pipe()
     memory = os.memfd_create("result")
     command = [sys.executable, "-P", "-m", __name__, str(theirs.fileno()), str(memory)]
-    places = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, sys.path)])  # ours before a namesake
-    environment = os.environ | ONE_THREAD | {"PYTHONPATH": places}
+    python_path = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, sys.path)])  # this package first
+    environment = os.environ | ONE_THREAD | {"PYTHONPATH": python_path}
     try:
         child = subprocess.Popen(
             command,
@@ -71,11 +71,11 @@ def in_child(
     with child, ours:
         try:
             with suppress(BrokenPipeError):
-                ours.send((work, given, str(source), asdict(LIMITS), (memory_bytes, seconds)))
+                ours.send((work, args, str(source), asdict(LIMITS), (memory_bytes, seconds)))
             result = _outcome(ours, str(source), seconds)
             if result is None:
-                why = f"takes more than {memory_bytes // MIB} MiB, or ends the process that reads it ({child.wait()})"
-                raise InputError(source, "", why)
+                limit = f"needs more than {memory_bytes // MIB} MiB"
+                raise InputError(source, "", f"{limit}, or crashes the process that reads it ({child.wait()})")
             return pickle.loads(result[0], buffers=_mapped(memory, result[1]))  # type: ignore[no-any-return]
         finally:
             child.kill()
@@ -83,29 +83,29 @@ def in_child(
 
 
 def _outcome(channel: Connection, source: str, seconds: float) -> tuple[bytes, list[int]] | None:
-    """A result's pickle and the sizes of its arrays; None where the child has ended without one."""
-    end_s, told = time.monotonic() + seconds, (f"reading {Path(source).name}", 0, None)
+    """Pickle of the result and sizes of its arrays; None if the child ended without a result."""
+    end_s, step = time.monotonic() + seconds, (f"reading {Path(source).name}", 0, None)
     while True:
         try:
-            kind, *said = channel.recv() if channel.poll(LOOK_S) else ("nothing",)
+            kind, *content = channel.recv() if channel.poll(LOOK_S) else ("nothing",)
         except (EOFError, ConnectionResetError):
             return None
         match kind:
             case "done":
-                return said[0], said[1]
+                return content[0], content[1]
             case "refused":
-                raise said[0] from said[1]
+                raise content[0] from content[1]
             case "log":
-                logging.getLogger(said[0]).log(said[1], "%s", said[2])
+                logging.getLogger(content[0]).log(content[1], "%s", content[2])
             case "progress":
-                told = said[0]
-        progress.tell(*told)  # who listens may raise
+                step = content[0]
+        progress.tell(*step)  # the listener may raise
         if time.monotonic() > end_s:
             raise InputError(source, "", f"is not ready after {seconds:g} s")
 
 
 def _mapped(memory: int, sizes: list[int]) -> list[memoryview | bytearray]:
-    """The arrays, one after the other; written to, they are copied; a small one holds nothing else."""
+    """Map the arrays copy-on-write; small ones are copied, so as not to keep the whole mapping alive."""
     total = sum(map(_room, sizes))
     whole = memoryview(mmap.mmap(memory, total, flags=mmap.MAP_PRIVATE) if total else b"")
     ends = [sum(map(_room, sizes[: number + 1])) for number in range(len(sizes))]
@@ -118,7 +118,7 @@ def _room(size: int) -> int:
 
 
 class _Forwarded(logging.Handler):
-    """Records go to the process that waits."""
+    """Sends log records to the parent process."""
 
     def __init__(self, channel: Connection) -> None:
         super().__init__()
@@ -130,26 +130,26 @@ class _Forwarded(logging.Handler):
 
 def main(channel: Connection, memory: int) -> None:
     """Entry point of the child process."""
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # nobody waits for a child whose parent was killed
-    work, given, source, limits, (memory_bytes, seconds) = channel.recv()
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # end with the parent
+    work, args, source, limits, (memory_bytes, seconds) = channel.recv()
     for name, limit in limits.items():
         setattr(LIMITS, name, limit)
-    processor_s = (os.cpu_count() or 1) * int(seconds) + 10  # where nobody is left to kill it
+    processor_s = (os.cpu_count() or 1) * int(seconds) + 10  # in case the parent can't kill it
     for kind, most in (
         (resource.RLIMIT_DATA, memory_bytes),
         (resource.RLIMIT_CPU, processor_s),
         (resource.RLIMIT_CORE, 0),
     ):
-        held = resource.getrlimit(kind)[1]  # by whoever began it, another child at times
-        most = most if held == resource.RLIM_INFINITY else min(most, held)
+        hard = resource.getrlimit(kind)[1]  # inherited, possibly from another child
+        most = most if hard == resource.RLIM_INFINITY else min(most, hard)
         resource.setrlimit(kind, (most, most))
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("1000")
     logging.getLogger().addHandler(_Forwarded(channel))
     logging.getLogger().setLevel(logging.INFO)
     try:
-        with progress.listening(lambda *told: channel.send(("progress", told))):
-            result = work(*given)
+        with progress.listening(lambda *step: channel.send(("progress", step))):
+            result = work(*args)
         sizes: list[int] = []
 
         def keep(buffer: pickle.PickleBuffer) -> None:
@@ -175,9 +175,9 @@ def main(channel: Connection, memory: int) -> None:
 
 
 def _passing(error: BaseException | None) -> OSError | None:
-    """The machine's trouble of the moment behind a refusal, as `is_retryable` looks for it.
+    """Transient system error that caused a refusal, for `is_retryable`.
 
-    Ends the process for want of memory: that is its own limit.
+    Ends the process on a MemoryError, which means that it hit its limit.
     """
     while error is not None:
         if isinstance(error, MemoryError):

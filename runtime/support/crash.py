@@ -1,4 +1,4 @@
-"""An exception that nobody expected: whole in a file, one line for people."""
+"""Report an unexpected exception: the traceback in a file, one line for people."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from runtime.errors import one_line, without_secrets
 from runtime.support.folders import state_folder
 
 STEM = "phasestack-error-"
-KEPT = 20  # files in a folder; older ones make way: a service that fails again and again must not fill the disk
+KEPT = 20  # newest files kept per folder, so that a service that fails repeatedly does not fill the disk
 
 
 def written(error: BaseException) -> str:
-    """Write an exception's report and answer one line that names the file. Never raises."""
+    """Write an exception's report; returns one line that names the file. Never raises."""
     from runtime.support.version import version
 
-    what = one_line(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__)
+    summary = one_line(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__)
     now = datetime.now(UTC)
     text = (
         f"phasestack {version()}, Python {platform.python_version()}, {platform.platform()}\n"
@@ -34,7 +34,7 @@ def written(error: BaseException) -> str:
     for folder in (state_folder(), Path(tempfile.gettempdir())):
         with contextlib.suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
-            # Its owner alone reads it: a path or a name in it may be private.
+            # mkstemp makes it readable by its owner alone: paths and names in it may be private.
             file, path = tempfile.mkstemp(".log", f"{STEM}{now:%Y%m%dT%H%M%S}-{os.getpid()}-", folder)
             try:
                 with os.fdopen(file, "w", encoding="utf-8", errors="backslashreplace") as opened:
@@ -42,15 +42,15 @@ def written(error: BaseException) -> str:
             except OSError:
                 Path(path).unlink()
                 raise
-            with contextlib.suppress(OSError):  # another user's
+            with contextlib.suppress(OSError):  # another user's files
                 for old in sorted(folder.glob(f"{STEM}*.log"))[:-KEPT]:
                     old.unlink()
-            return f"unexpected error ({what}); the whole of it is in {path}"
-    return f"unexpected error ({what}); it could be written down nowhere"
+            return f"unexpected error ({summary}); details are in {path}"
+    return f"unexpected error ({summary}); no report could be written"
 
 
 def watch_threads() -> None:
-    """Report exceptions that end a thread, or that Python can't raise, in one line."""
+    """Report exceptions that end a thread, and those that Python can't raise, in one line."""
     threading.excepthook = lambda hook: _say(hook.exc_value, hook.exc_type)
     sys.unraisablehook = lambda hook: _say(hook.exc_value, hook.exc_type)
 
@@ -59,7 +59,7 @@ def _say(error: BaseException | None, kind: type[BaseException]) -> None:
     if issubclass(kind, SystemExit):
         return
     if issubclass(kind, KeyboardInterrupt):
-        # It fell into a finaliser or a callback, where Python drops it, as it would in here: send it again soon.
+        # It hit a finaliser or a callback, where Python drops it, and would do so here: send the signal again.
         again = threading.Timer(0.01, signal.raise_signal, (signal.SIGINT,))
         again.daemon = True
         again.start()

@@ -1,4 +1,4 @@
-"""Optional packages: which extra of phasestack brings the one that is not installed."""
+"""Find the extra of phasestack that installs a missing optional package."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ NOT_TO_RUN = frozenset({"all", "docs", "test"})
 
 
 def missing_extra(error: BaseException) -> MissingPart | None:
-    """What to install for an import that failed; None where no extra brings it: another fault."""
+    """Error with the extra to install for a failed import; None if no extra has the package."""
     if not isinstance(error, ModuleNotFoundError) or not error.name:
         return None
     module = error.name.partition(".")[0]
@@ -28,6 +28,6 @@ def _extras_with(package: str) -> list[str]:
         lines = requires("phasestack") or []
     except PackageNotFoundError:
         return []
-    wanted = re.compile(rf"{re.escape(package)}\b(?!-).*extra == ['\"]([\w-]+)['\"]", re.IGNORECASE)
-    found = [match[1] for line in lines if (match := wanted.match(line.replace("_", "-")))]
-    return [extra for extra in found if extra not in NOT_TO_RUN]
+    pattern = re.compile(rf"{re.escape(package)}\b(?!-).*extra == ['\"]([\w-]+)['\"]", re.IGNORECASE)
+    extras = [match[1] for line in lines if (match := pattern.match(line.replace("_", "-")))]
+    return [extra for extra in extras if extra not in NOT_TO_RUN]

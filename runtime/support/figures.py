@@ -1,4 +1,4 @@
-"""A record as lines for people: every figure stands under the name that it has in JSON."""
+"""Format a record as lines for people, under the same names as in JSON."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ LINE_MAX = 2000  # characters
 
 
 def shown(record: Mapping[str, Any], *, as_json: bool) -> str:
-    """What a command prints of its result."""
+    """Format a command's result: JSON, or lines for people."""
     return json.dumps(record) if as_json else "\n".join(lines_of(record))
 
 
 def lines_of(record: Mapping[str, Any]) -> Iterator[str]:
-    """A line per field, or per object of a list; unmeasured, disabled and empty ones are left out.
+    """Yield a line per field, or per object of a list, without null, false and empty values.
 
-    What it holds can't break a line.
+    Line breaks in values are replaced.
     """
     for name, value in record.items():
         is_list = isinstance(value, list | tuple) and all(isinstance(item, dict) for item in value)
@@ -29,7 +29,7 @@ def lines_of(record: Mapping[str, Any]) -> Iterator[str]:
 
 
 def in_words(value: Any) -> str:
-    """A value on one line; empty where there is none."""
+    """Format a value on one line; empty for null and false."""
     match value:
         case None | False:
             return ""

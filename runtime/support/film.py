@@ -1,4 +1,4 @@
-"""Films read by OpenCV through FFmpeg, which may open nothing but the file that was named."""
+"""Open films with OpenCV's FFmpeg backend, restricted to the named file."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _alone = threading.Lock()
 
 
 def open_film(path: Path) -> cv2.VideoCapture:
-    """A film's file. FFmpeg's complaints and OpenCV's stay off stderr: our own line names the file.
+    """Open a film. FFmpeg's and OpenCV's own messages are suppressed; ours name the file.
 
-    A playlist or a script under a film's name would make FFmpeg open other files, and connections, and so would a name
-    that it takes for an address. Raises InputError for what is no file.
+    The restrictions matter because a playlist or script with a film's suffix, or a name that looks like a URL, would
+    make FFmpeg open other files and connections. Raises InputError for anything but a file.
     """
     untrusted_input.open_regular(path).close()
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")

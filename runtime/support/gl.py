@@ -17,21 +17,21 @@ if TYPE_CHECKING:
 
 DEBIAN_PACKAGES = "libegl1 libgl1-mesa-dri libgles2 libgl1"
 MINIMUM_VERSION = 330  # of OpenGL, times 100: the shaders' version
-# Libraries by their sonames: the search that moderngl does otherwise starts a compiler and costs 60 ms.
+# Sonames avoid moderngl's search for libraries, which starts a compiler and takes 60 ms.
 EGL: dict[str, Any] = {"backend": "egl", "libegl": "libEGL.so.1", "libgl": "libGL.so.1"}
 
 
 def offscreen_context() -> moderngl.Context:
-    """An offscreen context, current on this thread, shared by content and offscreen panels.
+    """Create an offscreen context, current on this thread; content and offscreen panels share it.
 
-    Use it on one thread only. Raises MissingPart, naming Debian's packages, where EGL can't give OpenGL 3.3.
+    Use it on one thread only. Raises MissingPart, naming Debian's packages, if EGL has no OpenGL 3.3.
     """
     try:
         import moderngl
     except ImportError as error:
         raise missing_extra(error) or error from None
 
-    if "MESA_SHADER_CACHE_DIR" not in os.environ:  # nothing is left in a home: ours compile in milliseconds
+    if "MESA_SHADER_CACHE_DIR" not in os.environ:  # no cache in the home folder: our shaders compile in milliseconds
         os.environ["MESA_SHADER_CACHE_DISABLE"] = "true"
     try:
         return moderngl.create_context(require=MINIMUM_VERSION, standalone=True, **EGL)
@@ -43,7 +43,7 @@ def offscreen_context() -> moderngl.Context:
 
 
 def leave_context() -> None:
-    """Make no context current on this thread: a current one that is released would leak."""
+    """Make no context current on this thread: releasing the current one would leak it."""
     egl, pointer = ctypes.CDLL(EGL["libegl"]), ctypes.c_void_p
     egl.eglGetCurrentDisplay.restype, egl.eglMakeCurrent.argtypes = pointer, [pointer] * 4
     egl.eglMakeCurrent(egl.eglGetCurrentDisplay(), None, None, None)
@@ -57,20 +57,20 @@ def _gl_finish() -> Any:
 def finish() -> None:
     """Wait until this thread's GL commands are complete, without holding Python's lock.
 
-    moderngl's own calls keep the interpreter's lock: reading a picture that a software rasteriser still draws would
-    hold every other thread up for tens of milliseconds.
+    moderngl keeps the lock during its calls: reading a picture that a software rasteriser is still drawing would block
+    all other threads for tens of milliseconds.
     """
     _gl_finish()()
 
 
 @dataclass(frozen=True, slots=True)
 class DrawnPicture:
-    """An RGBA picture of 8 bits that is left where it was drawn; row 0 is the top."""
+    """An 8-bit RGBA picture on the GPU; row 0 is the top."""
 
     texture: moderngl.Texture
-    target: moderngl.Framebuffer  # that the texture is in
-    held: U8  # (h, w, 4) of whoever drew it, for those who want the pixels
-    grey: bool = False  # whether it is known to be without colour
+    target: moderngl.Framebuffer  # contains `texture`
+    held: U8  # (h, w, 4) the renderer's buffer for reading pixels back
+    grey: bool = False  # known to have no colour
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -78,14 +78,14 @@ class DrawnPicture:
         return self.held.shape
 
     def pixels(self) -> U8:
-        """(h, w, 4) what was drawn, read back on the thread of its context; until the next is drawn."""
+        """(h, w, 4) pixels, valid until the next picture is drawn. Call on the thread of its context."""
         finish()
         self.target.read_into(self.held, components=4)
         return self.held
 
 
 def describe(context: moderngl.Context) -> dict[str, str]:
-    """Vendor, renderer and version as the driver names them."""
+    """Vendor, renderer and version as reported by the driver."""
     info = context.info
     return {
         "vendor": str(info["GL_VENDOR"]),

@@ -1,6 +1,6 @@
 """Log lines for people and for journald.
 
-A fault that repeats does not flood them, a message can't forge a line, and who logs never waits for who reads.
+Repeated faults are rate-limited, messages can't forge lines, and logging never blocks on a slow reader.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from runtime.clock import NS_PER_S, Clock, MonotonicClock
 from runtime.errors import one_line
 from runtime.support.crash import written
 
-# What sd-daemon(3) puts before a line so that journald files it under its level.
+# Prefixes of sd-daemon(3) that set a line's priority in journald.
 PRIORITY = {
     logging.DEBUG: "<7>",
     logging.INFO: "<6>",
@@ -29,26 +29,26 @@ PRIORITY = {
     logging.ERROR: "<3>",
     logging.CRITICAL: "<2>",
 }
-ROOTS = ("phasestack", "runtime")  # named for what they report, or after their module
-BURST = 5  # equal messages that pass in `QUIET_NS`
-REMEMBERED = 1000  # different messages that are counted
+ROOTS = ("phasestack", "runtime")  # loggers named by subject, and by module
+BURST = 5  # equal messages passed in `QUIET_NS`
+REMEMBERED = 1000  # different messages counted
 QUIET_NS = 30 * NS_PER_S  # after which a suppressed message passes again
-QUEUED_MAX = 4096  # lines that wait for a reader
-CLOSE_S = 1.0  # so long the last lines are waited for
+QUEUED_MAX = 4096  # lines waiting for a reader
+CLOSE_S = 1.0  # longest wait for the last lines
 LINE_MAX = 4000  # characters
 
 
 class TextFormat(logging.Formatter):
-    """The message; under journald with a priority and no time (it has its own), else with the time."""
+    """Format messages with a priority under journald (which adds the time), else with time and level."""
 
     def __init__(self, *, journald: bool) -> None:
         super().__init__()
         self._journald = journald
 
     def format(self, record: logging.LogRecord) -> str:
-        text = one_line(record.getMessage(), most=LINE_MAX)  # nobody's name or message forges another line
+        text = one_line(record.getMessage(), most=LINE_MAX)  # names and messages can't forge a line
         if record.exc_info and record.exc_info[1]:
-            text += f": {written(record.exc_info[1])}"  # the file where it stands whole: for whoever mends it
+            text += f": {written(record.exc_info[1])}"  # names the file with the traceback
         if self._journald:
             return PRIORITY.get(record.levelno, "<6>") + text
         when = datetime.fromtimestamp(record.created).strftime("%H:%M:%S")
@@ -56,9 +56,9 @@ class TextFormat(logging.Formatter):
 
 
 class RateLimit(logging.Filter):
-    """Passes five equal messages in half a minute; the next one says how many were suppressed.
+    """Passes five equal messages in half a minute; the next one gives the number suppressed.
 
-    A record with `extra={"always": True}` (a transition of state) always passes.
+    Records with `extra={"always": True}` (state transitions) always pass.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -71,7 +71,7 @@ class RateLimit(logging.Filter):
             return True
         key = (record.name, str(record.msg))
         now_ns = self._clock.now_ns()
-        if len(self._seen) > REMEMBERED:  # messages that are never twice the same must not pile up
+        if len(self._seen) > REMEMBERED:  # bounds the memory for messages that never repeat
             self._seen.clear()
         start_ns, passed, suppressed = self._seen.get(key, (now_ns, 0, 0))
         if now_ns - start_ns >= QUIET_NS:
@@ -86,23 +86,23 @@ class RateLimit(logging.Filter):
 
 
 class _Lines(logging.Handler):
-    """Writes lines to a descriptor, and waits for who reads it: used on the listener's thread."""
+    """Writes lines to a descriptor, blocking on its reader: used on the listener's thread."""
 
     def __init__(self, descriptor: int) -> None:
         super().__init__()
         self._descriptor = descriptor
 
     def createLock(self) -> None:
-        """None: one thread uses it, and who shuts logging down must not wait until it is through."""
+        """Use no lock: only one thread writes, and shutting logging down must not block on it."""
         self.lock = None
 
     def emit(self, record: logging.LogRecord) -> None:
-        with suppress(OSError):  # nobody reads any more, or the disk is full
+        with suppress(OSError):  # the reader has gone, or the disk is full
             os.write(self._descriptor, self.format(record).encode("utf-8", "backslashreplace") + b"\n")
 
 
 class QueuedLines(QueueHandler):
-    """Puts records into a bounded queue for a writer thread; when it is full, lines are dropped."""
+    """Puts records into a bounded queue for a writer thread; drops lines when it is full."""
 
     def __init__(self, descriptor: int, form: logging.Formatter) -> None:
         self.queue: queue.Queue[Any] = queue.Queue(QUEUED_MAX)
@@ -113,7 +113,7 @@ class QueuedLines(QueueHandler):
         self._listener.start()
 
     def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
-        """Its message in words now; its exception is put down by the listener, whose time it may take."""
+        """Format the message now, and leave the exception, which takes longer, to the listener."""
         prepared = copy.copy(record)
         prepared.msg, prepared.args = record.getMessage(), None
         return prepared
@@ -123,14 +123,14 @@ class QueuedLines(QueueHandler):
             self.queue.put_nowait(record)
 
     def flush(self) -> None:
-        """Wait a moment for what is not written yet."""
+        """Wait up to `CLOSE_S` for queued lines."""
         deadline_s = time.monotonic() + CLOSE_S
         while self.queue.unfinished_tasks and time.monotonic() < deadline_s:
             time.sleep(0.005)
 
     def close(self) -> None:
         self.flush()
-        if not self.queue.unfinished_tasks:  # else its thread waits for a reader, for as long as the process lives
+        if not self.queue.unfinished_tasks:  # else its thread is blocked and ends with the process
             self._listener.stop()
         super().close()
 
@@ -141,12 +141,12 @@ def configure(
     clock: Clock | None = None,
     environment: Mapping[str, str] = os.environ,
 ) -> None:
-    """Send every log line of ours to a stream (stderr). Calling it again replaces."""
+    """Send phasestack's log lines to a stream (default stderr), replacing an earlier call's."""
     for old in logging.getLogger(ROOTS[0]).handlers[:]:
         if isinstance(old, QueuedLines):
             old.close()
     form = TextFormat(journald="JOURNAL_STREAM" in environment)
-    handler = QueuedLines(os.dup((stream or sys.stderr).fileno()), form)  # whatever becomes of the number
+    handler = QueuedLines(os.dup((stream or sys.stderr).fileno()), form)  # a copy, safe if the stream is closed
     handler.addFilter(RateLimit(clock or MonotonicClock()))
     for name in ROOTS:
         root = logging.getLogger(name)
@@ -156,6 +156,6 @@ def configure(
 
 
 def flush() -> None:
-    """Wait a moment for what is not written yet: before the process ends without Python's own clean-up."""
+    """Wait up to `CLOSE_S` for queued lines, before ending the process without Python's clean-up."""
     for handler in logging.getLogger(ROOTS[0]).handlers:
         handler.flush()

@@ -1,4 +1,4 @@
-"""Freed memory: kept for the next frame, or back to the system."""
+"""Keep freed memory for the next frame, or return it to the system."""
 
 from __future__ import annotations
 
@@ -8,27 +8,24 @@ import sys
 from functools import cache
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8  # malloc.h of glibc
-LARGEST_KEPT = 32 << 20  # bytes of one block; the most that every glibc accepts
-MOST_KEPT = 1 << 30  # bytes free at the heap's end before any go back
-ARENAS = 2  # heaps for all threads; by default eight a processor, of which only the first gives its end back
+LARGEST_KEPT = 32 << 20  # bytes of one block; the maximum that every glibc accepts
+MOST_KEPT = 1 << 30  # free bytes at the heap's end before any are returned
+ARENAS = 2  # heaps for all threads; the default is eight per processor, of which only the first returns memory
 
 
 def give_back() -> None:
-    """Return freed memory to the system, as far as the C library can.
-
-    Takes milliseconds. Does nothing where the C library has no such call.
-    """
+    """Return freed memory to the system, if the C library can. Takes milliseconds."""
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
 
 
 @cache
 def keep_freed_memory() -> bool:
-    """Tell glibc's malloc to keep large blocks for the next frame; False where the C library is another.
+    """Make glibc's malloc keep large blocks for the next frame; returns False with another C library.
 
-    By default each picture is mapped anew and every page of it faults at its first use: measured, a quarter of
-    the time of a whole prediction at 1920x1080. All threads share `ARENAS` heaps: each would keep its own most. To be
-    called before threads have many.
+    By default every picture gets a new mapping and faults on the first use of each page, which takes a quarter of the
+    time of a prediction at 1920x1080. All threads share `ARENAS` heaps, because each heap keeps up to `MOST_KEPT`; so
+    call this before starting threads.
     """
     if sys.platform != "linux":
         return False
@@ -36,5 +33,5 @@ def keep_freed_memory() -> bool:
         mallopt = ctypes.CDLL(None).mallopt
     except (OSError, AttributeError):
         return False
-    told = ((M_ARENA_MAX, ARENAS), (M_MMAP_THRESHOLD, LARGEST_KEPT), (M_TRIM_THRESHOLD, MOST_KEPT))
-    return all([mallopt(*setting) for setting in told])
+    options = ((M_ARENA_MAX, ARENAS), (M_MMAP_THRESHOLD, LARGEST_KEPT), (M_TRIM_THRESHOLD, MOST_KEPT))
+    return all([mallopt(*option) for option in options])

@@ -1,4 +1,4 @@
-"""onnxruntime, and nothing sent home: the only place of the runtime that imports it."""
+"""The runtime's only import of onnxruntime, with telemetry disabled."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 @cache
 def onnxruntime() -> Any:
-    """The onnxruntime module, with telemetry off by environment and by its own switch."""
+    """Import onnxruntime with telemetry disabled, both by environment variable and by function."""
     os.environ["ORT_DISABLE_TELEMETRY"] = "1"
     import onnxruntime as ort
 

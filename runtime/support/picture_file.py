@@ -1,4 +1,4 @@
-"""Picture files as upright 8-bit sRGB over a colour: stills, stereo pairs, animations."""
+"""Read picture files as upright 8-bit sRGB over a background colour: stills, stereo pairs, animations."""
 
 from __future__ import annotations
 
@@ -30,24 +30,23 @@ log = logging.getLogger("phasestack.pictures")
 
 Colour = tuple[float, float, float]  # 0-1
 WHITE: Colour = (1.0, 1.0, 1.0)
-ROWS_AT_ONCE = 64  # of a picture that are converted together: bounds the memory
-LATTICE = 9  # colours a channel, on which a profile is compared with sRGB's
-SRGB_CODES = 2  # a profile that is nowhere farther off than this is sRGB's own, rounded
-STILL_MS = 100.0  # of an animation's frame that says 0, as browsers have it
+ROWS_AT_ONCE = 64  # rows converted together, which bounds the memory
+LATTICE = 9  # values per channel at which a profile is compared with sRGB
+SRGB_CODES = 2  # largest difference of a profile that is sRGB apart from rounding
+STILL_MS = 100.0  # duration of an animation's frame that gives 0, as in browsers
 DEEP = {"I;16": "<u2", "I;16L": "<u2", "I;16B": ">u2", "I;16N": "=u2"}  # Pillow's modes of 16 bits
 
 
 def read_image(path: Path, *, background: Colour = WHITE) -> U8:
-    """(h, w, 3) 8-bit sRGB of any common picture file, composed over a colour.
+    """Read any common picture file as (h, w, 3) 8-bit sRGB, composed over a colour; the first of several pictures.
 
-    Of several pictures it is the first. Raises InputError, naming the file: also for one that would take too much
-    memory, before it is unpacked.
+    Raises InputError, naming the file, before decoding if the picture would need too much memory.
     """
     return read_views(path, background=background)[0]
 
 
 def read_views(path: Path, *, background: Colour = WHITE) -> list[U8]:
-    """One picture, or the left and the right eye's where the file holds both, as `read_image` has them."""
+    """Read one picture, or the left and the right eye's if the file has both, in the format of `read_image`."""
     data, header = read_coded(path)
     if header.warning:
         log.warning("%s: %s", path, header.warning)
@@ -55,27 +54,26 @@ def read_views(path: Path, *, background: Colour = WHITE) -> list[U8]:
 
 
 def read_animation(path: Path, *, background: Colour = WHITE) -> tuple[list[U8], list[float]]:
-    """Frames of an animated picture, with the time that each is shown, milliseconds.
+    """Read the frames of an animated picture and their durations in milliseconds.
 
-    One that would take more memory than the largest picture is shown as a still, and the log says so.
-    Raises InputError.
+    An animation larger than the largest picture becomes a still, with a warning in the log. Raises InputError.
     """
     data, header = read_coded(path)
     with opened(data) as image:
         numbers = range(1 if image.info.get("default_image") else 0, image.n_frames)
     if len(numbers) * header.width_px * header.height_px > LIMITS.pixels:
         size = f"{header.width_px} x {header.height_px}"
-        told = f"{len(numbers)} frames of {size} pixels; at most {LIMITS.pixels:,} in all"
-        log.warning("%s: its first frame is shown as a still: it has %s", path, told)
+        total = f"{len(numbers)} frames of {size} pixels; at most {LIMITS.pixels:,} in all"
+        log.warning("%s: its first frame is shown as a still: it has %s", path, total)
         numbers = numbers[:1]
-    found = list(_decoded(path, data, header, tuple(numbers), background))
-    return [picture for picture, _ in found], [shown_ms for _, shown_ms in found]
+    frames = list(_decoded(path, data, header, tuple(numbers), background))
+    return [picture for picture, _ in frames], [shown_ms for _, shown_ms in frames]
 
 
 def _decoded(
     path: Path, data: bytes, header: Header, frames: tuple[int, ...], background: Colour
 ) -> Iterator[tuple[U8, float]]:
-    """Frames with the time that each is shown. Raises InputError, naming the file."""
+    """Yield frames with their durations. Raises InputError, naming the file."""
     if is_cut_off(data):
         raise InputError(path, "", undecodable(data))
     try:
@@ -94,9 +92,9 @@ def _decoded(
 
 
 def rgb_of(image: Any, source: object, *, background: Colour = WHITE) -> U8:
-    """(h, w, 3) 8-bit sRGB of Pillow's decoded image, over a colour.
+    """Convert Pillow's decoded image to (h, w, 3) 8-bit sRGB over a colour.
 
-    It is turned as EXIF says, and its profile is applied. Raises InputError where its values have no range.
+    Applies its EXIF orientation and its profile. Raises InputError if its values have no defined range.
     """
     profile = image.info.get("icc_profile")
     image = _upright(image)
@@ -125,7 +123,7 @@ def composed(colour: U8, alpha: U8, behind: Any) -> U8:
 
 
 def _upright(image: Any) -> Any:
-    with suppress(Exception):  # a malformed entry turns nothing
+    with suppress(Exception):  # ignore a malformed entry
         if image.getexif().get(ORIENTATION, 1) != 1:
             return ImageOps.exif_transpose(image)
     return image
@@ -151,8 +149,8 @@ def _to_srgb(profile: bytes, colours: str, source: object) -> Any:
             renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
             flags=ImageCms.Flags.BLACKPOINTCOMPENSATION,
         )
-    except Exception as error:  # as browsers do with one that is broken, or of another kind of colours
-        log.info("%s: its colour profile is left out (%s)", source, error)
+    except Exception as error:  # broken, or for another colour space: ignored, as in browsers
+        log.info("%s: its colour profile is ignored (%s)", source, error)
         return None
     if colours == "CMYK":
         return transform.apply

@@ -1,4 +1,4 @@
-"""Plausible settings: ranges that reveal a wrong unit, possible paths, misspelt names."""
+"""Checks of settings: ranges with hints at wrong units, valid paths, misspelt names."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PART_MAX_BYTES = 255  # of one part of a path
 
 
 def within(low: float, high: float, unit: str, *, zero: bool = False) -> AfterValidator:
-    """A number from low to high, or 0 where that means "not set"; what is outside may be of another unit.
+    """Validator for a number in [low, high]; zero: 0 is valid too, as "not set". Errors hint at other units.
 
     >>> within(0.005, 20.0, "m").func(518.4)
     Traceback (most recent call last):
@@ -31,7 +31,7 @@ def within(low: float, high: float, unit: str, *, zero: bool = False) -> AfterVa
 
 
 def check_text(value: str) -> str:
-    """The text, where a name or a path can be that. Raises ValueError."""
+    """Return the text if it can be a name or a path. Raises ValueError."""
     if "\0" in value:
         raise ValueError("holds a NUL character")
     try:
@@ -40,12 +40,12 @@ def check_text(value: str) -> str:
     except UnicodeEncodeError:
         raise ValueError("is not UTF-8") from None
     if size > TEXT_MAX_BYTES or longest > PART_MAX_BYTES:
-        raise ValueError(f"is too long ({len(value)} characters, beginning {value[:20]!r})")
+        raise ValueError(f"is too long ({len(value)} characters, starting with {value[:20]!r})")
     return value
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """`: did you mean model?` where a known word is like it, else an empty text.
+    """`: did you mean model?` if a known word is similar, else an empty text.
 
     >>> nearest("modle", ["model", "loop"])
     ': did you mean model?'

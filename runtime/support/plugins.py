@@ -16,14 +16,14 @@ PLUGIN = re.compile(r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*:[A-Za-z_]\w*", re.ASCII)
 
 
 def is_plugin(name: str) -> bool:
-    """True for `module:Class`."""
+    """Return True for `module:Class`."""
     return PLUGIN.fullmatch(name) is not None
 
 
 def located(name: str, folder: Path) -> str:
-    """A relative path resolved against a folder; a bare word without a suffix is a name and stays.
+    """Resolve a relative path against a folder.
 
-    What has a scheme (`rtsp://...`) is no path, nor is a class (`module:Class`).
+    Names (words without slash and suffix), URLs (`rtsp://...`) and classes (`module:Class`) are returned unchanged.
     """
     if "://" in name or is_plugin(name):
         return name
@@ -33,26 +33,26 @@ def located(name: str, folder: Path) -> str:
 
 
 def plugin_class(name: str, base: type, *, field: str) -> Any:
-    """The class named `module:Class`. Raises InputError if missing, or not derived from `base`.
+    """Import the class `module:Class`, named by the setting `field`.
 
-    field: the setting that names it.
+    Raises InputError if it is missing or not derived from `base`.
     """
     module, _, attribute = name.partition(":")
     try:
-        found = getattr(importlib.import_module(module), attribute, None)
-    except (Exception, SystemExit) as error:  # whatever a module does when it is imported
+        plugin = getattr(importlib.import_module(module), attribute, None)
+    except (Exception, SystemExit) as error:  # the module's own
         if missing := missing_extra(error):
             raise missing from None
         problem = one_line(f"{type(error).__name__}: {error}")
         raise InputError(field, "", f"`{module}` cannot be imported from Python's path ({problem})") from error
-    if not (isinstance(found, type) and issubclass(found, base)):
-        of = "torch.nn" if base.__module__.startswith("torch.") else "phasestack"
-        raise InputError(field, "", f"`{name}` is no class that derives from {of}.{base.__name__}")
-    return found
+    if not (isinstance(plugin, type) and issubclass(plugin, base)):
+        package = "torch.nn" if base.__module__.startswith("torch.") else "phasestack"
+        raise InputError(field, "", f"`{name}` is not a class derived from {package}.{base.__name__}")
+    return plugin
 
 
 def strict(options: type[BaseModel]) -> type[BaseModel]:
-    """A class's options with unknown keys refused, unless the class itself allows them."""
+    """Make a plugin's options refuse unknown keys, unless the class sets `extra` itself."""
     if "extra" in options.model_config:
         return options
     return type(options.__name__, (options,), {"__module__": __name__, "model_config": {"extra": "forbid"}})

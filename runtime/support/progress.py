@@ -1,7 +1,7 @@
-"""Progress of long work: reported by the work to a listener, which may stop it.
+"""Progress of long work, reported to an optional listener, which may stop the work.
 
-Readers call `tell` as they go. Nobody need listen; who wants to does so with `listening`, and an exception that the
-listener raises ends the work: so a signal is heard within one step.
+Work calls `tell` as it proceeds. `listening` installs a listener. An exception raised by the listener ends the work,
+so a signal takes effect within one step.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from contextvars import ContextVar
 from typing import Any, TextIO, TypeVar
 
 T = TypeVar("T")
-NOW_AND_THEN_S = 10.0  # between two lines where nobody watches
+NOW_AND_THEN_S = 10.0  # between two lines without a terminal
 
-Listener = Callable[[str, int, int | None], None]  # what is done, how many of them, of how many (None: not known)
+Listener = Callable[[str, int, int | None], None]  # task, steps done, steps in all (None: unknown)
 
 _LISTENER: ContextVar[Listener | None] = ContextVar("progress", default=None)
 
 
 def tell(what: str, done: int, total: int | None = None) -> None:
-    """Say that `done` of `total` are done."""
+    """Report that `done` of `total` steps are done."""
     listener = _LISTENER.get()
     if listener is not None:
         listener(what, done, total)
@@ -29,17 +29,17 @@ def tell(what: str, done: int, total: int | None = None) -> None:
 
 @contextmanager
 def task(what: str, *, seconds: float, too_slow: Exception) -> Iterator[None]:
-    """One piece of work, told as begun (0 done) and as ended (no name).
+    """Report the beginning (0 done) and end (empty name) of a task with a time limit.
 
-    A `tell` within it that comes after the time is up raises `too_slow`; whoever listens goes on hearing.
+    A `tell` within it after the limit raises `too_slow`; an outer listener still receives the reports.
     """
     end, outer = time.monotonic() + seconds, _LISTENER.get()
 
-    def check(told: str, done: int, total: int | None) -> None:
+    def check(step: str, done: int, total: int | None) -> None:
         if time.monotonic() > end:
             raise too_slow
         if outer is not None:
-            outer(told, done, total)
+            outer(step, done, total)
 
     tell(what, 0)
     try:
@@ -51,7 +51,7 @@ def task(what: str, *, seconds: float, too_slow: Exception) -> Iterator[None]:
 
 @contextmanager
 def listening(listener: Listener) -> Iterator[None]:
-    """Send this thread's reports of progress to a listener within the block."""
+    """Send this thread's progress reports to a listener within the block."""
     token = _LISTENER.set(listener)
     try:
         yield
@@ -61,16 +61,16 @@ def listening(listener: Listener) -> Iterator[None]:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar that is called with (done, of)."""
+    """Yield a function (done, total) that updates a progress bar."""
     try:
-        yield lambda done, of: tell(title, done, of)
+        yield lambda done, total: tell(title, done, total)
     finally:
         tell("", 0)
 
 
 @contextmanager
 def status_line(title: str) -> Iterator[Callable[[str], None]]:
-    """A line that says what is being done."""
+    """Yield a function that shows its text as the current step."""
     try:
         yield lambda text: tell(f"{title}: {text}", 0)
     finally:
@@ -78,15 +78,15 @@ def status_line(title: str) -> Iterator[Callable[[str], None]]:
 
 
 def tracked(title: str, items: Sequence[T]) -> Iterator[T]:
-    """The items, one after the other, with a bar of how many are done."""
-    with progress_bar(title) as told:
+    """Yield the items with a progress bar."""
+    with progress_bar(title) as update:
         for number, item in enumerate(items, start=1):
             yield item
-            told(number, len(items))
+            update(number, len(items))
 
 
 class ShownProgress:
-    """A listener that shows what takes long: on a terminal with rich, elsewhere by a line now and then."""
+    """Listener that shows long tasks: as a bar on a terminal, else as an occasional line."""
 
     def __init__(self, stream: TextIO, *, after_s: float = 1.0, now_and_then_s: float = NOW_AND_THEN_S) -> None:
         self._stream, self._after_s, self._now_and_then_s = stream, after_s, now_and_then_s

@@ -16,7 +16,7 @@ from typing import IO, Any
 
 from runtime.errors import InputError
 
-JSON_DEPTH_MAX = 64  # nested objects: Python's recursion bears more
+JSON_DEPTH_MAX = 64  # of nested objects, well within Python's recursion limit
 JSON_BYTES_MAX = 64 << 20  # of a JSON file
 DIGITS_MAX = 19  # of a 63-bit number
 MIB = 1 << 20
@@ -39,13 +39,13 @@ class Limits:
     chunk_bytes: int = 32 << 20  # one chunk or message of a recording, unpacked
 
 
-LIMITS = Limits()  # the same for every display; tests lower them
+LIMITS = Limits()  # not configurable; tests lower them
 
 
 def checked_path(path: str | Path, *, source: str | Path = "", field: str = "") -> Path:
-    """A path that the system can take, whether something is there or not. Raises InputError.
+    """Check that a path is valid on this system, whether it exists or not. Raises InputError.
 
-    source, field: who gave it, where that is not the path itself.
+    source, field: names for the error if the path came from elsewhere.
     """
     try:
         os.lstat(path)
@@ -53,7 +53,7 @@ def checked_path(path: str | Path, *, source: str | Path = "", field: str = "") 
         raise InputError(source or str(path), field, "the path holds a NUL character, or is not UTF-8") from None
     except OSError as error:
         if error.errno == errno.ENAMETOOLONG:
-            raise InputError(source or str(path), field, f"is no path ({error.strerror})") from None
+            raise InputError(source or str(path), field, f"is not a valid path ({error.strerror})") from None
     return Path(path)
 
 
@@ -69,22 +69,22 @@ def is_there(path: str | Path, *, folder: bool = False) -> bool:
 def open_regular(
     path: str | Path, *, most_bytes: int | None = None, source: str | Path = "", field: str = ""
 ) -> IO[bytes]:
-    """An open regular file, for reading. Raises InputError: a folder, FIFO, device, or too large.
+    """Open a regular file for reading. Raises InputError for a folder, FIFO or device, or if it is too large.
 
     Opening never waits (a FIFO without a writer would), and the opened file itself is checked.
     """
-    whence = source or str(path)
+    name = source or str(path)
     checked = checked_path(path, source=source, field=field)
     try:
         number = os.open(checked, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
     except OSError as error:
-        raise InputError(whence, field, f"cannot be read ({error.strerror})") from None
+        raise InputError(name, field, f"cannot be read ({error.strerror})") from None
     try:
         status = os.fstat(number)
         if not stat.S_ISREG(status.st_mode):
-            raise InputError(whence, field, f"is {_kind(status.st_mode)}, not a file")
+            raise InputError(name, field, f"is {_kind(status.st_mode)}, not a file")
         if most_bytes is not None and status.st_size > most_bytes:
-            raise InputError(whence, field, f"has {_size(status.st_size)}; at most {_size(most_bytes)}")
+            raise InputError(name, field, f"has {_size(status.st_size)}; at most {_size(most_bytes)}")
         return os.fdopen(number, "rb")
     except BaseException:
         os.close(number)
@@ -92,8 +92,8 @@ def open_regular(
 
 
 def read_bytes(path: str | Path, *, most_bytes: int, source: str | Path = "", field: str = "") -> bytes:
-    """A whole regular file. Raises InputError."""
-    whence = source or str(path)
+    """Read a whole regular file. Raises InputError."""
+    name = source or str(path)
     with open_regular(path, most_bytes=most_bytes, source=source, field=field) as file:
         try:
             size = min(os.fstat(file.fileno()).st_size, most_bytes)
@@ -101,20 +101,20 @@ def read_bytes(path: str | Path, *, most_bytes: int, source: str | Path = "", fi
             if len(data) > size:  # it grows while it is read
                 data += file.read(most_bytes + 1 - len(data))
         except OSError as error:
-            raise InputError(whence, field, f"cannot be read ({error.strerror})") from None
+            raise InputError(name, field, f"cannot be read ({error.strerror})") from None
     if len(data) > most_bytes:
-        raise InputError(whence, field, f"is larger than {_size(most_bytes)}")
+        raise InputError(name, field, f"is larger than {_size(most_bytes)}")
     return data
 
 
 def read_text(path: str | Path, *, most_bytes: int = JSON_BYTES_MAX, source: str | Path = "", field: str = "") -> str:
-    """A whole regular file of UTF-8. Raises InputError."""
+    """Read a whole regular file of UTF-8 text. Raises InputError."""
     data = read_bytes(path, most_bytes=most_bytes, source=source, field=field)
     return decoded(data, source=source or str(path), field=field)
 
 
 def decoded(data: bytes, *, source: str | Path, field: str = "") -> str:
-    """UTF-8 as text, without a byte-order mark. Raises InputError."""
+    """Decode UTF-8, without a byte-order mark. Raises InputError."""
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -122,12 +122,12 @@ def decoded(data: bytes, *, source: str | Path, field: str = "") -> str:
 
 
 def read_json(path: str | Path, *, most_bytes: int = JSON_BYTES_MAX, most_depth: int = JSON_DEPTH_MAX) -> Any:
-    """A file of JSON. Raises InputError."""
+    """Read a JSON file. Raises InputError."""
     return parsed_json(read_bytes(path, most_bytes=most_bytes), source=path, most_depth=most_depth)
 
 
 def parsed_json(text: str | bytes, *, source: str | Path, field: str = "", most_depth: int = JSON_DEPTH_MAX) -> Any:
-    """Strict JSON (no NaN or Infinity) of limited depth. Raises InputError."""
+    """Parse strict JSON (no NaN or Infinity) of limited depth. Raises InputError."""
     data = text if isinstance(text, bytes) else text.encode(errors="surrogatepass")
     try:
         value = json.loads(decoded(data, source=source, field=field), parse_constant=_no_constant, parse_int=_whole)
@@ -150,7 +150,7 @@ def _depth(value: Any) -> int:
 
 
 def _no_constant(name: str) -> float:
-    raise ValueError(f"{name} is not a number of JSON")
+    raise ValueError(f"{name} is not a JSON number")
 
 
 def _whole(digits: str) -> int | float:
@@ -159,8 +159,8 @@ def _whole(digits: str) -> int | float:
 
 
 def whole_from_text(text: str, *, source: str | Path, field: str) -> int:
-    """A whole number, not negative, in decimal digits. Raises InputError."""
-    # `isdigit` is true of a superscript two, and `int` takes other scripts' digits.
+    """Parse a non-negative whole number in decimal digits. Raises InputError."""
+    # `isdigit` accepts a superscript two, and `int` other scripts' digits.
     if not (text.isascii() and text.isdigit()):
         raise InputError(source, field, f"is not a whole number: {shown(text)}")
     if len(text) > DIGITS_MAX:
@@ -169,15 +169,15 @@ def whole_from_text(text: str, *, source: str | Path, field: str) -> int:
 
 
 def within(count: int | float, most: int | float, *, source: str | Path, field: str) -> None:
-    """Raises InputError where a count is over its limit: with both figures."""
+    """Raise InputError, with both figures, if a count exceeds its limit."""
     if count > most:
         raise InputError(source, field, f"{count:,} is over the limit of {most:,}")
 
 
 def shown(value: Any, *, most: int = 40) -> str:
-    """An untrusted value, printable and short."""
+    """Make an untrusted value printable and short."""
     if isinstance(value, int) and value.bit_length() > 256:
-        return f"a number of some {int(value.bit_length() * 0.30103) + 1} digits"
+        return f"a number of about {int(value.bit_length() * 0.30103) + 1} digits"
     text = value if isinstance(value, str) else repr(value)
     safe = "".join(c if c.isprintable() else "?" for c in text[: most + 1])
     return safe if len(safe) <= most else safe[:most] + "..."

@@ -1,4 +1,4 @@
-"""Which version this is."""
+"""Version of the installed package."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import cache
 
 @cache
 def version() -> str:
-    """As the installed package says; `unknown` where it is run from a folder that is not installed."""
+    """Version of the installed package; `unknown` when run from a folder without installation."""
     from importlib.metadata import PackageNotFoundError
     from importlib.metadata import version as installed
 

@@ -76,7 +76,7 @@ def test_photographs_from_one_place_are_refused() -> None:
         camera_from_stack(np.array([0.6, *random.normal(scale=0.02, size=2)]), towards_m=np.zeros(3)) for _ in range(8)
     ]
     seen = photographed(STACK, truth, count=8, noise_px=0.05, random=random, poses=poses)
-    with pytest.raises(Undetermined, match="all from one place"):
+    with pytest.raises(Undetermined, match="all from one position"):
         register(seen)
 
 

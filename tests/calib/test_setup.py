@@ -120,7 +120,7 @@ def test_as_root_the_last_step_installs_files_and_keeps_the_old_ones(
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     for width_px in (640, 1280):
         (tmp_path / "c.toml").write_text(f"[stack]\nwidth_px = {width_px}\nheight_px = {width_px * 9 // 16}\n")
-        assert "applied" in service(setup)["text"]
+        assert "installed" in service(setup)["text"]
     assert load_settings(installed / "phasestack.toml").stack.width_px == 1280
     assert "width_px = 640" in (installed / "phasestack.toml.~1~").read_text()
     assert (tmp_path / "asked").read_text() == "enable phasestack\nrestart phasestack\n" * 2
@@ -135,7 +135,7 @@ def test_a_step_that_is_done_is_where_it_goes_on_after(tmp_path: Path) -> None:
     walk_through(second)
     shown = [text.splitlines() for text in second.say.__self__ if text.startswith("\nStep")]
     assert [lines[1][:11] for lines in shown] == ["Step 1 of 7", "Step 2 of 7", "Step 3 of 7", "Step 2 of 7"]
-    assert shown[1][-1] == "(done before)"
+    assert shown[1][-1] == "(already done)"
 
 
 def test_sizes_are_typed_and_measured_distances_stay(tmp_path: Path) -> None:
@@ -146,7 +146,7 @@ def test_sizes_are_typed_and_measured_distances_stay(tmp_path: Path) -> None:
     found = load_settings(config).stack
     assert (found.width_m, found.height_m) == pytest.approx((0.3442, 0.1936))
     assert found.x_m == (-0.0601, 0.0, 0.0593)
-    assert "much is no number" in setup.say.__self__
+    assert "much is not a number" in setup.say.__self__
     with pytest.raises(InputError, match="height_m"):
         geometry(scripted(tmp_path, ["", "-3"] + [""] * 4))
     geometry(scripted(tmp_path, ["", "", "58.7"] + [""] * 3))

@@ -87,7 +87,7 @@ def test_millimetres_on_one_side_are_refused(tmp_path: Path, scale: float, side:
     path = write_pairs(tmp_path, *mixed)
     message = refusal(path, tmp_path)
     assert "units are mixed" in message
-    assert f"{side} is in millimetres" in message
+    assert f"{side} seems to be in millimetres" in message
 
 
 def test_pairs_that_do_not_fit_are_refused_with_a_hint(tmp_path: Path) -> None:

@@ -93,5 +93,5 @@ def test_a_scene_that_takes_all_memory_ends_only_its_reader(tmp_path: Path, monk
         assert "bad.stl" in asked[1]["error"]
         monkeypatch.setattr(child, "MEMORY_MAX", 48 << 20)
         answer = served.asked("scene", str(tmp_path / "ball.stl"))
-        assert not answer["ok"] and "ball.stl: takes more than 48 MiB" in answer["error"]
+        assert not answer["ok"] and "ball.stl: needs more than 48 MiB" in answer["error"]
         served.rig.refresh_until_solved()

@@ -101,7 +101,7 @@ def test_a_checkpoint_that_carries_code_is_refused_and_its_code_not_run(
 
     content = {"model": Evil()} if where == "model" else {"args": argparse.Namespace(hidden=Evil())}
     torch.save(torch.load(published, weights_only=False) | content, published)
-    with pytest.raises(InputError, match="no checkpoint of plain weights"):
+    with pytest.raises(InputError, match="not a checkpoint of plain weights"):
         load_eyereal(published)
     assert not ran.exists()
 

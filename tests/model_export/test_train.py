@@ -24,7 +24,7 @@ from model_export.checkpoint import load_checkpoint  # noqa: E402
 from model_export.data import TrainingPair, random_pair  # noqa: E402
 from model_export.export import export_model, picture_file  # noqa: E402
 from model_export.light import Views, improved, light_db  # noqa: E402
-from model_export.modules import Form, made  # noqa: E402
+from model_export.modules import Form, make_network  # noqa: E402
 from model_export.pairs import TrainingPairs, network_input  # noqa: E402
 from model_export.scene import Plane, Scene, draw  # noqa: E402
 from model_export.train import Training, _held_out_db, displayed, run_training  # noqa: E402
@@ -85,7 +85,7 @@ def test_a_network_of_pictures_is_fed_what_the_runtime_feeds_it(tmp_path: Path) 
     pair = random_pair(np.random.default_rng([4, 1]), **SMALL)
     for frame, value in (("centre", "intensity"), ("panel", "phase")):
         form = Form(input_frame=frame, input_value=value)
-        network = made("tests.model_export.unservable:Even", {})
+        network = make_network("tests.model_export.unservable:Even", {})
         network = dataclasses.replace(network, form=form)
         path = tmp_path / f"{frame}.onnx"
         path.write_bytes(picture_file(network, "", **SMALL))
@@ -132,7 +132,7 @@ def test_training_raises_the_light_that_eyes_get_and_leaves_its_files(tmp_path: 
     # Of the very pair, by the exact rays: from where it began to what it learned.
     pairs = TrainingPairs(Form(), seed=1, width_px=96, height_px=64, eye_sigma_mm=0.0, count=1)
     batch = torch.utils.data.default_collate([pairs[0]])
-    before, after = made(SHORT["arch"], SHORT["options"], seed=1), made(SHORT["arch"], SHORT["options"])
+    before, after = make_network(SHORT["arch"], SHORT["options"], seed=1), make_network(SHORT["arch"], SHORT["options"])
     after.net.load_state_dict(table["model"])
     assert _held_out_db(after, [batch], torch.device("cpu")) > _held_out_db(before, [batch], torch.device("cpu")) + 0.5
 
@@ -196,7 +196,7 @@ def test_the_published_network_learns_from_a_folder_of_its_pictures(tmp_path: Pa
     ("changes", "problem"),
     [
         ({"options": {"steps": 65}}, "my_network:MyNetwork: steps"),
-        ({"data": "/nowhere/lego_bulldozer"}, "is no folder"),
+        ({"data": "/nowhere/lego_bulldozer"}, "is not a folder"),
         ({"data": "/nowhere/unnamed"}, "holds none of"),
         ({"arch": "tests.model_export.unservable:NotFinite", "options": {}}, "not finite"),
         ({"options": {"width": 8, "depth": 3}}, "--option: depth"),
@@ -240,7 +240,7 @@ def test_a_network_of_ones_own_is_trained_exported_and_served(tmp_path: Path) ->
     predictor = load_predictor(str(path), pair.stack)
     assert predictor.name == "MyNetwork"
     solved = solve_still(*pair.images, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, predictor=predictor, eye_sigma_mm=0.0)
-    net = made(SHORT["arch"], SHORT["options"]).net.eval()
+    net = make_network(SHORT["arch"], SHORT["options"]).net.eval()
     net.load_state_dict(load_checkpoint(checkpoint)["model"])
     with torch.no_grad():
         fed = torch.from_numpy(predictor._proposal._input)
@@ -299,7 +299,7 @@ def test_unrolled_steps_learn_their_sizes_and_are_served_with_them(tmp_path: Pat
     learned = load_checkpoint(checkpoint)["model"]["step_sizes"]
     steps = json.loads(onnx.load(path).metadata_props[0].value)["steps"]
     assert [step["size"] for step in steps] == pytest.approx(learned.tolist()) and learned.std() > 0.01
-    network = made("unrolled", {"steps": 3, "size": 0.2})
+    network = make_network("unrolled", {"steps": 3, "size": 0.2})
     network.net.load_state_dict(load_checkpoint(checkpoint)["model"])
     pair = random_pair(np.random.default_rng([4, 1]), **SMALL)
     with torch.no_grad():

@@ -10,11 +10,11 @@ from torch import nn
 
 FAULTS = {
     "absent:Module": "`absent` cannot be imported from Python's path",
-    "tests.model_export.unservable:Absent": "is no class that derives from torch.nn.Module",
+    "tests.model_export.unservable:Absent": "is not a class derived from torch.nn.Module",
     "tests.model_export.unservable:WrongInput": "expected input",
     "tests.model_export.unservable:WrongOutput": "channels (3 panels of 3 colours)",
     "tests.model_export.unservable:HalfSize": "height (3 panels of 3 colours)",
-    "tests.model_export.unservable:NotFinite": "forward: answers with numbers that are not finite",
+    "tests.model_export.unservable:NotFinite": "forward: returns numbers that are not finite",
     "tests.model_export.unservable:NeedsGpu": "forward",
     "tests.model_export.unservable:Branches": "branches on the values of its input",
     "tests.model_export.unservable:Fourier": "aten::fft_rfft2",
