@@ -197,7 +197,7 @@ def test_the_published_network_learns_from_a_folder_of_its_pictures(tmp_path: Pa
     [
         ({"options": {"steps": 65}}, "my_network:MyNetwork: steps"),
         ({"data": "/nowhere/lego_bulldozer"}, "is not a folder"),
-        ({"data": "/nowhere/unnamed"}, "holds none of"),
+        ({"data": "/nowhere/unnamed"}, "contains none of"),
         ({"arch": "tests.model_export.unservable:NotFinite", "options": {}}, "not finite"),
         ({"options": {"width": 8, "depth": 3}}, "--option: depth"),
         ({"arch": "balanced", "options": {}}, "'balanced' is neither eyereal, unrolled nor module:Class"),
@@ -213,7 +213,7 @@ def test_what_cannot_be_trained_is_refused_before_anything_is_written(
 
 def test_more_memory_than_there_is_is_told_before_it_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("model_export.train._free_bytes", lambda: 1 << 20)
-    with pytest.raises(InputError, match=r"memory: needs more than the .* GiB that are free"):
+    with pytest.raises(InputError, match=r"memory: needs more than the .* GiB available"):
         run_training(tmp_path / "out", Training(**SHORT | {"width_px": 256, "height_px": 160}))
     assert not (tmp_path / "out").exists()
 
