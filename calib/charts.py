@@ -28,7 +28,7 @@ WIDEST_FOV_DEG = 40.0  # horizontal, of the eyes' images, as in the published co
 
 
 def chart_fov_deg(viewpoint: Viewpoint, stack: PanelStack) -> float:
-    """Horizontal field of view of a viewpoint's images: the published one, or the display's if that is smaller.
+    """Horizontal field of view of a viewpoint's images: as published, or the display's if smaller.
 
     This keeps the lines on the panels at any distance.
     """

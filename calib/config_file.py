@@ -58,7 +58,10 @@ def read_document(config: Path) -> TOMLDocument:
 
 
 def rewrite(config: Path, change: Callable[[TOMLDocument], None]) -> Path | None:
-    """Change a configuration if the result is valid; returns the path of the kept past version. Raises InputError."""
+    """Change a configuration if the result is valid; returns the path of the past version.
+
+    Raises InputError.
+    """
     document = read_document(config)
     change(document)
     text = tomlkit.dumps(document)

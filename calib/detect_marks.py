@@ -1,4 +1,4 @@
-"""Find the boards' saddle points in a photograph, to a few hundredths of a pixel, or report its fault."""
+"""Find the boards' saddle points in a photograph to hundredths of a pixel, or report its fault."""
 
 from __future__ import annotations
 

@@ -33,7 +33,10 @@ class PanelDisplay:
         self._sink.present(PanelFrame(self._number, layers, self._number))
 
     def key(self) -> Key | None:
-        """Return the next key or None; presents the layers again, to keep windows responsive. Raises PanelLost."""
+        """Return the next key or None; presents the layers again, which keeps windows responsive.
+
+        Raises PanelLost.
+        """
         if self._layers is not None:
             self.show(self._layers)
         return self._keys.poll()

@@ -154,10 +154,11 @@ def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F6
 
 
 def measure(pictures: list[F64], stack: PanelStack, panel: int, *, source: str) -> tuple[F64, float]:
-    """(13,) intensities of `GREYS`, 0 to 1, from histograms of equally exposed photographs, and the median residual.
+    """(13,) intensities of `GREYS` from histograms of photographs, and the median residual.
 
-    Jointly fits the camera's tone curve, each photograph's uneven light (its logarithm is a quadratic) and the greys.
-    The residual is relative, per patch. Raises InputError if the greys do not ascend.
+    The photographs must have one exposure. Jointly fits the camera's tone curve, each photograph's uneven light (its
+    logarithm is a quadratic) and the greys. The residual is relative, per patch. Raises InputError if the greys do not
+    ascend.
     """
     chart = patches(stack, panel)
     place = np.array([[p.left_px / stack.width_px - 0.5, p.top_px / stack.height_px - 0.5] for p in chart])

@@ -1,4 +1,4 @@
-"""Panels at their true poses, with six degrees of freedom each, and their projections to eyes and cameras.
+"""Panels at their true poses, and their projections to eyes and cameras.
 
 A panel's own frame has its origin at the panel's middle and the axes of `stack`: x out of the screen, y along the
 rows to the viewer's right, z up. Its pixel pitch is the stack's.

@@ -113,7 +113,7 @@ def _name_of(monitor: Monitor, monitors: Sequence[Monitor]) -> dict[str, Any]:
 
 
 def geometry(setup: Setup) -> Figures:
-    """Step 2: approximate size and gap of the panels and distance of viewers; registration refines the gap."""
+    """Step 2: approximate sizes, gap and viewing distances; registration refines the gap."""
     stack, calibration = setup.settings.stack, setup.settings.calibration
 
     def length_m(question: str, value_m: float, unit_m: float = 1e-3) -> float:

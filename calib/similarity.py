@@ -1,4 +1,4 @@
-"""Closed-form similarities from pairs of points (supplement, (19)-(27)), with a choice of scale rules.
+"""Closed-form similarities from pairs of points (supplement, (19)-(27)), with several scale rules.
 
 A similarity maps a sensor point c to the stack as  w = s·R·c + t.  All rules give the same rotation, which maximises
 the correlation of the centred points (Kabsch, Umeyama 1991). They differ in the scale:
@@ -73,7 +73,7 @@ def _scale(rule: ScaleRule, *, sensor_power: F64, stack_power: F64, correlation:
 
 
 def fit_batch(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
-    """Fit a batch of well-conditioned pairs (..., K, 3), without checks; degenerate members give infinities or NaN."""
+    """Fit a batch of pairs (..., K, 3) without checks; degenerate ones give infinities or NaN."""
     sensor, sensor_mean = _centred(sensor_m)
     stack, stack_mean = _centred(stack_m)
     left, values, right = np.linalg.svd(np.swapaxes(sensor, -1, -2) @ stack)

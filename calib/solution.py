@@ -70,7 +70,7 @@ class CalibrationSolution:
 
 
 def design_covariance(stack_m: F64, *, fixed_scale: bool) -> tuple[F64, F64, float]:
-    """Pivot (3,), covariance (7, 7) of the parameters for noise of 1 m, and condition number of the design.
+    """Pivot (3,), parameters' covariance (7, 7) for noise of 1 m, and the design's condition number.
 
     First order, for equal and independent noise in every coordinate; noise in the sensor counts times the scale. A
     design that leaves a parameter undetermined has infinite condition and covariance.

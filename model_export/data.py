@@ -38,7 +38,7 @@ def random_stack(random: Random, *, width_px: int, height_px: int) -> PanelStack
 
 
 def random_eyes(random: Random, stack: PanelStack) -> F64:
-    """(2, 3) eyes, 0.1 to 4 m from the centre, at least 0.1 m in front of the panels; head rolled and turned."""
+    """(2, 3) random eyes, 0.1 to 4 m from the centre, 0.1 m in front of the panels at least."""
     front_m = stack.x_m[-1]
     distance_m = math.exp(random.uniform(math.log(0.1 + front_m), math.log(4.0)))
     if random.random() < 0.5:

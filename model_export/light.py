@@ -69,7 +69,7 @@ class Views:
         fov_deg: float | None,
         places_m: ArrayLike = ((0.0, 0.0, 0.0),),
     ) -> Views:
-        """Rays through the pixels of a picture `fov_deg` wide, or through the centre panel's pixels if that is None.
+        """Rays through the pixels of a picture `fov_deg` wide; None: through the centre panel's.
 
         eyes_m: (2, 3) left, right, frame `stack`; places_m: displacements of both eyes, whose rays pass through the
         same points of the centre panel. Raises ValueError for an eye in the centre panel's plane.
@@ -86,7 +86,7 @@ class Views:
 
 
 def light(panels: Tensor, views: Views) -> tuple[Tensor, Tensor]:
-    """Intensities (E, C, h, w) of panels (N, C, H, W) by (L1) and (L2), and a mask of the rays that count (E, 1, h, w).
+    """Intensities (E, C, h, w) of panels (N, C, H, W) by (L1), (L2); mask (E, 1, h, w) of valid rays.
 
     Differentiable with respect to the panels; on their device, in their dtype.
     """
@@ -97,7 +97,7 @@ def light(panels: Tensor, views: Views) -> tuple[Tensor, Tensor]:
 def traced(
     panels: Tensor, views: Views, *, rays: int = 2, random: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Intensities from rays x rays random rays per pixel, noisy but unbiased, and a mask of where all of them count."""
+    """Unbiased intensities from rays x rays random rays per pixel, and a mask of where all are valid."""
     size, angle = (views.height_px, views.width_px), torch.pi * panels
     total, counts = torch.zeros((), dtype=panels.dtype, device=panels.device), torch.tensor(True, device=panels.device)
     for stratum in range(rays * rays):

@@ -28,7 +28,7 @@ STEPS_MOST = 64  # in a contract
 
 
 class Form(Section):
-    """Input and output format of a picture network, from class attributes of these names, or the defaults."""
+    """Input and output format of a picture network, from class attributes or defaults."""
 
     input_frame: Literal["centre", "panel"] = Field(
         "centre", description="both eyes' pictures on the centre panel's pixels, or on those of every panel"
@@ -104,7 +104,7 @@ def make_network(arch: str, options: dict[str, Any], *, seed: int = 0) -> Networ
 
 
 def probe(network: Network, *, width_px: int, height_px: int) -> None:
-    """Raise InputError unless the network maps a picture of that size to finite panels of the right shape."""
+    """Raise InputError unless the network maps a picture of that size to finite panels."""
     arch, form = network.arch, network.form
     example = torch.rand(1, form.channels, height_px, width_px, generator=torch.Generator().manual_seed(1))
     expected = (1, PANELS * COLOURS, height_px, width_px)

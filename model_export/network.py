@@ -75,7 +75,7 @@ class SpectralSolver(nn.Module):
         return share * m * spectrum[None], share * alpha2 + cost_g, gain_h
 
     def forward(self, *feeds: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Rear and front panel (rows, cells + 1, 2K·C) in 16-bit codes, starting one parallax before column 0.
+        """Rear and front panel (rows, cells + 1, 2K·C), 16-bit codes, from one parallax before column 0.
 
         The third result is finite if all intermediate numbers are.
 

@@ -131,7 +131,7 @@ def photographed(pair: Pair, stack: PanelStack, fov_deg: float) -> TrainingPair:
 
 
 def network_input(pair: TrainingPair, form: Form) -> F32:
-    """(channels, H, W) input of a picture network as the runtime feeds it: panel-major, then eye, then RGB."""
+    """(channels, H, W) input of a picture network, as at runtime: panel-major, then eye, then RGB."""
     stack, table = pair.stack, np.arange(256, dtype=np.float32) / np.float32(255)
     if form.input_value == "phase":
         table = phase_from_intensity(table, form.branch)

@@ -13,7 +13,7 @@ from runtime.config import Section
 
 
 class Unrolled(nn.Module):
-    """Starts from panels that share the mean of both pictures evenly; training optimises the steps that follow."""
+    """Starts from panels that share the pictures' mean evenly; training optimises the steps."""
 
     class Options(Section):
         """Number of steps and their initial size."""
@@ -27,7 +27,7 @@ class Unrolled(nn.Module):
         self.step_momenta = nn.Parameter(torch.full((steps,), MOMENTUM))
 
     def forward(self, eyes: Tensor) -> Tensor:
-        """(n, 6, h, w) intensities -> (n, 9, h, w): a third of the phase sum, in [1, 2], of the pictures' mean."""
+        """(n, 6, h, w) intensities -> (n, 9, h, w): a third of the phase sum of the pictures' mean."""
         mean = (eyes[:, :3] + eyes[:, 3:]) / 2
         phase = torch.asin(mean.clamp(0, 1).sqrt()) * (2 / torch.pi)
         return ((2 - phase) / 3).repeat(1, 3, 1, 1)

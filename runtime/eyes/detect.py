@@ -23,7 +23,10 @@ log = logging.getLogger(__name__)
 
 
 class EyeFinder:
-    """Finds one viewer's eyes. `choice`: how the viewer was chosen; `reason`: why the last frame gave no eyes."""
+    """Finds one viewer's eyes.
+
+    `choice`: how the viewer was chosen; `reason`: why the last frame gave no eyes.
+    """
 
     def __init__(self, settings: Settings | None = None) -> None:
         """Use the viewer's eye distance from `settings.calibration`, if it is known."""

@@ -116,7 +116,7 @@ class FaceNetwork:
         self._session = load_network("yunet.onnx")
 
     def find(self, picture: U8, *, longest_px: int, score_min: float) -> list[FoundFace]:
-        """Faces in an (h, w, 3) RGB picture, reduced to at most `longest_px` on its longer side, best score first."""
+        """Faces in an (h, w, 3) RGB picture, reduced to `longest_px` if larger, best score first."""
         height, width = picture.shape[:2]
         scale = min(1.0, longest_px / max(height, width))
         small = picture
@@ -166,7 +166,7 @@ class MeshNetwork:
 
 
 class IrisNetwork:
-    """Finds the iris in a square around an eye. Trained on the eye on a picture's left; the other one is mirrored."""
+    """Finds the iris in a square around an eye; trained on a picture's left eye, the other is mirrored."""
 
     SIZE = 64
 
@@ -174,7 +174,7 @@ class IrisNetwork:
         self._session = load_network("iris.onnx")
 
     def points(self, picture: U8, square: Square, *, is_left: bool) -> tuple[F64, F64]:
-        """(5, 2) px: the iris's centre and four points on its edge; (16, 2) px: the edges of the lids, lower first."""
+        """(5, 2) px centre and edge points of the iris; (16, 2) px edges of the lids, lower first."""
         crop, matrix = square.crop(picture, self.SIZE, mirrored=is_left)
         names = ["output_iris", "output_eyes_contours_and_brows"]
         iris, lids = self._session.run(names, {"input_1": crop})

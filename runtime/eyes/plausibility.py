@@ -39,7 +39,7 @@ _HINTS = {
 
 
 def reason_against(eyes_m: F64, *, in_front_m: float = 0.0) -> str:
-    """Reason why (2, 3) points can't be a viewer's eyes; empty if they can. in_front_m: minimum x of an eye.
+    """Reason why (2, 3) points can't be a viewer's eyes, else empty. in_front_m: minimum x.
 
     Eyes count as exchanged if the line from left to right points to the viewer's left.
     """

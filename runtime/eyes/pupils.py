@@ -92,7 +92,10 @@ class _Look:
 
 
 class PupilFinder:
-    """Finds and follows one viewer. `reason`: why the last picture gave no pupils; `choice`: how they were chosen."""
+    """Finds and follows one viewer.
+
+    `reason`: why the last picture gave no pupils; `choice`: how the viewer was chosen.
+    """
 
     def __init__(self, *, lock_ns: int = 0) -> None:
         """lock_ns: a viewer not seen for longer may be replaced by another."""

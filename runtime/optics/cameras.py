@@ -1,4 +1,4 @@
-"""Camera pictures taken at the eyes' positions, resampled as if the cameras looked at the stack's origin."""
+"""Pictures of cameras at the eyes, resampled as if they looked at the stack's origin."""
 
 from __future__ import annotations
 

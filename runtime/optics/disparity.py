@@ -24,7 +24,7 @@ LEAST_MATCHED = 0.1  # share of the panel that must be matched
 
 
 def disparities_m(pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, *, fov_deg: float) -> F64:
-    """(n,) horizontal disparities, metres on the middle panel, of points matched in both eyes' (h, w, 3) pictures.
+    """(n,) disparities, metres on the middle panel, of points matched in both (h, w, 3) pictures.
 
     Positive for points in front of that panel, which are farther right for the left eye. Pictures are `fov_deg` wide
     and look at the stack's origin. Empty if the line between the eyes is not level or not parallel to the panels.

@@ -41,7 +41,7 @@ def jones_intensity(angles_rad: ArrayLike) -> float:
 
 
 def intensity_from_phase(phase: NDArray[T]) -> NDArray[T]:
-    """Intensity sin²(π/2·phase) for the sum of the panel values along a ray (equation (7)); keeps the dtype."""
+    """Intensity sin²(π/2·phase) for the sum of a ray's panel values (equation (7)); keeps the dtype."""
     result: NDArray[T] = np.sin(phase * HALF_PI) ** 2
     return result
 

@@ -21,7 +21,7 @@ UNSEEN_PX = 0.05  # displacements below this, in panel pixels, are ignored
 
 
 def layer_from_seen(stack: PanelStack, index: int, eye_m: F64) -> F64:
-    """3x3 from (y, z, 1) on the ideal panel to the layer's, as seen by an eye (3,); the identity without tilt."""
+    """3x3 from (y, z, 1) on the ideal panel to the layer's, as seen by an eye (3,)."""
     if stack.tilt is None or not any(stack.tilt.depth[index]):
         return np.eye(3)
     return _projected(stack.tilt.depth[index], stack.tilt.seen_from_m, _triple(eye_m), stack.x_m[index])

@@ -80,9 +80,10 @@ def image_from_raster(image_from_stack: F64, raster: PlaneRaster) -> F64:
 
 
 def relative_scale_shift(eye_m: ArrayLike, *, from_x_m: float, to_x_m: float) -> tuple[float, F64]:
-    """Scale and (2,) shift (y, z) in metres that map a point p of one plane to a parallel one along an eye's ray.
+    """Scale and (2,) shift (y, z), metres, that project one plane to a parallel one from an eye.
 
-    The ray through p crosses the other plane at p·scale + shift. Raises ValueError for an eye in the first plane.
+    The ray through a point p crosses the other plane at p·scale + shift.
+    Raises ValueError for an eye in the first plane.
     """
     eye = np.asarray(eye_m, dtype=np.float64)
     distance_m = eye[0] - from_x_m

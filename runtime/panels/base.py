@@ -16,7 +16,7 @@ class PanelSink(ABC):
 
     @property
     def period_ns(self) -> int | None:
-        """Interval between vertical blanks of the monitor that sets the pace; None: no such monitor, or unknown."""
+        """Interval between vertical blanks of the monitor that sets the pace; None if unknown."""
         return None
 
     @property

@@ -18,7 +18,7 @@ def panel_size_px(*, screen_width_px: int, screen_height_px: int, rotation_deg: 
 
 
 def panel_from_screen(*, screen_width_px: int, screen_height_px: int, rotation_deg: int, mirror: str) -> F64:
-    """3x3 from a monitor's pixels to panel pixels as the viewer sees them, both continuous, top left origin, v down.
+    """3x3 from a monitor's pixels to the viewer's panel pixels, both continuous, v down.
 
     A monitor mounted `rotation_deg` counter-clockwise, seen from the front, gets its picture rotated clockwise.
     Mirroring applies to the viewer's picture, before the rotation.
@@ -90,7 +90,7 @@ DIRECTIONS: dict[Arrow, tuple[int, int]] = {"up": (0, -1), "down": (0, 1), "left
 
 
 def mounting_of(arrow: Arrow, *, mirrored: bool) -> tuple[int, str]:
-    """`rotation_deg` and `mirror` of a panel, from the direction of its card's arrow and its mirrored writing."""
+    """`rotation_deg` and `mirror` of a panel, from its card's arrow and mirrored writing."""
     mirror = "horizontal" if mirrored else "none"
     for rotation_deg in ROTATIONS:
         seen = panel_from_screen(screen_width_px=1, screen_height_px=1, rotation_deg=rotation_deg, mirror=mirror)

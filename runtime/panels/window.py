@@ -85,7 +85,7 @@ class WindowPanels(PanelSink):
         return [window.handle for window, _ in self._surfaces]
 
     def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
-        """Show a frame on all panels; does nothing for an unchanged frame that is still shown. Raises PanelLost."""
+        """Show a frame on all panels; skip an unchanged one that is still shown. Raises PanelLost."""
         if not self._surfaces and not self._may_try():
             raise PanelLost(self._lost)
         try:

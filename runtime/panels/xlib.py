@@ -135,7 +135,7 @@ _IO_ERROR_HANDLER = IOErrorHandler(_end)
 
 
 def take_over_errors() -> None:
-    """Install error handlers: a refused X request (for example about an unplugged monitor) is only logged.
+    """Install error handlers, so that a refused X request (an unplugged monitor) is only logged.
 
     The server's death ends the process immediately, with a line in the log. It may happen in the middle of a call, and
     afterwards Xlib, EGL and GLFW hang or crash even when releasing their objects.

@@ -59,9 +59,9 @@ class Sensor(ABC):
         """
 
     def read_arrived(self, timeout_s: float) -> list[SensorFrame]:
-        """Return all unread frames, oldest first (by default only the newest); waits up to `timeout_s` for one.
+        """Return all unread frames, oldest first; waits up to `timeout_s` for one.
 
-        Raises as `read_newest` does.
+        By default only the newest. Raises as `read_newest` does.
         """
         return [self.read_newest(timeout_s)]
 

@@ -230,7 +230,7 @@ def depth_from_message(data: bytes) -> U16:
 
 
 def calibration_message(intrinsics: Intrinsics, *, capture_ns: int) -> bytes:
-    """Encode pinhole intrinsics without distortion; Foxglove's pixel centres are integers, ours half-integers."""
+    """Encode pinhole intrinsics; Foxglove's pixel centres are integers, ours half-integers."""
     i = intrinsics
     matrix = [i.fx_px, 0.0, i.cx_px - 0.5, 0.0, i.fy_px, i.cy_px - 0.5, 0.0, 0.0, 1.0]
     projection = [*matrix[:3], 0.0, *matrix[3:6], 0.0, *matrix[6:], 0.0]

@@ -24,7 +24,7 @@ def demo_recording_path() -> Path:
 
 
 class ReplayDriver(SteppedSensor):
-    """Plays a recording with its rates and gaps, shifted to the run's clock: the first sample is captured at `open`.
+    """Plays a recording with its rates and gaps, on the run's clock from `open`.
 
     A sample arrives at its capture time plus the latency. Samples not later than their predecessor are skipped, and the
     first of these is logged.

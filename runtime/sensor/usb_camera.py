@@ -1,4 +1,4 @@
-"""Driver `usb-camera`: a webcam through V4L2. Without depth, the eyes' separation gives their distance."""
+"""Driver `usb-camera`: a webcam through V4L2; the eyes' separation gives their distance."""
 
 from __future__ import annotations
 

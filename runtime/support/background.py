@@ -1,4 +1,4 @@
-"""Background threads: priorities (presenter, then solver, then the rest), abandonment and one-off jobs."""
+"""Background threads: priorities (presenter, solver, then the rest), abandonment, one-off jobs."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def abandon(thread: threading.Thread) -> None:
 
 
 def raise_if_abandoned() -> None:
-    """Raise ThreadAbandoned on an abandoned thread. Called between operations that hold Python's lock, such as drawing.
+    """Raise ThreadAbandoned on an abandoned thread; for calls between operations like drawing.
 
     An asynchronous exception could arrive inside a call to moderngl, which would crash.
     """
@@ -75,7 +75,7 @@ def raise_if_abandoned() -> None:
 
 
 class BackgroundJob(Generic[T]):
-    """A job that starts on construction. `done`, `problem` and `take` never block; a failed start is a problem."""
+    """A job that starts on construction; `done`, `problem` and `take` never block."""
 
     def __init__(self, name: str, work: Callable[[], T], *, niceness: int = BACKGROUND_NICENESS) -> None:
         self._name, self._work, self._niceness = name, work, niceness

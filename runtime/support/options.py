@@ -29,7 +29,7 @@ def place(*, help: str) -> Any:
 
 @contextmanager
 def blame_option(command: str, **options: Any) -> Iterator[None]:
-    """Make an InputError about a setting name the command-line option that set it, if one of `options` did."""
+    """Make an InputError about a setting name the command-line option that set it, if any."""
     try:
         yield
     except InputError as error:

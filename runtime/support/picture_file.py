@@ -1,4 +1,4 @@
-"""Read picture files as upright 8-bit sRGB over a background colour: stills, stereo pairs, animations."""
+"""Read picture files as upright 8-bit sRGB over a colour: stills, stereo pairs, animations."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ DEEP = {"I;16": "<u2", "I;16L": "<u2", "I;16B": ">u2", "I;16N": "=u2"}  # Pillow
 
 
 def read_image(path: Path, *, background: Colour = WHITE) -> U8:
-    """Read any common picture file as (h, w, 3) 8-bit sRGB, composed over a colour; the first of several pictures.
+    """Read the (first) picture of a file as (h, w, 3) 8-bit sRGB, composed over a colour.
 
     Raises InputError, naming the file, before decoding if the picture would need too much memory.
     """
@@ -46,7 +46,7 @@ def read_image(path: Path, *, background: Colour = WHITE) -> U8:
 
 
 def read_views(path: Path, *, background: Colour = WHITE) -> list[U8]:
-    """Read one picture, or the left and the right eye's if the file has both, in the format of `read_image`."""
+    """Read one picture, or the left and right eye's if the file has both, as `read_image` does."""
     data, header = read_coded(path)
     if header.warning:
         log.warning("%s: %s", path, header.warning)

@@ -14,7 +14,7 @@ PART_MAX_BYTES = 255  # of one part of a path
 
 
 def within(low: float, high: float, unit: str, *, zero: bool = False) -> AfterValidator:
-    """Validator for a number in [low, high]; zero: 0 is valid too, as "not set". Errors hint at other units.
+    """Validator for a number in [low, high] with hints at other units; zero: allow 0 as "not set".
 
     >>> within(0.005, 20.0, "m").func(518.4)
     Traceback (most recent call last):

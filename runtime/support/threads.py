@@ -24,7 +24,7 @@ def parallel_map(work: Callable[[Item], Result], items: Sequence[Item]) -> list[
 
 
 def on_rows(work: Callable[[int, int], None], rows: int, *, threads: int | None = None) -> None:
-    """Split `rows` among `threads` (default: OpenCV's) and call `work(begin, end)` on each range in parallel."""
+    """Split `rows` among `threads` (default: OpenCV's) and call `work(begin, end)` in parallel."""
     parallel_map(lambda span: work(*span), row_ranges(rows, threads or max(1, cv2.getNumThreads())))
 
 

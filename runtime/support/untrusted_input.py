@@ -69,7 +69,7 @@ def is_there(path: str | Path, *, folder: bool = False) -> bool:
 def open_regular(
     path: str | Path, *, most_bytes: int | None = None, source: str | Path = "", field: str = ""
 ) -> IO[bytes]:
-    """Open a regular file for reading. Raises InputError for a folder, FIFO or device, or if it is too large.
+    """Open a regular file for reading. Raises InputError for any other kind, or if it is too large.
 
     Opening never waits (a FIFO without a writer would), and the opened file itself is checked.
     """
