@@ -213,7 +213,7 @@ class Recording:
         except Exception as error:  # mcap, lz4 and zstandard have their own errors for a damaged file
             if self.is_whole:
                 problem = str(error) or type(error).__name__
-                log.warning("%s: is truncated or damaged; reading the intact part (%s)", self.path, problem)
+                log.warning("%s: is cut off or damaged; reading the intact part (%s)", self.path, problem)
             self.is_whole = False
 
     def samples(self) -> Iterator[SensorFrame]:
