@@ -26,7 +26,7 @@ glfw.ERROR_REPORTING = "exception"
 
 @cache
 def gl_function(name: str) -> int:
-    """Address of an OpenGL function, equal for all contexts; 0 if there is none.
+    """Address of an OpenGL function, equal for all contexts; 0 if missing.
 
     Cached, because moderngl keeps references to all of them, 20 KiB per context.
     """
@@ -137,7 +137,7 @@ class Display:
         return self._adopt(handle)
 
     def poll(self) -> str:
-        """Process X events; returns faults that make the windows useless, empty if there are none."""
+        """Process X events; returns faults that make the windows useless, else an empty text."""
         glfw.poll_events()
         faults = self.faults + [fault for window in self._windows for fault in window.faults]
         return "; ".join(faults)

@@ -1,6 +1,6 @@
 """Assign monitors to panels, by EDID serial or connector, and check their modes and rates.
 
-Nothing is guessed, and nothing may rescale: phases must reach the panels' pixels unchanged, at one refresh rate.
+Monitors are never guessed and pictures never rescaled: phases must reach the panels unchanged, at one refresh rate.
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ class BrowserPanels(PanelSink):
 
 
 def panel_settings(settings: OutputSettings, count: int) -> tuple[PanelSettings, ...]:
-    """One table per panel: as configured, or defaults if there are none."""
+    """One table per panel: as configured, or defaults."""
     return settings.panels or tuple(PanelSettings() for _ in range(count))
 
 

@@ -40,7 +40,7 @@ class PlacementWatch:
         self._refusals = xlib.refusals()
 
     def look(self) -> str:
-        """Return faults, naming the panel; empty if there are none or no query was due."""
+        """Return faults, naming the panel; empty without a fault or a due query."""
         if xlib.refusals() != self._refusals:
             faults = [fault for fault in (question() for question in self._questions) if fault]
             self._refusals = xlib.refusals()  # read after the queries, which may be refused too

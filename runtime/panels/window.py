@@ -228,7 +228,7 @@ def _error(context: moderngl.Context) -> str:
 
 
 def _reset_status() -> str:
-    """Driver's report of a lost context (GPU reset); empty if there is none or it is not supported."""
+    """Driver's report of a lost context (GPU reset); empty if intact or not supported."""
     address = gl_function("glGetGraphicsResetStatus")
     status: int = ctypes.CFUNCTYPE(ctypes.c_uint)(address)() if address else 0
     return f"was reset (0x{status:x})" if status else ""
