@@ -49,6 +49,7 @@ def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
             for result in dots:  # above and to the left of a rising curve
                 axes.annotate(result.name, (result.ms_p50, result.quoted_db), xytext=(-5, 6), ha="right", **beside)
         axes.set(xscale="log", xlabel="median time of a whole solution, ms", ylabel="light, dB (tracking error 1 mm)")
+        axes.use_sticky_edges = False  # which bars have
         axes.margins(x=0.1, y=0.15)
         axes.set_title("Light against run time: up and to the left is better")
         axes.xaxis.set_major_formatter("{x:g}")
