@@ -7,13 +7,13 @@ import subprocess
 import sys
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
 from runtime.commands.app import app
 from runtime.errors import FatalError
 from runtime.support.artifacts import write_png
+from runtime.support.picture_file import read_image
 
 PANELS = {"width_m": 0.5184, "height_m": 0.2916, "x_m": [-0.06, 0.0, 0.06]}
 
@@ -143,8 +143,8 @@ def test_a_run_that_shows_no_solution_says_so(tmp_path: Path, frames: int, says:
 
 @pytest.mark.parametrize(("name", "layout"), [("pair_sbs.png", None), ("pair.png", "cross-eyed")])
 def test_one_file_that_holds_both_views_is_solved_as_two(pair: Path, name: str, layout: str | None) -> None:
-    left, right = (cv2.imread(str(pair / f"{side}.png")) for side in ("left", "right"))
-    cv2.imwrite(str(pair / name), cv2.hconcat([right, left] if layout else [left, right]))
+    left, right = (read_image(pair / f"{side}.png") for side in ("left", "right"))
+    write_png(pair / name, np.hstack([right, left] if layout else [left, right]))
     app(solve_arguments(pair, model="fast"), standalone_mode=False)
     both = json.loads((pair / "out" / "solve.json").read_text())["light_db"]["1"]
     arguments = solve_arguments(pair, model="fast", left=pair / name)
@@ -158,18 +158,18 @@ def test_one_view_is_refused_and_so_is_a_layout_for_two_files(pair: Path) -> Non
     arguments = solve_arguments(pair)
     at = arguments.index("--right")
     assert "left.png: layout: holds 1 view: give --right, or --layout" in refusal(*arguments[:at], *arguments[at + 2 :])
-    assert "solve: --layout: is of one file" in refusal(*arguments, "--layout", "side-by-side")
+    assert "solve: --layout: needs one file with both views" in refusal(*arguments, "--layout", "side-by-side")
     assert "--layout: layout" in refusal("run", "--replay", "demo", "--headless", "--layout", "sideways")
 
 
 def test_run_shows_a_file_in_the_layout_that_it_is_given(pair: Path, tmp_path: Path) -> None:
-    left, right = (cv2.imread(str(pair / f"{side}.png")) for side in ("left", "right"))
-    cv2.imwrite(str(pair / "pair.png"), cv2.hconcat([left, right]))
+    left, right = (read_image(pair / f"{side}.png") for side in ("left", "right"))
+    write_png(pair / "pair.png", np.hstack([left, right]))
     how = ("--replay", "demo", "--headless", "--max-speed", "--scale", "0.1", "--model", "fast", "--frames", "30")
     for layout, differ in (("side-by-side", True), ("mono", False)):
         done = phasestack(
             "run", *how, "--scene", str(pair / "pair.png"), "--layout", layout, "--out", str(tmp_path / layout)
         )
         assert done.returncode == 0, done.stderr
-        seen = [cv2.imread(str(tmp_path / layout / f"wanted-{side}.png")).astype(int) for side in ("left", "right")]
+        seen = [read_image(tmp_path / layout / f"wanted-{side}.png").astype(int) for side in ("left", "right")]
         assert (abs(seen[0] - seen[1]).mean() > 20) == differ
