@@ -1,4 +1,4 @@
-"""Imports our own `runtime`, `calib` and `model_export`, also beside modules of these names.
+"""Imports our own `runtime`, `calib` and `model_export`, also next to modules of these names.
 
 Raises ImportError where the program has imported another module under one of the names: Python holds one for each.
 """
