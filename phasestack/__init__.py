@@ -1,4 +1,4 @@
-"""What a program may import, and what is promised to it (docs/contracts.md, From Python)."""
+"""Public names for programs, kept stable (docs/contracts.md, From Python)."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG, SEPARATION_MIN_M, 
 
 EVERY_LEAST = 20  # pixels of a picture that has to be sampled, along its shorter side
 SAME_PLACE_M = 0.001  # an eye and its camera
-_one_at_a_time = Lock()  # a loaded model has buffers of its own
+_one_at_a_time = Lock()  # a loaded model reuses its buffers
 
 Eyes = Sequence[Sequence[float]] | Sequence[F64] | F64
 Cameras = Sequence[Sequence[Sequence[float]]] | Sequence[F64] | F64
@@ -46,28 +46,28 @@ Cameras = Sequence[Sequence[Sequence[float]]] | Sequence[F64] | F64
 
 @dataclass(frozen=True)
 class _Pair:
-    """What is asked for, checked: pictures of pinhole eyes that look at the stack's origin."""
+    """A checked request: pictures of pinhole eyes that look at the stack's origin."""
 
     pictures: tuple[Picture, ...]
     eyes_m: F64
     stack: PanelStack
     fov_deg: float
-    is_resampled: bool  # from cameras that were given
+    is_resampled: bool  # from the caller's cameras
 
     def judged(self, layers: U8) -> SolvedPair:
-        """What the eyes make of layers."""
+        """The layers with the eyes' views of them."""
         return SolvedPair(layers, self.pictures, self.stack, self.eyes_m, self.fov_deg)
 
 
 class Measuring(TypedDict, total=False):
-    """What to measure of quality, where that should cost less than all of it."""
+    """Options for a cheaper measurement of quality."""
 
-    sigmas_mm: Sequence[float]  # tracking errors, each the cost of four measurements; 0, 1 and 2 unless told
+    sigmas_mm: Sequence[float]  # tracking errors, each the cost of four measurements; default: 0, 1 and 2
     every: int  # every so-manieth pixel of every so-manieth row of the pictures; 1: all
 
 
 class Result:
-    """Layers for a pair of pictures, and what the eyes make of them."""
+    """Layers for a pair of pictures, with the eyes' views and their quality."""
 
     layers: U8  # (panels, h, w, 3), rear to front
     model: str  # what solved: a stack that the networks do not serve is solved by `sart`
@@ -84,7 +84,7 @@ class Result:
 
     @property
     def quality(self) -> PairQuality:
-        """Quality of what the eyes see; measured when first read, which may take longer than solving.
+        """Quality of the eyes' views; measured when first read, which may take longer than solving.
 
         Warns where `notes` has a reason for a bad one.
         """
@@ -112,7 +112,7 @@ class Result:
 
     @property
     def seen(self) -> U8:
-        """(2, h, w, 3): what each eye sees, left first."""
+        """(2, h, w, 3): the eyes' views, left first."""
         return np.stack(self._pair.seen)
 
     @cached_property
@@ -132,7 +132,7 @@ class Result:
         return path
 
     def _repr_html_(self) -> str:
-        """What a notebook shows of it: the viewer."""
+        """The viewer, for a notebook."""
         page = html.escape(self._pair.viewer([self._line, *self.notes]))
         return f'<iframe srcdoc="{page}" style="width: 100%; height: 640px; border: 0"></iframe>'
 
@@ -205,7 +205,7 @@ def solve_each(
 ) -> Iterator[Result]:
     """The results of many pairs, one after the other: left picture, right picture, eyes_m; the rest as for `solve`.
 
-    A pair is taken when its turn comes, so `pairs` may be a generator that draws or reads. progress: on stderr. Raises
+    Pairs are read one by one, so `pairs` may be a generator that draws or reads. progress: on stderr. Raises
     ValueError, naming the pair and the argument.
     """
     total = len(pairs) if isinstance(pairs, Sized) else None
@@ -236,12 +236,12 @@ def evaluate(
     cameras: Cameras | None = None,
     **how: Unpack[Measuring],
 ) -> PairQuality:
-    """How good what two eyes get of anybody's layers is, against the pictures that they should see.
+    """Quality of any layers for two eyes, against their target pictures.
 
     layers: (panels, h, w, 3 or 4), rear to front, in the stack's pixels, uint8 or float in 0..1: a panel's value v
     turns light by v·90 degrees, and an eye sees sin² of the summed angle; floats are rounded to the panels' 8 bits.
     sigmas_mm, every: at less cost, `evaluate(..., sigmas_mm=(1,), every=4)` measures the light of these tracking
-    errors alone, at every 4th pixel of every 4th row, with its standard error; SSIM is then left out.
+    errors alone, at every 4th pixel of every 4th row, with its standard error; SSIM is then NaN.
     The rest is as for `solve`. Raises ValueError, naming the argument.
     """
     pair = _checked((left, right), stack=stack, eyes_m=eyes_m, fov_deg=fov_deg, cameras=cameras)
@@ -259,7 +259,7 @@ def evaluate(
 
 
 def _measured(pair: SolvedPair, how: Measuring) -> PairQuality:
-    """All of the quality, or what is asked of it. Raises ValueError, naming the argument."""
+    """All of the quality, or the requested part. Raises ValueError, naming the argument."""
     if unknown := sorted(how.keys() - Measuring.__annotations__.keys()):
         raise TypeError(f"{unknown[0]}: there is no such argument")
     if not how:

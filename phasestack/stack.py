@@ -24,7 +24,7 @@ class Stack(PanelStack):
         height_px: int,
         tilt: Tilt | None = None,
     ) -> None:
-        """Raises ValueError, naming the argument, for what is no display."""
+        """Raises ValueError, naming the argument, for an impossible display."""
         given = {"width_m": width_m, "height_m": height_m, "width_px": width_px, "height_px": height_px}
         try:
             places = tuple(float(x) for x in x_m)
@@ -38,7 +38,7 @@ class Stack(PanelStack):
 
 
 def checked_stack(stack: object) -> PanelStack:
-    """Raises ValueError for what is none."""
+    """Plain copy of a stack. Raises ValueError for anything else."""
     if not isinstance(stack, PanelStack):
         raise ValueError(f"stack: is a {type(stack).__name__}: make a phasestack.Stack")
     return PanelStack(*(getattr(stack, field.name) for field in fields(PanelStack)))
