@@ -10,6 +10,7 @@ from typing import Any
 from runtime.config import ModelSettings, StackGeometry
 from runtime.model.predictor import load_predictor
 from runtime.report import focal, moving
+from runtime.report.benchmark import too_busy, yardstick_ms
 from runtime.report.frontier import Method, MethodResult, apart, measure, shipped_and_references
 from runtime.report.page import Page, PageSection, describe
 from runtime.report.pairs import StillPair, procedural_pairs, read_pairs
@@ -26,11 +27,16 @@ class GrowingPage:
         self.out, self._command, self._progress = out, command, progress
         self._sections: dict[str, PageSection] = {}
         self.record: dict[str, Any] = {"machine": describe(), "command": command, "quote": QUOTE, "complete": False}
+        self.record["yardsticks_ms"] = [yardstick_ms()]
 
     def doing(self, what: str) -> None:
         """Note the present measurement."""
         self._progress(what)
         self.record["measuring"] = what
+
+    def timed(self) -> None:
+        """Times were measured: note how long a fixed workload takes now."""
+        self.record["yardsticks_ms"].append(yardstick_ms())
 
     def put(self, name: str, section: PageSection) -> None:
         """Add a section, or replace the one of that name."""
@@ -47,6 +53,8 @@ class GrowingPage:
         """Write everything measured until now. Raises InputError."""
         doing = self.record.get("measuring")
         notes = [f"Not finished: the page grows with every measurement. Last known step: {doing}."] if doing else []
+        if busy := too_busy(self.record["yardsticks_ms"]):
+            notes.append(f"The machine had other work ({busy}): don't compare these times, not even their ratios.")
         sections, machine = list(self._sections.values()), self.record["machine"]
         lead = "Light, at a tracking error of 1 mm, is the figure to quote; higher is better."
         page = Page("Light against run time", lead, sections, machine, self._command, notes)
@@ -104,6 +112,7 @@ def _frontier(
     before, results = page.record.get(key, []), dict[str, MethodResult]()
     for done, result in measure(methods, pairs, viewers=page.out):
         page.doing(f"{title}: {done} is done")
+        page.timed()
         results[result.name] = result
         page.record[key] = before + [one.record() for one in results.values()]
         page.put(name, frontier_section(list(results.values()), title=title, name=name))

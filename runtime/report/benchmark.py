@@ -53,10 +53,15 @@ class RegressionFile(BaseModel):
 
     def too_busy(self) -> str:
         """Reason why times can't be compared (other load on the machine); empty: they can."""
-        least, most = min(self.yardsticks_ms), max(self.yardsticks_ms)
-        if most > UNSTEADY * least:
-            return f"the same work took {least:.1f} to {most:.1f} ms while it was measured"
-        return ""
+        return too_busy(self.yardsticks_ms)
+
+
+def too_busy(yardsticks_ms: Sequence[float]) -> str:
+    """Reason why times measured meanwhile can't be compared (other load on the machine); empty: they can."""
+    least, most = min(yardsticks_ms), max(yardsticks_ms)
+    if most > UNSTEADY * least:
+        return f"the same work took {least:.1f} to {most:.1f} ms while it was measured"
+    return ""
 
 
 def read(path: Path) -> RegressionFile:

@@ -115,6 +115,13 @@ class MethodResult:
     pairs: list[PairResult] = field(default_factory=list)
 
     @property
+    def spread_ms(self) -> tuple[float, float]:
+        """Run times below which one run in ten is, and nine in ten are, relative to each pair's median, of `ms_p50`."""
+        ratios = np.concatenate([np.asarray(pair.run_ms) / np.median(pair.run_ms) for pair in self.pairs])
+        low, high = np.percentile(ratios, (10, 90))
+        return float(low) * self.ms_p50, float(high) * self.ms_p50
+
+    @property
     def quoted_db(self) -> float:
         """The figure to quote; NaN where such eyes see no part of the panels."""
         return self.light_db.get(QUOTED, math.nan)

@@ -18,11 +18,11 @@ from runtime.errors import InputError
 from runtime.evaluation.solved import PairQuality
 from runtime.model.predictor import model_path
 from runtime.report import sections
-from runtime.report.assemble import whole_report
+from runtime.report.assemble import GrowingPage, whole_report
 from runtime.report.frontier import MethodResult, PairResult
 from runtime.report.moving import Moving, moving_run
 from runtime.report.page import Page, PageSection, Table, describe
-from runtime.report.sections import frontier_section, moving_section
+from runtime.report.sections import frontier_section, moving_section, rising
 from tests.report.test_pairs import case_folder
 
 
@@ -167,3 +167,18 @@ def test_only_a_moving_head_sees_less_of_a_slow_solver() -> None:
     assert quick.live_db > slow.live_db + 3
     assert rests.live_db > slow.live_db + 3
     assert slow.tracker_mm == quick.tracker_mm  # the tracker does not know of the solver
+
+
+def test_a_curve_goes_only_to_what_is_slower_and_better() -> None:
+    places = [(40.0, 36.5), (10.0, 35.0), (30.0, 37.0), (20.0, 34.0), (90.0, 38.0)]
+    assert rising(places) == [(10.0, 35.0), (30.0, 37.0), (90.0, 38.0)]
+
+
+def test_times_of_a_busy_machine_are_marked(tmp_path: Path) -> None:
+    page = GrowingPage(tmp_path, "phasestack report", lambda what: None)
+    page.write()
+    assert "had other work" not in (tmp_path / "index.html").read_text()
+    page.record["yardsticks_ms"] += [2 * page.record["yardsticks_ms"][0]]
+    page.write()
+    assert "had other work" in (tmp_path / "index.html").read_text()
+    assert len(json.loads((tmp_path / "report.json").read_text())["yardsticks_ms"]) == 2
