@@ -51,6 +51,8 @@ def measure(predictor: Predictor, content: ContentSource, eyes_m: F64, *, fov_de
         targets = retina_pictures(content, at_m, stack, fov_deg=fov_deg, time_ns=0)
         return displayed(layers, targets, stack, eyes_m=at_m, fov_deg=fov_deg, similarity=False).quality.psnr_db
 
+    count = 0
+
     def frames(made: Callable[[], Job]) -> Callable[[], U8]:
         def solved() -> U8:
             nonlocal count
@@ -60,7 +62,7 @@ def measure(predictor: Predictor, content: ContentSource, eyes_m: F64, *, fov_de
 
         return solved
 
-    stack, count = predictor.stack, 0
+    stack = predictor.stack
     job = drawn_job(predictor, content, eyes_m, time_ns=0, trimmed=True)
     left_out = job.savings
     ways: Mapping[str, Callable[[], Job]] = {
