@@ -36,7 +36,7 @@ PANEL = '[[output.panels]]\nconnector = "DP-{}"\n'
         ("[tracker]\nhold_s = 500", "tracker.hold_s", "did you mean milliseconds (0.5)?"),
         ("[sensor]\nfixed_eyes_m = [[600, -31, 0], [600, 31, 0]]", "sensor.fixed_eyes_m.0.0", "millimetres (0.6)"),
         ("[content]\ndepth_m = [-50, 50]", "content.depth_m.0", "did you mean millimetres (-0.05)?"),
-        ("[loop]\nrate_hz = 60000", "loop.rate_hz", "may be 1 to 1000 Hz"),
+        ("[loop]\nrate_hz = 60000", "loop.rate_hz", "the range is 1 to 1000 Hz"),
         ("[loop]\nsimulated_stage_ms = { render = -1 }", "loop.simulated_stage_ms.render", "greater than or equal"),
         ("[loop.simulated_stage_ms]\nrendr = 1", "loop.simulated_stage_ms", "rendr is no stage: did you mean render?"),
         ("[model]\neffort = 'half'", "model.effort", "'auto' or 'full'"),

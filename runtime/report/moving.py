@@ -72,6 +72,7 @@ def settings_for(recording: Path, *, solver_ms: float) -> Settings:
     table = Settings().model_dump()
     table["sensor"] |= {"driver": "replay", "source": str(recording), "loop": False}
     table["loop"]["evaluate_every"] = EVERY
+    table["model"]["effort"] = "full"  # the solver takes as long as is said
     table["loop"]["simulated_stage_ms"] |= {stage: share * solver_ms for stage, share in SHARES.items()}
     return validated(Settings, table, source="settings")
 

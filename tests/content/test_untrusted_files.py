@@ -288,7 +288,7 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
     "a URI with NUL": (gltf(buffers=[{"byteLength": 48, "uri": "a%00b.bin"}]), "uri: the path holds a NUL"),
     "a long name": (
         gltf(buffers=[{"byteLength": 48, "uri": "a" * 300}]),
-        "uri: is no path (File name too long)",
+        "uri: is not a valid path (File name too long)",
     ),
     "an address": (gltf(buffers=[{"byteLength": 48, "uri": "http://localhost/a.bin"}]), "only files beside this one"),
     "an absolute path": (gltf(buffers=[{"byteLength": 48, "uri": "/etc/passwd"}]), "is an absolute path"),

@@ -238,8 +238,8 @@ class BreakablePredictor:
         self._predictor, self.name, self.provider = predictor, predictor.name, predictor.provider
         self.answer: Callable[..., Any] | None = None
 
-    def solve(self, job: Any) -> Any:
-        return (self.answer or self._predictor.solve)(job)
+    def solve(self, job: Any, watch: Any = None) -> Any:
+        return self._predictor.solve(job, watch) if self.answer is None else self.answer(job)
 
     def well(self, job: Any) -> Any:
         """What it would have answered."""

@@ -22,7 +22,7 @@ def layers_of(served: Served) -> np.ndarray:
 
 
 def test_a_scene_is_moved_at_once_and_put_back(tmp_path: Path) -> None:
-    with Served(tmp_path, content={"scene": "sparse"}) as served:
+    with Served(tmp_path, content={"scene": "sparse"}, model={"effort": "full"}) as served:  # layers of one raster
         before = layers_of(served)
         assert served.asked("place", {"offset_m": [0.0, 0.1, 0.0], "scale": 1.5})["ok"]
         assert served.status()["placing"]["scale"] == 1.5

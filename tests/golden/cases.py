@@ -132,7 +132,6 @@ CASES = {
         },
         pictures=(50,),
     ),
-    # The effort is chosen, on a slow processor: coarse rasters in motion, refined at rest.
-    "live-lean": Case("lean", {"model": {"effort": "auto"}, "loop": SLOW}, pictures=(48, 70)),
-    "live-rest": Case("loss-and-return", {"model": {"effort": "auto"}, "loop": SLOW}, pictures=(40, 130)),
+    # The effort is chosen, on a slow processor: coarse rasters in motion.
+    "live-lean": Case("lean", {"model": {"effort": "auto"}, "loop": SLOW}),
 }

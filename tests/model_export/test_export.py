@@ -108,7 +108,7 @@ def test_an_export_that_fails_its_checks_is_not_written(tmp_path: Path, monkeypa
         ({"arch": "eyereal"}, "--checkpoint"),
         ({"random_init": 1, "checkpoint": Path("x.pth")}, "--random-init"),
         ({"arch": "eyereal", "checkpoint": Path("absent.pth")}, "cannot be read"),
-        ({"random_init": 1}, "fast is made from its recipe"),
+        ({"random_init": 1}, "fast is built from its recipe"),
     ],
 )
 def test_what_cannot_be_exported_is_refused_in_one_line(tmp_path: Path, options: dict[str, Any], field: str) -> None:

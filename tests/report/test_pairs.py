@@ -57,7 +57,7 @@ def test_other_json_files_are_ignored_and_views_off_the_eyes_optional(tmp_path: 
     [
         ({"eyes": [[0.7, 0.0, 0.1]]}, "case.json: eyes"),
         ({"eyes": [[0.7, 0.0, "a"], [0.7, 0.1, 0.1]]}, "case.json: eyes"),
-        ({"eyes": [[-0.7, 0.0, 0.1], [0.7, 0.1, 0.1]]}, "before every panel"),
+        ({"eyes": [[-0.7, 0.0, 0.1], [0.7, 0.1, 0.1]]}, "in front of every panel"),
         ({"fov": 0}, "case.json: fov"),
         ({"fov": None}, "case.json: fov"),
         ({"fov": 1e-320}, "case.json: fov"),
