@@ -1,4 +1,4 @@
-"""Frozen records that travel between stages. Arrays in them are never written to after construction."""
+"""Frozen records passed between stages; their arrays are never modified after construction."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ class Effort:
 
 @dataclass(frozen=True, slots=True)
 class Measures:
-    """Measurements of a solution and its pictures: squared errors of intensities in 0..1; None: not measured."""
+    """Measurements of a solution: squared errors of intensities in 0..1; None: not measured."""
 
     residual: float | None = None  # of sampled rays against the solution's own pictures
     detail: Mapping[int, float] = field(default_factory=dict)  # of coarser rasters' pictures, by reduction

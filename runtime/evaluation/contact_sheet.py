@@ -18,7 +18,7 @@ from runtime.records import F64, U8
 
 TILE_WIDTH = 640  # pixels
 MARGIN = 12  # pixels
-LINE_LETTERS = 58  # of a line below the headline, a tile
+LINE_LETTERS = 58  # letters per tile of a line below the headline
 HEADLINE, TITLE = 52, 34
 ERROR_GAIN = 8  # factor on the difference
 INK = (40, 40, 40)
@@ -31,9 +31,9 @@ class Moment:
 
     layers: U8  # (N, h, w, 3 or 4), as the panels showed them: aligned
     eye_views: EyeViews
-    light_db: float  # of tracking errors of 1 mm
+    light_db: float  # with tracking errors of 1 mm
     lines: tuple[str, ...]  # position of the eyes and its uncertainty
-    solution: U8  # (N, h, w, 3 or 4), before it was aligned
+    solution: U8  # (N, h, w, 3 or 4), before alignment
     solved_for_m: F64  # (2, 3) eyes, frame `stack`
     asked_for: tuple[U8, ...]  # (h, w, 3) their targets
 

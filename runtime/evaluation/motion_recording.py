@@ -20,7 +20,7 @@ from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
 
 SECONDS, RATE_HZ, NOISE_MM = 12.0, 30.0, 3.0
-SECONDS_MAX = 3600.0  # most: a synthetic recording is held in memory
+SECONDS_MAX = 3600.0  # longest: a synthetic recording is built in memory
 
 
 def write_motion(

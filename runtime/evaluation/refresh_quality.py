@@ -18,9 +18,9 @@ from runtime.records import F64, U8, RefreshAccount
 
 log = logging.getLogger("phasestack.quality")
 
-# Sampling of light. A displaced view errs at edges: a quarter of a small picture's pixels is 0.6 dB off.
+# Sampling of light. A displaced view errs at edges: sampling a quarter of a small picture's pixels is 0.6 dB off.
 ALIGNED, LIVE = Sampling(step=2), Sampling(rays=4)
-ALIGNED_LARGE, LIVE_LARGE = Sampling(step=4), Sampling(step=2)  # of pictures with `PLENTY` values
+ALIGNED_LARGE, LIVE_LARGE = Sampling(step=4), Sampling(step=2)  # for pictures with `PLENTY` values
 FIGURES = ("light_db", "psnr_db", "ssim", "carried_db", "psnr_db_true_eyes", "carried_db_true_eyes")
 Pictures = tuple[U8, U8]  # (h, w, 3) retina pictures of the left and right eye, panel size
 
@@ -49,7 +49,7 @@ def view_error_mm(eyes_m: F64, solved_for_m: F64) -> float:
 
 
 def live_error(layers: U8, targets: Pictures, stack: PanelStack, *, eyes_m: F64, fov_deg: float) -> float:
-    """Mean squared error of the light at eyes (2, 3) against what they should see from there.
+    """Mean squared error of the light at eyes (2, 3) against the target pictures for these eyes.
 
     layers: (N, H, W, 3 or 4), as the panels show them. Raises ValueError where the eyes see no part of them.
     """

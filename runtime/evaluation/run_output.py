@@ -20,8 +20,8 @@ from runtime.support.background import MEASURING_NICENESS, set_niceness
 log = logging.getLogger("phasestack.output")
 
 Work = Callable[[], object]
-WAITING = 4096  # most pieces of work queued for the disk: lines of a minute
-WAITING_PICTURES = 4  # most of them with a refresh's pictures, 25 MB at 1080p
+WAITING = 4096  # most jobs queued for the disk: a minute of lines
+WAITING_PICTURES = 4  # most of those with a refresh's pictures, 25 MB at 1080p
 
 
 class RunOutput:
@@ -32,15 +32,15 @@ class RunOutput:
     """
 
     def __init__(self, target: Path, *, every_one: bool = True) -> None:
-        """every_one: wait for a slow disk; otherwise drop lines and pictures that it is too slow for."""
+        """every_one: wait for a slow disk; otherwise drop lines and pictures it can't keep up with."""
         self._folder = OutputFolder(target)
         self._target, self._every_one = target, every_one
         self._lines: TextIO | None = None
-        self._work: queue.Queue[tuple[Work, Work] | None] = queue.Queue(WAITING)  # work, and what follows in any case
+        self._work: queue.Queue[tuple[Work, Work] | None] = queue.Queue(WAITING)  # a job, and its cleanup, always run
         self._pictures = threading.BoundedSemaphore(WAITING_PICTURES)
         self._writer = threading.Thread(target=self._write, name="output", daemon=True)
         self.problem = ""  # why the files were abandoned
-        self.left_out = 0  # lines and pictures that the disk was too slow for
+        self.left_out = 0  # lines and pictures dropped because the disk was too slow
 
     def __enter__(self) -> RunOutput:
         """Create the folder. Raises InputError if it can't be written."""
@@ -100,7 +100,7 @@ class RunOutput:
         return self._folder.staging / "light" / str(frame)
 
     def run_is_over(self) -> None:
-        """Wait for the disk from now on: no refresh depends on it any more."""
+        """Wait for the disk from now on, as no refresh depends on it any longer."""
         self._every_one = True
 
     def finish(
@@ -139,7 +139,7 @@ class RunOutput:
         self._work.put((write, lambda: None))
 
     def _pictures_later(self, work: Work) -> None:
-        """Queue work that holds pictures, within the memory that those may take."""
+        """Queue a job with pictures, within their memory limit."""
         if self.problem:
             return
         if not self._pictures.acquire(blocking=self._every_one):
@@ -149,7 +149,7 @@ class RunOutput:
             self._pictures.release()
 
     def _later(self, work: Work, *, then: Work = lambda: None) -> bool:
-        """Queue work; False: dropped."""
+        """Queue a job; return False if it was dropped."""
         if self.problem:
             return False
         try:
@@ -160,7 +160,7 @@ class RunOutput:
         return True
 
     def _write(self) -> None:
-        """Body of the writer's thread: do queued work in order, until None."""
+        """Body of the writer's thread: run queued jobs in order, until None."""
         set_niceness(MEASURING_NICENESS)
         while (queued := self._work.get()) is not None:
             work, then = queued

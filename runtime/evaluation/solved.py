@@ -16,7 +16,7 @@ from runtime.records import F64, U8
 from runtime.support.artifacts import write_png, write_text
 
 BySigma = Mapping[str, float]
-WHOLE_PX = 1920 * 1200  # of a picture that is measured whole
+WHOLE_PX = 1920 * 1200  # largest picture whose light is measured at every pixel
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,12 +26,12 @@ class PairQuality:
     NaN where such an error takes an eye to where it sees nothing, and what was not asked for.
     """
 
-    light_db: BySigma  # of real pixels and pupils; "1", a good tracker's, is the figure to quote
+    light_db: BySigma  # with real pixels and pupils; "1", a good tracker's, is the figure to quote
     expected_db: BySigma  # one ray a pixel
-    psnr_db: float  # one ray a pixel, of eyes that are known
+    psnr_db: float  # one ray a pixel, at exactly known eyes
     ssim: float
     eye_psnr_db: tuple[float, ...]  # left, right
-    standard_error_db: BySigma = field(default_factory=dict)  # of `light_db`, where it is of a part of the pixels
+    standard_error_db: BySigma = field(default_factory=dict)  # of `light_db`, if sampled
 
     def table(self) -> dict[str, Any]:
         """Entries of solve.json."""
@@ -64,7 +64,7 @@ class SolvedPair:
 
     @cached_property
     def quality(self) -> PairQuality:
-        """Measured quality; of pictures larger than `WHOLE_PX` light is of some pixels, with its standard error."""
+        """Measured quality; above `WHOLE_PX`, light is sampled and has a standard error."""
         views = self.eye_views
         at_eyes, height_px = views.quality, views.wanted[0].shape[0]
         every, errors = 1, dict[str, float]()
@@ -90,7 +90,7 @@ class SolvedPair:
 
     @property
     def seen(self) -> tuple[U8, ...]:
-        """(h, w, 3) retina image of each eye; black where it looks past a panel."""
+        """(h, w, 3) retina image of each eye; black where a ray misses a panel."""
         return tuple(retina.codes() for retina in self.eye_views.seen)
 
     def viewer(self, lines: Sequence[str]) -> str:

@@ -1,4 +1,4 @@
-"""What the solver is asked for at each refresh: the eyes in the middle of the next solution's life, and its effort."""
+"""Solver requests: at each refresh, the eyes midway through the next solution's life, and its effort."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from runtime.frame.solver_host import SolverHost
 from runtime.frame.viewer import Viewer
 from runtime.records import F64, Effort, EyesEstimate, EyesLabel, FrameTiming, Solution, SolveRequest
 
-HORIZON_NS = NS_PER_S // 8  # how far the eyes are predicted at most, beyond the light of this refresh
+HORIZON_NS = NS_PER_S // 8  # longest prediction beyond this refresh's display time
 SPEED_NS = NS_PER_S // 2  # time constant of the running mean of a head's squared speed
 REQUESTS_KEPT = 256
-WORTH = 0.995  # a solution is refined where that leaves less than this share of the expected error
+WORTH = 0.995  # refine only if the expected error drops below this share of the present one
 
 
 class Aim:
-    """Requests of one run. One thread uses it; it never reads a clock."""
+    """Builds the solver requests of one run. Single-threaded; never reads a clock."""
 
     def __init__(self, viewer: Viewer, solver: SolverHost, *, period_ns: int) -> None:
         self._viewer, self._solver, self._period_ns = viewer, solver, period_ns
         self._chooser = EffortChooser()
-        self._rested_ns: int | None = None  # since when the head has been at rest
-        self._expected: dict[int, float] = {}  # by the instant of a request: squared distance from its eyes, m²
+        self._rested_ns: int | None = None  # start of the head's present rest
+        self._expected: dict[int, float] = {}  # by target instant: expected squared distance from those eyes, m²
         self._speed2 = 0.0  # (m/s)², running mean
-        self._learned: int | None = None  # number of the newest solution whose measures were taken in
+        self._learned: int | None = None  # number of the newest solution whose measures have been used
 
     def request(
         self,
@@ -40,7 +40,7 @@ class Aim:
         flat_wanted: bool,
         paused: bool,
     ) -> SolveRequest:
-        """The next request. eyes: at the display time of this refresh; shown: the newest solution."""
+        """Return the next request. eyes: at the display time of this refresh; shown: the newest solution."""
         self._learn(shown, eyes)
         predictor, refined = state.predictor, None
         whole = Effort(1, predictor.steps)
@@ -63,11 +63,11 @@ class Aim:
         self._expected[then_ns] = expected_m2
         while len(self._expected) > REQUESTS_KEPT:
             self._expected.pop(next(iter(self._expected)))
-        # A solution is aligned to better known eyes when it is shown: what matters is how well those are known.
+        # A solution is aligned to newer eyes when shown, so the uncertainty of the present eyes is what counts.
         return SolveRequest(then_ns, then_m, label, eyes.sigma_m, flat_wanted, paused, effort, refined)
 
     def _learn(self, shown: Solution | None, eyes: EyesEstimate) -> None:
-        """Take in what the newest solution measured, and how far its eyes are from where the eyes are now."""
+        """Learn from the newest solution's measures and from the distance between its eyes and the present ones."""
         if shown is None or shown.solved_for_m is None:
             return
         expected_m2 = self._expected.get(shown.solved_for_ns, 0.0)
@@ -79,14 +79,14 @@ class Aim:
             self._chooser.pictures.learn(shown.measures, shown.effort)
 
     def _middle_ns(self, timing: FrameTiming, cost_ns: int) -> int:
-        """Middle of the time that a solution begun now is shown.
+        """Return the middle of the interval in which a solution begun now is shown.
 
-        It is complete after its cost, first shown half a period later on average, and replaced when the next one is.
+        It completes after its cost, appears half a period later on average, and lasts until the next one appears.
         """
         return timing.photon_ns + cost_ns + (self._period_ns + max(cost_ns, self._period_ns)) // 2
 
     def _eyes_then(self, timing: FrameTiming, eyes: EyesEstimate, *, cost_ns: int) -> tuple[int, F64 | None, EyesLabel]:
-        """The instant to solve for, and the eyes then: predicted only as far as the tracker knows where they go."""
+        """Return the instant to solve for and the eyes then, predicted only as far as the tracker is reliable."""
         middle_ns = self._middle_ns(timing, cost_ns)
         reach_ns = min(middle_ns, timing.photon_ns + HORIZON_NS)
         then = self._viewer.ahead(reach_ns) if eyes.eyes_m is not None else eyes
@@ -114,7 +114,7 @@ class Aim:
         return outlook
 
     def _horizon_s(self, timing: FrameTiming, eyes: EyesEstimate) -> float:
-        """How long what the head does is taken to last: a resting one, as long again as it has rested."""
+        """Return the time the present motion is assumed to continue; for a resting head, as long as it has rested."""
         if eyes.label != "rested":
             self._rested_ns = None
             return HORIZON_S
@@ -123,7 +123,7 @@ class Aim:
         return max(HORIZON_S, (timing.photon_ns - self._rested_ns) / NS_PER_S)
 
     def _usual_speed_m_s(self, moved_m: float, eyes: EyesEstimate) -> float:
-        """The head's speed, or its root mean square lately: one that turns back, or is lost, does not stay there."""
+        """Return the larger of the head's speed and its recent RMS, which covers turning points and lost eyes."""
         speed_m_s = moved_m * NS_PER_S / self._period_ns
         if eyes.label != "held":
             gain = self._period_ns / (self._period_ns + SPEED_NS)
@@ -131,7 +131,7 @@ class Aim:
         return float(max(speed_m_s if eyes.label != "held" else 0.0, self._speed2**0.5))
 
     def _shown_error(self, eyes: EyesEstimate, shown: Solution | None, *, time_ns: int) -> float:
-        """Expected squared error of what the panels show at an instant."""
+        """Return the expected squared error of the displayed picture at an instant."""
         pictures = self._chooser.pictures
         if shown is None or shown.effort is None or shown.solved_for_m is None or eyes.eyes_m is None:
             return pictures.contrast
@@ -139,7 +139,7 @@ class Aim:
         return pictures.own(shown.effort) + pictures.stale(moved_m, (time_ns - shown.solved_for_ns) / NS_PER_S)
 
     def _refined(self, shown: Solution, most: int, *, shown_error: float, horizon_s: float) -> Effort | None:
-        """How to continue a solution for a resting head: a finer raster, or further steps. None: it is good enough."""
+        """Choose how to refine a solution for a resting head: finer raster or more steps. None: good enough."""
         done, costs, pictures = shown.effort, self._solver.costs, self._chooser.pictures
         if done is None:
             return None

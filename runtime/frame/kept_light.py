@@ -1,4 +1,4 @@
-"""Kept light: the panels of every N-th refresh, and the pictures that a judge compares them with."""
+"""Kept light: the panel layers of every N-th refresh and the target pictures to compare them with."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from runtime.support.background import MEASURING_NICENESS, BackgroundJob
 
 log = logging.getLogger("phasestack.light")
 
-LOOK_S = 0.1  # between checks for a request to stop
-WRITTEN_WITHIN_S = 10.0  # limit on writing the last refresh's layers
+LOOK_S = 0.1  # interval between checks for a stop request
+WRITTEN_WITHIN_S = 10.0  # timeout for writing the last refresh's layers
 
 
 class Output(Protocol):
@@ -44,7 +44,7 @@ class _Kept:
 
 
 class KeptLight:
-    """Keeps every `every`-th refresh; 0: none."""
+    """Keeps the layers of every `every`-th refresh (0: none)."""
 
     def __init__(self, every: int, output: Output, drawer: TargetDrawer, truth: TrueEyes, *, simulated: bool) -> None:
         self._every, self._output, self._drawer, self._truth = every, output, drawer, truth
@@ -53,7 +53,7 @@ class KeptLight:
         self._kept: list[_Kept] = []
 
     def refreshed(self, refresh: Refresh) -> None:
-        """Write the layers of every N-th refresh; in real time one refresh at a time."""
+        """Write the layers of every N-th refresh; in real time, one write at a time."""
         account = refresh.account
         if not self._every or account.frame % self._every != self._every - 1 or not account.presented:
             return
@@ -71,19 +71,19 @@ class KeptLight:
         kept = _Kept(account, solved_for_ns, self._drawer.shown_content())
         if self._truth.is_recorded:
             self._kept.append(kept)
-        else:  # a live sensor's run ends by a signal: there is no time to draw afterwards
+        else:  # a live run ends with a signal, leaving no time to draw afterwards
             self._draw(kept, lambda: None)
 
     def finish(self, stopped: Callable[[], bool]) -> None:
-        """Draw all pictures.
+        """Draw the target pictures of all kept refreshes.
 
-        stopped: True after a request to stop; the rest is then written without pictures.
+        stopped: returns True after a stop request; the remaining refreshes are then written without pictures.
         """
         if self._job is not None:
             self._job.wait(WRITTEN_WITHIN_S)
         total = len(self._kept)
         for done, kept in enumerate(self._kept):
-            progress.tell("drawing what eyes should have seen", done, total)
+            progress.tell("drawing target pictures", done, total)
             drawn = threading.Event()
             if not stopped():
                 self._draw(kept, drawn.set)

@@ -1,4 +1,4 @@
-"""Measures solutions on the solver's thread, from samples: how good they are, and how fast their pictures change."""
+"""Sampled measures of solutions on the solver's thread: error, lost detail and rate of change."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from runtime.model.solver import REDUCTIONS
 from runtime.records import F32, F64, U8, Effort, Measures
 from runtime.support.gl import DrawnPicture
 
-RAYS = 1024  # of each eye
-SAMPLED = 54, 96  # rows and columns of the grid on which pictures are compared
-BAND_ROWS = 64  # of the two parts of a picture in which detail is measured
-EVERY = 4  # solutions of one effort, between two measurements of residual or detail
+RAYS = 1024  # per eye
+SAMPLED = 54, 96  # rows and columns of the grid for comparing successive pictures
+BAND_ROWS = 64  # height of each of the two bands in which detail is measured
+EVERY = 4  # residual and detail are measured in one of this many solutions of an effort
 
 
 class SolutionMeter:
-    """Remembers the samples of the pictures before."""
+    """Measures solutions, comparing each with samples of the previous pictures."""
 
     def __init__(self) -> None:
         self._before: tuple[tuple[int, ...], F32, F64, int] | None = None  # raster and window, samples, eyes, time
@@ -30,7 +30,7 @@ class SolutionMeter:
         self._places = np.random.default_rng(1).random((2, RAYS, 2))
 
     def measure(self, job: Job, layers: U8, effort: Effort, *, time_ns: int) -> Measures | None:
-        """Of one solution; None where its pictures were left in textures."""
+        """Measure one solution; None if its pictures exist only as textures."""
         if any(isinstance(view.picture, DrawnPicture) for view in job.views):
             return None
         key = Effort(effort.reduction, effort.steps)
@@ -55,11 +55,12 @@ class SolutionMeter:
 
 
 def sampled_light(layers: U8, job: Job, places: F64, *, boxes: bool) -> float | None:
-    """Squared error of light in sampled pixels of both pictures; None: no ray counts.
+    """Return the squared error of light in sampled pixels of both pictures; None: no ray counts.
 
-    places: (2, K, 2) in 0..1 of a picture's size, two rays in the same pixels. The mean product of their errors has no
-    bias (docs/contracts.md: light). A ray counts that crosses every panel. Panels' pixels are even boxes; those
-    of a coarse solution, which is enlarged bilinearly, are not. layers: (N, h, w, 4) of the job's stack.
+    places: (2, K, 2) as fractions of the picture's size; both rays of a pair fall into the same pixel, so the mean
+    product of their errors is unbiased (docs/contracts.md: light). Rays that miss a panel are ignored. boxes: panel
+    pixels are uniform boxes; False for a coarse solution, which is enlarged bilinearly. layers: (N, h, w, 4) of the
+    job's stack.
     """
     stack, middle = job.stack, job.stack.count // 2
     rasters = [stack.panel(n) for n in range(stack.count)]
@@ -70,7 +71,7 @@ def sampled_light(layers: U8, job: Job, places: F64, *, boxes: bool) -> float | 
         column, row = (places[0] * (width, height)).astype(int).T
         target = view.pixels[row, column, :3] / np.float32(255)
         errors, counts = [], np.ones(len(row), bool)
-        for offset in places % (1 / 64) * 64:  # within a pixel, independent of which
+        for offset in places % (1 / 64) * 64:  # position within the pixel, independent of the pixel chosen
             at = middle_from_picture @ np.stack([column + offset[:, 0], row + offset[:, 1], np.ones(len(row))])
             total = np.zeros((len(row), 3), np.float32)
             for n in range(stack.count):
@@ -84,7 +85,7 @@ def sampled_light(layers: U8, job: Job, places: F64, *, boxes: bool) -> float | 
 
 
 def lost_detail(picture: U8) -> Mapping[int, float]:
-    """Squared error of a picture (h, w, 3 or 4) on coarser rasters, enlarged bilinearly, by reduction."""
+    """Return by reduction the squared error of a picture (h, w, 3 or 4) reduced and enlarged bilinearly."""
     height = picture.shape[0]
     bands = [picture[first : first + BAND_ROWS, :, :3] for first in (height // 3, 2 * height // 3)]
     return {
@@ -102,13 +103,13 @@ def _lost(band: U8, reduction: int) -> float:
 
 
 def _grid(picture: U8) -> F32:
-    """(rows, columns, 3) of a few pixels, in 0..1."""
+    """Sample a picture on a coarse grid: (rows, columns, 3) in 0..1."""
     rows, columns = (np.linspace(0, n - 1, min(n, k)).astype(int) for n, k in zip(picture.shape, SAMPLED, strict=False))
     return np.asarray(picture[rows][:, columns, :3] / np.float32(255), np.float32)
 
 
 def _sampled(layer: U8, x: F64, y: F64, *, boxes: bool) -> tuple[F32, NDArray[np.bool_]]:
-    """(K, 3) of a layer at continuous pixels: even boxes, or bilinear with edges clamped; whether each is on it."""
+    """Sample a layer (K, 3) at continuous pixels, as boxes or bilinearly (clamped), with a mask of those inside."""
     height, width = layer.shape[:2]
     inside = (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
     if boxes:

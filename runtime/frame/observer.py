@@ -1,4 +1,4 @@
-"""Observes refreshes: passes each to what writes lines, samples quality and keeps light."""
+"""Observer of refreshes: passes each to the line writer, the quality sampler and the light keeper."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class RunObserver:
         on_account: Callable[[RefreshAccount], None] | None = None,
         simulated: bool = False,
     ) -> None:
-        """evaluate_every: measure quality at every N-th refresh and at the last; 0: at the last alone; None: never.
+        """evaluate_every: measure quality at every N-th refresh and the last; 0: only the last; None: never.
 
         keep_light: keep the light of every N-th refresh; 0: never.
         """
@@ -53,11 +53,11 @@ class RunObserver:
 
     @property
     def live_errors(self) -> dict[int, float]:
-        """Mean squared error of the light at the true eyes, by number of the sampled refresh."""
+        """Mean squared error of the light at the true eyes, by refresh number."""
         return self._sampler.live
 
     def measure_only_live(self) -> None:
-        """Measure live quality without the other figures: a sixth of the time."""
+        """Measure only live quality, which takes a sixth of the time."""
         self._sampler.only_live = True
 
     def sampled(self, sample: SensorFrame) -> None:
@@ -79,9 +79,9 @@ class RunObserver:
         self._sampler.advance()
 
     def finish(self, stopped: Callable[[], bool] = lambda: False) -> None:
-        """Write and measure everything still queued, draw kept light's pictures, measure the last refresh.
+        """Write and measure everything queued, draw the kept refreshes' pictures, measure the last refresh.
 
-        In real time the last is measured only if no other was. stopped: True after a request to stop.
+        In real time the last is measured only if no other was. stopped: returns True after a stop request.
         """
         self.truth.end()
         self._advance()
@@ -94,9 +94,9 @@ class RunObserver:
                 self._sampler.finish(last)
 
     def live(self) -> dict[str, Any]:
-        """Live figures (contract 5.5) up to now, for the status."""
+        """Return the live figures (contract 5.5) up to now, for the status."""
         return {"live_db": self._sampler.live_db, "view_error_mm": self._lines.view_error_mm.of("p50", "p95")}
 
     def summary(self) -> dict[str, Any]:
-        """The measured part of summary.json. Figures without a measurement are None."""
+        """Return the measured part of summary.json; unmeasured figures are null."""
         return {**self.live(), **self._sampler.summary()}

@@ -1,7 +1,7 @@
 """Pacing: wake, present and display times of refreshes, predicted from vertical blanks.
 
-Pure: it is given the time and what happened, and never reads a clock. The manner is that of Monado's compositor
-pacing: predict, report what happened, learn the phase of the blanks and the time that a refresh needs before one.
+Pure: callers pass in times and events; it never reads a clock. The scheme follows Monado's compositor pacing:
+predict, report events, learn the phase of the blanks and the time a refresh needs before one.
 """
 
 from __future__ import annotations
@@ -9,22 +9,22 @@ from __future__ import annotations
 from runtime.clock import NS_PER_MS
 from runtime.records import FrameTiming
 
-PHASE_GAIN = 0.1  # of the newest blank's error in the predicted phase
-WORK_GAIN = 0.05  # with which the time a refresh needs is forgotten; more is believed at once
-LATE_SHARE = 0.5  # of a period: later than this, the next slot is taken
-MARGIN_GROWTH = 1.5  # of the margin after a missed blank
-MARGIN_DECAY = 0.9995  # of the margin after a blank that was met: where drawing needs more, one in 800 is missed
+PHASE_GAIN = 0.1  # gain of the newest blank's error in the predicted phase
+WORK_GAIN = 0.05  # decay of the work-time estimate (increases use gain 0.5)
+LATE_SHARE = 0.5  # of a period; a refresh later than this moves to the next slot
+MARGIN_GROWTH = 1.5  # factor on the margin after a missed blank
+MARGIN_DECAY = 0.9995  # factor per met blank; if drawing needs more than the minimum, one blank in 800 is missed
 MARGIN_MIN_NS = NS_PER_MS
 
 
 class Pacer:
-    """One refresh after the other on a grid of one period; slots that can't be met are counted as missed.
+    """Schedules refreshes on a grid of one period; slots that can't be met are counted as missed.
 
-    A refresh that was left out on purpose (the same picture again) keeps its slot and is no missed blank.
+    A refresh skipped on purpose (unchanged picture) keeps its slot and does not count as missed.
     """
 
     def __init__(self, *, period_ns: int, photon_ns: int, work_ns: int = 0) -> None:
-        """photon_ns: from presenting to the middle of the light; work_ns: first guess of waking to presented."""
+        """photon_ns: from presenting to the middle of the light; work_ns: initial estimate of waking to presented."""
         if period_ns <= 0:
             raise ValueError("a period must be positive")
         self.period_ns, self._photon_ns = period_ns, photon_ns
@@ -36,7 +36,7 @@ class Pacer:
         self.missed = 0
 
     def predict(self, now_ns: int) -> FrameTiming:
-        """The next refresh."""
+        """Return the timing of the next refresh."""
         lead_ns = self._lead_ns()
         if self._target_ns is None:
             target_ns = now_ns + lead_ns
@@ -52,13 +52,13 @@ class Pacer:
         return FrameTiming(self._number, target_ns - lead_ns, target_ns, target_ns + self._photon_ns)
 
     def presented(self, timing: FrameTiming, *, woke_ns: int, done_ns: int, blank_ns: int | None = None) -> int:
-        """What became of a refresh; answers its display time, as well as that is known.
+        """Record the outcome of a refresh and return the best estimate of its display time.
 
-        blank_ns: when its vertical blank happened; None where the sink does not know, or left the swap out.
+        blank_ns: time of its vertical blank; None if the sink does not know it or skipped the swap.
         """
         if blank_ns is None:
             self._learn_work(done_ns - woke_ns)
-            # Where blanks are known, a swap that was left out shows the old picture until its slot.
+            # With known blanks, a skipped swap keeps the old picture on screen until its slot.
             return (timing.present_ns if self._has_blanks else done_ns) + self._photon_ns
         self._has_blanks = True
         error_ns = blank_ns - timing.present_ns
@@ -74,11 +74,11 @@ class Pacer:
         return blank_ns + self._photon_ns
 
     def _lead_ns(self) -> int:
-        """From waking to the instant of presenting."""
+        """Return the time from waking to presenting."""
         return round(self._work_ns + (self._margin_ns if self._has_blanks else 0.0))
 
     def _learn_work(self, work_ns: int) -> None:
-        # More work is believed by halves, so that one long refresh does not wake all others early.
+        # Increases count half, so that one long refresh does not make all later ones wake early.
         gain = 0.5 if work_ns > self._work_ns else WORK_GAIN
         bounded = min(work_ns, self.period_ns // 2)
         self._work_ns += gain * (bounded - self._work_ns)

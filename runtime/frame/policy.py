@@ -1,7 +1,7 @@
 """Decisions on what to solve and show (flat, solved, reuse): pure, without clock or I/O.
 
-Stillness is decided in one place, by the rest watch on the sensor's samples (`eyes.rest`): here, eyes labelled
-`rested` are solved for once. Whatever else moves them is solved for anew.
+Stillness is decided in one place, by the rest watch on the sensor's samples (`eyes.rest`): eyes labelled `rested` are
+solved for once; any other change of position gets a new solution.
 """
 
 from __future__ import annotations
@@ -13,35 +13,35 @@ from runtime.clock import NS_PER_S
 from runtime.plan.savings import Plan, selected_eyes
 from runtime.records import F64, Effort, EyesEstimate, SolveRequest
 
-BLEND_S = 0.3  # in which the picture goes over to the flat one, or back
+BLEND_S = 0.3  # duration of the blend to the flat picture and back
 
 Kind = Literal["solve", "refine", "flat", "nothing"]
 
 
 @dataclass(frozen=True, slots=True)
 class SolutionKey:
-    """Inputs that the newest solution, or flat picture, was made from."""
+    """Inputs of the newest solution or flat picture."""
 
     state_version: int
     revision: int  # of the content
-    eyes_m: F64 | None  # (2, 3) as they were solved for; None: flat
+    eyes_m: F64 | None  # (2, 3) solved for; None: flat picture
     effort: Effort | None = None  # of the solution
-    episode: int = 0  # of the flat picture: it keeps its place of drawing as long as it is wanted
+    episode: int = 0  # number of the current flat episode; the flat picture keeps one viewpoint throughout it
 
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What the solver does next."""
+    """The solver's next action."""
 
     kind: Kind
     eyes_m: F64 | None = None  # (2, 3) to solve for
 
 
 class FramePolicy:
-    """Decides between solving, drawing the flat picture and doing nothing, from what is there already."""
+    """Decides between solving, drawing the flat picture and doing nothing, given the existing pictures."""
 
     def __init__(self) -> None:
-        self.episode = 0  # number of the present (or last) time that the flat picture was wanted
+        self.episode = 0  # number of the current or last flat episode
         self._flat_wanted = False
         self._flat_was_last = False
 
@@ -55,7 +55,7 @@ class FramePolicy:
         solved: SolutionKey | None,
         flat: SolutionKey | None,
     ) -> Decision:
-        """plan: allowed savings; solved, flat: what there is; revision: the content's at `request.time_ns`."""
+        """plan: allowed savings; solved, flat: newest results; revision: content's at `request.time_ns`."""
         if request.flat_wanted and not self._flat_wanted:
             self.episode += 1
         self._flat_wanted = request.flat_wanted
@@ -79,7 +79,7 @@ class FramePolicy:
     def _eyes_to_solve(
         self, request: SolveRequest, plan: Plan | None, *, state_version: int, revision: int, solved: SolutionKey | None
     ) -> F64 | None:
-        """None: the newest solution will do, or there is nobody to solve for."""
+        """Return the eyes to solve for; None if the newest solution still holds or no eyes are known."""
         if request.eyes_m is None:
             return None
         eyes_m = request.eyes_m if plan is None else selected_eyes(request.eyes_m, plan.eyes)
@@ -90,14 +90,14 @@ class FramePolicy:
 
 
 def _is_more(effort: Effort | None, done: Effort | None) -> bool:
-    """Whether an effort adds to one that has been made: a finer raster, or further steps."""
+    """Return True if an effort goes beyond the one already spent: a finer raster or more steps."""
     if effort is None or done is None:
         return False
     return (-effort.reduction, effort.steps) > (-done.reduction, done.steps)
 
 
 def wants_flat(eyes: EyesEstimate, *, flat_asked: bool, flatness: float) -> bool:
-    """Whether the flat picture is shown or will soon be: it is made before it is needed."""
+    """Return True if the flat picture is shown or soon will be, so that it is ready in time."""
     return flat_asked or flatness > 0.0 or eyes.label in ("held", "none")
 
 
@@ -109,7 +109,7 @@ class Flatness:
     since_ns: int = -1
 
     def toward(self, target: float, *, now_ns: int) -> float:
-        """One step towards 0 or 1."""
+        """Move towards 0 or 1 by the time elapsed since the last call, and return the value."""
         elapsed_s = 0.0 if self.since_ns < 0 else (now_ns - self.since_ns) / NS_PER_S
         self.since_ns = now_ns
         step = elapsed_s / BLEND_S

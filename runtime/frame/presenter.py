@@ -1,7 +1,7 @@
-"""The presenter's loop: receive, map, predict, align, present, account; waits only for its time.
+"""The presenter's loop: receive, map, predict, align, present, account; it waits only for its slot.
 
 The solver works alongside it (`solver_host`) and hands over complete solutions; every refresh shows the newest one,
-aligned to where the eyes will be at its display time.
+aligned to the eyes' predicted position at its display time.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ log = logging.getLogger("phasestack.presenter")
 
 
 class Supervisor:
-    """The presenter's connection to the outside, called once a refresh, never waiting. Base: nothing."""
+    """Hooks that connect the presenter to the outside, called once per refresh; they must not wait."""
 
     def stop_reason(self) -> str:
-        """Why to stop; empty: go on."""
+        """Return the reason to stop; empty: continue."""
         return ""
 
     def carry_out_commands(self, presenter: Presenter) -> None:
-        """Carry out what an operator asked for since the last refresh."""
+        """Carry out the operator's commands received since the last refresh."""
 
     def refreshed(self, presenter: Presenter, account: RefreshAccount) -> None:
         """One refresh is complete."""
@@ -69,7 +69,7 @@ class Refresh:
 
 
 class Observer(Protocol):
-    """An observer of refreshes (files, sampled quality); it must be quick."""
+    """Observer of refreshes (files, sampled quality); must return quickly."""
 
     def sampled(self, sample: SensorFrame) -> None:
         """A sample arrived."""
@@ -89,28 +89,28 @@ class RefreshTimes:
 
     @property
     def simulated(self) -> bool:
-        """True where time passes only as the configuration says."""
+        """True if time advances only by configured durations."""
         return self._simulated is not None
 
     def lap(self, stage: str) -> None:
-        """What happened since the last lap was `stage`."""
+        """Charge the time since the last lap to `stage`."""
         self._watch.lap(stage)
         if self._simulated is None:
             self.stage_ms[stage] = self._watch.stage_ms[stage]
         elif stage not in self.stage_ms:
             cost_ms = self._simulated_ms.get(stage, 0.0)
-            if stage != "wait":  # waiting passes on the simulated clock by itself
+            if stage != "wait":  # waiting advances the simulated clock anyway
                 self._simulated.advance_ns(round(cost_ms * NS_PER_MS))
             self.stage_ms[stage] = cost_ms
 
     def overhead_ms(self) -> float:
-        """The refresh so far, less presenting and waiting; on the machine's clock."""
+        """Return the refresh's time up to now without presenting and waiting, on the machine's clock."""
         whole_ms = (perf_counter_ns() - self._start_ns) / NS_PER_MS
         return max(0.0, whole_ms - sum(self._watch.stage_ms.get(stage, 0.0) for stage in ("present", "wait")))
 
 
 class Presenter:
-    """One run. Everything it needs is given; it owns none of it but what it counts."""
+    """Presents one run. Its parts are passed in and owned by the caller; it owns only its counters."""
 
     def __init__(
         self,
@@ -127,7 +127,7 @@ class Presenter:
         supervisor: Supervisor | None = None,
         observers: Sequence[Observer] = (),
     ) -> None:
-        """stage_ms: what stages of a refresh cost on a simulated clock."""
+        """stage_ms: duration of each refresh stage on a simulated clock."""
         self.run_cell, self.stack, self.clock = run, stack, clock
         self.pacer, self.samples, self.viewer, self.solver, self.panels = pacer, samples, viewer, solver, panels
         self._stage_ms = stage_ms
@@ -139,16 +139,16 @@ class Presenter:
         self._lateness = Lateness(pacer.period_ns)
         self.flat_asked = False
         self.paused = False
-        self.missing: dict[str, str] = {}  # parts that don't work at present, and why
+        self.missing: dict[str, str] = {}  # failed parts, with the reason
         self.last: Refresh | None = None
         self._flatness = Flatness()
         self._presented = False
-        self._shown_solution: int | None = None  # number of the solution that was on the panels before
-        self._drew_solution = False  # a solution has been on the panels before
+        self._shown_solution: int | None = None  # number of the solution shown at the previous refresh
+        self._drew_solution = False  # True once any solution has been on the panels
         self._aligned: tuple[int, bytes, tuple[F64, ...], str] | None = None
 
     def run(self, *, frames: int | None = None) -> str:
-        """Refresh until the recording ends, `frames` are done, or it is told to stop; answers why."""
+        """Refresh until the recording ends, `frames` are done or a stop is requested; return why."""
         reason = ""
         while not reason:
             try:
@@ -162,7 +162,7 @@ class Presenter:
         return reason
 
     def refresh(self) -> RefreshAccount:
-        """One refresh. Raises EndOfRecording, FatalError."""
+        """Do one refresh. Raises EndOfRecording, FatalError."""
         times = RefreshTimes(self.clock, self._stage_ms)
         timing = self.pacer.predict(self.clock.now_ns())
         self.clock.sleep_until_ns(timing.wake_ns)
@@ -178,7 +178,7 @@ class Presenter:
         times.lap("track")
         report, lost = self._present(frame)
         times.lap("present")
-        if report is not None and times.simulated:  # presenting has been paid for only now
+        if report is not None and times.simulated:  # the clock has only now advanced by the cost of presenting
             report = replace(report, present_ns=self.clock.now_ns())
         photon_ns = self._presented_at(timing, report, woke_ns=woke_ns)
         request = self._aim.request(
@@ -197,7 +197,7 @@ class Presenter:
         return account
 
     def _adopt_settings(self) -> None:
-        """Other settings may have been taken over since the last refresh."""
+        """Adopt settings that changed since the last refresh."""
         state = self.run_cell.state
         if state.version != self._adopted:
             self._adopted = state.version
@@ -210,13 +210,13 @@ class Presenter:
                 observer.sampled(sample)
 
     def _compose(self, timing: FrameTiming, eyes: EyesEstimate, news: SolverUpdate) -> tuple[PanelFrame, str]:
-        """What the panels are given, and why an alignment is at its limit (empty: it is not)."""
+        """Return the frame for the panels and the reason the alignment is at its limit (empty: it is not)."""
         solution, flat = news.solution, news.flat
         target = 1.0 if eyes.eyes_m is None or self.flat_asked else 0.0
         if solution is None:
             self._flatness.value = 1.0
         elif not self._drew_solution and target == 0.0:
-            self._flatness.value = 0.0  # the first picture is not faded in
+            self._flatness.value = 0.0  # no fade-in for the first picture
         flatness = self._flatness.value
         if not self.paused:
             flatness = self._flatness.toward(target, now_ns=self.clock.now_ns())
@@ -237,7 +237,7 @@ class Presenter:
         return frame, limited
 
     def _alignment(self, eyes: EyesEstimate, solution: Solution | None) -> tuple[tuple[F64, ...], str]:
-        """One matrix a panel; the last one where no eyes are known; () where none is needed."""
+        """Return one matrix per panel (the last ones without eyes, () if none needed) and the limit's reason."""
         plan = self.run_cell.state.settings.plan
         if solution is None or solution.solved_for_m is None or not plan.align:
             return (), ""
@@ -252,7 +252,7 @@ class Presenter:
         return self._aligned[2], self._aligned[3]
 
     def _present(self, frame: PanelFrame) -> tuple[PresentReport | None, str]:
-        """Put it on the panels; None and why, where they are not there or there is nothing to show yet."""
+        """Present a frame; (None, reason) if a panel is lost, (None, "") before the first picture."""
         if frame.solved is None and frame.flat is None:
             return None, ""
         unchanged = self.last is not None and self.last.account.presented and _same(frame, self.last.frame)
@@ -265,7 +265,7 @@ class Presenter:
         return report, ""
 
     def _presented_at(self, timing: FrameTiming, report: PresentReport | None, *, woke_ns: int) -> int:
-        """Report to the pacer what happened; answers the display time."""
+        """Report the outcome to the pacer and return the display time."""
         blank_ns = report.vblank_ns if report is not None else None
         return self.pacer.presented(timing, woke_ns=woke_ns, done_ns=self.clock.now_ns(), blank_ns=blank_ns)
 
@@ -308,7 +308,7 @@ class Presenter:
         state: State,
         times: RefreshTimes,
     ) -> RefreshAccount:
-        solution = news.solution if report is not None and frame.flatness < 1.0 else None  # that is shown
+        solution = news.solution if report is not None and frame.flatness < 1.0 else None  # only if visible
         ran = solution is not None and solution.number != self._shown_solution
         stage_ms = dict(times.stage_ms)
         if solution is not None and ran:
@@ -346,7 +346,7 @@ class Presenter:
             observer.refreshed(self.last)
 
     def summary(self, *, simulated: bool = False) -> dict[str, Any]:
-        """The counted part of summary.json (contract 5.2); simulated: all times are the run's clock's."""
+        """Return the counted part of summary.json (contract 5.2). simulated: times are on the run's clock."""
         predictor = self.run_cell.state.predictor
         return {
             **self.stats.summary(stale_inputs=self.samples.stale_inputs, simulated=simulated),
@@ -357,7 +357,7 @@ class Presenter:
 
 
 def _same(frame: PanelFrame, before: PanelFrame) -> bool:
-    """Whether two frames show the same picture on every panel."""
+    """Return True if two frames show the same picture on every panel."""
     return (
         (frame.solved_version, frame.flat_version if frame.flatness > 0.0 else 0, frame.flatness)
         == (before.solved_version, before.flat_version if before.flatness > 0.0 else 0, before.flatness)

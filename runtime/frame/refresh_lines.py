@@ -1,4 +1,4 @@
-"""Lines of frames.jsonl, and the view error: both need the true eyes at a refresh's display time."""
+"""Lines of frames.jsonl and the view error; both need the true eyes at the display time."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from runtime.frame.stats import Quantiles
 from runtime.frame.truth import TrueEyes
 from runtime.records import RefreshAccount, State
 
-WAITING_MAX = 2048  # most refreshes waiting for the truth; older ones are written without
+WAITING_MAX = 2048  # refreshes queued for their true eyes; beyond it the oldest is written without
 LINE = (
     "frame", "capture_ns", "predicted_for_ns", "present_ns", "eyes_m", "eyes_label", "eye_sigma_mm", "state",
     "solution", "effort", "solved_for_m", "solution_age_ms", "true_eyes_m", "inference", "presented", "stage_ms",
@@ -33,7 +33,7 @@ class RefreshLines:
         self._waiting.append(account)
 
     def advance(self) -> None:
-        """Write the refreshes whose truth is settled."""
+        """Write the refreshes whose true eyes are known or known to be missing."""
         while self._waiting:
             photon_ns = self._waiting[0].photon_ns
             if self._truth.may_come(photon_ns) and len(self._waiting) < WAITING_MAX:
@@ -46,7 +46,7 @@ class RefreshLines:
 
 
 def line_of(account: RefreshAccount) -> dict[str, Any]:
-    """One line of frames.jsonl (contract 5.2)."""
+    """Return one line of frames.jsonl (contract 5.2)."""
     return {name: _plain(getattr(account, name)) for name in LINE}
 
 

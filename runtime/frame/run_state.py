@@ -13,14 +13,14 @@ from runtime.errors import Stopped
 from runtime.eyes.calibration import Calibration
 from runtime.model.predictor import Predictor
 
-LEFT_BEHIND = "content or model took so long to be made that the solver was made anew: nothing has changed"
+LEFT_BEHIND = "content or model took too long to load and the solver was restarted: nothing has changed"
 
 
 @dataclass(frozen=True, slots=True)
 class RunState:
     """Settings, calibration, content and model that belong together; the solver owns the last two."""
 
-    version: int  # another number for each value
+    version: int  # different for each state
     settings: Settings
     calibration: Calibration
     content: ContentSource
@@ -28,7 +28,7 @@ class RunState:
 
 
 class RunCell:
-    """Holds the newest RunState. Readers take `state` once and use that; any thread may."""
+    """Holds the newest RunState. Any thread may read `state`; read it once per use."""
 
     def __init__(
         self, settings: Settings, *, calibration: Calibration, content: ContentSource, predictor: Predictor
@@ -39,20 +39,20 @@ class RunCell:
         self.state = RunState(0, settings, calibration, content, predictor)
 
     def next_number(self) -> int:
-        """Of a solution or a flat picture; none is given twice in a run, whichever solver makes it."""
+        """Return the next number for a solution or flat picture, unique within the run across solvers."""
         with self._lock:
             return next(self._numbers)
 
     def begin(self) -> int:
-        """A new solver's generation; from now on the one before it changes nothing."""
+        """Start a new solver generation and return it; the previous one can no longer change the state."""
         with self._lock:
             self.generation += 1
             return self.generation
 
     def replace(self, generation: int | None = None, **changes: Any) -> RunState:
-        """Fields of RunState that change; answers the state before, whose parts are the caller's to close.
+        """Replace fields of the state; return the previous state, whose parts the caller must close.
 
-        generation: of the solver that changes them. Raises Stopped, and changes nothing, where another has begun.
+        generation: the calling solver's. Raises Stopped and changes nothing if a newer one has begun.
         """
         with self._lock:
             if generation not in (None, self.generation):

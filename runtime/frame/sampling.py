@@ -1,8 +1,8 @@
 """Quality of sampled refreshes, measured once their true eyes are known.
 
 Targets are drawn on the solver's thread. In real time they are compared with the layers on a background thread, one
-refresh at a time, the newest first. Of the samples that come meanwhile a few are held and measured at the end, the
-others are dropped. On a simulated clock every sample is measured, in order.
+refresh at a time, newest first. A few of the samples that arrive meanwhile are queued and measured at the end; the
+rest are dropped. On a simulated clock every sample is measured, in order.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F64, State
 from runtime.support.background import MEASURING_NICENESS, BackgroundJob
 
-HELD_MAX = 3  # samples held in real time, with their layers: 25 MB each at 1080p
-MEASURED_WITHIN_S = 60.0  # limit on measuring the samples held, after the run
-LOOK_S = 0.02  # between checks for their end
-DRAWN_WITHIN_S = 10.0  # limit on drawing the last refresh's targets
+HELD_MAX = 3  # samples queued in real time, with their layers: 25 MB each at 1080p
+MEASURED_WITHIN_S = 60.0  # timeout for measuring the queued samples after the run
+LOOK_S = 0.02  # interval between checks for completion
+DRAWN_WITHIN_S = 10.0  # timeout for drawing the last refresh's targets
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class QualitySampler:
         self._every, self._simulated = every, simulated
         self.only_live = False  # measure live quality without the other figures
         self.measured: dict[str, list[float]] = {}  # FIGURES of the sampled refreshes
-        self.live: dict[int, float] = {}  # mean squared error at the true eyes, by number of the refresh
+        self.live: dict[int, float] = {}  # mean squared error at the true eyes, by refresh number
         self.moment: Moment | None = None  # the newest refresh measured, for stills, sheet and viewer
         self._waiting: deque[_Sample] = deque()
         self._job: BackgroundJob[RefreshQuality] | None = None
@@ -64,7 +64,7 @@ class QualitySampler:
         self._drawing = False
 
     def refreshed(self, refresh: Refresh) -> None:
-        """Queue a refresh if it is a sample; in real time it may take another one's place."""
+        """Queue a refresh if it is due; in real time it may replace a queued one."""
         is_sample = self._every and refresh.account.frame % self._every == self._every - 1
         if not is_sample or not refresh.account.presented:
             return
@@ -78,7 +78,7 @@ class QualitySampler:
         return bool(self._waiting) or self._drawing or self._job is not None
 
     def drain(self, stopped: Callable[[], bool]) -> None:
-        """Measure the samples held, after a run in real time. stopped: True after a request to stop."""
+        """Measure the queued samples after a real-time run. stopped: returns True after a stop request."""
         ends_s = time.monotonic() + MEASURED_WITHIN_S
         self.advance()
         while self._is_busy and not stopped() and time.monotonic() < ends_s:
@@ -86,7 +86,7 @@ class QualitySampler:
             self.advance()
 
     def advance(self) -> None:
-        """Collect a finished measurement, and start those whose true eyes are known by now."""
+        """Collect a finished measurement and start those whose true eyes are now known."""
         if self._job is not None and self._job.done:
             job, self._job = self._job, None
             self._take(self._job_frame, job.take())
@@ -99,7 +99,7 @@ class QualitySampler:
             self._begin(sample)
 
     def finish(self, last: Refresh) -> None:
-        """Measure the run's last refresh. It counts in the means only if it is the sole one."""
+        """Measure the run's last refresh; it enters the means only if no other was measured."""
         queue: SimpleQueue[RefreshTargets | None] = SimpleQueue()
         true_m = self._truth.at(last.account.photon_ns)
         self._drawer.draw(self._wanted(last, true_m), None, queue.put)
@@ -132,7 +132,7 @@ class QualitySampler:
         self._drawer.draw(wanted, sample.content, compare)
 
     def _wanted(self, refresh: Refresh, true_m: F64 | None) -> dict[str, tuple[F64, int]]:
-        """Eyes and instants that targets are drawn for."""
+        """Return the eyes and instants to draw targets for."""
         account, solution = refresh.account, refresh.solution
         wanted: dict[str, tuple[F64, int]] = {}
         if true_m is not None:
@@ -170,7 +170,7 @@ class QualitySampler:
         return round(psnr_db(float(np.mean(list(self.live.values())))), 3) if self.live else None
 
     def summary(self) -> dict[str, Any]:
-        """The measured part of summary.json. Figures without a measurement are None."""
+        """Return the measured part of summary.json; unmeasured figures are null."""
         means = {
             name: round(float(np.mean(self.measured[name])), 3) if name in self.measured else None for name in FIGURES
         }
@@ -179,7 +179,7 @@ class QualitySampler:
 
 
 def has_picture(refresh: Refresh) -> bool:
-    """True where the panels show a solution for two eyes, and nothing of the flat picture."""
+    """Return True if the panels show only a solution for two eyes, with no flat picture mixed in."""
     solution = refresh.solution
     return (
         refresh.account.presented

@@ -1,4 +1,4 @@
-"""Draws content and predicts layers for the future eyes, on the one thread with its GL context."""
+"""Solver: draws content and computes layers for the predicted eyes, on its GL context's thread."""
 
 from __future__ import annotations
 
@@ -27,48 +27,48 @@ from runtime.support.gl import DrawnPicture
 
 log = logging.getLogger("phasestack.solver")
 
-FLAT_EYE_M = (0.7, 0.0, 0.0)  # where the flat picture is drawn from before any viewer was seen
+FLAT_EYE_M = (0.7, 0.0, 0.0)  # viewpoint of the flat picture before any viewer has been seen
 
 
 @dataclass(frozen=True, slots=True)
 class SolverUpdate:
-    """The result of one request; as news, the newest of all results so far."""
+    """The result of one request; as news, the newest results up to now."""
 
-    solution: Solution | None = None  # a new one for two eyes
+    solution: Solution | None = None  # new solution for two eyes
     flat: Solution | None = None  # a new flat picture
-    missing: dict[str, str] = field(default_factory=dict)  # parts that failed (content, model), and why
+    missing: dict[str, str] = field(default_factory=dict)  # failed parts (content, model), with the reason
 
 
 class Solver:
-    """One solution or flat picture a step, from whatever the run is made with at its beginning."""
+    """Computes one solution or flat picture per step, from the run's state at the start of the step."""
 
     def __init__(self, run: RunCell, stack: PanelStack, *, timed: bool = True) -> None:
-        """timed: `model.budget_ms` holds; on a simulated clock nothing may depend on the machine."""
+        """timed: apply `model.budget_ms`; False on a simulated clock, where results must not depend on the machine."""
         self.run, self.stack, self._timed = run, stack, timed
-        self.measured = Measured()  # what is known of the plan's times and errors
+        self.measured = Measured()  # measured times and errors of the plan's items
         self.plan: Plan | None = None
         self._planned_for: tuple[int, tuple[bool, bool]] | None = None
         self._seeing = (True, True)
         self._policy = FramePolicy()
         self._solved: SolutionKey | None = None
         self._flat: SolutionKey | None = None
-        self._windows: dict[int, SolveWindow | None] = {}  # of the newest solutions, by reduction
-        self._kept: Job | None = None  # with pictures that no later drawing changes; None: it has to be drawn
+        self._windows: dict[int, SolveWindow | None] = {}  # windows of the newest solutions, by reduction
+        self._kept: Job | None = None  # with private copies of its pictures; None: must be drawn
         self._meter = SolutionMeter()
         self._middle_m: F64 = np.array(FLAT_EYE_M)
         self._missing: dict[str, str] = {}
 
     def step(self, request: SolveRequest, state: RunState | None = None) -> SolverUpdate:
-        """Do what the request calls for, if anything. A part that fails is named; what there is stays good.
+        """Carry out a request. Failed parts are named in the result; earlier results stay valid.
 
-        state: to draw and solve with; None: the newest. Raises ContextLost: this solver is of no more use.
+        state: to draw and solve with; None: the newest. Raises ContextLost when this solver can't be used any longer.
         """
         state = state or self.run.state
         self._replan(state, request.eyes_m)
         time_ns = request.time_ns
         try:
             revision = state.content.revision(time_ns=time_ns)
-        except (Exception, SystemExit) as error:  # a vendor's `sys.exit()` too
+        except (Exception, SystemExit) as error:  # including a vendor's `sys.exit()`
             return SolverUpdate(missing=self._failed("content", error, expected=ContentFailure))
         job = self._policy.next_job(
             request,
@@ -85,7 +85,7 @@ class Solver:
             effort = wanted or Effort(1, state.predictor.steps)
             return self._solve(state, request, job.eyes_m, effort, revision=revision)
         if request.eyes_m is not None and not request.paused:
-            self._missing = {}  # what there is is what was asked for
+            self._missing = {}  # the newest solution already answers the request
         return SolverUpdate(missing=dict(self._missing))
 
     def _solve(
@@ -102,7 +102,7 @@ class Solver:
                 job = self._kept
             else:
                 job = self._drawn(state, request, eyes_m, effort.reduction)
-        except ContextLost:  # content and model are in it: the solver's owner makes another
+        except ContextLost:  # content and model live in the context: the owner starts another solver
             raise
         except (Exception, SystemExit) as error:
             return SolverUpdate(missing=self._failed("content", error, expected=ContentFailure))
@@ -134,7 +134,7 @@ class Solver:
         return SolverUpdate(solution=solution)
 
     def _drawn(self, state: RunState, request: SolveRequest, eyes_m: F64, reduction: int) -> Job:
-        """Draw the targets. Those of a resting head are kept, for the solution to be continued."""
+        """Draw the targets; keep a resting head's, so that its solution can be refined."""
         job = drawn_job(
             state.predictor,
             state.content,
@@ -172,12 +172,12 @@ class Solver:
         return SolverUpdate(flat=flat, missing=missing)
 
     def plan_items(self, measured: Measured | None = None) -> tuple[PlanItem, ...]:
-        """What is left out now, with what is known of its time and error. Any thread may ask."""
+        """Return the savings in force with their known times and errors. Thread-safe."""
         state = self.run.state
         return self._plan_of(state, self._seeing, measured or self.measured).items
 
     def _replan(self, state: RunState, eyes_m: F64 | None) -> None:
-        """Make the plan again where the content, the model, the settings or what the eyes can see have changed."""
+        """Update the plan after a change of content, model, settings or visible eyes."""
         seeing = self._seeing if eyes_m is None else seeing_eyes(eyes_m, self._seeing)
         self._seeing = seeing
         made_for = (state.version, seeing)

@@ -1,4 +1,4 @@
-"""Where a solver runs: the presenter's view of it, and the host of simulated time."""
+"""Solver hosts: the presenter's interface to a solver, and the host on a simulated clock."""
 
 from __future__ import annotations
 
@@ -12,68 +12,68 @@ from runtime.frame.effort import Costs
 from runtime.frame.solver import SolverUpdate
 from runtime.records import SolveRequest
 
-FIRST_REQUEST = SolveRequest(0, None, "none", 0.0, flat_wanted=True)  # before the first refresh: the flat picture
+FIRST_REQUEST = SolveRequest(0, None, "none", 0.0, flat_wanted=True)  # before the first refresh: flat picture
 
-SHOWN_STAGES = ("render", "prepare", "inference", "finish")  # of a solution in frames.jsonl; steps count as `finish`
+SHOWN_STAGES = ("render", "prepare", "inference", "finish")  # in frames.jsonl; steps count as `finish`
 
 
 class SolverParts(Protocol):
-    """A solver and what belongs to its thread, such as a GL context."""
+    """A solver and the resources of its thread, such as a GL context."""
 
     def step(self, request: SolveRequest) -> SolverUpdate:
-        """One request."""
+        """Carry out one request."""
 
     def simulated_costs(self) -> Costs:
-        """What solutions take on a simulated clock at present."""
+        """Return the present costs of solutions on a simulated clock."""
 
     def first_costs(self) -> Mapping[int, Mapping[str, float]]:
-        """Stage times by reduction, milliseconds, measured while warming up."""
+        """Return stage times by reduction, in milliseconds, measured while warming up."""
 
     def close(self) -> None:
-        """Release everything that no other solver uses by now, on the thread that made it."""
+        """Release everything that no newer solver uses, on the thread that created it."""
 
 
-Task = Callable[[SolverParts], bool]  # done on the solver's thread between two steps, until it answers True
+Task = Callable[[SolverParts], bool]  # called on the solver's thread between steps until it returns True
 
 
 class SolverHost(ABC):
-    """The presenter asks (`post`) and looks (`news`); neither waits."""
+    """Interface to a solver: the presenter posts requests and reads `news`; neither waits."""
 
     @property
     @abstractmethod
     def costs(self) -> Costs:
-        """What solutions take at present."""
+        """The present costs of solutions."""
 
     @abstractmethod
     def post(self, request: SolveRequest) -> None:
-        """Ask for a solution; a request that was not begun is forgotten."""
+        """Request a solution, replacing any request not yet begun."""
 
     @abstractmethod
     def news(self) -> SolverUpdate:
-        """The newest complete solution and flat picture, and what failed."""
+        """Return the newest complete solution and flat picture, and the failures."""
 
     @abstractmethod
     def do(self, task: Task) -> None:
-        """Have something done between two steps, again and again until it answers True."""
+        """Run a task between steps, repeatedly until it returns True."""
 
     @abstractmethod
     def close(self) -> None:
-        """Stop, and release what the solver holds. May be called twice."""
+        """Stop and release the solver's resources. May be called twice."""
 
 
 def taken_in(news: SolverUpdate, step: SolverUpdate) -> SolverUpdate:
-    """The news updated by a step: its results, where it has any, and its failures."""
+    """Return the news updated with a step's results, if any, and its failures."""
     return SolverUpdate(step.solution or news.solution, step.flat or news.flat, step.missing)
 
 
 class SimulatedSolver(SolverHost):
-    """Solves at once and hands over when the simulated clock has passed what the configured stages cost."""
+    """Solves immediately; publishes a result once the simulated clock has advanced by its cost."""
 
     def __init__(self, parts: SolverParts, clock: Clock) -> None:
         self._parts, self._clock = parts, clock
         self._news = taken_in(SolverUpdate(), parts.step(FIRST_REQUEST))
         self._posted: tuple[int, SolveRequest] | None = None
-        self._under_way: tuple[int, SolverUpdate] | None = None  # when it is complete
+        self._under_way: tuple[int, SolverUpdate] | None = None  # completion time and result
         self._idle_since_ns = clock.now_ns()
         self._tasks: list[Task] = []
         self._closed = False
@@ -101,7 +101,7 @@ class SimulatedSolver(SolverHost):
             self._parts.close()
 
     def _advance(self) -> None:
-        """Everything that happened up to now, in order."""
+        """Process all events up to now, in order."""
         now_ns = self._clock.now_ns()
         while True:
             if self._under_way is not None:
@@ -119,7 +119,7 @@ class SimulatedSolver(SolverHost):
             self._under_way = begun_ns + cost_ns, step
 
     def _timed(self, step: SolverUpdate) -> tuple[SolverUpdate, int]:
-        """A result with the stage times that the configuration says, and their sum in nanoseconds."""
+        """Return a result with the configured stage times, and their sum in nanoseconds."""
         solution, flat, costs = step.solution, step.flat, self.costs
         if solution is not None and solution.effort is not None:
             effort = solution.effort

@@ -1,4 +1,4 @@
-"""The solver's thread: hands over complete solutions; abandoned when a call does not return."""
+"""The solver's thread: publishes complete solutions; abandoned and replaced if a call hangs."""
 
 from __future__ import annotations
 
@@ -23,31 +23,31 @@ from runtime.support.untrusted_input import LIMITS
 
 log = logging.getLogger("phasestack.solver")
 
-LATE_S = 0.5  # a step that takes longer is late; one that takes twice as long is a fault by itself
-ABANDON_S = 10.0  # a step that does not return for so long is left behind, and the solver is made anew
-# Making it may take `LIMITS.start_s`, as at the start, and a task, which makes content, `LIMITS.load_s`.
-IDLE_S = 0.02  # between two looks at tasks while nothing is asked
-USUAL_S = 0.2  # that a step under way is waited for at the end
-LATE_STEPS = 3  # in a row that are late begin a fault, so many in time end it: a busy processor is none
-ANSWER_STEP_MS = 500  # of how long no answer came, as it is reported
-ABANDONED_MAX = 4  # hung threads that are left behind; with more, the solver stays as it is
+LATE_S = 0.5  # a longer step is late; a single one of twice this is a fault
+ABANDON_S = 10.0  # a step that takes longer is abandoned and a new solver started
+# Starting a solver may take `LIMITS.start_s`; a task, which loads content, `LIMITS.load_s`.
+IDLE_S = 0.02  # interval between checks for tasks while requests are absent
+USUAL_S = 0.2  # time allowed at the end for a running step to finish
+LATE_STEPS = 3  # this many consecutive late steps raise a fault, this many on time clear it
+ANSWER_STEP_MS = 500  # resolution of the reported time without an answer
+ABANDONED_MAX = 4  # most hung threads at a time; beyond it no new solver is started
 
 
 class _Attempt:
-    """One thread with one solver. Once abandoned, nothing that it makes counts any more."""
+    """One thread with one solver. Once it is abandoned, its results are ignored."""
 
     def __init__(self, number: int) -> None:
         self.number, self.abandoned = number, threading.Event()
         self.ready = threading.Event()
-        self.busy_since_ns = 0  # 0: it waits
+        self.busy_since_ns = 0  # 0: idle
         self.is_at_task = False
-        self.took_ns: deque[int] = deque(maxlen=LATE_STEPS)  # the last steps
-        self.costs: CostBook | None = None  # of its machine and scene
+        self.took_ns: deque[int] = deque(maxlen=LATE_STEPS)  # durations of the last steps
+        self.costs: CostBook | None = None  # measured on this machine and scene
         self.error: BaseException | None = None
         self.thread: threading.Thread | None = None
 
     def leave(self) -> None:
-        """End a step between two drawings: one that draws holds Python's lock again and again."""
+        """Abort a step between two drawings, because a drawing thread keeps taking the GIL."""
         if self.thread is not None and self.thread is not threading.current_thread():
             abandon(self.thread)
 
@@ -56,7 +56,7 @@ class SolverThread(SolverHost):
     """Runs a solver alongside the presenter. `post`, `news` and `watch` never wait."""
 
     def __init__(self, make: Callable[[], SolverParts], clock: Clock) -> None:
-        """make: a solver with its own GL context, called on the thread that will use it, again after it hung."""
+        """make: creates a solver with a separate GL context on the calling thread; called again after a hang."""
         self._make, self._clock = make, clock
         self._late_ns, self._abandon_ns = round(LATE_S * NS_PER_S), round(ABANDON_S * NS_PER_S)
         self._lock = threading.Condition()
@@ -66,14 +66,14 @@ class SolverThread(SolverHost):
         self._closing = threading.Event()
         self._hung: list[_Attempt] = []
         self._is_late = False
-        self._costs: Costs | None = None  # from the first solver on
+        self._costs: Costs | None = None  # None until the first solver is ready
         self.restarts = 0
         self._attempt = self._begin(1)
 
     def wait_ready(self, go_on: Callable[[], bool] = lambda: True, *, max_s: float = math.inf) -> None:
-        """Until the solver can be asked. go_on: asked now and then; False: stop waiting.
+        """Wait until the solver accepts requests. go_on: polled; False: stop waiting.
 
-        Raises whatever making it raised, and FatalError after `max_s`.
+        Raises the error that prevented the start, and FatalError after `max_s`.
         """
         begun_ns = self._clock.now_ns()
         while not self._attempt.ready.wait(0.1):
@@ -105,7 +105,7 @@ class SolverThread(SolverHost):
         self._tasks.put(task)
 
     def close(self, timeout_s: float = 1.0) -> None:
-        """One that is still being made is not waited for: the process ends without it (`commands.guard`)."""
+        """Stop without waiting for a solver still starting: the process ends without it (`commands.guard`)."""
         self._closing.set()
         with self._lock:
             self._lock.notify_all()
@@ -119,14 +119,14 @@ class SolverThread(SolverHost):
             thread.join(patience_s(timeout_s))
 
     def _late_reason(self) -> str:
-        """Why there is no solver at the moment, empty where all is well; leaves a hung thread behind."""
+        """Return why the solver is unavailable or late (empty: it is fine); abandon and replace a hung thread."""
         attempt = self._attempt
         busy_ns = self._clock.now_ns() - attempt.busy_since_ns if attempt.busy_since_ns else 0
         if attempt.error is not None:
             if busy_ns > self._abandon_ns:
-                with suppress(TransientError):  # no thread at present
+                with suppress(TransientError):  # no thread available
                     self._attempt = self._begin(attempt.number + 1)
-            return f"the solver failed, it is made anew by and by ({_line(attempt.error)})"
+            return f"the solver failed; restarting ({_line(attempt.error)})"
         if busy_ns <= 2 * self._late_ns:
             steps = tuple(attempt.took_ns)
             late = sum(took_ns > self._late_ns for took_ns in steps)
@@ -140,15 +140,15 @@ class SolverThread(SolverHost):
         if busy_ns > abandon_ns:
             self._hung = [hung for hung in self._hung if hung.thread is not None and hung.thread.is_alive()]
         if busy_ns > abandon_ns and len(self._hung) < ABANDONED_MAX:
-            with suppress(TransientError):  # no thread at present: asked again at the next refresh
+            with suppress(TransientError):  # no thread available: retried at the next refresh
                 self._attempt = self._begin(attempt.number + 1)
                 with self._lock:
                     attempt.abandoned.set()
                 self._hung.append(attempt)
                 self.restarts += 1
-                log.error("solver: no answer for %.1f s: left behind, and made anew", busy_ns / NS_PER_S)
+                log.error("solver: no answer for %.1f s: abandoned; starting a new one", busy_ns / NS_PER_S)
         busy_ms = busy_ns // NS_PER_MS // ANSWER_STEP_MS * ANSWER_STEP_MS
-        return f"the solver {'has not answered' if attempt.ready.is_set() else 'is being made anew'} for {busy_ms} ms"
+        return f"the solver {'has not answered' if attempt.ready.is_set() else 'has been restarting'} for {busy_ms} ms"
 
     def _begin(self, number: int) -> _Attempt:
         attempt = _Attempt(number)
@@ -158,7 +158,7 @@ class SolverThread(SolverHost):
 
     def _live(self, attempt: _Attempt) -> None:
         self._run(attempt)
-        if not self._closing.is_set():  # hundreds of MiB, which the next solver's thread would not find
+        if not self._closing.is_set():  # hundreds of MiB that the next solver's thread could not reuse
             give_back()
 
     def _run(self, attempt: _Attempt) -> None:
@@ -178,7 +178,7 @@ class SolverThread(SolverHost):
             attempt.error, attempt.busy_since_ns = error, self._clock.now_ns()
             attempt.ready.set()
             if attempt.number > 1 and not isinstance(error, PhasestackError | ThreadAbandoned):
-                log.exception("solver: it could not be made anew")
+                log.exception("solver: restart failed")
             return
         self._publish(attempt, first)
         self._costs = attempt.costs.costs()
@@ -191,16 +191,16 @@ class SolverThread(SolverHost):
                 if request is not None:
                     self._step(attempt, parts, request)
         except (ContextLost, Stopped) as error:
-            log.error("solver: %s", _line(error))  # a record that held the error would hold what it held
+            log.error("solver: %s", _line(error))  # logged as text: the error's frames keep large objects alive
             attempt.error, attempt.busy_since_ns = error.with_traceback(None), self._clock.now_ns()
         except ThreadAbandoned:
             raise
-        except BaseException as error:  # what no step answers with: a bug of ours, or a library's
+        except BaseException as error:  # not an expected failure of a step: a bug here or in a library
             log.exception("solver")
             attempt.error, attempt.busy_since_ns = error.with_traceback(None), self._clock.now_ns()
         finally:
             parts.close()
-            if attempt.abandoned.is_set():  # nobody asks any more, and its frames hold what it held
+            if attempt.abandoned.is_set():  # no longer needed, and its frames keep large objects alive
                 attempt.error = None
 
     def _next_request(self) -> SolveRequest | None:
@@ -221,14 +221,14 @@ class SolverThread(SolverHost):
             self._costs = attempt.costs.costs()
 
     def _publish(self, attempt: _Attempt, step: SolverUpdate) -> bool:
-        """Take a step into the news; False: it was made by one that has been left behind."""
+        """Add a step's result to the news; return False if this attempt has been abandoned."""
         with self._lock:
             if not attempt.abandoned.is_set():
                 self._news = taken_in(self._news, step)
             return not attempt.abandoned.is_set()
 
     def _do_tasks(self, attempt: _Attempt, parts: SolverParts) -> None:
-        """Each once; those that are not done come again after the next step."""
+        """Run each task once; unfinished ones are queued again for after the next step."""
         for _ in range(self._tasks.qsize()):
             if attempt.abandoned.is_set():
                 return

@@ -1,4 +1,4 @@
-"""The daemon's state as a pure function of its conditions, and detection of late refreshes."""
+"""The daemon's state as a pure function of its conditions; detection of late refreshes."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ PARTS: tuple[Part, ...] = ("sensor", "content", "model", "panel")
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """What one turn of the loop found."""
+    """Conditions observed in one turn of the loop."""
 
     eyes: EyesLabel
-    missing: dict[Part, str]  # what does not work, and why in a few words; empty: all is well
+    missing: dict[Part, str]  # failed parts, with a short reason; empty: all is well
     presented: bool  # True once any frame has been on the panels
     flat_wanted: bool = False  # the operator asked for the 2D picture
-    stopping: str = ""  # why the daemon stops; empty: it does not
-    limited: str = ""  # why the alignment to the eyes is at its limit; empty: it is not
-    late: str = ""  # why fewer refreshes are shown than the display has; empty: all are
+    stopping: str = ""  # reason for stopping; empty: not stopping
+    limited: str = ""  # reason the alignment to the eyes is at its limit; empty: it is not
+    late: str = ""  # shortfall of refreshes against the display's rate; empty: none
     paused: bool = False  # the operator froze the picture; it is still aligned to the eyes
 
 
 def judge(conditions: Conditions) -> tuple[State, str]:
-    """The state and its reason. Priority: stopping, starting, missing parts, then the eyes."""
+    """Return the state and its reason. Priority: stopping, starting, missing parts, then the eyes."""
     if conditions.stopping:
         return State.STOPPING, conditions.stopping
     missing = [part for part in PARTS if part in conditions.missing]
@@ -47,12 +47,12 @@ def judge(conditions: Conditions) -> tuple[State, str]:
     if conditions.limited:
         remarks.append(f"alignment at its limit until the next solution: {conditions.limited}")
     if conditions.eyes == "held":
-        return State.HOLDING, "; ".join(["eyes lost, the last ones are held", *remarks])
+        return State.HOLDING, "; ".join(["eyes lost; keeping the last position", *remarks])
     return State.TRACKING, "; ".join(["eyes seen", *remarks])
 
 
 class StateMachine:
-    """Holds the state, and how long each has been held."""
+    """The current state, and the time spent in each."""
 
     def __init__(self, *, now_ns: int) -> None:
         self.state = State.STARTING
@@ -67,32 +67,32 @@ class StateMachine:
         return f"{self.state}: {', '.join(self.missing)}" if self.state is State.DEGRADED else str(self.state)
 
     def update(self, conditions: Conditions, *, now_ns: int) -> bool:
-        """Take in one turn; True if the state or what is missing changed. Stopping is final."""
+        """Update from one turn; return True if the state or the missing parts changed. Stopping is final."""
         self._held_ns[self.state] += now_ns - self._counted_ns
         self._counted_ns = now_ns
         if self.state is State.STOPPING:
             return False
         before = self.name
         self.state, reason = judge(conditions)
-        self.reason = without_secrets(reason)  # a camera's address may be in it, and this goes everywhere
+        self.reason = without_secrets(reason)  # it may contain a camera's address and is widely published
         self.missing = tuple(part for part in PARTS if part in conditions.missing)
         return self.name != before
 
     def seconds(self, *, now_ns: int) -> dict[str, float]:
-        """Seconds spent in every state up to now; the states that never were are left out."""
+        """Return the seconds spent in each state up to now, without states never entered."""
         held = dict(self._held_ns)
         held[self.state] += now_ns - self._counted_ns
         return {str(state): held_ns / NS_PER_S for state, held_ns in held.items() if held_ns > 0}
 
 
 WINDOW_NS = NS_PER_S
-LATE_SHARE = 0.9  # of the refreshes that a second should have: with fewer it is late
-WELL_SHARE = 0.95  # with so many it is late no more
-REFRESHES_MAX = 1024  # in the window
+LATE_SHARE = 0.9  # share of a second's refreshes below which the display is late
+WELL_SHARE = 0.95  # share from which it is on time again
+REFRESHES_MAX = 1024  # most refreshes in the window
 
 
 class Lateness:
-    """Fed once a refresh. Late: for a second on end, the second before had too few refreshes."""
+    """Detects lateness, updated once per refresh: a full second of too few refreshes in the window."""
 
     def __init__(self, period_ns: int) -> None:
         self._wanted = WINDOW_NS / period_ns
@@ -103,7 +103,7 @@ class Lateness:
         self._told_ns = 0
 
     def update(self, *, presented: bool, now_ns: int) -> str:
-        """Empty: in time. Otherwise `late: 38 of 60 refreshes a second`; the figure is renewed once a second."""
+        """Return "" if on time, else `late: 38 of 60 refreshes a second`, updated once a second."""
         if self._begun_ns is None:
             self._begun_ns = now_ns
         if presented:

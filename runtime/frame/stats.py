@@ -1,4 +1,4 @@
-"""Statistics of a run in bounded memory, on the run's clock (`overhead_ms`: on the machine's)."""
+"""Statistics of a run in bounded memory, on the run's clock (`overhead_ms`: the machine's)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from runtime.evaluation.refresh_quality import view_error_mm
 from runtime.frame.solver_host import SHOWN_STAGES
 from runtime.records import RefreshAccount, State
 
-WINDOW = 8192  # most values that a quantile is computed from
+WINDOW = 8192  # most values kept for a quantile
 NOW_NS = NS_PER_S  # window of the present rates: the last second
 NOW_KEPT = 1024  # most refreshes in that window
 STAGES = ("sensor", "track", *SHOWN_STAGES, "present", "wait")
@@ -21,7 +21,7 @@ OVERHEAD_STAGES = ("sensor", "track")
 
 
 class Quantiles:
-    """Quantiles over a whole run; beyond `size` values every second one is dropped. The maximum is exact."""
+    """Quantiles over a whole run; beyond `size` values every other one is dropped. The maximum is exact."""
 
     def __init__(self, size: int = WINDOW) -> None:
         self._values = np.zeros(size)
@@ -39,7 +39,7 @@ class Quantiles:
         self._count += 1
 
     def of(self, *names: str) -> dict[str, float] | None:
-        """`p50`, `p95`, `p99`, `max`, ...; None before the first value."""
+        """Return the named quantiles (`p50`, `p95`, `p99`, `max`, ...); None before the first value."""
         held = self._values[: -(-self._count // self._every)]
         if held.size == 0:
             return None
@@ -48,7 +48,7 @@ class Quantiles:
 
 
 class RunStats:
-    """Counters and quantiles of a run, updated once a refresh."""
+    """Counters and quantiles of a run, updated once per refresh."""
 
     def __init__(self) -> None:
         self.frames = self.presented = self.dropped = self.solutions = self.missed_blanks = 0
@@ -60,11 +60,11 @@ class RunStats:
         self._overhead_run, self._skew, self._age, self._sigma = Quantiles(), Quantiles(), Quantiles(), Quantiles()
         self._view_error = Quantiles()
         self._efforts_ns: dict[str, int] = {}
-        self._effort: str | None = None  # shown since the last refresh
+        self._effort: str | None = None  # shown since the last refresh, by name
         self._recent: deque[tuple[int, bool, bool]] = deque(maxlen=NOW_KEPT)  # time, presented, shows a new solution
 
     def add(self, account: RefreshAccount, *, overhead_ms: float, missed_blanks: int = 0) -> None:
-        """Count a refresh. overhead_ms: its work without presenting and waiting, on the machine's clock."""
+        """Count a refresh. overhead_ms: its time without presenting and waiting, on the machine's clock."""
         now_ns, ran = account.present_ns, account.inference == "ran"
         self._first_ns = now_ns if self._first_ns < 0 else self._first_ns
         if self._effort is not None:
@@ -98,17 +98,17 @@ class RunStats:
             self._view_error.add(view_error_mm(account.eyes_m, account.solved_for_m))
 
     def seconds(self) -> float:
-        """Seconds from the first refresh to the last."""
+        """Return the seconds from the first refresh to the last."""
         return (self._last_ns - self._first_ns) / NS_PER_S if self.frames else 0.0
 
     def reuse_saves_ms(self) -> float | None:
-        """Solver time that a refresh saves by reusing a solution; None before the first one."""
+        """Return the solver time a refresh saves by reusing a solution; None before any was reused."""
         medians = [self._stages[stage].of("p50") for stage in SHOWN_STAGES]
         known = [median["p50"] for median in medians if median is not None]
         return sum(known) if known and self.presented > self.solutions > 0 else None
 
     def rates_now(self) -> dict[str, float | None]:
-        """Refreshes and solutions a second over the last second; None with fewer than two refreshes."""
+        """Return refreshes and solutions per second over the last second; None with fewer than two refreshes."""
         newest_first = reversed(tuple(self._recent))
         recent = [*takewhile(lambda entry: entry[0] > self._last_ns - NOW_NS, newest_first)][::-1]
         if len(recent) < 2:
@@ -124,7 +124,7 @@ class RunStats:
         self.faults[part] = self.faults.get(part, 0) + 1
 
     def summary(self, *, stale_inputs: int, simulated: bool = False) -> dict[str, Any]:
-        """The counted part of summary.json (contract 5.2). Figures without a measurement are None."""
+        """Return the counted part of summary.json (contract 5.2); unmeasured figures are null."""
         seconds = self.seconds()
         return {
             "frames": self.frames,

@@ -1,4 +1,4 @@
-"""Retina pictures of what eyes should see, drawn on the solver's thread in its GL context."""
+"""Target retina pictures, drawn on the solver's thread in its GL context."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Wanted = Mapping[str, tuple[F64, int]]  # by field of `RefreshTargets`: eyes (2,
 
 
 class TargetDrawer:
-    """Draws between two steps of the solver."""
+    """Draws targets between the solver's steps."""
 
     def __init__(
         self,
@@ -27,14 +27,14 @@ class TargetDrawer:
         fov_deg: float,
         shown_content: Callable[[], object | None] = lambda: None,
     ) -> None:
-        """shown_content: returns the run's present content; None: it is never replaced."""
+        """shown_content: returns the run's current content, or None if it is never replaced."""
         self._solver, self._stack, self.fov_deg = solver, stack, fov_deg
         self.shown_content = shown_content
 
     def draw(self, wanted: Wanted, content: object | None, then: Callable[[RefreshTargets | None], None]) -> None:
-        """Draw, and hand the pictures to `then` on the solver's thread.
+        """Draw and pass the pictures to `then` on the solver's thread.
 
-        content: the run's content at that refresh; None: the present one. `then` gets None where drawing failed (the
+        content: the run's content at that refresh; None: the current one. `then` gets None if drawing failed (the
         state gives the reason) or the content has been replaced.
         """
 

@@ -12,7 +12,7 @@ KEPT = 512  # samples: eight seconds at 60 Hz
 
 
 class TrueEyes:
-    """The recorded truth at samples' captures, interpolated between them."""
+    """True eyes recorded with samples, interpolated between their capture times."""
 
     def __init__(self) -> None:
         self._known: deque[tuple[int, F64]] = deque(maxlen=KEPT)
@@ -20,7 +20,7 @@ class TrueEyes:
 
     @property
     def is_recorded(self) -> bool:
-        """True once any sample had true eyes; a live sensor's have none."""
+        """True once any sample had true eyes; a live sensor never provides them."""
         return bool(self._known)
 
     def add(self, capture_ns: int, eyes_m: F64) -> None:
@@ -37,7 +37,7 @@ class TrueEyes:
         return bool(self._known) and time_ns > self._known[-1][0] and not self._ended
 
     def at(self, time_ns: int) -> F64 | None:
-        """(2, 3) true eyes at an instant; None: not known."""
+        """Return the true eyes (2, 3) at an instant; None: unknown."""
         if not self._known or time_ns > self._known[-1][0]:
             return None
         after_ns, after_m = self._known[-1]

@@ -1,4 +1,4 @@
-"""From sensor samples to the eyes at any instant: calibrate, track, detect rest."""
+"""Viewer's eyes at any instant from sensor samples: calibrate, track, detect rest."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from runtime.records import EyesEstimate, SensorFrame
 
 log = logging.getLogger("phasestack.viewer")
 
-MAX_REST_DRIFT_M = 0.001  # of a resting head, until its place is renewed
-IN_FRONT_M = 0.01  # nearer to the front panel than this, or behind it, no eye is served
+MAX_REST_DRIFT_M = 0.001  # drift of a resting head before its position is updated
+IN_FRONT_M = 0.01  # eyes nearer to the front panel than this, or behind it, are ignored
 
 
 class Viewer:
-    """One viewer's eyes in the `stack` frame. One thread uses it; it never reads a clock."""
+    """One viewer's eyes in the `stack` frame. Single-threaded; never reads a clock."""
 
     def __init__(
         self, settings: Settings, calibration: Calibration, *, front_m: float, in_stack_frame: bool = False
@@ -51,23 +51,23 @@ class Viewer:
 
     @property
     def warning(self) -> str:
-        """Why most recent samples are implausible (exchanged eyes, millimetres, ...); else empty."""
+        """Reason most recent samples are implausible (eyes swapped, millimetres, ...); else empty."""
         return self._refusals.warning
 
     @property
     def refused(self) -> Mapping[str, int]:
-        """Samples that were not used, by reason; each is counted once."""
+        """Number of rejected samples, by reason; each counts once."""
         return self._refusals.counts
 
     @property
     def rate_hz(self) -> float | None:
-        """Samples a second, by the newest ones' captures; None before there are two."""
+        """Samples per second, from recent capture times; None before there are two."""
         if len(self._captures_ns) < 2 or self._captures_ns[-1] <= self._captures_ns[0]:
             return None
         return round((len(self._captures_ns) - 1) * NS_PER_S / (self._captures_ns[-1] - self._captures_ns[0]), 2)
 
     def take(self, frame: SensorFrame, *, serial: str) -> None:
-        """Take in a sample; one that the tracker rejects is counted and goes no further."""
+        """Process a sample; one that the tracker rejects is only counted."""
         self._captures_ns.append(frame.capture_ns)
         points = frame.eyes
         if points is not None and not self._in_stack_frame:
@@ -84,15 +84,15 @@ class Viewer:
                 log.warning("%s", warning)
 
     def at(self, display_ns: int) -> EyesEstimate:
-        """The eyes at the display time of a refresh: what is shown next is aligned to them."""
+        """Return the eyes at a refresh's display time, for aligning the next picture."""
         return self._served(self._tracker.at(display_ns))
 
     def ahead(self, time_ns: int) -> EyesEstimate:
-        """The eyes at an instant that is not shown yet: for the solver."""
+        """Return the eyes at a future instant, for the solver."""
         return self._served(self._tracker.ahead(time_ns))
 
     def _served(self, eyes: EyesEstimate) -> EyesEstimate:
-        """Where the head rests, as long as it does; nobody, where a head is predicted into the panels."""
+        """Return a resting head's fixed position, no eyes if they are predicted inside the panels, else `eyes`."""
         if eyes.eyes_m is None:
             return eyes
         if self._rest is not None and self._rest.place is not None:
@@ -104,5 +104,5 @@ class Viewer:
 
 
 def _rest_watch(settings: Settings) -> RestWatch | None:
-    """None where the plan may not show a picture again for eyes that are only nearly the same."""
+    """Create the rest watch; None if the plan may not reuse a picture for nearly unchanged eyes."""
     return RestWatch(max_drift_m=MAX_REST_DRIFT_M) if settings.plan.enabled else None

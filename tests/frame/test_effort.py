@@ -53,7 +53,7 @@ def test_a_faster_head_never_gets_a_longer_solution(one: float, other: float) ->
     assert fast <= slow
 
 
-def test_a_resting_head_gets_the_full_raster_and_a_walking_one_a_coarse_raster_without_steps() -> None:
+def test_only_a_resting_head_gets_the_full_raster_and_steps() -> None:
     assert chosen(0.0).reduction == 1
     walking = chosen(1.0)
     assert walking.reduction > 1 and walking.steps == 0

@@ -351,7 +351,7 @@ def test_making_it_anew_may_take_as_long_as_at_the_start(shop: Workshop, monkeyp
     for _ in range(12):
         shop.pass_s(ABANDON_S + 0.1)
         shop.host.news()
-    assert "the solver is being made anew for 1" in shop.host.news().missing["model"]
+    assert "the solver has been restarting for 1" in shop.host.news().missing["model"]
     shop.open.set()
     shop.made.get(timeout=PATIENCE_S)
     shop.solve(2)
