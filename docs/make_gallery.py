@@ -43,6 +43,19 @@ PICTURES = {  # in docs/images: what the commands leave, and what is made here
     "moving-viewer.png": "report/moving-viewer.png",
     "focal-slices.jpg": "report/focal-slices.png",
 }
+# Measured with the commands that it names, on 2026-11-25: not by this script.
+CHOSEN = """\
+With `model.effort = "auto"` the loop chooses raster and steps for each solution ([how](mathematics.md#effort)). Costs of a slow
+processor (render 44, prepare 40, inference 31, finish 38, step 85 ms on the full raster), 960x540, 0.3 mm of sensor
+noise, seed 780: `record --motion NAME --seed 780 --noise-mm 0.3 --seconds 12`, then `run --max-speed --scale 0.5`.
+
+| motion | live, dB | view error, mm | 95% | efforts, most of the time |
+| --- | --- | --- | --- | --- |
+| still | 27.9 | 0.8 | 2.9 | 1/1+0, 1/1+1 |
+| lean | 21.0 | 5.1 | 11.1 | 1/2+0 |
+| walk | 20.4 | 10.4 | 95 | 1/3+0 |
+| stop-and-go | 22.5 | 1.7 | 23.2 | 1/2+0, 1/3+0 |
+"""
 HEAD = """\
 <!-- Written by `make gallery`: change docs/make_gallery.py, not this page. -->
 
@@ -107,6 +120,7 @@ def page(report: dict[str, Any]) -> str:
             "there at that refresh, so that a stale view counts.\n",
             _table(["motion", "solver, ms", "live, dB", "view error, mm", "95%", "tracking error, mm"], moving),
             "![live quality](images/moving-viewer.png)\n",
+            CHOSEN,
             "## Focal parallax\n",
             "Three cards, seen by a pupil of 4 mm: where the eyes converge on each, where its picture is sharpest\n"
             "through the layers, and where in truth.\n",
