@@ -203,7 +203,7 @@ def solve_each(
     eye_sigma_mm: float = 1.0,
     progress: bool = True,
 ) -> Iterator[Result]:
-    """The results of many pairs, one after the other: left picture, right picture, eyes_m; the rest as for `solve`.
+    """Yield the results of many pairs (left picture, right picture, eyes_m); the rest as for `solve`.
 
     Pairs are read one by one, so `pairs` may be a generator that draws or reads. progress: on stderr. Raises
     ValueError, naming the pair and the argument.

@@ -116,7 +116,7 @@ class MethodResult:
 
     @property
     def spread_ms(self) -> tuple[float, float]:
-        """Run times below which one run in ten is, and nine in ten are, relative to each pair's median, of `ms_p50`."""
+        """10th and 90th percentiles of run times, relative to each pair's median, times `ms_p50`."""
         ratios = np.concatenate([np.asarray(pair.run_ms) / np.median(pair.run_ms) for pair in self.pairs])
         low, high = np.percentile(ratios, (10, 90))
         return float(low) * self.ms_p50, float(high) * self.ms_p50

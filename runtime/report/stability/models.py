@@ -184,7 +184,7 @@ def smooth(stack: PanelStack) -> list[U8]:
 def stressed(
     model: str, images: Sequence[U8], eyes_m: F64, stack: PanelStack = STACK, *, light: bool = False
 ) -> Answer:
-    """Measure the RMS error of the displayed pictures: of one ray a pixel, or of `light` (docs/contracts.md, Error)."""
+    """Measure the RMS error of displayed pictures, of one ray a pixel or of `light` (contracts: Error)."""
     layers = layers_of(model, images, eyes_m, stack)
     if layers.shape != (3, stack.height_px, stack.width_px, 3) or layers.dtype != np.uint8:
         return Answer(1.0, 0.0, note=f"layers of {layers.shape}, {layers.dtype}")
