@@ -46,8 +46,9 @@ PICTURES = {  # in docs/images: what the commands leave, and what is made here
 # Measured with the commands that it names, on 2026-11-25: not by this script.
 CHOSEN = """\
 With `model.effort = "auto"` the loop chooses raster and steps for each solution ([how](mathematics.md#effort)).
-Costs of a slow processor (render 44, prepare 40, inference 31, finish 38, step 85 ms on the full raster), 960x540, 0.3 mm of sensor
-noise, seed 780: `record --motion NAME --seed 780 --noise-mm 0.3 --seconds 12`, then `run --max-speed --scale 0.5`.
+Costs of a slow processor (render 44, prepare 40, inference 31, finish 38, step 85 ms on the full raster), 960x540,
+0.3 mm of sensor noise, seed 780: `record --motion NAME --seed 780 --noise-mm 0.3 --seconds 12`, then
+`run --max-speed --scale 0.5`.
 
 | motion | live, dB | view error, mm | 95% | efforts, most of the time |
 | --- | --- | --- | --- | --- |
