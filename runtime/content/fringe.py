@@ -69,7 +69,7 @@ def silhouette(edges: Edges, eye: F64) -> tuple[I32, I32]:
 
 
 def ramps(clip: F64, ends: I32, apex: I32, *, width_px: int, height_px: int, ramp_px: float = 1.0) -> tuple[F32, I32]:
-    """Two triangles along each outline edge: coverage 1 at the edge, 0 so many pixels outside.
+    """Two triangles along each outline edge: coverage 1 at the edge, 0 `ramp_px` pixels outside.
 
     clip: (v, 4) clip coordinates of the shape's vertices.
     Returns (k, 6, 5) clip coordinates and coverage, and (k, 6) the vertex whose colour each corner has, of the edges

@@ -1,8 +1,8 @@
 // The solver's steps on the processor (docs/mathematics.md, L1 to L5; model_export/light.py is the reference).
 //
-// Rays are compared row by row, and what they see wrong waits in a ring of rows until all rays through a row of a panel
-// have been compared: then that row moves. Its phasors live in a ring as well, from the first of its rays to the last:
-// memory that is read and written holds nothing but the panels.
+// Rays are processed row by row. Residuals go to a ring buffer of rows; a panel row is updated once every ray that
+// crosses it has been processed. Phasors are kept in a ring buffer too, from a row's first ray to its last: only the
+// panels themselves are read from and written to memory.
 #include <vector>
 
 #include "sampling.hpp"
@@ -12,13 +12,13 @@ namespace {
 constexpr int FULL = 255 * 16;   // of a panel that shows 1: sixteenths of a code
 constexpr float UNIT = 8100;     // of 1 in phasors: rounding takes no product of theirs beyond 8191
 constexpr float PI = 3.14159265f;
-constexpr double NEAR_PX = 0.5;  // a ray counts that crosses every panel so far inside its edges
-constexpr double BESIDE_PX = 2;  // of a picture, its edge goes on: its outermost bundles cover panels' pixels there
+constexpr double NEAR_PX = 0.5;  // rays count that cross every panel at least this far inside its edges
+constexpr double BESIDE_PX = 2;  // border ray bundles are extended this many pixels beyond the picture (clamp to edge)
 constexpr int MAX_SETS = 4;      // of rays, whose sums of squared slopes, 7830 each, fit 16 bits
 static_assert(FIELDS * MAX_SETS <= 2 * MAX_PANELS, "tiles of work that all sets are gathered in");
 
 struct Panel {
-  Image ahead;   // what the rays see: with momentum
+  Image ahead;   // read by the rays: with momentum
   Image moved;   // the same after the step
   Image before;  // without momentum
   Image last;    // the same after the step: the same image, but for the first step, where `before` is `ahead`
@@ -30,10 +30,10 @@ struct Problem {
   const double *panels_from_rays;  // (sets, panels, 3, 3)
   const double *rays_from_panels;  // their inverses
   const uint8_t *targets[2];       // left and right eye's, (rows of all places, width, channels)
-  const int16_t *column_taper;     // (width, channels) what the rays' errors are multiplied with, 32767 for 1
+  const int16_t *column_taper;     // (width, channels) weights of the rays' errors, 32767 for 1
   const int16_t *row_taper;        // (rows of all places)
   const int32_t *table;            // (256,) of a target's code, the sum of all panels that shows it, and 65536 times its weight
-  float rest, missing;             // closing: what lies beside a panel counts for; weight of a ray that misses one
+  float rest, missing;             // closing: value outside a panel; weight of a ray that misses one
   Panel panel[MAX_PANELS];
   float size, momentum, floor;
 
@@ -43,7 +43,7 @@ struct Problem {
   }
 };
 
-// What one thread does: rows of rays, and those of panels that are complete by then.
+// One thread's partition: rows of rays, and the panel rows that are complete after them.
 struct Share {
   int first, end;
   std::vector<int> since[MAX_PANELS], until[MAX_PANELS];  // first and last row of rays that see each row of a panel
@@ -51,7 +51,7 @@ struct Share {
   int16_t *ring;
   int64_t stride, plane;  // of a row, of one field
   int rows, fields;
-  Image cosine[MAX_PANELS], sine[MAX_PANELS];  // of pi times what the rays see
+  Image cosine[MAX_PANELS], sine[MAX_PANELS];  // of pi times `ahead`
 
   int16_t *field(int set, int f) const { return ring + (int64_t(set) * fields + f) * plane; }
   int16_t *row(int set, int f, int r) const { return field(set, f) + int64_t(r % rows) * stride; }
@@ -111,7 +111,7 @@ Share share_of(const Problem &problem, int part, int parts, int fields, bool pha
   return share;
 }
 
-// Of x, x^3, x^5 and x^7 in sin(pi/2 x), and UNIT, for 16384; what 32768 / FULL has beyond 8, for 32768.
+// Coefficients of x, x^3, x^5 and x^7 in sin(pi/2 x), and UNIT, for 16384; 32768 / FULL - 8, for 32768.
 struct Factors {
   int16_t first = 25736, third = -10583, fifth = 1302, seventh = -71, unit = int16_t(UNIT * 2), beyond_eight = 1028;
 };
@@ -124,7 +124,7 @@ INLINE int16_t cosine_of(int16_t angle, const Factors &by) {
   return product(product(x, int16_t(by.first + product(y, series))), by.unit);
 }
 
-// Row q of a panel as cosine and sine of pi times what it shows.
+// Cosine and sine of pi times row q of a panel.
 INLINE void to_phasors(const Problem &problem, const Share &share, int n, int q) {
   Factors by;
   asm("" : "+m"(by));  // products with numbers that a compiler knows are taken apart, which takes four times as long
@@ -146,7 +146,7 @@ INLINE void clear_beside(const Problem &problem, const Share &share, int set, in
   }
 }
 
-// What 1 is in the product of so many panels' phasors.
+// Fixed-point value of 1 in the product of the panels' phasors.
 INLINE float unit_of(int panels) {
   float unit = UNIT;
   for (int n = 1; n < panels; ++n) unit *= UNIT / 8192;
@@ -191,7 +191,7 @@ INLINE void compare(const Problem &problem, const Share &share, int set, int r, 
   clear_beside(problem, share, set, r, span);
 }
 
-// Where all sets' rays through a panel's row are.
+// Lines of all sets' rays through a panel's row.
 struct Back {
   Line line[MAX_SETS];
   Span span[MAX_SETS];
@@ -203,7 +203,7 @@ struct Back {
   }
 };
 
-// What the first F fields of all sets come to at pixels of a panel's row, into work.tile[0] to [F - 1].
+// Sum the first F fields of all sets at pixels of a panel's row, into work.tile[0] to [F - 1].
 template <int F, int C>
 INLINE void gather(const Problem &problem, const Share &share, const Back &back, Span tile, Work &work) {
   const int count = (tile.last - tile.first) * C;
@@ -226,7 +226,7 @@ INLINE void gather(const Problem &problem, const Share &share, const Back &back,
   }
 }
 
-// Row q of a panel, by (L5).
+// Gradient step with momentum for row q of a panel (L5).
 template <int C, int N>
 INLINE void move(const Problem &problem, const Share &share, int n, int q, Work &work) {
   const Panel &panel = problem.panel[n];
@@ -250,7 +250,7 @@ INLINE void move(const Problem &problem, const Share &share, int n, int q, Work 
   }
 }
 
-// Row r of a set of rays: the weight of a target, and that times what the other panels leave to the middle one.
+// Row r of a set of rays: the target's weight, and its product with the middle panel's residual.
 template <int C>
 INLINE void residual(const Problem &problem, const Share &share, int set, int r, Work &work) {
   const int middle = problem.panels / 2;
@@ -339,7 +339,7 @@ INLINE void close_rows(const Problem &problem, const Share &share) {
 
 }  // namespace
 
-// One of so many parts of a step, all of which may run at once; a panel's phasors are `ahead`'s.
+// Run partition `part` of `parts` of one step. Partitions are independent. Phasors are computed from `ahead`.
 FOR_EVERY_CPU void step(const Problem *problem, int part, int parts) {
   const Share share = share_of(*problem, part, parts, 2, true);
   switch (problem->channels * 10 + problem->panels) {
@@ -354,7 +354,7 @@ FOR_EVERY_CPU void step(const Problem *problem, int part, int parts) {
   }
 }
 
-// One of so many parts of the middle panel's `last`: the best for the other panels' as they stand.
+// Run partition `part` of `parts` of solving the middle panel's `last`, with the other panels fixed.
 FOR_EVERY_CPU void close_middle(const Problem *problem, int part, int parts) {
   const Share share = share_of(*problem, part, parts, 2, false);
   if (problem->channels == 3) close_rows<3>(*problem, share);

@@ -1,1 +1,1 @@
-"""Predictors: two eyes and what they should see to the values of every panel."""
+"""Predictors: values of every panel from the target pictures of two eyes."""

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("phasestack.model")
 
 EYES_M = ((0.6, -0.031, 0.0), (0.6, 0.031, 0.0))
-FIRST_SHARE = 4  # the first look is at panels of so many times fewer columns and rows
+FIRST_SHARE = 4  # the first comparison is at panels with this many times fewer columns and rows
 CLEAR = 2.5  # times as fast there: no second look is needed
 RUNS = 3  # timed, of which the fastest counts
 
@@ -35,7 +35,7 @@ class Choice:
     """A backend, and why."""
 
     backend: SolverBackend
-    why: str  # one line, with what was measured
+    why: str  # one line, with the measurement
 
 
 def choose(wanted: Wanted, predictor: Predictor, context: Callable[[], Any]) -> Choice:
@@ -89,11 +89,11 @@ def _faster(predictor: Predictor, made: Callable[[], GlBackend]) -> Choice:
 
 
 def solution_ms(predictor: Predictor, stack: PanelStack, backend: SolverBackend, *, runs: int) -> float:
-    """What one solution takes, the fastest of a few; the first, which compiles and allocates, does not count."""
+    """Milliseconds of one solution: the fastest of a few, after one that compiles and allocates."""
     solver = predictor.on_panels(stack)
     assert solver is not None
     solver.set_backend(backend)
-    # For two points: what an unsure eye costs besides is the same for all.
+    # For known eyes: the extra cost of unsure ones is the same on every backend.
     job = replace(drawn_job([_noise(stack, seed) for seed in (0, 1)], np.array(EYES_M), stack), eye_sigma_m=0.0)
     try:
         solver.solve(job)
@@ -108,7 +108,7 @@ def solution_ms(predictor: Predictor, stack: PanelStack, backend: SolverBackend,
 
 
 def _noise(stack: PanelStack, seed: int) -> U8:
-    """(h, w, 4) in colour: nothing of it can be left out."""
+    """(h, w, 4) in colour: no part of it can be skipped."""
     noise = np.random.default_rng(seed).integers(0, 256, (stack.height_px, stack.width_px, 4), np.uint8)
     noise[..., 3] = 255
     return noise

@@ -1,4 +1,4 @@
-"""What every model answers: the layers of a job."""
+"""Interface of every model: a job in, layers out."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ class Predictor(ABC):
     warmed_ms: Mapping[int, Mapping[str, float]] = MappingProxyType({1: {}})  # stage times of `warm_up`, by reduction
 
     def reads_textures_of(self, context: object) -> bool:
-        """Whether `solve` takes pictures that were left in textures of a GL context (`DrawnPicture`)."""
+        """Return True if `solve` reads pictures in textures of a GL context (`DrawnPicture`)."""
         return False
 
     def on_panels(self, stack: PanelStack) -> Predictor | None:
-        """The same model for other panels of its kind, to measure backends; None: it has one backend."""
+        """Copy of the model for other panels of its kind, to time backends; None: it has one backend."""
         return None
 
     def set_backend(self, backend: SolverBackend) -> None:  # noqa: B027 - most have one

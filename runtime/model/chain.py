@@ -157,7 +157,7 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int)
 
 @dataclass(frozen=True, slots=True)
 class _Window:
-    """What a raster covers of its plane, metres; frame `stack`."""
+    """Extent of a raster on its plane, metres; frame `stack`."""
 
     low_m: float  # along y
     high_m: float
@@ -180,7 +180,7 @@ class _Window:
 
 @dataclass(frozen=True, slots=True)
 class _LineOfEyes:
-    """Where the line through the eyes meets the plane: F = towards_f_m2 / nearer_m, anywhere up to infinity."""
+    """Intersection of the eyes' line with the plane: F = towards_f_m2 / nearer_m, up to infinity."""
 
     nearer_m: float  # half of what the right eye is farther from the plane than the left; 0 where F counts as infinite
     towards_f_m2: F64  # (2,) y, z

@@ -1,4 +1,4 @@
-"""What a model file says about itself (docs/contracts.md), checked at load."""
+"""The contract in a model file (docs/contracts.md), checked at load."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ class CpuState:
 
     def step(self, step: Step) -> None:
         held = self._held
-        # What the rays see is read long after a row has moved: the first step, which sees `last`, writes it elsewhere.
+        # Rays read rows that have been updated long ago: the first step, whose rays read `last`, writes elsewhere.
         ahead, last = (held.last, held.ahead) if self._starts else (held.ahead, held.last)
         panels_from_rays = self._geometry.panels_from_rays(step.places, self._sigma_m)
         problem, _keep = self._problem(panels_from_rays, ahead=ahead, last=last)
@@ -114,7 +114,7 @@ class CpuState:
             layer.view(np.uint32)[..., 0] = pixel
 
     def _rest_others(self) -> None:
-        """All panels that nothing was set in."""
+        """Set all panels to rest that have not been set."""
         for n in self._resting:
             box = self._geometry.boxes[n]
             self._held.last[n, : box.height_px, : box.width_px * self._channels] = self._rest
@@ -124,7 +124,7 @@ class CpuState:
         parallel_map(lambda part: work(byref(problem), part, self._threads), range(self._threads))
 
     def _problem(self, panels_from_rays: F64, *, ahead: I16, last: I16) -> tuple[Problem, object]:
-        """What the loops are given; and arrays that must live as long."""
+        """Arguments of the compiled loops, and the arrays that must outlive the call."""
         geometry, held, channels = self._geometry, self._held, self._channels
         seen, back = np.ascontiguousarray(panels_from_rays), np.ascontiguousarray(inverse(panels_from_rays))
         if len(seen) > MAX_SETS:
@@ -152,7 +152,7 @@ def _packed_table(panels: int) -> NDArray[np.int32]:
 
 
 class _Buffers:
-    """Panels between steps, for pictures of so many channels; a box begins at the first row and element."""
+    """Panels between steps, for one number of channels; a box begins at the first row and element."""
 
     def __init__(self, stack: PanelStack, channels: int) -> None:
         shape = (stack.count, stack.height_px + 1, stack.width_px * channels + SAFE)

@@ -1,7 +1,7 @@
-"""The rays of a solution: what each eye should see, the panels' windows, and homographies from rays to panel pixels.
+"""The rays of a solution: targets, the panels' windows, and homographies from rays to panel pixels.
 
-A ray belongs to a pixel of a picture. Where the picture's pixels are is the only thing that tells apart content that
-was drawn on the middle panel's raster, in a window of it or on a coarser one, and captured photographs.
+A ray belongs to a pixel of a picture. Only that homography distinguishes content that was
+drawn on the middle panel's raster, in a window of it or on a coarser one, and captured photographs.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from runtime.optics.views import relative_scale_shift, stack_from_eye
 from runtime.records import F32, F64, U8
 from runtime.support.gl import DrawnPicture
 
-PAD_PX = 2  # of what is visible
+PAD_PX = 2  # around the visible pixels
 ALIGN_PX = 8  # boxes begin and end at multiples of this, so that a half or a quarter of them is whole
 LEAST_PX = 32
 MIN_WEIGHT = 0.05  # least homogeneous weight of a window's corner relative to its middle: below, it has no image
@@ -67,7 +67,7 @@ class Geometry:
 
     @property
     def missing_weight(self) -> float:
-        """Of a ray that misses a box, where the middle panel is closed; beside a window panels rest, and it counts."""
+        """Weight of a ray that misses a box in solving the middle panel; 1 with a window, outside which panels rest."""
         return 1.0 if any(self.taper_px) else MISSING_WEIGHT
 
     def is_like(self, other: Geometry) -> bool:
@@ -107,7 +107,7 @@ class Geometry:
         return np.array(found)
 
     def _moved_px(self, eye_sigma_m: float) -> float:
-        """How far one sigma of the eyes moves what they see of a panel against the middle one, at most."""
+        """Largest displacement of a panel's picture against the middle one, for one sigma of the eyes."""
         pitch_m, middle_x_m = self.stack.panel(self.middle).pitch_u_m, self.stack.x_m[self.middle]
         shares = [abs((x_m - middle_x_m) / (self.eyes_m[:, 0].mean() - middle_x_m)) for x_m in self.stack.x_m]
         return float(eye_sigma_m * max(shares) / pitch_m)
@@ -228,7 +228,7 @@ def _span(low: float, high: float, size: int) -> tuple[int, int]:
 
 
 def taper(at_px: F64, first: int, last: int, size: int, over_px: float) -> F32:
-    """0 at pixels `first` and `last` to 1 so far inside of them, but at the edges of a panel of so many."""
+    """Ramp from 0 at pixels `first` and `last` to 1 `over_px` inside, except at the edges of a panel of `size`."""
     weights = np.ones(len(at_px))
     if over_px > 0 and first > 0:
         weights = np.minimum(weights, (at_px - first) / over_px)

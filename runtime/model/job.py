@@ -1,4 +1,4 @@
-"""The input of one solution: what both eyes should see, on which rays, and how much of the panels is solved."""
+"""The input of one solution: targets, their rays, and the part of the panels that is solved."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class SolveWindow:
     that both eyes see.
     """
 
-    box: PixelRect  # panel pixels; empty: nothing is solved
+    box: PixelRect  # panel pixels; empty: no pixel is solved
     kept: PixelRect  # middle-panel pixels inside `box` that are written; outside, the flat fill owns them
     taper_px: tuple[float, float]  # right and down: width over which the outer panels' drive is tapered to zero
     colour: tuple[int, ...] | None = None  # 8-bit codes of the background outside; None: the views show it
@@ -37,7 +37,7 @@ class SolveWindow:
 
 @dataclass(frozen=True)
 class Targets:
-    """What both eyes should see, and the rays of its pixels through a stack of a given raster."""
+    """Targets of both eyes, and the rays of their pixels through a stack of a given raster."""
 
     stack: PanelStack  # the panels' pixels as they are solved: the display's own, or coarser ones
     eyes_m: F64  # (2, 3) left and right, frame `stack`
@@ -74,7 +74,7 @@ class Targets:
 
 @dataclass(frozen=True, slots=True)
 class Savings:
-    """What was left out of a job."""
+    """Work that a job saves."""
 
     solved_share: float = 1.0  # of the panels' pixels
     channels: int = 3
@@ -110,7 +110,7 @@ class Job:
 
     @property
     def savings(self) -> Savings:
-        """What is left out."""
+        """Work that this job saves."""
         box = None if self.window is None else self.window.box
         pixels = self.stack.width_px * self.stack.height_px
         return Savings(1.0 if box is None else box.width_px * box.height_px / pixels, self.channels)

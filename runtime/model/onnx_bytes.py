@@ -48,7 +48,7 @@ def fields(data: memoryview) -> Iterator[tuple[int, memoryview, memoryview]]:
 
 
 def digest(data: bytes) -> str:
-    """SHA-256 of a model but for its metadata (where it stands itself). Raises ValueError."""
+    """SHA-256 of a model without its metadata, which holds the digest. Raises ValueError."""
     found = hashlib.sha256()
     for number, _, whole in fields(memoryview(data)):
         if number != MODEL_METADATA:
@@ -57,7 +57,7 @@ def digest(data: bytes) -> str:
 
 
 def has_external_data(data: bytes) -> bool:
-    """True where a tensor of the model lies in another file. Raises ValueError."""
+    """Return True if a tensor of the model is stored in another file. Raises ValueError."""
     for number, value, _ in fields(memoryview(data)):
         if number == MODEL_GRAPH and _graph(value, DEEPEST):
             return True

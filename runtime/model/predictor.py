@@ -1,4 +1,4 @@
-"""The model that a name stands for, and its loading; the interface is in `base`."""
+"""Find and load a model by name; the interface is in `base`."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def shipped_sha256(name: str) -> str:
 
 
 def steps_from_even(steps: int) -> tuple[Step, ...]:
-    """What serves where panels begin even in place of so many steps from a network's proposal."""
+    """Steps from panels at rest that replace `steps` steps from a network's proposal."""
     in_turn: tuple[Places, ...] = ("rising", "middle", "falling", "middle")
     sizes = (1.2,) * (4 * steps) + (0.8,) * (3 * steps // 2)
     return tuple(Step(size=size, places=in_turn[n % 4]) for n, size in enumerate(sizes))

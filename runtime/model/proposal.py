@@ -27,9 +27,9 @@ from runtime.optics.tilt import coarse_layer_from_seen
 from runtime.records import F32, F64, I16
 from runtime.support.threads import parallel_map
 
-HALF_BASELINE_M = 0.031  # of one eye that stands for both: any would do
-EDGE_SHARE = 1 / 40  # of a picture: so far beside it at most its edge goes on
-UNSEEN = -1  # what pictures ask for is positive
+HALF_BASELINE_M = 0.031  # for a single eye that replaces both: any value does
+EDGE_SHARE = 1 / 40  # of a picture's size: most pixels by which its edge is extended
+UNSEEN = -1  # targets are positive
 SHARPENED = 0.2  # of the difference, on either side: what two interpolations blur
 SHARPENING = np.array([-SHARPENED, 1 + 2 * SHARPENED, -SHARPENED])
 EVEN = rest_of(3)  # of an outer panel, sixteenths of a code
@@ -50,7 +50,7 @@ class Proposal(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class _Local:
-    """A part of the panels as a stack of its own, turned so that the eyes are beside each other."""
+    """A window of the panels as a separate stack, turned so that the eyes are level."""
 
     stack: PanelStack
     eyes_m: F64  # (2, 3), the first is the left one there
@@ -141,10 +141,10 @@ class ChainProposal:
 
 
 def _residual(targets: Sequence[I16]) -> I16:
-    """Half of how far an eye's target lies above the other one's."""
+    """Half the difference between an eye's target and the other one's."""
     own, other = targets
     half = np.asarray(cv2.subtract(own, other), np.int16) >> 1
-    # What one eye's picture does not show contradicts nothing.
+    # Rays outside one eye's picture have no residual.
     np.copyto(half, 0, where=cv2.min(own, other) < 0)
     return np.asarray(cv2.sepFilter2D(half, cv2.CV_16S, SHARPENING, SHARPENING), np.int16)
 
@@ -161,10 +161,10 @@ def _local(geometry: Geometry, *, whole: bool) -> _Local:
         eyes_m = eyes_m - np.array([0.0, y_m, z_m])
         plane_from_local = np.array([[1.0, 0.0, y_m], [0.0, 1.0, z_m], [0.0, 0.0, 1.0]])
     apart_m = np.abs(eyes_m[1] - eyes_m[0])
-    if apart_m[2] > apart_m[1]:  # eyes above each other: what was down (-z) is to the right (+y)
+    if apart_m[2] > apart_m[1]:  # eyes above each other: down (-z) becomes right (+y)
         eyes_m = np.stack([eyes_m[:, 0], -eyes_m[:, 2], -eyes_m[:, 1]], axis=1)
         stack, plane_from_local = replace(stack, tilt=None).transposed(), plane_from_local @ _SWAPPED
-    elif not apart_m.any():  # one eye that stands for both asks for no difference: any line will do
+    elif not apart_m.any():  # a single eye for both has no difference: any line does
         eyes_m = eyes_m + HALF_BASELINE_M * np.array([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
     order = (0, 1) if eyes_m[1, 1] >= eyes_m[0, 1] else (1, 0)
     return _Local(stack, eyes_m[list(order)], order, plane_from_local)

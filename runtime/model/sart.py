@@ -1,6 +1,6 @@
 """SART on one branch of Malus' law: the literature's solver, for comparison.
 
-Any stack of 2 to 8 panels. Every turn corrects all panels at once by equal shares of both eyes' residual phases
+Any stack of 2 to 8 panels. Every turn corrects all panels together by equal shares of both eyes' residual phases
 (Andersen and Kak 1984; on polarization fields Lanman et al. 2011), with the relaxation that serves it best.
 """
 

@@ -28,7 +28,10 @@ REDUCTIONS = (
     4,
 )  # rasters that are solved on: the display's own, and with this many times fewer rows and columns
 REFINED_STEPS = 8  # a solution is continued up to this many steps, as many as `best` has
-REFINING = (Step(size=0.8, places="falling"), Step(size=0.8, places="rising"))  # in turn, after the model's own
+REFINING = (
+    Step(size=0.8, places="falling"),
+    Step(size=0.8, places="rising"),
+)  # alternately, after the model's
 
 
 class StepPredictor(Predictor):
@@ -58,7 +61,7 @@ class StepPredictor(Predictor):
         self.refined_steps = max(self.steps, REFINED_STEPS)
         self._backend: SolverBackend = backend or CpuBackend()
         self._rasters: dict[PanelStack, tuple[SolverState, LayerPool]] = {}
-        self._improved: tuple[Geometry, int, int] | None = None  # rays, channels and steps that panels are held of
+        self._improved: tuple[Geometry, int, int] | None = None  # rays, channels and steps of the panels in the state
 
     @property
     def backend(self) -> str:  # type: ignore[override]

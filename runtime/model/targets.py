@@ -13,17 +13,17 @@ from runtime.records import F32, I16, U8
 
 SUBCODE = 16  # fixed point: sixteenths of an 8-bit panel code
 FULL = 255 * SUBCODE  # one panel's whole range, a quarter turn
-SLOPE_FLOOR = 0.25  # the least weight of a ray beside the slope of sin² where it is wanted
-COARSE_STEP = 16  # a look at every so many pixels tells most coloured pictures for next to nothing
+SLOPE_FLOOR = 0.25  # least weight of a ray, relative to the steepest slope of sin²
+COARSE_STEP = 16  # pixels between samples of the quick look that recognises most coloured pictures
 
 
 def rest_of(panels: int) -> int:
-    """What a panel shows at rest, in sixteenths of a code."""
+    """Value of a panel at rest, in sixteenths of a code."""
     return round(rest_value(panels) * FULL)
 
 
 def slope_of(panels: int) -> int:
-    """Which of sin²'s slopes sums are on: 1 falls from 1 to 2, 2 rises from there."""
+    """Slope of sin² that sums are on: 1 falls from 1 to 2, 2 rises from there."""
     return int(rest_value(panels) * panels)
 
 

@@ -117,7 +117,7 @@ def _compared(job: Job) -> tuple[U8, U8, tuple[int, int]]:
 def _window_around(
     box: PixelRect, eyes_m: F64, stack: PanelStack, before: SolveWindow | None, *, steep: float
 ) -> SolveWindow | None:
-    """What is solved for a box in which the eyes' pictures differ; None where that is as good as all."""
+    """Window for a box in which the eyes' pictures differ; None if the whole panel is as fast."""
     parallaxes = taper_parallaxes(steep)
     window = window_around(box, eyes_m, stack, parallaxes=parallaxes)
     if window is None:

@@ -17,8 +17,8 @@ from runtime.optics.stack import PlaneRaster
 from runtime.records import F64, I16, U8
 from runtime.support.threads import on_rows
 
-LEAST_PX, MIN_SCALE = 16, 0.25  # of a picture: smaller ones, and finer rasters, would tell nothing new
-REACH_PX = 3.0  # beside an image, to which its edge goes on at most: less than the loop's EDGE_PX
+LEAST_PX, MIN_SCALE = 16, 0.25  # of a picture: smaller ones and finer rasters add no information
+REACH_PX = 3.0  # most pixels by which an image's edge is extended: less than the loop's EDGE_PX
 LARGEST = 8191  # of an element that the compiled loop samples, either way
 _TRANSPOSED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
@@ -32,7 +32,7 @@ def source_px(image_from_raster: F64, size: tuple[int, int]) -> tuple[float, flo
 
 
 def resized_px(pixels: int, scale: float) -> int:
-    """As many pixels as a raster has in place of `pixels`, of which `scale` lie in one of its own."""
+    """Number of pixels that replace `pixels`, with `scale` of them in one."""
     return max(min(pixels, LEAST_PX), round(pixels / max(scale, MIN_SCALE)))
 
 
@@ -57,7 +57,7 @@ def picture_on(
     view: TargetView, middle: PlaneRaster, *, middle_from_result: F64, edge: int, size: tuple[int, int]
 ) -> U8:
     """(rows, columns, 3 or 4) a view's picture on a raster of (rows, columns) that a homography takes to the middle
-    panel's pixels; the picture itself where it lies there. edge: OpenCV's name for what is outside it."""
+    panel's pixels; the picture itself where it lies there. edge: OpenCV's border mode."""
     picture_from_result = np.linalg.inv(view.plane_from_picture) @ middle.plane_from_raster() @ middle_from_result
     picture_from_result = picture_from_result / picture_from_result[2, 2]
     if view.picture.shape[:2] == size and np.abs(picture_from_result - np.eye(3)).max() < SNAPPED:
@@ -69,7 +69,7 @@ def resample(
     image: NDArray[Any], image_from_result: F64, *, size: tuple[int, int], edge: int = cv2.BORDER_CONSTANT
 ) -> NDArray[Any]:
     """Bilinear samples of an image (h, w[, C]) on a raster of (rows, columns); pixel centres at half-integers.
-    edge: OpenCV's name for what lies beside the image."""
+    edge: OpenCV's border mode."""
     to_corners = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
     at_centres = np.linalg.inv(to_corners) @ image_from_result @ to_corners
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP

@@ -36,7 +36,7 @@ def retina_view(eye_m: F64, side: int, *, width_px: int, height_px: int, fov_deg
 def retina_pictures(
     content: ContentSource, eyes_m: F64, stack: PanelStack, *, fov_deg: float, time_ns: int
 ) -> tuple[U8, U8]:
-    """What content shows to eyes (2, 3), frame `stack`: (h, w, 3) retina pictures, panel size."""
+    """Draw retina pictures (h, w, 3), panel size, of content for eyes (2, 3), frame `stack`."""
     size = {"width_px": stack.width_px, "height_px": stack.height_px}
     views = [retina_view(eye, side, **size, fov_deg=fov_deg) for side, eye in enumerate(eyes_m)]
     content.expect(views, time_ns=time_ns)
@@ -57,7 +57,7 @@ def drawn_job(
     """The job of solving for eyes (2, 3), frame `stack`: content drawn for them on the middle panel's pixels.
 
     Pictures stay in textures where the model reads those; else they are the source's own arrays. reduction: of the
-    panels' rows and columns. trimmed: leave out what the scene does not need (`trim`), also of the drawing where the
+    panels' rows and columns. trimmed: skip work that the scene does not need (`trim`), drawing included, where the
     content knows its extent. before: the window of the solution before, on the same raster.
     """
     stack, trimmed = predictor.stack.reduced(reduction), trimmed and predictor.trims

@@ -1,4 +1,4 @@
-"""Measures what each saving of the plan saves and costs, here and for this scene."""
+"""Measure the time and quality of each saving of the plan, on this machine and scene."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ class TrialResult:
 
     @property
     def frame_ms(self) -> float:
-        """Of the median frame."""
+        """Time of the median frame."""
         return float(np.median(self.times_ms))
 
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """A scene with the plan and without, in turn."""
+    """A scene with the plan and without, alternately."""
 
     numbers: Measured
     with_plan: TrialResult

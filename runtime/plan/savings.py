@@ -26,7 +26,7 @@ RETURN_MARGIN_DEG = 3.0  # three standard deviations of an eye's direction: 3 mm
 
 @dataclass(frozen=True, slots=True)
 class Saving:
-    """What leaving something out came to, in one run, with and without; None: not measured."""
+    """Time saved and quality lost by a saving, measured with and without it; None: not measured."""
 
     saves_ms: float | None = None
     costs_db: float | None = None
@@ -45,21 +45,21 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is left out: for the pipeline, and as words for people."""
+    """The savings in use: for the pipeline, and as text."""
 
     eyes: tuple[bool, bool]  # left, right: which are solved for
     items: tuple[PlanItem, ...] = field(default=())
 
 
 def eyes_in_range(eyes_m: F64, *, range_deg: float = VISIBLE_DEG) -> tuple[bool, bool]:
-    """Which of two eyes (2, 3) can see the display: in front, within `range_deg` of its axis."""
+    """Return for two eyes (2, 3) whether each sees the display: in front, within `range_deg` of its axis."""
     off_axis = np.degrees(np.arctan2(np.linalg.norm(eyes_m[:, 1:], axis=1), eyes_m[:, 0]))
     left, right = (off_axis <= range_deg).tolist()
     return left, right
 
 
 def seeing_eyes(eyes_m: F64, before: tuple[bool, bool]) -> tuple[bool, bool]:
-    """The same for a viewer who is watched: an eye that is out comes back only well within the range.
+    """`eyes_in_range` with hysteresis: an eye that is out returns only well within the range.
 
     before: what this answered last. Without the margin an eye at the edge would flicker with the tracker's noise.
     """
@@ -116,7 +116,7 @@ def make_plan(
 
 
 def network_items(info: ContentInfo, numbers: Measured) -> list[PlanItem]:
-    """What the model left out of the pictures that it was given."""
+    """Plan items for the savings of the model."""
     items = _focus_items(info, numbers)
     if numbers.left_out.channels == 1:
         why = "the pictures are grey: one channel is solved for all three"

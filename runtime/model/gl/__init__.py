@@ -1,1 +1,1 @@
-"""What surrounds the network, by fragment shaders of OpenGL 3.3 core."""
+"""The solver's operations as fragment shaders of OpenGL 3.3 core."""

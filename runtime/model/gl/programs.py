@@ -32,7 +32,7 @@ class Image:
 
 
 def source(name: str, *, defines: Sequence[str] = ()) -> str:
-    """A shader with what it includes. defines: what it asks for by `#ifdef`."""
+    """Return a shader with its includes. defines: names for its `#ifdef`s."""
 
     def read(file: str) -> str:
         return (resources.files(SHADERS) / "shaders" / file).read_text(encoding="ascii")
@@ -52,7 +52,7 @@ class Passes:
 
     @contextmanager
     def drawing(self) -> Iterator[None]:
-        """Draw within this, whatever the context was used for before. Raises ContextLost where that fails."""
+        """Prepare the context for drawing. Raises ContextLost if drawing fails."""
         try:
             self.context.enable_only(moderngl.NOTHING)
             yield

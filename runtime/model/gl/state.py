@@ -31,7 +31,7 @@ PANELS, MIDDLE = 3, 1
 
 @dataclass(frozen=True, slots=True)
 class _Target:
-    """What one eye should see, in a texture."""
+    """One eye's target, in a texture."""
 
     image: Image
     first: tuple[int, int]  # its column and row that belong to the first ray
@@ -228,5 +228,5 @@ def check_size(context: moderngl.Context, stack: PanelStack) -> None:
 
 
 def _mat3(matrix: F64) -> tuple[float, ...]:
-    """Column by column, as OpenGL has it."""
+    """Column-major values, for OpenGL."""
     return tuple(matrix.T.ravel().tolist())
