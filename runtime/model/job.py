@@ -63,7 +63,9 @@ class Targets:
         """The views with about one pixel for `reduction` x `reduction` of the panels'. Computed once for each value."""
         if reduction not in self._reduced:
             middle = self.stack.panel(self.stack.count // 2)
-            left, right = parallel_map(lambda view: reduced_view(view, middle, reduction), self.views)
+            # A texture is read back on the thread of its context only, which is this one.
+            views = [TargetView(view.pixels, view.plane_from_picture) for view in self.views]
+            left, right = parallel_map(lambda view: reduced_view(view, middle, reduction), views)
             self._reduced[reduction] = left, right
         return self._reduced[reduction]
 

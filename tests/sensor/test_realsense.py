@@ -60,7 +60,8 @@ def test_colour_aligned_depth_and_the_camera_s_own_intrinsics_arrive(recording: 
     depths = [depth_of(frame) for frame in frames]
     assert depths == sorted(set(depths)) and set(depths) <= set(range(700, 700 + 10 * COUNT, 10))
     # The hole is where the colour camera, to the right of the depth camera, sees it.
-    (columns,) = np.nonzero(frame.depth_mm[60, : WIDTH_PX - 30] == 0)
+    empty = frame.depth_mm[60, : WIDTH_PX - 30] == 0
+    (columns,) = np.nonzero(empty[:-4] & empty[2:-2] & empty[4:])  # the alignment leaves single pixels without depth
     assert columns.min() == pytest.approx(100 - FOCAL_PX * OFFSET_M / (depths[-1] / 1000), abs=1.5)
 
 
