@@ -193,7 +193,12 @@ def build_run(
         raise Stopped("stopped while starting")
     in_stack_frame = driver.capabilities.in_stack_frame
     run_cell = maker.run
-    drawer = TargetDrawer(solver, stack, fov_deg=settings.content.fov_deg, shown_content=lambda: run_cell.state.content)
+    drawer = TargetDrawer(
+        solver,
+        stack,
+        fov_deg=lambda: run_cell.state.settings.content.fov_deg,
+        shown_content=lambda: run_cell.state.content,
+    )
     observer = RunObserver(
         stack,
         drawer,

@@ -29,6 +29,7 @@ Pictures = tuple[U8, U8]  # (h, w, 3) retina pictures of the left and right eye,
 class RefreshTargets:
     """Target pictures for a refresh; None: not drawn."""
 
+    fov_deg: float  # horizontal, of every picture
     solved: Pictures | None = None  # for the eyes and the instant of the solution
     used: Pictures | None = None  # for the eyes aligned to, at the solution's instant
     true: Pictures | None = None  # for the true eyes, at the display time
@@ -66,8 +67,6 @@ def measure_refresh(
     unaligned: U8 | None,
     targets: RefreshTargets,
     stack: PanelStack,
-    *,
-    fov_deg: float,
 ) -> RefreshQuality:
     """Measure a refresh as far as its targets were drawn; skip eyes that see no part of the panels.
 
@@ -77,11 +76,11 @@ def measure_refresh(
     error = None
     if targets.true is not None and account.true_eyes_m is not None:
         try:
-            error = live_error(layers, targets.true, stack, eyes_m=account.true_eyes_m, fov_deg=fov_deg)
+            error = live_error(layers, targets.true, stack, eyes_m=account.true_eyes_m, fov_deg=targets.fov_deg)
         except ValueError as why:
             log.info("live quality: not measured here (%s)", why)
     try:
-        moment, figures = _at_aligned_eyes(account, layers, unaligned, targets, stack, fov_deg, error)
+        moment, figures = _at_aligned_eyes(account, layers, unaligned, targets, stack, error)
     except ValueError as why:
         log.info("quality: not measured here (%s)", why)
         return RefreshQuality(live_error=error)
@@ -94,10 +93,10 @@ def _at_aligned_eyes(
     unaligned: U8 | None,
     targets: RefreshTargets,
     stack: PanelStack,
-    fov_deg: float,
     error: float | None,
 ) -> tuple[Moment | None, dict[str, float]]:
     eyes_m, solved_for_m, true_m = account.eyes_m, account.solved_for_m, account.true_eyes_m
+    fov_deg = targets.fov_deg
     if unaligned is None or eyes_m is None or solved_for_m is None or targets.solved is None or targets.used is None:
         return None, {}
 

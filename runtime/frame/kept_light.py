@@ -92,7 +92,7 @@ class KeptLight:
             if not drawn.is_set():
                 log.warning("stopped: no pictures for %d of %d refreshes with kept light", total - done, total)
                 for rest in self._kept[done:]:
-                    self._write(rest, RefreshTargets())
+                    self._write(rest, RefreshTargets(self._drawer.fov_deg()))
                 return
 
     def _draw(self, kept: _Kept, then: Callable[[], None]) -> None:
@@ -104,7 +104,7 @@ class KeptLight:
             wanted["true"] = true_m, account.photon_ns
 
         def write(targets: RefreshTargets | None) -> None:
-            self._write(kept, targets or RefreshTargets())
+            self._write(kept, targets or RefreshTargets(self._drawer.fov_deg()))
             then()
 
         self._drawer.draw(wanted, kept.content, write)
@@ -115,6 +115,6 @@ class KeptLight:
             "solved_for_m": account.solved_for_m,
             "eyes_m": account.eyes_m,
             "true_eyes_m": self._truth.at(account.photon_ns),
-            "fov": self._drawer.fov_deg,
+            "fov": targets.fov_deg,
         }
         self._output.light_targets(account.frame, info=info, drawn=targets.solved, true=targets.true)

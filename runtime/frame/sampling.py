@@ -152,7 +152,7 @@ class QualitySampler:
         layers, unaligned = shown_layers(refresh.frame), None
         if targets.used is not None:
             unaligned = shown_layers(replace(refresh.frame, solved_from_shown=()))
-        return measure_refresh(account, layers, unaligned, targets, self._stack, fov_deg=self._drawer.fov_deg)
+        return measure_refresh(account, layers, unaligned, targets, self._stack)
 
     def _take(self, frame: int, quality: RefreshQuality | None, *, figures: bool = True, live: bool = True) -> None:
         if quality is None:

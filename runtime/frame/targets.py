@@ -24,10 +24,13 @@ class TargetDrawer:
         solver: SolverHost,
         stack: PanelStack,
         *,
-        fov_deg: float,
+        fov_deg: Callable[[], float],
         shown_content: Callable[[], object | None] = lambda: None,
     ) -> None:
-        """shown_content: returns the run's current content, or None if it is never replaced."""
+        """fov_deg: returns the targets' present field of view, which a reload may change.
+
+        shown_content: returns the run's current content, or None if it is never replaced.
+        """
         self._solver, self._stack, self.fov_deg = solver, stack, fov_deg
         self.shown_content = shown_content
 
@@ -51,9 +54,9 @@ class TargetDrawer:
         self._solver.do(task)
 
     def _drawn(self, content: Any, wanted: Wanted) -> RefreshTargets:
-        return RefreshTargets(
-            **{
-                name: retina_pictures(content, eyes_m, self._stack, fov_deg=self.fov_deg, time_ns=time_ns)
-                for name, (eyes_m, time_ns) in wanted.items()
-            }
-        )
+        fov_deg = self.fov_deg()
+        pictures = {
+            name: retina_pictures(content, eyes_m, self._stack, fov_deg=fov_deg, time_ns=time_ns)
+            for name, (eyes_m, time_ns) in wanted.items()
+        }
+        return RefreshTargets(fov_deg, **pictures)

@@ -99,7 +99,7 @@ def looking(
     content: Any, *, solver: Drawing | None = None, simulated: bool = True, **how: Any
 ) -> tuple[RunObserver, Kept]:
     kept = Kept()
-    drawer = TargetDrawer(solver or Drawing(content), SMALL, fov_deg=FOV_DEG)
+    drawer = TargetDrawer(solver or Drawing(content), SMALL, fov_deg=lambda: FOV_DEG)
     return RunObserver(SMALL, drawer, output=kept, simulated=simulated, **how), kept
 
 
@@ -383,17 +383,22 @@ def test_a_coarse_solution_is_measured_as_the_panels_show_it(content: ContentSou
     assert kept.lights[1]["layers"].shape == observer.moment.layers.shape == observer.moment.solution.shape == shape
 
 
-def test_pictures_of_a_scene_that_was_replaced_are_not_drawn(content: ContentSource, solved: Solution) -> None:
+def test_after_a_reload_only_the_new_scene_is_drawn_in_its_own_field_of_view(
+    content: ContentSource, solved: Solution
+) -> None:
     shown: list[Any] = [content]
+    fovs_deg = [FOV_DEG]
     solver, kept = Drawing(content), Kept()
-    drawer = TargetDrawer(solver, SMALL, fov_deg=FOV_DEG, shown_content=lambda: shown[0])
+    drawer = TargetDrawer(solver, SMALL, fov_deg=lambda: fovs_deg[-1], shown_content=lambda: shown[0])
     observer = RunObserver(SMALL, drawer, evaluate_every=1, keep_light=1, output=kept, simulated=True)
     observer.sampled(sample(NS_PER_S))
     observer.refreshed(refresh(1, solved))
     shown[0] = solver.content = Moving()
+    fovs_deg.append(30.0)
     observer.sampled(sample(NS_PER_S + 3 * PERIOD_NS))
     observer.refreshed(refresh(2, solved))
     observer.finish()
+    assert observer.moment is not None and observer.moment.eye_views.fov_deg == kept.lights[2]["info"]["fov"] == 30.0
     assert list(observer.live_errors) == [2]
     assert (kept.lights[1]["true"], kept.lights[1]["drawn"]) == (None, None)
     assert kept.lights[2]["true"] is not None
