@@ -78,6 +78,19 @@ class EyesEstimate:
 
 
 @dataclass(frozen=True, slots=True)
+class Parallax:
+    """Movement of content on the panels between the eyes solved for and the present ones (`optics.relief`).
+
+    Content of relief b that is seen through pixel p of the middle panel was seen through p + b·(drift_px + growth·p).
+    """
+
+    drift_px: tuple[float, float]  # right and down
+    growth: float  # of a head that comes nearer or goes away
+    middle_from_shown: tuple[F64, ...]  # per panel (3, 3), a scale and a shift, along the present middle's rays
+    weights: tuple[float, ...]  # per panel: its pixels for one of the middle panel's, along the old middle's rays
+
+
+@dataclass(frozen=True, slots=True)
 class PanelFrame:
     """What all panels show at one refresh: an aligned solution, the flat picture, or a mix."""
 
@@ -89,6 +102,8 @@ class PanelFrame:
     flat_version: int = 0
     flatness: float = 0.0  # 0: `solved` alone, 1: `flat` alone, between: mixed linearly, code by code
     size_px: tuple[int, int] | None = None  # columns and rows of the panels; None: those of `solved`
+    relief: F32 | None = None  # (h, w) of the solution's content over the middle panel; None: unknown
+    parallax: Parallax | None = None  # None: content stays where it is on the middle panel
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,6 +187,7 @@ class Solution:
     stage_ms: dict[str, float] = field(default_factory=dict)  # by `SOLVING_STAGES`; the run's clock
     effort: Effort | None = None  # None: flat
     measures: Measures | None = None
+    relief: F32 | None = None  # (h, w) of its content over the middle panel (`optics.relief`); None: unknown
 
 
 @dataclass(frozen=True, slots=True)

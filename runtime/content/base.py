@@ -15,7 +15,7 @@ from pydantic import BaseModel
 
 from runtime.config import Section
 from runtime.optics.rect import PixelRect
-from runtime.records import F64, U8
+from runtime.records import F32, F64, U8
 
 if TYPE_CHECKING:
     from runtime.support.gl import DrawnPicture
@@ -78,6 +78,14 @@ class ContentSource(ABC):
         """The picture in a texture, valid until the side's next; None: use `render`. Raises ContentFailure."""
         return None
 
+    def nearness(self, view: View) -> F32 | None:
+        """(h, w) 1/m: the inverse of the view's third coordinate at each pixel of its side's newest picture.
+
+        0: only the background shows there. None: unknown, the panels are aligned to a new eye without it. Valid until
+        the side's next picture.
+        """
+        return None
+
     def expect(self, views: Sequence[View], *, time_ns: int) -> None:  # noqa: B027 - most have nothing to prepare
         """These views of both eyes are rendered next. Raises ContentFailure."""
 
@@ -115,6 +123,7 @@ class ForwardingSource(ContentSource):
     """A source that shows another one."""
 
     source: ContentSource  # that is shown at present
+    _drew: tuple[ContentSource | None, ContentSource | None] = (None, None)  # each side's newest picture
 
     @abstractmethod
     def forwarded(self, view: View, time_ns: int) -> tuple[ContentSource, View, int]:
@@ -137,12 +146,22 @@ class ForwardingSource(ContentSource):
         return self.source.draws_in
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture | None:
-        source, view, time_ns = self.forwarded(view, time_ns)
+        source, view, time_ns = self._forwarded(view, time_ns)
         return source.draw(view, time_ns=time_ns)
 
     def render(self, view: View, *, time_ns: int) -> U8:
-        source, view, time_ns = self.forwarded(view, time_ns)
+        source, view, time_ns = self._forwarded(view, time_ns)
         return source.render(view, time_ns=time_ns)
+
+    def nearness(self, view: View) -> F32 | None:
+        source = self._drew[view.side]
+        return None if source is None else source.nearness(view)
+
+    def _forwarded(self, view: View, time_ns: int) -> tuple[ContentSource, View, int]:
+        found = self.forwarded(view, time_ns)
+        left, right = self._drew
+        self._drew = (left, found[0]) if view.side else (found[0], right)
+        return found
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect | None:
         source, view, time_ns = self.forwarded(view, time_ns)

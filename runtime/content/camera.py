@@ -20,7 +20,7 @@ def clip_from_stack(view: View, corners_m: F64) -> F64:
     GL's first row in memory is its lowest, so the raster's v runs along GL's +y and nothing need be flipped.
     Raises ValueError where none of the corners is before the eye.
     """
-    near_m, far_m = _depth_bounds(view, corners_m)
+    near_m, far_m = depth_bounds(view, corners_m)
     if not 0.0 < near_m < far_m:
         raise ValueError(f"near {near_m} and far {far_m} do not bound a view")
     u, v, w = view.pixels_from_stack
@@ -45,7 +45,7 @@ def project(pixels_from_stack: F64, points_m: F64) -> tuple[F64, F64]:
 def covered_box(view: View, corners_m: F64, *, align_px: int = 32) -> PixelRect:
     """The pixels that a convex hull of corners may cover, grown to `align_px`; empty behind the eye."""
     pixels, depths = project(view.pixels_from_stack, corners_m)
-    if _depth_bounds(view, corners_m)[1] <= 2 * NEAREST_M:
+    if depth_bounds(view, corners_m)[1] <= 2 * NEAREST_M:
         return PixelRect(0, 0, 0, 0)
     size = [view.width_px, view.height_px]
     if (depths <= NEAREST_M).any():
@@ -57,8 +57,8 @@ def covered_box(view: View, corners_m: F64, *, align_px: int = 32) -> PixelRect:
     return PixelRect(u0, v0, max(u1, u0), max(v1, v0))
 
 
-def _depth_bounds(view: View, corners_m: F64) -> tuple[float, float]:
-    """Near and far, with a margin, that hold all of `corners_m` before the eye."""
+def depth_bounds(view: View, corners_m: F64) -> tuple[float, float]:
+    """Near and far, metres, with a margin, that hold all of `corners_m` before the eye."""
     depths = project(view.pixels_from_stack, corners_m)[1]
     far = float(depths.max()) * 1.001 + NEAREST_M
     return max(float(depths.min()) * 0.999 - NEAREST_M, min(NEAREST_M, far / 2)), far

@@ -11,7 +11,7 @@ import numpy as np
 
 from runtime.content.base import WHITE, ContentInfo, ContentSource, View
 from runtime.optics.rect import PixelRect
-from runtime.records import U8
+from runtime.records import F32, U8
 from runtime.support.background import raise_if_abandoned
 from runtime.support.gl import DrawnPicture
 
@@ -42,6 +42,7 @@ class CanvasSource(ContentSource):
         self._samples = min(samples, context.max_samples)
         self._clear_colour = (*(info.background or WHITE), 0.0)
         self._targets: dict[tuple[int, int], _Target] = {}
+        self._bounds: list[tuple[float, float] | None] = [None] * SIDES  # near and far of each side's newest picture
 
     @abstractmethod
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture: ...
@@ -52,6 +53,7 @@ class CanvasSource(ContentSource):
     def drawn(self, view: View, box: PixelRect, paint: Callable[[], None]) -> DrawnPicture:
         """Clear, let `paint` draw inside `box`; the picture of the view's side, valid until its next one."""
         raise_if_abandoned()
+        self._bounds[view.side] = None
         target = self._target(view.width_px, view.height_px)
         plain = target.plain[view.side]
         plain.use()
@@ -72,6 +74,19 @@ class CanvasSource(ContentSource):
                 self.context.copy_framebuffer(plain, drawn)
                 plain.scissor = None
         return DrawnPicture(plain.color_attachments[0], plain, target.pictures[view.side])
+
+    def nearness(self, view: View) -> F32 | None:
+        bounds, target = self._bounds[view.side], self._targets.get((view.width_px, view.height_px))
+        if bounds is None or target is None:
+            return None
+        near_m, far_m = bounds
+        read = target.plain[view.side].read(components=1, attachment=-1, dtype="f4")
+        depth = np.frombuffer(read, np.float32).reshape(view.height_px, view.width_px)
+        # Between the near and the far plane, depth is linear in the inverse of the distance.
+        found = depth * np.float32(1 / far_m - 1 / near_m)
+        found += np.float32(1 / near_m)
+        found[depth >= 1.0] = 0.0
+        return found
 
     def close(self) -> None:
         while self._targets:

@@ -284,7 +284,10 @@ class TriangleSource(CanvasSource):
             if any(part.is_blended for part in self.parts):
                 self._draw_translucent(placed, looks)
 
-        return self.drawn(view, area, paint)
+        picture = self.drawn(view, area, paint)
+        if area.width_px and area.height_px:
+            self._bounds[view.side] = camera.depth_bounds(view, corners.reshape(-1, 3))
+        return picture
 
     def _draw_translucent(self, placed: list[tuple[DrawnPart, F64]], looks: dict[int, _Look]) -> None:
         """Blend translucent parts over the opaque ones: farthest part first, back faces before front faces."""

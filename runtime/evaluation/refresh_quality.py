@@ -64,14 +64,15 @@ def live_error(layers: U8, targets: Pictures, stack: PanelStack, *, eyes_m: F64,
 def measure_refresh(
     account: RefreshAccount,
     layers: U8,
-    unaligned: U8 | None,
+    carried: tuple[U8, U8] | None,
     targets: RefreshTargets,
     stack: PanelStack,
 ) -> RefreshQuality:
     """Measure a refresh as far as its targets were drawn; skip eyes that see no part of the panels.
 
     account: with its true eyes, where they are known; layers: (N, h, w, 4), as the panels showed them;
-    unaligned: the same before alignment, None where they show no solution alone.
+    carried: the layers aligned as if all content were on the middle panel, and before alignment; None where
+    the panels show no solution alone.
     """
     error = None
     if targets.true is not None and account.true_eyes_m is not None:
@@ -80,7 +81,7 @@ def measure_refresh(
         except ValueError as why:
             log.info("live quality: not measured here (%s)", why)
     try:
-        moment, figures = _at_aligned_eyes(account, layers, unaligned, targets, stack, error)
+        moment, figures = _at_aligned_eyes(account, layers, carried, targets, stack, error)
     except ValueError as why:
         log.info("quality: not measured here (%s)", why)
         return RefreshQuality(live_error=error)
@@ -90,22 +91,24 @@ def measure_refresh(
 def _at_aligned_eyes(
     account: RefreshAccount,
     layers: U8,
-    unaligned: U8 | None,
+    carried: tuple[U8, U8] | None,
     targets: RefreshTargets,
     stack: PanelStack,
     error: float | None,
 ) -> tuple[Moment | None, dict[str, float]]:
     eyes_m, solved_for_m, true_m = account.eyes_m, account.solved_for_m, account.true_eyes_m
     fov_deg = targets.fov_deg
-    if unaligned is None or eyes_m is None or solved_for_m is None or targets.solved is None or targets.used is None:
+    if carried is None or eyes_m is None or solved_for_m is None or targets.solved is None or targets.used is None:
         return None, {}
 
-    def one_ray_db(pictures: Pictures, *, drawn_for_m: F64, seen_from_m: F64) -> float:
+    aligned, unaligned = carried
+
+    def one_ray_db(layers: U8, pictures: Pictures, *, drawn_for_m: F64, seen_from_m: F64) -> float:
         return carried_db(layers, pictures, stack, solved_for_m=drawn_for_m, eyes_m=seen_from_m, fov_deg=fov_deg)
 
     views = displayed(layers, targets.used, stack, eyes_m=eyes_m, fov_deg=fov_deg)
     light = light_psnrs_db(
-        layers,
+        aligned,
         targets.solved,
         stack,
         eyes_m=solved_for_m,
@@ -116,10 +119,10 @@ def _at_aligned_eyes(
     )
     light_db = light[TRACKING_SIGMA_MM]
     values = [light_db, views.quality.psnr_db, views.quality.ssim]
-    values.append(one_ray_db(targets.solved, drawn_for_m=solved_for_m, seen_from_m=eyes_m))
+    values.append(one_ray_db(aligned, targets.solved, drawn_for_m=solved_for_m, seen_from_m=eyes_m))
     if targets.true is not None and true_m is not None:
-        values.append(one_ray_db(targets.true, drawn_for_m=true_m, seen_from_m=true_m))
-        values.append(one_ray_db(targets.solved, drawn_for_m=solved_for_m, seen_from_m=true_m))
+        values.append(one_ray_db(layers, targets.true, drawn_for_m=true_m, seen_from_m=true_m))
+        values.append(one_ray_db(aligned, targets.solved, drawn_for_m=solved_for_m, seen_from_m=true_m))
     moment = Moment(layers, views, light_db, _lines(account, error), unaligned, solved_for_m, targets.solved)
     return moment, dict(zip(FIGURES, values, strict=False))
 

@@ -5,7 +5,7 @@ through that interval. Averaged over its life, its squared error in light at the
 who keeps still plus that of a stale view (docs/mathematics.md, "Effort"):
 
     J = Q(raster, steps) + D(sqrt(2·sigma² + v²·T²/12 + l²), T/sqrt(12)),
-    D(d, t) = y / (1 + y/D_max),    y = a·d² + b·t²
+    D(d, t) = y / (1 + y/D_max),    y = a·d²/(d + d0) + b·t²
 
 sigma: the tracker's error per axis at that instant; v: the head's speed; l: the distance moved beyond the tracker's
 horizon. One factor scales all three, so that predicted displacements match observed ones. a, b: rates at which the
@@ -37,7 +37,8 @@ FIRST_DETAIL = {
     3: 3.6e-3,
     4: 6e-3,
 }  # squared error due to a coarse raster's lost detail; initial values
-FIRST_RATE = 2e-4 / 1e-6  # per m², from the demo scene
+FIRST_RATE = 0.5  # per m, from the demo scene
+BLUR_M = 4e-3  # d0: beyond it, outlines are off by more than they are blurred, and the error grows linearly
 FIRST_CONTRAST = 0.03
 FORESIGHT_GAIN = 1 / 60  # weight of the newest refresh
 LEAST_SCALE, MOST_SCALE = 0.02, 4.0
@@ -132,7 +133,7 @@ class PictureStatistics:
 
     residual: float = FIRST_RESIDUAL  # squared error of a solution without steps, on the raster solved on
     detail: dict[int, float] = field(default_factory=lambda: dict(FIRST_DETAIL))  # by reduction
-    rate_m2: float = FIRST_RATE  # a, per m²
+    rate_m: float = FIRST_RATE  # a, per m
     rate_s2: float = 0.0  # b, per s²
     contrast: float = FIRST_CONTRAST  # D_max
     _measured: bool = False
@@ -153,7 +154,7 @@ class PictureStatistics:
 
     def stale(self, distance_m: float, elapsed_s: float) -> float:
         """Return D, the squared error of a picture drawn for an earlier, different head position."""
-        y = self.rate_m2 * distance_m**2 + self.rate_s2 * elapsed_s**2
+        y = self.rate_m * _outlines_off_m(distance_m) + self.rate_s2 * elapsed_s**2
         return y / (1 + y / self.contrast) + TAIL * y
 
     def own(self, effort: Effort) -> float:
@@ -161,13 +162,17 @@ class PictureStatistics:
         return self.detail.get(effort.reduction, 0.0) + self.residual * step_share(effort.steps)
 
     def _learn_change(self, changed: float, distance_m: float, elapsed_s: float) -> None:
-        """Fit y = a·d² + b·t² by normalised least mean squares."""
+        """Fit y = a·d²/(d + d0) + b·t² by normalised least mean squares."""
         y = changed / max(1 - changed / self.contrast, 0.1)
-        d2, t2 = (distance_m / SCALE_M) ** 2, (elapsed_s / SCALE_S) ** 2
-        a, b = self.rate_m2 * SCALE_M**2, self.rate_s2 * SCALE_S**2
-        weight = GAIN * (y - a * d2 - b * t2) / max(d2 * d2 + t2 * t2, 1e-3)
-        self.rate_m2 = max(a + weight * d2, 1e-7) / SCALE_M**2
+        off, t2 = _outlines_off_m(distance_m) / SCALE_M, (elapsed_s / SCALE_S) ** 2
+        a, b = self.rate_m * SCALE_M, self.rate_s2 * SCALE_S**2
+        weight = GAIN * (y - a * off - b * t2) / max(off * off + t2 * t2, 1e-3)
+        self.rate_m = max(a + weight * off, 1e-5) / SCALE_M
         self.rate_s2 = max(b + weight * t2, 0.0) / SCALE_S**2
+
+
+def _outlines_off_m(distance_m: float) -> float:
+    return distance_m**2 / (distance_m + BLUR_M)
 
 
 def step_share(steps: int) -> float:

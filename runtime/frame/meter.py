@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
@@ -12,6 +12,7 @@ from runtime.clock import NS_PER_S
 from runtime.model.geometry import panel_from_middle
 from runtime.model.job import Job
 from runtime.model.solver import REDUCTIONS
+from runtime.optics.relief import displacement, parallax
 from runtime.records import F32, F64, U8, Effort, Measures
 from runtime.support.gl import DrawnPicture
 
@@ -25,7 +26,7 @@ class SolutionMeter:
     """Measures solutions, comparing each with samples of the previous pictures."""
 
     def __init__(self) -> None:
-        self._before: tuple[tuple[int, ...], F32, F64, int] | None = None  # raster and window, samples, eyes, time
+        self._before: tuple[tuple[int, ...], list[U8], Job, int] | None = None  # raster and window, pictures, time
         self._counts: dict[Effort, int] = {}
         self._places = np.random.default_rng(1).random((2, RAYS, 2))
 
@@ -36,20 +37,24 @@ class SolutionMeter:
         key = Effort(effort.reduction, effort.steps)
         count = self._counts.get(key, 0)
         self._counts[key] = count + 1
-        samples = np.stack([_grid(view.pixels) for view in job.views])
+        pictures = [view.pixels for view in job.views]
+        samples = [_grid(picture) for picture in pictures]
         box = () if job.window is None else job.window.box.corners
         raster = (job.stack.width_px, job.stack.height_px, *box)
-        before, self._before = self._before, (raster, samples, job.eyes_m, time_ns)
+        before, self._before = self._before, (raster, [picture.copy() for picture in pictures], job, time_ns)
         change = None
         if before is not None and before[0] == raster:
-            moved_m = float(np.linalg.norm((job.eyes_m - before[2]).mean(axis=0)))
-            change = float(((samples - before[1]) ** 2).mean()), moved_m, abs(time_ns - before[3]) / NS_PER_S
+            _, earlier, solved, earlier_ns = before
+            moved_m = float(np.linalg.norm((job.eyes_m - solved.eyes_m).mean(axis=0)))
+            shown = _moved_grid(earlier, solved, job.eyes_m)
+            changed = float(np.mean([((new - old) ** 2).mean() for new, old in zip(samples, shown, strict=True)]))
+            change = changed, moved_m, abs(time_ns - earlier_ns) / NS_PER_S
         if count % EVERY:
             return Measures(change=change)
         return Measures(
             residual=sampled_light(layers, job, self._places, boxes=effort.reduction == 1),
             detail=lost_detail(job.views[0].pixels) if effort.reduction == 1 else {},
-            contrast=float(samples.var(axis=(1, 2)).mean()) / 2,
+            contrast=float(np.mean([sample.var(axis=(0, 1)) for sample in samples])) / 2,
             change=change,
         )
 
@@ -104,8 +109,30 @@ def _lost(band: U8, reduction: int) -> float:
 
 def _grid(picture: U8) -> F32:
     """Sample a picture on a coarse grid: (rows, columns, 3) in 0..1."""
-    rows, columns = (np.linspace(0, n - 1, min(n, k)).astype(int) for n, k in zip(picture.shape, SAMPLED, strict=False))
+    rows, columns = _grid_lines(picture)
     return np.asarray(picture[rows][:, columns, :3] / np.float32(255), np.float32)
+
+
+def _grid_lines(picture: U8) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    rows, columns = (np.linspace(0, n - 1, min(n, k)).astype(int) for n, k in zip(picture.shape, SAMPLED, strict=False))
+    return rows, columns
+
+
+def _moved_grid(pictures: Sequence[U8], job: Job, eyes_m: F64) -> list[F32]:
+    """Sample a job's pictures on the coarse grid as the panels show them to eyes (2, 3) that have moved."""
+    middle = job.stack.count // 2
+    moved = displacement(
+        job.relief, parallax(job.stack, old_m=job.eyes_m.mean(axis=0), new_m=eyes_m.mean(axis=0)), middle
+    )
+    if moved is None:
+        return [_grid(picture) for picture in pictures]
+    rows, columns = _grid_lines(pictures[0])
+    u0, v0 = (0, 0) if job.window is None else (job.window.box.u0, job.window.box.v0)
+    size_px = job.stack.width_px, job.stack.height_px
+    right, down = moved.at(columns + (u0 + 0.5), rows + (v0 + 0.5), size_px=size_px)
+    u, v = (columns + right).astype(np.float32), (rows[:, None] + down).astype(np.float32)
+    found = [cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for picture in pictures]
+    return [np.asarray(picture[..., :3] / np.float32(255), np.float32) for picture in found]
 
 
 def _sampled(layer: U8, x: F64, y: F64, *, boxes: bool) -> tuple[F32, NDArray[np.bool_]]:

@@ -25,12 +25,11 @@ from runtime.frame.solver_host import SHOWN_STAGES, SolverHost
 from runtime.frame.states import Conditions, Lateness, Part, StateMachine
 from runtime.frame.stats import RunStats
 from runtime.frame.viewer import Viewer
-from runtime.optics.alignment import align
+from runtime.optics.alignment import Alignment, align
 from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
 from runtime.plan.savings import selected_eyes
 from runtime.records import (
-    F64,
     EyesEstimate,
     FrameTiming,
     PanelFrame,
@@ -145,7 +144,7 @@ class Presenter:
         self._presented = False
         self._shown_solution: int | None = None  # number of the solution shown at the previous refresh
         self._drew_solution = False  # True once any solution has been on the panels
-        self._aligned: tuple[int, bytes, tuple[F64, ...], str] | None = None
+        self._aligned: tuple[int, bytes, Alignment] | None = None  # solution, eyes
 
     def run(self, *, frames: int | None = None) -> str:
         """Refresh until the recording ends, `frames` are done or a stop is requested; return why."""
@@ -223,33 +222,35 @@ class Presenter:
         if solution is None or flat is None:
             flatness = self._flatness.value = 1.0 if solution is None else 0.0
         self._drew_solution = self._drew_solution or (solution is not None and flatness < 1.0)
-        matrices, limited = self._alignment(eyes, solution)
+        alignment = self._alignment(eyes, solution)
         frame = PanelFrame(
             timing.id,
             solution.layers if solution is not None else None,
             solution.number if solution is not None else 0,
-            matrices,
+            alignment.solved_from_shown,
             flat.layers if flat is not None else None,
             flat.number if flat is not None else 0,
             flatness,
             (self.stack.width_px, self.stack.height_px),
+            solution.relief if solution is not None else None,
+            alignment.parallax,
         )
-        return frame, limited
+        return frame, alignment.limited
 
-    def _alignment(self, eyes: EyesEstimate, solution: Solution | None) -> tuple[tuple[F64, ...], str]:
-        """Return one matrix per panel (the last ones without eyes, () if none needed) and the limit's reason."""
+    def _alignment(self, eyes: EyesEstimate, solution: Solution | None) -> Alignment:
+        """Return the alignment to the eyes; without eyes the last one, and without matrices if none is needed."""
         plan = self.run_cell.state.settings.plan
         if solution is None or solution.solved_for_m is None or not plan.align:
-            return (), ""
+            return Alignment(())
+        last = self._aligned
         if eyes.eyes_m is None:
-            last = self._aligned
-            return (last[2], "") if last is not None and last[0] == solution.number else ((), "")
+            return replace(last[2], limited="") if last is not None and last[0] == solution.number else Alignment(())
         eyes_m = selected_eyes(eyes.eyes_m, solution.seeing)
         key = eyes_m.tobytes()
-        if self._aligned is None or self._aligned[:2] != (solution.number, key):
+        if last is None or last[:2] != (solution.number, key):
             found = align(self.stack, solved_for_m=solution.solved_for_m, eyes_m=eyes_m)
-            self._aligned = solution.number, key, found.solved_from_shown, found.limited
-        return self._aligned[2], self._aligned[3]
+            self._aligned = last = solution.number, key, found
+        return last[2]
 
     def _present(self, frame: PanelFrame) -> tuple[PresentReport | None, str]:
         """Present a frame; (None, reason) if a panel is lost, (None, "") before the first picture."""

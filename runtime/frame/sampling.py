@@ -149,10 +149,11 @@ class QualitySampler:
         if targets is None:
             return RefreshQuality()
         account = replace(refresh.account, true_eyes_m=true_m)
-        layers, unaligned = shown_layers(refresh.frame), None
+        frame, carried = refresh.frame, None
         if targets.used is not None:
-            unaligned = shown_layers(replace(refresh.frame, solved_from_shown=()))
-        return measure_refresh(account, layers, unaligned, targets, self._stack)
+            aligned = replace(frame, parallax=None)
+            carried = shown_layers(aligned), shown_layers(replace(aligned, solved_from_shown=()))
+        return measure_refresh(account, shown_layers(frame), carried, targets, self._stack)
 
     def _take(self, frame: int, quality: RefreshQuality | None, *, figures: bool = True, live: bool = True) -> None:
         if quality is None:

@@ -130,6 +130,7 @@ class Solver:
             stage_ms=watch.stage_ms,
             effort=effort,
             measures=self._meter.measure(job, prediction.layers, effort, time_ns=request.time_ns),
+            relief=job.relief,
         )
         return SolverUpdate(solution=solution)
 
@@ -143,6 +144,7 @@ class Solver:
             reduction=reduction,
             trimmed=state.settings.plan.enabled,
             before=self._windows.get(reduction),
+            in_depth=state.settings.plan.align,
         )
         self._kept = None
         if request.eyes_label == "rested" and not any(isinstance(v.picture, DrawnPicture) for v in job.views):

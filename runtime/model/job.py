@@ -13,7 +13,7 @@ from runtime.model.warp import reduced_view
 from runtime.optics.pupil import TRACKING_SIGMA_MM
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
-from runtime.records import F64, U8
+from runtime.records import F32, F64, U8
 from runtime.support.gl import DrawnPicture
 from runtime.support.threads import parallel_map
 
@@ -94,6 +94,7 @@ class Job:
     steps: int | None = None  # at most; None: the model's
     continued: bool = False  # begin from the panels of the solution before, where its rays were the same
     deadline_ns: int | None = None  # of `time.perf_counter_ns`: no further step begins after it; None: none
+    relief: F32 | None = None  # (h, w) of the content over the middle panel (`optics.relief`): for the panels, not here
 
     @property
     def views(self) -> tuple[TargetView, TargetView]:

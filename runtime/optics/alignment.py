@@ -16,13 +16,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runtime.optics.malus import rest_code
+from runtime.optics.relief import Displacement, displacement, parallax
 from runtime.optics.stack import PanelStack
-from runtime.records import F32, F64, U8, PanelFrame
+from runtime.records import F32, F64, U8, PanelFrame, Parallax
 
 FARTHEST_M = 1e6  # of any coordinate: what is farther counts as not finite
 NEAREST_M = 0.01  # of an eye before the front panel: nearer, its rays graze the panels
@@ -37,6 +39,7 @@ class Alignment:
 
     solved_from_shown: tuple[F64, ...]  # per panel (3, 3), a scale and a shift: pixels of the solved layer from shown
     limited: str = ""  # why it is at its limit, with the eyes too far from those solved for; empty: it is not
+    parallax: Parallax | None = None  # of content off the middle panel; None: the eyes are those solved for
 
 
 def reference_x_m(stack: PanelStack) -> float:
@@ -65,7 +68,8 @@ def align(stack: PanelStack, *, solved_for_m: F64, eyes_m: F64) -> Alignment:
     if share == 0.0:
         return Alignment(_as_they_are(stack), limited)
     step = (new - old) * share
-    return Alignment(tuple(_solved_from_shown(stack, n, old=old, step=step) for n in range(stack.count)), limited)
+    maps = tuple(_solved_from_shown(stack, n, old=old, step=step) for n in range(stack.count))
+    return Alignment(maps, limited, parallax(stack, old_m=old, new_m=old + step))
 
 
 def scale_and_shift(matrix: F64) -> tuple[float, float, float, float]:
@@ -100,15 +104,19 @@ def shown_layers(frame: PanelFrame) -> U8:
     maps = frame.solved_from_shown or (np.eye(3),) * len(solved)
     width, height = frame.size_px or (solved.shape[2], solved.shape[1])
     coarse = (height, width) != solved.shape[1:3]
-    if flatness <= 0.0 and not coarse and all(is_identity(matrix) for matrix in maps):
+    moved = [displacement(frame.relief, frame.parallax, n) for n in range(len(solved))]
+    still = [is_identity(matrix) and moved[n] is None for n, matrix in enumerate(maps)]
+    if flatness <= 0.0 and not coarse and all(still):
         return solved
     out = np.empty((len(solved), height, width, 4), np.uint8)
     for n, matrix in enumerate(maps):
         mixed = None if flat is None else flat[n]
-        if mixed is None and not coarse and is_identity(matrix):
+        if mixed is None and not coarse and still[n]:
             out[n] = solved[n]
             continue
-        for rows, codes in _resampled(solved[n], matrix, rest_code(len(solved)), size=(height, width)):
+        where = moved[n]
+        how = _resampled if where is None else partial(_displaced, where)
+        for rows, codes in how(solved[n], matrix, rest_code(len(solved)), size=(height, width)):
             if mixed is not None:
                 codes += (mixed[rows] - codes) * np.float32(flatness)
             codes += np.float32(0.5)
@@ -202,6 +210,36 @@ def _resampled(layer: U8, matrix: F64, rest: int, *, size: tuple[int, int]) -> I
             pixels.take(columns + k, axis=1).view(np.float32).reshape(*pixels.shape[:1], size[1], 4) for k in (0, 1)
         )
         yield strip, _between(left, right, across[:, None])
+
+
+def _displaced(
+    displacement: Displacement, layer: U8, matrix: F64, rest: int, *, size: tuple[int, int]
+) -> Iterator[tuple[slice, F32]]:
+    """`_resampled` with every pixel's own displacement."""
+    su, sv, tu, tv = scale_and_shift(matrix)
+    height, width = layer.shape[:2]
+    by_u, by_v, extended = width / size[1], height / size[0], int((height, width) != size)
+    # Outside is the resting code, and around a coarse layer first a pixel of its edge.
+    padded = np.pad(layer, ((extended, extended), (extended, extended), (0, 0)), mode="edge")
+    padded = np.pad(padded, ((1, 1), (1, 1), (0, 0)), constant_values=rest).astype(np.float32)
+    padded[..., 3] = 255.0
+    pixels, stride = padded.view(np.complex128).ravel(), padded.shape[1]
+    columns = np.arange(size[1]) + 0.5
+    for begin in range(0, size[0], ROWS):
+        strip = slice(begin, min(begin + ROWS, size[0]))
+        rows = np.arange(strip.start, strip.stop) + 0.5
+        right, down = displacement.at(columns, rows, size_px=size[::-1])
+        u = (columns * su + tu + right) * by_u + (extended + 0.5)
+        v = ((rows * sv + tv)[:, None] + down) * by_v + (extended + 0.5)
+        u, v = np.clip(u, 0.0, stride - 1.0), np.clip(v, 0.0, len(padded) - 1.0)
+        low_u, low_v = np.minimum(np.floor(u), stride - 2.0), np.minimum(np.floor(v), len(padded) - 2.0)
+        first = (low_v * stride + low_u).astype(np.intp)
+        across, along = (u - low_u).astype(np.float32)[..., None], (v - low_v).astype(np.float32)[..., None]
+        corners = [
+            pixels.take(first + step).view(np.float32).reshape(*first.shape, 4) for step in (0, 1, stride, stride + 1)
+        ]
+        above, below = _between(corners[0], corners[1], across), _between(corners[2], corners[3], across)
+        yield strip, _between(above, below, along)
 
 
 def _between(low: F32, high: F32, weight: F32) -> F32:

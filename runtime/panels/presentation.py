@@ -8,9 +8,10 @@ import numpy as np
 from runtime.config import PanelSettings
 from runtime.optics.alignment import is_identity, scale_and_shift
 from runtime.optics.malus import rest_code
+from runtime.optics.relief import displacement
 from runtime.panels import lut
 from runtime.panels.geometry import layer_from_screen, permutes_pixels
-from runtime.records import U8, PanelFrame
+from runtime.records import F32, U8, PanelFrame
 
 VERTEX = """#version 330 core
 // One triangle that covers the framebuffer; pixel: the monitor's pixels, top left origin, v down.
@@ -38,6 +39,11 @@ uniform int extended;            // pixels by which its edge is extended: a coar
 uniform bool exact;              // the mounting takes pixels to pixels
 uniform bool aligned;            // or enlarged
 uniform vec4 solved_from_shown;  // scale u, v, shift u, v in pixels of the solution
+uniform sampler2D relief;        // of the content, over the middle panel
+uniform bool displaced;          // by it
+uniform vec4 middle_from_shown;  // scale u, v, shift u, v in pixels of the panels
+uniform vec3 drift;              // right, down, and growth
+uniform float weight_px;
 uniform float flatness;
 uniform float even;
 in vec3 layer_px;
@@ -50,8 +56,15 @@ vec3 solved_texel(ivec2 at) {
     bool inside = all(greaterThanEqual(at, ivec2(-extended))) && all(lessThan(at, size + extended));
     return inside ? texelFetch(solved, clamp(at, ivec2(0), size - 1), 0).rgb : vec3(even);
 }
+vec2 solved_at(vec2 px) {  // pixels of the solution
+    vec2 at = px * solved_from_shown.xy + solved_from_shown.zw;
+    if (!displaced) return at;
+    vec2 middle = px * middle_from_shown.xy + middle_from_shown.zw;
+    float b = texture(relief, middle / size_px).r;
+    return at + weight_px * b * (drift.xy + drift.z * middle) * solved_px / size_px;
+}
 vec3 aligned_at(vec2 px) {
-    vec2 place = clamp(px * solved_from_shown.xy + solved_from_shown.zw - 0.5, vec2(-3.0), solved_px + 2.0);
+    vec2 place = clamp(solved_at(px) - 0.5, vec2(-3.0), solved_px + 2.0);
     vec2 low = floor(place), weight = place - low;
     ivec2 at = ivec2(low);
     return mix(mix(solved_texel(at), solved_texel(at + ivec2(1, 0)), weight.x),
@@ -64,7 +77,7 @@ vec4 cubic(float t) {  // of four neighbours, as OpenCV's INTER_CUBIC has them (
     return vec4(far.x, near.y, near.z, far.w);
 }
 vec3 registered_at(vec2 px) {
-    vec2 place = (aligned ? px * solved_from_shown.xy + solved_from_shown.zw : px) - 0.5;
+    vec2 place = (aligned ? solved_at(px) : px) - 0.5;
     place = clamp(place, vec2(-3.0), solved_px + 2.0);
     vec2 low = floor(place);
     vec4 across = cubic(place.x - low.x), down = cubic(place.y - low.y);
@@ -106,6 +119,8 @@ class FrameTextures:
         self._textures: dict[tuple[str, tuple[int, int]], tuple[moderngl.Texture, ...]] = {}  # by kind and raster
         self._solved: tuple[moderngl.Texture, ...] = ()
         self._flat: tuple[moderngl.Texture, ...] = ()
+        self._reliefs: dict[tuple[int, int], moderngl.Texture] = {}  # by raster
+        self._relief: moderngl.Texture | None = None  # the solution's
         self._solved_version: int | None = None
         self._flat_version: int | None = None
 
@@ -127,6 +142,7 @@ class FrameTextures:
         if lacks_solved and frame.solved is not None:
             self._solved_version = None  # until it is here as a whole
             self._solved = self._written("solved", frame.solved)
+            self._relief = None if frame.relief is None else self._relief_of(frame.relief)
             self._solved_version = frame.solved_version
         if lacks_flat and frame.flat is not None:
             self._flat_version = None
@@ -138,13 +154,25 @@ class FrameTextures:
         for unit, uploaded in enumerate((self._solved, self._flat)):
             if uploaded:
                 uploaded[index].use(unit)
+        if self._relief is not None:
+            self._relief.use(3)
 
     def release(self) -> None:
         """Give the GL objects back."""
-        for textures in self._textures.values():
+        for textures in (*self._textures.values(), self._reliefs.values()):
             for texture in textures:
                 texture.release()
         self._textures, self._solved, self._flat = {}, (), ()
+        self._reliefs, self._relief = {}, None
+
+    def _relief_of(self, relief: F32) -> moderngl.Texture:
+        key = relief.shape[1], relief.shape[0]
+        if key not in self._reliefs:
+            self._reliefs[key] = self._context.texture(key, 1, dtype="f4")
+            self._reliefs[key].filter = (moderngl.LINEAR, moderngl.LINEAR)
+            self._reliefs[key].repeat_x = self._reliefs[key].repeat_y = False
+        self._reliefs[key].write(relief)
+        return self._reliefs[key]
 
     def _written(self, kind: str, layers: U8) -> tuple[moderngl.Texture, ...]:
         """One texture a panel, of the layers' raster; created when the first of that raster come."""
@@ -201,6 +229,7 @@ class Painter:
         self._program["solved"] = 0
         self._program["flat_picture"] = 1
         self._program["curve"] = 2
+        self._program["relief"] = 3
         self._program["screen_px"] = tuple(map(float, screen_px))
         self._program["layer_from_screen"] = tuple(matrix.T.ravel())
         self._program["exact"] = permutes_pixels(matrix)
@@ -216,7 +245,14 @@ class Painter:
         self._program["size_px"] = float(width), float(height)
         self._program["solved_px"] = float(solved_width), float(solved_height)
         self._program["extended"] = int(coarse)
-        self._program["aligned"] = coarse or not is_identity(matrix)
+        moved = displacement(frame.relief, frame.parallax, index)
+        self._program["aligned"] = coarse or moved is not None or not is_identity(matrix)
+        self._program["displaced"] = moved is not None
+        if moved is not None:
+            scale_u, scale_v, shift_u, shift_v = scale_and_shift(moved.middle_from_shown)
+            self._program["middle_from_shown"] = scale_u, scale_v, shift_u, shift_v
+            self._program["drift"] = *moved.drift_px, moved.growth
+            self._program["weight_px"] = moved.weight
         self._program["solved_from_shown"] = su * by_u, sv * by_v, tu * by_u, tv * by_v
         self._program["flatness"] = 1.0 if frame.solved is None else float(frame.flatness)
         textures.use(index)

@@ -12,9 +12,10 @@ from runtime.model.job import Job, SolveWindow, Targets, drawn_views
 from runtime.model.predictor import Predictor
 from runtime.model.trim import extent_window, trim
 from runtime.optics.rect import PixelRect, union
+from runtime.optics.relief import relief_of
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import image_from_stack, raster_from_stack
-from runtime.records import F64, U8
+from runtime.records import F32, F64, U8
 from runtime.support.gl import DrawnPicture
 
 
@@ -53,12 +54,14 @@ def drawn_job(
     reduction: int = 1,
     trimmed: bool = False,
     before: SolveWindow | None = None,
+    in_depth: bool = False,
 ) -> Job:
     """The job of solving for eyes (2, 3), frame `stack`: content drawn for them on the middle panel's pixels.
 
     Pictures stay in textures where the model reads those; else they are the source's own arrays. reduction: of the
     panels' rows and columns. trimmed: skip work that the scene does not need (`trim`), drawing included, where the
-    content knows its extent. before: the window of the solution before, on the same raster.
+    content knows its extent. before: the window of the solution before, on the same raster. in_depth: with the
+    content's relief, where the source knows it.
     """
     stack, trimmed = predictor.stack.reduced(reduction), trimmed and predictor.trims
     window: SolveWindow | None = None
@@ -73,7 +76,8 @@ def drawn_job(
     views = raster_views(eyes_m, raster, reduction=reduction)
     content.expect(views, time_ns=time_ns)
     pictures = [_picture(predictor, content, view, time_ns=time_ns) for view in views]
-    job = Job(Targets(stack, eyes_m, drawn_views(pictures, stack, window)), window=window)
+    relief = _relief(content, views, stack, window) if in_depth else None
+    job = Job(Targets(stack, eyes_m, drawn_views(pictures, stack, window)), window=window, relief=relief)
     return trim(job, before) if trimmed else job
 
 
@@ -83,6 +87,21 @@ def _extent(content: ContentSource, eyes_m: F64, middle: PlaneRaster, *, time_ns
     boxes = [content.extent(view, time_ns=time_ns) for view in views]
     known = [box for box in boxes if box is not None]
     return union(known) if len(known) == len(boxes) else None
+
+
+def _relief(
+    content: ContentSource, views: tuple[View, View], stack: PanelStack, window: SolveWindow | None
+) -> F32 | None:
+    """The relief of the content that was drawn for both views, over the middle panel; None: the source has no depth."""
+    left, right = (content.nearness(view) for view in views)
+    if left is None or right is None:
+        return None
+    if window is not None:
+        whole = np.zeros((2, stack.height_px, stack.width_px), np.float32)
+        whole[(slice(None), *window.box.slices)] = left, right
+        left, right = whole
+    middle_m = stack.x_m[stack.count // 2]
+    return relief_of((left, right), distance_m=[float(view.eye_m[0]) - middle_m for view in views])
 
 
 def _picture(predictor: Predictor, content: ContentSource, view: View, *, time_ns: int) -> U8 | DrawnPicture:

@@ -1,0 +1,118 @@
+"""Depth of the content across the display, and the movement of its picture with the eyes.
+
+A point of the content on the plane x is seen from the middle between the eyes, o, through a point c of the middle
+panel's plane (x = r). With c relative to the plane's origin, relief b = (x - r) / (o_x - x) and the middle n that the
+eyes have moved to, k = (o_x - r) / (n_x - r), the same content is seen through c now where it was seen before through
+
+    c + b·((k·n - o) + (1 - k)·c)        (y and z alone).
+
+The relief of a plane at the middle panel is 0: content there stays where it is, which is what `alignment` does with
+all of it. From there, the old middle's ray leads to every other panel's pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.optics.stack import PanelStack
+from runtime.records import F32, F64, Parallax
+
+WIDEST_PX = 480  # columns of a relief: more of them show no finer outlines
+RIM_PX = 2  # of a relief's, by which nearer content extends over its surroundings: its outline must move with it
+
+Pixels = NDArray[np.floating[Any]]
+
+
+def relief_of(nearness: Sequence[F32], *, distance_m: Sequence[float]) -> F32:
+    """(h, w) relief of pictures of both eyes on one raster, of at most `WIDEST_PX` columns.
+
+    nearness: per eye (H, W), 1/m, the inverse distance along x of what the eye sees, 0: the background alone, which has
+    no relief; distance_m: per eye, from the middle panel. Of both eyes' reliefs, the one farther from 0 counts.
+    """
+    columns = nearness[0].shape[1]
+    every = -(-columns // WIDEST_PX)
+    rim = np.ones((2 * RIM_PX * every + 1,) * 2, np.uint8)
+    reliefs = []
+    for inverse, eye_m in zip(nearness, distance_m, strict=True):
+        kept = cv2.dilate(inverse, rim)[every // 2 :: every, every // 2 :: every]
+        reliefs.append(np.where(kept > 0.0, kept * np.float32(eye_m) - np.float32(1), np.float32(0)))
+    left, right = reliefs
+    return np.ascontiguousarray(np.where(np.abs(left) > np.abs(right), left, right), np.float32)
+
+
+def parallax(stack: PanelStack, *, old_m: F64, new_m: F64) -> Parallax | None:
+    """How content moves on the panels for a middle between the eyes (3,) that moved; frame `stack`.
+
+    None: with an even number of panels, none of which is the middle one, or without a movement.
+    """
+    if stack.count % 2 == 0 or np.array_equal(old_m, new_m):
+        return None
+    middle = stack.panel(stack.count // 2)
+    old, new = old_m[0] - middle.x_m, new_m[0] - middle.x_m
+    k = old / new
+    drift_m, growth = k * new_m[1:] - old_m[1:], 1.0 - k
+    places, weights = [], []
+    for n in range(stack.count):
+        raster = stack.panel(n)
+        # Along the new middle's ray, from the panel to the middle one.
+        scale = (new_m[0] - middle.x_m) / (new_m[0] - raster.x_m)
+        matrix = np.diag([scale * raster.pitch_u_m / middle.pitch_u_m, scale * raster.pitch_v_m / middle.pitch_v_m, 1])
+        y_m, z_m = new_m[1:] + (np.array([raster.left_m, raster.top_m]) - new_m[1:]) * scale
+        matrix[0, 2], matrix[1, 2] = (y_m - middle.left_m) / middle.pitch_u_m, (middle.top_m - z_m) / middle.pitch_v_m
+        places.append(matrix)
+        weights.append((old_m[0] - raster.x_m) / (old_m[0] - middle.x_m) * middle.pitch_u_m / raster.pitch_u_m)
+    drift_px = (
+        float(drift_m[0] + growth * middle.left_m) / middle.pitch_u_m,
+        -float(drift_m[1] + growth * middle.top_m) / middle.pitch_v_m,
+    )
+    return Parallax(drift_px, float(growth), tuple(places), tuple(map(float, weights)))
+
+
+@dataclass(frozen=True, slots=True)
+class Displacement:
+    """What a panel's alignment is corrected by, for content off the middle panel."""
+
+    relief: F32
+    drift_px: tuple[float, float]
+    growth: float
+    middle_from_shown: F64
+    weight: float
+
+    def at(self, columns: Pixels, rows: Pixels, *, size_px: tuple[int, int]) -> tuple[F32, F32]:
+        """(rows, columns) each, pixels of the panel right and down, for pixels (centres at half-integers)."""
+        scale_u, scale_v = self.middle_from_shown[0, 0], self.middle_from_shown[1, 1]
+        u = columns * scale_u + self.middle_from_shown[0, 2]
+        v = rows * scale_v + self.middle_from_shown[1, 2]
+        height, width = self.relief.shape
+        low_u, right = _between_centres(u * (width / size_px[0]), width)
+        low_v, down = _between_centres(v * (height / size_px[1]), height)
+        lines = (
+            self.relief[low_v] * (1 - down)[:, None] + self.relief[np.minimum(low_v + 1, height - 1)] * down[:, None]
+        )
+        b = lines[:, low_u] * (1 - right) + lines[:, np.minimum(low_u + 1, width - 1)] * right
+        b *= np.float32(self.weight)
+        across = np.asarray(self.drift_px[0] + self.growth * u, np.float32)
+        along = np.asarray(self.drift_px[1] + self.growth * v, np.float32)
+        return b * across, b * along[:, None]
+
+
+def displacement(relief: F32 | None, parallax: Parallax | None, panel: int) -> Displacement | None:
+    """A panel's; None without a relief or a movement."""
+    if relief is None or parallax is None:
+        return None
+    return Displacement(
+        relief, parallax.drift_px, parallax.growth, parallax.middle_from_shown[panel], parallax.weights[panel]
+    )
+
+
+def _between_centres(place: Pixels, count: int) -> tuple[NDArray[np.intp], F32]:
+    """The pixel whose centre is before each place, and the distance past it; clamped to the edge."""
+    inside = np.clip(place - 0.5, 0.0, count - 1.0)
+    low = np.floor(inside)
+    return low.astype(np.intp), (inside - low).astype(np.float32)
