@@ -17,8 +17,7 @@ def require(*modules: str) -> None:
     """Raise MissingPart with the package to install if a module of the `export` extra is missing."""
     for module in modules:
         if importlib.util.find_spec(module) is None:
-            package = "tensorboard" if module == "tensorboard" else "'phasestack[export]'"
-            raise MissingPart(f"{module} is not installed: pip install {package}")
+            raise MissingPart(f"{module} is not installed: pip install 'phasestack[export]'")
 
 
 Arch = Annotated[str, typer.Option(help="eyereal, unrolled, or module:Class, your torch.nn.Module on Python's path")]
@@ -54,14 +53,13 @@ def train(
     validate_every: Annotated[int, typer.Option(min=1, help="iterations between points of the curve")] = 100,
     device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="auto: a GPU if torch finds one")] = "auto",
     resume: Annotated[bool, typer.Option("--resume", help="continue from --out's checkpoint")] = False,
-    tensorboard: Annotated[bool, typer.Option("--tensorboard", help="also write event files")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="the result as one object on stdout")] = False,
 ) -> None:
     """Train a picture network by gradient descent on the light that reaches the eyes.
 
     Example: phasestack train --arch my_network:MyNetwork --out out/mine
     """
-    require("torch", *(["tensorboard"] if tensorboard else []))
+    require("torch")
     from model_export.train import Training, run_training
     from runtime.config import validated
     from runtime.support.figures import shown
@@ -83,7 +81,7 @@ def train(
         "validate_every": validate_every,
     }
     training = validated(Training, settings, source="train")
-    result = run_training(out, training, device=device, resume=resume, tensorboard=tensorboard)
+    result = run_training(out, training, device=device, resume=resume)
     typer.echo(shown(result, as_json=as_json))
 
 

@@ -17,7 +17,7 @@ from model_export.eyereal import LEAST_PX, OFFSET
 from model_export.modules import PANELS, Network, blamed, check_known, check_static, make_network, probe
 from model_export.network import SpectralSolver
 from model_export.onnx_files import picture_bytes, ports, spectral_bytes, with_contract
-from model_export.recipe import DESIGN_RANGE, Recipe, read_recipe
+from model_export.recipe import DESIGN_RANGE, read_recipe
 from model_export.stress import Feeds
 from model_export.validate import Reference, Report, check_model
 from runtime.errors import InputError
@@ -76,14 +76,9 @@ def in_torch(module: nn.Module) -> Reference:
 
 
 def spectral_model(name: str) -> tuple[bytes, nn.Module]:
-    """Build a shipped model from its recipe."""
+    """Build a shipped model from its recipe: its ONNX file with the contract, and its module."""
     recipe = read_recipe(name)
     net = SpectralSolver(recipe.cell_px).eval()
-    return spectral_file(net, recipe), net
-
-
-def spectral_file(net: SpectralSolver, recipe: Recipe) -> bytes:
-    """Export a recipe's network as ONNX with its contract."""
     contract = Contract(
         version=2,
         arch="spectral",
@@ -106,7 +101,7 @@ def spectral_file(net: SpectralSolver, recipe: Recipe) -> bytes:
         reduction=recipe.reduction,
         steps=recipe.steps,
     )
-    return with_contract(spectral_bytes(net, cell_px=recipe.cell_px), contract)
+    return with_contract(spectral_bytes(net, cell_px=recipe.cell_px), contract), net
 
 
 def picture_network(

@@ -160,14 +160,10 @@ def improved(panels: Tensor, targets: Tensor, views: Views, sizes: Sequence[Any]
     return x
 
 
-def _phasors(panels: Tensor) -> Tensor:
-    angle = torch.pi * panels
-    return torch.complex(torch.cos(angle), torch.sin(angle))
-
-
 def _bundles(panels: Tensor, views: Views) -> tuple[list[Tensor], Tensor]:
     """z_n of every ray set, (N, C, h, w) complex each, and a mask of the rays that count (E, 1, h, w)."""
-    parts = torch.view_as_real(_phasors(panels)).movedim(-1, 1).flatten(1, 2)  # (N, 2C, H, W)
+    angle = torch.pi * panels
+    parts = torch.cat([torch.cos(angle), torch.sin(angle)], dim=1)  # (N, 2C, H, W)
     bundles, counts = [], []
     for matrices in views.panels_from_rays:
         values, inside = _sample(parts, matrices, (views.height_px, views.width_px), near_px=NEAR_PX)

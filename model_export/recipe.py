@@ -28,13 +28,10 @@ class Recipe(Section):
     reduction: Literal[1, 2, 4] = 2
     steps: Steps = ()
 
-    def canonical(self) -> bytes:
-        """Canonical JSON, equal for equal recipes."""
-        return json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":")).encode()
-
     def sha256(self) -> str:
-        """Digest for the contract."""
-        return hashlib.sha256(self.canonical()).hexdigest()
+        """Digest for the contract, of canonical JSON."""
+        text = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()
 
 
 def read_recipe(name: str) -> Recipe:

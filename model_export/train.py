@@ -7,21 +7,19 @@ a resumed training gives the same result as an uninterrupted one.
 from __future__ import annotations
 
 import contextlib
-import io
 import math
 import os
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, Literal
 
 import torch
-from matplotlib.figure import Figure
 from pydantic import Field
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
@@ -32,6 +30,7 @@ from model_export.modules import COLOURS, PANELS, Form, Network, blamed, make_ne
 from model_export.pairs import TrainingPairs, folder_pairs
 from runtime.config import Section, load_stack
 from runtime.errors import InputError
+from runtime.report.page import drawing, png
 from runtime.support.artifacts import write_bytes, write_text
 from runtime.support.progress import progress_bar
 
@@ -63,9 +62,7 @@ class Training(Section):
     panels: str = ""
 
 
-def run_training(
-    out: Path, training: Training, *, device: Device = "auto", resume: bool = False, tensorboard: bool = False
-) -> dict[str, Any]:
+def run_training(out: Path, training: Training, *, device: Device = "auto", resume: bool = False) -> dict[str, Any]:
     """Train, writing checkpoint, curve and its plot along the way. Raises InputError."""
     place, start = _placed(device), time.monotonic()
     network = make_network(training.arch, training.options, seed=training.seed)
@@ -80,7 +77,6 @@ def run_training(
     if place.type == "cpu" and training.width_px * training.height_px * training.batch <= SMALL_PX:
         torch.set_num_threads(1)
     unseen = list(DataLoader(held_out, 1, sampler=range(len(held_out))))
-    needs = _needs(network, _loader(pairs, training, 0, 1), place)
     curve = curve or [[0, math.nan, _held_out_db(network, unseen, place)]]
 
     def save(number: int) -> None:
@@ -94,8 +90,7 @@ def run_training(
         }
         save_checkpoint(out / "checkpoint.pth", state)
 
-    title = f"training {training.arch}, {needs}"
-    with progress_bar(title) as progress, _board(out, done, asked=tensorboard) as board, _signals() as stop:
+    with progress_bar(f"training {training.arch}") as progress, _signals() as stop:
         for number, batch in enumerate(_loader(pairs, training, done, training.iterations), start=done + 1):
             torch.manual_seed(training.seed * HELD_OUT_SEED + number)
             with blamed(training.arch, f"iteration {number}"):
@@ -122,7 +117,6 @@ def run_training(
                 continue
             curve.append([number, sum(lights) / len(lights), _held_out_db(network, unseen, place)])
             lights.clear()
-            board(curve[-1])
             save(number)
             write_text(out / "curve.csv", "\n".join([",".join(COLUMNS), *map(_row, curve)]) + "\n")
             write_bytes(out / "curve.png", _drawn(curve, training.arch))
@@ -130,7 +124,6 @@ def run_training(
         "arch": training.arch,
         "iterations": curve[-1][0],
         "seconds": round(time.monotonic() - start, 1),
-        "needs": needs,
         "start_db": round(curve[0][2], 3),
         "held_out_db": round(curve[-1][2], 3),
         "held_out_pairs": "the training pair" if pairs.folder == held_out.folder != () else held_out.count,
@@ -221,11 +214,9 @@ def _data(training: Training, form: Form) -> tuple[TrainingPairs, TrainingPairs]
     return learned, replace(learned, seed=HELD_OUT_SEED, count=len(held) or HELD_OUT, folder=held)
 
 
-def _loader(
-    pairs: TrainingPairs, training: Training, first: int, last: int, *, batch: int | None = None
-) -> DataLoader[Batch]:
+def _loader(pairs: TrainingPairs, training: Training, first: int, last: int) -> DataLoader[Batch]:
     """Load the batches of iterations `first` to `last`, which depend only on their numbers."""
-    size = batch or training.batch
+    size = training.batch
     workers = min(8, len(os.sched_getaffinity(0)) - 1) if torch.cuda.is_available() else 0
     return DataLoader(pairs, size, sampler=range(first * size, last * size), num_workers=workers)
 
@@ -238,39 +229,6 @@ def _placed(device: Device) -> torch.device:
 
 def _on(batch: Batch, device: torch.device) -> Batch:
     return {name: value.to(device) for name, value in batch.items()}
-
-
-def _needs(network: Network, batches: DataLoader[Batch], device: torch.device) -> str:
-    """Memory needed by an iteration, as text, measured by one forward pass. Raises InputError if there is less."""
-    free = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else _free_bytes()
-    weights = 4 * sum(p.numel() * p.element_size() for p in network.net.parameters())  # with gradient and two moments
-    kept: dict[int, int] = {}
-
-    def keep(tensor: Tensor) -> Tensor:
-        kept[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
-        if weights + sum(kept.values()) > free:
-            problem = f"needs more than the {_gib(free)} available: reduce --width, --height or --batch"
-            raise InputError(network.arch, "memory", problem)
-        return tensor
-
-    state = {name: value.clone() for name, value in network.net.state_dict().items()}
-    with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor), blamed(network.arch, "forward"):
-        loss = _loss(network, _on(next(iter(batches)), device))
-    del loss
-    network.net.load_state_dict(state)  # restores running statistics changed by the batch
-    return f"{_gib(weights + sum(kept.values()))} of memory of {_gib(free)} free"
-
-
-def _free_bytes() -> int:
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
-            if line.startswith("MemAvailable:"):
-                return int(line.split()[1]) << 10
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-
-
-def _gib(size: int) -> str:
-    return f"{size / (1 << 30):.2g} GiB"
 
 
 def _resumed(
@@ -296,36 +254,16 @@ def _resumed(
     return int(table.get("done", curve[-1][0])), curve, list(table.get("lights", []))
 
 
-@contextlib.contextmanager
-def _board(out: Path, done: int, *, asked: bool) -> Iterator[Callable[[list[float]], None]]:
-    """Yield a function that adds points of the curve to TensorBoard's event files, if asked for."""
-    if not asked:
-        yield lambda point: None
-        return
-    from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415 - an optional package
-
-    with SummaryWriter(str(out / "tensorboard"), purge_step=done + 1) as writer:
-
-        def add(point: list[float]) -> None:
-            for name, value in zip(COLUMNS[1:], point[1:], strict=True):
-                writer.add_scalar(name, value, int(point[0]))
-
-        yield add
-
-
 def _row(point: list[float]) -> str:
     return ",".join("" if math.isnan(value) else f"{value:.6g}" for value in point)
 
 
 def _drawn(curve: list[list[float]], title: str) -> bytes:
     """Plot the curve as a PNG."""
-    figure = Figure(figsize=(7, 4), layout="constrained")
-    axes = figure.add_subplot(title=title, xlabel="iterations", ylabel="light, dB")
-    numbers, learned, held_out = zip(*curve, strict=True)
-    axes.plot(numbers, learned, label="training pairs (model of light)")
-    axes.plot(numbers, held_out, "o-", label="held-out pairs (random rays)")
-    axes.legend()
-    axes.grid(alpha=0.3)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=120)
-    return buffer.getvalue()
+    with drawing(7, 4) as figure:
+        axes = figure.add_subplot(title=title, xlabel="iterations", ylabel="light, dB")
+        numbers, learned, held_out = zip(*curve, strict=True)
+        axes.plot(numbers, learned, label="training pairs (model of light)")
+        axes.plot(numbers, held_out, "o-", label="held-out pairs (random rays)")
+        axes.legend()
+    return png(figure)

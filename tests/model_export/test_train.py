@@ -125,7 +125,7 @@ def test_training_raises_the_light_that_eyes_get_and_leaves_its_files(tmp_path: 
     result = run_training(tmp_path, Training(**SHORT | {"iterations": 40, "validate_every": 40, "pairs": 1}))
     rows = curve(tmp_path)
     assert rows[0] == ["iteration", "light_db", "held_out_light_db"] and [row[0] for row in rows[1:]] == ["0", "40"]
-    assert "GiB" in result["needs"] and result["iterations"] == 40
+    assert result["iterations"] == 40
     assert read_image(tmp_path / "curve.png").shape[2] == 3
     table = load_checkpoint(tmp_path / "checkpoint.pth")
     assert table["training"]["options"] == SHORT["options"]
@@ -208,13 +208,6 @@ def test_what_cannot_be_trained_is_refused_before_anything_is_written(
 ) -> None:
     with pytest.raises(InputError, match=re.escape(problem)):
         run_training(tmp_path / "out", Training(**SHORT | changes))
-    assert not (tmp_path / "out").exists()
-
-
-def test_more_memory_than_there_is_is_told_before_it_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("model_export.train._free_bytes", lambda: 1 << 20)
-    with pytest.raises(InputError, match=r"memory: needs more than the .* GiB available"):
-        run_training(tmp_path / "out", Training(**SHORT | {"width_px": 256, "height_px": 160}))
     assert not (tmp_path / "out").exists()
 
 
