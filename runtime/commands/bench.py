@@ -57,7 +57,8 @@ def compare(
     before, after = benchmark.read(old), benchmark.read(new)
     changes = benchmark.compare(before, after)
     worse = [change for change in changes if change.worse]
-    busy = [f"{path}: {why}" for path, file in ((old, before), (new, after)) if (why := file.too_busy())]
+    files = ((old, before), (new, after))
+    busy = [f"{path}: {why}" for path, file in files if (why := benchmark.too_busy(file.yardsticks_ms))]
     if as_json:
         rows = [{"what": change.what, "worse": change.worse, "text": change.text} for change in changes]
         print(to_json({"worse": len(worse), "changes": rows, "times_compared": not busy, "too_busy": busy}))

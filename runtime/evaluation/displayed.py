@@ -129,5 +129,4 @@ def on_panels_raster(picture: Picture, stack: PanelStack) -> Picture:
     if (width_px, height_px) == size:
         return picture
     resized: Any = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    result: Picture = resized
-    return result
+    return resized  # type: ignore[no-any-return]

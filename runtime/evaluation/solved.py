@@ -65,22 +65,18 @@ class SolvedPair:
     @cached_property
     def quality(self) -> PairQuality:
         """Measured quality; above `WHOLE_PX`, light is sampled and has a standard error."""
-        views = self.eye_views
-        at_eyes, height_px = views.quality, views.wanted[0].shape[0]
-        every, errors = 1, dict[str, float]()
-        if height_px * views.wanted[0].shape[1] <= WHOLE_PX:
-            light = expected_db(views, self.layers, light=True)
-        else:
-            every = 4 * math.ceil(height_px / 2160)
-            light, errors = sampled_db(views, self.layers, sigmas_mm=SIGMAS_MM, every=every)
-        expected = expected_db(views, self.layers, every=every)
-        return PairQuality(light, expected, at_eyes.psnr_db, at_eyes.ssim, tuple(at_eyes.eye_psnr_db), errors)
+        height_px, width_px = self.eye_views.wanted[0].shape[:2]
+        every = 1 if height_px * width_px <= WHOLE_PX else 4 * math.ceil(height_px / 2160)
+        return self._measured(self.eye_views, sigmas_mm=SIGMAS_MM, every=every)
 
     def sampled(self, *, sigmas_mm: Sequence[float], every: int) -> PairQuality:
         """Light of every `every`-th pixel each way, with its standard error; no SSIM."""
         views = displayed(
             self.layers, self.pictures, self.stack, eyes_m=self.eyes_m, fov_deg=self.fov_deg, similarity=False
         )
+        return self._measured(views, sigmas_mm=sigmas_mm, every=every)
+
+    def _measured(self, views: EyeViews, *, sigmas_mm: Sequence[float], every: int) -> PairQuality:
         if every == 1:
             light, errors = expected_db(views, self.layers, light=True, sigmas_mm=sigmas_mm), dict[str, float]()
         else:

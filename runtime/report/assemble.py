@@ -34,10 +34,6 @@ class GrowingPage:
         self._progress(what)
         self.record["measuring"] = what
 
-    def timed(self) -> None:
-        """Times were measured: note how long a fixed workload takes now."""
-        self.record["yardsticks_ms"].append(yardstick_ms())
-
     def put(self, name: str, section: PageSection) -> None:
         """Add a section, or replace the one of that name."""
         self._sections[name] = section
@@ -112,9 +108,9 @@ def _frontier(
     before, results = page.record.get(key, []), dict[str, MethodResult]()
     for done, result in measure(methods, pairs, viewers=page.out):
         page.doing(f"{title}: {done} is done")
-        page.timed()
+        page.record["yardsticks_ms"].append(yardstick_ms())
         results[result.name] = result
-        page.record[key] = before + [one.record() for one in results.values()]
+        page.record[key] = before + [asdict(one) for one in results.values()]
         page.put(name, frontier_section(list(results.values()), title=title, name=name))
 
 
@@ -134,8 +130,5 @@ def _focal(page: GrowingPage) -> None:
         stack = focal.focal_stack(
             painter, full, model="best", progress=lambda done, of: page.doing(f"focal stack {done}/{of}")
         )
-    page.record["focal"] = {
-        "model": stack.model,
-        "cards": [asdict(card) for card in stack.cards],
-    }
+    page.record["focal"] = {"model": stack.model, "cards": [asdict(card) for card in stack.cards]}
     page.put("focal", focal_section(stack))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -50,10 +50,6 @@ class RegressionFile(BaseModel):
     yardstick_ms: PositiveFloat
     yardsticks_ms: Annotated[list[PositiveFloat], Field(min_length=1)]  # over the whole measurement
     methods: list[BenchEntry]
-
-    def too_busy(self) -> str:
-        """Reason why times can't be compared (other load on the machine); empty: they can."""
-        return too_busy(self.yardsticks_ms)
 
 
 def too_busy(yardsticks_ms: Sequence[float]) -> str:
@@ -119,7 +115,7 @@ def measured(
 
 
 def _entry(result: MethodResult) -> dict[str, Any]:
-    record = result.record()
+    record = asdict(result)
     del record["pairs"]
     return record | {"scatter": scatter(result.pairs[0].run_ms)}
 
@@ -140,7 +136,7 @@ def compare(old: RegressionFile, new: RegressionFile) -> list[Change]:
     """
     later = {entry.title: entry for entry in new.methods}
     machine = new.yardstick_ms / old.yardstick_ms
-    comparable = not (old.too_busy() or new.too_busy())
+    comparable = not (too_busy(old.yardsticks_ms) or too_busy(new.yardsticks_ms))
     changes: list[Change] = []
     for before in old.methods:
         name = before.title

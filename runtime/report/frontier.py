@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeVar
@@ -125,10 +125,6 @@ class MethodResult:
     def quoted_db(self) -> float:
         """The figure to quote; NaN where such eyes see no part of the panels."""
         return self.light_db.get(QUOTED, math.nan)
-
-    def record(self) -> dict[str, Any]:
-        """Entry of report.json."""
-        return asdict(self)
 
 
 def measure(

@@ -62,7 +62,7 @@ def test_methods_are_measured_whole_pair_by_pair(
         assert 0 < result.ms_p50 <= result.ms_p99
         assert 30 < result.memory_mib < 4096
         assert result.worst_eye_psnr_db <= result.psnr_db
-        assert result.record()["light_db"].keys() == {"0", "1", "2"}
+        assert result.light_db.keys() == {"0", "1", "2"}
         assert result.quoted_db == result.light_db["1"]
         # What is exact at the eyes is less so beside them.
         assert result.psnr_db_off_eye["6mm"] < result.psnr_db

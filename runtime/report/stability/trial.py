@@ -13,7 +13,6 @@ from runtime.errors import PhasestackError
 Behaviour = Literal["answers", "refuses"]
 EPS64 = 2.0**-52
 WORSE = 1.05  # largest accepted ratio of an error to the recorded one
-NO_LIMIT = "no limit is recorded: phasestack stability --record"
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +32,7 @@ class Trial:
 
     stage: str
     name: str
-    run: Callable[[], Answer | None]  # None: it answered where it must refuse
+    run: Callable[[], Answer]
     expected: Behaviour = "answers"
     measure: str = "relative"  # unit of the forward error
     # Set: the recorded error limits the forward error, too. What another machine's rounding may add, in the measure.
@@ -61,42 +60,29 @@ class Case:
     note: str = ""
 
 
-def refusal(stage: str, name: str, call: Callable[[], object]) -> Trial:
-    """Return a trial that passes if the call raises one of the project's own errors."""
-
-    def run() -> None:
-        call()
-
-    return Trial(stage, name, run, expected="refuses", measure="-")
-
-
 def settle(trial: Trial, *, limit: float | None = None) -> Case:
     """Run a trial. No exception escapes, and only the project's own errors count as a refusal.
 
     limit: the recorded forward error; a trial with a floor fails without it.
     """
-    behaviour: Behaviour = "answers"
-    answer, is_refusal = None, False
-    note = "it answered where no answer exists"
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # numpy's, about inf and NaN: the result is measured
             answer = trial.run()
     except Exception as error:
-        behaviour, is_refusal = "refuses", isinstance(error, PhasestackError | ValueError)
+        is_refusal = isinstance(error, PhasestackError | ValueError)
         note = str(error) if is_refusal else f"{type(error).__name__}: {error}"
-    if answer is None:
         passed = is_refusal and trial.expected == "refuses"
-        return Case(trial.name, trial.stage, inf, nan, nan, behaviour, 0.0, passed, trial.measure, note)
-    if trial.floor is not None and limit is None:
-        answer = replace(
-            answer, tolerance=-1.0, note=f"{answer.note} no limit is recorded: phasestack stability --record"
-        )
+        return Case(trial.name, trial.stage, inf, nan, nan, "refuses", 0.0, passed, trial.measure, note)
+    if trial.expected == "refuses":
+        answer = replace(answer, note="it answered where no answer exists")
+    elif trial.floor is not None and limit is None:
+        answer = replace(answer, tolerance=-1.0, note="no limit is recorded: phasestack stability --record")
     elif trial.floor is not None and limit is not None:
         answer = replace(answer, tolerance=min(answer.tolerance, WORSE * limit + trial.floor))
     backward = answer.forward_error if answer.backward_error is None else answer.backward_error
     passed = trial.expected == "answers" and answer.forward_error <= answer.tolerance  # NaN fails
     return Case(
-        trial.name, trial.stage, answer.condition, answer.forward_error, backward, behaviour, answer.tolerance, passed,
-        trial.measure, answer.note.strip(),
+        trial.name, trial.stage, answer.condition, answer.forward_error, backward, "answers", answer.tolerance, passed,
+        trial.measure, answer.note,
     )  # fmt: skip
