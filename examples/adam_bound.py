@@ -1,4 +1,4 @@
-"""What three panels could show of a pair: the solver's own kind of step, and then Adam.
+"""Upper bound on the quality of three panels for a pair: the solver's gradient steps, then Adam.
 
 Adam minimises the squared error of random rays through square pixels, another set at every iteration. On the model of
 light (`light`) it would do worse than the steps: it finds panels where the model is wrong, up to 2 dB of 44.

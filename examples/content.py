@@ -1,8 +1,8 @@
-"""One scene of each kind, made from nothing and run: the file, the three layers, what each eye sees, a contact sheet.
+"""Write and run one scene of each kind: its file, the three layers, each eye's view, a contact sheet.
 
-    python examples/content.py gltf --out out/content        # or any other kind; without one: all of them
+    python examples/content.py gltf --out out/content        # any of the kinds; without one: all
 
-It leaves the file that was shown beside the run's pictures, so that it can be shown on a display, too:
+The scene's file is kept next to the run's pictures, so that a display can show it, too:
 
     phasestack run --scene out/content/gltf/ring.glb
 """
@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-Made = tuple[str, str]  # the scene, as --scene takes it; further lines of [content]
+Made = tuple[str, str]  # value of --scene; further lines of [content]
 
 
 def ball_and_ground(width: int, height: int, eye_x: float = 0.0) -> tuple[Image.Image, Image.Image]:
@@ -50,7 +50,7 @@ def picture(folder: Path) -> Made:
 
 
 def side_by_side(folder: Path, *, half: bool = False) -> Made:
-    """Two views beside each other."""
+    """Two views side by side."""
     left, right = (ball_and_ground(960, 540, eye_x=x)[0] for x in (-12, 12))
     pair = Image.new("RGB", (1920, 540))
     pair.paste(left, (0, 0))
@@ -61,7 +61,7 @@ def side_by_side(folder: Path, *, half: bool = False) -> Made:
 
 
 def half_side_by_side(folder: Path) -> Made:
-    """The same in half the columns."""
+    """Two views side by side in half the columns."""
     return side_by_side(folder, half=True)
 
 
@@ -87,7 +87,7 @@ def rgbd(folder: Path) -> Made:
 
 
 def film(folder: Path) -> Made:
-    """Two views beside each other, moving."""
+    """Film of two views side by side."""
     import cv2
 
     writer = cv2.VideoWriter(str(folder / "film_sbs.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 25, (960, 270))
@@ -160,7 +160,7 @@ def playlist(folder: Path) -> Made:
 
 
 def data_set(folder: Path) -> Made:
-    """A pair as the published data set names it, in a folder that names its scene."""
+    """Pair with the published data set's file names, in a folder named after its scene."""
     pairs = folder / "lego_bulldozer"
     pairs.mkdir(exist_ok=True)
     for half, y, shift in ((1, -0.263, -20), (0, 0.237, 20)):
@@ -181,12 +181,14 @@ KINDS: dict[str, Callable[[Path], Made]] = {
 
 
 def main() -> int:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("kind", nargs="*", choices=[*KINDS, []], help="which kinds; all where none is named")
-    parser.add_argument("--out", type=Path, default=Path("out/content"), help="a folder a kind is made in it")
+    parser.add_argument("kind", nargs="*", choices=[*KINDS, []], help="kinds to run; default: all")
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/content"), help="output folder; each kind gets a subfolder"
+    )
     parser.add_argument("--frames", type=int, default=45, help="refreshes of each run")
-    parser.add_argument("--scale", default="0.25", help="of the panels' pixels")
+    parser.add_argument("--scale", default="0.25", help="factor on the panels' pixels")
     given = parser.parse_args()
     for kind in given.kind or KINDS:
         folder = (given.out / kind).absolute()
@@ -218,8 +220,9 @@ def main() -> int:
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
         if done.returncode:
             return done.returncode
-        told = json.loads(done.stdout)
-        print(f"{kind:18} {told['psnr_db']:6.2f} dB  {told['scene']}  {folder / 'contact-sheet.png'}", flush=True)
+        result = json.loads(done.stdout)
+        psnr_db, name = result["psnr_db"], result["scene"]
+        print(f"{kind:18} {psnr_db:6.2f} dB  {name}  {folder / 'contact-sheet.png'}", flush=True)
     return 0
 
 

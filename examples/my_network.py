@@ -1,12 +1,12 @@
-"""A network of one's own, a small U-Net from two pictures to three panels. One file on Python's path.
+"""Custom network: a small U-Net from two pictures to three panels. One file on Python's path.
 
     export PYTHONPATH=examples
     phasestack train --arch my_network:MyNetwork --panels panels.json --out out/mine
     phasestack export --arch my_network:MyNetwork --checkpoint out/mine/checkpoint.pth --out mine.onnx
     phasestack solve --model mine.onnx ...
 
-It is given both eyes' pictures on the centre panel's pixels: (batch, 6, height, width), left eye first, intensities
-from 0 to 1. It answers with what every panel shows: (batch, 9, height, width), rear panel first, 0 to 1.
+Input: both eyes' pictures on the centre panel's pixels, (batch, 6, height, width), left eye first, intensities from 0
+to 1. Output: the panels' codes, (batch, 9, height, width), rear panel first, 0 to 1.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from torch.nn import functional
 
 
 class MyNetwork(nn.Module):
-    """What each panel shows beside an even share of what both eyes should see; works on every second pixel."""
+    """Predict each panel's deviation from an equal share of the mean picture; works on every second pixel."""
 
     input_frame = "centre"  # or "panel": both eyes' pictures on the pixels of every panel, 18 channels
-    input_value = "intensity"  # or "phase": what the panels must add up to for it
+    input_value = "intensity"  # or "phase": the sum of the panels' values that gives it
 
     class Options(BaseModel):
-        """What `--option` may set: checked by its name, kept in the checkpoint, given to `__init__`."""
+        """Values of `--option`: validated by name, stored in the checkpoint, passed to `__init__`."""
 
         width: int = Field(32, ge=4, le=256, description="channels on the finest raster")
         levels: int = Field(3, ge=1, le=5, description="coarser rasters")
@@ -52,8 +52,8 @@ class MyNetwork(nn.Module):
             x = functional.interpolate(x, size=skip.shape[2:], mode="nearest")
             x = up(torch.cat([skip, x], dim=1))
         mean = (eyes[:, :3] + eyes[:, 3:]) / 2
-        phase = torch.asin(mean.clamp(1e-4, 1 - 1e-4).sqrt()) * (2 / torch.pi)  # the panels' sum that gives it, or
-        even = (2 - phase) / 3  # one of three parts of 2 less that: near the middle of a panel's range
+        phase = torch.asin(mean.clamp(1e-4, 1 - 1e-4).sqrt()) * (2 / torch.pi)  # the sum of the panels that gives it
+        even = (2 - phase) / 3  # a third of 2 minus that: near the middle of a panel's range
         return even.repeat(1, 3, 1, 1) + functional.pixel_shuffle(self.last(x), 2)
 
 

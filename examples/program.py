@@ -1,7 +1,7 @@
 """A program that draws for the display: a turning cube, by moderngl. Needs `pip install moderngl websockets numpy`.
 
 With `phasestack try --scene program` (or `run`): python examples/program.py ADDRESS
-`phasestack status` tells the address (`program`); so does the page of `try`.
+`phasestack status` and the page of `try` show the address (`program`).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A scene of one's own: a tunnel behind the display, in plain numpy. One file on Python's path, one line of TOML.
+"""Custom scene: a tunnel behind the display, in plain numpy. One file on Python's path, one line of TOML.
 
     [content]
     scene = "tunnel:Tunnel"
@@ -6,7 +6,7 @@
 
     PYTHONPATH=examples phasestack run --config tunnel.toml --replay demo --headless --max-speed --frames 60 --out out
 
-The frame is the display's: x out of it, y to the right, z up, metres from its middle.
+Coordinates are the display's: metres from its centre, x out of the screen, y to the right, z up.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ DARK_AFTER_M = 0.5
 
 
 class TunnelOptions(BaseModel):
-    """What [content.options] may hold."""
+    """Fields of [content.options]."""
 
     radius_m: float = Field(0.12, gt=0.02, lt=1.0)
     speed_m_per_s: float = 0.05
 
 
 class Tunnel(phasestack.ContentSource):
-    """A tiled tube around the display's axis, which comes towards the viewer."""
+    """Tiled tube around the display's axis that moves towards the viewer."""
 
     Options = TunnelOptions
 
@@ -40,10 +40,10 @@ class Tunnel(phasestack.ContentSource):
         self._options = options
 
     def render(self, view: Any, *, time_ns: int) -> np.ndarray:
-        """Where the ray through each pixel meets the tube."""
+        """Draw the tube where the ray through each pixel meets it."""
         u, v = np.meshgrid(np.arange(view.width_px) + 0.5, np.arange(view.height_px) + 0.5)
         rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(view.pixels_from_stack[:, :3]).T
-        # Its wall: |eye + t ray| = radius across the axis, and of the two such points the one ahead.
+        # The wall is where |eye + t ray| = radius across the axis; of the two solutions take the one ahead.
         across, eye = rays[..., 1:], view.eye_m[1:]
         a, b = (across**2).sum(-1), across @ eye
         c = eye @ eye - self._options.radius_m**2
@@ -57,5 +57,5 @@ class Tunnel(phasestack.ContentSource):
         picture = np.full((view.height_px, view.width_px, 4), 255, np.uint8)
         for channel, (one, other) in enumerate(((235, 40), (160, 70), (60, 120))):
             picture[..., channel] = light * np.where(chequer > 0, one, other)
-        picture[(b * b < a * c) | (t <= 0) | (depth < 0)] = 0  # beside the tube: black, and nothing of ours
+        picture[(b * b < a * c) | (t <= 0) | (depth < 0)] = 0  # outside the tube: transparent black
         return picture

@@ -1,4 +1,4 @@
-"""A sensor of one's own: eyes as JSON datagrams. One file on Python's path, one line of TOML.
+"""Custom sensor: eyes as JSON datagrams. One file on Python's path, one line of TOML.
 
     [sensor]
     driver = "udp_eyes:UdpEyes"
@@ -6,7 +6,7 @@
 
     PYTHONPATH=examples phasestack run --config udp.toml --headless --out out/udp
 
-A datagram is `{"n": 1, "t_ns": 0, "left": [x, y, z], "right": [x, y, z]}`: counted, with the sender's own time, metres
+A datagram is `{"n": 1, "t_ns": 0, "left": [x, y, z], "right": [x, y, z]}`: a count, the sender's time, and metres
 in the sensor's frame (x to its right, y down, z away from it); `left` is the viewer's.
 """
 
@@ -23,7 +23,7 @@ from phasestack import Capabilities, DeviceClock, EyePoints, Sensor, SensorFrame
 
 
 class UdpOptions(BaseModel):
-    """What [sensor.options] may hold."""
+    """Fields of [sensor.options]."""
 
     port: int = Field(ge=1, le=65535)
     noise_mm: tuple[float, float, float] = (0.5, 0.5, 2.0)  # right, down, away: standard deviations
@@ -37,7 +37,7 @@ class UdpEyes(Sensor):
     capabilities = Capabilities(eye_points=True)
 
     def __init__(self, options: UdpOptions, *, clock: Any) -> None:
-        # Only keep settings here: whatever can fail belongs into `open`.
+        # Only store settings here; anything that can fail belongs in `open`.
         self._port, self._clock = options.port, clock
         self._covariance_m2 = np.diag(np.square(options.noise_mm)) * 1e-6
         self._socket: socket.socket | None = None
@@ -49,7 +49,7 @@ class UdpEyes(Sensor):
         try:
             channel.bind(("127.0.0.1", self._port))
         except OSError as error:
-            channel.close()  # what was acquired is released when the rest fails
+            channel.close()  # release the socket if binding fails
             raise SensorLost(f"port {self._port}: {error.strerror}") from None
         self._socket, self._times = channel, DeviceClock()
 

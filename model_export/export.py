@@ -151,7 +151,7 @@ def picture_file(
         layout="NCHW",
         eye_order=eye_order,
         value_range=(least, 1 + least),
-        trained_for=None,  # a checkpoint does not tell what it was trained on
+        trained_for=None,  # checkpoints don't record their training stack
         recipe_sha256=origin,
         **form.model_dump(exclude={"steps"}),
         steps=steps,

@@ -156,19 +156,17 @@ def solve(
     model: str | Path = "balanced",
     eye_sigma_mm: float = 1.0,
 ) -> Result:
-    """Layers with which two eyes see two pictures.
+    """Solve for layers that show each eye its picture.
 
-    left, right: (h, w, 3 or 4), uint8 or float in 0..1, or images of Pillow: what a pinhole camera at each eye sees
-    that looks at the stack's origin, x to its right and parallel to the ground, `fov_deg` wide; nothing else has to be
-    known of them.
+    left, right: (h, w, 3 or 4), uint8 or float in 0..1, or Pillow images, as seen by a pinhole camera at each eye that
+    looks at the stack's origin, without roll, `fov_deg` wide.
     eyes_m: left and right eye, metres, frame `stack` (+x out of the screen, +y the viewer's right, +z up).
-    cameras: how the pictures were taken, where it was otherwise (parallel, shifted, any pinhole): two 3x4 matrices from
-    homogeneous metres of the stack's frame to pixels, +u right, +v down, a pixel's centre at a half: K·[R | t] with
-    OpenCV's axes, and half a pixel more to K's middle where that has centres at whole numbers. They say where the eyes
-    are and how wide the pictures: `eyes_m` and `fov_deg` are not needed. What is solved for, and measured, is then the
-    pictures turned to the stack's origin, as large as the panels are seen.
-    model: fast, balanced, best, sart or an ONNX file. eye_sigma_mm: the tracking's error; 1: a good tracker's; 0: none.
-    Raises ValueError, naming the argument; warns where pictures or eyes can hardly be meant as they are.
+    cameras: for pictures of other pinhole cameras (parallel, shifted), two 3x4 matrices from homogeneous metres of the
+    stack's frame to pixels, +u right, +v down, pixel centres at half-integers: K·[R | t] with OpenCV's axes, plus half
+    a pixel on K's principal point if its pixel centres are integers. They replace `eyes_m` and `fov_deg`; the pictures
+    solved for and measured are then resampled to look at the stack's origin and to cover the panels.
+    model: fast, balanced, best, sart or an ONNX file. eye_sigma_mm: tracking error; 1: a good tracker's; 0: none.
+    Raises ValueError, naming the argument; warns about implausible pictures or eyes.
     """
     pair = _checked((left, right), stack=stack, eyes_m=eyes_m, fov_deg=fov_deg, cameras=cameras)
     eye_sigma_mm = _number("eye_sigma_mm", eye_sigma_mm, 0.0, 1000.0, "mm")

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Writes the hashes of every pinned package's files into the locks anew: change a pin there, then `make hashes`.
+# Rewrites the hashes of every pinned package's files in the locks: change a pin there, then `make hashes`.
 # The pins stay; the registry is asked for the hashes of each (minutes). Local wheels and other indexes are not looked at.
 set -eu
 cd "$(dirname -- "$0")"

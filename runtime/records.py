@@ -21,7 +21,7 @@ Inference = Literal["ran", "reused", "skipped"]
 
 
 class State(StrEnum):
-    """What the daemon is doing; DEGRADED names what is missing as well."""
+    """State of the daemon; the reason of DEGRADED names the missing parts."""
 
     STARTING = "starting"
     TRACKING = "tracking"
@@ -45,33 +45,33 @@ class Intrinsics:
 
 @dataclass(frozen=True, slots=True)
 class EyePoints:
-    """Two eyes at one instant, as a sensor or a finder measured them."""
+    """Two eyes at one instant, measured by a sensor or a finder."""
 
-    eyes_m: F64  # (2, 3) left, right (the viewer's own); metres; frame `sensor` or `stack`, as its carrier says
+    eyes_m: F64  # (2, 3) the viewer's left, right; metres; frame `sensor` or `stack`, given by the carrier
     confidence: F64  # (2,) in [0, 1], left, right
     completed: Literal["", "left", "right"] = ""  # the eye that was hidden and filled in from the head's pose
-    covariance_m2: F64 | None = None  # (3, 3) of the middle between the eyes, same frame; None: the driver does not say
+    covariance_m2: F64 | None = None  # (3, 3) of the middle between the eyes, same frame; None: unknown
 
 
 @dataclass(frozen=True, slots=True)
 class SensorFrame:
-    """A driver's sample: one instant, with the streams that the sensor has."""
+    """A driver's sample: one instant of the sensor's streams."""
 
     sequence: int  # counts up by one for each frame of the device; gaps are losses
     capture_ns: int  # monotonic clock, when the light was integrated
-    eyes: EyePoints | None = None  # frame `sensor`; None: no face in this frame, or not this sensor's business
+    eyes: EyePoints | None = None  # frame `sensor`; None: no face, or the sensor does not find eyes
     colour: U8 | None = None  # (h, w, 3) RGB
     depth_mm: U16 | None = None  # (h, w), registered to the colour image where both exist; 0: no measurement
     intrinsics: Intrinsics | None = None  # of the image in which depth and colour are registered
-    true_eyes_m: F64 | None = None  # (2, 3) frame `stack`; only recordings that know the truth
+    true_eyes_m: F64 | None = None  # (2, 3) frame `stack`; only in recordings with ground truth
 
 
 @dataclass(frozen=True, slots=True)
 class EyesEstimate:
-    """Estimated eyes at one instant, with a label for how they are known."""
+    """Estimated eyes at one instant, with a label for their origin."""
 
-    time_ns: int  # the instant asked for
-    capture_ns: int  # of the newest sample that went into it; 0 with label none
+    time_ns: int  # instant of the estimate
+    capture_ns: int  # newest sample used; 0 with label none
     eyes_m: F64 | None  # (2, 3) left, right; frame `stack`; None with label none
     label: EyesLabel
     sigma_m: float = 0.0  # standard deviation of an axis of the middle between the eyes, at that instant
@@ -92,11 +92,11 @@ class Parallax:
 
 @dataclass(frozen=True, slots=True)
 class PanelFrame:
-    """What all panels show at one refresh: an aligned solution, the flat picture, or a mix."""
+    """Layers of all panels at one refresh: an aligned solution, the flat picture, or a mix."""
 
-    number: int  # of the refresh: all panels show the same
+    number: int  # of the refresh, the same on all panels
     solved: U8 | None  # (N, h, w, 4) RGBA, rear to front, of any raster; layers solved for two eyes; None: none yet
-    solved_version: int  # another number whenever `solved` holds other values
+    solved_version: int  # changes whenever `solved` changes
     solved_from_shown: tuple[F64, ...] = ()  # per panel (3, 3), both in the panels' pixels; (): layers as solved
     flat: U8 | None = None  # (N, height_px, width_px, 4): the picture for eyes anywhere; never aligned
     flat_version: int = 0
@@ -111,14 +111,14 @@ class PresentReport:
     """Outcome of presenting a PanelFrame."""
 
     number: int
-    present_ns: int  # when the last panel's light left, as well as it is known
+    present_ns: int  # estimated instant at which the last panel was lit
     skew_ms: float  # between the first and the last panel
-    vblank_ns: int | None = None  # the vertical blank that it was shown at, as well as it is known; None: no such thing
+    vblank_ns: int | None = None  # estimated vertical blank of the refresh; None: not applicable
 
 
 @dataclass(frozen=True, slots=True)
 class PlanItem:
-    """A saving: what is left out, why, the time saved and the quality lost."""
+    """A saving: the work omitted, the reason, the time saved and the quality lost."""
 
     what: str
     why: str
@@ -132,31 +132,31 @@ class FrameTiming:
 
     id: int  # number of the refresh
     wake_ns: int
-    present_ns: int  # the vertical blank, or where there is none the end of presenting
-    photon_ns: int  # the middle of the panels' light
+    present_ns: int  # the vertical blank or, without one, the end of presenting
+    photon_ns: int  # middle of the display time
 
 
 @dataclass(frozen=True, slots=True)
 class SolveRequest:
-    """A request of the presenter to the solver; a newer one replaces one that has not begun."""
+    """Request of the presenter to the solver; it replaces an older one that has not begun."""
 
-    time_ns: int  # the instant to solve for: the middle of the time that the solution will be shown
-    eyes_m: F64 | None  # (2, 3) left, right; frame `stack`; where they will be then; None: no viewer
+    time_ns: int  # instant to solve for: middle of the solution's expected display time
+    eyes_m: F64 | None  # (2, 3) left, right; frame `stack`; predicted for `time_ns`; None: no viewer
     eyes_label: EyesLabel
-    sigma_m: float  # how sure these eyes are: standard deviation of an axis
-    flat_wanted: bool  # the flat picture will be needed, or is shown
-    paused: bool = False  # nothing new is solved
-    effort: Effort | None = None  # of a solution for these eyes; None: all that the model has
-    refined_to: Effort | None = None  # continue the newest solution to this where its eyes and pictures are the same
+    sigma_m: float  # standard deviation of these eyes per axis
+    flat_wanted: bool  # the flat picture is shown or will be needed
+    paused: bool = False  # no new solutions
+    effort: Effort | None = None  # of a solution for these eyes; None: full
+    refined_to: Effort | None = None  # continue the newest solution to this if eyes and pictures are unchanged
 
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """Work that a solution has had: its raster and its updates of all panels."""
+    """Work spent on a solution: its raster and its updates of all panels."""
 
-    reduction: int = 1  # of the panels' rows and columns, on which it was solved
+    reduction: int = 1  # divisor of the panels' rows and columns
     steps: int = 0
-    continued_from: int | None = None  # steps that the solution before had already; None: begun from a proposal
+    continued_from: int | None = None  # steps of the solution that was continued; None: from a proposal
 
     @property
     def name(self) -> str:
@@ -168,10 +168,10 @@ class Effort:
 class Measures:
     """Measurements of a solution: squared errors of intensities in 0..1; None: not measured."""
 
-    residual: float | None = None  # of sampled rays against the solution's own pictures
-    detail: Mapping[int, float] = field(default_factory=dict)  # of coarser rasters' pictures, by reduction
-    contrast: float | None = None  # of pictures far apart: half the variance
-    change: tuple[float, float, float] | None = None  # against the pictures before; the head moved by m, s have passed
+    residual: float | None = None  # of sampled rays against the solution's targets
+    detail: Mapping[int, float] = field(default_factory=dict)  # of the pictures on coarser rasters, by reduction
+    contrast: float | None = None  # between unrelated pictures: half the variance
+    change: tuple[float, float, float] | None = None  # from the previous pictures; metres moved; seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +181,7 @@ class Solution:
     number: int  # counts up from 1, flat pictures and solutions together
     layers: U8  # (N, h, w, 4) RGBA, rear to front; the panels' pixels, or fewer (`effort.reduction`)
     solved_for_m: F64 | None  # (2, 3) left, right; frame `stack`; None: flat, for eyes anywhere
-    solved_for_ns: int  # the instant that it is for; its content is of that instant
+    solved_for_ns: int  # instant of its eyes and content
     seeing: tuple[bool, bool] = (True, True)  # left, right: an eye outside the viewing range is replaced by the other
     eye_sigma_m: float | None = None  # tracking error that it allows for
     stage_ms: dict[str, float] = field(default_factory=dict)  # by `SOLVING_STAGES`; the run's clock
@@ -195,20 +195,20 @@ class RefreshAccount:
     """One refresh: a line of frames.jsonl (contract 5.2)."""
 
     frame: int
-    capture_ns: int  # of the newest sample that the eyes are known from; 0: none
-    predicted_for_ns: int  # the light
+    capture_ns: int  # newest sample used for the eyes; 0: none
+    predicted_for_ns: int  # display time
     present_ns: int
-    eyes_m: F64 | None  # (2, 3) that the panels are aligned to; frame `stack`
+    eyes_m: F64 | None  # (2, 3) eyes that the panels are aligned to; frame `stack`
     eyes_label: EyesLabel
-    eye_sigma_mm: float | None  # how sure they are; None without eyes
+    eye_sigma_mm: float | None  # their standard deviation per axis; None without eyes
     state: State
     solution: int | None  # number of the solution that is shown; None: the flat picture alone
     solved_for_m: F64 | None  # (2, 3)
-    solution_age_ms: float | None  # the light less the instant that the solution is for
+    solution_age_ms: float | None  # display time minus the solution's instant
     inference: Inference  # ran: the first refresh that shows its solution; reused; skipped: no solution is shown
     presented: bool
     skew_ms: float
-    photon_ns: int = 0  # the light, from when it was really presented
-    true_eyes_m: F64 | None = None  # (2, 3) at the light, where the recording knows them
+    photon_ns: int = 0  # display time computed from the actual present time
+    true_eyes_m: F64 | None = None  # (2, 3) at the display time, from recordings with ground truth
     stage_ms: dict[str, float] = field(default_factory=dict)  # on the run's clock
     effort: str | None = None  # of the solution shown: 1/2+1 is half the raster and one step

@@ -27,9 +27,9 @@ html_css_files = ["site.css"]
 templates_path: list[str] = []
 myst_heading_anchors = 3
 myst_enable_extensions = ["deflist"]
-# Code without a language is a shell's or Python's: it is shown as it stands.
+# Code without a language is a shell's or Python's: it is shown verbatim.
 highlight_language = "none"
-# Names in docstrings stand in single backticks; `--out` keeps both dashes.
+# Names in docstrings have single backticks; `--out` keeps both dashes.
 default_role = "code"
 smartquotes = False
 suppress_warnings = ["myst.xref_ambiguous"]

@@ -1,4 +1,4 @@
-"""The link between the loop and the live pages: the viewer's eyes in, the panels' layers out."""
+"""Link between the loop and the live pages: the viewer's eyes in, the panels' layers out."""
 
 from __future__ import annotations
 
@@ -15,58 +15,58 @@ import numpy as np
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, EyePoints, PanelFrame, SensorFrame
 
-SAMPLES_MAX = 256  # that wait for the sensor
-CAPTURES_MAX = 512  # whose time on the page is remembered
-OVERLAY_PX = 320  # width of the camera's picture that pages are shown
+SAMPLES_MAX = 256  # samples waiting for the sensor
+CAPTURES_MAX = 512  # captures whose page time is remembered
+OVERLAY_PX = 320  # width of the camera picture sent to pages
 
 
 @dataclass(frozen=True, slots=True)
 class SeenEyes:
-    """Where a page says that its viewer's eyes are."""
+    """Eyes that a page reports."""
 
-    eyes_m: F64 | None  # (2, 3), frame `stack`; None: nobody is before the display
-    page_ms: float  # by the page's own clock
+    eyes_m: F64 | None  # (2, 3), frame `stack`; None: no viewer
+    page_ms: float  # time on the page's clock
 
 
 @dataclass(eq=False)
 class BrowserLink:
     """Thread-safe link to the pages. One page is the viewer; the others look on."""
 
-    stack: PanelStack  # whose panels are shown at present
+    stack: PanelStack  # the stack that is shown at present
     fov_deg: float
-    is_sensor: bool = True  # the page's eyes are the viewer's; else a camera's are
-    noise_mm: float = 0.2  # of the simulated sensor: standard deviation of an axis
+    is_sensor: bool = True  # True: the viewer's eyes come from the page; False: from a camera
+    noise_mm: float = 0.2  # standard deviation per axis of the simulated sensor
     latency_ms: float = 0.0
-    is_camera: bool = False  # the viewer's page sends pictures of its own camera
-    camera_fov_deg: float = 65.0  # their width; most cameras in or on a screen
-    wishes: dict[str, float] = field(default_factory=dict)  # of a page, that need a new start: gap_mm, camera
-    moment: Any = None  # the newest that was measured: layers, and what eyes should see of them
-    found: dict[str, Any] | None = None  # the newest picture of a camera, and the pupils in it
-    frame: PanelFrame | None = None  # that the panels were given
-    shown: tuple[PanelFrame | None, dict[str, Any]] = (None, {})  # by the newest refresh, and what is known of it
-    news: dict[object, Callable[[], None]] = field(default_factory=dict)  # whom to tell of a refresh, by page
+    is_camera: bool = False  # the viewer's page sends its camera's pictures
+    camera_fov_deg: float = 65.0  # horizontal; 65 fits most webcams
+    wishes: dict[str, float] = field(default_factory=dict)  # settings of a page that need a restart: gap_mm, camera
+    moment: Any = None  # newest measured moment: layers and targets
+    found: dict[str, Any] | None = None  # newest camera picture and the pupils in it
+    frame: PanelFrame | None = None  # newest frame handed to the panels
+    shown: tuple[PanelFrame | None, dict[str, Any]] = (None, {})  # frame of the newest refresh and its account
+    news: dict[object, Callable[[], None]] = field(default_factory=dict)  # callback for each refresh, by page
     _arrived: threading.Condition = field(default_factory=threading.Condition)
-    _picture: tuple[bytes, float] | None = None  # of the page's camera, and when by the page's clock
+    _picture: tuple[bytes, float] | None = None  # coded camera picture and its time on the page's clock
     _samples: deque[SeenEyes] = field(default_factory=lambda: deque(maxlen=SAMPLES_MAX))
     _captures: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=CAPTURES_MAX))
 
     def is_viewer(self, page: object) -> bool:
-        """Whether this page is the viewer: the one connected longest."""
+        """Return True if this page is the viewer: the one connected longest."""
         return next(iter(self.news), None) is page
 
     def see(self, eyes_m: Any, page_ms: float) -> None:
-        """Take in a sample. Raises ValueError for what are no eyes before the panels."""
+        """Add a sample. Raises ValueError unless these are two eyes in front of the panels."""
         eyes = None
         if eyes_m is not None:
             eyes = np.array(eyes_m, np.float64)
             if eyes.shape != (2, 3) or not np.isfinite(eyes).all() or eyes[:, 0].min() <= self.stack.x_m[-1]:
-                raise ValueError("eyes: two points before the front panel, metres")
+                raise ValueError("eyes: two points in front of the front panel, metres")
         with self._arrived:
             self._samples.append(SeenEyes(eyes, float(page_ms)))
             self._arrived.notify()
 
     def seen(self, timeout_s: float) -> list[SeenEyes]:
-        """The samples that were not taken yet, oldest first; waits for one."""
+        """Take the unread samples, oldest first; waits for one."""
         with self._arrived:
             if not self._samples:
                 self._arrived.wait(timeout_s)
@@ -75,21 +75,21 @@ class BrowserLink:
         return samples
 
     def send_picture(self, coded: bytes, page_ms: float) -> None:
-        """Take in a picture of the page's camera; one that was not looked at yet goes."""
+        """Store the newest camera picture; an unread one is dropped."""
         with self._arrived:
             self._picture = coded, page_ms
             self._arrived.notify()
 
     def picture(self, timeout_s: float) -> tuple[bytes, float] | None:
-        """The newest picture that was not taken yet; waits for one."""
+        """Take the newest unread picture; waits for one."""
         with self._arrived:
             if self._picture is None:
                 self._arrived.wait(timeout_s)
             taken, self._picture = self._picture, None
         return taken
 
-    def looked_at(self, finder: Any) -> Callable[[SensorFrame], EyePoints | None]:
-        """An eye finder for a page's camera whose results are also sent to the pages."""
+    def reporting(self, finder: Any) -> Callable[[SensorFrame], EyePoints | None]:
+        """Eye finder for a page's camera whose results are also sent to the pages."""
 
         def find(frame: SensorFrame) -> EyePoints | None:
             eyes: EyePoints | None = finder.find(frame)
@@ -102,24 +102,24 @@ class BrowserLink:
                 pupils_px = None if pupils is None else np.asarray(pupils.eyes_px) * (OVERLAY_PX / width)
                 self.found = {"url": f"data:image/jpeg;base64,{coded}", "size": size, "pupils_px": pupils_px,
                               "reason": finder.reason}  # fmt: skip
-                self._tell()
+                self._notify()
             return eyes
 
         return find
 
     def captured(self, capture_ns: int, page_ms: float) -> None:
-        """Remember which instant of the page a capture is."""
+        """Remember the page time of a capture."""
         self._captures.append((capture_ns, page_ms))
 
     def page_ms_of(self, capture_ns: int) -> float | None:
-        """When, by the page's clock, the newest sample was seen that had been captured by then."""
+        """Page time of the newest sample captured by `capture_ns`."""
         return next((page_ms for ns, page_ms in reversed(tuple(self._captures)) if ns <= capture_ns), None)
 
     def refreshed(self, account: dict[str, Any]) -> None:
-        """The panels show `frame`, and this is known of it."""
+        """Publish a refresh: the panels show `frame`; account: the figures known about it."""
         self.shown = self.frame, account
-        self._tell()
+        self._notify()
 
-    def _tell(self) -> None:
-        for tell in tuple(self.news.values()):
-            tell()
+    def _notify(self) -> None:
+        for notify in tuple(self.news.values()):
+            notify()

@@ -22,12 +22,12 @@ from runtime.support.artifacts import png_bytes, to_json
 from runtime.support.threads import parallel_map
 
 WEBP_MAX_PX = 16383
-BESIDE_BYTES = 60 << 10  # that a page may have beside its layers as PNG files
-QUALITIES = (92, 84, 76, 66, 54)  # of AVIF: the first that fits
+EXTRA_BYTES = 60 << 10  # a page's size beyond its layers as PNG files
+QUALITIES = (92, 84, 76, 66, 54)  # AVIF qualities: the first that fits is used
 
 
 def asset(name: str) -> str:
-    """The text of one of the browser's files."""
+    """Text of one of the browser's files."""
     return (files("runtime.browser") / "assets" / name).read_text(encoding="utf-8")
 
 
@@ -42,25 +42,24 @@ def viewer_html(
     lines: Sequence[str] = (),
     follows: bool = True,
 ) -> str:
-    """The viewer page. layers: (N, h, w, 3 or 4), rear to front, as shown to eyes (2, 3), frame `stack`.
+    """Viewer page. layers: (N, h, w, 3 or 4), rear to front, as shown to eyes (2, 3), frame `stack`; stored exactly.
 
-    Layers are stored exactly. wanted: an (h, w, 3) picture for each eye, `fov_deg` wide, in what room is left; () where
-    none is known; lines: what stands below.
-    follows: outer panels follow the head until one says otherwise.
+    wanted: target pictures (h, w, 3), one per eye, `fov_deg` wide, compressed into the remaining size; () for none.
+    lines: text below the controls. follows: outer panels follow the head until the user switches that off.
     """
     scene = {"stack": stack_table(stack), "eyes_m": eyes_m, "fov_deg": fov_deg, "title": title, "follows": follows}
     parts = {"TITLE": html.escape(title), "CSS": asset("look.css"), "SCRIPT": _script()}
     parts["LAYERS"] = _embedded(parallel_map(_exact, list(layers)))
-    room = BESIDE_BYTES + sum(map(len, parallel_map(png_bytes, list(layers)))) - len("".join(parts.values())) - 2048
+    room = EXTRA_BYTES + sum(map(len, parallel_map(png_bytes, list(layers)))) - len("".join(parts.values())) - 2048
     targets, error = _stored(wanted, room) if wanted else ([], 0.0)
-    told = [f"What was asked for is stored to {-10 * math.log10(error):.0f} dB."] if error else []
-    scene |= {"target_error": error, "lines": [*lines, *told]}
+    quality = [f"Targets are compressed to {-10 * math.log10(error):.0f} dB."] if error else []
+    scene |= {"target_error": error, "lines": [*lines, *quality]}
     parts |= {"SCENE": _embedded(scene), "WANTED": _embedded(targets)}
     return re.sub(r"@([A-Z]+)@", lambda found: parts.get(found[1], found[0]), asset("still.html"))
 
 
 def stack_table(stack: PanelStack) -> dict[str, Any]:
-    """The stack's geometry, and what its panels show at rest, as a table for the script."""
+    """Geometry of the stack and rest code of its panels, as a table for the script."""
     fields = ("width_m", "height_m", "x_m", "width_px", "height_px")
     table: dict[str, Any] = {name: getattr(stack, name) for name in fields}
     table["rest_code"] = rest_code(stack.count)
@@ -71,19 +70,19 @@ def stack_table(stack: PanelStack) -> dict[str, Any]:
 
 @cache
 def _script() -> str:
-    """The modules as one script, without comments: what they export to each other is in one scope."""
+    """Concatenate the modules into one script, without comments, imports and exports."""
     text = "\n".join(asset(name) for name in ("display.js", "look.js", "still.js"))
     return re.sub(r"^ *//.*\n|^ +|^export |^import .*\n", "", text, flags=re.MULTILINE)
 
 
 def _exact(layer: U8) -> str:
-    """A layer as a data URL, to the bit; a third smaller than PNG, which makes up for base64."""
+    """Lossless data URL of a layer; WebP is a third smaller than PNG, which makes up for base64."""
     how = {"format": "WEBP", "lossless": True, "method": 2, "quality": 20}
     return _url(layer, **(how if max(layer.shape) <= WEBP_MAX_PX else {"format": "PNG"}))
 
 
 def _stored(pictures: Sequence[U8], room: int) -> tuple[list[str], float]:
-    """Targets as data URLs of at most `room` bytes where that can be; the mean square of what coding changes (of 1)."""
+    """Targets as data URLs, within `room` bytes if possible; mean squared error of the coding (full scale 1)."""
     urls: list[str] = []
     for quality in QUALITIES:
         coder = partial(_url, format="AVIF", quality=quality, speed=8, subsampling="4:4:4")
@@ -102,5 +101,5 @@ def _url(picture: U8, **how: Any) -> str:
 
 
 def _embedded(value: Any) -> str:
-    """JSON that ends no script element."""
+    """JSON that can't end a script element."""
     return to_json(value).replace("<", "\\u003c")

@@ -1,4 +1,4 @@
-"""All commands by name. Each command imports what it needs only when it runs."""
+"""All commands by name. A command's own dependencies are imported only when it runs."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ for command in COMMANDS:
         app.command(name)(made)
 
 
-def _tell_version(wanted: bool) -> None:
+def _print_version(wanted: bool) -> None:
     if wanted:
         from runtime.support.version import version
 
@@ -77,7 +77,7 @@ def _tell_version(wanted: bool) -> None:
 @app.callback()
 def options(
     version: Annotated[
-        bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="print the version and exit")
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and exit")
     ] = False,
 ) -> None:
-    """What holds for all commands; typer shows the app's own help, not this."""
+    """Options of all commands; typer shows the app's help instead of this text."""

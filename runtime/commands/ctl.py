@@ -15,7 +15,7 @@ app = typer.Typer(
     help="Control the running daemon. Exits with 1 if no daemon answers.\n\nExample: phasestack ctl scene demo",
 )
 
-Config = Annotated[Path | None, typer.Option(help="configuration of the daemon, which names its socket")]
+Config = Annotated[Path | None, typer.Option(help="the daemon's configuration, for its socket")]
 
 
 @app.command()
@@ -23,9 +23,9 @@ def scene(
     name: Annotated[str, typer.Argument(help="a value of `content.scene`, or `next`: the playlist's next entry")],
     config: Config = None,
 ) -> None:
-    """Show another scene: a built-in one, such as `demo`, or a file or folder (`./NAME`) on this machine.
+    """Show another scene: a built-in one such as `demo`, or a file or folder (`./NAME`) on this machine.
 
-    The present scene is shown while the other one loads. If that fails, it stays, and this exits with 2.
+    The current scene stays until the new one has loaded. If loading fails, it remains and this exits with 2.
 
     Example: phasestack ctl scene demo
     """
@@ -49,7 +49,7 @@ def place(
     reset: Annotated[bool, typer.Option("--reset", help="return to the configured placement")] = False,
     config: Config = None,
 ) -> None:
-    """Move, turn or scale the present scene. Options that are not given stay as they are.
+    """Move, turn or scale the current scene. Options that are not given keep their values.
 
     The next scene is placed as configured.
 
@@ -69,7 +69,7 @@ def model(
     name: Annotated[str, typer.Argument(help="fast, balanced, best, sart or an ONNX file")],
     config: Config = None,
 ) -> None:
-    """Solve with another model. The present one is used while the other loads, and stays if that fails.
+    """Solve with another model. The current one stays until the new one has loaded, and if loading fails.
 
     Example: phasestack ctl model best
     """
@@ -82,8 +82,8 @@ PLAIN = {
     "pause": "Freeze the picture until `resume`.",
     "resume": "Follow the viewer again, after `pause` or `flat`.",
     "flat": "Show the flat (2D) picture until `resume`.",
-    "reload": "Read the configuration again. A bad one is refused, and the old one stays in force.\n\n"
-    "Scene, model and place chosen by `ctl` stay, unless the file has a new value for them.",
+    "reload": "Read the configuration again. An invalid one is refused and the old one stays in force.\n\n"
+    "Scene, model and placement set by `ctl` stay unless the file has a new value for them.",
     "blackbox": "Write the last minutes (eyes, states, times, log) to an MCAP file, and print its name.",
 }  # commands without a value
 
@@ -116,7 +116,7 @@ def tell(request: dict[str, Any], config: Path | None) -> None:
 
 
 def _advised(error: Exception) -> str:
-    """What a client that no daemon answers may do."""
+    """Error of an unanswered request, with advice for the user."""
     from runtime.daemon.client import unit_advice
 
     advice = unit_advice()

@@ -1,6 +1,6 @@
 """`phasestack doctor`: check everything that the configuration needs, with a remedy for each fault.
 
-Each check is a small function of the settings that answers rows and never raises.
+Each check is a small function from the settings to rows of a table.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from runtime.model.device import SolverBackend
 
 Verdict = Literal["ok", "warn", "fail", "skip"]
-CHECK_SENSOR_FOR_S = 3.0  # so long a sensor may take to its first sample
+CHECK_SENSOR_FOR_S = 3.0  # longest wait for a sensor's first sample
 SERVICE_CONFIG = Path("/etc/phasestack/phasestack.toml")
-SLOW_MS = 150.0  # of a solution: what a moving viewer loses by it is in docs/performance.md
-MEASURED_MS = 2000.0  # a solution that takes longer is only reckoned
+SLOW_MS = 150.0  # time of a solution above which moving viewers lose quality (docs/performance.md)
+MEASURED_MS = 2000.0  # a solution that takes longer is estimated, not timed
 NO_DEVICE = ("replay", "fixed")  # drivers that need no device
 
 
@@ -38,20 +38,21 @@ class Row:
 
     name: str
     state: Verdict
-    detail: str  # what was found
-    remedy: str = ""  # what to do; empty where nothing needs doing
+    detail: str  # the finding
+    remedy: str = ""  # action to take; empty if none is needed
 
 
 def doctor(
     config: Annotated[Path | None, typer.Option(help="configuration to check; without one, the defaults")] = None,
     as_service: Annotated[
-        bool, typer.Option("--service", help="as root: with the service's user, groups, environment and configuration")
+        bool,
+        typer.Option("--service", help="as the service: its user, groups, environment and configuration (needs root)"),
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout")] = False,
 ) -> None:
     """Check settings, sensor, permissions, OpenGL, monitors, scene, model, calibration and service.
 
-    What is only unusual is a warning. Exits with 1 where a check fails.
+    Unusual findings are warnings. Exits with 1 if a check fails.
 
     Example: phasestack doctor --config /etc/phasestack/phasestack.toml
 
@@ -68,14 +69,14 @@ def doctor(
         typer.echo(json.dumps({"ok": not failed, "checks": [asdict(row) for row in rows]}))
     else:
         for row in rows:
-            remedy = f"\n      to do: {row.remedy}" if row.remedy else ""
+            remedy = f"\n      remedy: {row.remedy}" if row.remedy else ""
             typer.echo(f"{row.state:5} {row.name}: {row.detail}{remedy}")
     if failed:
         raise typer.Exit(1)
 
 
 def _become_service() -> None:
-    """The rest of this process is as systemd would start the daemon, but for the unit's sandbox. Raises InputError."""
+    """Turn this process into one that systemd would start, except for the unit's sandbox. Raises InputError."""
     import grp
     import pwd
     import shlex
@@ -90,13 +91,13 @@ def _become_service() -> None:
         ).stdout
         unit = dict(line.partition("=")[::2] for line in shown.splitlines())
         if unit.get("LoadState") != "loaded":
-            raise InputError("doctor", "--service", "no phasestack.service is installed here")
+            raise InputError("doctor", "--service", "phasestack.service is not installed")
         os.setgroups([grp.getgrnam(name).gr_gid for name in unit["SupplementaryGroups"].split()])
         os.setgid(grp.getgrnam(unit["Group"]).gr_gid)
         os.setuid(pwd.getpwnam(unit["User"]).pw_uid)
         os.chdir(unit["WorkingDirectory"])
     except (OSError, KeyError) as error:
-        raise InputError("doctor", "--service", f"can't become the service's user ({error}): sudo, or root") from None
+        raise InputError("doctor", "--service", f"can't become the service's user ({error}): run with sudo") from None
     os.environ |= dict(entry.partition("=")[::2] for entry in shlex.split(unit["Environment"]))
     os.environ["STATE_DIRECTORY"] = f"/var/lib/{unit['StateDirectory']}"
 
@@ -105,23 +106,23 @@ Check = Callable[["Settings"], Iterator[Row]]
 
 
 def examine(settings: Settings) -> list[Row]:
-    """Every check in turn. A check that fails unexpectedly is a failed row, not the end."""
+    """Run all checks. An unexpected exception becomes a failed row."""
     rows: list[Row] = []
     for name, check in CHECKS.items():
         try:
             rows += check(settings)
         except PhasestackError as error:
             rows.append(Row(name, "fail", str(error)))
-        except Exception as error:  # a doctor that dies of what it looks for helps nobody
+        except Exception as error:  # the remaining checks still run
             if missing := missing_extra(error):
                 rows.append(Row(name, "fail", str(missing)))
                 continue
-            rows.append(Row(name, "fail", f"{type(error).__name__}: {error}", "a fault of phasestack: report it"))
+            rows.append(Row(name, "fail", f"{type(error).__name__}: {error}", "a bug in phasestack: please report it"))
     return rows
 
 
 def sensor(settings: Settings) -> Iterator[Row]:
-    """The configured driver opens and delivers."""
+    """Check that the configured driver opens and delivers."""
     from runtime.clock import MonotonicClock
     from runtime.errors import EndOfRecording, SensorLost, SensorTimeout
     from runtime.eyes.calibration import load_calibration
@@ -129,7 +130,7 @@ def sensor(settings: Settings) -> Iterator[Row]:
 
     if settings.sensor.driver not in NO_DEVICE and (answer := _daemon(settings)):
         eyes = answer.get("eyes_label", "unknown")
-        yield Row("sensor", "skip", f"the running daemon has it (eyes: {eyes})")
+        yield Row("sensor", "skip", f"in use by the running daemon (eyes: {eyes})")
         return
     driver = open_sensor(settings.sensor, MonotonicClock())
     own = is_plugin(settings.sensor.driver)
@@ -138,7 +139,7 @@ def sensor(settings: Settings) -> Iterator[Row]:
         driver.open()
         frame = driver.read_newest(CHECK_SENSOR_FOR_S)
     except (SensorLost, SensorTimeout, EndOfRecording) as error:
-        remedy = "docs/sensors.md: a driver of your own" if own else "plug it in; see the rows on USB; docs/planning.md"
+        remedy = "docs/sensors.md, A driver of your own" if own else "plug it in; see the usb rows and docs/planning.md"
         yield Row("sensor", "fail", f"{what}: {error or 'no sample'}", remedy)
         return
     finally:
@@ -153,7 +154,7 @@ def sensor(settings: Settings) -> Iterator[Row]:
 
 
 def usb(settings: Settings) -> Iterator[Row]:
-    """Known depth cameras on USB: port speed, permissions, driver."""
+    """Check depth cameras on USB: port speed, permissions, driver."""
     from runtime.errors import MissingPart
     from runtime.sensor.usb_devices import find_devices
 
@@ -175,7 +176,7 @@ def usb(settings: Settings) -> Iterator[Row]:
 
 
 def opengl(settings: Settings) -> Iterator[Row]:
-    """OpenGL without a screen, for the content and offscreen panels."""
+    """Check OpenGL without a screen, for content and offscreen panels."""
     from runtime.support.gl import describe, offscreen_context
 
     context = offscreen_context()
@@ -185,15 +186,15 @@ def opengl(settings: Settings) -> Iterator[Row]:
         context.release()
     for node in sorted(Path("/dev/dri").glob("renderD*")):
         if not os.access(node, os.R_OK | os.W_OK):
-            yield Row("opengl", "warn", f"{node} may not be opened by this user", "join the groups video and render")
+            yield Row("opengl", "warn", f"this user can't open {node}", "join the groups video and render")
     software = any(name in found["renderer"].lower() for name in ("llvmpipe", "softpipe", "swrast"))
     bad = software and (settings.output.kind != "offscreen" or settings.model.backend == "gl")
-    slow = "slow: the processor draws; install the GPU's driver where there is one" if software else ""
+    slow = "slow software rendering; install the GPU's driver if there is a GPU" if software else ""
     yield Row("opengl", "warn" if bad else "ok", f"{found['renderer']}, {found['version']} ({found['vendor']})", slow)
 
 
 def monitors(settings: Settings) -> Iterator[Row]:
-    """Each panel has its monitor."""
+    """Check that each panel has its monitor."""
     from runtime.errors import InputError, PanelLost
     from runtime.panels.monitors import bind, check_modes, refresh_difference
     from runtime.panels.registry import panel_settings
@@ -203,11 +204,11 @@ def monitors(settings: Settings) -> Iterator[Row]:
         return
     from runtime.panels.display import connected_monitors
 
-    remedy = "phasestack identify shows what each monitor is called"
+    remedy = "phasestack identify shows each monitor's name"
     try:
         there = connected_monitors()
     except PanelLost as error:
-        yield Row("monitors", "fail", str(error), "start the X server; DISPLAY and XAUTHORITY name it")
+        yield Row("monitors", "fail", str(error), "start the X server and set DISPLAY and XAUTHORITY")
         return
     panels = panel_settings(settings.output, len(settings.stack.x_m))
     named = {panel.connector for panel in panels}
@@ -223,11 +224,11 @@ def monitors(settings: Settings) -> Iterator[Row]:
     for number, monitor in enumerate(bound):
         yield Row("panels", "ok", f"panel {number} is {monitor}")
     if difference := refresh_difference(bound):
-        yield Row("panels", "warn", difference, "set them to the same mode")
+        yield Row("panels", "warn", difference, "set all panels to the same mode")
 
 
 def content(settings: Settings) -> Iterator[Row]:
-    """The scene is there and can be read."""
+    """Check that the scene exists and can be read."""
     from runtime.content.registry import prepare_content
 
     prepare_content(settings.content, settings.stack.stack())
@@ -235,7 +236,7 @@ def content(settings: Settings) -> Iterator[Row]:
 
 
 def model(settings: Settings) -> Iterator[Row]:
-    """The network loads, its contract fits the stack, and the provider is there."""
+    """Check that the network loads, fits the stack and has its provider; time a solution."""
     import cv2
 
     from runtime.model.backends import choose
@@ -256,14 +257,14 @@ def model(settings: Settings) -> Iterator[Row]:
         rate = _rate(predictor, choice.backend, settings)
         predictor.close()
     other = settings.model.name not in name and "/" not in settings.model.name
-    remedy = f"{settings.model.name} was asked for and does not fit this stack" if other else ""
+    remedy = f"{settings.model.name} does not fit this stack" if other else ""
     yield Row("model", "warn" if other else "ok", f"{name} on {settings.model.provider}", remedy)
-    yield Row("backend", "ok", f"{choice.backend.name} around the network: {choice.why}")
+    yield Row("backend", "ok", f"{choice.backend.name} for the solver steps: {choice.why}")
     yield rate
 
 
 def _rate(predictor: Predictor, backend: SolverBackend, settings: Settings) -> Row:
-    """How often the configured raster can be solved in full; the slowest pictures, those without a plain part."""
+    """Rate of full solutions on the configured raster, for pictures without plain regions (the slowest)."""
     from dataclasses import replace
 
     from runtime.model.backends import solution_ms
@@ -273,29 +274,30 @@ def _rate(predictor: Predictor, backend: SolverBackend, settings: Settings) -> R
     if predictor.on_panels(stack) is None:
         return Row("rate", "skip", f"{predictor.name} is not timed")
     coarse = replace(stack, width_px=max(64, stack.width_px // 4), height_px=max(64, stack.height_px // 4))
-    took_ms, how = 16 * solution_ms(predictor, coarse, backend, runs=3), f"reckoned from {coarse.width_px} columns"
+    took_ms, how = 16 * solution_ms(predictor, coarse, backend, runs=3), f"estimated from {coarse.width_px} columns"
     if took_ms < MEASURED_MS:
         took_ms, how = solution_ms(predictor, stack, backend, runs=1), "measured"
-    detail = f"{raster}: {took_ms:.0f} ms a solution in full, {1000 / took_ms:.1f} a second ({how})"
+    detail = f"{raster}: {took_ms:.0f} ms per full solution, {1000 / took_ms:.1f} per second ({how})"
     if took_ms < SLOW_MS:
         return Row("rate", "ok", detail)
-    coarser = "coarser rasters and fewer steps are taken in time; " if settings.model.effort == "auto" else ""
-    return Row("rate", "warn", detail, f"{coarser}sharper: a GPU, the model `fast` or fewer pixels (docs/planning.md)")
+    coarser = "moving viewers get coarser rasters and fewer steps; " if settings.model.effort == "auto" else ""
+    sharper = "for sharper pictures use a GPU, the model `fast` or fewer pixels (docs/planning.md)"
+    return Row("rate", "warn", detail, coarser + sharper)
 
 
 def calibration(settings: Settings) -> Iterator[Row]:
-    """The calibration file is there, is a similarity, and is not the demo's on a real sensor."""
+    """Check the calibration file: a similarity, and for a real sensor not the demo's."""
     from runtime.eyes.calibration import load_calibration
     from runtime.sensor.base import Sensor
 
     if not settings.calibration.file:
         driver = settings.sensor.driver
         if is_plugin(driver) and plugin_class(driver, Sensor, field="sensor.driver").capabilities.in_stack_frame:
-            yield Row("calibration", "ok", "none is needed: this sensor's eyes are in the stack's frame")
+            yield Row("calibration", "ok", "not needed: this sensor delivers eyes in the stack's frame")
             return
         real = driver not in NO_DEVICE
         remedy = "phasestack calibrate capture, then solve, and set calibration.file" if real else ""
-        yield Row("calibration", "fail" if real else "ok", "the built-in one of the demo recording", remedy)
+        yield Row("calibration", "fail" if real else "ok", "the demo recording's built-in calibration", remedy)
         return
     found = load_calibration(Path(settings.calibration.file))
     fit = f", residual {found.file.residuals.rms_m * 1000:.1f} mm" if found.file.residuals else ""
@@ -305,7 +307,7 @@ def calibration(settings: Settings) -> Iterator[Row]:
 
 
 def service(settings: Settings) -> Iterator[Row]:
-    """Whether a daemon runs, and how it is."""
+    """Check the running daemon, if any."""
     from runtime.daemon.client import HUNG_AFTER_S
 
     answer = _daemon(settings)
@@ -315,7 +317,7 @@ def service(settings: Settings) -> Iterator[Row]:
     state = str(answer.get("state", "unknown"))
     age_s = float(answer.get("turn_age_s", 0.0))
     if age_s > HUNG_AFTER_S:
-        yield Row("service", "fail", f"its loop has stood still for {age_s:.0f} s", "journalctl -u phasestack")
+        yield Row("service", "fail", f"its display loop has hung for {age_s:.0f} s", "journalctl -u phasestack")
     elif state.startswith("degraded"):
         yield Row("service", "fail", f"{state} ({answer.get('reason', '')})", "journalctl -u phasestack")
     else:
@@ -323,7 +325,7 @@ def service(settings: Settings) -> Iterator[Row]:
 
 
 def _daemon(settings: Settings) -> dict[str, Any] | None:
-    """What the running daemon says of itself; None where none runs."""
+    """Status of the running daemon; None if no daemon runs."""
     from runtime.daemon.client import NotRunning, ask, candidates
 
     try:

@@ -1,4 +1,4 @@
-"""The body of `phasestack try`: the daemon, and the web server that is its sensor and its panels."""
+"""Body of `phasestack try`: the daemon, and a web server that acts as its sensor and panels."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from runtime.daemon.supervise import run_daemon
 from runtime.page.connections import LOOPBACK, listening, server_of
 from runtime.page.server import application
 
-SIZE_PX = {"width_px": 960, "height_px": 540}  # without a configuration: solved often on a small machine
+SIZE_PX = {"width_px": 960, "height_px": 540}  # default: small, for frequent solutions
 SCENE = "room"  # without a configuration
-WEBCAM_FOV_DEG = 65.0  # of most cameras in or on a screen; a configuration says it of others
-SLOW_PAGE_S = 2.0  # without a picture of a page's camera
-MEASURED_EVERY_S = 4.0  # the light at the eyes
+WEBCAM_FOV_DEG = 65.0  # fits most webcams; set it in a configuration for others
+SLOW_PAGE_S = 2.0  # without a picture from a page's camera
+MEASURED_EVERY_S = 4.0  # interval between measurements of the light at the eyes
 
 
 def settings_of(
     config: Path | None, *, scene: str | None, layout: str | None, model: str | None, webcam: bool
 ) -> Settings:
-    """Raises InputError."""
+    """Settings of `phasestack try`. Raises InputError."""
     settings = load_settings(config) if config else changed(Settings(), "stack", SIZE_PX, source="try")
     settings = with_options(settings, scene=scene or (None if config else SCENE), layout=layout, model=model)
     if settings.sensor.driver != "usb-camera" or not webcam:
@@ -49,14 +49,14 @@ def settings_of(
 
 
 def try_display(settings: Settings, *, port: int, opens: bool, seconds: float | None, as_json: bool) -> None:
-    """Serve and run until told to stop. Raises InputError."""
+    """Serve the page and run the daemon until stopped. Raises InputError."""
     is_sensor = settings.sensor.driver == "browser"
     link = BrowserLink(settings.stack.stack(), settings.content.fov_deg, is_sensor=is_sensor)
     ends_s = float("inf") if seconds is None else time.monotonic() + seconds
 
     def until() -> str:
         if link.wishes:
-            return f"the page asks for {', '.join(link.wishes)}"
+            return f"the page changed {', '.join(link.wishes)}"
         return "its time is up" if time.monotonic() > ends_s else ""
 
     with tempfile.TemporaryDirectory(prefix="phasestack-") as folder:
@@ -64,7 +64,7 @@ def try_display(settings: Settings, *, port: int, opens: bool, seconds: float | 
         service = {"socket": str(socket), "blackbox_minutes": 0.0}
         settings = changed(settings, "service", service, source="try")
         with _served(link, socket, port) as url:
-            typer.echo(json.dumps({"url": url}) if as_json else f"look into it: {url}")
+            typer.echo(json.dumps({"url": url}) if as_json else f"open this address: {url}")
             if opens and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
                 webbrowser.open(url)
             while True:
@@ -79,7 +79,7 @@ def _as_it_is(settings: Settings) -> Settings:
 
 
 def _as_wished(settings: Settings, link: BrowserLink) -> Settings:
-    """The gap and the sensor that a page asked for; scene and model as they were."""
+    """Settings with the gap and sensor that a page chose, and the current scene and model."""
     wishes, link.wishes = link.wishes, {}
     account = link.shown[1]
     settings = with_options(settings, scene=account.get("scene"), model=account.get("model"))
@@ -95,7 +95,7 @@ def _as_wished(settings: Settings, link: BrowserLink) -> Settings:
 
 @contextmanager
 def _served(link: BrowserLink, socket: Path, port: int) -> Iterator[str]:
-    """The page, in a thread; answers its address, token included."""
+    """Serve the page in a thread; yields its address, with the token."""
     token, served = secrets.token_urlsafe(32), listening("try", port)
     server = server_of(application(DaemonClient((socket,)), token, link=link))
     sockets: dict[str, Any] = {"sockets": [served]}

@@ -160,7 +160,7 @@ def build_run(
 
     def make_find() -> FindEyes:
         finder = EyeFinder(settings)
-        return finder.find if options.browser is None else options.browser.looked_at(finder)
+        return finder.find if options.browser is None else options.browser.reporting(finder)
 
     driver = make_driver()
     samples: Samples

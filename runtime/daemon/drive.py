@@ -39,7 +39,7 @@ def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> 
         on_account = advance if options.max_speed else None
         run = build_run(settings, options, cleanup, host, output=output, on_account=on_account)
         reason = run.presenter.run(frames=options.frames)
-        run.presenter.panels.close()  # dark at once: what a run leaves may take seconds
+        run.presenter.panels.close()  # dark immediately; writing the run's files may take seconds
         for sample in run.presenter.samples.recorded_ahead():
             run.observer.sampled(sample)  # true eyes at the last display times
         if output is not None:

@@ -28,7 +28,7 @@ class RunOutput:
     """Writes a run's files into a folder, where they appear together on a clean exit.
 
     A background thread writes, so that no refresh waits for the disk. If the disk fails during the run (full, gone,
-    permission lost), the files are abandoned: `problem` gives the reason, one line is logged, and the run goes on.
+    permission lost), the files are abandoned: `problem` gives the reason, one line is logged, and the run continues.
     """
 
     def __init__(self, target: Path, *, every_one: bool = True) -> None:
@@ -84,8 +84,7 @@ class RunOutput:
     ) -> None:
         """Write the rest of `light/<frame>/`: light.json as `info`, and retina pictures.
 
-        drawn: what the eyes solved for should see; true: what the true eyes should see. Neither may be changed
-        afterwards.
+        drawn: targets of the eyes solved for; true: targets of the true eyes. Neither may be changed afterwards.
         """
 
         def write() -> None:

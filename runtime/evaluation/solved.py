@@ -23,7 +23,7 @@ WHOLE_PX = 1920 * 1200  # largest picture whose light is measured at every pixel
 class PairQuality:
     """Quality at the eyes (docs/contracts.md, Error), by tracking error: "0", "1", "2" mm.
 
-    NaN where such an error takes an eye to where it sees nothing, and what was not asked for.
+    NaN if not requested, or if such an error takes an eye to where it sees nothing.
     """
 
     light_db: BySigma  # with real pixels and pupils; "1", a good tracker's, is the figure to quote

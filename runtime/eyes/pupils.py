@@ -179,7 +179,7 @@ class PupilFinder:
             iris[side] = (np.linalg.norm(points[1] - points[3]) + np.linalg.norm(points[2] - points[4])) / 2
             openness[side] = np.linalg.norm(lids[4] - lids[12]) / np.linalg.norm(lids[0] - lids[8])
         line = eyes[0] - eyes[1]
-        eyes -= TOO_LOW * np.array([-line[1], line[0]])  # down the face, whichever way it is rolled
+        eyes -= TOO_LOW * np.array([-line[1], line[0]])  # towards the chin at any roll of the head
         return _Look(mesh, presence, eyes, iris, openness, _looks(picture, mesh, float(np.linalg.norm(line))))
 
     def _steadied(self, picture: U8, look: _Look, seen: Seen) -> Pupils:

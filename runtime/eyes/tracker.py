@@ -27,7 +27,7 @@ FIRST_SPEED = 0.3  # m/s, standard deviation for a head just found
 REACH_SPEED, REACH_ACCELERATION = 2.0, 30.0  # m/s, m/s²: limits of a head's motion
 KEEP_S = 0.4  # a longer gap discards a head's motion
 ANOTHER_AFTER_S = 0.5  # a viewer unseen for this long, or for hold_s if that is shorter, is replaced by another
-LOSS_S = 0.2  # after this long without a sample the eyes are held, not predicted
+LOSS_S = 0.2  # after this long without a sample they stop being predicted and are held
 HORIZON_S = 0.2  # longest prediction
 DECAY_S = 0.06  # time constant of a lost head's slowing to rest
 REVIVE_S = 0.06  # duration of the blend to eyes that were lost and found
@@ -50,7 +50,7 @@ class _Head(NamedTuple):
     capture_ns: int
     middle: imm.Belief  # between the eyes, frame `stack`
     half: imm.Belief  # from the middle to the right eye
-    samples: int  # taken in so far
+    samples: int  # count processed
     surprise: float  # of the newest (chi²)
 
     def age_s(self, time_ns: int) -> float:
@@ -243,7 +243,7 @@ class Tracker:
     def at(self, time_ns: int) -> EyesEstimate:
         """Eyes at a display time, on the samples' clock.
 
-        Labels: exact, a sample was taken then; interpolated, between two samples; predicted, after the newest by at
+        Labels: exact, at a sample; interpolated, between two samples; predicted, after the newest by at
         most `HORIZON_S`; held, the face is lost and the eyes slow to rest; none, never seen, lost for longer than
         `hold_s`, or forgotten.
         """

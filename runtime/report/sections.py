@@ -32,7 +32,7 @@ def frontier_section(results: Sequence[MethodResult], *, title: str, name: str) 
 def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
     """One curve for the shipped models and one for the reference; added models as single points.
 
-    More steps are to the right. A curve leaves out what is slower and no better. Bars: eight runs in ten; small dots:
+    More steps are to the right. A curve omits slower points that are no better. Bars: eight runs in ten; small dots:
     single pairs.
     """
     beside: Any = {"textcoords": "offset points", "fontsize": 8.5}
@@ -99,7 +99,7 @@ def method_table(results: Sequence[MethodResult]) -> Table:
 
 
 def moving_section(found: Sequence[Moving]) -> PageSection:
-    """Live quality for every motion and solver measured so far, with the view error and the tracker's."""
+    """Live quality for every measured motion and solver, with the view error and the tracker's."""
     text = [
         "A solution takes longer than a refresh, and the head keeps moving. At every refresh the outer panels are "
         "shifted and scaled to the eyes, which removes ghosts but not the age of the view. Live quality counts both: "

@@ -14,7 +14,7 @@ from runtime.config import Section
 from runtime.errors import SensorTimeout
 from runtime.records import SensorFrame
 
-ARRIVED_MAX = 1024  # samples returned at once; the rest follow in later calls
+ARRIVED_MAX = 1024  # samples returned per call; the rest follow in later calls
 WINDOW_NS = 5_000_000_000  # for estimating a device clock's offset
 
 

@@ -128,7 +128,7 @@ class OutputFolder:
     """A folder whose new files appear together at the end, or not at all.
 
     A context manager: write to `staging`. On success all files are renamed into `target`, replacing those of the same
-    names; on an error no new file remains. The next writer removes what a killed process left staged.
+    names; on an error no new file remains. The next writer removes a killed process's staged files.
     """
 
     def __init__(self, target: Path) -> None:

@@ -197,7 +197,7 @@ def test_a_page_is_no_larger_than_its_layers_files_and_60_kib(tmp_path: Path, wi
     for url, layer in zip(urls, result.layers, strict=True):
         decoded = cv2.imdecode(np.frombuffer(base64.b64decode(url.partition(",")[2]), np.uint8), cv2.IMREAD_COLOR_RGB)
         assert np.array_equal(decoded, layer)
-    stored_db = float(re.search(r"stored to (\d+) dB", page)[1])  # type: ignore[index]
+    stored_db = float(re.search(r"compressed to (\d+) dB", page)[1])  # type: ignore[index]
     assert stored_db >= 35
 
 

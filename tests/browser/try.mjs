@@ -30,7 +30,7 @@ say("another solution", await until(async () => (await status()).solution > befo
 say("and the page shows it", await until(() => page.evaluate(() => /is where/.test(document.querySelector(".head").textContent))));
 const size = await page.evaluate(() => window.phasestack.picture(0, 320, 180).length);
 say("the picture is one", size > 5000);
-say("figures are told", await until(async () => /[\d.]+ refreshes a second/.test(await page.textContent(".figures"))));
+say("figures are told", await until(async () => /[\d.]+ refreshes per second/.test(await page.textContent(".figures"))));
 await page.screenshot({ path: `${folder}/try.png` });
 
 await page.click("[data-mode=target]");

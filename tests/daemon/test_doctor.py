@@ -135,4 +135,4 @@ def test_a_sensor_in_the_stack_s_frame_needs_no_calibration(tmp_path: Path, monk
     code, checks = examined(tmp_path, '[sensor]\ndriver = "own_eyes:Own"')
     assert code == 0 and checks["usb"]["state"] != "fail"
     assert checks["sensor"]["detail"] == "own_eyes:Own delivers eyes"
-    assert "none is needed" in checks["calibration"]["detail"]
+    assert "not needed" in checks["calibration"]["detail"]

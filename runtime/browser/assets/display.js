@@ -1,7 +1,7 @@
-// What a stack of panels shows and what eyes see of it: optics, WebGL 2, and the plan of eyes and panels.
+// Optics of a stack of panels, its picture in WebGL 2, and the plan of eyes and panels.
 // Frame `stack`: metres, x out of the screen, y to the viewer's right, z up. Matrices are 3x3, row after row.
 
-const NEAREST_M = 0.01, MOST_SHIFT = 0.5, MOST_SCALE = 2; // limits of an alignment, as the runtime has them
+const NEAREST_M = 0.01, MOST_SHIFT = 0.5, MOST_SCALE = 2; // limits of an alignment, equal to the runtime's
 const PUPILS = 7;
 
 export const mul = (a, b) => [0, 1, 2].flatMap((i) => [0, 1, 2].map((j) => a[3 * i] * b[j] + a[3 * i + 1] * b[3 + j] + a[3 * i + 2] * b[6 + j]));
@@ -19,20 +19,20 @@ function reference(stack) {
   return stack.x_m.length % 2 ? stack.x_m[half] : (stack.x_m[half - 1] + stack.x_m[half]) / 2;
 }
 
-// (y, z, 1) on a plane x = x_m from a picture's pixel (u to the right, v down, 1): of an eye that looks at the origin.
+// Homography to (y, z, 1) on the plane x = x_m from a pixel (u right, v down, 1) of the picture of an eye that looks at the origin.
 export function planeFromPicture(eye, picture, x_m) {
   const norm = Math.hypot(...eye), back = eye.map((v) => v / norm), across = Math.hypot(eye[0], eye[1]) || 1;
   const right = [-eye[1] / across, eye[0] / across, 0];
   const up = [-back[2] * right[1], back[2] * right[0], back[0] * right[1] - back[1] * right[0]];
   const focal = picture.width / 2 / Math.tan((picture.fov_deg * Math.PI) / 360);
-  const ray = [0, 1, 2].map((k) => [ // of the direction, times focal: against u, v, 1
+  const ray = [0, 1, 2].map((k) => [ // direction times focal length, as coefficients of u, v, 1
     right[k], -up[k], -back[k] * focal - (right[k] * picture.width) / 2 + (up[k] * picture.height) / 2]);
   const far = eye[0] - x_m;
   return [...ray[1].map((v, j) => far * v - eye[1] * ray[0][j]), ...ray[2].map((v, j) => far * v - eye[2] * ray[0][j]),
     ...ray[0].map((v) => -v)];
 }
 
-// How far from the middle of their pictures, at a focal length of 1, eyes see through all panels: across and up.
+// Half width and half height, at focal length 1, of the picture that holds all the eyes see through every panel.
 export function reach(stack, eyes) {
   const { width_m, height_m, x_m } = stack;
   const found = eyes.map((eye) => {
@@ -43,18 +43,18 @@ export function reach(stack, eyes) {
       const ray = [x, (a * width_m) / 2, (b * height_m) / 2].map((v, k) => v - eye[k]), depth = Math.max(1e-6, -dot(ray, back));
       return [dot(ray, right) / depth, dot(ray, up) / depth];
     })));
-    return [0, 1].map((k) => Math.max(...[-1, 1].map((side) => // of what every panel still has there
+    return [0, 1].map((k) => Math.max(...[-1, 1].map((side) => // the narrowest panel limits the picture
       Math.min(...panels.map((corners) => Math.max(...corners.map((corner) => side * corner[k])))))));
   });
   return [0, 1].map((k) => Math.max(1e-3, ...found.map((one) => one[k])));
 }
 
-// Where the layer of a tilted panel has what an eye sees at (y, z, 1) of the ideal one; null: it is not tilted.
+// Homography to a tilted panel's layer from (y, z, 1) on the ideal panel, as an eye sees both; null: not tilted.
 function layerFromSeen(stack, n, eye) {
   const depth = stack.tilt?.depth[n];
   if (!depth?.some((v) => v)) return null;
   const [offset, right, up] = depth, x = stack.x_m[n], o = stack.tilt.seen_from_m, normal = [1, -right, -up];
-  const ideal = [[0, 1, 0], [0, 0, 1], [x, 0, 0]]; // columns: of y, z, 1
+  const ideal = [[0, 1, 0], [0, 0, 1], [x, 0, 0]]; // coefficients of y, z, 1
   const far = x + offset - dot(normal, eye);
   const columns = ideal.map((column, k) => {
     const weight = dot(normal, column) - (k === 2 ? dot(normal, eye) : 0);
@@ -65,14 +65,14 @@ function layerFromSeen(stack, n, eye) {
   return [0, 1, 2].flatMap((i) => columns.map((column) => column[i]));
 }
 
-// Panel pixels from (y, z, 1).
+// Affine map to panel pixels from (y, z, 1).
 function pixels(stack) {
   const u = stack.width_px / stack.width_m, v = stack.height_px / stack.height_m;
   return [u, 0, stack.width_px / 2, 0, -v, stack.height_px / 2, 0, 0, 1];
 }
 
-// Panel n's pixels from those of a picture: the ray of each is the one from `eye` through the point of the centre panel
-// that an eye at `nominal` has there.
+// Homography to panel n's pixels from a picture's: the ray runs from `eye` through the point of the centre panel that
+// `nominal` sees at that pixel.
 export function panelFromPicture(stack, n, eye, picture, nominal = eye) {
   const x = centre(stack), share = (stack.x_m[n] - eye[0]) / (x - eye[0]);
   const carried = [share, 0, eye[1] * (1 - share), 0, share, eye[2] * (1 - share), 0, 0, 1];
@@ -81,8 +81,8 @@ export function panelFromPicture(stack, n, eye, picture, nominal = eye) {
   return mul(pixels(stack), seen ? mul(seen, ideal) : ideal);
 }
 
-// Layers solved for eyes, aligned to other eyes (runtime/optics/alignment.py has the derivation): for each panel
-// [scale u, scale v, shift u, shift v] of solved pixels from shown ones; `limited` says why they end before the eyes do.
+// Alignment of solved layers to other eyes (derivation: runtime/optics/alignment.py): for each panel
+// [scale u, scale v, shift u, shift v] to solved pixels from shown ones; `limited`: why they follow only part of the way.
 export function alignment(stack, solved, eyes) {
   const old = middle(solved), now = middle(eyes), step = now.map((v, k) => v - old[k]), r = reference(stack);
   let share = 1, limited = "";
@@ -113,12 +113,12 @@ export function alignment(stack, solved, eyes) {
   return { maps, limited };
 }
 
-export const asTheyStand = (stack) => stack.x_m.map(() => [1, 1, 0, 0]);
+export const unaligned = (stack) => stack.x_m.map(() => [1, 1, 0, 0]);
 
 const VERTEX = `#version 300 es
 void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }`;
 
-// One layer as its panel shows it: aligned, mixed with the flat picture. Rounded to 8 bits by what it is drawn into.
+// One layer as its panel shows it: aligned, mixed with the flat picture, rounded to 8 bits by its framebuffer.
 const SHOW = `#version 300 es
 precision highp float; precision highp sampler2DArray;
 uniform sampler2DArray solved, flat_picture; uniform int panel; uniform vec4 map; uniform float flatness, rest; uniform vec2 size;
@@ -136,14 +136,14 @@ void main() {
   colour = vec4(code, 1.0);
 }`;
 
-// One layer of a coarse solution, enlarged to the panel's pixels.
+// Layer of a coarse solution enlarged to the panel's pixels.
 const ENLARGE = `#version 300 es
 precision highp float; precision highp sampler2DArray;
 uniform sampler2DArray layers; uniform int panel; uniform vec2 size; out vec4 colour;
 void main() { colour = texture(layers, vec3(gl_FragCoord.xy / size, panel)); }`;
 
-// What an eye sees: sin² of the summed phases along each ray, averaged over the pixel. Panels' pixels are even boxes. With
-// `rays` a grid of rays; without, exactly: the pixel is cut at every edge of every panel's pixels in it.
+// Picture that an eye sees: sin² of the summed phases along each ray, averaged over the pixel. Panel pixels are uniform
+// boxes. `rays` > 0: a grid of rays; 0: exact, the pixel is cut at every edge of a panel pixel in it.
 const SEE = `#version 300 es
 precision highp float; precision highp sampler2DArray;
 const int PANELS = @PANELS@;
@@ -157,7 +157,7 @@ vec3 malus(vec3 phase) {
   vec3 s = sin(phase * 1.5707963267948966);
   return s * s;
 }
-vec4 ray(vec2 p) { // and 1 where it crosses every panel
+vec4 ray(vec2 p) { // alpha 1: the ray crosses every panel
   vec3 sum = vec3(0.0);
   for (int n = 0; n < PANELS; n++) {
     vec2 q = place(n, p);
@@ -166,7 +166,7 @@ vec4 ray(vec2 p) { // and 1 where it crosses every panel
   }
   return vec4(malus(sum), 1.0);
 }
-float next(float at, float slope) { // how far along the pixel the next edge is
+float next(float at, float slope) { // distance along the pixel to the next edge
   float edge = slope > 0.0 ? floor(at + 1e-4) + 1.0 : ceil(at - 1e-4) - 1.0;
   return abs(slope) < 1e-6 ? 2.0 : (edge - at) / slope;
 }
@@ -224,7 +224,7 @@ void main() {
   colour = vec4(light, sum.a);
 }`;
 
-// A panel drawn as a parallelogram: its corner and two edges in the view, -1 to 1.
+// Panel drawn as a parallelogram: its corner and two edges in clip space, -1 to 1.
 const CARD_VERTEX = `#version 300 es
 uniform vec2 corner, right, down; out vec2 at;
 void main() { at = vec2(gl_VertexID & 1, gl_VertexID >> 1); gl_Position = vec4(corner + right * at.x + down * at.y, 0.0, 1.0); }`;
@@ -239,7 +239,7 @@ void main() {
   colour = vec4(sum * 0.25, 1.0) * opacity;
 }`;
 
-// The display in a canvas. Layers lie in texture arrays, a panel each.
+// The display in a canvas. Layers are texture arrays with one slice per panel.
 export class Display {
   constructor(canvas, stack) {
     this.canvas = canvas;
@@ -256,7 +256,7 @@ export class Display {
     for (const name of ["solved", "flat", "shown"]) this.textures[name] = this.#layers(width, height);
     this.targets = [null, null];
     this.framebuffer = g.createFramebuffer();
-    this.maps = null; // of what `shown` holds; null: nothing yet
+    this.maps = null; // maps that `shown` was drawn with; null: not drawn yet
   }
 
   #layers(width, height) {
@@ -295,7 +295,7 @@ export class Display {
     return places;
   }
 
-  // `solved` or `flat`: all layers after each other as RGBA bytes, or a picture for each panel; of a coarse solution, of its size.
+  // Load `solved` or `flat`: concatenated RGBA bytes or one picture per panel; a coarse solution gives its own size.
   load(name, layers, [w, h] = [this.stack.width_px, this.stack.height_px]) {
     const g = this.g, { width_px: width, height_px: height, x_m } = this.stack, coarse = w !== width || h !== height, key = `${w}x${h}`;
     g.activeTexture(g.TEXTURE0);
@@ -321,7 +321,7 @@ export class Display {
     g.bindFramebuffer(g.FRAMEBUFFER, null);
   }
 
-  // What an eye should see; null: that is not known.
+  // Set an eye's target picture; null: none.
   target(side, image) {
     const g = this.g, texture = image && g.createTexture();
     g.deleteTexture(this.targets[side]);
@@ -335,7 +335,7 @@ export class Display {
     g.texParameteri(g.TEXTURE_2D, g.TEXTURE_MIN_FILTER, g.LINEAR_MIPMAP_LINEAR);
   }
 
-  // The panels show the solution by these maps, mixed with the flat picture.
+  // Draw the panels: the solution mapped by `maps`, mixed with the flat picture.
   show(maps, flatness = 0) {
     const g = this.g, key = JSON.stringify([maps, flatness]);
     if (key === this.maps) return;
@@ -344,7 +344,7 @@ export class Display {
     g.bindTexture(g.TEXTURE_2D_ARRAY, this.textures.flat);
     g.uniform1i(places.flat_picture, 1);
     g.uniform1f(places.flatness, flatness);
-    g.uniform1f(places.rest, this.stack.rest_code / 255); // beside a solution that was shifted
+    g.uniform1f(places.rest, this.stack.rest_code / 255); // outside a shifted solution
     g.uniform2f(places.size, w, h);
     g.bindFramebuffer(g.FRAMEBUFFER, this.framebuffer);
     g.viewport(0, 0, w, h);
@@ -358,9 +358,9 @@ export class Display {
     this.maps = key;
   }
 
-  // One eye's picture into a part [x, y, width, height] (from below) of what is bound. `rays` 0: exact boxes; nominal: whose
-  // picture it is, carried along on the centre panel; gain 1: the target itself, more: the difference to it, so many times;
-  // maps: through the solution itself, shifted, without what panels make of it: quick.
+  // Draw one eye's picture into a part [x, y, width, height] (y from below) of the bound framebuffer. rays 0: exact boxes.
+  // nominal: eye whose picture is carried along on the centre panel. gain 1: the target; above 1: difference times gain.
+  // maps: sample the shifted solution directly, without drawing the panels first (faster).
   see({ eye, nominal = eye, picture, part, maps = null, rays = 0, pupil_mm = 0, side = 0, gain = 0, stride = [1, 1], room = [0.07, 0.08, 0.1] }) {
     const g = this.g, { stack } = this, places = this.#use("see", maps ? "solved" : "shown"), count = stack.x_m.length;
     g.viewport(...part);
@@ -368,7 +368,7 @@ export class Display {
     for (let n = 0; n < count; n += 1) {
       const ideal = panelFromPicture(stack, n, eye, picture, nominal), [su, sv, tu, tv] = maps?.[n] ?? [1, 1, 0, 0];
       const m = maps ? mul([su, 0, tu, 0, sv, tv, 0, 0, 1], ideal) : ideal, share = 1 - (stack.x_m[n] - eye[0]) / (centre(stack) - eye[0]);
-      const scale = 1 / (m[6] * picture.width / 2 + m[7] * picture.height / 2 + m[8] || 1); // before the eye: positive
+      const scale = 1 / (m[6] * picture.width / 2 + m[7] * picture.height / 2 + m[8] || 1); // in front of the eye: positive
       for (let k = 0; k < 3; k += 1) columns.push(...[m[k], m[3 + k], m[6 + k]].map((v) => v * scale));
       apart.push((share * stack.width_px) / stack.width_m, (-share * stack.height_px) / stack.height_m);
     }
@@ -391,7 +391,8 @@ export class Display {
     g.drawArrays(g.TRIANGLES, 0, 3);
   }
 
-  // The same as numbers: RGBA bytes, the top row first; opaque where every ray crosses every panel. Drawn a few rows at a time, so that no browser ends it.
+  // Picture of `see` as RGBA bytes, top row first; alpha 255 where every ray crosses every panel. Drawn in strips of 64 rows,
+  // because browsers kill long draw calls.
   seen({ columns, rows, ...how }) {
     const g = this.g, texture = g.createTexture(), bytes = new Uint8Array(columns * rows * 4);
     g.activeTexture(g.TEXTURE1);
@@ -415,7 +416,7 @@ export class Display {
     return bytes;
   }
 
-  // A PNG's data URL of what an eye sees, light of even boxes.
+  // Data URL of a PNG of an eye's exact picture.
   picture(how, width, height) {
     const bytes = this.seen({ ...how, columns: width, rows: height, picture: { width, height, fov_deg: how.fov_deg } });
     for (let k = 3; k < bytes.length; k += 4) bytes[k] = 255;
@@ -424,7 +425,7 @@ export class Display {
     return canvas.toDataURL("image/png");
   }
 
-  // The codes that panel n shows at a pixel.
+  // Codes that panel n shows at a pixel.
   codes(n, u, v) {
     const g = this.g, found = new Uint8Array(4);
     g.bindFramebuffer(g.FRAMEBUFFER, this.framebuffer);
@@ -434,7 +435,7 @@ export class Display {
     return [...found.slice(0, 3)];
   }
 
-  // Panel n as a parallelogram: corner, edge to the right, edge down, in the canvas's pixels.
+  // Draw panel n as a parallelogram: corner, right edge and downward edge in canvas pixels.
   card(n, corner, right, down, opacity = 1) {
     const g = this.g, places = this.#use("card", "shown"), { width, height } = this.canvas;
     g.viewport(0, 0, width, height);
@@ -449,7 +450,7 @@ export class Display {
   }
 }
 
-// Eyes and panels in an SVG, from above (axis 1) or from the side (axis 2): x, to the viewer, is drawn to the right.
+// Plan of eyes and panels in an SVG, from above (axis 1) or from the side (axis 2); x, towards the viewer, points right.
 export function drawPlan(svg, { stack, eyes, axis, range = null, sigma_m = 0, solved = null, far_m = 1 }) {
   const size_m = axis === 1 ? stack.width_m : stack.height_m;
   const far = Math.max(far_m, eyes ? 1.15 * Math.max(eyes[0][0], eyes[1][0]) : 0);

@@ -1,21 +1,21 @@
-// The page around a display: pointer and keys are the head, modes to look in, what is told beside it.
-import { Display, alignment, asTheyStand, drawPlan, middle, moved, reach } from "/display.js";
+// The page around a display: head control by pointer and keys, viewing modes, and the figures next to the picture.
+import { Display, alignment, unaligned, drawPlan, middle, moved, reach } from "/display.js";
 
-const MODES = [ // key, name, group, what it says of itself
-  ["wiggle", "Wiggle", "Eyes", "Both eyes' pictures in turn: what jumps most is nearest."],
-  ["parallel", "Side by side", "Eyes", "Look through the screen: the left picture is the left eye's."],
-  ["crossed", "Crossed", "Eyes", "Cross your eyes: the left picture is the right eye's."],
+const MODES = [ // key, name, group, hint
+  ["wiggle", "Wiggle", "Eyes", "Alternates between both eyes' pictures: the nearest parts jump most."],
+  ["parallel", "Side by side", "Eyes", "Look through the screen: the left picture is for the left eye."],
+  ["crossed", "Crossed", "Eyes", "Cross your eyes: the left picture is for the right eye."],
   ["anaglyph", "Red and cyan", "Eyes", "For glasses with a red left and a cyan right glass."],
   ["left", "Left eye", "Eyes", ""],
   ["right", "Right eye", "Eyes", ""],
   ["panels", "Each panel", "Panels", "What each panel shows, rear to front."],
-  ["apart", "Drawn apart", "Panels", "A point of the picture, and the rays that reach each eye from there. Point at another one."],
-  ["target", "Asked for", "Check", "What each eye should see where the layers were solved for."],
-  ["difference", "Difference × 8", "Check", "Between what each eye sees and should see; black is perfect. Head where the layers were solved for."],
+  ["apart", "Drawn apart", "Panels", "One point of the picture and the rays from it to each eye. Point elsewhere to move it."],
+  ["target", "Target", "Check", "What each eye should see from the head position the layers were solved for."],
+  ["difference", "Difference × 8", "Check", "What each eye sees minus what it should see; black is perfect. For the head position the layers were solved for."],
 ];
 const KEYS = { ArrowLeft: [0, -1, 0], ArrowRight: [0, 1, 0], ArrowUp: [0, 0, 1], ArrowDown: [0, 0, -1], "+": [-2, 0, 0], "-": [2, 0, 0] };
-const STEP_M = 0.005, REACH_M = [0.5, 0.3]; // of a key; of the picture's whole width and height
-const REST_MS = 200, REST_RAYS = 5, STRIPS = 12, WIGGLE_MS = 280, SAMPLED = 12; // every so-manieth pixel, each way, tells the light
+const STEP_M = 0.005, REACH_M = [0.5, 0.3]; // head movement per key press; across the picture's whole width and height
+const REST_MS = 200, REST_RAYS = 5, STRIPS = 12, WIGGLE_MS = 280, SAMPLED = 12; // light is measured on every SAMPLED-th pixel in each direction
 const PAGE = `
 <div class="stage"><canvas tabindex="0" aria-label="What the eyes see. Arrow keys move the head, + and - bring it nearer and farther."></canvas>
 <svg class="over" aria-hidden="true"></svg><div class="names" aria-hidden="true"></div><p class="notice" role="status" hidden></p></div>
@@ -31,7 +31,7 @@ const node = (name, text = "", kind = "") => Object.assign(document.createElemen
 const mm = (metres) => Math.round(Math.abs(metres) * 1000);
 
 export class Look {
-  // scene: stack, fov_deg, and eyes_m that the layers at hand were solved for; eyesAt: both eyes from the head's move.
+  // scene: stack, fov_deg, and the eyes_m that the layers were solved for; eyesAt: both eyes for a head's displacement.
   constructor(root, scene, { title, eyesAt = (head) => moved(scene.eyes_m, head) }) {
     root.innerHTML = PAGE;
     this.$ = (query) => root.querySelector(query);
@@ -40,17 +40,17 @@ export class Look {
     this.display = new Display(this.canvas, this.stack);
     Object.assign(this, { mode: "parallel", head: [0, 0, 0], aligned: true, pupil: false, point: [0, 0], rays: 3, coarse: 1, frames: 0 });
     this.flatness = 0;
-    this.used = null; // eyes that the panels are aligned to, where that is not where they truly are
-    this.state = ""; // why this is not what two eyes should see
-    this.told = () => {}; // called where the head has moved
+    this.used = null; // eyes that the panels are aligned to, if not the true ones
+    this.state = ""; // why the picture is not the one two eyes should see
+    this.onhead = () => {}; // called with the eyes after the head has moved
     this.onframe = () => {};
-    this.onmode = () => {}; // called where another mode is chosen, with whether it needs what eyes should see
+    this.onmode = () => {}; // called when a mode is chosen; true: it needs the targets
     this.$("h1").textContent = title;
     this.$(".stage").style.setProperty("--aspect", this.stack.width_m / this.stack.height_m);
     this.#modes();
     this.#controls();
     new ResizeObserver(() => this.draw()).observe(this.canvas);
-    this.canvas.addEventListener("webglcontextlost", () => (this.$(".hint").textContent = "The browser has lost its graphics. Load the page again."));
+    this.canvas.addEventListener("webglcontextlost", () => (this.$(".hint").textContent = "The browser lost its graphics context. Reload the page."));
   }
 
   get eyes() {
@@ -58,11 +58,11 @@ export class Look {
   }
 
   get maps() {
-    if (!this.aligned || !this.scene.eyes_m) return { maps: asTheyStand(this.stack), limited: "" };
+    if (!this.aligned || !this.scene.eyes_m) return { maps: unaligned(this.stack), limited: "" };
     return alignment(this.stack, this.scene.eyes_m, this.used ?? this.eyes);
   }
 
-  // Panels of the same pixels elsewhere; what is shown of them comes later.
+  // Change the panels' positions; layers for them follow later.
   turnTo(stack) {
     this.stack = this.scene.stack = this.display.stack = stack;
     this.scene.eyes_m = null;
@@ -70,18 +70,18 @@ export class Look {
 
   moveTo(head) {
     this.head = head;
-    this.told(this.eyes);
+    this.onhead(this.eyes);
     this.draw();
   }
 
-  // What stands over the picture where there is none to look at; empty: nothing.
+  // Show a message over the picture; empty: hide it.
   notice(text) {
     const box = this.$(".notice");
     if (box.textContent !== text) box.textContent = text;
     box.hidden = !text;
   }
 
-  // Soon; with more rays once nothing has moved for a while.
+  // Redraw at the next frame, and with more rays after a rest of REST_MS.
   draw() {
     this.moving = performance.now();
     this.fresh = true;
@@ -91,7 +91,7 @@ export class Look {
   #frame(now) {
     this.next = null;
     clearTimeout(this.turn);
-    if (this.before !== undefined) { // pictures after each other: as fine as this machine draws in time
+    if (this.before !== undefined) { // consecutive frames: adapt rays and resolution to this machine's speed
       this.pace = 0.8 * (this.pace ?? 30) + 0.2 * (now - this.before);
       if (this.pace > 50 && this.rays > 1) [this.rays, this.pace] = [this.rays - 1, 30];
       else if (this.pace > 50 && this.coarse > 0.6) [this.coarse, this.pace] = [this.coarse * 0.7, 30];
@@ -101,7 +101,7 @@ export class Look {
     this.frames += 1;
     const resting = !this.fresh && performance.now() - this.moving > REST_MS, { width, height, resized } = this.#fitted(resting);
     this.fresh = false;
-    const { maps, limited } = this.mode === "difference" ? { maps: asTheyStand(this.stack), limited: "" } : this.maps;
+    const { maps, limited } = this.mode === "difference" ? { maps: unaligned(this.stack), limited: "" } : this.maps;
     this.quick = !resting && this.rays === 1 && this.flatness === 0 && !["panels", "apart"].includes(this.mode) ? maps : null;
     if (!this.quick) this.display.show(maps, this.flatness);
     const turning = this.mode === "wiggle";
@@ -110,7 +110,7 @@ export class Look {
       this.#paint(width, height, this.rays);
       this.onframe();
       if (!resting) {
-        this.#tell(limited);
+        this.#report(limited);
         [this.before, this.isMeasured] = [now, false];
         this.next = requestAnimationFrame((then) => this.#frame(then));
         return;
@@ -139,12 +139,12 @@ export class Look {
   #fitted(resting) {
     const scale = Math.min(window.devicePixelRatio || 1, 2) * (resting ? 1 : this.coarse), { clientWidth, clientHeight } = this.canvas;
     const width = Math.max(16, Math.round(clientWidth * scale)), height = Math.max(16, Math.round(clientHeight * scale));
-    const resized = this.canvas.width !== width || this.canvas.height !== height; // which clears it
+    const resized = this.canvas.width !== width || this.canvas.height !== height; // resizing clears the canvas
     if (resized) Object.assign(this.canvas, { width, height });
     return { width, height, resized };
   }
 
-  // What can be seen through all panels fills a picture of this size for a head where the layers were solved for.
+  // Picture whose field of view fits all that the eyes solved for can see through every panel.
   #picture(width, height) {
     const [across, up] = reach(this.stack, this.scene.eyes_m ?? this.eyes);
     const focal = 0.48 * Math.min(width / across, height / up);
@@ -154,7 +154,7 @@ export class Look {
   #paint(width, height, rays) {
     const { display, mode } = this, g = display.g, pupil_mm = this.pupil ? 4 : 0;
     const wide = width >= height, checks = mode === "target" || mode === "difference", two = checks || mode === "parallel" || mode === "crossed";
-    const across = two && (checks ? this.#fitsBeside(width, height) : wide) ? 2 : 1, down = two && across === 1 ? 2 : 1, w = Math.floor(width / across), h = Math.floor(height / down);
+    const across = two && (checks ? this.#fitsSideBySide(width, height) : wide) ? 2 : 1, down = two && across === 1 ? 2 : 1, w = Math.floor(width / across), h = Math.floor(height / down);
     this.$(".over").replaceChildren();
     g.clearColor(0.07, 0.08, 0.1, 1);
     const sides = two ? (mode === "crossed" ? [1, 0] : [0, 1]) : [mode === "right" || (mode === "wiggle" && Math.floor(performance.now() / WIGGLE_MS) % 2) ? 1 : 0];
@@ -163,7 +163,7 @@ export class Look {
     if (mode === "apart") return this.#apart(width, height);
     if (checks) {
       g.clear(g.COLOR_BUFFER_BIT);
-      if (!display.targets[0]) return; // a moment is being measured
+      if (!display.targets[0]) return; // the targets have not arrived yet
       const { width: pw, height: ph } = this.scene.picture, fit = 0.97 * Math.min(w / pw, h / ph), pic = { width: Math.floor(pw * fit), height: Math.floor(ph * fit) };
       sides.forEach((side, k) => {
         const left = (k % across) * w + ((w - pic.width) >> 1), below = height - (Math.floor(k / across) + 1) * h + ((h - pic.height) >> 1);
@@ -183,8 +183,8 @@ export class Look {
     this.#names(mode === "anaglyph" ? [] : sides.map((side, k) => [`${side ? "right" : "left"} eye`, ((k % across) + 0.5) / across, (Math.floor(k / across) + 1) / down]));
   }
 
-  // Whether two pictures become larger beside than above each other.
-  #fitsBeside(width, height) {
+  // True if two pictures are larger side by side than one above the other.
+  #fitsSideBySide(width, height) {
     const { width: pw, height: ph } = this.scene.picture;
     return Math.min(width / 2 / pw, height / ph) >= Math.min(width / pw, height / 2 / ph);
   }
@@ -213,7 +213,7 @@ export class Look {
     this.#names(names);
   }
 
-  // The panels drawn apart, seen from the left and above; two rays cross at a point of the centre panel.
+  // Exploded view of the panels from the upper left; two rays cross at a point of the centre panel.
   #drawnApart(width, height) {
     const { x_m, width_m, height_m } = this.stack, deep = x_m.at(-1) - x_m[0], scale = Math.min((0.56 * width) / width_m, (0.6 * height) / height_m);
     const toViewer = [(0.26 * width) / deep, (0.2 * height) / deep], origin = [0.47 * width, 0.47 * height], half = (x_m.at(-1) + x_m[0]) / 2;
@@ -251,10 +251,10 @@ export class Look {
     this.#names(x_m.map((x, n) => [panelName(n, count), ...at(x, -0.36 * width_m, height_m / 2).map((p, k) => p / (k ? height : width))]));
   }
 
-  // What a ray's panels show, and what comes of it.
+  // Line of text: the codes along a ray and the light they add up to.
   #sum(kind, codes) {
     const line = node("p", `${kind} eye: `, kind);
-    if (codes.includes(null)) return line.append("passes beside a panel"), line;
+    if (codes.includes(null)) return line.append("misses a panel"), line;
     const swatch = (rgb) => {
       const made = node("i");
       made.style.background = `rgb(${rgb.map(Math.round)})`;
@@ -267,7 +267,7 @@ export class Look {
     return line;
   }
 
-  #tell(limited) {
+  #report(limited) {
     const { eyes_m: solved } = this.scene, eyes = this.eyes;
     for (const svg of this.$(".views").querySelectorAll("svg"))
       drawPlan(svg, { stack: this.stack, eyes, solved, axis: Number(svg.dataset.axis), far_m: 0.7, sigma_m: this.sigma_m ?? 0 });
@@ -276,12 +276,12 @@ export class Look {
     const parts = [[y, "to the right", "to the left"], [z, "up", "down"], [x, "farther", "nearer"]].filter(([v]) => mm(v));
     const where = parts.length ? `The head is ${parts.map(([v, one, other]) => `${mm(v)} mm ${v > 0 ? one : other}`).join(", ")} from where the layers were solved for` : "The head is where the layers were solved for";
     if (this.state) return void (this.$(".head").textContent = this.state);
-    const limit = limited ? `; the panels could only follow part of the way: ${limited}` : "";
+    const limit = limited ? `; the outer panels could follow only part of the way: ${limited}` : "";
     this.$(".head").textContent = `${where}${limit}.`;
     if (this.display.targets[0]) this.$(".light").textContent = "…";
   }
 
-  // The light that both eyes get, against what was asked for, carried along on the centre panel; of some of its pixels.
+  // PSNR of the light at both eyes on sampled pixels; the targets move with the centre panel.
   #measure() {
     const { display, scene } = this;
     if (!display.targets[0] || this.flatness > 0) return;
@@ -299,11 +299,11 @@ export class Look {
         counted += 3;
       }
     }
-    if (!counted) return void (this.$(".light").textContent = "From here nothing is seen through all panels.");
-    this.light_db = -10 * Math.log10(Math.max(error / counted - (scene.target_error ?? 0), 1e-9)); // less what storing targets changes
-    const words = this.light_db > 33 ? "hard to tell from what was asked for" : this.light_db > 27 ? "a good picture with faint traces of the other layers" :
-      this.light_db > 21 ? "ghosts and coloured edges are plain to see" : "the layers fall apart";
-    this.$(".light").textContent = `Light that reaches both eyes here: ${this.light_db.toFixed(1)} dB against what was asked for: ${words}.`;
+    if (!counted) return void (this.$(".light").textContent = "No ray from here crosses all panels.");
+    this.light_db = -10 * Math.log10(Math.max(error / counted - (scene.target_error ?? 0), 1e-9)); // minus the error of the targets' compression
+    const words = this.light_db > 33 ? "hard to distinguish from the target" : this.light_db > 27 ? "a good picture with faint traces of the other layers" :
+      this.light_db > 21 ? "obvious ghosts and coloured edges" : "the layers fall apart";
+    this.$(".light").textContent = `Light reaching both eyes here: ${this.light_db.toFixed(1)} dB against the target: ${words}.`;
   }
 
   #modes() {
@@ -379,7 +379,7 @@ export class Look {
     this.moveTo([Math.max(least, Math.min(1.5, this.head[0] + metres)), this.head[1], this.head[2]]);
   }
 
-  // What scripts may ask of every page (docs/contracts.md).
+  // Functions that every page offers to scripts (docs/contracts.md).
   get doors() {
     return {
       setHead: (head) => this.moveTo([...head]),

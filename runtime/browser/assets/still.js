@@ -1,4 +1,4 @@
-// A solution as one file: its layers and its pictures are in the page.
+// A solution as one file with its layers and targets embedded.
 import { Look } from "/look.js";
 
 const read = (id) => JSON.parse(document.getElementById(id).textContent);
@@ -12,7 +12,7 @@ const image = async (url) => {
 async function begin() {
   const scene = read("scene"), layers = await Promise.all(read("layers").map(image));
   const wanted = await Promise.all(read("wanted").map(image)).catch(() => {
-    scene.lines.push("This browser can't read AVIF, in which the page has what was asked for.");
+    scene.lines.push("This browser can't read AVIF, the format of this page's targets.");
     return [];
   });
   if (wanted.length) scene.picture = { width: wanted[0].naturalWidth, height: wanted[0].naturalHeight };
@@ -27,6 +27,6 @@ async function begin() {
 
 window.phasestack = {};
 window.phasestack.ready = begin().catch((error) => {
-  document.querySelector("main").textContent = `This can't be shown here: ${error.message}`;
+  document.querySelector("main").textContent = `This browser can't show the page: ${error.message}`;
   throw error;
 });

@@ -1,39 +1,39 @@
-// The display, live: this page's pointer is the head that the daemon's sensor sees, and this page is the panels.
+// Live display: this page's pointer is the head that the daemon's sensor sees, and this page shows the panels.
 import { Look } from "/look.js";
 import { ask, token } from "/session.js";
 
-const AGAIN_MS = 500, STATUS_MS = 500, RETRY_MS = 1000, KEPT = 600; // a head that rests is still there; what latencies are kept
+const AGAIN_MS = 500, STATUS_MS = 500, RETRY_MS = 1000, KEPT = 600; // AGAIN_MS: a resting head is sent again; KEPT: latencies in the statistics
 const PLACE_M = [0.6, 0, 0];
 const CONTROLS = `
 <dl class="figures"></dl>
 <form><label>Scene <input type="text" name="scene" list="scenes" autocomplete="off"></label><datalist id="scenes"></datalist>
 <label>Model <select name="model"></select></label>
 <label>Gap between panels, mm <input type="number" name="gap_mm" min="1" max="500" step="1"></label>
-<label>Sensor's noise, mm <input type="number" name="noise_mm" min="0" max="50" step="0.1"></label>
-<label>Sensor's latency, ms <input type="number" name="latency_ms" min="0" max="1000" step="5"></label>
-<label>Eyes apart, mm <input type="number" name="ipd_mm" min="45" max="80" step="1"></label>
-<label>Turns a minute <input type="number" name="turntable" min="-60" max="60" step="1" value="0"></label>
-<label class="tick"><input type="checkbox" name="camera"> this browser's camera sees the head</label>
-<label hidden>Camera's picture is wide, degrees <input type="number" name="camera_fov_deg" min="20" max="150" step="1" value="65"></label>
-<figure class="found" hidden><svg role="img" aria-label="What the camera sees, and the pupils found in it"></svg><figcaption></figcaption></figure>
-<label class="tick"><input type="checkbox" name="held"> hold the solver: alignment alone follows the head</label>
-<label class="tick"><input type="checkbox" name="lost"> eyes lost: nobody before the display</label></form>
+<label>Sensor noise, mm <input type="number" name="noise_mm" min="0" max="50" step="0.1"></label>
+<label>Sensor latency, ms <input type="number" name="latency_ms" min="0" max="1000" step="5"></label>
+<label>Distance between eyes, mm <input type="number" name="ipd_mm" min="45" max="80" step="1"></label>
+<label>Turntable, turns per minute <input type="number" name="turntable" min="-60" max="60" step="1" value="0"></label>
+<label class="tick"><input type="checkbox" name="camera"> track the head with this browser's camera</label>
+<label hidden>Camera's horizontal field of view, degrees <input type="number" name="camera_fov_deg" min="20" max="150" step="1" value="65"></label>
+<figure class="found" hidden><svg role="img" aria-label="Camera picture with the pupils found"></svg><figcaption></figcaption></figure>
+<label class="tick"><input type="checkbox" name="held"> pause the solver: only alignment follows the head</label>
+<label class="tick"><input type="checkbox" name="lost"> lose the eyes, as if the viewer had left</label></form>
 <p class="told" role="status"></p><p><a href="/operator">the operator's page</a></p>`;
 
 let look = null, socket = null, viewer = false, sensor = true, lastSent = 0, follows = null, ipd_m = 0.063, newest = null, pending = null;
 let checks = false, camera = null, lookedAt = null;
-let layersSeen = { solved: false, flat: false }, first = null, wishes = 0, answered_ms = 0; // commands under way; when the last one ended
+let layersSeen = { solved: false, flat: false }, first = null, wishes = 0, answered_ms = 0; // wishes: commands in progress; answered_ms: when the last one ended
 const latencies = [], drawn = [];
 const main = document.querySelector("main");
 
-// Both eyes of a head that faces the display's middle.
+// Both eyes of a head that faces the centre of the display.
 function eyesOf(head) {
   const at = PLACE_M.map((v, k) => v + head[k]), norm = Math.hypot(at[0], at[1]);
   const right = [-at[1] / norm, at[0] / norm, 0];
   return [-0.5, 0.5].map((side) => at.map((v, k) => v + side * ipd_m * right[k]));
 }
 
-// Where they truly are: under the pointer; of another page's or a camera's head, what is known of it.
+// True eyes under this page's pointer; otherwise the newest that the daemon measured for another page or a camera.
 const eyesNow = (head) => (viewer && sensor ? eyesOf(head) : newest?.eyes_m ?? follows ?? eyesOf([0, 0, 0]));
 const say = (message) => { if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message)); };
 
@@ -65,7 +65,7 @@ function build({ stack, fov_deg }) {
   const title = stack.x_m.length > 2 ? `${stack.x_m.length} panels, live` : "two panels, live";
   const picture = { width: stack.width_px, height: stack.height_px };
   look = new Look(main, { stack, fov_deg, picture, eyes_m: null }, { title, eyesAt: (head) => eyesNow(head) });
-  look.told = see;
+  look.onhead = see;
   look.onmode = check;
   main.querySelector(".more").innerHTML = CONTROLS;
   for (const [name, value] of [["noise_mm", 0.2], ["latency_ms", 0], ["ipd_mm", ipd_m * 1000]]) form(name).value = value;
@@ -86,17 +86,17 @@ function build({ stack, fov_deg }) {
   about();
 }
 
-// What eyes should see is known of moments that are measured: such a mode shows the newest one instead of what is live.
+// Targets exist only for measured moments: a checking mode shows the newest of those instead of the live picture.
 function check(on) {
   if (on === checks) return;
   checks = on;
   for (const side of [0, 1]) look.display.target(side, null);
   main.querySelector(".light").textContent = "";
-  look.notice(on ? "A moment is being measured …" : "");
+  look.notice(on ? "Measuring a moment …" : "");
   say({ checks });
 }
 
-// This browser's own camera, where it is permitted: a picture at a time, the next one once that was looked at.
+// Send this browser's camera, if permitted, one picture at a time: the next one follows the daemon's answer.
 async function film(on) {
   camera?.getTracks().forEach((track) => track.stop());
   camera = null;
@@ -115,7 +115,7 @@ async function film(on) {
   while (camera === mine) {
     const taken_ms = performance.now();
     plain.drawImage(video, 0, 0, canvas.width, canvas.height);
-    const coded = await [0.85, 0.6, 0.3].reduce(async (before, quality) => { // as fine as a message may be long
+    const coded = await [0.85, 0.6, 0.3].reduce(async (before, quality) => { // the best quality that fits a message
       const blob = await before;
       return blob?.size < 60000 ? blob : canvas.convertToBlob({ type: "image/jpeg", quality });
     }, null);
@@ -139,7 +139,7 @@ function found({ url, size: [width, height], pupils_px, reason }) {
   svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
   const rings = (pupils_px ?? []).map(([cx, cy], side) => made("circle", { cx, cy, r: 6, class: `pupil ${side ? "right" : "left"}` }));
   svg.replaceChildren(made("image", { href: url, width, height }), ...rings);
-  box.querySelector("figcaption").textContent = pupils_px ? "what the camera sees, and the pupils found" : `no viewer: ${reason}`;
+  box.querySelector("figcaption").textContent = pupils_px ? "camera picture and the pupils found" : `no viewer: ${reason}`;
 }
 
 function painted() {
@@ -166,13 +166,13 @@ function take({ refresh, viewer: mine }) {
   if (layersSeen.solved && flatness < 1) first?.();
 }
 
-// Why the picture is not what two eyes should see.
+// Why the picture is not the one two eyes should see.
 function explained({ state, reason }) {
   const late = /solutions take (\d+) ms|has not answered for (\d+) ms/.exec(reason);
   if (!late) return `${state.split(":")[0]}: ${reason}`;
   const seconds = ((late[1] ?? late[2]) / 1000).toFixed(1);
   return `A solution takes ${late[1] ? "" : "more than "}${seconds} s on this machine. Until the next one the panels are aligned to your head. ` +
-    "Sooner: choose the model fast, close other programs, or give smaller panels (--config).";
+    "To speed it up: choose the model fast, close other programs, or configure smaller panels (--config).";
 }
 
 function load(bytes) {
@@ -216,7 +216,7 @@ function connect() {
   socket.onclose = () => {
     [newest, drawn.length, latencies.length] = [null, 0, 0];
     for (const kind of [".figures", ".head"]) main.querySelector(kind)?.replaceChildren();
-    look?.notice("phasestack try has ended. Start it again, and open the address that it names.");
+    look?.notice("phasestack try has ended. Start it again and open the address it prints.");
     setTimeout(connect, RETRY_MS);
   };
 }
@@ -235,19 +235,19 @@ async function about() {
   }
 }
 
-// asked_ms: when it was asked for. What is older than a command says nothing of what that set.
+// asked_ms: time of the request; a status requested before the last command ended does not update the controls.
 function figures(now, asked_ms) {
   const at = (share) => [...latencies].sort((a, b) => a - b)[Math.floor(share * (latencies.length - 1))];
   const rests = now.eyes_label === "rested", solves = now.solutions_per_s_now > 0;
-  const rows = { // what is not known is left out
-    "this page draws": drawn.length > 1 && `${drawn.length} pictures a second`,
-    "the panels are given": now.fps_now > 0 && `${number(now.fps_now)} refreshes a second`,
-    "the solver makes": solves ? `${number(now.solutions_per_s_now)} solutions a second (${now.model})` : now.paused ? "nothing: it is held" : rests && "nothing new while the head rests",
-    "it works at": solves && now.effort && `${now.effort} (raster and steps)`,
+  const rows = { // rows without a value are omitted
+    "this page draws": drawn.length > 1 && `${drawn.length} pictures per second`,
+    "the panels receive": now.fps_now > 0 && `${number(now.fps_now)} refreshes per second`,
+    "the solver makes": solves ? `${number(now.solutions_per_s_now)} solutions per second (${now.model})` : now.paused ? "nothing: it is paused" : rests && "nothing new while the head rests",
+    "effort": solves && now.effort && `${now.effort} (raster and steps)`,
     "the view was drawn for a head": solves && typeof now.view_error_estimated_now_mm === "number" && `${number(now.view_error_estimated_now_mm)} mm from yours`,
-    "the newest is": solves && `${number(now.solution_age_now_ms, 0)} ms old`,
-    "the eyes are known to": typeof now.eye_sigma_now_mm === "number" && `${number(now.eye_sigma_now_mm, 2)} mm (${now.eyes_label})`,
-    "pointer to aligned picture": latencies.length > 20 && `${number(at(0.5), 0)} ms, 99 of 100 within ${number(at(0.99), 0)} ms`,
+    "the newest solution is": solves && `${number(now.solution_age_now_ms, 0)} ms old`,
+    "standard deviation of the eyes": typeof now.eye_sigma_now_mm === "number" && `${number(now.eye_sigma_now_mm, 2)} mm (${now.eyes_label})`,
+    "pointer to aligned picture": latencies.length > 20 && `${number(at(0.5), 0)} ms median, 99% within ${number(at(0.99), 0)} ms`,
     ...(now.program ? { "a program draws": now.missing?.content ?? (now.program.frame_ms > 0 && `${number(now.program.frame_ms, 0)} ms a frame`), "it connects to": now.program.address } : {}),
     "light at the eyes": typeof now.light_db === "number" && `${number(now.light_db)} dB`,
   };
@@ -264,10 +264,10 @@ async function report() {
   try {
     const asked_ms = performance.now(), now = await status();
     const starting = main.querySelector(".starting");
-    if (starting && now.reason) starting.textContent = `Starting: ${now.reason}. The first time on a machine takes some ten seconds longer.`;
+    if (starting && now.reason) starting.textContent = `Starting: ${now.reason}. The first start on a machine takes about ten seconds longer.`;
     if (look && now.ok) figures(now, asked_ms);
   } catch {
-    // told by the connection
+    // the closed connection shows it
   }
   setTimeout(report, document.hidden ? 4 * STATUS_MS : STATUS_MS);
 }

@@ -225,7 +225,7 @@ def trials(*, full: bool = False) -> Iterator[Trial]:
             yield case(model, f"panels {gap_m:g} m apart", smooth(stack), eyes_at(distance_m=0.6 + gap_m), stack)
         for width, height in ((16, 16), (17, 31), (333, 77), *(((3840, 2160),) if full else ())):
             stack = replace(STACK, width_px=width, height_px=height)
-            # 333x77: a row of the panels covers three of the picture, and shows their mean: one ray in it tells little.
+            # 333x77: a row of the panels covers three of the picture and shows their mean, so one ray says little.
             flat = (width, height) == (333, 77)
             yield case(model, f"panels of {width}x{height}", smooth(stack), eyes_at(distance_m=0.6), stack, light=flat)
     far_aside = partial(stressed, "balanced", smooth(STACK), eyes_at(distance_m=3.0, angle_deg=85.0))
