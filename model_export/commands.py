@@ -43,7 +43,7 @@ def train(
     panels: Annotated[
         Path | None, typer.Option(help="configuration of the panels; default: any three evenly spaced ones")
     ] = None,
-    iterations: Annotated[int, typer.Option(min=1, help="gradient steps in all")] = 2000,
+    iterations: Annotated[int, typer.Option(min=1, help="total gradient steps")] = 2000,
     batch: Annotated[int, typer.Option(min=1, help="pairs per iteration")] = 1,
     learning_rate: Annotated[float, number(1e-8, 1, help="initial, with cosine decay to zero")] = 1e-3,
     width: Annotated[int, typer.Option(min=32, max=8192, help="of panels and pictures in training, pixels")] = 480,

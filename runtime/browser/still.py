@@ -42,8 +42,9 @@ def viewer_html(
     lines: Sequence[str] = (),
     follows: bool = True,
 ) -> str:
-    """Viewer page. layers: (N, h, w, 3 or 4), rear to front, as shown to eyes (2, 3), frame `stack`; stored exactly.
+    """Viewer page of layers (N, h, w, 3 or 4), rear to front, solved for eyes (2, 3) in frame `stack`.
 
+    The layers are stored exactly.
     wanted: target pictures (h, w, 3), one per eye, `fov_deg` wide, compressed into the remaining size; () for none.
     lines: text below the controls. follows: outer panels follow the head until the user switches that off.
     """

@@ -1,4 +1,4 @@
-"""`phasestack try`: the display without the display."""
+"""`phasestack try`: the display without hardware."""
 
 from __future__ import annotations
 
@@ -11,17 +11,19 @@ from runtime.support.options import blame_option, number
 
 
 def try_(
-    config: Annotated[Path | None, typer.Option(help="TOML file; without: panels of 960x540")] = None,
+    config: Annotated[Path | None, typer.Option(help="TOML file; default: panels of 960x540")] = None,
     scene: Annotated[str | None, typer.Option(help="a built-in scene, a file or folder")] = None,
     layout: Annotated[
-        str | None, typer.Option(help="how pictures hold their views, as content.layout has it: side-by-side, ...")
+        str | None, typer.Option(help="arrangement of the views in pictures, a value of content.layout")
     ] = None,
     model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
-    webcam: Annotated[bool, typer.Option("--webcam", help="your own head, before this PC's camera")] = False,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0: any that is free")] = 0,
-    no_browser: Annotated[bool, typer.Option("--no-browser", help="only say the address")] = False,
-    seconds: Annotated[float | None, number(1, 1e6, "s", help="end after so long")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help='{"url": ...} on a line once it is served')] = False,
+    webcam: Annotated[bool, typer.Option("--webcam", help="track your head with this PC's camera")] = False,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0: any free one")] = 0,
+    no_browser: Annotated[
+        bool, typer.Option("--no-browser", help="print the address without opening a browser")
+    ] = False,
+    seconds: Annotated[float | None, number(1, 1e6, "s", help="stop after this long")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help='print {"url": ...} once the page is served')] = False,
 ) -> None:
     """Try the display without hardware: the daemon's own loop, with a browser as viewer and panels.
 
