@@ -41,9 +41,7 @@ def solve(
     ] = 1.0,
     backend: Annotated[
         str | None,
-        typer.Option(
-            help="device for everything except the network: cpu, gl, or auto (timed if --repeat is 10 or more)"
-        ),
+        typer.Option(help="device for everything except the network: cpu, gl or auto (timed from --repeat 10)"),
     ] = None,
     no_plan: Annotated[bool, typer.Option("--no-plan", help="skip no work, even if the pictures allow it")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="solve.json's object on stdout")] = False,
