@@ -13,7 +13,7 @@ picture changes with the head's position and time; D_max: half its variance. All
 
 Until a solution is complete, the panels show the previous one, with error E, and do not respond to a head that starts
 moving: over a horizon H the mean is (c·E + (H - c)·J) / H + D_max·(c/H)²/2. The effort with the least mean is chosen,
-with a preference for the present one.
+with a preference for the present one and for faster ones.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from runtime.records import Effort, Measures
 
 SOLVING_STAGES = ("render", "prepare", "inference", "finish", "step")
 HORIZON_S = 1.0  # time over which head and content are assumed to continue as they are
+EQUAL = 1.03  # of efforts whose expected errors differ by less, the fastest is chosen
 PREFERRED = 0.93  # switch effort only if its expected error is below this share of the present one's
 GAIN = 0.2  # weight of the newest measurement in a running mean
 # Squared error in light after k steps, relative to no steps: solver `best`, mean of the scenes demo and texture at
@@ -212,7 +213,8 @@ class EffortChooser:
             cost_ms = costs.ms(effort)
             error = self.expected_error(effort, outlook(cost_ms), life_s=max(cost_ms, period_ms) / 1e3)
             means[effort] = self.mean_error(error, cost_ms, shown_error=shown_error, horizon_s=horizon_s)
-        best = min(means, key=means.__getitem__)
+        least = min(means.values())
+        best = min((effort for effort in means if means[effort] <= EQUAL * least), key=costs.ms)
         if self._chosen in means and means[best] > PREFERRED * means[self._chosen]:
             best = self._chosen
         self._chosen = best

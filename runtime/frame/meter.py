@@ -37,11 +37,11 @@ class SolutionMeter:
         key = Effort(effort.reduction, effort.steps)
         count = self._counts.get(key, 0)
         self._counts[key] = count + 1
-        pictures = [view.pixels for view in job.views]
+        pictures = [_halved(view.pixels) for view in job.views]
         samples = [_grid(picture) for picture in pictures]
         box = () if job.window is None else job.window.box.corners
         raster = (job.stack.width_px, job.stack.height_px, *box)
-        before, self._before = self._before, (raster, [picture.copy() for picture in pictures], job, time_ns)
+        before, self._before = self._before, (raster, pictures, job, time_ns)
         change = None
         if before is not None and before[0] == raster:
             _, earlier, solved, earlier_ns = before
@@ -107,6 +107,15 @@ def _lost(band: U8, reduction: int) -> float:
     return cv2.norm(band, enlarged, cv2.NORM_L2SQR) / (band.size * 255.0**2)
 
 
+def _halved(picture: U8) -> U8:
+    """Average 2 x 2 pixels, so that the comparison's own interpolation hardly counts."""
+    height, width = picture.shape[:2]
+    if min(height, width) < 2:
+        return picture.copy()
+    even = picture[: height // 2 * 2, : width // 2 * 2]
+    return np.asarray(cv2.resize(even, (width // 2, height // 2), interpolation=cv2.INTER_AREA), np.uint8)
+
+
 def _grid(picture: U8) -> F32:
     """Sample a picture on a coarse grid: (rows, columns, 3) in 0..1."""
     rows, columns = _grid_lines(picture)
@@ -129,8 +138,8 @@ def _moved_grid(pictures: Sequence[U8], job: Job, eyes_m: F64) -> list[F32]:
     rows, columns = _grid_lines(pictures[0])
     u0, v0 = (0, 0) if job.window is None else (job.window.box.u0, job.window.box.v0)
     size_px = job.stack.width_px, job.stack.height_px
-    right, down = moved.at(columns + (u0 + 0.5), rows + (v0 + 0.5), size_px=size_px)
-    u, v = (columns + right).astype(np.float32), (rows[:, None] + down).astype(np.float32)
+    right, down = moved.at(2 * columns + (u0 + 1.0), 2 * rows + (v0 + 1.0), size_px=size_px)
+    u, v = (columns + right / 2).astype(np.float32), (rows[:, None] + down / 2).astype(np.float32)
     found = [cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for picture in pictures]
     return [np.asarray(picture[..., :3] / np.float32(255), np.float32) for picture in found]
 

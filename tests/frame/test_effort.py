@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from runtime.frame.effort import (
+    BLUR_M,
     CostBook,
     Costs,
     EffortChooser,
@@ -92,9 +93,9 @@ def test_rates_of_change_are_learned_from_successive_pictures() -> None:
     pictures = PictureStatistics(contrast=0.03)
     for k in range(200):
         moved_m, elapsed_s = 1e-3 * (k % 7), 0.02 * (k % 3)
-        y = 80.0 * moved_m**2 + 0.4 * elapsed_s**2
+        y = 0.8 * moved_m**2 / (moved_m + BLUR_M) + 0.4 * elapsed_s**2
         pictures.learn(Measures(change=(y / (1 + y / 0.03), moved_m, elapsed_s)), Effort())
-    assert pictures.rate_m2 == pytest.approx(80.0, rel=0.05)
+    assert pictures.rate_m == pytest.approx(0.8, rel=0.05)
     assert pictures.rate_s2 == pytest.approx(0.4, rel=0.05)
 
 

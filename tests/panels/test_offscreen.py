@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import moderngl
@@ -198,6 +199,25 @@ def test_a_new_solution_is_recognised_by_its_version_alone(sink: DrawnPanels) ->
     for version in (1, 2):
         sink.present(PanelFrame(version, smooth(version), version))
         assert np.array_equal(codes(sink.read_back()), codes(smooth(version)))
+
+
+@pytest.mark.parametrize("reduction", [1, 2])
+@pytest.mark.parametrize("step_m", [(0.0, 0.004, 0.0), (0.01, 0.016, 0.008), (-0.1, -0.1, 0.05)])
+def test_content_moves_by_its_relief_as_the_reference_says(
+    sink: DrawnPanels, step_m: tuple[float, float, float], reduction: int
+) -> None:
+    v, u = np.mgrid[0:27, 0:48] / 8
+    relief = np.asarray(0.15 * np.sin(u) * np.cos(v), np.float32)
+    moved = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array(step_m))
+    layers = np.ascontiguousarray(smooth(1)[:, ::reduction, ::reduction])
+    size_px = STACK.width_px, STACK.height_px
+    frame = PanelFrame(
+        1, layers, 1, moved.solved_from_shown, size_px=size_px, relief=relief, parallax=moved.parallax
+    )  # fmt: skip
+    sink.present(frame)
+    difference = np.abs(codes(sink.read_back()) - codes(shown_layers(frame)))
+    assert (difference <= 1).mean() >= 0.999 and difference.max() <= 3  # the driver's filter of the relief: 1/256
+    assert np.abs(codes(shown_layers(frame)) - codes(shown_layers(replace(frame, relief=None)))).max() > 20
 
 
 @pytest.mark.parametrize("reduction", [2, 4])

@@ -1,0 +1,106 @@
+"""Content moves with the eyes by its depth: against the projection of points, and in light."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from runtime.config import Settings, with_options
+from runtime.content.registry import open_content
+from runtime.evaluation.refresh_quality import live_error
+from runtime.model.predictor import load_predictor
+from runtime.optics.alignment import align, shown_layers
+from runtime.optics.relief import RIM_PX, WIDEST_PX, displacement, parallax, relief_of
+from runtime.optics.stack import PanelStack
+from runtime.plan.drawing import drawn_job, retina_pictures
+from runtime.records import F64, PanelFrame
+from runtime.support.gl import offscreen_context
+
+STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 480, 270)
+EYES_M = np.array([[0.6, -0.031, 0.0], [0.6, 0.031, 0.0]])
+FOV_DEG = 46.0
+
+
+def metres(low: float, high: float) -> st.SearchStrategy[float]:
+    return st.floats(low, high, allow_nan=False)
+
+
+def on_panel(panel: int, eye_m: F64, point_m: F64) -> F64:
+    """Pixel of a panel through which a point is seen: the ray's intersection, pixel by pixel."""
+    raster = STACK.panel(panel)
+    y_m, z_m = (eye_m + (point_m - eye_m) * (eye_m[0] - raster.x_m) / (eye_m[0] - point_m[0]))[1:]
+    return np.array([(y_m - raster.left_m) / raster.pitch_u_m, (raster.top_m - z_m) / raster.pitch_v_m])
+
+
+@given(
+    st.tuples(metres(-0.1, 0.1), metres(-0.1, 0.1), metres(-0.1, 0.1)),
+    st.tuples(metres(0.4, 1.5), metres(-0.2, 0.2), metres(-0.2, 0.2)),
+    st.tuples(metres(0.4, 1.5), metres(-0.2, 0.2), metres(-0.2, 0.2)),
+)
+def test_a_point_is_found_where_the_old_middle_saw_it(
+    point: tuple[float, ...], old: tuple[float, ...], new: tuple[float, ...]
+) -> None:
+    point_m, old_m, new_m = map(np.array, (point, old, new))
+    moved = parallax(STACK, old_m=old_m, new_m=new_m)
+    if moved is None:
+        assert np.array_equal(old_m, new_m)
+        return
+    relief = np.full((2, 2), point_m[0] / (old_m[0] - point_m[0]), np.float32)
+    aligned = align(STACK, solved_for_m=np.stack([old_m] * 2), eyes_m=np.stack([new_m] * 2))
+    for panel in range(3):
+        shown = on_panel(panel, new_m, point_m)
+        shift = displacement(relief, moved, panel)
+        assert shift is not None
+        right, down = shift.at(shown[:1], shown[1:], size_px=(480, 270))
+        matrix = aligned.solved_from_shown[panel]
+        found = shown * np.diag(matrix)[:2] + matrix[:2, 2] + np.array([right.item(), down.item()])
+        if not aligned.limited:
+            np.testing.assert_allclose(found, on_panel(panel, old_m, point_m), atol=2e-3 * (1 + np.abs(shown).max()))
+
+
+def test_the_relief_of_the_middle_panel_and_of_the_background_is_none() -> None:
+    nearness = np.full((2, 40, 60), 1 / 0.6, np.float32)
+    nearness[:, :20] = 0.0
+    assert not relief_of(nearness, distance_m=(0.6, 0.6)).round(6).any()
+
+
+def test_nearer_content_extends_by_a_rim_and_wide_rasters_are_reduced() -> None:
+    nearness = np.zeros((2, 90, 4 * WIDEST_PX), np.float32)
+    nearness[:, 44, 800] = 1 / 0.5  # a single pixel is not lost
+    relief = relief_of(nearness, distance_m=(0.6, 0.6))
+    assert relief.shape == (22, WIDEST_PX)
+    assert relief.max() == pytest.approx(0.2)
+    assert 2 * RIM_PX <= (relief.max(axis=0) > 0).sum() <= 2 * RIM_PX + 2
+
+
+def test_without_a_movement_or_a_middle_panel_nothing_is_displaced() -> None:
+    middle = EYES_M.mean(axis=0)
+    assert parallax(STACK, old_m=middle, new_m=middle) is None
+    even = PanelStack(0.5184, 0.2916, (-0.03, 0.03), 480, 270)
+    assert parallax(even, old_m=middle, new_m=middle + 0.01) is None
+    assert displacement(None, parallax(STACK, old_m=middle, new_m=middle + 0.01), 0) is None
+
+
+@pytest.mark.parametrize("step_m", [(0.0, 0.02, 0.0), (0.0, -0.02, 0.01), (0.05, 0.0, 0.0)])
+def test_a_moved_eye_sees_its_own_view_in_light(step_m: tuple[float, float, float]) -> None:
+    """Of the error that 2 cm of staleness add, at least half goes: against pictures drawn for where the eyes are."""
+    now_m = EYES_M + np.array(step_m)
+    with offscreen_context() as context:
+        content = open_content(with_options(Settings(), scene="demo").content, STACK, context)
+        predictor = load_predictor("balanced", STACK)
+        targets = retina_pictures(content, now_m, STACK, fov_deg=FOV_DEG, time_ns=0)
+        fresh = predictor.solve(drawn_job(predictor, content, now_m, time_ns=0)).layers
+        job = drawn_job(predictor, content, EYES_M, time_ns=0, in_depth=True)
+        layers = predictor.solve(job).layers
+        content.close()
+    moved = align(STACK, solved_for_m=EYES_M, eyes_m=now_m)
+    frame = PanelFrame(1, layers, 1, moved.solved_from_shown, relief=job.relief, parallax=moved.parallax)
+    best, displaced, carried = (
+        live_error(shown, targets, STACK, eyes_m=now_m, fov_deg=FOV_DEG)
+        for shown in (fresh, shown_layers(frame), shown_layers(replace(frame, relief=None)))
+    )
+    assert best < displaced < best + 0.5 * (carried - best)
