@@ -7,7 +7,6 @@ from importlib.metadata import PackageNotFoundError, requires
 
 from runtime.errors import MissingPart
 
-IMPORTED_AS = {"usb": "pyusb"}  # packages whose module has another name
 NOT_TO_RUN = frozenset({"all", "docs", "test"})
 
 
@@ -15,8 +14,7 @@ def missing_extra(error: BaseException) -> MissingPart | None:
     """Error with the extra to install for a failed import; None if no extra has the package."""
     if not isinstance(error, ModuleNotFoundError) or not error.name:
         return None
-    module = error.name.partition(".")[0]
-    package = IMPORTED_AS.get(module, module).replace("_", "-")
+    package = error.name.partition(".")[0].replace("_", "-")
     for extra in _extras_with(package):
         return MissingPart(f"{package} is not installed: pip install 'phasestack[{extra}]'")
     return None
