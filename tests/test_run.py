@@ -34,15 +34,8 @@ from tests.waiting import PATIENT
 
 FRAMES = 60
 LAYERS = ("layer-0.png", "layer-1.png", "layer-2.png")
-PICTURES = (
-    *LAYERS,
-    "seen-left.png",
-    "seen-right.png",
-    "wanted-left.png",
-    "wanted-right.png",
-    "contact-sheet.png",
-    "viewer.html",
-)
+VIEWS = ("seen-left.png", "seen-right.png", "wanted-left.png", "wanted-right.png")
+PICTURES = (*LAYERS, *VIEWS, "contact-sheet.png", "viewer.html")
 REFRESH_STAGES = {"sensor", "track", "present", "wait"}
 SOLVING_STAGES = {"render", "prepare", "inference", "finish"}
 

@@ -12,7 +12,6 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -213,36 +212,20 @@ def _check_free(place: Path, *, within: Path) -> None:
         raise InputError(place, "", "is a folder, and is in the way of an output")
 
 
-@dataclass(slots=True)
-class Held:
-    """Output captured by `held_back`, available after its block."""
-
-    text: str = ""
-
-    @property
-    def first_line(self) -> str:
-        """First non-empty line; empty if there is none."""
-        return next((line.strip() for line in self.text.splitlines() if line.strip()), "")
-
-
 @contextmanager
-def held_back() -> Iterator[Held]:
-    """Capture what libraries write to stderr's file descriptor within the block.
+def held_back() -> Iterator[None]:
+    """Hide what libraries write to stderr's file descriptor within the block.
 
     Does nothing if other threads run, because the descriptor belongs to the whole process.
     """
-    held = Held()
     if threading.active_count() > 1:
-        yield held
+        yield
         return
     kept = os.dup(2)
-    buffer = os.memfd_create("stderr")
-    os.dup2(buffer, 2)
+    with open(os.devnull, "wb") as nowhere:  # noqa: PTH123
+        os.dup2(nowhere.fileno(), 2)
     try:
-        yield held
+        yield
     finally:
         os.dup2(kept, 2)
         os.close(kept)
-        data = os.pread(buffer, 1 << 16, 0)
-        os.close(buffer)
-        held.text = data.decode(errors="replace")

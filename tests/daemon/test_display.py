@@ -33,13 +33,7 @@ rate_hz = 30.0
 socket = "{{folder}}/status.sock"
 [output]
 kind = "windows"
-[[output.panels]]
-connector = "DUMMY0"
-[[output.panels]]
-connector = "DUMMY1"
-[[output.panels]]
-connector = "DUMMY2"
-"""
+""" + "".join(f'[[output.panels]]\nconnector = "DUMMY{index}"\n' for index in range(3))
 
 
 @pytest.fixture

@@ -170,9 +170,7 @@ def asleep(rig: Rig, solver: Any) -> list[RefreshAccount]:
     return accounts
 
 
-def test_a_model_that_never_returns_is_abandoned_and_its_resources_freed(
-    steady: Rig,
-) -> None:
+def test_a_model_that_never_returns_is_abandoned_and_its_resources_freed(steady: Rig) -> None:
     held = weakref.ref(steady.run.parts)
     slow, solver = Slow(steady), steady.presenter.solver
     try:
@@ -193,9 +191,6 @@ def test_a_model_that_never_returns_is_abandoned_and_its_resources_freed(
         assert held() is None, "the solver that hung, with its context, content and model"
     finally:
         slow.gate.set()
-
-
-# --- panels --------------------------------------------------------------------------------------------------------
 
 
 # --- the watchdog --------------------------------------------------------------------------------------------------

@@ -58,9 +58,14 @@ def notifier_of() -> Iterator[Callable[..., Notifier]]:
 WATCHED = {"WATCHDOG_USEC": "1000000", "WATCHDOG_PID": str(os.getpid())}
 
 
-def test_ready_is_said_once(supervisor: Supervisor, notifier_of: Callable[..., Notifier]) -> None:
+def test_ready_is_said_once_and_by_no_reload_before_it(
+    supervisor: Supervisor, notifier_of: Callable[..., Notifier]
+) -> None:
     notifier = notifier_of()
     assert notifier.supervised
+    notifier.reloading()
+    notifier.reloaded()
+    assert supervisor.heard() == []
     notifier.ready()
     notifier.ready()
     assert supervisor.heard() == ["READY=1"]
@@ -101,7 +106,7 @@ def test_presented_frames_feed_the_watchdog_four_times_a_period_at_most(
     assert supervisor.heard() == ["WATCHDOG=1"] * 4
 
 
-def test_refreshes_that_present_nothing_starve_the_watchdog(
+def test_refreshes_that_present_nothing_starve_the_watchdog_unless_a_panel_is_missing(
     supervisor: Supervisor, notifier_of: Callable[..., Notifier]
 ) -> None:
     clock = SimulatedClock()
@@ -110,13 +115,6 @@ def test_refreshes_that_present_nothing_starve_the_watchdog(
         clock.advance_ns(2000 * NS_PER_MS)
         notifier.refreshed(state, missing, presented=False)
     assert supervisor.heard() == []
-
-
-def test_while_a_panel_is_missing_completed_refreshes_feed_it(
-    supervisor: Supervisor, notifier_of: Callable[..., Notifier]
-) -> None:
-    clock = SimulatedClock()
-    notifier = notifier_of(clock, WATCHED)
     notifier.refreshed(State.DEGRADED, ("sensor", "panel"), presented=False)
     assert supervisor.heard() == ["WATCHDOG=1"]
 
@@ -126,15 +124,6 @@ def test_a_watchdog_that_is_not_ours_is_not_fed(
     supervisor: Supervisor, notifier_of: Callable[..., Notifier], environment: dict[str, str]
 ) -> None:
     notifier_of(environment=environment).refreshed(State.TRACKING, (), presented=True)
-    assert supervisor.heard() == []
-
-
-def test_a_reload_before_the_first_frame_does_not_make_it_ready(
-    supervisor: Supervisor, notifier_of: Callable[..., Notifier]
-) -> None:
-    notifier = notifier_of()
-    notifier.reloading()
-    notifier.reloaded()
     assert supervisor.heard() == []
 
 

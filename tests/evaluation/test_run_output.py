@@ -7,9 +7,6 @@ import errno
 import json
 import os
 import re
-import signal
-import subprocess
-import sys
 import threading
 from pathlib import Path
 from typing import Any
@@ -23,7 +20,6 @@ from runtime.evaluation.displayed import displayed
 from runtime.evaluation.run_output import RunOutput
 from runtime.optics.stack import PanelStack
 from runtime.records import State
-from runtime.support.artifacts import OutputFolder
 from runtime.support.picture_file import read_image
 
 STACK = PanelStack(0.5, 0.3, (-0.06, 0.0, 0.06), 32, 18)
@@ -147,31 +143,3 @@ def test_an_error_of_the_run_itself_leaves_nothing_new(tmp_path: Path) -> None:
         output.refresh(line(0))
         raise RuntimeError
     assert not (tmp_path / "out").exists()
-
-
-KILLED = """
-import os, signal, sys
-from pathlib import Path
-from runtime.support.artifacts import OutputFolder
-with OutputFolder(Path(sys.argv[1])) as folder:
-    (folder.staging / "half.png").write_bytes(b"half")
-    os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
-def test_what_a_killed_process_left_is_cleared_away_at_the_next_start(tmp_path: Path) -> None:
-    done = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], check=False)
-    assert done.returncode == -signal.SIGKILL
-    (left,) = tmp_path.iterdir()
-    assert (left / "half.png").exists()
-    with OutputFolder(tmp_path) as folder:
-        assert list(tmp_path.iterdir()) == [folder.staging]
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_living_neighbours_folder_is_left_alone(tmp_path: Path) -> None:
-    with OutputFolder(tmp_path) as one:
-        (one.staging / "one").write_text("1")
-        with OutputFolder(tmp_path) as other:
-            (other.staging / "other").write_text("2")
-    assert {path.name for path in tmp_path.iterdir()} == {"one", "other"}

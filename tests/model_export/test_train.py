@@ -50,10 +50,6 @@ EYES = np.array([[0.7, -0.0315, 0.02], [0.7, 0.0315, 0.02]])
 SMALL = {"width_px": 160, "height_px": 96}
 
 
-def first_pairs(count: int, *, seed: int = 1, **size: int) -> list[TrainingPair]:
-    return [random_pair(np.random.default_rng([seed, number]), **(size or SMALL)) for number in range(count)]
-
-
 def drawn(scene: Scene, eye: np.ndarray) -> np.ndarray:
     return draw(scene, raster_from_stack(eye, STACK.panel(1)), width_px=480, height_px=270)
 

@@ -63,16 +63,12 @@ def check(panel: PanelSettings, monitor: Monitor) -> None:
     check_modes(panels, monitors, width_px=1920, height_px=1080)
 
 
-def test_a_mode_of_the_stacks_shape_but_not_its_pixels_is_refused() -> None:
-    small = replace(FULL, width_px=1280, height_px=720)
+def test_a_mode_of_other_pixels_is_refused_and_a_rotated_panel_compared_as_seen() -> None:
+    small, upright = replace(FULL, width_px=1280, height_px=720), replace(FULL, width_px=1080, height_px=1920)
     check(PanelSettings(), FULL)
+    check(PanelSettings(rotation_deg=90), upright)
     with pytest.raises(PanelLost, match=r"panel 1: DP-1 shows 1280x720 .*the stack is 1920x1080: .*rescaled"):
         check(PanelSettings(), small)
-
-
-def test_a_wrong_mode_is_refused_and_a_rotated_panel_compared_as_seen() -> None:
-    upright = replace(FULL, width_px=1080, height_px=1920)
-    check(PanelSettings(rotation_deg=90), upright)
     with pytest.raises(PanelLost, match="panel 1: DP-1 shows 1080x1920"):
         check(PanelSettings(), upright)
 

@@ -239,8 +239,3 @@ def test_an_even_coarse_solution_reaches_the_panel_s_edge(sink: DrawnPanels) -> 
     sink.present(frame := PanelFrame(1, even, 1, (), size_px=(STACK.width_px, STACK.height_px)))
     assert (shown_layers(frame)[..., :3] == 200).all()
     assert (codes(sink.read_back()) == 200).all()
-
-
-def aligned(solved: NDArray[np.uint8], flat: NDArray[np.uint8]) -> PanelFrame:
-    matrices = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.0, 0.016, 0.03])).solved_from_shown
-    return PanelFrame(1, solved, 1, matrices, flat, 1, 0.25)

@@ -54,29 +54,21 @@ def comes_back(x: XServer, sink: WindowPanels, *monitors: int) -> bool:
 
 
 @pytest.mark.parametrize("unchanged", [False, True])
-def test_a_window_that_somebody_destroyed_is_a_lost_panel_and_comes_back(
-    x: XServer, opened: Callable[..., Any], unchanged: bool
+@pytest.mark.parametrize(
+    ("does", "told"),
+    [
+        (("XDestroyWindow",), "panel 1: the window was destroyed"),
+        (("XUnmapWindow",), "panel 1: the window was unmapped"),
+        (("XMoveWindow", 600, 7), "panel 1: the window is 320x180+600+7, not 320x180+0+0"),
+    ],
+)
+def test_a_window_that_somebody_took_or_moved_is_a_lost_panel_and_comes_back(
+    x: XServer, opened: Callable[..., Any], does: tuple[Any, ...], told: str, unchanged: bool
 ) -> None:
     sink = opened(*BY_CONNECTOR)
     assert presents(sink, 0)
-    x.do_to_window("XDestroyWindow", x11_window(sink, 1))
-    assert "panel 1: the window was destroyed" in lost(sink, unchanged=unchanged)
-    assert comes_back(x, sink, 2, 0, 1)
-
-
-def test_a_window_that_somebody_unmapped_is_a_lost_panel_and_comes_back(x: XServer, opened: Callable[..., Any]) -> None:
-    sink = opened(*BY_CONNECTOR)
-    assert presents(sink, 0)
-    x.do_to_window("XUnmapWindow", x11_window(sink, -1))
-    assert "panel 2: the window was unmapped" in lost(sink)
-    assert comes_back(x, sink, 2, 0, 1)
-
-
-def test_a_window_that_somebody_moved_is_a_lost_panel_and_comes_back(x: XServer, opened: Callable[..., Any]) -> None:
-    sink = opened(*BY_CONNECTOR)
-    assert presents(sink, 0)
-    x.do_to_window("XMoveWindow", x11_window(sink, 0), 600, 7)
-    assert "panel 0: the window is 320x180+600+7, not 320x180+640+0" in lost(sink)
+    x.do_to_window(does[0], x11_window(sink, 1), *does[1:])
+    assert told in lost(sink, unchanged=unchanged)
     assert comes_back(x, sink, 2, 0, 1)
 
 
