@@ -6,7 +6,6 @@ whole number of columns, and answers with both outer panels there.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -85,18 +84,20 @@ class ChainProposal:
             lambda view: self._target_codes(view, job.channels), job.targets.reduced(self._reduction)
         )
 
-        def targets(side: int) -> list[I16]:
-            """An eye's targets along its rays, and the other one's in the same places."""
+        def residual(side: int) -> I16:
+            """Half the difference of an eye's targets along its rays from the other one's in the same places."""
             to_plane = local.plane_from_local @ frame.plane_from_frame(local.eyes_m[side], x_m=middle_x_m)
-            return [
+            own, other = (
                 warp(
                     codes, from_plane @ to_plane, size=(frame.rows, frame.width_px), beside=UNSEEN,
-                    reach_px=min(REACH_PX, EDGE_SHARE * min(codes.shape[:2])), result_columns=frame.columns,
+                    reach_px=min(REACH_PX, EDGE_SHARE * min(codes.shape[:2])), result_columns=frame.columns, threads=1,
                 )
                 for codes, from_plane in (pictures[local.order[side]], pictures[local.order[1 - side]])
-            ]  # fmt: skip
+            )  # fmt: skip
+            return _residual(own, other)
 
-        left, right = parallel_map(_residual, [targets(side) for side in (0, 1)])
+        # A thread for each eye's whole way: handing over single steps costs more than small ones take.
+        left, right = parallel_map(residual, (0, 1))
         waves, shifted_waves, spectrum, modes_in = chain_modes(frame.cells)
         feeds: dict[str, NDArray[Any]] = {
             "left": left.reshape(frame.rows, frame.cells, -1),
@@ -114,7 +115,8 @@ class ChainProposal:
             raise ModelFailure("the network answered with numbers that are not finite")
         watch.lap("inference")
         outer = {n: answer[name].reshape(frame.rows, -1, *left.shape[2:]) for n, name in ((0, "rear"), (2, "front"))}
-        return {n: self._on_panel(n, panel, geometry, local, frame) for n, panel in outer.items()}
+        panels = parallel_map(lambda item: self._on_panel(*item, geometry, local, frame), list(outer.items()))
+        return dict(zip(outer, panels, strict=True))
 
     def _target_codes(self, view: TargetView, channels: int) -> tuple[I16, F64]:
         """Target sum of all panels for each pixel, sixteenths of a code up to a constant; its picture_from_plane."""
@@ -132,7 +134,7 @@ class ChainProposal:
         columns = ColumnLaw(frame.columns.bend, frame.columns.middle + frame.cell_px)
         matrix = begin @ to_frame @ seen_from_layer @ raster.plane_from_raster()
         size = raster.height_px, raster.width_px
-        codes = warp(np.clip(answer, 0, FULL), matrix, size=size, beside=EVEN, image_columns=columns)
+        codes = warp(np.clip(answer, 0, FULL), matrix, size=size, beside=EVEN, image_columns=columns, threads=1)
         if max(geometry.taper_px) > 0:
             weights = _wave_taper(geometry, raster, middle_m)
             weights = weights[..., None] if codes.ndim == 3 else weights
@@ -140,9 +142,8 @@ class ChainProposal:
         return codes
 
 
-def _residual(targets: Sequence[I16]) -> I16:
+def _residual(own: I16, other: I16) -> I16:
     """Half the difference between an eye's target and the other one's."""
-    own, other = targets
     half = np.asarray(cv2.subtract(own, other), np.int16) >> 1
     # Rays outside one eye's picture have no residual.
     np.copyto(half, 0, where=cv2.min(own, other) < 0)

@@ -85,11 +85,13 @@ def warp(
     reach_px: float = REACH_PX,
     image_columns: ColumnLaw = EVEN_COLUMNS,
     result_columns: ColumnLaw = EVEN_COLUMNS,
+    threads: int | None = None,
 ) -> I16:
     """`resample` of an image (h, w[, 3]) of LARGEST at most either way, several times as fast, through a homography
     between what the two laws make of columns. One of them is even.
 
-    beside: what lies farther beside the image than reach_px (REACH_PX at most), to which its edge goes on.
+    beside: what lies farther beside the image than reach_px (REACH_PX at most), to which its edge goes on. threads:
+    OpenCV's number, unless given.
     """
     x, y, w = image_from_result @ (result_columns.middle or size[1] / 2, size[0] / 2, 1.0)
     right, down = image_from_result[:2, 0] - np.array([x, y]) / w * image_from_result[2, 0]
@@ -106,7 +108,11 @@ def warp(
     by = Warp((c_double * 9)(*image_from_result.ravel()), *laws, reach_px)
     images = [Image.of(x.reshape(len(x), -1), rows=x.shape[0], width=x.shape[1]) for x in (source, result)]
     loops = library()
-    on_rows(lambda first, end: loops.warp(*map(byref, (*images, by)), channels, beside, first, end), size[0])
+    on_rows(
+        lambda first, end: loops.warp(*map(byref, (*images, by)), channels, beside, first, end),
+        size[0],
+        threads=threads,
+    )
     return np.ascontiguousarray(np.swapaxes(result, 0, 1)) if turned else result
 
 
