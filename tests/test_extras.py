@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from runtime.support.extras import IMPORTED_AS
+
 PYPROJECT = Path(__file__).resolve().parents[1] / "pyproject.toml"
 BLOCKED = "import sys\nsys.modules.update(dict.fromkeys({packages}))\n"  # as if they were not there, when imported
 MAIN = "from runtime.cli import main\nmain()\n"
@@ -19,7 +21,8 @@ def of_extras() -> set[str]:
     project = tomllib.loads(PYPROJECT.read_text())["project"]
     extras = {name: needed for name, needed in project["optional-dependencies"].items() if name not in ("test", "docs")}
     packages = {one.partition(">")[0].partition("[")[0] for needed in extras.values() for one in needed}
-    return {package.replace("-", "_") for package in packages - {"phasestack"}}
+    module = {package: name for name, package in IMPORTED_AS.items()}
+    return {module.get(package, package).replace("-", "_") for package in packages - {"phasestack"}}
 
 
 def without(*packages: str, command: list[str]) -> subprocess.CompletedProcess[str]:
@@ -56,7 +59,8 @@ def test_a_command_names_the_extra_that_it_needs(
 
 
 def test_the_doctor_lists_what_is_not_installed_and_goes_on() -> None:
-    done = without("moderngl", command=["doctor"])
+    done = without("moderngl", "usb", command=["doctor"])
     assert done.returncode == 1
     assert "fail  opengl: moderngl is not installed: pip install 'phasestack[content]'" in done.stdout
+    assert "skip  usb: pyusb is not installed: pip install 'phasestack[sensors]'" in done.stdout
     assert "service:" in done.stdout

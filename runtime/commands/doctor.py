@@ -155,12 +155,17 @@ def sensor(settings: Settings) -> Iterator[Row]:
 
 def usb(settings: Settings) -> Iterator[Row]:
     """Check depth cameras on USB: port speed, permissions, driver."""
+    from runtime.errors import MissingPart
     from runtime.sensor.usb_devices import find_devices
 
     driver = settings.sensor.driver
     needed = driver not in (*NO_DEVICE, "usb-camera") and not is_plugin(driver)
     absent: Verdict = "fail" if needed else "skip"
-    devices = find_devices()
+    try:
+        devices = find_devices()
+    except MissingPart as error:
+        yield Row("usb", absent, str(error), "install it" if needed else "")
+        return
     if not devices:
         remedy = "plug one in; docs/planning.md lists them" if needed else ""
         yield Row("usb", absent, "no known depth camera is plugged in", remedy)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import os
-from contextlib import suppress
+from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from runtime.errors import MissingPart, SensorLost
+from runtime.support.extras import missing_extra
 
 UDEV_RULE = "70-phasestack-sensors.rules"
-USB2 = {"1.5": "low speed", "12": "full speed", "480": "high speed, USB 2"}  # by Mbit/s, as Linux tells it
-SPEEDS = {**USB2, "5000": "SuperSpeed, USB 3", "10000": "SuperSpeed+, USB 3", "20000": "SuperSpeed+, USB 3"}
-ATTRIBUTES = ("idVendor", "idProduct", "busnum", "devnum", "speed")
+SPEEDS = {1: "low speed (1.5 Mbit/s)", 2: "full speed (12 Mbit/s)", 3: "high speed, USB 2 (480 Mbit/s)"}
+SPEEDS |= {4: "SuperSpeed, USB 3 (5 Gbit/s)", 5: "SuperSpeed+, USB 3 (10 Gbit/s)"}
+SUPER_SPEED = 4  # libusb's number of USB 3's speed
 
 
 class KnownDevice(NamedTuple):
@@ -46,31 +47,55 @@ class UsbDevice:
     """A known device that is connected."""
 
     known: KnownDevice
-    speed_mbit_s: str
+    bus: int
+    address: int
+    serial: str  # empty: none, or not readable
+    speed: int  # libusb's number, 0: unknown
     is_accessible: bool
 
+    @property
+    def usb_id(self) -> str:
+        return f"{self.known.vendor_id:04x}:{self.known.product_id:04x}"
+
     def __str__(self) -> str:
-        speed = f"{SPEEDS.get(self.speed_mbit_s, 'speed')} ({self.speed_mbit_s} Mbit/s)"
-        return f"{self.known.name} ({self.known.vendor_id:04x}:{self.known.product_id:04x}, {speed})"
+        return f"{self.known.name} ({self.usb_id}, {SPEEDS.get(self.speed, 'unknown')})"
 
     def problems(self) -> list[str]:
         """Problems that prevent its use, each with its remedy."""
         problems = []
-        if self.known.needs_usb3 and self.speed_mbit_s in USB2:
-            problems.append(f"is on {self.speed_mbit_s} Mbit/s and needs USB 3: use a blue port and the original cable")
+        if self.known.needs_usb3 and 0 < self.speed < SUPER_SPEED:
+            problems.append(f"is on {SPEEDS[self.speed]} and needs USB 3: use a blue port and the original cable")
         if not self.is_accessible:
             problems.append(f"permission denied: install the udev rule {UDEV_RULE} and plug it in again")
         return problems
 
 
-def find_devices(listed: Path = Path("/sys/bus/usb/devices"), nodes: Path = Path("/dev/bus/usb")) -> list[UsbDevice]:
-    """Find all known devices in Linux' list, in its order. nodes: where the devices themselves are opened."""
-    found = []
-    for folder in sorted(path.parent for path in listed.glob("*/idVendor")):
-        with suppress(OSError):  # unplugged meanwhile
-            told = {name: (folder / name).read_text().strip() for name in ATTRIBUTES}
-            known = _BY_ID.get((int(told["idVendor"], 16), int(told["idProduct"], 16)))
-            if known is not None:
-                node = nodes / f"{int(told['busnum']):03d}" / f"{int(told['devnum']):03d}"
-                found.append(UsbDevice(known, told["speed"], os.access(node, os.R_OK | os.W_OK)))
-    return found
+def _described(device: Any, known: KnownDevice) -> UsbDevice:
+    import usb.core
+    import usb.util
+
+    serial, accessible = "", True
+    try:
+        serial = device.serial_number or ""
+    except (usb.core.USBError, NotImplementedError, ValueError):
+        accessible = False  # pyusb raises ValueError ("no langid") without permission to read strings
+    finally:
+        usb.util.dispose_resources(device)  # which reading the serial opened
+    return UsbDevice(known, device.bus or 0, device.address or 0, serial, device.speed or 0, accessible)
+
+
+def find_devices(backend: Any = None) -> list[UsbDevice]:
+    """Find all known devices, ordered by bus and address. Raises MissingPart without libusb."""
+    try:
+        import usb.core
+    except ImportError as error:
+        raise missing_extra(error) or error from None
+    try:
+        devices: Iterable[Any] = usb.core.find(find_all=True, backend=backend)
+        pairs = [(device, _BY_ID.get((device.idVendor, device.idProduct))) for device in devices]
+    except usb.core.NoBackendError:
+        raise MissingPart("libusb is not installed (Debian: apt install libusb-1.0-0)") from None
+    except usb.core.USBError as error:
+        raise SensorLost(f"the USB bus cannot be listed: {error}") from None
+    connected = [_described(device, known) for device, known in pairs if known is not None]
+    return sorted(connected, key=lambda d: (d.bus, d.address))

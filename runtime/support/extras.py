@@ -7,6 +7,7 @@ from importlib.metadata import PackageNotFoundError, requires
 
 from runtime.errors import MissingPart
 
+IMPORTED_AS = {"usb": "pyusb"}  # packages whose module has another name
 NOT_TO_RUN = frozenset({"all", "docs", "test"})
 
 
@@ -14,7 +15,8 @@ def missing_extra(error: BaseException) -> MissingPart | None:
     """Error with the extra to install for a failed import; None if no extra has the package."""
     if not isinstance(error, ModuleNotFoundError) or not error.name:
         return None
-    package = error.name.partition(".")[0].replace("_", "-")
+    module = error.name.partition(".")[0]
+    package = IMPORTED_AS.get(module, module).replace("_", "-")
     for extra in _extras_with(package):
         return MissingPart(f"{package} is not installed: pip install 'phasestack[{extra}]'")
     return None

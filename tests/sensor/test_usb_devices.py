@@ -2,42 +2,72 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import errno
+from array import array
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+import usb.backend
+from usb.core import USBError
 
 from runtime.sensor.usb_devices import UDEV_RULE, find_devices
 
 
-def plug_in(folder: Path, usb_id: str, *, speed: str, number: int) -> None:
-    """Adds a device to a list as the kernel documents it (ABI/testing/sysfs-bus-usb)."""
-    device = folder / "devices" / f"1-{number}"
-    device.mkdir(parents=True)
-    vendor, product = usb_id.split(":")
-    told = {"idVendor": vendor, "idProduct": product, "busnum": "1", "devnum": str(number), "speed": speed}
-    for name, value in told.items():
-        (device / name).write_text(f"{value}\n")
+@dataclass(eq=False)
+class Plugged:
+    ids: tuple[int, int]
+    speed: int = 4
+    readable: bool = True  # False: permission is missing
+
+
+class FakeUsb(usb.backend.IBackend):
+    """What pyusb asks of a bus to find devices and read their serial numbers."""
+
+    def __init__(self, *devices: Plugged) -> None:
+        super().__init__()
+        self.devices = devices
+
+    def enumerate_devices(self) -> Any:
+        return self.devices
+
+    def get_device_descriptor(self, dev: Plugged) -> Any:
+        return SimpleNamespace(
+            bLength=18, bDescriptorType=1, bcdUSB=0x0300, bDeviceClass=0, bDeviceSubClass=0, bDeviceProtocol=0,
+            bMaxPacketSize0=64, idVendor=dev.ids[0], idProduct=dev.ids[1], bcdDevice=0x0100, iManufacturer=0,
+            iProduct=0, iSerialNumber=1, bNumConfigurations=0, address=5, bus=1, port_number=5, port_numbers=(5,),
+            speed=dev.speed,
+        )  # fmt: skip
+
+    def open_device(self, dev: Plugged) -> Plugged:
+        if not dev.readable:
+            raise USBError("permission", -1, errno.EACCES)
+        return dev
+
+    def close_device(self, dev_handle: Plugged) -> None: ...
+
+    def ctrl_transfer(self, dev_handle: Plugged, kind: int, request: int, value: int, *data: Any) -> int:
+        text = {0: b"\x09\x04", 1: "K2".encode("utf-16-le")}[value & 0xFF]
+        answer = array("B", bytes([len(text) + 2, 3]) + text)
+        data[1][: len(answer)] = answer
+        return len(answer)
 
 
 @pytest.mark.parametrize(
-    ("usb_id", "speed", "has_node", "problem"),
+    ("device", "problem"),
     [
-        ("045e:02d8", "480", True, "needs USB 3"),
-        ("1d27:0600", "480", False, UDEV_RULE),
-        ("1d27:0600", "480", True, ""),
-        ("045e:02d8", "5000", True, ""),
+        (Plugged((0x045E, 0x02D8), speed=3), "USB 3"),
+        (Plugged((0x1D27, 0x0600), readable=False), UDEV_RULE),
     ],
-    ids=["a Kinect v2 on USB 2", "no permission", "an Xtion", "a Kinect v2 on USB 3"],
+    ids=["a Kinect v2 on USB 2", "no permission"],
 )
-def test_what_stands_in_the_way_is_told_with_its_remedy(
-    tmp_path: Path, usb_id: str, speed: str, has_node: bool, problem: str
-) -> None:
-    plug_in(tmp_path, usb_id, speed=speed, number=5)
-    plug_in(tmp_path, "1d6b:0002", speed="480", number=6)
-    (tmp_path / "nodes" / "001").mkdir(parents=True)
-    if has_node:
-        (tmp_path / "nodes" / "001" / "005").touch()
-    (found,) = find_devices(tmp_path / "devices", tmp_path / "nodes")
-    assert usb_id in str(found) and speed in str(found)
-    problems = found.problems()
-    assert len(problems) == bool(problem) and all(problem in each for each in problems)
+def test_what_stands_in_the_way_is_told_with_its_remedy(device: Plugged, problem: str) -> None:
+    (found,) = find_devices(FakeUsb(device, Plugged((1, 2))))
+    assert any(problem in each for each in found.problems())
+    assert f"{device.ids[0]:04x}:{device.ids[1]:04x}" in str(found)
+
+
+def test_a_camera_that_may_be_opened_is_known_by_its_serial() -> None:
+    (found,) = find_devices(FakeUsb(Plugged((0x045E, 0x02D8))))
+    assert found.serial == "K2" and not found.problems()
