@@ -18,8 +18,8 @@
 #     --token-file page-token
 # NVIDIA: --gpus all -e NVIDIA_DRIVER_CAPABILITIES=all in place of --device /dev/dri.
 
-# The digest of the index of all architectures, as others pin it too (where this was written no image registry could be
-# asked). A newer one: docker buildx imagetools inspect python:3.11-slim-bookworm
+# Digest of the index of all architectures, as pinned by other projects (not checked against a registry).
+# A newer one: docker buildx imagetools inspect python:3.11-slim-bookworm
 ARG BASE=python:3.11.14-slim-bookworm@sha256:65a93d69fa75478d554f4ad27c85c1e69fa184956261b4301ebaf6dbb0a3543d
 
 FROM ${BASE} AS build
@@ -57,7 +57,7 @@ ENV PATH=/opt/phasestack/bin:$PATH \
 USER phasestack
 WORKDIR /var/lib/phasestack
 STOPSIGNAL SIGTERM
-# Fails where no daemon answers, or its loop has stood still; the demo is over before it is asked.
+# Fails if no daemon answers or its loop hangs; the demo ends before the first check.
 HEALTHCHECK --interval=15s --timeout=10s --start-period=60s --retries=3 CMD ["phasestack", "status"]
 ENTRYPOINT ["phasestack"]
 CMD ["demo"]

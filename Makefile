@@ -1,4 +1,4 @@
-# Two commands do all the set-up: `make demo` (what the runtime needs, no torch) and `make test` (everything).
+# Two commands do all the set-up: `make demo` (the runtime's needs, without torch) and `make test` (everything).
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -23,7 +23,7 @@ test-slow: $(VENV)/.test
 	@sh systemd/packages.sh slow
 	$(BIN)/python -m pytest -m slow --timeout 3600 $(PYTEST_ARGS)
 
-# The golden runs' references anew, on purpose; GOLDEN_ARGS="walk fault" for some of them.
+# Replace the golden runs' references, on purpose; GOLDEN_ARGS="walk fault": some of them.
 golden: $(VENV)/.test
 	$(BIN)/python -m tests.golden --renew $(GOLDEN_ARGS)
 
@@ -42,19 +42,19 @@ types: $(VENV)/.test
 secrets: $(VENV)/.test
 	git ls-files -z | xargs -0 $(BIN)/detect-secrets-hook --exclude-files '\.lock$$|\.npz$$'
 
-# Of branches; the floor is in pyproject.toml. Twice the tests' time.
+# Branch coverage, with its floor in pyproject.toml; takes twice the tests' time.
 coverage: $(VENV)/.test
 	$(BIN)/python -m pytest -m "not slow" -n $(TEST_WORKERS) --dist loadfile --cov --cov-report=term:skip-covered --cov-report=html:out/coverage
 
-# What takes too long for every change: the slow tests, coverage, every fuzzer, secrets in all files, and the frontier
-# against that of the night before (exit 1 where it got slower or worse beyond noise).
+# Checks that take too long for every change: the slow tests, coverage, every fuzzer, secrets in all files, and the frontier
+# against the night before (exit 1 if slower or worse beyond noise).
 nightly: test-slow coverage fuzz secrets
 	mkdir -p $(NIGHTLY)
 	$(BIN)/phasestack bench --out $(NIGHTLY)/bench-new.json
 	if [ -e $(NIGHTLY)/bench.json ]; then $(BIN)/phasestack bench compare $(NIGHTLY)/bench.json $(NIGHTLY)/bench-new.json; fi
 	mv $(NIGHTLY)/bench-new.json $(NIGHTLY)/bench.json
 
-# Wheel and sdist in dist/; tests/test_packages.py (slow) installs them from nothing and runs the demo.
+# Wheel and sdist in dist/; tests/test_packages.py (slow) installs them into an empty environment and runs the demo.
 package: $(VENV)/.test
 	$(BIN)/python -m build --outdir dist
 
@@ -74,11 +74,11 @@ install: system
 uninstall:
 	sh systemd/uninstall.sh
 
-# The networks that find eyes anew from their publishers' files, beside those that are shipped.
+# Rebuild the eye networks from their publishers' files, next to the shipped ones.
 eye-models:
 	sh docs/make_eye_models.sh out/eye-models
 
-# The models that ship anew from their recipes, the same bytes with the pinned torch and onnx.
+# Rebuild the shipped models from their recipes; the pinned torch and onnx give the same bytes.
 models: $(VENV)/.test
 	for name in fast balanced best; do $(BIN)/phasestack export --arch $$name --out runtime/model/data/$$name.onnx || exit 1; done
 	cd runtime/model/data && sha256sum balanced.onnx best.onnx fast.onnx > SHA256SUMS
@@ -92,7 +92,7 @@ site: $(VENV)/.docs
 gallery: $(VENV)/.test
 	$(BIN)/python -m docs.make_gallery
 
-# The locks' hashes anew from their pins, as the registry tells them.
+# Rewrite the locks' hashes for their pins, from the registry.
 hashes:
 	sh requirements/make_hashes.sh
 

@@ -69,14 +69,14 @@ HEAD = """\
 
 **Quote light, at a tracking error of 1 mm** (`light_db`, `"1"`). It, *one ray* (`psnr_db`) and *carried* are
 [defined in contracts](contracts.md#error); *time* is that of a whole solution, from two decoded pictures to 8-bit
-layers. Every method runs in a process of its own, whose peak is its memory. Times hold for one machine and hour:
+layers. Every method runs in a separate process, whose peak is its memory. Times hold for one machine and hour:
 compare ratios. The published network (`eyereal`), exported from its checkpoint, is compared as `--model FILE.onnx`.
 
 `bench compare` divides times by a yardstick of the same run, does not compare them where the machine was busy, and
 exits with 1 where a model got slower by more than the noise, lost 0.1 dB or took 15% more memory.
 
 A [case file](contracts.md#cases-pairs-calibration) is any `*.json` in DIR like this one; `off` (optional) is what
-should be seen `mm` beside an eye:
+should be seen `mm` away from an eye:
 
     {"panels": {"width_m": 0.5184, "height_m": 0.2916, "x_m": [-0.06, 0.0, 0.06]},
      "eyes": [[0.78, -0.03, 0.24], [0.78, 0.03, 0.24]], "images": ["left.png", "right.png"], "fov": 40.0,

@@ -108,7 +108,7 @@ def as_codes(picture: Picture) -> U8:
 
 
 def find_eyes(picture: ArrayLike) -> Pupils | None:
-    """The foremost viewer's pupils in an (h, w, 3|4) picture, uint8 or float in 0..1; None: nobody.
+    """Find the foremost viewer's pupils in a picture (h, w, 3|4), uint8 or float in 0..1, or None.
 
     `eyes_px` is (2, 2): the viewer's left eye first, which is on the right of an unmirrored picture; continuous pixels,
     centres at half-integers. `sigma_px` is their standard deviation. Raises ValueError for anything but a picture.

@@ -79,7 +79,7 @@ class EyesEstimate:
 
 @dataclass(frozen=True, slots=True)
 class Parallax:
-    """Movement of content on the panels between the eyes solved for and the present ones (`optics.relief`).
+    """Motion of content on the panels from the eyes solved for to the present ones (`optics.relief`).
 
     Content of relief b that is seen through pixel p of the middle panel was seen through p + b·(drift_px + growth·p).
     """

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Installs phasestack for the whole machine; `sh systemd/install.sh --help` says how.
+# Installs phasestack for the whole machine; `sh systemd/install.sh --help` explains it.
 set -eu
 usage() {
   cat <<'HELP'

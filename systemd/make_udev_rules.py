@@ -1,12 +1,12 @@
-"""Prints the udev rules for every sensor that phasestack knows: python systemd/make_udev_rules.py"""
+"""Print the udev rules of all known sensors: python systemd/make_udev_rules.py."""
 
 from __future__ import annotations
 
 from runtime.sensor.usb_devices import KNOWN_DEVICES
 
 HEADER = """\
-# Depth cameras that phasestack knows: the group plugdev, and whoever sits at the seat, may open
-# them; they are never put to sleep. Made by systemd/make_udev_rules.py from runtime/sensor/usb_devices.py.
+# Depth cameras that phasestack knows: the group plugdev and the user at the seat may open them;
+# they are never suspended. Made by systemd/make_udev_rules.py from runtime/sensor/usb_devices.py.
 ACTION=="remove", GOTO="phasestack_end"
 SUBSYSTEM!="usb", GOTO="phasestack_end"
 """
@@ -14,7 +14,7 @@ FOOTER = 'LABEL="phasestack_end"\n'
 
 
 def rules() -> str:
-    """The whole file."""
+    """Text of the rules file."""
     lines = []
     for device in KNOWN_DEVICES:
         lines.append(f"# {device.name}")

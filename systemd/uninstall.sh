@@ -1,5 +1,5 @@
 #!/bin/sh
-# Removes the files of install.sh; `sh systemd/uninstall.sh --help` says how.
+# Removes the files of install.sh; `sh systemd/uninstall.sh --help` explains it.
 set -eu
 usage() {
   cat <<'HELP'

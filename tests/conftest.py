@@ -1,4 +1,4 @@
-"""What holds for every test: folders of its own, one thread a library, logs as they were, no property about time."""
+"""Fixtures of all tests: separate folders, one thread per library, logs restored, no time limits for hypothesis."""
 
 from __future__ import annotations
 

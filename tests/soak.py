@@ -60,7 +60,7 @@ ON_WINDOWS: dict[str, Any] = {
 
 
 class Soak:
-    """What is done to a daemon beside it, and what came of it."""
+    """Actions on a running daemon from outside, and their outcome."""
 
     def __init__(self, folder: Path, seconds: float) -> None:
         self.socket, self._end_s = folder / "s.sock", time.monotonic() + seconds

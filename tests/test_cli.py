@@ -25,7 +25,7 @@ def phasestack(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 
 
 def refusal(*arguments: str | Path) -> str:
-    """What a command's mistake is told as; the guard makes one line and exit 2 of it (tests/test_exit_codes.py)."""
+    """Message of a command's error; the guard turns it into one line and exit 2 (tests/test_exit_codes.py)."""
     with pytest.raises(FatalError) as told:
         app([str(argument) for argument in arguments])
     assert "\n" not in str(told.value)

@@ -39,7 +39,7 @@ def fields_of(table: str) -> set[str]:
 
 
 def test_every_command_is_promised() -> None:
-    """That a promised one takes its options is in tests/test_docs.py, as of every page."""
+    """The options of promised commands are tested in tests/test_docs.py."""
     promised = re.findall(r"^    phasestack ((?:[a-z]+(?: |$))+)", PAGE, re.MULTILINE)
     known = {" ".join(path) for path, command in walk(typer.main.get_command(app)) if not hasattr(command, "commands")}
     assert known - {name.strip() for name in promised} == set()
@@ -47,7 +47,7 @@ def test_every_command_is_promised() -> None:
 
 @pytest.fixture(scope="module")
 def left(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a short run leaves."""
+    """Folder of a short run."""
     out = tmp_path_factory.mktemp("contract") / "out"
     options = RunOptions(max_speed=True, measure=True, scale=0.05, keep_light=6, frames=12, out=out)
     drive(with_options(Settings(), replay="demo", headless=True), options)

@@ -53,7 +53,7 @@ def walk(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, 
 
 
 def blocks_of(page: Path) -> list[str]:
-    """What a page shows as code, fenced or indented, without its indentation."""
+    """Code blocks of a page, fenced or indented, without their indentation."""
     found = BLOCK.findall(page.read_text(encoding="utf-8") + "\n")
     return [fenced or re.sub(r"^ {4}", "", indented, flags=re.MULTILINE) for fenced, indented in found]
 

@@ -1,4 +1,4 @@
-"""What an extra brings is asked for where it is needed, by one line that names the extra."""
+"""A missing package of an extra is reported where it is needed, in one line that names the extra."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the contracts of imports in pyproject.toml (`make lint`) can't say: no circles, and what a command may load."""
+"""Import rules that pyproject.toml (`make lint`) can't express: no cycles, and modules a command may load."""
 
 from __future__ import annotations
 

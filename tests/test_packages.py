@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
 
 def done(*command: str | Path, cwd: Path) -> str:
-    """What a command prints; it knows nothing of this checkout."""
+    """Output of a command run outside this checkout."""
     environment = {name: value for name, value in os.environ.items() if name not in {"PYTHONPATH", "VIRTUAL_ENV"}}
     result = subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=1500)
     assert result.returncode == 0, result.stderr[-2000:]

@@ -127,7 +127,7 @@ result = phasestack.solve(grey, grey, eyes_m=((0.7, -0.03, 0), (0.7, 0.03, 0)), 
 
 
 def test_solving_judging_and_saving_need_no_extra(tmp_path: Path) -> None:
-    """As where the base dependencies alone are installed."""
+    """Simulates an installation with the base dependencies alone."""
     code = BLOCKED.format(packages=sorted(of_extras())) + SMALL_PAIR + f"result.save({str(tmp_path / 'out')!r})\n"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, done.stderr
@@ -184,7 +184,7 @@ def scene_at(points_m: np.ndarray) -> np.ndarray:
 
 
 def taken(matrix: np.ndarray, width_px: int, height_px: int) -> np.ndarray:
-    """What a pinhole camera sees of it: a plain tracer."""
+    """A pinhole camera's view of the scene: a plain tracer."""
     u, v = np.meshgrid(np.arange(width_px) + 0.5, np.arange(height_px) + 0.5)
     place = -np.linalg.solve(matrix[:, :3], matrix[:, 3])
     rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(matrix[:, :3]).T

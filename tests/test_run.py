@@ -63,7 +63,7 @@ def run(folder: Path, *arguments: Any) -> Path:
 
 
 def played(folder: Path, recording: Path | str, *, scale: float = 0.05, frames: int | None = None) -> Path:
-    """The same without a process of its own."""
+    """Run a recording in this process; returns the folder."""
     options = RunOptions(max_speed=True, measure=True, scale=scale, frames=frames, out=folder)
     drive(with_options(Settings(), replay=str(recording), headless=True), options)
     return folder
@@ -91,7 +91,7 @@ DEMO = ("--replay", "demo", "--frames", FRAMES, "--scale", 0.1, "--keep-light", 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Path]]:
-    """The same run, twice."""
+    """Two identical runs."""
     folders = tmp_path_factory.mktemp("runs")
     yield run(folders / "a", *DEMO), run(folders / "b", *DEMO)
 

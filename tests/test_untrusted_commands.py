@@ -1,4 +1,4 @@
-"""What is no file, no path or no JSON, as any option of any command: one line that names it, exit 2, no waiting."""
+"""Invalid files, paths and JSON as any command's options: one line that names them, exit 2, no delay."""
 
 from __future__ import annotations
 

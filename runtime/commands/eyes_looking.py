@@ -155,7 +155,7 @@ def drawn(picture: U8, pupils: Pupils | None, row: Row) -> U8:
         x, y = np.rint((np.asarray(point) * scale - 0.5) * (1 << bits)).astype(int)
         return int(x), int(y)
 
-    line = f"nobody: {row['reason']}"
+    line = f"no viewer: {row['reason']}"
     if pupils is not None:
         for point in pupils.mesh_px[RIGID, :2]:
             cv2.circle(canvas, place(point), 1 << bits, WHITE, -1, cv2.LINE_AA, bits)

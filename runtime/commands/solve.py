@@ -69,4 +69,4 @@ def solve(
     typer.echo(shown(result, as_json=as_json))
     if not as_json:
         typer.echo("light_db at a tracking error of 1 mm is the figure to quote")
-        typer.echo(f"see {out / 'contact-sheet.png'}; look into it: {out / 'viewer.html'}")
+        typer.echo(f"see {out / 'contact-sheet.png'}; interactive: {out / 'viewer.html'}")

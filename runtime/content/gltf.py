@@ -241,7 +241,7 @@ class GltfScene:
         uses = base.get(f"{prefix}Texture"), material.get("emissiveTexture") if glow != BLACK else None
         use: Table = uses[0] or uses[1] or {}
         if uses[0] and uses[1] and _coordinates(uses[0]) != _coordinates(uses[1]):
-            self.left_out.add("an emissive texture with coordinates of its own")
+            self.left_out.add("an emissive texture with separate coordinates")
             uses, glow = (uses[0], None), BLACK
         textures = [None if used is None else file.item("textures", used["index"]) for used in uses]
         pictures = [None if texture is None else file.picture(texture) for texture in textures]
@@ -268,7 +268,7 @@ def _problem(error: Exception) -> str:
     if isinstance(error, KeyError):
         return f"{untrusted_input.shown(str(error))} is missing"
     if isinstance(error, IndexError):
-        return "a reference to what is not there"
+        return "a reference to a missing object"
     own = isinstance(error, ValueError) and error.args and str(error.args[0]).startswith(OWN_PROBLEMS)
     return one_line(str(error), most=120) if own else "a value of a wrong kind"
 

@@ -121,15 +121,15 @@ def folder_reader(path: Path, field: str) -> Callable[[str], bytes]:
 
 
 def _file_of(uri: str, *, source: Path, field: str) -> Path:
-    """The file in the folder of `source` that a URI names. Raises InputError."""
+    """Path of the file that a URI names in the folder of `source`. Raises InputError."""
     shown = untrusted_input.shown(uri, most=200)
     if "://" in uri or uri.startswith("data:"):
-        raise InputError(source, field, f"{shown}: only files beside this one are read")
+        raise InputError(source, field, f"{shown}: only files next to this one are read")
     name = untrusted_input.checked_path(unquote(uri), source=source, field=field)
     if name.is_absolute():
-        raise InputError(source, field, f"{shown} is an absolute path; files beside this one are read")
+        raise InputError(source, field, f"{shown} is an absolute path; only files next to this one are read")
     if not (source.parent / name).exists():
-        raise InputError(source, field, f"{shown} is not there")
+        raise InputError(source, field, f"{shown} does not exist")
     return source.parent / name
 
 

@@ -50,7 +50,7 @@ class FolderResolver(trimesh.resolvers.FilePathResolver):
             found = self._named(name)
             if found is None:
                 what = "materials" if is_material else "texture"
-                why = f"{untrusted_input.shown(name)} is not there"
+                why = f"{untrusted_input.shown(name)} does not exist"
                 log.warning("%s: is drawn grey without its %s (%s)", self._path, what, why)
                 self.has_materials = self.has_materials and not is_material
                 return b"" if is_material else _grey()
@@ -96,7 +96,9 @@ def read_mesh(path: Path, data: bytes, read: Read) -> tuple[list[Part], list[tup
         if resolver.refused is not None:
             raise resolver.refused from None
         why = (
-            "a face names a vertex that is not there" if isinstance(error, IndexError) else "it is damaged, or no mesh"
+            "a face names a vertex that does not exist"
+            if isinstance(error, IndexError)
+            else "it is damaged, or no mesh"
         )
         raise InputError(path, "", f"cannot be read as a mesh: {why}") from None
     if resolver.refused is not None:

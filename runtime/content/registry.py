@@ -103,7 +103,7 @@ def _from_path(file: SceneFile) -> Opener:
     path = file.path
     untrusted_input.checked_path(path, source="content", field="file")
     if not path.exists():
-        raise InputError(path, "", "is not there")
+        raise InputError(path, "", "does not exist")
     suffix = path.suffix.lower()
     if suffix in OTHER_FILES and path.is_file():
         kind, way_out = OTHER_FILES[suffix]

@@ -62,7 +62,7 @@ def _unseen(layers: U8, account: RefreshAccount, run: Run, settings: Settings) -
     away_m = max(USUAL_M, stack.x_m[-1] + USUAL_M / 2)
     eyes_m = np.array([[away_m, -IPD_M / 2, 0.0], [away_m, IPD_M / 2, 0.0]])
     eyes_m = eyes_m if account.eyes_m is None else account.eyes_m
-    title = "Nobody was seen: the flat picture" if is_flat else "The last refresh, not measured"
+    title = "No viewer was seen: the flat picture" if is_flat else "The last refresh, not measured"
     fov_deg = settings.content.fov_deg
     return viewer_html(layers, (), stack, eyes_m=eyes_m, fov_deg=fov_deg, title=title, follows=not is_flat)
 
@@ -78,11 +78,11 @@ def print_summary(summary: dict[str, Any], out: Path | None) -> None:
             print(f"  {line}")
     if summary["live_db"] is not None:
         print(
-            "live_db (light at the true eyes, of what they should see there and then) is the figure to quote for motion"
+            "live_db (light at the true eyes against their targets at each refresh) is the figure to quote for motion"
         )
     if summary["light_db"] is not None:
         print("light_db (pupils at the eyes used, tracking error 1 mm) is the figure to quote for a head at rest")
     if not summary["inferences"]:
-        print("no solution was shown: nobody was seen, or the run ended before the first was ready (--frames)")
+        print("no solution was shown: no viewer was seen, or the run ended before the first solution (--frames)")
     if out is not None:
-        print(f"see {out}/contact-sheet.png; look into it: {out}/viewer.html")
+        print(f"see {out}/contact-sheet.png; interactive: {out}/viewer.html")

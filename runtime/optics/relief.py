@@ -47,7 +47,7 @@ def relief_of(nearness: Sequence[F32], *, distance_m: Sequence[float]) -> F32:
 
 
 def parallax(stack: PanelStack, *, old_m: F64, new_m: F64) -> Parallax | None:
-    """How content moves on the panels for a middle between the eyes (3,) that moved; frame `stack`.
+    """Motion of content on the panels when the middle between the eyes (3,) moves; frame `stack`.
 
     None: with an even number of panels, none of which is the middle one, or without a movement.
     """
@@ -76,7 +76,7 @@ def parallax(stack: PanelStack, *, old_m: F64, new_m: F64) -> Parallax | None:
 
 @dataclass(frozen=True, slots=True)
 class Displacement:
-    """What a panel's alignment is corrected by, for content off the middle panel."""
+    """Correction of a panel's alignment for content off the middle panel."""
 
     relief: F32
     drift_px: tuple[float, float]

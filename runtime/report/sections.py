@@ -147,7 +147,7 @@ def focal_section(stack: FocalStack) -> PageSection:
     text = [
         f"Three cards, 5 cm behind, in and 4.5 cm in front of the middle panel, seen from {DISTANCE_M:g} m by a pupil "
         f"of {1000 * PUPIL_M:g} mm. The layers ({stack.model}) are solved for two pinhole eyes only; the rest of the "
-        "pupil had no target. On a flat panel every card is sharpest in the panel's plane, whatever its depth.",
+        "pupil had no target. On a flat panel every card is sharpest in the panel's plane at any depth.",
     ]
     caption = "Vergence against accommodation, right eye: up to 0.3 dioptres are commonly considered comfortable."
     table = Table([*headings, "conflict, dioptres"], rows, caption)

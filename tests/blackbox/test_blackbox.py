@@ -136,7 +136,7 @@ def test_it_keeps_no_more_than_its_minutes_and_its_bytes(tmp_path: Path, monkeyp
 
 
 def test_a_journal_that_hangs_costs_no_more_memory_than_is_kept(tmp_path: Path, monkeypatch: Any) -> None:
-    """What waited for the journal was kept without bound."""
+    """Entries waiting for the journal used to be kept without bound."""
     hangs, added, add = threading.Event(), [], recording._Journal.add
     monkeypatch.setattr(recording, "JOURNAL_EVERY_NS", 0)
     monkeypatch.setattr(recording, "BYTES_MAX", 20_000)
@@ -253,7 +253,7 @@ def test_a_flood_of_one_kind_displaces_no_other_kind(tmp_path: Path) -> None:
 
 
 def test_many_requests_in_one_second_all_get_whole_files(tmp_path: Path) -> None:
-    """Of a hundred 73 were refused, and 3 were told of a file that nothing could read."""
+    """A hundred requests once gave 73 refusals and 3 unreadable files."""
     answers: list[tuple[str, Path | None]] = []
     with Rig(recorder=(recorder := Recorder(tmp_path, minutes=1))) as rig:
         rig.refreshes(50)

@@ -44,7 +44,7 @@ def needs_chromium() -> None:
 
 
 def driven(script: str, *arguments: object) -> dict[str, Any]:
-    """What a script that drives Chromium says, by its name."""
+    """Values printed by a script that drives Chromium, by name."""
     needs_chromium()
     command = ["node", str(HERE / script), *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=1800, check=False)
@@ -232,4 +232,4 @@ def test_a_run_that_saw_nobody_can_be_looked_into_too(tmp_path: Path) -> None:
     options = ["--config", config, "--replay", tmp_path / "r.mcap", "--headless", "--max-speed", "--out", out]
     assert phasestack_command("run", *options).returncode == 0
     page = (out / "viewer.html").read_text()
-    assert "Nobody was seen" in page and page.count("data:image/webp;base64,") == 3 and '"follows": false' in page
+    assert "No viewer was seen" in page and page.count("data:image/webp;base64,") == 3 and '"follows": false' in page

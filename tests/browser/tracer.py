@@ -32,8 +32,8 @@ class Panels:
         return point[..., 1], point[..., 2]
 
     def aligned(self, layers: np.ndarray, solved: np.ndarray, now: np.ndarray) -> np.ndarray:
-        """What the panels show for a head that moved: each pixel's centre goes along the new middle's ray to the centre
-        panel, and from there along the old one's back to its own."""
+        """Layers aligned to a moved head: each pixel's centre follows the new middle's ray to the centre panel, and the
+        old middle's ray back to its own panel."""
         height, width = layers.shape[1:3]
         old, new, r = solved.mean(axis=0), now.mean(axis=0), self.x_m[self.reference]
         v, u = np.mgrid[0:height, 0:width] + 0.5

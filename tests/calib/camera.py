@@ -17,7 +17,7 @@ KNOWN_M = np.array([viewpoint.midpoint_m for viewpoint in grid()])  # (27, 3) th
 def measured(
     points: np.ndarray = KNOWN_M, *, sigma_m: float = 0.0, scale: float = 1.0, seed: int = 0
 ) -> NDArray[np.float64]:
-    """What the demo's camera reports of points, with noise and with a metre of its own."""
+    """Points measured by the demo's camera, with noise and a scale error."""
     sensor_from_stack = np.linalg.inv(demo_stack_from_sensor())
     exact = points @ sensor_from_stack[:3, :3].T + sensor_from_stack[:3, 3]
     return exact / scale + sigma_m * np.random.default_rng(seed).normal(size=exact.shape)

@@ -118,7 +118,7 @@ def misplaced(
 
 @dataclass(frozen=True)
 class Errors:
-    """What a registration is off by, in the frame of the reference panel."""
+    """Errors of a registration, in the frame of the reference panel."""
 
     pixels: np.ndarray  # (K,) distance over an even grid of points of every panel but the reference
     gap_m: np.ndarray  # (N-1,)
@@ -126,7 +126,7 @@ class Errors:
 
 
 def in_frame_of(panels: tuple[PlacedPanel, ...], *, reference: int, reference_x_m: float) -> tuple[PlacedPanel, ...]:
-    """The same panels in the frame that a registration has: of the reference panel, which lies at its ideal place."""
+    """Panels in a registration's frame, whose reference panel is at its ideal pose."""
     turn = panels[reference].rotation.T
     middle, shift = panels[reference].centre_m, np.array([reference_x_m, 0.0, 0.0])
     return tuple(PlacedPanel(turn @ p.rotation, turn @ (p.centre_m - middle) + shift) for p in panels)
@@ -172,8 +172,8 @@ def photographed(
     random: np.random.Generator,
     poses: list[np.ndarray] | None = None,
 ) -> list[SeenMarks]:
-    """What `find_marks` would find in `count` photographs by hand with one phone, whose lens distorts: every saddle in
-    the picture, with noise."""
+    """Marks as `find_marks` finds them in `count` hand-held photographs by one phone with lens distortion: every saddle
+    in the picture, with noise."""
     lens = Camera(4000, 3000, 4000 * random.uniform(0.72, 0.80))
     brown = [random.uniform(-0.06, 0.10), random.uniform(-0.12, 0.05), *random.normal(scale=4e-4, size=2), 0.01]
     found = []

@@ -20,8 +20,8 @@ CAMERA_M = (0.05, 0.02, 0.22)
 
 @cache
 def mean_error_m(*, sigma_m: float, scale: float = 1.0, seeds: int = 60) -> dict[str, float]:
-    """Of the calibrated place over the viewing volume: 27 viewpoints, a camera turned at random for each seed, noise on
-    the sensor's side, whose metre is `scale` of ours."""
+    """Mean position error over the viewing volume after calibration at 27 viewpoints, with a random camera rotation per
+    seed and sensor noise; the sensor's metre is `scale` of ours."""
     known_m, volume_m = np.array([viewpoint.midpoint_m for viewpoint in grid()]), viewing_volume_m()
     errors: dict[str, list[float]] = {name: [] for name in (*METHODS, "default")}
     for seed in range(seeds):

@@ -56,7 +56,7 @@ def setup_command(folder: Path, keys: str, *options: str) -> subprocess.Complete
 
 
 def photographs_into(folder: Path) -> None:
-    """Of the boards, and of every panel's chart, on panels that hands put together and whose greys have a gamma."""
+    """Photograph the boards and every panel's chart, on imprecisely assembled panels with a gamma."""
     random = np.random.default_rng(5)
     truth = misplaced(STACK, shift_m=0.002, turn_deg=0.25, gap_m=0.0005, random=random)
     phases = np.rint(255 * phase_from_intensity((np.arange(256) / 255) ** 2.1, branch=1)).astype(np.uint8)

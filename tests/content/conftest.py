@@ -1,4 +1,4 @@
-"""What the content tests share: one GL context, the display of the paper, views of it."""
+"""Shared fixtures of the content tests: one GL context, the paper's display, and views of it."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ def files_are_read_here(request: pytest.FixtureRequest, monkeypatch: pytest.Monk
 
 
 def panel_view(eye_m: ArrayLike, raster: PlaneRaster, side: int = 0) -> View:
-    """What an eye sees, in a plane's pixels."""
+    """An eye's view, in a plane's pixels."""
     eye = np.asarray(eye_m, dtype=np.float64)
     return View(eye, side, raster_from_stack(eye, raster), raster.width_px, raster.height_px)
 
 
 def image_view(eye_m: ArrayLike, width_px: int, height_px: int, fov_deg: float = 40.0, side: int = 0) -> View:
-    """What an eye sees, in its own image."""
+    """An eye's view, in its own image."""
     eye = np.asarray(eye_m, dtype=np.float64)
     projection = image_from_stack(eye, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
     return View(eye, side, projection, width_px, height_px)

@@ -32,7 +32,7 @@ class Buffer:
         return len(self.accessors) - 1
 
     def table(self, primitive: dict[str, Any], **tables: Any) -> dict[str, Any]:
-        """Of one mesh that one node has, unless `tables` say otherwise."""
+        """Document of one node with one mesh; `tables` override its parts."""
         uri = "data:application/octet-stream;base64," + base64.b64encode(self.data).decode()
         return {
             "asset": {"version": "2.0"},

@@ -43,7 +43,7 @@ def element(name: str, held: dict[str, np.ndarray], kind: str) -> PlyElement:
 
 
 def write_compressed(path: Path, table: np.ndarray, *, harmonics: bool = False) -> Path:
-    """As SuperSplat: 256 splats a chunk, bounds of places, scales and colours, harmonics of 8 bits."""
+    """File in SuperSplat's format: 256 splats per chunk, bounds of places, scales and colours, harmonics of 8 bits."""
     count, rgba, turns = len(table), colours(table), unit_turns(table)
     bounds: dict[str, np.ndarray] = {}
 
@@ -76,7 +76,7 @@ def write_compressed(path: Path, table: np.ndarray, *, harmonics: bool = False) 
 
 
 def write_splat(path: Path, table: np.ndarray) -> Path:
-    """As the web viewers' .splat: 32 bytes a splat."""
+    """File in the web viewers' .splat format: 32 bytes per splat."""
     out = np.zeros(len(table), [("place", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("turn", "u1", 4)])
     out["place"] = columns(table, "x", "y", "z")
     out["scale"] = np.exp(columns(table, "scale_0", "scale_1", "scale_2"))

@@ -47,7 +47,7 @@ def test_eyes_are_read_from_names_and_left_is_on_the_left(tmp_path: Path, contex
 
 
 def check_alike(scene: ContentSource, pair: Pair, stack: PanelStack, *, inside_share: float, better: float) -> None:
-    """What a pair shows at its own eyes is what the scene draws, and not the same four pixels aside."""
+    """Check that the scene drawn for a pair's eyes matches the pair, better than shifted by four pixels."""
     source = EyeRealSource((pair,), fov_deg=40, background=(1, 1, 1), name="lego")
     for side in (0, 1):
         view = panel_view(pair.eyes_m[side], stack.panel(1), side=side)

@@ -1,4 +1,4 @@
-"""Which edges are outlines."""
+"""Classification of edges as outlines."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ class Counting:
 
     @property
     def left(self) -> list[Any]:
-        """What was not released."""
+        """GL objects that were not released."""
         return [item for item in self.made if not isinstance(item.mglo, moderngl.InvalidObject)]
 
 

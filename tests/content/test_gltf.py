@@ -372,7 +372,7 @@ def test_what_is_behind_glass_shows_through_it_whatever_the_order(
 
 
 def test_a_front_alone_is_seen_through_unless_it_has_two_sides(tmp_path: Path, context: Any, stack: PanelStack) -> None:
-    """Of a closed glass box: one layer, or two."""
+    """A closed glass box has one visible layer, or two."""
     b = Buffer()
     near, far = np.add(SQUARE, [0, 0, 0.5]), np.subtract(SQUARE, [0, 0, 0.5])[::-1]
     attributes = {"POSITION": b.add([*near, *far]), "NORMAL": b.add([[0, 0, 1]] * 4 + [[0, 0, -1]] * 4)}
@@ -449,7 +449,7 @@ def test_draco_is_decoded(tmp_path: Path, context: Any, stack: PanelStack) -> No
     assert data.low == pytest.approx([-1, -1, 0], abs=1e-3) and data.high == pytest.approx([1, 1, 0], abs=1e-3)
     table = json.loads(path.read_text())
     path.write_text(json.dumps(table | {"buffers": [{"uri": "0.bin", "byteLength": 9}]}))
-    with pytest.raises(InputError, match=r"KHR_draco_mesh_compression: 0\.bin is not there"):
+    with pytest.raises(InputError, match=r"KHR_draco_mesh_compression: 0\.bin does not exist"):
         load_mesh(path)
 
 

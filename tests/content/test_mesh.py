@@ -230,7 +230,7 @@ def test_a_texture_is_found_as_windows_and_exporters_write_it(tmp_path: Path, na
 def test_a_missing_texture_is_grey_and_a_line_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (part,) = load_mesh(with_material(tmp_path, "map_Kd gone.png")).parts
     assert np.ptp(part.picture[0, 0, :3].astype(int)) < 30
-    assert f"{tmp_path / 'a.obj'}: is drawn grey without its texture (gone.png is not there)" in caplog.text
+    assert f"{tmp_path / 'a.obj'}: is drawn grey without its texture (gone.png does not exist)" in caplog.text
 
 
 @pytest.mark.parametrize(("line", "opacity"), [("d 0.2", 0.2), ("Tr 0.8", 0.2), ("d 1", 1.0), ("d x", 1.0), ("", 1.0)])

@@ -33,7 +33,7 @@ def near(found: Any, wanted: tuple[int, int, int], *, by: int = 12) -> bool:
 
 
 def shown(path: Path, context: Any, stack: PanelStack, **settings: Any) -> list[list[int]]:
-    """What each eye sees in the middle."""
+    """Colours at the centre of both eyes' views."""
     source = opened(path, context, stack, **settings)
     return [centre(source, stack, side) for side in (0, 1)]
 
@@ -234,7 +234,7 @@ def test_a_transparent_picture_lies_over_the_scene_s_background(
 
 @pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.tif", "a.webp", "a.avif", "a.heic"])
 def test_a_profile_s_colours_become_srgb(tmp_path: Path, name: str) -> None:
-    """Of a profile that exchanges red and green, against one that is sRGB's."""
+    """Compares a profile that swaps red and green with sRGB's."""
     if name.endswith("heic"):
         pytest.importorskip("pillow_heif").register_heif_opener()
     picture = Image.fromarray(solid((200, 80, 60)))

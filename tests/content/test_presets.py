@@ -20,7 +20,7 @@ SHIFTS = {"matrixcity": (0, 1.5, 0), "room_floor": (0, 0.35, 0.15)}
 
 @pytest.mark.parametrize("name", PLACES)
 def test_the_published_reading_places_the_panels_as_that_code_does(name: str) -> None:
-    """That code spans three panels evenly from half a thickness below `ground` to half a thickness above its end."""
+    """The published code spaces three panels from half a thickness below `ground` to half a thickness above its end."""
     scale, thickness_cm, out, up, ground, coefficient = PLACES[name]
     z_min = ground if coefficient is None else thickness_cm * scale * coefficient
     z_max = z_min + thickness_cm * scale

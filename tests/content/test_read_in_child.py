@@ -125,7 +125,7 @@ print(json.dumps([told, more, mib(resource.RUSAGE_CHILDREN), time.process_time()
 
 
 def loaded(path: Path) -> tuple[str, int, int, float]:
-    """How it was refused, MiB more of the process that asks, MiB of its child, seconds of the former's processor."""
+    """Refusal, MiB added to the asking process, MiB of its child, and the former's CPU seconds."""
     done = subprocess.run([sys.executable, "-c", LOADS, str(path)], capture_output=True, text=True, check=True)
     return tuple(json.loads(done.stdout))
 

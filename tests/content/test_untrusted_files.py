@@ -45,7 +45,7 @@ def png(width: int, height: int) -> bytes:
 
 
 def png_header(width: int, height: int, *, bits: int = 8) -> bytes:
-    """As much of it as says the size."""
+    """PNG whose header alone has this size."""
     small = png(1, 1)
     body = b"IHDR" + struct.pack(">IIB", width, height, bits) + small[25:29]
     return small[:12] + body + struct.pack(">I", zlib.crc32(body)) + small[33:]
@@ -282,7 +282,7 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "a buffer that is not there": (
         gltf(buffers=[{"uri": "gone.bin", "byteLength": 9}]),
-        "uri: gone.bin is not there",
+        "uri: gone.bin does not exist",
     ),
     "nothing": (gltf(meshes=[], nodes=[], scenes=[{"nodes": []}]), "faces: there are none"),
     "a URI with NUL": (gltf(buffers=[{"byteLength": 48, "uri": "a%00b.bin"}]), "uri: the path holds a NUL"),
@@ -290,10 +290,10 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
         gltf(buffers=[{"byteLength": 48, "uri": "a" * 300}]),
         "uri: is not a valid path (File name too long)",
     ),
-    "an address": (gltf(buffers=[{"byteLength": 48, "uri": "http://localhost/a.bin"}]), "only files beside this one"),
+    "an address": (gltf(buffers=[{"byteLength": 48, "uri": "http://localhost/a.bin"}]), "only files next to this one"),
     "an absolute path": (gltf(buffers=[{"byteLength": 48, "uri": "/etc/passwd"}]), "is an absolute path"),
     "a device": (gltf(buffers=[{"byteLength": 48, "uri": "zero.bin"}]), "uri: is a device"),
-    "a missing texture": (textured(0, [{"source": 0}], [{"uri": "gone.png"}]), "uri: gone.png is not there"),
+    "a missing texture": (textured(0, [{"source": 0}], [{"uri": "gone.png"}]), "uri: gone.png does not exist"),
     "a broken texture": (
         textured(0, [{"source": 0}], [{"uri": "data:image/png;base64,iVBORw0KGgo="}]),
         "texture: images[0] is not an image that can be decoded",
@@ -318,7 +318,7 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "a corner that is not there": (
         gltf(accessors=[{"componentType": 5126, "count": 1, "type": "VEC3"}, *gltf()["accessors"][1:]]),
-        "is damaged, or no glTF (a reference to what is not there)",
+        "is damaged, or no glTF (a reference to a missing object)",
     ),
     "a number as a list": (gltf(nodes=7), "is damaged, or no glTF (a value of a wrong kind)"),
     "an older table": (gltf(asset={"version": "1.0"}, accessors={"a": {}}), "asset.version: is 1.0, which is not read"),

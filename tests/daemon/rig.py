@@ -34,7 +34,7 @@ QUICK = {
 
 
 class Plan:
-    """What the sensor does next; shared by every driver that is opened."""
+    """Plan of the sensor's behaviour; shared by every driver that is opened."""
 
     def __init__(self) -> None:
         self.opened = 0
@@ -132,7 +132,7 @@ class Rig:
         return FragileDriver(self.plan, clock) if settings.driver == "fragile" else open_sensor(settings, clock, **how)
 
     def mend(self) -> None:
-        """What was broken is as it was at the beginning."""
+        """Restore everything that was broken to its initial state."""
         self.plan.mend()
         self.presenter.panels, predictor = self._well
         self.presenter.run_cell.replace(predictor=predictor)
@@ -147,12 +147,12 @@ class Rig:
 
     @property
     def content(self) -> Any:
-        """What is drawn at present."""
+        """Content currently drawn."""
         return self.presenter.run_cell.state.content
 
     @property
     def predictor(self) -> Any:
-        """What solves at present."""
+        """Predictor currently in use."""
         return self.presenter.run_cell.state.predictor
 
     def refresh_until(self, wanted: str | Callable[[], Any], *, within_s: float = 90.0) -> RefreshAccount:
@@ -242,7 +242,7 @@ class BreakablePredictor:
         return self._predictor.solve(job, watch) if self.answer is None else self.answer(job)
 
     def well(self, job: Any) -> Any:
-        """What it would have answered."""
+        """Answer of the wrapped predictor."""
         return self._predictor.solve(job)
 
     def __getattr__(self, name: str) -> Any:

@@ -106,7 +106,7 @@ class Pc:
         assert eventually(lambda: self.run("systemctl list-units").returncode == 0)
 
     def _has_leader(self) -> bool:
-        """Whether there is the container's first process, and which: nspawn begins with others."""
+        """The container's first process, if it exists yet; nspawn starts others before it."""
         assert self._container is not None
         children = Path(f"/proc/{self._container.pid}/task/{self._container.pid}/children").read_text().split()
         for child in children:
@@ -157,7 +157,7 @@ class Pc:
         return all(self.prop("ActiveState", unit) == "active" for unit in units)
 
     def shows(self) -> bool:
-        """Whether the daemon has a picture on the panels."""
+        """Return True once the daemon shows a picture on the panels."""
         told = self.run("phasestack status --json", timeout_s=30).stdout
         return json.loads(told or "{}").get("state") in ("tracking", "holding", "flat")
 

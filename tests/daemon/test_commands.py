@@ -94,7 +94,7 @@ def test_without_a_daemon_status_fails_with_one_line(tmp_path: Path) -> None:
 def test_without_the_service_status_says_how_it_is_and_what_to_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, state: str, result: str, told: str
 ) -> None:
-    """What systemd 252 prints; the booted system's test asks it itself."""
+    """Output of systemd 252; the test of the booted system uses the real one."""
     lines = ["LoadState=loaded", f"ActiveState={state}", f"Result={result}", "ExecMainStatus=2",
              "StatusText=a.toml: stack: no"]  # fmt: skip
     (tmp_path / "systemctl").write_text("#!/bin/sh\ncat <<'E'\n" + "\n".join(lines) + "\nE\n")

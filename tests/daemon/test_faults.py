@@ -42,7 +42,7 @@ def rig(running: Rig) -> Iterator[Rig]:
 
 @pytest.fixture
 def steady() -> Iterator[Rig]:
-    """The same, on a machine however busy: nothing is late, lost or left behind unless the test says so."""
+    """Running rig with limits so long that a busy machine causes no fault by itself."""
     with Rig(
         late_s=60.0,
         abandon_s=600.0,
@@ -61,7 +61,7 @@ def presented_all(accounts: list[RefreshAccount]) -> bool:
 
 
 def alignments(rig: Rig, count: int) -> int:
-    """How many different alignments so many refreshes have."""
+    """Number of different alignments in `count` refreshes."""
     found = set()
     for _ in range(count):
         rig.presenter.refresh()

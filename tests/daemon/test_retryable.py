@@ -1,4 +1,4 @@
-"""What may pass is told from what is wrong for good: 75 or carry on for the one, 2 for the other alone."""
+"""Temporary faults are distinguished from permanent ones: carry on or exit with 75, against exit with 2."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def read_by_a_reader(number: int) -> InputError:
-    """As every reader of files tells what the system refused."""
+    """InputError as file readers raise it for an OSError."""
     try:
         try:
             raise OSError(number, os.strerror(number))

@@ -1,4 +1,4 @@
-"""What an operator steers while it runs, beside another scene: its place, the model, and a restart."""
+"""Operator's changes to a running daemon other than the scene: placement, model, restart."""
 
 from __future__ import annotations
 

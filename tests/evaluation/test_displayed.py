@@ -93,7 +93,7 @@ def test_a_large_picture_is_measured_in_as_many_pixels_as_panels_have() -> None:
 
 
 def solved(left: Path, right: Path) -> tuple[dict[str, Any], np.ndarray]:
-    """What `solve` leaves of two pictures' files: solve.json and the layers."""
+    """solve.json and layers that `solve` writes for two picture files."""
     out, panels = left.parent / "out", left.parent / "panels.json"
     panels.write_text(json.dumps({"width_m": 0.4, "height_m": 0.3, "x_m": STACK.x_m, "width_px": 80, "height_px": 60}))
     files = {"--left": left, "--right": right, "--panels": panels, "--out": out, "--fov": FOV}

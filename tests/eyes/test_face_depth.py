@@ -1,4 +1,4 @@
-"""How far away the eyes are, from depth that has faults, or from no depth at all."""
+"""Distance of the eyes from faulty depth, or without depth."""
 
 from __future__ import annotations
 

@@ -132,7 +132,7 @@ class FakePanels(PanelSink):
 
     @property
     def unchanged(self) -> bool:
-        """What was vouched for the newest."""
+        """`unchanged` flag of the newest frame."""
         return self.shown[-1][1]
 
 
@@ -202,7 +202,7 @@ class Stage:
         self._sensor_ns, self._next_ns, self._start_ns = round(NS_PER_S / sensor_hz), NS_PER_S, NS_PER_S
 
     def refresh(self, count: int = 1) -> list[Refresh]:
-        """So many refreshes; the sensor delivers what it saw up to each."""
+        """Run `count` refreshes; before each the sensor delivers its samples up to then."""
         done = []
         for _ in range(count):
             until_ns = self.clock.now_ns() + PERIOD_NS

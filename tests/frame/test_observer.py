@@ -1,4 +1,4 @@
-"""What observes refreshes: lines that wait for the truth, sampled and live quality, kept light."""
+"""Observers of refreshes: lines that wait for the truth, sampled and live quality, kept light."""
 
 from __future__ import annotations
 
@@ -383,9 +383,7 @@ def test_a_coarse_solution_is_measured_as_the_panels_show_it(content: ContentSou
     assert kept.lights[1]["layers"].shape == observer.moment.layers.shape == observer.moment.solution.shape == shape
 
 
-def test_after_a_reload_only_the_new_scene_is_drawn_in_its_own_field_of_view(
-    content: ContentSource, solved: Solution
-) -> None:
+def test_a_reload_draws_the_new_scene_in_its_field_of_view(content: ContentSource, solved: Solution) -> None:
     shown: list[Any] = [content]
     fovs_deg = [FOV_DEG]
     solver, kept = Drawing(content), Kept()

@@ -1,4 +1,4 @@
-"""What is made next: a solution, the flat picture, or nothing. Decisions alone."""
+"""Choice of the next job: a solution, the flat picture, or nothing. Decisions alone."""
 
 from __future__ import annotations
 

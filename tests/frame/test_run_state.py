@@ -1,4 +1,4 @@
-"""What a run is made with is one value: it changes as a whole or not at all."""
+"""The parts of a run are one value that changes as a whole or not at all."""
 
 from __future__ import annotations
 

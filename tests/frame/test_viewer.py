@@ -34,7 +34,7 @@ def watched(
     lost: Callable[[float], bool] = lambda _: False,
     look: Callable[[Viewer], None] = lambda _: None,
 ) -> list[EyesEstimate]:
-    """What it answers at every refresh of a display, from a sensor with noise."""
+    """Estimates at every refresh of a display, from a noisy sensor."""
     random, estimates, number = np.random.default_rng(5), [], 0
     for refresh in range(round(seconds * DISPLAY_HZ)):
         now_ns = NS_PER_S + refresh * NS_PER_S // DISPLAY_HZ

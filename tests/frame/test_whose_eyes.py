@@ -28,7 +28,7 @@ Tamper = Callable[[int, F64, np.random.Generator], EyePoints | None]  # number, 
 
 @dataclass(frozen=True, slots=True)
 class Served:
-    """What refreshes were aligned to, from two seconds on."""
+    """Eyes that refreshes were aligned to, after the first two seconds."""
 
     error_mm: F64  # (n,) mean of both eyes; infinite where nobody was served
     sigma_mm: F64  # (n,) as told

@@ -135,7 +135,7 @@ def pairs() -> list[bytes]:
 
 
 def tables() -> list[bytes]:
-    """What calibration reads besides pairs: the first line tells which reader it is for."""
+    """Calibration files other than pairs; the first line selects the reader."""
     return [
         b"phase,grey\n0,0\n0.4,0.5\n1,1\n",
         b"phase,red,green,blue\n0,0,0,0\n1,1,1,1\n",

@@ -1,4 +1,4 @@
-"""What once broke a reader, and new bad files for each: refused in one line, in no time, in little memory."""
+"""Files that once broke a reader, and new bad ones: refused in one line, quickly, in little memory."""
 
 from __future__ import annotations
 

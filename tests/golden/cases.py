@@ -1,4 +1,4 @@
-"""What is played: which recording, with which settings, and what an operator or a fault does on the way."""
+"""Cases of the golden runs: recording, settings, and the operator's actions or faults during the run."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Case:
 
     @property
     def mounted(self) -> bool:
-        """Whether panels show their layers turned, mirrored or through a curve."""
+        """Return True if panels rotate, mirror or curve their layers."""
         return "output" in self.tables
 
     def settings(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What moved between a stored run and one of now: by field, with a tolerance a field, in lines for a person."""
+"""Differences between a stored and a new run: by field, with a tolerance each, in readable lines."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def _is_number(value: Any) -> bool:
 
 
 def compare_text(stored: list[dict[str, Any]], now: list[dict[str, Any]]) -> list[Moved]:
-    """What moved in a summary (first) and a run's refreshes (the rest)."""
+    """Differences in a summary (first) and in a run's refreshes (the rest)."""
     found = list(moved_values(stored[0], now[0], field="", tolerance=EQUAL, where=None))
     if len(stored) != len(now):
         found.append(Moved(None, "refreshes", len(stored) - 1, len(now) - 1, None, EQUAL))
@@ -108,7 +108,7 @@ def compare_text(stored: list[dict[str, Any]], now: list[dict[str, Any]]) -> lis
 
 
 def compare_picture(stored: U8 | None, now: U8, *, number: int, what: str) -> list[Moved]:
-    """Whether a refresh's panels (N, h, w, 3) are still the same picture."""
+    """Return True if a refresh's panels (N, h, w, 3) still show the same picture."""
     if stored is None or stored.shape != now.shape:
         return [Moved(number, what, "none" if stored is None else stored.shape, now.shape, None, EQUAL)]
     off = np.abs(stored.astype(np.float64) - now)

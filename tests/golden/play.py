@@ -34,7 +34,7 @@ SUMMARY = (
 
 @dataclass(slots=True)
 class Played:
-    """What one run did; `told` is what is stored as text, `panels` as pictures."""
+    """Record of one run; `told` is stored as text, `panels` as pictures."""
 
     summary: dict[str, Any]
     refreshes: list[dict[str, Any]]

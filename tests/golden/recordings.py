@@ -44,7 +44,7 @@ HEADS = {
 
 
 def path_to(name: str) -> Path:
-    """Where a recording is kept."""
+    """Path of a stored recording."""
     return DATA / f"{name}.mcap"
 
 

@@ -26,7 +26,7 @@ def run(name: str) -> Played:
 
 
 def moved_in(name: str, now: Played) -> list[Moved]:
-    """What is not as it is stored. Everything, where nothing is stored."""
+    """Differences from the stored run; everything if none is stored."""
     stored = stored_text(name)
     if stored is None:
         return [Moved(None, "reference", "none", "a run", None, 0.0)]
@@ -54,7 +54,7 @@ def renew(name: str) -> list[str]:
 
 
 def check(name: str, *, pictures: Path | None = None) -> list[str]:
-    """What moved, in lines; none: all is as it is stored.
+    """Lines that describe the differences from the stored run; empty if there are none.
 
     pictures: where to leave stored, present and different panels, one above the other, if a picture moved.
     """

@@ -23,7 +23,7 @@ def test_a_recorded_run_is_as_it_is_stored(case: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("head", HEADS)
 def test_a_kept_recording_is_the_one_that_its_seed_makes(head: str, tmp_path: Path) -> None:
-    """So that `--record` changes nothing by itself. Samples, not bytes: a writer may pack them another way."""
+    """Guards `--record`. Compares samples, not bytes: a writer may pack them differently."""
     from runtime.sensor.recording import Recording
 
     write(head, tmp_path / "again.mcap")

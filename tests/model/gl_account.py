@@ -1,4 +1,4 @@
-"""What OpenGL draws, reads and writes, and what crosses the bus, counted around the runtime."""
+"""Account of OpenGL's draws, reads, writes and bus transfers, counted around the runtime."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def bytes_of(image: Image) -> int:
 
 @contextmanager
 def counted() -> Iterator[Account]:
-    """Of all contexts, meanwhile."""
+    """Count in all contexts while the block runs."""
     account = Account()
     draw, write, read_into = Passes.draw, moderngl.Texture.write, moderngl.Framebuffer.read_into
 

@@ -56,7 +56,7 @@ def card_scene(eye_m: F64, *, seed: int = 0, width_px: int = 480, height_px: int
 
 
 def displayed(layers: U8, pair: F64, stack: PanelStack, *, seed: int = 0) -> Quality:
-    """What two eyes see of layers against the card scene."""
+    """PSNR of two eyes' views of layers against the card scene."""
     retinas = [seen_by(eye, layers, stack, fov_deg=FOV_DEG) for eye in pair]
     size = {"width_px": stack.width_px, "height_px": stack.height_px}
     wanted = [card_scene(eye, seed=seed, **size).astype(np.float32) / np.float32(255) for eye in pair]

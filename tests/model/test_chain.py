@@ -38,7 +38,7 @@ def test_sigma_moves_the_outer_panels_as_a_displaced_eye_does() -> None:
     at = frame.plane_from_raster @ np.array([frame.width_px / 3, frame.rows / 2, 1.0])
 
     def on(eye: np.ndarray, x_m: float) -> np.ndarray:
-        """Where the eye's ray through `at` meets a panel, in line as seen from between the eyes."""
+        """Raster position of the point where the eye's ray through `at` meets a panel, seen from between the eyes."""
         here, shift = relative_scale_shift(eye, from_x_m=frame.x_m, to_x_m=x_m)
         there, back = relative_scale_shift(frame.middle_m, from_x_m=x_m, to_x_m=frame.x_m)
         return raster_from_plane @ np.append((at[:2] * here + shift) * there + back, 1.0)

@@ -189,7 +189,7 @@ def test_every_pixel_on_a_ray_through_all_panels_is_solved(pose: str) -> None:
 
 
 def test_the_kernels_of_another_python_are_not_loaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of several builds in the folder the first by name was loaded, which may have been of an older source."""
+    """Once the first of several builds by name was loaded, even if it was older."""
     (built,) = Path(kernels.__file__).parent.glob(f"compiled{EXTENSION_SUFFIXES[0]}")
     shutil.copy(built, tmp_path)
     (tmp_path / "compiled.cpython-310-x86_64-linux-gnu.so").write_bytes(b"stale")

@@ -1,4 +1,4 @@
-"""What a session takes: one file, whole, that says what it is; and nothing sent home."""
+"""A session loads one complete, self-describing file, and sends nothing home."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where two eyes' pictures differ, and the window around it."""
+"""Differing regions of two eyes' pictures, and the window around them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the official code was given when its golden arrays were made: weights, pictures and eyes by formula.
+"""Inputs of the official code for its golden arrays: weights, pictures and eyes by formula.
 
 `golden-eyereal.npz` holds what the official forward (WeijieMax/EyeReal, commit d19f4a8, on torch 2.13 and torchvision
 0.29, run once on 21 November 2026) made of these: `<place>_x` its 18 input channels (times 65535), `<place>_y` its

@@ -1,4 +1,4 @@
-"""What an eye sees along another eye's rays, carried on the centre panel: plain, by the retina's own sampling."""
+"""Reference for an eye's view along another eye's rays, carried on the centre panel."""
 
 from __future__ import annotations
 

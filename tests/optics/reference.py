@@ -45,7 +45,7 @@ def ray(eye: Vector, u: float, v: float, *, width: int, height: int, fov_deg: fl
 
 
 def hit_plane(eye: Vector, direction: Vector, x: float) -> Vector:
-    """Where a ray crosses the plane at x."""
+    """Point where a ray crosses the plane at x."""
     return add_scaled(eye, direction, (x - eye[0]) / direction[0])
 
 
@@ -77,7 +77,7 @@ def traced_pixel(
     image_size: tuple[int, int],
     fov_deg: float,
 ) -> tuple[float, bool, float]:
-    """What one ray sees: intensity, whether it counts, and how near (pixels) it is to not being so.
+    """Intensity along one ray, whether it counts, and its distance (pixels) from that limit.
 
     layers: per panel a grey image of panel values in [0, 1]. The Jones product is worked out rotation by rotation.
     """

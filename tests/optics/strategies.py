@@ -1,4 +1,4 @@
-"""What hypothesis draws: eyes, stacks and images over and beyond the design range."""
+"""Hypothesis strategies: eyes, stacks and images within and beyond the design range."""
 
 from __future__ import annotations
 

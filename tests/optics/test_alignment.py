@@ -47,7 +47,7 @@ def pixel_of(stack: PanelStack, point: tuple[float, float, float]) -> np.ndarray
 
 
 def hit_px(stack: PanelStack, eye_m: np.ndarray, through: tuple[float, float, float], *, panel: int) -> np.ndarray:
-    """Where the ray from an eye through a point meets a panel, in its pixels; by plain geometry."""
+    """Panel pixel where the ray from an eye through a point meets the panel; by plain geometry."""
     eye = tuple(map(float, eye_m))
     return pixel_of(stack, reference.hit_plane(eye, reference.subtract(through, eye), stack.x_m[panel]))
 

@@ -60,7 +60,7 @@ def traced(
 
 
 def crossed(start: F64, direction: F64, stack: PanelStack, index: int) -> tuple[F64, F64]:
-    """Where rays cross a panel, in its layer's columns and rows."""
+    """Columns and rows of a panel's layer where rays cross it."""
     x_m, point = stack.x_m[index], start + direction * ((stack.x_m[index] - start[..., :1]) / direction[..., :1])
     if stack.tilt is not None:  # the panel stands at x = x_m + d + r·y + u·z; its layer is what `seen_from_m` sees
         d, r, u = stack.tilt.depth[index]
@@ -127,7 +127,7 @@ def test_few_rays_and_many_estimate_the_same_error_without_bias() -> None:
 
 
 def seen_by_both(layers: U8, *, pupil_mm: float, rays: int) -> list[F64]:
-    """What the tracer's eyes see of three panels."""
+    """The tracer's views of three panels."""
     random = np.random.default_rng(9)
     return [traced(eye, eye, layers, THREE, random, pupil_mm=pupil_mm, rays=rays) for eye in EYES]
 

@@ -48,7 +48,7 @@ def test_m_rpu_is_the_inverse_of_the_homography(eye: np.ndarray, stack: PanelSta
 
 
 def test_an_eye_in_a_panel_s_plane_is_refused_in_any_units() -> None:
-    """What is rounding error grows with the projection: a hundred thousand pixels, or a millionth of one."""
+    """Rounding error scales with the projection: a hundred thousand pixels, or a millionth of one."""
     stack, random = PanelStack(0.5, 0.3, (-0.06, 0.0, 0.06), 1920, 1080), np.random.default_rng(1)
     for size in (1e-6, 1.0, 1e5):
         for _ in range(50):

@@ -73,7 +73,7 @@ class RunningDaemon:
 
 @pytest.fixture(scope="module")
 def tried(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
-    """What became of everything that was tried, by its name."""
+    """Outcome of every step, by name."""
     modules = Path(os.environ.get("NODE_PATH", ""))
     there = all((modules / name).is_dir() for name in ("playwright-core", "axe-core"))
     if shutil.which("node") is None or shutil.which("chromium") is None or not there:

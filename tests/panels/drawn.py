@@ -13,7 +13,7 @@ from runtime.records import U8, PanelFrame, PresentReport
 
 
 class DrawnPanels(OffscreenPanels):
-    """The same sink; `read_back` uploads what is not there yet, and draws."""
+    """Offscreen panels whose `read_back` uploads missing layers and draws."""
 
     def __init__(
         self, context: moderngl.Context, *, clock: Clock, size_px: tuple[int, int], panels: tuple[PanelSettings, ...]

@@ -1,4 +1,4 @@
-"""What a monitor says of itself."""
+"""Identity of a monitor from its EDID."""
 
 from __future__ import annotations
 

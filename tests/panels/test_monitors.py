@@ -58,7 +58,7 @@ FULL = Monitor("DP-1", "A", "EIZ", 0, 0, 1920, 1080, 60.0)
 
 
 def check(panel: PanelSettings, monitor: Monitor) -> None:
-    """As the second panel of a stack of 1920x1080."""
+    """Bind as the second panel of a stack of 1920x1080."""
     panels, monitors = (PanelSettings(), panel), (FULL, monitor)
     check_modes(panels, monitors, width_px=1920, height_px=1080)
 

@@ -1,4 +1,4 @@
-"""What each panel's monitor is sent, pixel by pixel, drawn by the real shader."""
+"""Pixels sent to each panel's monitor, drawn by the real shader."""
 
 from __future__ import annotations
 

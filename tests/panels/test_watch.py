@@ -1,4 +1,4 @@
-"""What others do to the panels' windows and monitors behind GLFW's back, on a real X server."""
+"""Changes to the panels' windows and monitors made behind GLFW's back, on a real X server."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ EVERY_S = 0.1  # a round of all questions
 
 @pytest.fixture(autouse=True)
 def often(monkeypatch: pytest.MonkeyPatch) -> None:
-    """So that no test waits for a second's end."""
+    """Shorten the intervals, which are seconds in the runtime."""
     monkeypatch.setattr("runtime.panels.watch.EVERY_NS", round(EVERY_S * NS_PER_S))
     monkeypatch.setattr("runtime.panels.window.RETRY_NS", round(EVERY_S * NS_PER_S))
     monkeypatch.setattr("runtime.panels.window.LOOK_NS", round(EVERY_S * NS_PER_S))
 
 
 def lost(sink: WindowPanels, *, unchanged: bool = False, within_s: float = 3.0) -> str:
-    """How the loss of a panel is told while the same sixty refreshes a second go on; empty: never."""
+    """Reported loss of a panel during refreshes at 60 Hz; empty: none within `within_s`."""
     deadline = time.monotonic() + within_s
     number = 1000
     while time.monotonic() < deadline:

@@ -54,7 +54,7 @@ NEEDED = ("Xorg", "xrandr", "xwd")
 
 
 def missing() -> str:
-    """What this machine lacks for it; empty: nothing."""
+    """Programs missing on this machine; empty: none."""
     absent = [name for name in NEEDED if shutil.which(name) is None]
     if not any(Path(folder, "dummy_drv.so").exists() for folder in ("/usr/lib/xorg/modules/drivers",)):
         absent.append("xserver-xorg-video-dummy")
@@ -116,7 +116,7 @@ class XServer:
         self.xrandr("--query")  # the dummy driver looks at what is connected only when it is asked
 
     def unplug(self, index: int) -> None:
-        """As if its cable had been pulled."""
+        """Disconnect monitor `index`."""
         self.xrandr("--output", f"DUMMY{index}", "--off")
         self.xrandr("--query")
 
@@ -163,7 +163,7 @@ class XServer:
             randr.XRRChangeOutputProperty(display, output, edid, integer, 8, replace, data, len(data))
 
     def ask_to_close(self, window: int) -> None:
-        """What a window manager's close button sends: WM_DELETE_WINDOW."""
+        """Send WM_DELETE_WINDOW, as a window manager's close button does."""
         with self._connected() as (x11, display):
             protocols = x11.XInternAtom(display, b"WM_PROTOCOLS", 0)
             delete = x11.XInternAtom(display, b"WM_DELETE_WINDOW", 0)

@@ -182,7 +182,7 @@ def test_models_that_can_t_be_cut_are_left_whole(context: Any) -> None:
 
 
 def test_after_the_deadline_no_further_step_begins(context: Any, fast: Predictor) -> None:
-    """What there is by then is shown: less than all, more than nothing."""
+    """The solution so far is shown: some steps, but not all."""
     source = ProceduralSource("texture", stack=STACK, context=context)
     job = drawn_job(fast, source, EYES, time_ns=0)
     layers, steps = [], []

@@ -1,4 +1,4 @@
-"""What is left out, and that each saving can be switched off."""
+"""Savings and their switches."""
 
 from __future__ import annotations
 

@@ -68,6 +68,6 @@ def test_the_true_cards_are_sharpest_where_they_stand(stack: focal.FocalStack) -
 
 
 def test_through_the_layers_nearer_cards_are_sharpest_nearer(stack: focal.FocalStack) -> None:
-    """What no flat panel can do: the depths in which the three cards are sharpest differ, in the right order."""
+    """Impossible on a flat panel: the depths in which the three cards are sharpest differ, in the right order."""
     behind, _, before = (card.sharpest_shown_m for card in stack.cards)
     assert behind > before

@@ -33,7 +33,7 @@ def test_what_lies_behind_the_eye_is_not_seen() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("model", SHIPPED)
 def test_no_random_pair_is_far_worse_than_the_iterative_reference(model: str) -> None:
-    """Of what SART-30 shows with 32 dB, a model shows 28 at least."""
+    """A pair that SART-30 shows with 32 dB has at least 28 with a model."""
     for number in range(40):
         pair = random_still(0, number, width_px=480, height_px=270)
         shown = []

@@ -1,4 +1,4 @@
-"""What all tests of sensors share."""
+"""Shared fixtures of the sensor tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a recording's driver has delivered by a time."""
+"""Samples that a recording's driver has delivered by a time."""
 
 from __future__ import annotations
 

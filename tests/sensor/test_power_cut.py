@@ -1,4 +1,4 @@
-"""What is on the disk when the power goes: the blocks of an image under a real file system, mounted anew."""
+"""Disk contents after a power cut: the image of a real file system, mounted again."""
 
 from __future__ import annotations
 

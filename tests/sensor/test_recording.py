@@ -188,7 +188,7 @@ def test_another_program_s_recording_is_called_so_with_what_one_must_hold(tmp_pa
 
 
 def test_a_recording_with_its_metadata_at_the_end_is_played(tmp_path: Path) -> None:
-    """As tools leave it that mend one."""
+    """Repair tools write such files."""
     from mcap.reader import make_reader
     from mcap.writer import Writer
 

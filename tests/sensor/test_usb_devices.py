@@ -23,7 +23,7 @@ class Plugged:
 
 
 class FakeUsb(usb.backend.IBackend):
-    """What pyusb asks of a bus to find devices and read their serial numbers."""
+    """Fake bus with the calls that pyusb makes to find devices and read serial numbers."""
 
     def __init__(self, *devices: Plugged) -> None:
         super().__init__()

@@ -33,7 +33,7 @@ def test_what_is_no_files_name_is_refused_and_leaves_nothing(
 
 @pytest.fixture
 def tiny() -> Iterator[None]:
-    """As on a full disk: no file of this process may become larger than 4 KiB."""
+    """Simulate a full disk: limit this process's files to 4 KiB."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))

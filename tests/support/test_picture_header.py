@@ -1,4 +1,4 @@
-"""What the header of a picture tells before anything is unpacked."""
+"""Picture sizes read from the header, before decoding."""
 
 from __future__ import annotations
 
