@@ -63,7 +63,7 @@ def check(panel: PanelSettings, monitor: Monitor) -> None:
     check_modes(panels, monitors, width_px=1920, height_px=1080)
 
 
-def test_a_mode_of_other_pixels_is_refused_and_a_rotated_panel_compared_as_seen() -> None:
+def test_modes_of_other_pixels_are_refused_and_rotated_panels_compared_as_seen() -> None:
     small, upright = replace(FULL, width_px=1280, height_px=720), replace(FULL, width_px=1080, height_px=1920)
     check(PanelSettings(), FULL)
     check(PanelSettings(rotation_deg=90), upright)

@@ -62,7 +62,7 @@ def comes_back(x: XServer, sink: WindowPanels, *monitors: int) -> bool:
         (("XMoveWindow", 600, 7), "panel 1: the window is 320x180+600+7, not 320x180+0+0"),
     ],
 )
-def test_a_window_that_somebody_took_or_moved_is_a_lost_panel_and_comes_back(
+def test_windows_taken_or_moved_are_lost_panels_and_come_back(
     x: XServer, opened: Callable[..., Any], does: tuple[Any, ...], told: str, unchanged: bool
 ) -> None:
     sink = opened(*BY_CONNECTOR)
