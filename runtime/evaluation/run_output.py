@@ -56,7 +56,8 @@ class RunOutput:
     def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
         self._work.put(None)
         self._writer.join()
-        self._attempt(self._close_lines)
+        if self._lines is not None:
+            self._attempt(self._lines.close)
         if self.left_out:
             log.warning("output: the disk was too slow for %d lines or pictures of %s", self.left_out, self._target)
         if self.problem:
@@ -185,10 +186,6 @@ class RunOutput:
     def _line(self, line: Mapping[str, Any]) -> None:
         assert self._lines is not None
         self._lines.write(to_json(line) + "\n")
-
-    def _close_lines(self) -> None:
-        if self._lines is not None:
-            self._lines.close()
 
 
 def in_one_line(summary: dict[str, Any]) -> str:

@@ -11,6 +11,7 @@ from runtime.clock import NS_PER_S
 from runtime.records import F64, EyePoints
 
 IPD_M = 0.063
+DISTANCE_M = 0.6  # of the eyes from the panels, at rest
 DROPOUT_S = 0.2  # length of every dropout
 NECK_TO_EYES_M = np.array([-0.09, 0.0, 0.14])  # forward (towards the display), aside, up
 
@@ -110,14 +111,14 @@ def path_of(seed: int) -> Path:
     )
 
 
-def true_eyes(motion: str, times_s: F64, *, distance_m: float = 0.6, path: Path = BENCHMARK_PATH) -> F64:
+def true_eyes(motion: str, times_s: F64, *, path: Path = BENCHMARK_PATH) -> F64:
     """(n, 2, 3) left and right eye in `stack`, metres."""
     neck, pitch = MOTIONS[motion](path.start_s + path.pace * times_s)
     neck, pitch = path.size * neck * [1.0, path.side, 1.0], path.size * pitch
     forward, _, up = NECK_TO_EYES_M
     c, s = np.cos(pitch), np.sin(pitch)
     middle = neck + np.stack([forward * c + up * s, np.zeros_like(c), up * c - forward * s], 1)
-    middle += np.array([distance_m - forward, 0.0, -up])
+    middle += np.array([DISTANCE_M - forward, 0.0, -up])
     # The head turns towards the display and tilts into a lean.
     yaw, roll = np.arctan2(middle[:, 1], middle[:, 0]), -0.6 * neck[:, 1]
     across = [-np.sin(yaw) * np.cos(roll), np.cos(yaw) * np.cos(roll), np.sin(roll)]

@@ -169,7 +169,8 @@ def run_method(method: Method, pair: StillPair, threads: int) -> MethodRun:
 
     cv2.setNumThreads(threads)
     predictor = method.opened(pair.stack, threads=threads)
-    _forget_peak()
+    with contextlib.suppress(OSError):  # older kernels: the peak then includes the interpreter's start, which is less
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
     done = timed(
         lambda: solve_still(*pair.images, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, predictor=predictor).layers,
         runs=FEWEST_RUNS,
@@ -179,12 +180,6 @@ def run_method(method: Method, pair: StillPair, threads: int) -> MethodRun:
     )
     layers, peak_mib = np.array(done.answer[..., :3]), _peak_mib()
     return MethodRun(layers, done.times_ms, peak_mib, predictor.parameters, predictor.precision)
-
-
-def _forget_peak() -> None:
-    # Older kernels refuse: the peak then includes the interpreter's start, which needs less.
-    with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 
 
 def _peak_mib() -> float:

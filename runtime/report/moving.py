@@ -77,11 +77,11 @@ def settings_for(recording: Path, *, solver_ms: float) -> Settings:
     return validated(Settings, table, source="settings")
 
 
-def moving_run(motion: str, solver_ms: float, *, seconds: float = SECONDS, scale: float = 0.5, seed: int = 1) -> Moving:
+def moving_run(motion: str, solver_ms: float, *, seconds: float = SECONDS, scale: float = 0.5) -> Moving:
     """Run one motion with one solver, in a separate process. Raises FatalError without any result."""
     with tempfile.TemporaryDirectory(prefix="phasestack-") as folder:
         recording = Path(folder) / "motion.mcap"
-        write_motion(recording, motion, seconds=seconds, seed=seed)
+        write_motion(recording, motion, seconds=seconds, seed=1)
         settings = settings_for(recording, solver_ms=solver_ms)
         lines, errors = simulated_run(settings, scale=scale)
     first = SETTLED_S * settings.loop.rate_hz

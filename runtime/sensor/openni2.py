@@ -30,7 +30,7 @@ DRAIN_MAX = 32  # frames skipped in one call, so that a fast source can't block 
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
-_idle: list[_PersistentThread] = []
+_idle: list[_PersistentThread] = []  # for reuse; a thread that hangs never comes back
 _lock = threading.Lock()
 
 
@@ -63,7 +63,8 @@ class OpenNI2Driver(Sensor):
 
     def open(self) -> None:
         self.close()
-        self._thread = thread = _borrowed("openni2")
+        with _lock:
+            self._thread = thread = _idle.pop() if _idle else _PersistentThread("openni2")
         try:
             thread(self._open)
         except BaseException:
@@ -214,7 +215,8 @@ class OpenNI2Driver(Sensor):
         thread, self._thread = self._thread, None
         if thread is not None:
             thread(self._close)
-            _give_back(thread)
+            with _lock:
+                _idle.append(thread)
 
     def _close(self) -> None:
         streams, self._streams = self._streams, {}
@@ -297,15 +299,3 @@ class _PersistentThread:
             except BaseException as error:  # raised by the caller
                 outcome.set_exception(error)
             del outcome, call  # so that nothing stays alive until the next call
-
-
-def _borrowed(name: str) -> _PersistentThread:
-    """Take an idle thread, or start one; a thread that hangs is never returned."""
-    with _lock:
-        return _idle.pop() if _idle else _PersistentThread(name)
-
-
-def _give_back(thread: _PersistentThread) -> None:
-    """Return a thread for reuse."""
-    with _lock:
-        _idle.append(thread)

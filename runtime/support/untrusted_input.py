@@ -121,23 +121,23 @@ def decoded(data: bytes, *, source: str | Path, field: str = "") -> str:
         raise InputError(source, field, f"is not UTF-8 at byte {error.start}") from None
 
 
-def read_json(path: str | Path, *, most_bytes: int = JSON_BYTES_MAX, most_depth: int = JSON_DEPTH_MAX) -> Any:
+def read_json(path: str | Path, *, most_bytes: int = JSON_BYTES_MAX) -> Any:
     """Read a JSON file. Raises InputError."""
-    return parsed_json(read_bytes(path, most_bytes=most_bytes), source=path, most_depth=most_depth)
+    return parsed_json(read_bytes(path, most_bytes=most_bytes), source=path)
 
 
-def parsed_json(text: str | bytes, *, source: str | Path, field: str = "", most_depth: int = JSON_DEPTH_MAX) -> Any:
+def parsed_json(text: str | bytes, *, source: str | Path, most_depth: int = JSON_DEPTH_MAX) -> Any:
     """Parse strict JSON (no NaN or Infinity) of limited depth. Raises InputError."""
     data = text if isinstance(text, bytes) else text.encode(errors="surrogatepass")
     try:
-        value = json.loads(decoded(data, source=source, field=field), parse_constant=_no_constant, parse_int=_whole)
+        value = json.loads(decoded(data, source=source), parse_constant=_no_constant, parse_int=_whole)
         if _depth(value) <= most_depth:
             return value
     except ValueError as error:
-        raise InputError(source, field, f"malformed JSON: {error}") from None
+        raise InputError(source, "", f"malformed JSON: {error}") from None
     except RecursionError:
         pass
-    raise InputError(source, field, f"JSON is nested deeper than {most_depth}")
+    raise InputError(source, "", f"JSON is nested deeper than {most_depth}")
 
 
 def _depth(value: Any) -> int:
