@@ -38,13 +38,7 @@ def broken(body: str, home: Path, **how: Any) -> subprocess.CompletedProcess[str
     return run("config", code=BROKEN.format(body=body), home=home, **how)
 
 
-@pytest.mark.parametrize(
-    "body",
-    [
-        "raise ValueError('two\\nlines\\0')",
-        "(lambda f: f(f))(lambda f: f(f))",
-    ],
-)
+@pytest.mark.parametrize("body", ["raise ValueError('two\\nlines\\0')", "(lambda f: f(f))(lambda f: f(f))"])
 def test_an_error_that_nobody_expected_is_one_line_a_file_and_70(tmp_path: Path, body: str) -> None:
     answer = broken(body, tmp_path)
     assert answer.returncode == 70, answer.stderr

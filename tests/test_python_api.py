@@ -283,10 +283,7 @@ def test_the_command_takes_the_cameras_that_pictures_were_taken_with(
     eyes = ["--left-eye", *map(str, eyes_m[0]), "--right-eye", *map(str, eyes_m[1])]
     app([*command, *eyes, "--fov", "62"], standalone_mode=False)
     assert "outside the panels" in capfd.readouterr().err
-    for given, told in (
-        (eyes[:4], "are needed"),
-        ([*eyes, "--camera", f"{tmp_path}/cameras.json"], "omit --left-eye"),
-    ):
+    for given, told in ((eyes[:4], "are needed"), ([*eyes, "--camera", f"{tmp_path}/cameras.json"], "omit --left-eye")):
         with pytest.raises(InputError, match=told):
             app([*command, *given], standalone_mode=False)
 

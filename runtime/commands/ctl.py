@@ -66,8 +66,7 @@ def place(
 
 @app.command()
 def model(
-    name: Annotated[str, typer.Argument(help="fast, balanced, best, sart or an ONNX file")],
-    config: Config = None,
+    name: Annotated[str, typer.Argument(help="fast, balanced, best, sart or an ONNX file")], config: Config = None
 ) -> None:
     """Solve with another model. The current one stays until the new one has loaded, and if loading fails.
 
@@ -126,8 +125,7 @@ def _advised(error: Exception) -> str:
 
 
 def status(
-    config: Config = None,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout")] = False,
+    config: Config = None, as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout")] = False
 ) -> None:
     """Show the running daemon: state and reason, rates, eyes and their uncertainty, times, faults.
 

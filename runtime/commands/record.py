@@ -33,8 +33,7 @@ def record(
         bool, typer.Option("--images", help="record colour and depth pictures, too: they show faces")
     ] = False,
     seconds: Annotated[
-        float | None,
-        number(0.1, RECORD_MOST_S, "s", help="stop after this long; default: 600 s, with --motion 12 s"),
+        float | None, number(0.1, RECORD_MOST_S, "s", help="stop after this long; default: 600 s, with --motion 12 s")
     ] = None,
     motion: Annotated[str | None, typer.Option(help="simulate a head: still, lean, nod, walk or stop-and-go")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="with --motion: seed of its path")] = None,

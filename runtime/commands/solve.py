@@ -18,10 +18,7 @@ def solve(
     panels: Annotated[Path, typer.Option(help="TOML or JSON: width_m, height_m, x_m")],
     out: Annotated[Path, typer.Option(help="folder for the layers")],
     right: Annotated[Path | None, typer.Option(help="picture for the right eye; without it, --left holds both")] = None,
-    layout: Annotated[
-        str | None,
-        typer.Option(help="arrangement of the views in --left, as content.layout"),
-    ] = None,
+    layout: Annotated[str | None, typer.Option(help="arrangement of the views in --left, as content.layout")] = None,
     left_eye: Annotated[tuple[float, float, float] | None, place(help="left eye, metres, stack frame")] = None,
     right_eye: Annotated[tuple[float, float, float] | None, place(help="right eye, metres")] = None,
     camera: Annotated[

@@ -17,8 +17,7 @@ def stability(
     full: Annotated[bool, typer.Option("--full", help="run the long cases, too: minutes instead of seconds")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
     record: Annotated[
-        Path | None,
-        typer.Option(help="write the errors to a limits file, after a change of a model"),
+        Path | None, typer.Option(help="write the errors to a limits file, after a change of a model")
     ] = None,
 ) -> None:
     """Run every numerical step on stiff and extreme cases, and compare it with references.

@@ -54,8 +54,7 @@ class StackGeometry(Section):
         "written by `calibrate panels`; empty: parallel panels",
     )
     registered_from_m: Point = Field(
-        (0.5, 0.0, 0.0),
-        description="eye in frame `stack` to whom the homographies make tilted panels look parallel",
+        (0.5, 0.0, 0.0), description="eye in frame `stack` to whom the homographies make tilted panels look parallel"
     )
 
     @model_validator(mode="after")
@@ -109,8 +108,7 @@ class SensorSettings(Section):
         "", description="driver `openni2`: folder with libOpenNI2.so and OpenNI2/Drivers; empty: the system's"
     )
     fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
-        0.0,
-        description="horizontal field of view of a camera that does not report its own (usb-camera); 0: unknown",
+        0.0, description="horizontal field of view of a camera that does not report its own (usb-camera); 0: unknown"
     )
     fixed_eyes_m: tuple[Point, Point] | None = Field(
         None, description="driver `fixed`: left and right eye in the stack frame"
@@ -144,12 +142,10 @@ class CalibrationSettings(Section):
 
     file: PathText = Field("", description="calibration TOML; empty: the demo recording's")
     ipd_m: Annotated[float, within(0.04, 0.08, "m", zero=True)] = Field(
-        0.0,
-        description="the viewer's eye separation; 0: unknown; for calibration charts and cameras without depth",
+        0.0, description="the viewer's eye separation; 0: unknown; for calibration charts and cameras without depth"
     )
     viewing_m: tuple[Annotated[float, within(0.05, 20.0, "m")], Annotated[float, within(0.05, 20.0, "m")]] = Field(
-        (0.4, 0.6),
-        description="nearest and farthest viewer, for calibration charts and registration",
+        (0.4, 0.6), description="nearest and farthest viewer, for calibration charts and registration"
     )
     viewing_side_deg: Annotated[float, Field(ge=2, le=40)] = Field(
         10.0, description="angle to either side within which viewers stand, from the display's middle"
@@ -333,8 +329,7 @@ class PlanSettings(Section):
     """Allowed savings."""
 
     enabled: bool = Field(
-        True,
-        description="skip work made unnecessary by the scene or a resting head; false: draw and solve everything",
+        True, description="skip work made unnecessary by the scene or a resting head; false: draw and solve everything"
     )
     align: bool = Field(True, description="shift and scale the panels at every refresh to follow the eyes")
 

@@ -188,12 +188,7 @@ def run_daemon(read_settings: Callable[[], Settings], options: RunOptions) -> di
         if server is not None:
             cleanup.callback(server.close)
         daemon = Daemon(
-            read_settings,
-            signals=signals,
-            notifier=notifier,
-            server=server,
-            recorder=recorder,
-            options=options,
+            read_settings, signals=signals, notifier=notifier, server=server, recorder=recorder, options=options
         )
         try:
             summary = drive(settings, options, daemon)

@@ -50,13 +50,7 @@ class EyeViews:
 
 
 def displayed(
-    layers: U8,
-    wanted: Sequence[Picture],
-    stack: PanelStack,
-    *,
-    eyes_m: F64,
-    fov_deg: float,
-    similarity: bool = True,
+    layers: U8, wanted: Sequence[Picture], stack: PanelStack, *, eyes_m: F64, fov_deg: float, similarity: bool = True
 ) -> EyeViews:
     """Retina images of eyes (2, 3), frame `stack`, through layers, with a target for each eye.
 

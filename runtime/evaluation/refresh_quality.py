@@ -62,11 +62,7 @@ def live_error(layers: U8, targets: Pictures, stack: PanelStack, *, eyes_m: F64,
 
 
 def measure_refresh(
-    account: RefreshAccount,
-    layers: U8,
-    carried: tuple[U8, U8] | None,
-    targets: RefreshTargets,
-    stack: PanelStack,
+    account: RefreshAccount, layers: U8, carried: tuple[U8, U8] | None, targets: RefreshTargets, stack: PanelStack
 ) -> RefreshQuality:
     """Measure a refresh as far as its targets were drawn; skip eyes that see no part of the panels.
 

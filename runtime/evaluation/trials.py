@@ -28,12 +28,7 @@ class Timed(Generic[T]):
 
 
 def timed(
-    call: Callable[[], T],
-    *,
-    runs: int,
-    most: int | None = None,
-    enough_s: float = 0.0,
-    slow_s: float = float("inf"),
+    call: Callable[[], T], *, runs: int, most: int | None = None, enough_s: float = 0.0, slow_s: float = float("inf")
 ) -> Timed[T]:
     """Time a warm function: at least `runs` times, then until `enough_s` or `most` runs.
 

@@ -103,14 +103,7 @@ class FaceDepth:
         self._variance = float(1 / weights.sum())
 
     def _measure(
-        self,
-        pupils: Pupils,
-        depth_mm: U16,
-        scale: F64,
-        relief: F64,
-        eyes: F64,
-        tilts: tuple[F64, F64],
-        away: float,
+        self, pupils: Pupils, depth_mm: U16, scale: F64, relief: F64, eyes: F64, tilts: tuple[F64, F64], away: float
     ) -> None:
         """Update the estimate from a depth picture.
 

@@ -79,13 +79,7 @@ def _stop_and_go(times_s: F64) -> tuple[F64, F64]:
     return neck + minimum_jerk(times_s, knots_s=np.array(knots), values=np.array(places)), pitch
 
 
-MOTIONS: dict[str, Motion] = {
-    "still": _still,
-    "lean": _lean,
-    "nod": _nod,
-    "walk": _walk,
-    "stop-and-go": _stop_and_go,
-}
+MOTIONS: dict[str, Motion] = {"still": _still, "lean": _lean, "nod": _nod, "walk": _walk, "stop-and-go": _stop_and_go}
 
 
 @dataclass(frozen=True, slots=True)

@@ -124,10 +124,7 @@ class WindowPanels(PanelSink):
         swapped_ns = [self._swap(window) for window, _ in self._surfaces]
         self._shown = True
         return PresentReport(
-            frame.number,
-            swapped_ns[-1],
-            (swapped_ns[-1] - swapped_ns[0]) / NS_PER_MS,
-            vblank_ns=swapped_ns[0],
+            frame.number, swapped_ns[-1], (swapped_ns[-1] - swapped_ns[0]) / NS_PER_MS, vblank_ns=swapped_ns[0]
         )
 
     def _draw(self, panel: int, window: Window, painter: Painter, textures: FrameTextures, frame: PanelFrame) -> None:

@@ -23,7 +23,7 @@ def frontier_section(results: Sequence[MethodResult], *, title: str, name: str) 
         f"Every method on {pairs}, in one run. Light is the figure to quote: panel pixels are squares, pupils 4 mm "
         "wide, the tracking error 1 mm. Published evaluations measure one ray a pixel, sampled bilinearly. The time is "
         "that of a whole solution, from two decoded pictures to 8-bit layers. Each method runs in a separate process, "
-        "whose peak is its memory.",
+        "whose peak is its memory."
     ]
     links = [(f"Viewer: {pair.pair}, {results[0].name}", pair.viewer) for pair in results[0].pairs if pair.viewer]
     return PageSection(title, text, [frontier_plot(results, name=f"frontier-{name}")], [method_table(results)], links)
@@ -106,7 +106,7 @@ def moving_section(found: Sequence[Moving]) -> PageSection:
         "the light at the true eyes against what they should see from there at that refresh. The view error is the "
         "distance from the true eyes to those that the layers were solved for. These are the daemon's own runs on the "
         "simulated clock: refreshes, solver and sensor take the times given here, which are configured, not measured. "
-        "Heads at 0.6 m, 30 samples a second, 3 mm of noise, outliers and dropouts.",
+        "Heads at 0.6 m, 30 samples a second, 3 mm of noise, outliers and dropouts."
     ]
     headings = ["motion", "solver ms", "live dB", "view error p50 mm", "p95 mm", "tracking error p50 mm", "p95 mm"]
     rows = [
@@ -147,7 +147,7 @@ def focal_section(stack: FocalStack) -> PageSection:
     text = [
         f"Three cards, 5 cm behind, in and 4.5 cm in front of the middle panel, seen from {DISTANCE_M:g} m by a pupil "
         f"of {1000 * PUPIL_M:g} mm. The layers ({stack.model}) are solved for two pinhole eyes only; the rest of the "
-        "pupil had no target. On a flat panel every card is sharpest in the panel's plane at any depth.",
+        "pupil had no target. On a flat panel every card is sharpest in the panel's plane at any depth."
     ]
     caption = "Vergence against accommodation, right eye: up to 0.3 dioptres are commonly considered comfortable."
     table = Table([*headings, "conflict, dioptres"], rows, caption)

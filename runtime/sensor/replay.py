@@ -32,14 +32,7 @@ class ReplayDriver(SteppedSensor):
 
     name = "replay"
 
-    def __init__(
-        self,
-        source: str,
-        clock: Clock,
-        *,
-        loop: bool = False,
-        latency_ms: float = 0.0,
-    ) -> None:
+    def __init__(self, source: str, clock: Clock, *, loop: bool = False, latency_ms: float = 0.0) -> None:
         """source: a recording's path, or `demo`. latency_ms: from a sample's capture to its arrival."""
         self.path = demo_recording_path() if source == "demo" else Path(source)
         self._clock, self._loop = clock, loop

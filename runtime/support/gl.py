@@ -87,8 +87,4 @@ class DrawnPicture:
 def describe(context: moderngl.Context) -> dict[str, str]:
     """Vendor, renderer and version as reported by the driver."""
     info = context.info
-    return {
-        "vendor": str(info["GL_VENDOR"]),
-        "renderer": str(info["GL_RENDERER"]),
-        "version": str(info["GL_VERSION"]),
-    }
+    return {"vendor": str(info["GL_VENDOR"]), "renderer": str(info["GL_RENDERER"]), "version": str(info["GL_VERSION"])}

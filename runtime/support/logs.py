@@ -136,10 +136,7 @@ class QueuedLines(QueueHandler):
 
 
 def configure(
-    *,
-    stream: TextIO | None = None,
-    clock: Clock | None = None,
-    environment: Mapping[str, str] = os.environ,
+    *, stream: TextIO | None = None, clock: Clock | None = None, environment: Mapping[str, str] = os.environ
 ) -> None:
     """Send phasestack's log lines to a stream (default stderr), replacing an earlier call's."""
     for old in logging.getLogger(ROOTS[0]).handlers[:]:

@@ -13,12 +13,9 @@ from calib.commands import app
 from runtime.errors import InputError
 from runtime.support.picture_file import read_image
 from tests.calib.camera import measured, write_pairs
+from tests.eyes.test_calibration_file import PUBLISHED
 
 run = CliRunner()
-PUBLISHED = """stack_from_sensor = [
-    [0.699976, 2.09768, 7.81822, -1.90611], [8.09414, -0.276962, -0.650369, 0.166057],
-    [0.0985957, 7.8446, -2.11359, 3.31142], [0, 0, 0, 1]]
-"""
 
 
 def report(*options: str) -> dict:

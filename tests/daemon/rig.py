@@ -26,11 +26,7 @@ SMALL: dict[str, Any] = {
     "model": {"name": "fast", "threads": 1, "backend": "opencv"},  # auto would be what the machine is like today
     "loop": {"rate_hz": 200.0},
 }
-QUICK = {
-    "sensor.worker.REOPEN_AFTER_S": 0.02,
-    "sensor.worker.REOPEN_AFTER_MAX_S": 0.05,
-    "frame.policy.BLEND_S": 0.02,
-}
+QUICK = {"sensor.worker.REOPEN_AFTER_S": 0.02, "sensor.worker.REOPEN_AFTER_MAX_S": 0.05, "frame.policy.BLEND_S": 0.02}
 
 
 class Plan:
@@ -116,11 +112,7 @@ class Rig:
                 self._cleanup.enter_context(patch(f"runtime.{name}", seconds))
             self._cleanup.enter_context(patch("runtime.daemon.build.open_sensor", self._opened))
             self.run: Run = build_run(
-                self.settings,
-                RunOptions(),
-                self._cleanup,
-                self.host,
-                on_account=self.accounts.append,
+                self.settings, RunOptions(), self._cleanup, self.host, on_account=self.accounts.append
             )
         except BaseException:
             self._cleanup.close()

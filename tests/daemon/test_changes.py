@@ -215,9 +215,7 @@ def configuration(scene: str = "demo", **changes: dict[str, Any]) -> str:
     )
 
 
-def test_a_reload_keeps_what_was_chosen_unless_the_file_changed_it(
-    served: Served,
-) -> None:
+def test_a_reload_keeps_what_was_chosen_unless_the_file_changed_it(served: Served) -> None:
     served.config.write_text(configuration())
     for name, value in (("scene", "sparse"), ("model", "balanced"), ("place", {"scale": 1.5})):
         holds = served.asked(name, value)

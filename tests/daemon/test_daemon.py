@@ -112,10 +112,7 @@ def started(tmp_path: Path) -> Iterator[Callable[..., Any]]:
         daemon.close()
 
 
-@pytest.mark.parametrize(
-    ("number", "after_s"),
-    [(signal.SIGTERM, 0.05), (signal.SIGTERM, 1.6), (signal.SIGINT, 1.0)],
-)
+@pytest.mark.parametrize(("number", "after_s"), [(signal.SIGTERM, 0.05), (signal.SIGTERM, 1.6), (signal.SIGINT, 1.0)])
 def test_a_signal_at_any_stage_of_the_start_ends_it_cleanly(
     started: Callable[..., Any], number: Signals, after_s: float
 ) -> None:

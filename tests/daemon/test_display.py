@@ -11,6 +11,7 @@ import pytest
 
 from runtime.daemon.client import ask
 from runtime.panels.xlib import SERVER_DIED
+from tests.daemon.test_daemon import CONFIG as daemon_config
 from tests.daemon.test_daemon import Daemon
 from tests.panels import xserver
 from tests.panels.xserver import HEIGHT_PX, WIDTH_PX, XServer
@@ -18,22 +19,9 @@ from tests.waiting import eventually
 
 pytestmark = pytest.mark.windows
 
-CONFIG = f"""
-[stack]
-width_px = {WIDTH_PX}
-height_px = {HEIGHT_PX}
-[sensor]
-loop = true
-[model]
-name = "fast"
-threads = 1
-[loop]
-rate_hz = 30.0
-[service]
-socket = "{{folder}}/status.sock"
-[output]
-kind = "windows"
-""" + "".join(f'[[output.panels]]\nconnector = "DUMMY{index}"\n' for index in range(3))
+SMALL = daemon_config.replace("192", str(WIDTH_PX)).replace("108", str(HEIGHT_PX)).replace("60.0", "30.0")
+PANELS = "".join(f'[[output.panels]]\nconnector = "DUMMY{index}"\n' for index in range(3))
+CONFIG = SMALL + '[output]\nkind = "windows"\n' + PANELS
 
 
 @pytest.fixture

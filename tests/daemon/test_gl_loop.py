@@ -62,9 +62,7 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[xserver.
     made.stop()
 
 
-def test_panels_show_opengl_s_solution_and_a_returning_monitor_keeps_the_solver(
-    server: xserver.XServer,
-) -> None:
+def test_panels_show_opengl_s_solution_and_a_returning_monitor_keeps_the_solver(server: xserver.XServer) -> None:
     with Rig(**ON_WINDOWS) as rig:
         rig.refresh_until_solved(times=2)
         parts = rig.run.parts

@@ -145,9 +145,7 @@ def test_an_unaligned_panel_is_exact_to_the_bit_beside_aligned_ones(sink: DrawnP
     assert not np.array_equal(codes(sink.read_back())[0], codes(frame.solved)[0])
 
 
-def test_a_registered_panel_is_aligned_first_then_warped_by_its_registration(
-    context: moderngl.Context,
-) -> None:
+def test_a_registered_panel_is_aligned_first_then_warped_by_its_registration(context: moderngl.Context) -> None:
     shift = PanelSettings(homography=((1.0, 0.0, 5.0), (0.0, 1.0, -3.0), (0.0, 0.0, 1.0)))
     sink = offscreen(context, STACK, *(shift,) * 3)
     matrices = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.02, 0.016, 0.03])).solved_from_shown

@@ -118,10 +118,7 @@ def report_page() -> Page:
         for motion in ("still", "lean")
         for solver_ms in (33.0, 150.0)
     ]
-    parts = [
-        frontier_section(methods, title="Frontier", name="test"),
-        moving_section(moving),
-    ]
+    parts = [frontier_section(methods, title="Frontier", name="test"), moving_section(moving)]
     return Page("Light against run time", "A lead.", parts, describe(), "phasestack report")
 
 

@@ -38,12 +38,7 @@ def evenly(rate_hz: int, seconds: float, start_s: float = 1.0) -> NDArray[np.flo
 
 
 def play(
-    path: Path,
-    *,
-    timeout_s: float = 0.1,
-    latency_ms: float = 0.0,
-    busy_s: float = 0.002,
-    at_most_s: float = 8.0,
+    path: Path, *, timeout_s: float = 0.1, latency_ms: float = 0.0, busy_s: float = 0.002, at_most_s: float = 8.0
 ) -> tuple[list[tuple[SensorFrame, int]], set[str], SensorWorker]:
     """Every sample that a worker hands out, with the time at which the reader got it, and the worker."""
     clock = MonotonicClock()

@@ -56,10 +56,7 @@ class FakeUsb(usb.backend.IBackend):
 
 @pytest.mark.parametrize(
     ("device", "problem"),
-    [
-        (Plugged((0x045E, 0x02D8), speed=3), "USB 3"),
-        (Plugged((0x1D27, 0x0600), readable=False), UDEV_RULE),
-    ],
+    [(Plugged((0x045E, 0x02D8), speed=3), "USB 3"), (Plugged((0x1D27, 0x0600), readable=False), UDEV_RULE)],
     ids=["a Kinect v2 on USB 2", "no permission"],
 )
 def test_what_stands_in_the_way_is_told_with_its_remedy(device: Plugged, problem: str) -> None:
