@@ -78,11 +78,12 @@ class ContentSource(ABC):
         """The picture in a texture, valid until the side's next; None: use `render`. Raises ContentFailure."""
         return None
 
-    def nearness(self, view: View) -> F32 | None:
-        """(h, w) 1/m: the inverse of the view's third coordinate at each pixel of its side's newest picture.
+    def nearness(self, view: View, *, every: int, first: tuple[int, int]) -> F32 | None:
+        """(h, w) 1/m: the inverse distance of the nearest point in each block of a view's picture.
 
-        0: only the background shows there. None: unknown, the panels are aligned to a new eye without it. Valid until
-        the side's next picture.
+        The distance is the view's third coordinate; the picture is the side's newest, of the same raster; 0: only the background shows there. None: unknown, and
+        content is aligned to a new eye as if on the middle panel. every: pixels of a block, right and down; first:
+        pixels, fewer than those, by which the first block is cut.
         """
         return None
 
@@ -153,9 +154,9 @@ class ForwardingSource(ContentSource):
         source, view, time_ns = self._forwarded(view, time_ns)
         return source.render(view, time_ns=time_ns)
 
-    def nearness(self, view: View) -> F32 | None:
+    def nearness(self, view: View, *, every: int, first: tuple[int, int]) -> F32 | None:
         source = self._drew[view.side]
-        return None if source is None else source.nearness(view)
+        return None if source is None else source.nearness(view, every=every, first=first)
 
     def _forwarded(self, view: View, time_ns: int) -> tuple[ContentSource, View, int]:
         found = self.forwarded(view, time_ns)

@@ -13,9 +13,28 @@ from runtime.content.base import WHITE, ContentInfo, ContentSource, View
 from runtime.optics.rect import PixelRect
 from runtime.records import F32, U8
 from runtime.support.background import raise_if_abandoned
-from runtime.support.gl import DrawnPicture
+from runtime.support.gl import DrawnPicture, finish
 
 SIDES = 2
+WHOLE = """#version 330
+void main() { gl_Position = vec4(vec2((gl_VertexID << 1) & 2, gl_VertexID & 2) * 2.0 - 1.0, 0.0, 1.0); }
+"""
+NEAREST = """#version 330
+uniform sampler2D depth;
+uniform int every;
+uniform ivec2 first;
+uniform float at_near;
+uniform float at_far;
+out float nearness;
+void main() {
+    ivec2 begin = ivec2(gl_FragCoord.xy) * every - first, last = textureSize(depth, 0) - 1;
+    float nearest = 1.0;
+    for (int j = 0; j < every; j++)
+        for (int i = 0; i < every; i++)
+            nearest = min(nearest, texelFetch(depth, clamp(begin + ivec2(i, j), ivec2(0), last), 0).r);
+    nearness = nearest < 1.0 ? mix(at_near, at_far, nearest) : 0.0;
+}
+"""
 SIZES_KEPT = 8
 
 
@@ -24,6 +43,55 @@ class _Target:
     smooth: Any  # framebuffer with several samples or half floats; None where neither is needed
     plain: list[Any]  # one a side
     pictures: list[U8]  # one (h, w, 4) array a side, reused
+
+
+class _Reducer:
+    """Reads depth back as its nearest value in blocks of pixels: a whole raster's floats would hold Python's lock."""
+
+    def __init__(self, context: Any) -> None:
+        self._context = context
+        self._program = context.program(vertex_shader=WHOLE, fragment_shader=NEAREST)
+        self._array = context.vertex_array(self._program, [])
+        self._targets: dict[tuple[int, int], Any] = {}
+
+    def reduced(
+        self,
+        depth: Any,
+        size: tuple[int, int],
+        *,
+        every: int,
+        first: tuple[int, int],
+        at_near: float,
+        at_far: float,
+    ) -> F32:
+        """(rows, columns), `size` the other way round: at_near at depth 0 to at_far at 1; 0 where it is 1."""
+        if size not in self._targets:
+            if len(self._targets) >= SIZES_KEPT:
+                self._drop(next(iter(self._targets)))
+            self._targets[size] = self._context.framebuffer([self._context.texture(size, 1, dtype="f4")])
+        target = self._targets[size]
+        self._context.enable_only(self._context.NOTHING)
+        target.use()
+        depth.compare_func = ""
+        depth.use(0)
+        self._program["every"], self._program["first"] = every, first
+        self._program["at_near"], self._program["at_far"] = at_near, at_far
+        self._array.render(self._context.TRIANGLES, vertices=3)
+        finish()
+        found = np.frombuffer(target.read(components=1, dtype="f4"), np.float32)
+        return found.reshape(size[1], size[0])
+
+    def release(self) -> None:
+        while self._targets:
+            self._drop(next(iter(self._targets)))
+        self._array.release()
+        self._program.release()
+
+    def _drop(self, size: tuple[int, int]) -> None:
+        target = self._targets.pop(size)
+        self._context.detect_framebuffer(0).use()
+        target.color_attachments[0].release()
+        target.release()
 
 
 class CanvasSource(ContentSource):
@@ -42,6 +110,7 @@ class CanvasSource(ContentSource):
         self._samples = min(samples, context.max_samples)
         self._clear_colour = (*(info.background or WHITE), 0.0)
         self._targets: dict[tuple[int, int], _Target] = {}
+        self._reducer: _Reducer | None = None
         self._bounds: list[tuple[float, float] | None] = [None] * SIDES  # near and far of each side's newest picture
 
     @abstractmethod
@@ -75,22 +144,26 @@ class CanvasSource(ContentSource):
                 plain.scissor = None
         return DrawnPicture(plain.color_attachments[0], plain, target.pictures[view.side])
 
-    def nearness(self, view: View) -> F32 | None:
+    def nearness(self, view: View, *, every: int, first: tuple[int, int]) -> F32 | None:
         bounds, target = self._bounds[view.side], self._targets.get((view.width_px, view.height_px))
         if bounds is None or target is None:
             return None
         near_m, far_m = bounds
-        read = target.plain[view.side].read(components=1, attachment=-1, dtype="f4")
-        depth = np.frombuffer(read, np.float32).reshape(view.height_px, view.width_px)
+        if self._reducer is None:
+            self._reducer = _Reducer(self.context)
+        size = -(-(view.width_px + first[0]) // every), -(-(view.height_px + first[1]) // every)
+        depth = target.plain[view.side].depth_attachment
         # Between the near and the far plane, depth is linear in the inverse of the distance.
-        found = depth * np.float32(1 / far_m - 1 / near_m)
-        found += np.float32(1 / near_m)
-        found[depth >= 1.0] = 0.0
-        return found
+        return self._reducer.reduced(
+            depth, size, every=every, first=first, at_near=1 / near_m, at_far=1 / far_m
+        )  # fmt: skip
 
     def close(self) -> None:
         while self._targets:
             self._forget_oldest()
+        if self._reducer is not None:
+            self._reducer.release()
+            self._reducer = None
         while self.held:
             self.held.pop().release()
 

@@ -9,9 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from runtime.content.shapes import I32, Shape
 from runtime.records import F32, F64
+
+CORNER_ENDS = (0, 0, 1, 1, 0, 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +25,8 @@ class Edges:
     ends: I32  # (e, 2, 2) per face: the vertices of the edge, in one order for both
     apex: I32  # (e, 2) per face: its third vertex
     normals: F64  # (t, 3) of faces, not normalised
-    centres: F64  # (t, 3)
+    heights: F64  # (t,) of faces' planes along their normals: an eye whose product with the normal is larger sees them
+    border: NDArray[np.bool_]  # (e,) edges of one face
 
 
 def edges_of(shape: Shape) -> Edges:
@@ -45,14 +49,16 @@ def edges_of(shape: Shape) -> Edges:
     paired = (second > first) & (key[order[second]] == key[order[first]])
     one, two = order[first], order[second]
     corner = positions[triangles]
+    normals = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     return Edges(
         faces=np.column_stack([face[one], np.where(paired, face[two], -1)]).astype(np.int32),
         ends=np.stack([vertices[one], np.where(paired[:, None], vertices[two], vertices[one])], axis=1).astype(
             np.int32
         ),
         apex=np.column_stack([apex[one], np.where(paired, apex[two], apex[one])]).astype(np.int32),
-        normals=np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]),
-        centres=corner.mean(1),
+        normals=normals,
+        heights=np.einsum("ij,ij->i", normals, corner.mean(1)),
+        border=~paired,
     )
 
 
@@ -61,29 +67,30 @@ def silhouette(edges: Edges, eye: F64) -> tuple[I32, I32]:
 
     eye: (3,) in the shape's own frame. Normals must point outwards.
     """
-    facing = np.einsum("ij,ij->i", edges.normals, eye - edges.centres) > 0
-    border = edges.faces[:, 1] < 0
-    chosen = np.flatnonzero(border | (facing[edges.faces[:, 0]] != facing[edges.faces[:, 1]]))
-    which = np.where(border[chosen] | facing[edges.faces[chosen, 0]], 0, 1)
+    if not len(edges.normals):
+        return edges.ends[:, 0], edges.apex[:, 0]
+    facing = edges.normals @ eye > edges.heights
+    first, second = facing[edges.faces.T]
+    chosen = np.flatnonzero(edges.border | (first != second))
+    which = np.where(edges.border[chosen] | first[chosen], 0, 1)
     return edges.ends[chosen, which], edges.apex[chosen, which]
 
 
-def ramps(clip: F64, ends: I32, apex: I32, *, width_px: int, height_px: int, ramp_px: float = 1.0) -> tuple[F32, I32]:
+def ramps(points: F64, *, width_px: int, height_px: int, ramp_px: float = 1.0) -> tuple[F32, NDArray[np.intp]]:
     """Two triangles along each outline edge: coverage 1 at the edge, 0 `ramp_px` pixels outside.
 
-    clip: (v, 4) clip coordinates of the shape's vertices.
-    Returns (k, 6, 5) clip coordinates and coverage, and (k, 6) the vertex whose colour each corner has, of the edges
-    that lie wholly before the eye and are long enough to have a direction.
+    points: (k, 3, 4) clip coordinates of edges' ends and apexes.
+    Returns (m, 6, 5) clip coordinates and coverage of the edges that lie wholly before the eye and are long enough to
+    have a direction, and which of the k they are; the corners have the colours of the ends in `CORNER_ENDS`.
     """
     scale = np.array([width_px / 2, height_px / 2])
-    points = clip[np.column_stack([ends, apex])]
-    before = (points[..., 3] > 1e-6).all(1)
-    points, ends = points[before], ends[before]
+    kept = np.flatnonzero((points[..., 3] > 1e-6).all(1))
+    points = points[kept]
     pixels = points[..., :2] / points[..., 3:] * scale
     along = pixels[:, 1] - pixels[:, 0]
     length = np.hypot(along[:, 0], along[:, 1])
     long_enough = length > 1e-3
-    points, pixels, ends = points[long_enough], pixels[long_enough], ends[long_enough]
+    points, pixels, kept = points[long_enough], pixels[long_enough], kept[long_enough]
     along = along[long_enough] / length[long_enough, None]
     outward = np.column_stack([-along[:, 1], along[:, 0]])
     inside = ((pixels[:, 2] - pixels[:, 0]) * outward).sum(1)
@@ -93,4 +100,4 @@ def ramps(clip: F64, ends: I32, apex: I32, *, width_px: int, height_px: int, ram
     corners[:, 1::2, :2] += (outward / scale)[:, None] * corners[:, 1::2, 3:]
     quad = [0, 1, 2, 2, 1, 3]
     packed = np.concatenate([corners, coverage[..., None]], axis=2)[:, quad]
-    return packed.astype(np.float32), ends[:, [0, 0, 1, 1, 0, 1]]
+    return packed.astype(np.float32), kept

@@ -14,7 +14,7 @@ import numpy as np
 from runtime.content import camera
 from runtime.content.base import ContentInfo, View
 from runtime.content.canvas import CanvasSource
-from runtime.content.fringe import edges_of, ramps, silhouette
+from runtime.content.fringe import CORNER_ENDS, edges_of, ramps, silhouette
 from runtime.content.parts import OPAQUE_FROM, OUTLINED_MAX, Part, Sampler
 from runtime.content.shapes import I32
 from runtime.optics.rect import PixelRect
@@ -327,22 +327,33 @@ class TriangleSource(CanvasSource):
         return self._textures[key]
 
     def _draw_outlines(self, placed: list[tuple[DrawnPart, F64]], looks: dict[int, _Look], view: View) -> None:
-        context, framebuffer = self.context, self.context.fbo
-        context.enable_only(context.DEPTH_TEST | context.BLEND)
-        context.blend_func = OVER
-        framebuffer.depth_mask = False
+        outlined, vertices, points = [], [], []
         for part, stack_from_part in reversed(placed):
             look = looks[id(stack_from_part)]
             if part.edges is None or not look.has_inside:
                 continue
             ends, apex = silhouette(part.edges, look.eye)
-            clip = part.positions @ look.clip_from_part[:, :3].T + look.clip_from_part[:, 3]
-            size = {"width_px": view.width_px, "height_px": view.height_px}
-            corners, vertices = ramps(clip, ends, apex, **size, ramp_px=1 / view.reduction)
-            if len(corners):
+            corners = part.positions[np.column_stack([ends, apex])]
+            outlined.append((part, look))
+            vertices.append(ends)
+            points.append(corners @ look.clip_from_part[:, :3].T + look.clip_from_part[:, 3])
+        if not outlined:
+            return
+        # For all parts at once: most have few edges.
+        size = {"width_px": view.width_px, "height_px": view.height_px}
+        packed, kept = ramps(np.concatenate(points), **size, ramp_px=1 / view.reduction)
+        ends_before = np.cumsum([0, *map(len, vertices)])
+        first = np.searchsorted(kept, ends_before)
+        context, framebuffer = self.context, self.context.fbo
+        context.enable_only(context.DEPTH_TEST | context.BLEND)
+        context.blend_func = OVER
+        framebuffer.depth_mask = False
+        for n, (part, look) in enumerate(outlined):
+            own = slice(first[n], first[n + 1])
+            if own.stop > own.start:
                 look.set(part.outline_program, part)
                 _set_uniforms(part.outline_program, kept=(part.cutoff, ANY_ALPHA))
-                part.draw_outline(corners, vertices)
+                part.draw_outline(packed[own], vertices[n][kept[own] - ends_before[n]][:, CORNER_ENDS])
         framebuffer.depth_mask = True
 
 

@@ -29,18 +29,21 @@ RIM_PX = 2  # of a relief's, by which nearer content extends over its surroundin
 Pixels = NDArray[np.floating[Any]]
 
 
-def relief_of(nearness: Sequence[F32], *, distance_m: Sequence[float]) -> F32:
-    """(h, w) relief of pictures of both eyes on one raster, of at most `WIDEST_PX` columns.
+def block_px(width_px: int) -> int:
+    """Pixels of a raster of so many columns that one pixel of its relief stands for, right and down."""
+    return -(-width_px // WIDEST_PX)
 
-    nearness: per eye (H, W), 1/m, the inverse distance along x of what the eye sees, 0: the background alone, which has
-    no relief; distance_m: per eye, from the middle panel. Of both eyes' reliefs, the one farther from 0 counts.
+
+def relief_of(nearness: Sequence[F32], *, distance_m: Sequence[float]) -> F32:
+    """(h, w) relief of what both eyes see.
+
+    nearness: per eye (h, w), 1/m, the inverse distance along x, 0: the background alone, which has no relief;
+    distance_m: per eye, from the middle panel. Of both eyes' reliefs, the one farther from 0 counts.
     """
-    columns = nearness[0].shape[1]
-    every = -(-columns // WIDEST_PX)
-    rim = np.ones((2 * RIM_PX * every + 1,) * 2, np.uint8)
+    rim = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
     reliefs = []
     for inverse, eye_m in zip(nearness, distance_m, strict=True):
-        kept = cv2.dilate(inverse, rim)[every // 2 :: every, every // 2 :: every]
+        kept = cv2.dilate(inverse, rim)
         reliefs.append(np.where(kept > 0.0, kept * np.float32(eye_m) - np.float32(1), np.float32(0)))
     left, right = reliefs
     return np.ascontiguousarray(np.where(np.abs(left) > np.abs(right), left, right), np.float32)

@@ -12,7 +12,7 @@ from runtime.model.job import Job, SolveWindow, Targets, drawn_views
 from runtime.model.predictor import Predictor
 from runtime.model.trim import extent_window, trim
 from runtime.optics.rect import PixelRect, union
-from runtime.optics.relief import relief_of
+from runtime.optics.relief import block_px, relief_of
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import image_from_stack, raster_from_stack
 from runtime.records import F32, F64, U8
@@ -93,12 +93,15 @@ def _relief(
     content: ContentSource, views: tuple[View, View], stack: PanelStack, window: SolveWindow | None
 ) -> F32 | None:
     """The relief of the content that was drawn for both views, over the middle panel; None: the source has no depth."""
-    left, right = (content.nearness(view) for view in views)
+    every = block_px(stack.width_px)
+    u0, v0 = (0, 0) if window is None else (window.box.u0, window.box.v0)
+    left, right = (content.nearness(view, every=every, first=(u0 % every, v0 % every)) for view in views)
     if left is None or right is None:
         return None
     if window is not None:
-        whole = np.zeros((2, stack.height_px, stack.width_px), np.float32)
-        whole[(slice(None), *window.box.slices)] = left, right
+        whole = np.zeros((2, -(-stack.height_px // every), -(-stack.width_px // every)), np.float32)
+        rows, columns = left.shape
+        whole[:, v0 // every :, u0 // every :][:, :rows, :columns] = left, right
         left, right = whole
     middle_m = stack.x_m[stack.count // 2]
     return relief_of((left, right), distance_m=[float(view.eye_m[0]) - middle_m for view in views])

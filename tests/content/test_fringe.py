@@ -29,7 +29,7 @@ def test_the_ramp_is_one_pixel_wide_and_lies_outside() -> None:
     card = shapes.card(1.0, 1.0)
     ends, apex = silhouette(edges_of(card), np.array([5.0, 0.0, 0.0]))
     clip = np.column_stack([card.positions_m[:, 1], -card.positions_m[:, 2], np.zeros(4), np.ones(4)]).astype(float)
-    corners, _ = ramps(clip, ends, apex, width_px=100, height_px=50)
+    corners, _ = ramps(clip[np.column_stack([ends, apex])], width_px=100, height_px=50)
     uncovered = corners[corners[..., 4] == 0]
     reach = (np.abs(uncovered[:, :2]) - 0.5) * [50, 25]
     assert reach.max(axis=1) == pytest.approx(np.ones(len(reach)), abs=1e-4)

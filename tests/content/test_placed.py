@@ -95,3 +95,24 @@ def test_a_picture_turned_edge_on_is_the_background_and_no_error(tmp_path: Path,
     source = open_content(ContentSettings(scene=str(tmp_path / "a.png")), stack, context)
     turned = PlacedSource(source, Placing(rotation_deg=(0, 0, 90)))
     assert (turned.render(panel_view((0.6, 0, 0), stack.panel(1)), time_ns=0) == (31, 31, 31, 0)).all()
+
+
+def test_depth_is_that_of_the_place_in_blocks_of_pixels(context: Any, stack: PanelStack) -> None:
+    """The nearest point of a scene that is moved 5 cm nearer is seen 5 cm nearer; blocks keep their nearest pixel."""
+    view = panel_view(EYE, stack.panel(1))
+    settings = ContentSettings(scene="demo")
+    nearest_m = []
+    for offset_m in (0.0, 0.05):
+        with_offset = settings.model_copy(update={"offset_m": (offset_m, 0.0, 0.0)})
+        content = open_content(with_offset, stack, context)
+        content.render(view, time_ns=0)
+        fine = content.nearness(view, every=1, first=(0, 0))
+        coarse = content.nearness(view, every=4, first=(3, 1))
+        assert fine is not None and coarse is not None and (fine == 0.0).any()
+        assert fine.shape == (view.height_px, view.width_px)
+        padded = np.zeros((4 * coarse.shape[0], 4 * coarse.shape[1]), np.float32)
+        padded[1:, 3:][: fine.shape[0], : fine.shape[1]] = fine
+        np.testing.assert_allclose(coarse, padded.reshape(coarse.shape[0], 4, -1, 4).max((1, 3)), rtol=1e-5)
+        nearest_m.append(1 / fine.max())
+        content.close()
+    assert nearest_m[0] - nearest_m[1] == pytest.approx(0.05, abs=1e-3)
