@@ -81,9 +81,9 @@ class ContentSource(ABC):
     def nearness(self, view: View, *, every: int, first: tuple[int, int]) -> F32 | None:
         """(h, w) 1/m: the inverse distance of the nearest point in each block of a view's picture.
 
-        The distance is the view's third coordinate; the picture is the side's newest, of the same raster; 0: only the background shows there. None: unknown, and
-        content is aligned to a new eye as if on the middle panel. every: pixels of a block, right and down; first:
-        pixels, fewer than those, by which the first block is cut.
+        The distance is the view's third coordinate; the picture is the side's newest, of the same raster; 0: only the
+        background shows there. None: unknown, and content is aligned to a new eye as if on the middle panel. every:
+        pixels of a block, right and down; first: pixels, fewer than those, by which the first block is cut.
         """
         return None
 
