@@ -80,18 +80,14 @@ def _become_service() -> None:
     import grp
     import pwd
     import shlex
-    import subprocess
 
+    from runtime.daemon.client import unit_properties
     from runtime.errors import InputError
 
-    wanted = ("LoadState", "User", "Group", "SupplementaryGroups", "Environment", "WorkingDirectory", "StateDirectory")
+    unit = unit_properties("User", "Group", "SupplementaryGroups", "Environment", "WorkingDirectory", "StateDirectory")
+    if not unit:
+        raise InputError("doctor", "--service", "phasestack.service is not installed")
     try:
-        shown = subprocess.run(
-            ["systemctl", "show", "phasestack", f"--property={','.join(wanted)}"], capture_output=True, text=True
-        ).stdout
-        unit = dict(line.partition("=")[::2] for line in shown.splitlines())
-        if unit.get("LoadState") != "loaded":
-            raise InputError("doctor", "--service", "phasestack.service is not installed")
         os.setgroups([grp.getgrnam(name).gr_gid for name in unit["SupplementaryGroups"].split()])
         os.setgid(grp.getgrnam(unit["Group"]).gr_gid)
         os.setuid(pwd.getpwnam(unit["User"]).pw_uid)

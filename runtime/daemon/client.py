@@ -94,20 +94,21 @@ def _advice(error: Exception) -> str:
     return str(error) or type(error).__name__
 
 
+def unit_properties(*names: str) -> dict[str, str]:
+    """Return properties of the systemd unit; empty if it is not installed."""
+    command = ["systemctl", "show", UNIT, f"--property=LoadState,{','.join(names)}"]
+    try:
+        shown = subprocess.run(command, capture_output=True, text=True, timeout=5.0).stdout
+    except (OSError, subprocess.TimeoutExpired):
+        return {}
+    unit = dict(line.partition("=")[::2] for line in shown.splitlines())
+    return unit if unit.get("LoadState") == "loaded" else {}
+
+
 def unit_advice() -> str:
     """Return the systemd unit's state with its last error and a remedy; empty without a unit."""
-    properties = ("LoadState", "ActiveState", "Result", "ExecMainStatus", "StatusText")
-    try:
-        shown = subprocess.run(
-            ["systemctl", "show", UNIT, f"--property={','.join(properties)}"],
-            capture_output=True,
-            text=True,
-            timeout=5.0,
-        ).stdout
-    except (OSError, subprocess.TimeoutExpired):
-        return ""
-    unit = {name: value for name, _, value in (line.partition("=") for line in shown.splitlines())}
-    if unit.get("LoadState") != "loaded":
+    unit = unit_properties("ActiveState", "Result", "ExecMainStatus", "StatusText")
+    if not unit:
         return ""
     why = f"{unit['Result']}, exit status {unit['ExecMainStatus']}: {unit['StatusText'] or 'no message'}"
     match unit["ActiveState"], unit["Result"]:
