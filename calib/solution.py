@@ -16,9 +16,10 @@ from runtime.records import F64
 
 Method = Literal["seed", "least-squares", "inverse", "robust", "fixed-scale"]
 METHODS: tuple[Method, ...] = get_args(Method)
-# Prior of the scale: 80 % of sensors are exact as far as pairs can show; the others are off by about 2 % or more, as
-# likely by 4 to 8 % as by 8 to 16 %, and by a factor of ten at most.
-EXACT_SHARE, SCALE_SIGMA, FARTHEST = 0.8, 0.02, np.log(10.0)
+# Prior of the scale's logarithm: share and standard deviation of three kinds of sensors. They are exact as far as pairs
+# can show, off by some percent, or in other units. The shares balance the excess error with a right metre against that
+# with one that is off by up to a tenth (tests/calib/test_methods.py).
+SCALE_PRIOR = np.array([(0.8, 0.0), (0.17, 0.06), (0.03, 1.0)])
 MIN_SIGMA = 1e-12  # of the scale's logarithm, for exact pairs
 
 
@@ -118,19 +119,20 @@ def solve(
     )
 
 
-def posterior_scale(fitted: F64 | float, *, sigma: float, freedom: int) -> tuple[F64, F64]:
-    """Posterior mean and standard deviation of a log scale (...), averaged over two hypotheses.
+def posterior_scale(fitted: float, *, sigma: float, freedom: int) -> tuple[float, float]:
+    """Posterior mean and standard deviation of a log scale, averaged over the kinds of sensors.
 
-    The hypotheses are an exact sensor (0) and the fitted value. The fitted value's error `sigma` is estimated with
-    `freedom` degrees of freedom, hence Student's likelihood. Averaging avoids a threshold, and does not pull back a
-    sensor that is off by a tenth.
+    The fitted value's error `sigma` is estimated with `freedom` degrees of freedom, hence Student's likelihood.
+    Averaging avoids a threshold, and does not pull back a sensor that is off by a tenth.
     """
-    sigma = max(sigma, MIN_SIGMA)
-    exact = EXACT_SHARE * student.pdf(fitted / sigma, freedom) / sigma
-    # The prior of inexact sensors is nearly flat over the likelihood: use its density at the fitted value.
-    off = (1 - EXACT_SHARE) / (2 * np.log1p(FARTHEST / SCALE_SIGMA)) / (SCALE_SIGMA + np.abs(fitted))
-    chance = exact / (exact + off)
-    return (1 - chance) * fitted, np.sqrt((1 - chance) * (sigma**2 + chance * np.square(fitted)))
+    shares, widths = SCALE_PRIOR.T
+    noise = max(sigma, MIN_SIGMA) ** 2
+    spread = np.sqrt(noise + widths**2)
+    weights = shares * student.pdf(fitted / spread, freedom) / spread
+    weights /= weights.sum()
+    trust = (widths / spread) ** 2
+    mean = float(weights @ trust) * fitted
+    return mean, float(np.sqrt(weights @ (trust * noise + (trust * fitted - mean) ** 2)))
 
 
 def solve_default(sensor_m: F64, stack_m: F64) -> CalibrationSolution:
@@ -145,15 +147,15 @@ def solve_default(sensor_m: F64, stack_m: F64) -> CalibrationSolution:
         return replace(robust, reason=f"{rejected} of {len(sensor_m)} pairs do not agree with the others")
     inverse = solve(sensor_m, stack_m, method="inverse")
     fitted = float(inverse.similarity.scale)
-    mean, spread = posterior_scale(np.log(fitted), sigma=inverse.scale_sigma, freedom=3 * len(sensor_m) - 7)
-    scale, sigma = float(np.exp(mean)), float(spread)
+    mean, sigma = posterior_scale(float(np.log(fitted)), sigma=inverse.scale_sigma, freedom=3 * len(sensor_m) - 7)
+    scale = float(np.exp(mean))
     solution = solve(
         sensor_m,
         stack_m,
         method="fixed-scale",
         known_scale=scale,
         reason=f"scale {scale:.5g} ± {sigma * scale:.2g}: fitted {fitted:.5g} ± {inverse.scale_sigma * fitted:.2g}, "
-        f"prior 1 or off by about {100 * SCALE_SIGMA:g}%",
+        f"prior 1 or off by about {100 * SCALE_PRIOR[1, 1]:g}%",
     )
     unit = solution.unit_covariance.copy()
     # About the pairs' centre the scale is independent of rotation and shift.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from itertools import product
 
@@ -10,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib.robust import fit_robust
-from calib.solution import METHODS, solve, solve_default
+from calib.solution import METHODS, Method, solve, solve_default
 from calib.viewpoints import grid, viewing_volume_m
 from tests.calib.camera import KNOWN_M, measured
 
@@ -18,22 +19,22 @@ SIGMAS_M = (0.0, 0.001, 0.003, 0.010, 0.030)
 CAMERA_M = (0.05, 0.02, 0.22)
 
 
+def errors_m2(methods: Sequence[Method], *, seed: int, sigma_m: float, scale: float) -> np.ndarray:
+    """(methods and the default, points) squared position errors over the viewing volume after calibration at 27
+    viewpoints, with a random camera rotation and sensor noise; the sensor's metre is `scale` of ours."""
+    known_m, volume_m = np.array([viewpoint.midpoint_m for viewpoint in grid()]), viewing_volume_m()
+    random = np.random.default_rng(seed)
+    turn = Rotation.random(rng=random).as_matrix()
+    sensor, seen = ((points - CAMERA_M) @ turn / scale for points in (known_m, volume_m))
+    sensor = sensor + sigma_m * random.normal(size=sensor.shape)
+    found = [*(solve(sensor, known_m, method=name) for name in methods), solve_default(sensor, known_m)]
+    return np.array([((each.similarity.points(seen) - volume_m) ** 2).sum(-1) for each in found])
+
+
 @cache
 def mean_error_m(*, sigma_m: float, scale: float = 1.0, seeds: int = 60) -> dict[str, float]:
-    """Mean position error over the viewing volume after calibration at 27 viewpoints, with a random camera rotation per
-    seed and sensor noise; the sensor's metre is `scale` of ours."""
-    known_m, volume_m = np.array([viewpoint.midpoint_m for viewpoint in grid()]), viewing_volume_m()
-    errors: dict[str, list[float]] = {name: [] for name in (*METHODS, "default")}
-    for seed in range(seeds):
-        random = np.random.default_rng(seed)
-        turn = Rotation.random(rng=random).as_matrix()
-        sensor, seen = ((points - CAMERA_M) @ turn / scale for points in (known_m, volume_m))
-        sensor = sensor + sigma_m * random.normal(size=sensor.shape)
-        found = {name: solve(sensor, known_m, method=name) for name in METHODS}
-        found["default"] = solve_default(sensor, known_m)
-        for name, solution in found.items():
-            errors[name].append(float(np.linalg.norm(solution.similarity.points(seen) - volume_m, axis=1).mean()))
-    return {name: float(np.mean(values)) for name, values in errors.items()}
+    squares = [errors_m2(METHODS, seed=seed, sigma_m=sigma_m, scale=scale) for seed in range(seeds)]
+    return dict(zip([*METHODS, "default"], np.sqrt(squares).mean((0, 2)).tolist(), strict=True))
 
 
 @pytest.mark.parametrize("sigma_m", SIGMAS_M)
@@ -48,6 +49,19 @@ def test_with_a_wrong_metre_the_default_is_nearly_the_best(scale: float, sigma_m
     means = mean_error_m(sigma_m=sigma_m, scale=scale)
     assert means["default"] <= 1.02 * min(means[method] for method in METHODS)
     assert means["fixed-scale"] > 2 * means["default"]
+
+
+@pytest.mark.parametrize(("sigma_m", "excess"), [(0.001, 0.03), (0.003, 0.04), (0.01, 0.065)])
+def test_with_any_metre_up_to_a_tenth_off_hidden_points_are_nearly_as_well_placed_as_by_the_best(
+    sigma_m: float, excess: float
+) -> None:
+    """RMS over 240 sensors. No rule has the least error with a right metre and with every wrong one: the choice by
+    held-out pairs costs 8% with a right one, where the default may cost 2% (above)."""
+    scales = np.random.default_rng(9).uniform(0.9, 1.1, size=240)
+    names = [name for name in METHODS if name != "robust"]
+    squares = np.array([errors_m2(names, seed=n, sigma_m=sigma_m, scale=s).mean(-1) for n, s in enumerate(scales)])
+    rms_m = dict(zip([*names, "default"], np.sqrt(squares.mean(0)), strict=True))
+    assert rms_m["default"] <= (1 + excess) * min(rms_m[name] for name in names)
 
 
 def spoiled(sensor: np.ndarray, wrong: list[int], *, by_m: float = 0.3) -> np.ndarray:
