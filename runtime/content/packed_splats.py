@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +43,7 @@ def load_compressed(header: PlyHeader) -> Gaussians:
         of = np.arange(len(splats)) // CHUNK
         return [np.column_stack([bounds[column] for column in wanted])[of] for wanted in columns]
 
-    rgba = _parts(colour, (8, 8, 8, 8))
+    rgba = fields_of(colour, (8, 8, 8, 8))
     if "min_r" in (bounds.dtype.names or ()):
         rgba[:, :3] = _between(rgba[:, :3], *bounds_of("", "rgb"))
     dc = ((rgba[:, :3] - np.float32(0.5)) / np.float32(FLAT_HARMONIC))[:, None]
@@ -55,8 +56,8 @@ def load_compressed(header: PlyHeader) -> Gaussians:
         harmonics = np.concatenate([dc, higher.transpose(0, 2, 1)], axis=1)
     return drawable(
         header.path,
-        centres=_between(_parts(place, (11, 10, 11)), *bounds_of("", "xyz")),
-        log_scales=_between(_parts(scale, (11, 10, 11)), *bounds_of("scale_", "xyz")),
+        centres=_between(fields_of(place, (11, 10, 11)), *bounds_of("", "xyz")),
+        log_scales=_between(fields_of(scale, (11, 10, 11)), *bounds_of("scale_", "xyz")),
         quaternions=_turns(turn),
         logits=logit(rgba[:, 3]),
         harmonics=harmonics,
@@ -83,7 +84,7 @@ def load_splat(path: Path) -> Gaussians:
     )
 
 
-def _parts(packed: U32, bits: tuple[int, ...]) -> F32:
+def fields_of(packed: U32, bits: tuple[int, ...]) -> F32:
     """(n, len(bits)) fields of a word as fractions of their largest value, the first in the highest bits."""
     parts = []
     for width in reversed(bits):
@@ -99,10 +100,14 @@ def _between(share: F32, low: F32, high: F32) -> F32:
 
 def _turns(packed: U32) -> F32:
     """(n, 4) quaternions w, x, y, z: the largest, whose number is in two bits, follows from the three others."""
-    three = (_parts(packed, (10, 10, 10)) - np.float32(0.5)) * np.float32(np.sqrt(2))
+    return with_largest((fields_of(packed, (10, 10, 10)) - np.float32(0.5)) * np.float32(np.sqrt(2)), packed >> 30)
+
+
+def with_largest(three: NDArray[np.floating[Any]], number: NDArray[np.integer[Any]]) -> F32:
+    """(n, 4) unit quaternions, of (n, 3) and the largest, which has that number; 0 where there is none of it."""
     largest = np.sqrt(np.maximum(1 - (three**2).sum(1), 0))
-    found = np.empty((len(packed), 4), np.float32)
-    for number in range(4):
-        rows = packed >> 30 == number
-        found[rows] = np.insert(three[rows], number, largest[rows], axis=1)
+    found = np.zeros((len(three), 4), np.float32)
+    for place in range(4):
+        rows = number == place
+        found[rows] = np.insert(three[rows], place, largest[rows], axis=1)
     return found

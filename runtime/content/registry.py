@@ -28,7 +28,7 @@ from runtime.support.plugins import is_plugin, plugin_class, strict
 from runtime.support.untrusted_input import LIMITS
 
 MESHES = (".glb", ".gltf", ".obj", ".off", ".stl")
-SPLATS = (".ply", ".splat")  # a .ply may be a mesh
+SPLATS = (".ply", ".splat", ".spz", ".sog")  # a .ply may be a mesh
 PLAYLISTS = (".toml", ".json")
 HARMLESS = {".png": PNG, ".jpg": JPEG, ".jpeg": JPEG}  # small stills of these first bytes are read here
 HARMLESS_PX = 4096 * 4096
@@ -41,7 +41,7 @@ OTHER_FILES = {  # by their names: format and the way out
         (".3mf", ".step", ".stp", ".iges", ".igs"), ("a model of CAD or 3D print", "export it as STL or glTF")
     ),
     **dict.fromkeys((".xyz", ".pts", ".pcd", ".las", ".laz", ".e57"), ("a point cloud", TO_PLY)),
-    **dict.fromkeys((".spz", ".sog", ".ksplat", ".lcc"), ("compressed splats", TO_SPLATS)),
+    **dict.fromkeys((".ksplat", ".lcc"), ("compressed splats", TO_SPLATS)),
 }
 LFS = b"version https://git-lfs"
 TRIED_PX = (32, 18)  # a picture that a class is asked for before it is shown
@@ -137,10 +137,12 @@ def _read(file: SceneFile) -> Opener:
     path = file.path
     suffix = path.suffix.lower()
     if path.is_dir():
-        from runtime.content import eyereal
+        from runtime.content import compressed_splats, eyereal, splat
 
         if eyereal.is_data_set(path):
             return eyereal.prepare(file)
+        if compressed_splats.is_sog_folder(path):
+            return splat.prepare(file)
     elif suffix in MESHES:
         from runtime.content import mesh
 
@@ -148,7 +150,7 @@ def _read(file: SceneFile) -> Opener:
     elif suffix in SPLATS:
         from runtime.content import mesh, splat
 
-        is_splats = suffix == ".splat" or read_header(path).kind == "splats"
+        is_splats = suffix != ".ply" or read_header(path).kind == "splats"
         return splat.prepare(file) if is_splats else mesh.prepare(file)
     from runtime.content import pictures, rgbd
     from runtime.content.layout import layout_of

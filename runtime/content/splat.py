@@ -11,6 +11,7 @@ import numpy as np
 
 from runtime.content.base import ContentInfo, View
 from runtime.content.canvas import CanvasSource
+from runtime.content.compressed_splats import load_compressed_splats
 from runtime.content.gaussians import Gaussians, bounds, colours_towards, load_gaussians, moved, seen_splats
 from runtime.content.packed_splats import load_compressed, load_splat
 from runtime.content.placing import SceneFile
@@ -20,7 +21,7 @@ from runtime.records import F64
 from runtime.support.gl import DrawnPicture
 
 OVER = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA)
-CUSTOM = ("-y", "-z")  # up, and to the viewer: trainers use OpenCV's camera axes
+CUSTOM, CUSTOM_SPZ = ("-y", "-z"), ("+y", "+z")  # up, and to the viewer: trainers use OpenCV's camera axes
 FLOATS = 8  # a corner: place in clip space (2), place in standard deviations (2), colour and opacity (4)
 VERTEX = """
 #version 330
@@ -50,12 +51,13 @@ void main() {
 
 def prepare(file: SceneFile) -> Callable[..., SplatSource]:
     """Read the file; the result uploads it to GL. Raises InputError."""
-    if file.path.suffix.lower() == ".splat":
-        gaussians = load_splat(file.path)
-    else:
+    suffix = file.path.suffix.lower()
+    if suffix == ".ply":
         header = read_header(file.path)
         gaussians = load_compressed(header) if header.is_packed else load_gaussians(header)
-    matrix = file.placed(*bounds(gaussians), custom=CUSTOM)
+    else:
+        gaussians = load_splat(file.path) if suffix == ".splat" else load_compressed_splats(file.path)
+    matrix = file.placed(*bounds(gaussians), custom=CUSTOM_SPZ if suffix == ".spz" else CUSTOM)
     info = ContentInfo(file.path.stem, background=file.background)
     return partial(SplatSource, gaussians, stack_from_scene=matrix, info=info)
 

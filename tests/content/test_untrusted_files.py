@@ -348,8 +348,8 @@ def test_a_gltf_is_refused_by_what_it_says_of_itself(tmp_path: Path, name: str) 
         ("a.3mf", "is a model of CAD or 3D print (.3mf), which is not read: export it as STL or glTF"),
         ("a.xyz", "is a point cloud (.xyz), which is not read: save it as PLY"),
         (
-            "a.SOG",
-            "is compressed splats (.sog), which is not read: convert it: `npx @playcanvas/splat-",
+            "a.LCC",
+            "is compressed splats (.lcc), which is not read: convert it: `npx @playcanvas/splat-transform in.lcc",
         ),
         ("a.glb", "is a pointer of Git LFS: fetch the file itself (git lfs pull)"),
         ("a.ply", "is a pointer of Git LFS"),

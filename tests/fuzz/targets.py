@@ -23,6 +23,7 @@ from calib.pairs import read_pairs
 from calib.setup_run import read_progress
 from runtime.clock import MonotonicClock, SimulatedClock
 from runtime.config import ContentSettings, Settings, load_settings, load_stack
+from runtime.content.compressed_splats import load_compressed_splats
 from runtime.content.frames import open_frames
 from runtime.content.gaussians import bounds, load_gaussians, of_points
 from runtime.content.mesh import load_mesh
@@ -46,7 +47,7 @@ from runtime.sensor.recording_format import RecordingHeader
 from runtime.sensor.replay import ReplayDriver
 from runtime.support.untrusted_input import parsed_json
 from tests.content.gltf_files import Buffer
-from tests.content.packed_splat_files import write_compressed, write_splat
+from tests.content.packed_splat_files import write_compressed, write_sog, write_splat, write_spz
 from tests.content.picture_files import heic_pair, mpo, swapped_profile
 from tests.content.test_gltf import square
 from tests.content.test_splat import splat_table
@@ -293,6 +294,17 @@ def small_splats() -> list[bytes]:
         return [write_splat(Path(folder) / "a.splat", splat_table(20, degree=0)).read_bytes()]
 
 
+def spz_splats() -> list[bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        table = splat_table(20, degree=1)
+        return [write_spz(Path(folder) / "a.spz", table, version=k).read_bytes() for k in (1, 2, 3, 4)]
+
+
+def sog_splats() -> list[bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        return [write_sog(Path(folder) / f"{k}.sog", splat_table(20, degree=k)).read_bytes() for k in (0, 1)]
+
+
 PLACE, LOOK = ["x", "y", "z", "opacity"], ["f_dc_0", "f_dc_1", "f_dc_2"]
 SPLAT = [*PLACE, *LOOK, *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4))]
 PLAYLIST = """
@@ -351,6 +363,8 @@ TARGETS: dict[str, Target] = {
     "splat": Target(splats, file("a.ply", lambda path: bounds(load_gaussians(read_header(path))))),
     "compressed": Target(compressed_splats, file("a.ply", lambda path: bounds(load_compressed(read_header(path))))),
     "dotsplat": Target(small_splats, file("a.splat", lambda path: bounds(load_splat(path)))),
+    "spz": Target(spz_splats, file("a.spz", lambda path: bounds(load_compressed_splats(path)))),
+    "sog": Target(sog_splats, file("a.sog", lambda path: bounds(load_compressed_splats(path)))),
     "playlist": Target(
         lambda: [PLAYLIST.encode(), b'{"show": [{"scene": "flat", "seconds": 3}]}'],
         file("a.toml", lambda path: read_playlist(path, ContentSettings()), json_marks=b"{"),

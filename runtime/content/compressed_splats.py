@@ -1,0 +1,190 @@
+"""Splats compressed as SPZ (versions 1 to 4) and SOG (version 2, as one file or a folder)."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import struct
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logit
+
+from runtime.content.gaussians import COEFFICIENTS, Gaussians, drawable
+from runtime.content.packed_splats import fields_of, with_largest
+from runtime.errors import InputError, one_line
+from runtime.records import F32, U8
+from runtime.support import untrusted_input
+from runtime.support.picture_header import decoded_picture
+from runtime.support.untrusted_input import LIMITS
+
+SPZ_HEADER = struct.Struct("<4sIIBBBBI12x")  # mark, version, count, degree, position bits, flags, streams, their table
+SPZ_SHORT = 16  # bytes of it before version 4
+SPZ_COLOUR = 0.15  # units of a flat harmonic in the range of a colour's byte
+SOG_PARTS = {"means": 2, "scales": 1, "quats": 1, "sh0": 1}  # number of pictures
+FIRST_TAG = 252  # in a turn's alpha, where the first number is the largest
+WIDE = 64  # palette entries in a row of `shN_centroids`
+MOST = max(COEFFICIENTS) // 3  # coefficients of a channel that are drawn: those of degree 4 are left out
+U32 = NDArray[np.uint32]
+
+
+def is_sog_folder(folder: Path) -> bool:
+    """Return True if a folder holds the files of a SOG."""
+    return (folder / "meta.json").is_file() and (folder / "means_l.webp").is_file()
+
+
+def load_compressed_splats(path: Path) -> Gaussians:
+    """Read an SPZ or SOG file, or a folder that holds SOG's pictures. Raises InputError."""
+    try:
+        with np.errstate(all="ignore"):
+            return _spz(path) if path.suffix.lower() == ".spz" else _sog(path)
+    except (InputError, ImportError, MemoryError):
+        raise
+    except Exception as error:  # zlib, zipfile, zstandard and JSON of another shape raise their own
+        raise InputError(path, "", f"is damaged ({one_line(str(error) or type(error).__name__)})") from None
+
+
+def _spz(path: Path) -> Gaussians:
+    """Read bytes of all splats' places, then of opacities, colours, scales, turns and harmonics."""
+    data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
+    zipped = zlib.decompressobj(31) if data[:2] == b"\x1f\x8b" else None
+    head = zipped.decompress(data, SPZ_SHORT) if zipped else data[: SPZ_HEADER.size]
+    mark, version, count, degree, bits, _, _, table = SPZ_HEADER.unpack(head.ljust(SPZ_HEADER.size, b"\0"))
+    if mark != b"NGSP" or not 1 <= version <= 4 or degree > 4:
+        raise InputError(path, "", "is no SPZ of version 1 to 4")
+    untrusted_input.within(count, LIMITS.splats, source=path, field="splats")
+    rest = (degree + 1) ** 2 - 1
+    sizes = [count * each for each in (6 if version == 1 else 9, 1, 3, 3, 3 if version < 3 else 4, 3 * rest)]
+    if zipped:
+        body = zipped.decompress(zipped.unconsumed_tail, sum(sizes) or 1)
+        ends = np.cumsum([0, *sizes])
+        blocks = [body[first:end] for first, end in itertools.pairwise(ends)]
+    else:
+        blocks = _zstd_blocks(data, table, sizes)
+    if [len(block) for block in blocks] != sizes:
+        raise InputError(path, "", f"is cut off: {count:,} splats are promised")
+    places, alphas, colours, scales, turns, higher = (np.frombuffer(block, np.uint8) for block in blocks)
+    harmonics = np.concatenate(
+        [
+            (colours.reshape(count, 1, 3) / np.float32(255) - np.float32(0.5)) / np.float32(SPZ_COLOUR),
+            (higher.reshape(count, rest, 3)[:, :MOST].astype(np.float32) - 128) / 128,
+        ],
+        axis=1,
+    )
+    return drawable(
+        path,
+        centres=places.view("<f2").reshape(count, 3).astype(np.float32) if version == 1 else _fixed(places, bits),
+        log_scales=np.asarray(scales.reshape(count, 3) / 16 - 10, np.float32),
+        quaternions=_three_bytes(turns.reshape(count, 3)) if version < 3 else _four_bytes(turns.view("<u4")),
+        logits=logit(alphas / np.float32(255)),
+        harmonics=harmonics.astype(np.float32),
+    )
+
+
+def _zstd_blocks(data: bytes, table: int, sizes: list[int]) -> list[bytes]:
+    """The streams of version 4, each unpacked to at most its size. Those without a byte may be missing."""
+    import zstandard
+
+    names = [size for size in sizes if size]
+    place, blocks = table + 16 * len(names), []
+    for number, size in enumerate(names):
+        packed, _ = struct.unpack_from("<QQ", data, table + 16 * number)
+        with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(data[place : place + packed]) as stream:
+            blocks.append(stream.read(size))
+        place += packed
+    return [blocks.pop(0) if size else b"" for size in sizes]
+
+
+def _fixed(places: U8, bits: int) -> F32:
+    """(n, 3) of signed numbers of 24 bits, `bits` of them behind the point."""
+    low, middle, high = places.reshape(-1, 3, 3).astype(np.int32).transpose(2, 0, 1)
+    return np.asarray(((high << 24 | middle << 16 | low << 8) >> 8) * 2.0**-bits, np.float32)
+
+
+def _three_bytes(turns: U8) -> F32:
+    """(n, 4) w, x, y, z of x, y and z."""
+    xyz = turns / np.float32(127.5) - 1
+    return np.column_stack([np.sqrt(np.maximum(1 - (xyz**2).sum(1), 0)), xyz]).astype(np.float32)
+
+
+def _four_bytes(turns: U32) -> F32:
+    """(n, 4) w, x, y, z of words: the largest's number among x, y, z, w, and a sign and 9 bits of each other."""
+    share = fields_of(turns, (1, 9, 1, 9, 1, 9))
+    three = (1 - 2 * share[:, ::2]) * share[:, 1::2] * np.float32(np.sqrt(0.5))
+    return np.roll(with_largest(three, turns >> 30), 1, axis=1)
+
+
+def _sog(path: Path) -> Gaussians:
+    """Read pictures with a pixel for each splat, whose bytes lie between bounds or name an entry of a codebook."""
+    with _SogFiles(path) as files:
+        meta = untrusted_input.parsed_json(files.read("meta.json"), source=path, field="meta.json")
+        if meta.get("version") != 2:
+            version = untrusted_input.shown(meta.get("version", 1))
+            raise InputError(path, "meta.json", f"is of SOG's version {version}; 2 is read")
+        count = int(meta["count"])
+        untrusted_input.within(count, LIMITS.splats, source=path, field="splats")
+        low, high, scales, turns, flat = (
+            files.pixels(name, count) for part, number in SOG_PARTS.items() for name in meta[part]["files"][:number]
+        )
+        ends = (np.array(meta["means"][end], np.float32) for end in ("mins", "maxs"))
+        share = (high[:, :3].astype(np.float32) * 256 + low[:, :3]) / 65535
+        first, last = ends
+        logs = first + (last - first) * share
+        harmonics = np.array(meta["sh0"]["codebook"], np.float32)[flat[:, :3]][:, None]
+        if more := meta.get("shN"):
+            palette = files.picture(more["files"][0])
+            entries = palette[..., :3].reshape(-1, palette.shape[1] // WIDE, 3)
+            label = files.pixels(more["files"][1], count)[:, :2].astype(np.int64) @ [1, 256]
+            higher = np.array(more["codebook"], np.float32)[entries[label]]
+            harmonics = np.concatenate([harmonics, higher[:, :MOST]], axis=1)
+    if 3 * (harmonics.shape[1] - 1) not in COEFFICIENTS:
+        raise InputError(path, "shN", "holds no harmonics of degree 1 to 3")
+    three = (turns[:, :3] / np.float32(255) - np.float32(0.5)) * np.float32(np.sqrt(2))
+    return drawable(
+        path,
+        centres=np.sign(logs) * np.expm1(np.abs(logs)),
+        log_scales=np.array(meta["scales"]["codebook"], np.float32)[scales[:, :3]],
+        quaternions=with_largest(three, turns[:, 3].astype(np.uint32) - FIRST_TAG),
+        logits=logit(flat[:, 3] / np.float32(255)),
+        harmonics=harmonics,
+    )
+
+
+class _SogFiles:
+    """The files of a SOG: in a folder, or a ZIP."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._zip = (
+            None
+            if path.is_dir()
+            else zipfile.ZipFile(io.BytesIO(untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)))
+        )
+
+    def __enter__(self) -> _SogFiles:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._zip is not None:
+            self._zip.close()
+
+    def read(self, name: str) -> bytes:
+        if self._zip is None:
+            return untrusted_input.read_bytes(self._path / Path(name).name, most_bytes=LIMITS.file_bytes)
+        untrusted_input.within(self._zip.getinfo(name).file_size, LIMITS.file_bytes, source=self._path, field=name)
+        return self._zip.read(name)
+
+    def picture(self, name: str) -> U8:
+        """(h, w, 4) RGBA. Raises InputError."""
+        image = decoded_picture(self.read(name), source=self._path, field=untrusted_input.shown(name), name="")
+        return np.asarray(image.convert("RGBA"))
+
+    def pixels(self, name: str, count: int) -> U8:
+        """(count, 4) RGBA of the first pixels. Raises ValueError where there are fewer."""
+        found = self.picture(name).reshape(-1, 4)[:count]
+        if len(found) < count:
+            raise ValueError(f"{untrusted_input.shown(name)} has {len(found)} of {count} pixels")
+        return found
