@@ -120,7 +120,7 @@ def _four_bytes(turns: U32) -> F32:
 def _sog(path: Path) -> Gaussians:
     """Read pictures with a pixel for each splat, whose bytes lie between bounds or name an entry of a codebook."""
     with _SogFiles(path) as files:
-        meta = untrusted_input.parsed_json(files.read("meta.json"), source=path, field="meta.json")
+        meta = untrusted_input.parsed_json(files.read("meta.json"), source=path)
         if meta.get("version") != 2:
             version = untrusted_input.shown(meta.get("version", 1))
             raise InputError(path, "meta.json", f"is of SOG's version {version}; 2 is read")
