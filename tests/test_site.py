@@ -31,7 +31,7 @@ def test_the_python_that_a_page_shows_runs(page: str, tmp_path: Path) -> None:
         [sys.executable, "-c", python_of(page)], cwd=tmp_path, capture_output=True, text=True, timeout=600
     )
     assert done.returncode == 0, done.stderr
-    assert page != "README.md" or "(3, 512, 512, 3)" in done.stdout
+    assert page != "README.md" or "(3, 360, 640, 3)" in done.stdout
 
 
 @pytest.mark.slow
