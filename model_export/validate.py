@@ -87,7 +87,7 @@ def check_model(data: bytes, *, source: str, reference: Reference | None = None)
         model = onnx.load_from_string(data)
         onnx.checker.check_model(model)
     except Exception as error:  # protobuf and onnx raise their own
-        raise InputError(source, "", f"is no ONNX model ({_said(error)})") from None
+        raise InputError(source, "", f"is not an ONNX model ({_said(error)})") from None
     contract = parse_contract({item.key: item.value for item in model.metadata_props}, source=source)
     checks = [Check("contract", f"{contract.arch} {contract.name}", f"version {VERSION}", True)]
     try:

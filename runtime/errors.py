@@ -115,7 +115,7 @@ def retry_advised() -> Iterator[None]:
     except Exception as error:
         if isinstance(error, TransientError) or not is_retryable(error):
             raise
-        raise TransientError(f"{str(error) or type(error).__name__} (this may pass: start again)") from error
+        raise TransientError(f"{str(error) or type(error).__name__} (temporary: try again)") from error
 
 
 def is_retryable(error: BaseException | None) -> bool:

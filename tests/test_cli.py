@@ -1,4 +1,4 @@
-"""The command line: what a user gets wrong is answered in one line with exit 2, and nothing is left behind."""
+"""The command line: a user's mistake is one line and exit 2, and leaves no files."""
 
 from __future__ import annotations
 

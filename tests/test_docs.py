@@ -1,4 +1,4 @@
-"""Pages lead somewhere: what they link to, name, and show to be typed (shell, Python, TOML) is there and is taken."""
+"""Links and names in pages exist, and their commands, Python and TOML are valid."""
 
 from __future__ import annotations
 

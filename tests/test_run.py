@@ -41,7 +41,7 @@ SOLVING_STAGES = {"render", "prepare", "inference", "finish"}
 
 
 def files_of(folder: Path) -> dict[str, str]:
-    """Digest of every file in a folder, whatever its name."""
+    """Digest of every file in a folder."""
     paths = sorted(path for path in folder.rglob("*") if path.is_file())
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
 
@@ -146,7 +146,7 @@ def test_what_a_line_tells_agrees_with_the_lines_before_it(runs: tuple[Path, Pat
 
 
 def known(folder: Path) -> list[dict[str, Any]]:
-    """The lines whose truth the recording had told when the run ended: all but those of its last few samples."""
+    """Lines with known truth when the run ended: all but those of the last few samples."""
     lines = lines_of(folder)
     newest_ns = max(line["capture_ns"] for line in lines)
     told = [line for line in lines if line["true_eyes_m"] is not None]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-# `phasestack` in a process of its own, whose solver is never late: a busy machine is no fault.
+# `phasestack` in a separate process, whose solver is never late, even on a busy machine.
 PATIENT = (
     "from runtime.cli import main; from runtime.frame import solver_thread; "
     "solver_thread.LATE_S, solver_thread.ABANDON_S = 60.0, 600.0; main()"

@@ -42,7 +42,7 @@ def report(
                 progress=tell,
             )
     except KeyboardInterrupt:
-        typer.echo(f"report: stopped; {out / 'index.html'} has what was measured until then", err=True)
+        typer.echo(f"report: stopped; {out / 'index.html'} has the measurements so far", err=True)
         raise
     if as_json:
         print(to_json(record))

@@ -75,7 +75,7 @@ def read_folder(folder: Path, preset: str) -> tuple[Pair, ...]:
         if left_eye[1] == right_eye[1]:
             raise InputError(left, f"pair{number}", "both eyes are at the same y: left can't be told from right")
         if name == "right":
-            raise InputError(right, f"pair{number}", f"_left stands to the right of _right with preset {preset}")
+            raise InputError(right, f"pair{number}", f"_left is to the right of _right with preset {preset}")
         pairs.append(Pair(number, (left, right), np.array([left_eye, right_eye]), stack_from_scene[:3, 3]))
     return tuple(pairs)
 

@@ -89,7 +89,7 @@ class PictureFiles(Frames):
             raise refused[0]
         if refused:
             some = "; ".join(f"{Path(error.source).name} {error.problem}" for error in refused[:TOLD])
-            log.warning("%s: %d of %d pictures are left out: %s", folder, len(refused), len(paths), some)
+            log.warning("%s: %d of %d pictures are skipped: %s", folder, len(refused), len(paths), some)
         self._held = -1, np.empty((0, 0, 3), np.uint8)
         self._held = 0, self._read(0)
         self.count, self.rate_hz = len(self._paths), settings.picture_rate_hz

@@ -74,7 +74,7 @@ def load_gaussians(header: PlyHeader) -> Gaussians:
     def columns(*wanted: str) -> F32:
         """(n, len(wanted)) numbers."""
         if missing := [name for name in wanted if name not in names]:
-            raise InputError(path, missing[0], "the property is missing: this is no 3D Gaussian splat file")
+            raise InputError(path, missing[0], "the property is missing: not a 3D Gaussian splat file")
         with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite
             return np.column_stack([table[name] for name in wanted]).astype(np.float32)
 
@@ -111,7 +111,7 @@ def drawable(path: Path, *, centres: F32, log_scales: F32, quaternions: F32, log
         logits, harmonics = logits[usable], harmonics[usable]
     opacities = np.asarray(expit(logits.astype(np.float64)), dtype=np.float32)
     if not (opacities > ALPHA_MIN).any():
-        raise InputError(path, "opacity", "no splat can be seen")
+        raise InputError(path, "opacity", "no splat is visible")
     return Gaussians(centres, covariances_of(np.exp(log_scales), quaternions), opacities, harmonics)
 
 

@@ -54,7 +54,7 @@ class GltfScene:
             self._check()
             self._read()
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-            raise InputError(path, "", f"is damaged, or no glTF ({_problem(error)})") from None
+            raise InputError(path, "", f"is damaged, or not glTF ({_problem(error)})") from None
 
     def _check(self) -> None:
         file, path = self.file, self.path

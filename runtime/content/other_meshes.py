@@ -98,7 +98,7 @@ def read_mesh(path: Path, data: bytes, read: Read) -> tuple[list[Part], list[tup
         why = (
             "a face names a vertex that does not exist"
             if isinstance(error, IndexError)
-            else "it is damaged, or no mesh"
+            else "it is damaged, or not a mesh"
         )
         raise InputError(path, "", f"cannot be read as a mesh: {why}") from None
     if resolver.refused is not None:
@@ -152,7 +152,7 @@ def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8]) -> Part:
     """A trimesh as a part: its material, or the colours of its faces or vertices; grey without any."""
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError(path, "faces", "are no triangles of vertices that are there")
+        raise InputError(path, "faces", "are not triangles of existing vertices")
     visual, kind = mesh.visual, mesh.visual.kind
     picture, colour, opacity, colours = None, UNCOLOURED, 1.0, None
     if kind == "texture":

@@ -59,7 +59,7 @@ def read_header(path: Path) -> PlyHeader:
     text, mark, _ = head.partition(b"end_header")
     newline = head.find(b"\n", len(text))
     if not head.startswith(b"ply") or not mark or newline < 0:
-        raise InputError(path, "header", "no whole PLY header")
+        raise InputError(path, "header", "the PLY header is incomplete")
     order, counts, properties = "", dict[str, int](), dict[str, list[tuple[str, str]]]()
     for line in text.decode("latin-1").splitlines()[1:]:
         match line.split():
@@ -84,7 +84,7 @@ def read_header(path: Path) -> PlyHeader:
         most = getattr(LIMITS, kind) * (3 if kind == "triangles" and name == "vertex" else 1)
         untrusted_input.within(count, most, source=path, field=field)
         if count > size:  # the shortest has a byte
-            raise InputError(path, field, f"the file is cut off: {count:,} are promised in {size:,} bytes")
+            raise InputError(path, field, f"the file is cut off: {count:,} are declared in {size:,} bytes")
     return header
 
 
@@ -103,11 +103,11 @@ def read_elements(header: PlyHeader) -> dict[str, Table]:
             dtype = np.dtype([(field, ORDERS[header.order] + kind) for field, kind in header.properties[name]])
             held = (header.size - place) // max(dtype.itemsize, 1)
             if held < count:
-                problem = f"the file is cut off: {count} are promised and {max(held, 0)} there"
+                problem = f"the file is cut off: {count} are declared, {max(held, 0)} present"
                 raise InputError(path, untrusted_input.shown(name), problem)
             file.seek(place)
             found[name] = np.frombuffer(file.read(count * dtype.itemsize), dtype)
             place += count * dtype.itemsize
     if "vertex" not in found:
-        raise InputError(path, "vertex", "must stand before lists, with one number a property")
+        raise InputError(path, "vertex", "must come before lists, with one number per property")
     return found

@@ -110,10 +110,12 @@ class Programs:
                 self._connected, HOST, port, process_request=self._refused, max_size=most_bytes, compression=None
             )
         except OSError as error:
-            raise InputError("content.options", "port", f"{port}: can't be listened on ({error.strerror})") from None
+            raise InputError(
+                "content.options", "port", f"{port}: cannot be opened for listening ({error.strerror})"
+            ) from None
         self.address = f"ws://{HOST}:{self._server.socket.getsockname()[1]}/?token={self._token}"
         begin("programs", self._server.serve_forever)
-        log.info("a program may draw: its address is in `phasestack status` (program)")
+        log.info("waiting for a program; its address is in `phasestack status` (program)")
 
     def ask(self, views: Sequence[View], *, time_ns: int) -> int:
         """Request a frame's pictures and return its number. Raises ContentFailure without a program."""
@@ -132,7 +134,7 @@ class Programs:
                 connection.send(message)
         if program is None:
             why = f" ({self.problem})" if self.problem else ""
-            raise ContentFailure(f"no program draws{why}: where it may connect is in the status (program)")
+            raise ContentFailure(f"no program is connected{why}: its address is in the status (program)")
         if number not in self._frames:
             raise ContentFailure(f"the program is late: {IN_FLIGHT_MAX} frames are not answered")
         return number
@@ -189,7 +191,7 @@ class Programs:
                     self._drawing, self.problem = None, why
                     self._frames.clear()
                     self._changed.notify_all()
-                    log.warning("a program draws no more: %s", why)
+                    log.warning("the program disconnected: %s", why)
 
     def _welcome(self, connection: ServerConnection, hello: dict[str, Any]) -> None:
         with self._changed:

@@ -49,7 +49,7 @@ def split_rgbd(rgb: U8, path: Path) -> tuple[U8, F32]:
         raise InputError(path, "layout", "the picture is too small for colour and depth side by side")
     depth = rgb[:, width : 2 * width]
     if np.ptp(depth[::4, ::4].astype(np.int16), axis=2).max() > 24:
-        raise InputError(path, "layout", "the right half is no grey depth map")
+        raise InputError(path, "layout", "the right half is not a grey depth map")
     return np.ascontiguousarray(rgb[:, :width]), depth.mean(2, dtype=np.float32) / 255
 
 

@@ -160,7 +160,7 @@ class Recording:
         first = next(self.samples(), None)
         if first is None:
             cut_off = "" if self.is_whole else " (it is cut off before the first one ends)"
-            raise InputError(path, "", f"holds no whole sample{cut_off}")
+            raise InputError(path, "", f"contains no complete sample{cut_off}")
         self.first = first
 
     def _opened(self) -> IO[bytes]:

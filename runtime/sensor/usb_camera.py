@@ -52,7 +52,7 @@ class UsbCameraDriver(Sensor):
     def open(self) -> None:
         self.close()
         if self._is_device and not Path(self._source).exists():
-            raise SensorLost(f"{self._source}: there is no such camera")
+            raise SensorLost(f"{self._source}: no such camera")
         capture = self._opened()
         if not capture.isOpened():
             capture.release()
@@ -73,7 +73,7 @@ class UsbCameraDriver(Sensor):
         for _ in range(QUEUE_MAX):
             begin_ns = self._clock.now_ns()
             if not self._capture.grab():  # blocks until the next one; the worker's timeout handles a hang
-                raise SensorLost(f"{self._source}: delivers no more pictures")
+                raise SensorLost(f"{self._source}: stopped delivering pictures")
             self._number += 1
             now_ns = self._clock.now_ns()
             if not self._is_device or now_ns - begin_ns > WAITED_NS:

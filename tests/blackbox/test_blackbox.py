@@ -1,4 +1,4 @@
-"""A black box beside a run: bounded, written at a fault, an error, or when asked; a recording that can be replayed."""
+"""The black box of a run: bounded, written at a fault, an error, or when asked; a recording that can be replayed."""
 
 from __future__ import annotations
 
@@ -178,7 +178,7 @@ def test_a_fault_writes_what_preceded_and_followed_it_for_its_owner_alone(tmp_pa
     reason = [m.value for m in messages if m.topic == "/state" and m.value["state"] == "degraded"][-1]
     assert reason["missing"] == ["sensor"] and "unplugged" in reason["reason"]
     assert any("degraded: sensor" in m.value["message"] for m in messages if m.topic == "/log")
-    assert len(list(tmp_path.iterdir())) == 1  # nothing half-written beside it
+    assert len(list(tmp_path.iterdir())) == 1  # no partial file next to it
 
 
 def test_a_start_without_a_sensor_is_no_fault(tmp_path: Path, monkeypatch: Any) -> None:

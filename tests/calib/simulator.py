@@ -1,6 +1,6 @@
-"""Photographs of a stack whose panels are not where they should be; points alone where pictures would take time.
+"""Simulated photographs of a misaligned stack, or their points alone where pictures would take time.
 
-A photograph adds the panels' phases along every ray, each panel where it truly is; sin² of the sum is what is seen
+A photograph adds the panels' phases along every ray, each panel at its true place; the intensity is sin² of the sum
 (EyeReal, (7)). The lens is a pinhole that darkens the corners, the sensor adds shot and read noise.
 """
 
@@ -22,7 +22,7 @@ from runtime.optics.malus import intensity_from_phase
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 
-SAMPLES = 3  # by as many, of what a pixel of the camera sees
+SAMPLES = 3  # per axis and pixel of the camera
 BLUR_PX = 0.7  # standard deviation: lens and focus
 ELECTRONS, READ_NOISE = 4000.0, 0.003  # at full scale: shot noise; of full scale
 VIGNETTING = 0.3  # loss of light in the corners
@@ -50,7 +50,7 @@ class Camera:
 def photograph(
     phases: U8, panels: Sequence[PlacedPanel], stack: PanelStack, camera: Camera, pose: F64, random: np.random.Generator
 ) -> U8:
-    """(h, w) what a camera at `pose` (4, 4; camera_from_stack) sees of panels with 8-bit codes (N, H, W)."""
+    """Photograph (h, w) by a camera at `pose` (4, 4; camera_from_stack) of panels with 8-bit codes (N, H, W)."""
     size = (SAMPLES * camera.width_px, SAMPLES * camera.height_px)
     middle = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # a pixel's centre from its index
     fine = np.diag([SAMPLES, SAMPLES, 1.0])
@@ -82,10 +82,10 @@ def camera_from_stack(place_m: F64, *, towards_m: F64, roll_rad: float = 0.0) ->
 
 
 def by_hand(count: int, stack: PanelStack, *, random: np.random.Generator) -> list[F64]:
-    """`count` poses (4, 4) of a camera that is held by hand round a display, as `docs/setup.md` asks for.
+    """`count` poses (4, 4) of a hand-held camera round a display, as `docs/setup.md` requests.
 
-    In turn from the middle, the left, the right, above and below; some with the camera on its side; so near that the
-    panel fills most of the picture.
+    They cycle through the middle, the left, the right, above and below; some have the camera on its side; the panel
+    fills most of the picture.
     """
     directions = [(0, 0), (-32, 4), (32, 4), (0, 24), (0, -22), (-22, 20), (22, 20), (-22, -18), (22, -18), (-38, 0),
                   (38, 0), (12, -26)]  # fmt: skip

@@ -92,7 +92,7 @@ def test_a_recording_that_does_not_know_its_truth_is_refused(tmp_path: Path) -> 
 
 
 def test_the_demo_recording_calibrates_itself(tmp_path: Path) -> None:
-    """From end to end: its own truth gives back the geometry that it was made with, to the millimetre."""
+    """End to end: a recording's truth reproduces its geometry to the millimetre."""
     told = capture("--replay", "demo", "--out", str(tmp_path / "p.csv"))
     assert told["pairs"] >= 8
     result = run.invoke(app, ["solve", "--pairs", str(tmp_path / "p.csv"), "--out", str(tmp_path / "c.toml"), "--json"])
@@ -102,7 +102,7 @@ def test_the_demo_recording_calibrates_itself(tmp_path: Path) -> None:
 
 
 def test_a_person_at_the_terminal_takes_pairs_from_a_sensor(tmp_path: Path) -> None:
-    """The command itself in a process of its own: Enter, again and again, until the sensor has seen enough."""
+    """Run the command in a separate process, with Enter pressed until enough samples have arrived."""
     viewpoint = grid()[0]
     source = recording(tmp_path / "r.mcap", [viewpoint.midpoint_m] * 30, true=False)
     (tmp_path / "config.toml").write_text(f'[sensor]\ndriver = "replay"\nsource = "{source}"\n')

@@ -1,4 +1,4 @@
-"""Pairs from people's files: read, or refused with the row and the column; captured ones are safe at once."""
+"""Pairs from people's files: read, or refused with the row and the column; captured pairs are saved immediately."""
 
 from __future__ import annotations
 

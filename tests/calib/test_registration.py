@@ -1,4 +1,4 @@
-"""Registration by photographs, on points alone: what is found, how sure, and what is refused."""
+"""Registration by photographs, on points alone: results, their standard errors, and refusals."""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ def test_keys_alone_lead_from_nothing_to_a_configuration_that_is_valid(tmp_path:
     eyes = np.array([viewpoint.midpoint_m for viewpoint in grid()])
     sensor = np.column_stack([eyes, np.ones(27)]) @ np.linalg.inv(demo_stack_from_sensor()).T
     assert np.linalg.norm((sensor @ found.T)[:, :3] - eyes, axis=1).mean() < 0.002
-    there = shutil.copytree(folder / "out" / "service", tmp_path / "etc")  # what the service reads stands by itself
+    there = shutil.copytree(folder / "out" / "service", tmp_path / "etc")  # the service's folder is self-contained
     settings = load_settings(there / "phasestack.toml")
     assert Path(settings.calibration.file) == there / "calibration.toml"
     assert [Path(panel.lut) for panel in settings.output.panels] == [there / f"panel-{n}.csv" for n in range(3)]
@@ -102,7 +102,7 @@ def test_keys_alone_lead_from_nothing_to_a_configuration_that_is_valid(tmp_path:
 
 
 def scripted(tmp_path: Path, lines: list[str], keys: Sequence[Key] = (), kind: type = SimulatedHardware) -> Setup:
-    """A setup whose lines and keys are given, without a terminal; what it says is `setup.say.__self__`."""
+    """Setup with given lines and keys, without a terminal; `setup.say.__self__` holds its output."""
     pressed, typed, said = iter(keys), iter(lines), list[str]()
     hardware = kind(lambda: next(pressed, Key.QUIT), STACK, say=said.append, seed=1)
     return Setup(tmp_path / "c.toml", tmp_path / "out", hardware, said.append, lambda: next(typed, "q"))
@@ -204,7 +204,7 @@ def test_nothing_is_asked_of_a_terminal_that_is_closed(tmp_path: Path) -> None:
 
 
 def test_rewriting_a_configuration_widens_no_permission_and_keeps_links(tmp_path: Path) -> None:
-    """A camera's password in it: setup made 0600 to 0644, and the link a file of its own."""
+    """The file holds a camera's password: setup once changed 0600 to 0644 and replaced the link by a copy."""
     (tmp_path / "kept").mkdir()
     config, link = tmp_path / "kept" / "display.toml", tmp_path / "phasestack.toml"
     config.write_text('[content]\nscene = "rtsp://user:secret@cam/1"\n')  # pragma: allowlist secret

@@ -24,7 +24,7 @@ def shared_context() -> Any:
 
 @pytest.fixture
 def context(shared_context: Any) -> Iterator[Any]:
-    """The shared context, current again whatever another test made current."""
+    """The shared context, made current again."""
     with shared_context:
         yield shared_context
 

@@ -1,4 +1,4 @@
-"""glTF files written by hand: arrays in one buffer, and what the tests say of them."""
+"""glTF files written by hand: arrays in one buffer, and the tests' tables."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A source that is closed leaves nothing in the graphics memory: scenes may change for ever."""
+"""A closed source leaves no GL object, so that scenes can change without limit."""
 
 from __future__ import annotations
 

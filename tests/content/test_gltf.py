@@ -55,7 +55,7 @@ def painted(path: Path, b: Buffer, primitive: dict[str, Any], picture: np.ndarra
 
 
 def columns(picture: np.ndarray) -> str:
-    """Colours along the middle row, from left to right: r, g, b, or - where nothing is."""
+    """Colours along the middle row, from left to right: r, g, b, or - for the background."""
     row = picture[picture.shape[0] // 2]
     letters = ["-" if pixel[3] < 255 else "rgb"[int(pixel[:3].argmax())] for pixel in row]
     return "".join(one for one, before in zip(letters, ["", *letters], strict=False) if one != before).strip("-")
@@ -106,7 +106,7 @@ def test_every_mode_of_triangles_is_drawn_from_its_front(
 
 
 def test_a_sparse_accessor_replaces_what_it_names(tmp_path: Path) -> None:
-    """Section 3.6.2.3, with and without a buffer view of its own."""
+    """Section 3.6.2.3, with and without a separate buffer view."""
     b = Buffer()
     places, moved = b.add([3], np.uint16), b.add([[-3, 3, 0]])
     sparse = {"count": 1, "indices": {"bufferView": 0, "componentType": 5123}, "values": {"bufferView": 1}}
@@ -289,7 +289,7 @@ def test_factor_picture_and_vertices_multiply_as_light(tmp_path: Path, context: 
 
 
 def test_the_lamp_dims_what_is_lit_alone(tmp_path: Path, context: Any, stack: PanelStack) -> None:
-    """Unlit shows the picture's own values; lit ones follow the lamp, whatever is multiplied."""
+    """Unlit shows the picture's own values; lit ones follow the lamp with any factors."""
     grey = np.full((1, 1, 4), (200, 200, 200, 255), np.uint8)
     base = {"baseColorTexture": {"index": 0}}
     seen = []

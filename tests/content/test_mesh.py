@@ -1,4 +1,4 @@
-"""Meshes from files: placed, coloured, textured; and what a broken file is told."""
+"""Meshes from files: placed, coloured, textured; and messages for broken files."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_a_fitted_mesh_fills_the_display_or_its_depth(tmp_path: Path, context: A
     rear, front = depth_of(source_of(path, context, stack, depth_m=(-0.3, 0.3)))
     assert front == pytest.approx(-rear)
     assert front - rear == pytest.approx(30 * 0.75 * stack.width_m / 100, rel=1e-3)
-    # Where depth is short it begins at the front and reaches twice as deep.
+    # A shallow depth range starts at the front and may reach twice as deep.
     rear, front = depth_of(source_of(path, context, stack, depth_m=(-0.01, 0.03)))
     assert (rear, front) == pytest.approx((-0.05, 0.03), abs=1e-4)
 
@@ -114,7 +114,7 @@ def test_a_fitted_mesh_fills_the_display_or_its_depth(tmp_path: Path, context: A
 @pytest.mark.parametrize(
     ("low", "high", "axes"),
     [
-        ((-0.036, -0.037, 0.004), (0.036, 0.037, 0.219), ("+z", "-y")),  # a bottle that stands on z = 0
+        ((-0.036, -0.037, 0.004), (0.036, 0.037, 0.219), ("+z", "-y")),  # a bottle with its base at z = 0
         ((-0.095, 0.033, -0.062), (0.061, 0.186, 0.059), ("+y", "+z")),  # a rabbit above y = 0
         ((-0.266, -0.332, -0.263), (0.266, 0.332, 0.264), ("+y", "+z")),  # a chair around the origin: its longer axis
     ],
@@ -133,7 +133,7 @@ CARD = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]  # in the plane of two a
 def test_what_is_flat_shows_its_front(
     tmp_path: Path, context: Any, stack: PanelStack, suffix: str, turns: tuple[float, ...]
 ) -> None:
-    """Whichever way a card lies in its file, it fills the display's height with its front."""
+    """A card of any orientation in its file fills the display's height with its front."""
     columns = [np.array(CARD)[:, abs(int(axis))] * (-1 if np.signbit(axis) else 1) for axis in turns]
     trimesh.Trimesh(np.column_stack(columns), [[0, 1, 2], [0, 2, 3]], process=False).export(tmp_path / f"a{suffix}")
     source = source_of(tmp_path / f"a{suffix}", context, stack)
@@ -147,7 +147,7 @@ def test_what_is_flat_shows_its_front(
 def test_up_is_what_the_format_has_by_custom(
     tmp_path: Path, context: Any, stack: PanelStack, suffix: str, up: str
 ) -> None:
-    """A pole along the file's axis stands, however the numbers lie."""
+    """A pole along the file's up axis is upright at any offset."""
     pole = trimesh.creation.box((1, 5, 1) if up == "y" else (1, 1, 5))
     pole.export(tmp_path / f"a{suffix}")
     picture = source_of(tmp_path / f"a{suffix}", context, stack).render(panel_view(EYE, stack.panel(1)), time_ns=0)

@@ -1,4 +1,4 @@
-"""Pictures as cameras, phones and browsers write them: views, colours, movement, and what is refused."""
+"""Pictures as cameras, phones and browsers write them: views, colours, movement, and refusals."""
 
 from __future__ import annotations
 
@@ -176,7 +176,7 @@ def square_px(view: U8) -> tuple[float, int, int]:
 
 @pytest.mark.parametrize("name", ["a_360.png", "a_equirect.jpg", "a_360_TB.png", "a_180_LR.png", "a_180_hsbs.png"])
 def test_of_a_picture_all_around_the_view_ahead_is_shown(tmp_path: Path, name: str) -> None:
-    """Twenty degrees to the right lie at tan(20)/tan(37.5) of the half width."""
+    """Twenty degrees to the right are at tan(20)/tan(37.5) of the half width."""
     span_deg = 180 if "180" in name else 360
     one = around(20, span_deg=span_deg)
     picture = np.concatenate([one, one], axis=0) if "TB" in name else np.concatenate([one, one], axis=1)
@@ -292,7 +292,7 @@ def test_what_a_folder_holds_besides_is_left_out_and_named(tmp_path: Path, caplo
         open_frames(tmp_path, AUTO)
     write_png(tmp_path / "c.png", solid(RED))
     assert open_frames(tmp_path, AUTO).count == 1
-    assert "2 of 3 pictures are left out: a.jxl is JPEG XL" in caplog.text and "b.png is not an image" in caplog.text
+    assert "2 of 3 pictures are skipped: a.jxl is JPEG XL" in caplog.text and "b.png is not an image" in caplog.text
 
 
 @pytest.mark.parametrize(("kind", "first_ms"), [("GIF", 200), ("WEBP", 200), ("PNG", 200), ("AVIF", 200)])

@@ -176,7 +176,7 @@ def test_an_rgbd_picture_has_parallax_of_the_right_size(tmp_path: Path, context:
 
 def test_an_rgbd_picture_without_depth_is_told(tmp_path: Path, context: Any, stack: PanelStack) -> None:
     write_png(tmp_path / "a_rgbd.png", np.concatenate([solid(RED), solid(BLUE)], axis=1))
-    with pytest.raises(InputError, match=r"a_rgbd.png: layout: the right half is no grey depth map"):
+    with pytest.raises(InputError, match=r"a_rgbd.png: layout: the right half is not a grey depth map"):
         opened(tmp_path / "a_rgbd.png", context, stack)
 
 

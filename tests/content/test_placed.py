@@ -69,7 +69,7 @@ def test_a_turntable_turns_by_the_clock(context: Any, stack: PanelStack) -> None
     assert (pictures[0] != pictures[1]).any()
     assert (pictures[0] == pictures[2]).all()  # six turns a minute
     assert source.revision(time_ns=1) != source.revision(time_ns=2)
-    assert placed_source(source, Placing()) is source.source  # placed anew, not on top
+    assert placed_source(source, Placing()) is source.source  # a new placement replaces the old one
     source.close()
 
 

@@ -1,4 +1,4 @@
-"""Playlists: which scene is shown when, what each has of its own, and what is told of one that is wrong."""
+"""Playlists: the scene shown at each time, settings of entries, and messages for wrong ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A scene of a user's own: one file on Python's path, one line of TOML; and what a wrong one is told."""
+"""A custom scene: one file on Python's path, one line of TOML; and messages for wrong ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The built-in scenes: where points land, which surface is in front, and that nothing changes from run to run."""
+"""The built-in scenes: where points land, which surface is in front, and equality from run to run."""
 
 from __future__ import annotations
 

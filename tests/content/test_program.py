@@ -45,7 +45,7 @@ def source() -> Iterator[Any]:
 
 
 def picture_of(asked: dict, eye: dict) -> bytes:
-    """Its red tells whose it is, its green which row (from above)."""
+    """Red encodes the eye, green the row (from above)."""
     picture = np.zeros((asked["height"], asked["width"], 4), np.uint8)
     picture[..., 0] = 200 if eye["eye"] == "left" else 100
     picture[..., 1] = np.arange(asked["height"])[:, None]
@@ -54,7 +54,7 @@ def picture_of(asked: dict, eye: dict) -> bytes:
 
 
 class Program:
-    """Answers as it is told to, on a thread of its own."""
+    """Answers as instructed, on a separate thread."""
 
     def __init__(self, source: Any, answer: Callable[..., bytes | None] = picture_of, **hello: Any) -> None:
         self.asked: list[dict] = []
@@ -128,7 +128,7 @@ def test_matrices_put_points_where_the_view_has_them(source: Any, placed: bool) 
 
 
 def test_without_a_program_the_state_says_where_one_may_connect(source: Any) -> None:
-    with pytest.raises(ContentFailure, match="no program draws: where it may connect"):
+    with pytest.raises(ContentFailure, match="no program is connected: its address"):
         drawn(source)
 
 
@@ -197,7 +197,7 @@ def test_who_begins_with_nonsense_is_sent_away(source: Any, hello: Any) -> None:
         socket.send(hello)
         with pytest.raises(ConnectionClosed):
             socket.recv(10)
-    with pytest.raises(ContentFailure, match="no program draws"):
+    with pytest.raises(ContentFailure, match="no program is connected"):
         drawn(source)
 
 

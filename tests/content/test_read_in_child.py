@@ -1,6 +1,6 @@
-"""Files of nobody knows whom are read in another process: what is drawn is the same, memory and time have limits.
+"""Untrusted files are read in another process: same pictures, limited memory and time.
 
-Sizes beside the tests: what the same file took before in the process that shows pictures.
+Sizes in comments: memory that the same file used to take in the display's process.
 """
 
 from __future__ import annotations

@@ -168,7 +168,7 @@ def test_an_unusable_splat_is_left_out_and_a_line_says_so(
 def test_a_file_without_a_usable_splat_is_refused(tmp_path: Path) -> None:
     table = splat_table(50)
     table["x"] = np.nan
-    with pytest.raises(InputError, match="opacity: no splat can be seen"):
+    with pytest.raises(InputError, match="opacity: no splat is visible"):
         loaded(written(tmp_path, table))
 
 
@@ -259,7 +259,7 @@ def test_a_compressed_file_stands_by_its_format_s_custom(tmp_path: Path, stack: 
         ("a.sog", lambda data: data.replace(b'"version": 2', b'"version": 3'), "is damaged (Bad CRC-32"),
         ("a.splat", lambda data: data[:-1], "is cut off, or no .splat: it has 19199 bytes, no multiple of 32"),
         ("a.splat", lambda data: b"", "is cut off, or no .splat: it has 0 bytes"),
-        ("a.ply", lambda data: data[:-1], "vertex: the file is cut off: 600 are promised and 599 there"),
+        ("a.ply", lambda data: data[:-1], "vertex: the file is cut off: 600 are declared, 599 present"),
         ("a.ply", lambda data: data.replace(b"element chunk", b"element chumk"), "chunk: is missing"),
     ],
 )
@@ -283,7 +283,7 @@ def edited(folder: Path, old: bytes, new: bytes, cut: int = 0) -> Path:
 @pytest.mark.parametrize(
     ("old", "new", "cut", "told"),
     [
-        (b"", b"", 100, "vertex: the file is cut off: 20 are promised and 19 there"),
+        (b"", b"", 100, "vertex: the file is cut off: 20 are declared, 19 present"),
         (b"vertex 20", b"vertex 2999999", 0, "element vertex: the file is cut off"),
         (b"vertex 20", b"vertex 3000001", 0, "element vertex: 3,000,001 is over the limit of 3,000,000"),
         (b"vertex 20", b"vertex 0", 0, "vertex: there are none"),
@@ -292,7 +292,7 @@ def edited(folder: Path, old: bytes, new: bytes, cut: int = 0) -> Path:
             b"property float x",
             b"property list uchar float x",
             0,
-            "vertex: must stand before lists, with one number a property",
+            "vertex: must come before lists, with one number per property",
         ),
         (
             b"property float nx",
@@ -301,7 +301,7 @@ def edited(folder: Path, old: bytes, new: bytes, cut: int = 0) -> Path:
             "vertex: the header has no format, no vertices, or one of their properties twice",
         ),
         (b"property float nx", b"property words nx", 0, "header: not understood: property words nx"),
-        (b"end_header", b"comment", 0, "header: no whole PLY header"),
+        (b"end_header", b"comment", 0, "header: the PLY header is incomplete"),
         (b"format binary_little_endian 1.0\n", b"", 0, "vertex: the header has no format"),
         (b"format binary_little_endian", b"format ascii", 0, "format: is ascii"),
     ],

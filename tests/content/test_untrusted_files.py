@@ -1,4 +1,4 @@
-"""Files that promise too much, nest too deep or are no files: refused from their headers, in one line, in no time."""
+"""Files that declare too much, nest too deep or are not files: refused by their headers, in one line, quickly."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from runtime.support.untrusted_input import LIMITS
 from tests.content.gltf_files import Buffer
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 480, 270)
-HANG_S = 30  # what took minutes, or for ever
+HANG_S = 30  # these once took minutes, or never ended
 
 
 def png(width: int, height: int) -> bytes:
@@ -130,7 +130,7 @@ def test_a_large_video_is_refused_and_a_smaller_one_is_not(tmp_path: Path, monke
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.mkv"])
 def test_a_playlist_under_a_videos_name_opens_no_other_file(tmp_path: Path, name: str) -> None:
-    """FFmpeg tells a container by its content, and a playlist names files and addresses."""
+    """FFmpeg recognises a container by its content, and a playlist names files and addresses."""
     other = video(tmp_path / "secret.mp4", (64, 48))
     for text in (
         f"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n{other}\n#EXT-X-ENDLIST\n",
@@ -228,7 +228,7 @@ def ply(folder: Path, vertices: Any, faces: Any, form: str = "binary_little_endi
     [
         (9, 10_000_000, "element face: 10,000,000 is over the limit of 2,000,000"),
         (10**18, 1, "is over the limit of 6,000,000"),
-        (9, 1_999_999, "the file is cut off: 1,999,999 are promised in"),
+        (9, 1_999_999, "the file is cut off: 1,999,999 are declared in"),
         ("²", 1, "element vertex: is not a whole number: ²"),
         (9, "²", "element face: is not a whole number: ²"),
         ("9" * 5000, 1, "element vertex: is a number of 5000 digits"),
@@ -314,13 +314,13 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
     "an older version": (gltf(asset={"version": "1.0"}), "asset.version: is 1.0, which is not read; convert it"),
     "an accessor beyond its view": (
         gltf(accessors=[{"bufferView": 0, "componentType": 5126, "count": 99, "type": "VEC3"}] * 2),
-        "is damaged, or no glTF (an accessor reaches beyond its buffer view)",
+        "is damaged, or not glTF (an accessor reaches beyond its buffer view)",
     ),
     "a corner that is not there": (
         gltf(accessors=[{"componentType": 5126, "count": 1, "type": "VEC3"}, *gltf()["accessors"][1:]]),
-        "is damaged, or no glTF (a reference to a missing object)",
+        "is damaged, or not glTF (a reference to a missing object)",
     ),
-    "a number as a list": (gltf(nodes=7), "is damaged, or no glTF (a value of a wrong kind)"),
+    "a number as a list": (gltf(nodes=7), "is damaged, or not glTF (a value of a wrong kind)"),
     "an older table": (gltf(asset={"version": "1.0"}, accessors={"a": {}}), "asset.version: is 1.0, which is not read"),
     "a buffer without data": (gltf(buffers=[{"byteLength": 48}]), "buffers[0].uri: is missing"),
 }

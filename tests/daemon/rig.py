@@ -1,4 +1,4 @@
-"""A real run with real content, network and offscreen panels, small; and parts of it that break when told to."""
+"""Small real run with real content, network and offscreen panels, whose parts break on request."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SMALL: dict[str, Any] = {
     "stack": {"width_px": 192, "height_px": 108},
     "sensor": {"driver": "fragile", "timeout_s": 0.1},
     "tracker": {"hold_s": 0.1},
-    "model": {"name": "fast", "threads": 1, "backend": "opencv"},  # auto would be what the machine is like today
+    "model": {"name": "fast", "threads": 1, "backend": "opencv"},  # auto depends on the machine's load
     "loop": {"rate_hz": 200.0},
 }
 QUICK = {"sensor.worker.REOPEN_AFTER_S": 0.02, "sensor.worker.REOPEN_AFTER_MAX_S": 0.05, "frame.policy.BLEND_S": 0.02}
@@ -88,7 +88,7 @@ class Rig:
         *,
         host: Any = None,
         recorder: Any = None,
-        late_s: float = 5.0,  # a busy machine is no fault
+        late_s: float = 5.0,  # tolerate a busy machine
         abandon_s: float = 60.0,
         open_timeout_s: float = 0.3,
         **changes: dict[str, Any],
@@ -158,13 +158,13 @@ class Rig:
         raise AssertionError(f"never {wanted}; {machine.name} ({machine.reason})")
 
     def refresh_until_solved(self, *, times: int = 1) -> RefreshAccount:
-        """Refreshes until so many other solutions are shown."""
+        """Refresh until `count` further solutions are shown."""
         for _ in range(times):
             ran = self.refresh_until(lambda: self.accounts[-1].inference == "ran")
         return ran
 
     def settle(self, work: Callable[[], object] = lambda: None) -> None:
-        """Refreshes until the solver has completed what it was at, and a refresh has shown it.
+        """Refresh until the solver has completed its current work and a refresh has shown it.
 
         work: done on the solver's thread between two solutions.
         """
@@ -183,7 +183,7 @@ class Rig:
         return [self.presenter.refresh() for _ in range(count)]
 
     def refreshes_for(self, seconds: float) -> list[RefreshAccount]:
-        """Refreshes for so long."""
+        """Refresh for this long."""
         deadline, done = time.monotonic() + seconds, []
         while time.monotonic() < deadline:
             done.append(self.presenter.refresh())

@@ -72,7 +72,7 @@ def debian(root: Path, packages: str) -> None:
 
 
 class Pc:
-    """The container; its files lie under `root`."""
+    """The container, with its files under `root`."""
 
     def __init__(self, folder: Path) -> None:
         self.root, self._console = folder / "root", folder / "console.log"

@@ -1,6 +1,6 @@
-"""Another scene, model or configuration while it runs: loaded beside it, taken over or refused, never half.
+"""Another scene, model or configuration while it runs: loaded in the background, taken over or refused as a whole.
 
-Whatever changes, no refresh is lost: the presenter goes on with the solution that there is.
+No change loses a refresh: the presenter keeps showing the existing solution.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ STEADY: dict[str, Any] = {"sensor": {"timeout_s": 5.0}, "tracker": {"hold_s": 20
 
 
 class Served:
-    """A run with a daemon that listens; what is asked of it is answered while it refreshes."""
+    """A run with a listening daemon that answers requests while it refreshes."""
 
     def __init__(self, folder: Path, *, recorder: Any = None, **changes: Any) -> None:
         self.config = folder / "phasestack.toml"
@@ -66,14 +66,14 @@ class Served:
         return self.rig.run
 
     def read_settings(self) -> Settings:
-        """The configuration's file; where the test wrote none, what the run began with."""
+        """The configuration file; if the test wrote none, the run's initial settings."""
         return load_settings(self.config) if self.config.exists() else self.rig.settings
 
     def status(self) -> dict[str, Any]:
         return ask([self.server.path], {"command": "status"})
 
     def asked(self, name: str, value: Any = None, *, meanwhile: Callable[[], None] = lambda: None) -> dict[str, Any]:
-        """The answer to a command; refreshes go on until it is there."""
+        """Answer to a command; refreshes continue until it arrives."""
         answers: list[dict[str, Any]] = []
         request = {"command": name, "value": value}
         asking = threading.Thread(target=lambda: answers.append(ask([self.server.path], request, timeout_s=30.0)))
@@ -252,7 +252,7 @@ def test_a_reload_refuses_what_is_read_only_at_the_start(
 
 
 def test_only_the_presenter_s_thread_writes_what_was_chosen(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A scene was moved on the solver's thread, which wrote what the presenter's thread was reading."""
+    """Moving a scene on the solver's thread once wrote data that the presenter's thread was reading."""
     writers: dict[str, set[str]] = {}
 
     def note(self: Any, name: str, value: Any) -> None:
@@ -306,7 +306,7 @@ class Scene(ContentSource):
 
 @pytest.fixture
 def slow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """A module with a scene's class that is made once its gate is open."""
+    """Module with a scene class whose constructor waits for its gate."""
     (tmp_path / "slow_scene.py").write_text(SLOW)
     monkeypatch.syspath_prepend(str(tmp_path))
     module = importlib.import_module("slow_scene")
@@ -318,7 +318,7 @@ def slow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 def test_a_scene_that_never_loads_is_refused_and_never_shown(
     served: Served, slow: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its thread is left behind; when it goes on, it neither publishes its scene nor closes the new solver's."""
+    """The abandoned thread, once it continues, neither publishes its scene nor closes the new solver's."""
     rig, solver = served.rig, served.rig.presenter.solver
 
     def meanwhile() -> None:

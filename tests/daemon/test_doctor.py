@@ -1,4 +1,4 @@
-"""The doctor finds what is wrong, says what to do, and its exit code tells scripts."""
+"""The doctor finds faults, names remedies, and has an exit code for scripts."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ PATIENCE_S = 300
 
 @pytest.fixture(scope="module")
 def endless(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A shipped model with the loop before its last output, and no digest that would tell."""
+    """A shipped model with the loop before its last output, and no digest."""
     model = onnx.load(str(model_path("fast")))
     for node in model.graph.node:
         for index, name in enumerate(node.output):
@@ -73,7 +73,7 @@ def test_a_stop_while_it_starts_is_heard_and_no_abort(endless: Path, tmp_path: P
 def test_an_endless_model_is_refused_and_hangs_no_thread_of_the_daemon(
     endless: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It held a thread for two minutes, and at the end of the daemon for good."""
+    """It used to block a thread for two minutes, and the daemon's end forever."""
     monkeypatch.setattr(reconfigure, "MODEL_S", 10.0)
     with Served(tmp_path) as served:
         answer = served.asked("model", str(endless))

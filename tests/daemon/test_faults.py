@@ -1,4 +1,4 @@
-"""Faults are injected into a real run: it degrades, says why, goes on without losing a refresh, and recovers."""
+"""Faults injected into a real run: it degrades with a reason, loses no refresh, and recovers."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def running() -> Iterator[Rig]:
 
 @pytest.fixture
 def rig(running: Rig) -> Iterator[Rig]:
-    """A run that is well; whatever a test breaks is mended after it."""
+    """A healthy run, repaired after each test."""
     running.refresh_until_solved()
     yield running
     running.mend()
@@ -140,7 +140,7 @@ def test_content_that_raises_keeps_the_last_picture(
 
 
 class Slow:
-    """The next solution does not return until `gate` is set; `begun` tells when it has begun."""
+    """The next solution does not return until `gate` is set; `begun` is set once it has begun."""
 
     def __init__(self, rig: Rig) -> None:
         self.begun, self.gate = threading.Event(), threading.Event()
@@ -157,7 +157,7 @@ class Slow:
 
 
 def asleep(rig: Rig, solver: Any) -> list[RefreshAccount]:
-    """A hundred refreshes while a solution is under way, after which it is told as late."""
+    """A hundred refreshes during one solution, which is then reported as late."""
     number = rig.presenter.last.solution.number
     accounts = rig.refreshes(100)  # any that waited for it would not return
     assert {account.solution for account in accounts} == {number}
@@ -229,7 +229,7 @@ def fed(heard: Supervisor) -> Iterator[Rig]:
 
 
 def test_the_watchdog_outlives_a_hung_solver_but_not_an_endless_refresh(fed: Rig, heard: Supervisor) -> None:
-    """The presenter's clock alone feeds it: there is a picture, it follows the eyes, and the solver is made anew."""
+    """The presenter's clock alone feeds it: there is a picture, it follows the eyes, and the solver is restarted."""
     gate = threading.Event()
     predictor = fed.break_predictor()
     predictor.answer = lambda job: gate.wait(60.0) and predictor.well(job)
@@ -249,7 +249,7 @@ def test_the_watchdog_outlives_a_hung_solver_but_not_an_endless_refresh(fed: Rig
 
     panels.present = slow  # type: ignore[method-assign]
     fed.refreshes(1)
-    assert "WATCHDOG=1" not in spoken  # nothing feeds it beside the presenter: the solver went on meanwhile
+    assert "WATCHDOG=1" not in spoken  # only the presenter feeds it: the solver kept running meanwhile
     panels.present = present  # type: ignore[method-assign]
     fed.refreshes_for(WATCHDOG_S)
     assert "WATCHDOG=1" in heard.heard()

@@ -1,4 +1,4 @@
-"""The loop's solver with the OpenGL backend: it solves what the processor solves, and lost contexts leave nothing."""
+"""The loop's solver with the OpenGL backend: same solutions as the processor's, and lost contexts leak nothing."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ Buildah = Callable[..., subprocess.CompletedProcess[str]]
 
 @pytest.fixture(scope="module")
 def buildah(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Buildah]:
-    """buildah with a storage of its own, in which the image is."""
+    """buildah with separate storage that holds the image."""
     folder = tmp_path_factory.mktemp("image")
 
     def run(*arguments: str | Path, check: bool = True) -> subprocess.CompletedProcess[str]:

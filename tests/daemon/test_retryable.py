@@ -44,7 +44,7 @@ def test_what_the_machine_lacks_passes_however_it_was_told(number: int) -> None:
 @pytest.mark.parametrize("error", [MemoryError(), OSError(errno.EMFILE, "x"), read_by_a_reader(errno.EIO)])
 def test_a_run_that_the_machine_ended_may_be_started_again(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
     monkeypatch.setattr(supervise, "drive", raising(error))
-    with pytest.raises(TransientError, match=r"\w.* \(this may pass: start again"):
+    with pytest.raises(TransientError, match=r"\w.* \(temporary: try again"):
         lived()
 
 
@@ -85,7 +85,7 @@ def test_without_descriptors_the_exit_code_is_never_that_of_bad_configuration(tm
 
 
 class Refusing:
-    """A sensor that the system has no descriptor for, so often as it is told."""
+    """Sensor that fails to open a given number of times for lack of descriptors."""
 
     name, serial, skipped, missed = "refusing", "", 0, 0
     refused: ClassVar[dict[str, int]] = {}

@@ -1,4 +1,4 @@
-"""The status and control socket: who may use it, what it answers, crowds and attackers; the loop never waits for it."""
+"""The status and control socket: permissions, answers, crowds and attackers; the loop never waits for it."""
 
 from __future__ import annotations
 
@@ -166,13 +166,13 @@ def connected(path: Path) -> socket.socket:
     client.settimeout(20)
     try:
         client.connect(str(path))
-    except OSError:  # so many wait that the next is turned away at once
+    except OSError:  # the queue is full: the next client is refused immediately
         client.close()
         raise
     return client
 
 
-# What was refused is never done
+# Refused commands are never executed
 
 
 def test_a_command_that_was_refused_as_too_late_is_never_done(

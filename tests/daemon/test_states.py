@@ -1,4 +1,4 @@
-"""The daemon's states: what each refresh finds decides, and each transition is told once with its reason."""
+"""The daemon's states: decided by each refresh's findings; each transition is reported once with its reason."""
 
 from __future__ import annotations
 

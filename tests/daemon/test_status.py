@@ -1,4 +1,4 @@
-"""`status` says what is so: now, and only what was measured."""
+"""`status` reports current values, and only measured ones."""
 
 from __future__ import annotations
 

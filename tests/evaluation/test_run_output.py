@@ -1,4 +1,4 @@
-"""The files of a run: what is in them, and what happens when the disk fails."""
+"""The files of a run: contents, and behaviour when the disk fails."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ LIVE = {
 
 
 def line(frame: int, **more: Any) -> dict[str, Any]:
-    """A refresh as a presenter tells it."""
+    """A refresh as a presenter reports it."""
     return {"frame": frame, "eyes_m": EYES, "state": State.TRACKING, "true_eyes_m": None} | more
 
 

@@ -1,4 +1,4 @@
-"""The one timer: what it counts, and in which order it calls."""
+"""The timer of trials: counts and order of calls."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`phasestack eyes`: pictures, films and recordings to pupils and overlays; what is wrong is told in one line."""
+"""`phasestack eyes`: pictures, films and recordings to pupils and overlays; mistakes are one line."""
 
 from __future__ import annotations
 

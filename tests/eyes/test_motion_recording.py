@@ -1,4 +1,4 @@
-"""A benchmark's motion as a recording: what the pipeline replays is what the benchmark's tracker sees."""
+"""A benchmark's motion as a recording: the pipeline replays the samples of the benchmark's tracker."""
 
 from __future__ import annotations
 

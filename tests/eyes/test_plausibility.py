@@ -1,4 +1,4 @@
-"""Eyes that can't be a viewer's are told with the mistake that they look like, and counted."""
+"""Implausible eyes are reported with the likely mistake, and counted."""
 
 from __future__ import annotations
 

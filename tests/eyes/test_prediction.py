@@ -20,7 +20,7 @@ SETTLED = 45  # samples: until then no filter knows the velocity
 
 
 def truth(motion: str, observed: Sequence[Observation], *, ahead_ns: int) -> F64:
-    """(n, 3) the middle between the eyes, so much later than each sample."""
+    """(n, 3) the middle between the eyes, `ahead_s` after each sample."""
     times_s = np.array([(o.capture_ns + ahead_ns) / NS_PER_S for o in observed])
     return true_eyes(motion, np.append(times_s, times_s[-1] + 1.0))[:-1].mean(1)
 
@@ -31,7 +31,7 @@ def p95_mm(places: F64, motion: str, observed: Sequence[Observation]) -> float:
 
 
 def tracked(observed: Sequence[Observation]) -> F64:
-    """(n, 3) what the tracker says of 60 ms after each sample."""
+    """(n, 3) the tracker's estimate 60 ms after each sample."""
     tracker, places = Tracker(), []
     for sample in observed:
         tracker.update(sample.points, capture_ns=sample.capture_ns)
@@ -41,7 +41,7 @@ def tracked(observed: Sequence[Observation]) -> F64:
 
 
 def constant_velocity(measured: F64, *, q: float, ahead_s: float) -> F64:
-    """(n, 3) a plain Kalman filter with white acceleration of density q, m²/s³, predicting so far ahead."""
+    """(n, 3) a plain Kalman filter with white acceleration of density q, m²/s³, predicting `ahead_s` ahead."""
     dt, state, covariance = 1 / RATE_HZ, np.vstack([measured[0], np.zeros(3)]), np.diag([NOISE_M**2 / 2, 0.09])
     step = np.array([[1, dt], [0, 1]])
     places = [measured[0]]

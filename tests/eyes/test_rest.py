@@ -1,4 +1,4 @@
-"""A head at rest is told from a moving one, whatever the sensor's noise."""
+"""A head at rest is distinguished from a moving one at any sensor noise."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ def fed(count: int = 30, motion: Callable[..., Any] = lambda k: STILL, **noise: 
     return tracker, 10**9 + (count - 1) * PERIOD
 
 
-# --- what an answer is called
+# --- labels
 
 
 def test_answers_are_exact_at_samples_interpolated_between_and_predicted_after() -> None:
@@ -96,7 +96,7 @@ def test_every_answer_is_for_the_instant_asked_with_eyes_unless_none(ms: int) ->
     assert (answer.eyes_m is None) == (answer.label == "none")
 
 
-# --- what it does not believe
+# --- rejected samples
 
 
 def test_duplicates_and_late_samples_are_passed_over() -> None:
@@ -147,11 +147,11 @@ def test_a_hasty_head_is_followed_at_its_second_sample() -> None:
     np.testing.assert_allclose(tracker.at(last + 16 * PERIOD + 20 * MS).eyes_m, far, atol=1e-9)  # and at once
 
 
-# --- how sure
+# --- uncertainty
 
 
 def drawn(covariance_m2: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Errors (n, 3) of the middle 45 ms ahead, and sigma as told (n,), of a leaning head with such noise."""
+    """Errors (n, 3) of the middle 45 ms ahead, and reported sigma (n,), of a leaning head with this noise."""
     random, tracker, off, told = np.random.default_rng(2), Tracker(), [], []
     for k in range(600):
         time_s = k * PERIOD / 1e9

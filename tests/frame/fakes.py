@@ -1,4 +1,4 @@
-"""Small stand-ins for the presenter's neighbours, driven by a test clock: none of them waits for anything."""
+"""Fakes of the presenter's neighbours, driven by a test clock; they never wait."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def solution(number: int, eyes_m: Any = EYES, *, time_ns: int = 0, **changes: An
 
 
 class FakeSamples(Samples):
-    """Gives what a test puts in, once it has arrived; raises where the test says so."""
+    """Delivers a test's samples once they have arrived; raises on request."""
 
     def __init__(self) -> None:
         self.waiting: list[SensorFrame] = []
@@ -74,11 +74,11 @@ class FakeSamples(Samples):
         return self.why
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing."""
 
 
 class FakeSolver(SolverHost):
-    """Holds what a test hands over, and remembers what it was asked."""
+    """Returns a test's results, and records its requests."""
 
     def __init__(self, *, cost_ns: int = 20 * NS_PER_MS) -> None:
         self.solve_cost_ns = cost_ns
@@ -104,11 +104,11 @@ class FakeSolver(SolverHost):
         self.tasks.append(task)
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing."""
 
 
 class FakePanels(PanelSink):
-    """Keeps what it was given; lost while `lost` says why; tells blanks where it is given a display's period."""
+    """Keeps the frames presented; lost while `lost` has a reason; reports blanks if given a display's period."""
 
     name = "fake"
 
@@ -123,7 +123,7 @@ class FakePanels(PanelSink):
         return PresentReport(frame.number, self._clock.now_ns(), 0.25)
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing."""
 
     @property
     def frame(self) -> PanelFrame:
@@ -159,7 +159,7 @@ class FakeParts:
 
 
 class Watching:
-    """An observer that keeps all it is told."""
+    """An observer that keeps all reports."""
 
     def __init__(self) -> None:
         self.samples: list[SensorFrame] = []

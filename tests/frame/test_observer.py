@@ -37,7 +37,7 @@ CONTRACT = {
 
 
 class Kept:
-    """Output that keeps what it is given."""
+    """Output that keeps all it receives."""
 
     def __init__(self) -> None:
         self.lines: list[dict[str, Any]] = []
@@ -54,7 +54,7 @@ class Kept:
 
 
 class Drawing(FakeSolver):
-    """A solver whose thread does tasks at once, or when the test says."""
+    """A solver whose thread runs tasks immediately, or on request."""
 
     def __init__(self, content: Any, *, at_once: bool = True) -> None:
         super().__init__()
@@ -91,7 +91,7 @@ def refresh(number: int, solution: Solution | None, *, eyes_m: Any = EYES, **cha
 
 
 def sample(time_ns: int, *, y_m: float | None = 0.0) -> SensorFrame:
-    """One that knows the truth: a head that is aside by so much."""
+    """Sample with ground truth: a head displaced sideways."""
     return SensorFrame(1, time_ns, true_eyes_m=None if y_m is None else aside(y_m))
 
 

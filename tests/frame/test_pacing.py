@@ -1,4 +1,4 @@
-"""Refreshes lie on the display's grid; what comes too late is counted, what is left out on purpose is not."""
+"""Refreshes are on the display's grid; late ones are counted, intentionally skipped ones are not."""
 
 from __future__ import annotations
 

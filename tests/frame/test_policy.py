@@ -23,7 +23,7 @@ def wish(eyes_m: Any = EYES, *, flat: bool = False, paused: bool = False) -> Sol
 
 
 class Told:
-    """A policy and what was made so far: whatever it decides is done."""
+    """A policy with its results so far; each decision is carried out."""
 
     def __init__(self, *, plan: Plan | None = STILL) -> None:
         self.policy, self.plan = FramePolicy(), plan

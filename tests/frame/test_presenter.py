@@ -1,4 +1,4 @@
-"""One refresh after the other on a test clock: aligned to the eyes of its light, whatever the solver does."""
+"""Refreshes on a test clock: aligned to the eyes at their display time, independent of the solver."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_an_eye_that_the_solution_was_not_made_for_moves_nothing(stage: Stage) -
 
 
 def test_at_rest_codes_ignore_noise_and_with_movement_they_change() -> None:
-    """A 60 Hz head with 3 mm of noise: nothing shimmers."""
+    """A 60 Hz head with 3 mm of noise does not shimmer."""
     from runtime.optics.alignment import shown_layers
 
     random = np.random.default_rng(3)
@@ -211,7 +211,7 @@ def test_a_picture_is_vouched_to_be_unchanged_only_where_nothing_differs() -> No
     assert stage.panels.unchanged
     stage.solver.hand_over(flat=solution(4, None))
     stage.refresh()
-    assert stage.panels.unchanged  # another flat picture, of which nothing is seen
+    assert stage.panels.unchanged  # another flat picture, invisible
     stage.presenter.flat_asked = True
     stage.refresh()
     assert not stage.panels.unchanged  # the mixture differs
@@ -241,7 +241,7 @@ def test_a_lost_panel_drops_refreshes_and_comes_back_with_the_newest(stage: Stag
     stage.panels.lost = ""
     (back,) = stage.refresh()
     assert back.account.presented and back.account.inference == "ran"  # with the refresh that first shows it
-    assert not stage.panels.unchanged  # nothing is vouched for
+    assert not stage.panels.unchanged  # not marked as unchanged
     assert stage.panels.frame.solved_version == 8
     assert stage.presenter.machine.state is State.TRACKING
 
@@ -285,7 +285,7 @@ def test_no_refresh_waits_for_the_solver() -> None:
     assert ages == pytest.approx(PERIOD_NS / NS_PER_MS, abs=0.01)  # and it says how old the solution is
 
 
-# --- what the solver is asked ------------------------------------------------------------------------------------
+# --- requests to the solver ------------------------------------------------------------------------------------
 
 
 def test_eyes_are_requested_for_the_middle_of_the_solution_s_showing(

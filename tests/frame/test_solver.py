@@ -1,4 +1,4 @@
-"""One solution a step, from real content and a real model; what fails is named, and what there is stays good."""
+"""One solution a step, from real content and a real model; failures are named, and existing results stay valid."""
 
 from __future__ import annotations
 

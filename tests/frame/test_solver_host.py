@@ -23,7 +23,7 @@ def wish(number: int = 0) -> SolveRequest:
 
 
 class Solving:
-    """Solves whatever it is asked, and draws the flat picture for nobody."""
+    """Solves every request, and draws the flat picture without a viewer."""
 
     def __init__(self) -> None:
         self.number = 0
@@ -75,7 +75,7 @@ def test_a_busy_solver_takes_the_newest_request_next(
     clock.advance_ns(1)
     assert host.news().solution.solved_for_ns == 4
     clock.advance_ns(10 * SUM_NS)
-    assert [request.time_ns for request in parts.asked] == [0, 1, 4]  # what was skipped is never made
+    assert [request.time_ns for request in parts.asked] == [0, 1, 4]  # skipped requests are never solved
 
 
 def test_nothing_depends_on_when_it_is_looked_at(clock: SimulatedClock) -> None:

@@ -1,4 +1,4 @@
-"""The solver beside the presenter: what raises, hangs or is late is told, left behind and made anew; nobody waits."""
+"""The solver's thread: exceptions, hangs and delays are reported and it is restarted; the presenter never stalls."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def solves(request: SolveRequest) -> SolverUpdate:
 
 
 class Workshop:
-    """A solver thread, whose parts do at every step what the test says; every step is announced."""
+    """Solver thread whose parts run the test's function at every step; every step is announced."""
 
     def __init__(self) -> None:
         self.clock = SimulatedClock(NS_PER_S)
@@ -69,7 +69,7 @@ class Workshop:
         return self.behave(request)
 
     def hang(self, request: SolveRequest) -> SolverUpdate:
-        """A step that returns when its gate is opened; what it made is number 99."""
+        """Step that returns solution 99 once its gate is opened."""
         gate = threading.Event()
         self.hung.append(threading.current_thread())
         self.gates.append(gate)
@@ -83,7 +83,7 @@ class Workshop:
             pass
 
     def settle(self) -> None:
-        """Wait until what is under way is complete."""
+        """Wait until the current step is complete."""
         done = threading.Event()
         self.host.do(lambda parts: bool(done.set()) or True)
         assert done.wait(PATIENCE_S)
@@ -96,7 +96,7 @@ class Workshop:
         self.clock.advance_ns(round(seconds * NS_PER_S))
 
     def left(self) -> None:
-        """Pass the time after which a hung step is left behind; wait for the parts that are made anew."""
+        """Advance beyond the time limit of a hung step; wait for the new parts."""
         while not self.made.empty():
             self.made.get()
         self.pass_s(ABANDON_S + 0.1)
@@ -114,7 +114,7 @@ class Workshop:
 
 
 class _Announced(FakeParts):
-    """Tells which thread closes it."""
+    """Records the thread that closes it."""
 
     def __init__(self, step: Behaviour, closed: queue.Queue[str]) -> None:
         super().__init__(step)
@@ -262,7 +262,7 @@ def test_a_solver_that_hangs_repeatedly_leaves_few_threads(shop: Workshop) -> No
 
 
 def test_a_step_that_raises_is_reported_and_the_solver_remade(shop: Workshop) -> None:
-    """`Solver.step` answers with what is missing; what is raised beside it must not end solving silently."""
+    """`Solver.step` returns the missing parts; exceptions elsewhere must not end solving silently."""
     shop.solve(1)
 
     def fail(request: SolveRequest) -> SolverUpdate:
@@ -338,7 +338,7 @@ def test_tasks_behind_a_hung_step_are_done_by_the_new_solver(shop: Workshop) -> 
 
 
 def test_making_it_anew_may_take_as_long_as_at_the_start(shop: Workshop, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Content of two minutes was begun again every ten seconds, for ever, each time on one more thread."""
+    """Content that took two minutes was once restarted every ten seconds, each time on one more thread."""
 
     def fail(request: SolveRequest) -> SolverUpdate:
         raise RuntimeError("its context was lost")

@@ -1,4 +1,4 @@
-"""A run's figures: counted as the contract says, now and since the start; None where nothing was measured."""
+"""A run's figures: counted as in the contract, now and since the start; None if not measured."""
 
 from __future__ import annotations
 

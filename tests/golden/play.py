@@ -1,4 +1,4 @@
-"""Plays one case by the production path (`drive`, as `run --replay --headless --max-speed`) and tells what it did."""
+"""Plays one case by the production path (`drive`, as `run --replay --headless --max-speed`) and records it."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class Collector:
 
 
 class Operator(Host):
-    """The run's supervisor: does what the case says, when it says."""
+    """Supervisor of the run: executes the case's actions at their times."""
 
     def __init__(self, case: Case, runs: list[Run]) -> None:
         self._actions, self._refresh, self._runs = case.actions, 0, runs

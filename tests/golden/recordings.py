@@ -1,6 +1,6 @@
 """The recordings that golden runs play: kept in `data`, made by `python -m tests.golden --record`.
 
-They are kept, not made anew at each run, so that a reference never moves because a random generator did.
+They are stored, so that a change of a random generator never moves a reference.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def path_to(name: str) -> Path:
 
 
 def write(name: str, path: Path) -> None:
-    """Make one of HEADS anew: the same file from the same generator."""
+    """Write one of HEADS: the same samples from the same generator."""
     head = HEADS[name]
     way = path_of(head.seed)
     observed = observe(

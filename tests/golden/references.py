@@ -82,7 +82,7 @@ def stored_text(name: str) -> list[dict[str, Any]] | None:
 
 
 def stored_panels(name: str, number: int, *, count: int) -> U8 | None:
-    """(N, h, w, 3) of a kept refresh, or None where there is none of so many panels."""
+    """(N, h, w, 3) of a kept refresh, or None if there is none of that many panels."""
     path = _picture_path(name, number)
     if not path.exists():
         return None

@@ -1,4 +1,4 @@
-"""Export and validation: what is written passes its checks and runs in the runtime; what fails isn't written."""
+"""Export and validation: written files pass their checks and run in the runtime; failing ones aren't written."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_what_cannot_be_exported_is_refused_in_one_line(tmp_path: Path, options:
 def test_validate_refuses_what_is_not_ours(tmp_path: Path) -> None:
     path = tmp_path / "other.onnx"
     path.write_bytes(b"nonsense")
-    with pytest.raises(InputError, match="is no ONNX model"):
+    with pytest.raises(InputError, match="is not an ONNX model"):
         validate_file(path)
     model = onnx.load_from_string(spectral_model("fast")[0])
     del model.metadata_props[:]

@@ -1,5 +1,5 @@
-"""The published network: its keys and size, what a checkpoint must be to be imported, and that it does and is fed
-what the official code does and feeds (golden arrays, made by running that code)."""
+"""The published network: keys, size, requirements of checkpoints, and equality of inputs and outputs with the official
+code's (golden arrays made by running that code)."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def test_a_damaged_checkpoint_is_refused_by_the_key_that_is_amiss(published: Pat
         load_eyereal(published)
 
 
-# ---- what the official code does and feeds
+# ---- equality with the official code
 
 
 @pytest.fixture(scope="module")
@@ -201,7 +201,7 @@ def test_the_network_s_input_and_output_layers_are_the_official_code_s(
 
 
 def test_pictures_of_another_view_are_black_outside_the_network_s_40_degrees(official: Path, tmp_path: Path) -> None:
-    """`--fov 70` shows the network what it was trained on: the 40 degrees in the middle."""
+    """`--fov 70` still gives the network its training input: the 40 degrees in the middle."""
     pair = pair_of(tmp_path, "near")
     predictor = predictor_of(official, tmp_path)
     white = np.full((200, 320, 3), 255, np.uint8)

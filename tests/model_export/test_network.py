@@ -1,4 +1,4 @@
-"""The shipped network: what it works out, beside the same steps written plainly, and the check that goes with it."""
+"""The shipped network against a plain version of its steps, and its check."""
 
 from __future__ import annotations
 

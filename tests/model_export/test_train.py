@@ -1,4 +1,4 @@
-"""Training: exact geometry of the data, light as the loss, resumed as if never stopped; and modules of one's own."""
+"""Training: exact geometry of the data, light as the loss, resumed as if never stopped; and custom modules."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_pairs_of_a_scene_are_the_runtime_s_own_pictures_of_it() -> None:
 
 
 def test_a_network_of_pictures_is_fed_what_the_runtime_feeds_it(tmp_path: Path) -> None:
-    """Pixel by pixel: the runtime's own input, of a pair of its own panels."""
+    """Pixel by pixel: equal to the runtime's input, for a pair with other panels."""
     pair = random_pair(np.random.default_rng([4, 1]), **SMALL)
     for frame, value in (("centre", "intensity"), ("panel", "phase")):
         form = Form(input_frame=frame, input_value=value)
@@ -89,7 +89,7 @@ def test_a_network_of_pictures_is_fed_what_the_runtime_feeds_it(tmp_path: Path) 
         solve_still(*pair.images, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, predictor=predictor, eye_sigma_mm=0.0)
         fed, wanted = predictor._proposal._input[0], network_input(pair, form)
         assert wanted.shape == fed.shape
-        inside = slice(8, -8)  # what goes on beside the pictures is the runtime's guess
+        inside = slice(8, -8)  # outside the pictures the runtime extrapolates
         assert np.abs(fed - wanted)[:, inside, inside].max() < 3 / 255
         predictor.close()
 
@@ -220,7 +220,7 @@ def test_a_module_that_cannot_be_served_is_refused_in_one_line(
 
 
 def test_a_network_of_ones_own_is_trained_exported_and_served(tmp_path: Path) -> None:
-    """The example, by the commands of its page: what the runtime shows is what torch answers."""
+    """The example, by the commands of its page: the runtime shows torch's results."""
     run_training(tmp_path, Training(**SHORT | {"iterations": 4}))
     path, checkpoint = tmp_path / "mine.onnx", tmp_path / "checkpoint.pth"
     assert export_model(SHORT["arch"], path, checkpoint=checkpoint, width_px=160, height_px=96).passed

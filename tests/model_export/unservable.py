@@ -1,4 +1,4 @@
-"""Modules that can't be served, one reason each. `FAULTS`: what is told of it."""
+"""Modules that can't be served, one reason each. `FAULTS`: their messages."""
 
 from __future__ import annotations
 

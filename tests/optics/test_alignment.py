@@ -198,7 +198,7 @@ def test_at_a_limit_nothing_jumps(
         assert inside == pytest.approx(outside, abs=1e-6 * stack.width_px)
 
 
-# What the panels show.
+# The shown panels.
 
 
 @pytest.fixture(scope="module")
@@ -211,7 +211,7 @@ def matrix(scale_u: float = 1.0, scale_v: float = 1.0, shift_u: float = 0.0, shi
 
 
 def slow_sample(layer: np.ndarray, m: np.ndarray, row: int, column: int) -> np.ndarray:
-    """One pixel, read as it is said: linear between four texels, those beside the layer even."""
+    """One bilinear sample; texels outside the layer are at rest."""
     u, v = m[0, 0] * (column + 0.5) + m[0, 2] - 0.5, m[1, 1] * (row + 0.5) + m[1, 2] - 0.5
     total = np.zeros(3)
     for y in (int(np.floor(v)), int(np.floor(v)) + 1):

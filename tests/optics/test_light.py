@@ -1,4 +1,4 @@
-"""Light against a ray tracer in plain numpy, with random rays of its own: pixels are even boxes, an eye has a pupil."""
+"""Light against a ray tracer in plain numpy, with independent random rays: pixels are boxes, eyes have pupils."""
 
 from __future__ import annotations
 

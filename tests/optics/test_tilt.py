@@ -1,4 +1,4 @@
-"""Panels that are not quite parallel: what an eye sees of them, against rays that are traced one by one."""
+"""An eye's view of panels that are not quite parallel, against individually traced rays."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ EYES = ((0.5, 0.03, 0.0), (0.42, -0.1, 0.05), (0.7, 0.2, -0.1))
 def traced(
     stack: PanelStack, index: int, eye_m: NDArray[np.float64], place_m: tuple[float | np.float32, float | np.float32]
 ) -> NDArray[np.float64]:
-    """(2,) where the layer has what an eye sees at (y, z) of the ideal panel: two rays and a plane."""
+    """(2,) point of the layer that an eye sees at (y, z) of the ideal panel: two rays and a plane."""
     offset, right, up = stack.tilt.depth[index]
     normal, far = np.array([1.0, -right, -up]), stack.x_m[index] + offset
     ray = np.array([stack.x_m[index], *place_m]) - eye_m

@@ -33,7 +33,7 @@ PATHS = ("/metrics", "/now/status", "/now/pictures", "/now/log", "/now/about", "
 
 
 class Loop:
-    """A daemon's socket and a loop that does what it is told; `told` remembers."""
+    """A daemon's socket and a loop that executes commands; `told` records them."""
 
     def __init__(self, path: Path) -> None:
         self.server = StatusServer(path, clock=MonotonicClock())

@@ -1,4 +1,4 @@
-"""A monitor's pixel shows the layer's pixel that lies behind it for the viewer, however the panel is mounted."""
+"""A monitor's pixel shows the layer's pixel at its position for the viewer, for any mounting."""
 
 from __future__ import annotations
 

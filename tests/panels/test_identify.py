@@ -64,7 +64,7 @@ def config(tmp_path: Path) -> Path:
 
 
 def started(x: XServer, *arguments: Path | str) -> Popen[Any]:
-    """The command in a process of its own, its keys in our hands."""
+    """The command in a separate process, with the test's keys."""
     command = [sys.executable, "-m", "runtime.cli", "identify", *map(str, arguments)]
     environment = os.environ | {"DISPLAY": x.name, "OMP_NUM_THREADS": "1"}
     return subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)

@@ -1,4 +1,4 @@
-"""A real X server with three virtual monitors (Xorg's dummy driver), and what a test asks of it."""
+"""A real X server with three virtual monitors (Xorg's dummy driver), and a test's requests to it."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def missing() -> str:
 
 
 def start_or_skip(folder: Path) -> XServer:
-    """A server whose files lie in `folder`; skips the test that asks, saying why, where there can be none."""
+    """Server with its files in `folder`; skips the test, with the reason, if none can run."""
     if absent := missing():
         pytest.skip(f"no virtual monitors without {absent}")
     return XServer(folder)

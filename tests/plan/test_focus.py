@@ -48,7 +48,7 @@ def fast() -> Predictor:
 
 
 def trimmed(source: ProceduralSource, predictor: Predictor, eyes: F64 = EYES, *, aim: bool = True, **how: Any) -> Job:
-    """aim: the content tells where it lies; else that is found in the pictures."""
+    """aim: the content gives its extent; otherwise it is found in the pictures."""
     if aim:
         return drawn_job(predictor, source, eyes, time_ns=0, trimmed=True, **how)
     pictures = [source.render(view, time_ns=0).copy() for view in raster_views(eyes, STACK.panel(1))]
@@ -63,7 +63,7 @@ def psnr(layers: U8, source: ProceduralSource, eyes: F64 = EYES, stack: PanelSta
 def compared(
     predictor: Predictor, source: ProceduralSource, eyes: F64 = EYES, **how: Any
 ) -> tuple[float, float, float]:
-    """PSNR of the whole and of what is left of it, and how much of the panels that is."""
+    """PSNR of the whole and of the window, and the window's share of the panels."""
     whole = psnr(predictor.solve(drawn_job(predictor, source, eyes, time_ns=0)).layers, source, eyes, predictor.stack)
     job = trimmed(source, predictor, eyes, **how)
     part = psnr(predictor.solve(job).layers, source, eyes, predictor.stack)
@@ -74,13 +74,13 @@ def compared(
 def test_a_sparse_object_looks_the_same_from_a_small_window(context: Any, fast: Predictor, aim: bool) -> None:
     whole, part, share = compared(fast, ProceduralSource("sparse", stack=STACK, context=context), aim=aim)
     assert share < 0.2
-    assert part > whole - 0.35  # steps gain that much beside the object
+    assert part > whole - 0.35  # gain of steps outside the object
 
 
 def test_a_flat_scene_is_filled_in_closed_form(context: Any, fast: Predictor) -> None:
     whole, part, share = compared(fast, ProceduralSource("flat", stack=STACK, context=context), aim=False)
     assert share == 0.0
-    assert part > whole - 0.35  # steps gain that much beside the object
+    assert part > whole - 0.35  # gain of steps outside the object
 
 
 def test_of_a_full_picture_nothing_is_left_out(context: Any, fast: Predictor) -> None:
@@ -130,7 +130,7 @@ def test_there_is_no_seam(context: Any, name: str) -> None:
     assert job.savings.solved_share < 0.25
     assert worst[1] < 1.1 * worst[0]
     assert mean[1] < 1.2 * mean[0]
-    assert quality[1] > quality[0] - 0.25  # what the whole gains beside the object, by steps
+    assert quality[1] > quality[0] - 0.25  # gain of the whole outside the object, by steps
 
 
 @pytest.mark.parametrize("tilted", [False, True], ids=["even panels", "tilted panels"])
@@ -146,7 +146,7 @@ def test_a_window_costs_little_wherever_the_object_is(
     eyes = EYES + np.array([turn, np.zeros(3)])
     whole, part, share = compared(load_predictor("balanced", stack), source, eyes)
     assert share < 0.5
-    assert part > whole - 0.35  # steps gain that much beside the object
+    assert part > whole - 0.35  # gain of steps outside the object
 
 
 def test_one_eye_alone_costs_no_inference(context: Any, fast: Predictor) -> None:

@@ -65,7 +65,7 @@ def test_what_is_not_imported_is_said() -> None:
 
 
 def at_angle(degrees: float) -> np.ndarray:
-    """Eyes of which the right one is so far off the axis, at 0.5 m."""
+    """Eyes whose right one is off the axis by this much, at 0.5 m."""
     angle = np.radians(degrees)
     right = 0.5 * np.array([np.cos(angle), np.sin(angle), 0.0])
     return np.array([[0.5, 0.0, 0.0], right])

@@ -1,4 +1,4 @@
-"""Focal parallax: pinholes of a pupil agree on the plane in focus, and cards are sharpest where they stand."""
+"""Focal parallax: pinholes of a pupil agree on the plane in focus, and cards are sharpest at their own depth."""
 
 from __future__ import annotations
 

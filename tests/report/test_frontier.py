@@ -1,4 +1,4 @@
-"""Displayed quality beside the eyes, and methods measured in processes of their own."""
+"""Displayed quality next to the eyes, and methods measured in separate processes."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_methods_are_measured_whole_pair_by_pair(
         assert result.worst_eye_psnr_db <= result.psnr_db
         assert result.light_db.keys() == {"0", "1", "2"}
         assert result.quoted_db == result.light_db["1"]
-        # What is exact at the eyes is less so beside them.
+        # Exact at the eyes, less so next to them.
         assert result.psnr_db_off_eye["6mm"] < result.psnr_db
 
 

@@ -1,4 +1,4 @@
-"""Case files, eyes and the views beside them."""
+"""Case files, eyes and neighbouring views."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`phasestack report`: refuses bad input before it measures, shows what there is as it comes, leaves page and JSON."""
+"""`phasestack report`: refuses bad input before measuring, shows results as they arrive, writes page and JSON."""
 
 from __future__ import annotations
 

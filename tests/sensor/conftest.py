@@ -7,6 +7,6 @@ import pytest
 
 @pytest.fixture(autouse=True)
 def quick_to_reopen(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A lost sensor is opened again at once."""
+    """Reopen a lost sensor immediately."""
     monkeypatch.setattr("runtime.sensor.worker.REOPEN_AFTER_S", 0.02)
     monkeypatch.setattr("runtime.sensor.worker.REOPEN_AFTER_MAX_S", 0.1)

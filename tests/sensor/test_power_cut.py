@@ -32,7 +32,7 @@ def done(*command: str | Path) -> str:
 
 
 class Disk:
-    """A file system on an image that is written past the page cache: a power cut leaves what the image holds."""
+    """A file system on an image that is written past the page cache: a power cut leaves the image's contents."""
 
     def __init__(self, folder: Path) -> None:
         self._image, self.mounted, self._cut = folder / "image", folder / "disk", folder / "cut"

@@ -1,4 +1,4 @@
-"""`phasestack record` writes what the sensor saw: eyes always, pictures only on request."""
+"""`phasestack record` writes the sensor's samples: eyes always, pictures only on request."""
 
 from __future__ import annotations
 

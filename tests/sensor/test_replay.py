@@ -1,4 +1,4 @@
-"""A replayed recording is a sensor, at its own pace or sample after sample; and what the built-in one shows."""
+"""A replayed recording is a sensor, at its own pace or sample after sample; and the built-in one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A recording of any rate and with any gap plays through once, at its own times; what is no sample is told."""
+"""A recording of any rate and with any gap plays through once, at its own times; invalid samples are reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The doctor sees which depth cameras are plugged in and says what stands in the way."""
+"""The doctor lists the connected depth cameras and their problems."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The sensor's thread: the newest wins, what is lost comes back, and what hangs is left behind."""
+"""The sensor's thread: the newest sample wins, lost sensors are reopened, hung ones abandoned."""
 
 from __future__ import annotations
 
@@ -200,10 +200,10 @@ def test_an_sdk_that_hangs_is_left_behind_and_never_blocks_the_loop(
         taken.append(time.perf_counter() - begin)
         time.sleep(0.002)
     assert seen and state == "running" and sum("open" in line for line in log) == 2
-    # The driver hangs for 20 s; no call waited for it, whatever else this machine was busy with.
+    # The driver hangs for 20 s; no call waited for it, even on a busy machine.
     assert max(taken) < 0.5 and statistics.median(taken) < FRAME_S / 4
     assert hung[0].is_alive()
-    # What the abandoned thread still says does not count, and it closes its driver on its way out.
+    # The abandoned thread's results are ignored, and it closes its driver as it ends.
     closed = log.count("close")
     release.set()
     assert eventually(lambda: not hung[0].is_alive())
@@ -276,7 +276,7 @@ class Camera(Scripted):
     """Stamps its pictures as the test says."""
 
     ahead_ns, frozen = 0, ""  # what of DELIVERED does not change
-    delivered = itertools.count()  # by all of them: one that is opened anew does not begin again
+    delivered = itertools.count()  # by all drivers: a reopened one continues the count
     capabilities = Capabilities(colour=True, eye_points=True)
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
@@ -315,7 +315,7 @@ def test_future_stamps_are_rejected_and_a_persistent_sensor_counts_as_lost(
     camera.take()
     assert eventually(lambda: camera.state is SensorState.LOST)
     assert "capture times are +0.9" in camera.fault()
-    time.sleep(0.3)  # it is opened anew meanwhile
+    time.sleep(0.3)  # it is reopened meanwhile
     assert camera.state is not SensorState.FAILED
     assert all(frame.capture_ns <= time.monotonic_ns() for frame in camera.take())
     monkeypatch.setattr(Camera, "ahead_ns", 0)
@@ -331,7 +331,7 @@ def test_a_sensor_whose_samples_never_change_is_lost_until_they_do(
     monkeypatch.setattr(Camera, "frozen", what)
     assert eventually(lambda: camera.state is SensorState.LOST)
     assert camera.fault() == f"its {what} not changed for 0.1 s"
-    for _ in range(30):  # opened anew, it is not well for a moment each time
+    for _ in range(30):  # reopened, it is unhealthy for a moment each time
         time.sleep(0.01)
         assert camera.state is SensorState.LOST
     monkeypatch.setattr(Camera, "frozen", "")

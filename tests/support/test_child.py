@@ -1,4 +1,4 @@
-"""Work in a process of its own: its arrays, words and refusals come back, and whatever it does ends nothing else."""
+"""Work in a separate process: its arrays, texts and refusals are returned, and its crash ends nothing else."""
 
 from __future__ import annotations
 

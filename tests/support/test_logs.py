@@ -1,4 +1,4 @@
-"""Logging never holds up who logs, loses nothing silently, and can't be made to say what it was not told."""
+"""Logging never delays its caller, reports lost lines, and can't be made to forge lines."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def file(tmp_path: Path) -> Iterator[File]:
 
 
 class Pipe:
-    """A reader that reads when it is told to."""
+    """A reader that reads on request."""
 
     def __init__(self) -> None:
         self.out, self._in = os.pipe()

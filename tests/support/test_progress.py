@@ -1,4 +1,4 @@
-"""Long work tells how far it is; a terminal shows what takes long, and nothing else is written to."""
+"""Long work reports its progress on terminals, and on nothing else."""
 
 from __future__ import annotations
 
