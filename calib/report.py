@@ -68,7 +68,7 @@ def write_report(file: Path, out: Path, *, viewing: CalibrationSettings) -> dict
 
 
 def _stored_points(data: Any, calibration: Calibration, *, source: Path) -> Points | None:
-    """The pairs that a calibration file holds in `[data]`; None where it holds none. Raises InputError."""
+    """The pairs that a calibration file holds in `[data]`; None if it holds none. Raises InputError."""
     if not isinstance(data, dict) or "sensor_m" not in data:
         return None
     found = validated(StoredPairs, data, source=f"{source}: data")

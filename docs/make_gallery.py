@@ -73,7 +73,7 @@ layers. Every method runs in a separate process, whose peak is its memory. Times
 compare ratios. The published network (`eyereal`), exported from its checkpoint, is compared as `--model FILE.onnx`.
 
 `bench compare` divides times by a yardstick of the same run, does not compare them where the machine was busy, and
-exits with 1 where a model got slower by more than the noise, lost 0.1 dB or took 15% more memory.
+exits with 1 if a model got slower by more than the noise, lost 0.1 dB or took 15% more memory.
 
 A [case file](contracts.md#cases-pairs-calibration) is any `*.json` in DIR like this one; `off` (optional) is what
 should be seen `mm` away from an eye:
@@ -205,7 +205,7 @@ def _label(sheet: Image.Image, place: tuple[int, int], text: str) -> None:
 
 
 def smaller(source: Path, name: str) -> bytes:
-    """A picture as the pages show it. Raises SystemExit where it stays too large."""
+    """A picture as the pages show it. Raises SystemExit if it stays too large."""
     image = Image.open(source).convert("RGB")
     image.thumbnail((WIDTH_PX, 10 * WIDTH_PX), Image.Resampling.LANCZOS)
     for quality in range(90, 50, -5):

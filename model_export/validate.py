@@ -81,7 +81,7 @@ def validate_file(path: Path) -> Report:
 def check_model(data: bytes, *, source: str, reference: Reference | None = None) -> Report:
     """Check a model's bytes against its torch source or, without that, against its own graph.
 
-    Raises InputError where the bytes are not an ONNX model or have no known contract.
+    Raises InputError if the bytes are not an ONNX model or have no known contract.
     """
     try:
         model = onnx.load_from_string(data)

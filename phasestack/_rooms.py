@@ -1,6 +1,6 @@
 """Imports our own `runtime`, `calib` and `model_export`, also next to modules of these names.
 
-Raises ImportError where the program has imported another module under one of the names: Python holds one for each.
+Raises ImportError if the program has imported another module under one of the names: Python holds one for each.
 """
 
 from __future__ import annotations

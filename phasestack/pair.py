@@ -125,7 +125,7 @@ class Result:
         return line + f"one ray a pixel, as published: {self._pair.quality.psnr_db:.1f} dB"
 
     def show(self) -> Path:
-        """Open the solution's viewer in a browser; answers its file, which stays."""
+        """Open the solution's viewer in a browser; returns its file, which is kept."""
         path = Path(tempfile.mkdtemp(prefix="phasestack-")) / "viewer.html"
         path.write_text(self._pair.viewer([self._line, *self.notes]), encoding="utf-8")
         webbrowser.open(path.as_uri())

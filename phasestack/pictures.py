@@ -86,7 +86,7 @@ def _advice_on_type(name: str, picture: Any) -> str:
         return f": codes are {name} * np.uint8(255)"
     if picture.min() >= 0 and picture.max() <= 255:
         return f": codes are {name}.astype(np.uint8)"
-    return f": {name} / 65535 where that is white" if picture.dtype == np.uint16 else ": divide by what is white"
+    return f": {name} / 65535 if that is white" if picture.dtype == np.uint16 else ": divide by what is white"
 
 
 def _advice_on_range(name: str, low: float, high: float) -> str:

@@ -1,4 +1,4 @@
-"""The display as a program says it."""
+"""Description of the display in Python."""
 
 from __future__ import annotations
 

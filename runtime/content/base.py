@@ -58,7 +58,7 @@ class ContentSource(ABC):
     draws_in: object = None  # the GL context that its textures are in; None: it has arrays
 
     def __init__(self, options: Any, *, stack: Any, context: Any) -> None:
-        """Construct a user-defined scene. Raises InputError where it cannot be shown.
+        """Construct a user-defined scene. Raises InputError if it cannot be shown.
 
         options: an instance of `Options`; stack: the panels (`PanelStack`); context: moderngl's, current.
         """

@@ -18,7 +18,7 @@ def clip_from_stack(view: View, corners_m: F64) -> F64:
     Row 0 of the raster is row 0 of what GL reads back.
 
     GL's first row in memory is its lowest, so the raster's v runs along GL's +y and nothing need be flipped.
-    Raises ValueError where none of the corners is before the eye.
+    Raises ValueError if none of the corners is before the eye.
     """
     near_m, far_m = depth_bounds(view, corners_m)
     if not 0.0 < near_m < far_m:

@@ -212,7 +212,7 @@ def _why_none(folder: Path) -> str:
 def read_pair(path: Path, settings: ContentSettings) -> list[U8]:
     """The left and the right eye's view of one file, of square pixels, over white.
 
-    Raises InputError where it holds one, or a quilt's many.
+    Raises InputError if it holds one, or a quilt's many.
     """
     views = read_views(path)
     if len(views) == 2:

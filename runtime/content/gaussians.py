@@ -95,7 +95,7 @@ def load_gaussians(header: PlyHeader) -> Gaussians:
 def drawable(path: Path, *, centres: F32, log_scales: F32, quaternions: F32, logits: F32, harmonics: F32) -> Gaussians:
     """The splats that can be drawn: not those without numbers or turn, or far larger than the scene.
 
-    quaternions: (n, 4) w, x, y, z of any length; logits: (n,) of opacities. Raises InputError where none is left.
+    quaternions: (n, 4) w, x, y, z of any length; logits: (n,) of opacities. Raises InputError if none is left.
     """
     with np.errstate(invalid="ignore"):  # NaN compares as false
         usable = (np.abs(centres) < LARGEST_COORDINATE).all(1) & (quaternions != 0).any(1) & ~np.isnan(logits)

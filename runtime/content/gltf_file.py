@@ -43,7 +43,7 @@ WAY_OUT = "save it without that compression, in Blender or with `gltf-transform`
 
 
 class GltfFile:
-    """One file. Raises LookupError, TypeError or ValueError where it is malformed, else InputError."""
+    """One file. Raises LookupError, TypeError or ValueError if it is malformed, else InputError."""
 
     def __init__(self, path: Path, data: bytes, read: Read) -> None:
         text, self._binary = (data, b"") if data[:4] != b"glTF" else _chunks(path, data)
@@ -60,7 +60,7 @@ class GltfFile:
             untrusted_input.within(elements, most, source=path, field=f"accessors[{number}].count")
 
     def all(self, kind: str) -> list[Table]:
-        """The objects of a kind, such as `meshes`; empty where the file has none."""
+        """The objects of a kind, such as `meshes`; empty if the file has none."""
         found: list[Table] = self.table.get(kind, [])
         return found
 

@@ -134,7 +134,7 @@ def _file_of(uri: str, *, source: Path, field: str) -> Path:
 
 
 def _check(path: Path, parts: Sequence[Part], places: Sequence[F32], left_out: set[str]) -> None:
-    """Raises InputError where nothing could be seen, or not drawn."""
+    """Raises InputError if nothing could be seen, or not drawn."""
     if not any(len(place) for place in places):
         alone = f", and {' and '.join(sorted(left_out))} are not drawn" if left_out else ""
         raise InputError(path, "faces", f"there are none{alone}")

@@ -121,7 +121,7 @@ def _text(data: bytes) -> str:
 
 
 def _wires(file: io.StringIO) -> F32 | None:
-    """(n, 2, 3) the lines of an OBJ; None where it has none."""
+    """(n, 2, 3) the lines of an OBJ; None if it has none."""
     places: list[list[str]] = []
     ends: list[tuple[int, int]] = []
     for kind, *words in filter(None, map(str.split, file.getvalue().splitlines())):

@@ -45,7 +45,7 @@ class PicturesSource(ContentSource):
     """Views of pictures or films that hang in the plane of the display's centre."""
 
     def __init__(self, frames: Frames, *, file: SceneFile, context: object = None) -> None:
-        """Raises InputError where the picture is too small for its layout."""
+        """Raises InputError if the picture is too small for its layout."""
         self._frames, self._file = frames, file
         first = frames.frame(0)
         try:
@@ -75,7 +75,7 @@ class PicturesSource(ContentSource):
         return self._shown[which].warped(matrix, view)
 
     def _take(self, number: int, picture: U8) -> None:
-        """Raises ValueError where it is too small."""
+        """Raises ValueError if it is too small."""
         layout = self._frames.layout(number)
         views = layout.views(picture)
         height, width = views[0].shape[:2]

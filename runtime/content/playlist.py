@@ -85,7 +85,7 @@ class PlaylistSource(ForwardingSource):
     """The scenes of a list, one after another, counted from its first request."""
 
     def __init__(self, playlist: Playlist, openers: list[Callable[..., ContentSource]], *, context: Any) -> None:
-        """Raises InputError where one of them can't be shown."""
+        """Prepare every entry. Raises InputError if one can't be shown."""
         self._list = playlist
         self._ends_ns = list(accumulate(round(entry.seconds * NS_PER_S) for entry in playlist.entries))
         self._begin_ns: int | None = None
@@ -141,7 +141,7 @@ class PlaylistSource(ForwardingSource):
             source.close()
 
     def _turn_to(self, time_ns: int) -> int:
-        """Show the one whose time it is; answers how long it has been shown."""
+        """Show the entry due now; returns the time it has been shown."""
         if self._begin_ns is None:
             self._begin_ns = time_ns
         self._number, since_ns = self._at(time_ns)

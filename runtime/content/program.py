@@ -51,7 +51,7 @@ class ProgramOptions(Section):
 
 
 def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
-    """Listens from now on. Raises InputError where the port is in use."""
+    """Listens from now on. Raises InputError if the port is in use."""
     options = validated(ProgramOptions, file.settings.options, source="content.options")
     size_px = file.stack.width_px * file.stack.height_px
     source = ProgramSource(Programs(options.port, most_bytes=8 * size_px + HEAD.size), background=file.background)
@@ -96,7 +96,7 @@ class Programs:
     """Connections of drawing programs, and their answers. Thread-safe."""
 
     def __init__(self, port: int, *, most_bytes: int) -> None:
-        """Raises InputError where the port is in use."""
+        """Raises InputError if the port is in use."""
         self._token = secrets.token_urlsafe(24)
         self._changed = threading.Condition()
         self._drawing: ServerConnection | None = None  # the newest

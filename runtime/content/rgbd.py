@@ -175,7 +175,7 @@ def _edge_to_edge(index: Any, count: int) -> F64:
 
 
 def prepare(file: SceneFile) -> Callable[..., TriangleSource]:
-    """Read the file; the result uploads it to GL. Raises InputError where it holds no depth."""
+    """Read the file; the result uploads it to GL. Raises InputError if it holds no depth."""
     colour, depth = split_rgbd(open_frames(file.path, file.settings).frame(0), file.path)
     # Outlines of a torn surface run through its inside: samples there, no ramps.
     found = surfaces(colour, depth, stack=file.stack, depth_m=file.settings.depth_m)

@@ -58,7 +58,7 @@ def join(shapes: Sequence[Shape]) -> Shape:
 
 
 def flat_normals(corners: ArrayLike) -> F32:
-    """(t, 3) unit normals of triangles' corners (t, 3, 3); zero where one has no area."""
+    """(t, 3) unit normals of triangles' corners (t, 3, 3); zero for triangles without area."""
     corners = np.asarray(corners)
     normals = np.empty((len(corners), 3), np.float32)
     for first in range(0, len(corners), AT_ONCE):

@@ -52,7 +52,7 @@ def view_error_mm(eyes_m: F64, solved_for_m: F64) -> float:
 def live_error(layers: U8, targets: Pictures, stack: PanelStack, *, eyes_m: F64, fov_deg: float) -> float:
     """Mean squared error of the light at eyes (2, 3) against the target pictures for these eyes.
 
-    layers: (N, H, W, 3 or 4), as the panels show them. Raises ValueError where the eyes see no part of them.
+    layers: (N, H, W, 3 or 4), as the panels show them. Raises ValueError if the eyes see no part of them.
     """
     pictures = [intensities(picture) for picture in targets]
     sampling = LIVE_LARGE if pictures[0].size > PLENTY else LIVE

@@ -56,7 +56,7 @@ class FaceDepth:
     def at(self, pupils: Pupils, depth_mm: U16 | None, intrinsics: Intrinsics, depth_from_colour: F64) -> EyeDepths:
         """Estimate the eyes' distances in one picture.
 
-        depth_mm: (h, w), 0 where there is no measurement; depth_from_colour: (2,) depth pixels per colour pixel.
+        depth_mm: (h, w), 0 if there is no measurement; depth_from_colour: (2,) depth pixels per colour pixel.
         """
         relief = pupils.mesh_px[:, 2]
         eyes = np.array([relief[list(corners)].mean() for corners in CORNERS])

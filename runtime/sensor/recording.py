@@ -114,7 +114,7 @@ def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -
     """Open a writer whose file appears under its name, replacing an older one, with the first sample.
 
     Until then an older file of that name stays; after a crash it is readable up to its last whole chunk.
-    One with pictures is its owner's alone. Raises InputError where it can't be written, or another process writes it.
+    One with pictures is its owner's alone. Raises InputError if it can't be written, or another process writes it.
     """
     part, file = path.with_name(f".{path.name}.part"), None
     try:

@@ -58,7 +58,7 @@ def checked_path(path: str | Path, *, source: str | Path = "", field: str = "") 
 
 
 def is_there(path: str | Path, *, folder: bool = False) -> bool:
-    """Return True if something, or a folder, is at a path. Raises InputError where that cannot be asked."""
+    """Return True if something, or a folder, is at a path. Raises InputError if that cannot be asked."""
     checked = checked_path(path)
     try:
         return checked.is_dir() if folder else checked.exists()
