@@ -1,15 +1,15 @@
-"""Layers that were solved for eyes at one place, aligned to where the eyes are now.
+"""Alignment of layers solved for earlier eyes to the present eyes.
 
 Parallel planes seen from one point differ by a scale and a shift. A ray from the middle between the eyes through
-point c of the reference plane (x = r) meets panel n (x = a) at c·k + m·(1 - k), k = (m_x - a) / (m_x - r). What is
-shown at p on panel n for a new middle n goes to the reference plane along the new ray, and from there to panel n along
+point c of the reference plane (x = r) meets panel n (x = a) at c·k + m·(1 - k), k = (m_x - a) / (m_x - r). A point p
+shown on panel n for a new middle n is traced to the reference plane along the new ray, and from there to panel n along
 the old middle's: both are a scale and a shift, so that q = p·s + t with (o: the old middle, d = n - o, D = o_x - a)
 
     s = 1 + d_x·(r - a) / ((D + d_x)·(o_x - r)),    t = (a - r) / (o_x - r) · (o·d_x - d·D) / (D + d_x).
 
-Written so, nothing is left of rounding where the middle has not moved (s = 1, t = 0) or the panel is the reference
-plane. The middle's rays are carried exactly; so are both eyes' of a head that faces the panels and moved parallel to
-them. One that came nearer or went away keeps the disparity of where it was: no shift could change that.
+In this form s = 1 and t = 0 without rounding error if the middle has not moved or the panel is the reference plane. The
+middle's rays are carried exactly, and so are both eyes' rays if the head faces the panels and moved parallel to them. A
+head that came nearer or moved away keeps its old disparity, which no shift can change.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from runtime.optics.relief import Displacement, displacement, parallax
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8, PanelFrame, Parallax
 
-FARTHEST_M = 1e6  # of any coordinate: what is farther counts as not finite
-NEAREST_M = 0.01  # of an eye before the front panel: nearer, its rays graze the panels
-MOST_SHIFT = 0.5  # of a panel's width or height, that its middle may be moved: by then half of what is seen is even
-MOST_SCALE = 2.0  # that a panel may be drawn larger, or smaller by
-ROWS = 32  # that are resampled together: their float32 pixels fit a core's cache
+FARTHEST_M = 1e6  # limit of any coordinate; beyond it counts as not finite
+NEAREST_M = 0.01  # least distance of an eye from the front panel
+MOST_SHIFT = 0.5  # largest shift of a panel's middle, of its width or height
+MOST_SCALE = 2.0  # largest enlargement or reduction of a panel
+ROWS = 32  # rows resampled together, so that their float32 pixels fit a core's cache
 
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """How every panel is drawn for where the eyes are now."""
+    """Maps that draw every panel for the present eyes."""
 
     solved_from_shown: tuple[F64, ...]  # per panel (3, 3), a scale and a shift: pixels of the solved layer from shown
     limited: str = ""  # why it is at its limit, with the eyes too far from those solved for; empty: it is not

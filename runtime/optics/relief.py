@@ -30,7 +30,7 @@ Pixels = NDArray[np.floating[Any]]
 
 
 def block_px(width_px: int) -> int:
-    """Pixels of a raster of so many columns that one pixel of its relief stands for, right and down."""
+    """Side, in pixels of a raster `width_px` wide, of the block that one pixel of its relief covers."""
     return -(-width_px // WIDEST_PX)
 
 

@@ -130,7 +130,7 @@ class FrameTextures:
         return self._solved[0].size if self._solved else self.size_px
 
     def lacks(self, frame: PanelFrame) -> tuple[bool, bool]:
-        """Whether the frame's solution, and its flat picture, are visible but not uploaded."""
+        """Return True for the frame's solution, and its flat picture, if visible but not uploaded."""
         return (
             shows_solved(frame) and frame.solved_version != self._solved_version,
             shows_flat(frame) and frame.flat_version != self._flat_version,
@@ -188,12 +188,12 @@ class FrameTextures:
 
 
 def shows_solved(frame: PanelFrame) -> bool:
-    """Whether anything of the solution is seen."""
+    """Return True if the solution is visible."""
     return frame.solved is not None and frame.flatness < 1.0
 
 
 def shows_flat(frame: PanelFrame) -> bool:
-    """Whether anything of the flat picture is seen."""
+    """Return True if the flat picture is visible."""
     return frame.solved is None or frame.flatness > 0.0
 
 
@@ -208,7 +208,7 @@ class Painter:
         screen_px: tuple[int, int],
         layer_px: tuple[int, int],
     ) -> None:
-        """Of one panel. Raises InputError (curve), ValueError (homography)."""
+        """Prepare one panel. Raises InputError (curve), ValueError (homography)."""
         matrix = layer_from_screen(
             screen_width_px=screen_px[0],
             screen_height_px=screen_px[1],
