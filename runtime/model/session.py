@@ -187,7 +187,7 @@ def _checked(path: Path, sha256: str) -> bytes:
     try:
         external = has_external_data(data)
     except ValueError as error:
-        raise InputError(path, "", f"is no ONNX model ({error})") from None
+        raise InputError(path, "", f"is not an ONNX model ({error})") from None
     if external:
         way_out = "onnx.save(onnx.load(NAME), OTHER_NAME) makes one of both"
         raise InputError(path, "external_data", f"is refused: a model is one file, with its weights in it; {way_out}")
