@@ -23,7 +23,9 @@ from runtime.support.threads import parallel_map
 
 WEBP_MAX_PX = 16383
 EXTRA_BYTES = 60 << 10  # a page's size beyond its layers as PNG files
-QUALITIES = (92, 84, 76, 66, 54)  # AVIF qualities: the first that fits is used
+PAGE_BYTES = 8_000_000  # a page's size at most
+LAYERS_BYTES = 6_400_000  # of these for layers; larger ones (4K) are not stored exactly
+QUALITIES = (98, 92, 84, 76, 66, 54)  # AVIF qualities: the first that fits is used
 
 
 def asset(name: str) -> str:
@@ -44,16 +46,22 @@ def viewer_html(
 ) -> str:
     """Viewer page of layers (N, h, w, 3 or 4), rear to front, solved for eyes (2, 3) in frame `stack`.
 
-    The layers are stored exactly.
+    Layers are stored exactly if they fit in `LAYERS_BYTES`, else as AVIF, and the page says how well.
     wanted: target pictures (h, w, 3), one per eye, `fov_deg` wide, compressed into the remaining size; () for none.
     lines: text below the controls. follows: outer panels follow the head until the user switches that off.
     """
     scene = {"stack": stack_table(stack), "eyes_m": eyes_m, "fov_deg": fov_deg, "title": title, "follows": follows}
     parts = {"TITLE": html.escape(title), "CSS": asset("look.css"), "SCRIPT": _script()}
-    parts["LAYERS"] = _embedded(parallel_map(_exact, list(layers)))
-    room = EXTRA_BYTES + sum(map(len, parallel_map(png_bytes, list(layers)))) - len("".join(parts.values())) - 2048
-    targets, error = _stored(wanted, room) if wanted else ([], 0.0)
-    quality = [f"Targets are compressed to {-10 * math.log10(error):.0f} dB."] if error else []
+    room, coded = PAGE_BYTES, 0.0
+    stored = parallel_map(_exact, list(layers))
+    if sum(map(len, stored)) > LAYERS_BYTES:
+        stored, coded = _stored(list(layers), LAYERS_BYTES)
+    else:
+        room = min(room, EXTRA_BYTES + sum(map(len, parallel_map(png_bytes, list(layers)))))
+    parts["LAYERS"] = _embedded(stored)
+    targets, error = _stored(wanted, room - len("".join(parts.values())) - 2048) if wanted else ([], 0.0)
+    named = (("Targets", error), ("Layers (exact in their PNG files)", coded))
+    quality = [f"{name} are compressed to {-10 * math.log10(square):.0f} dB." for name, square in named if square]
     scene |= {"target_error": error, "lines": [*lines, *quality]}
     parts |= {"SCENE": _embedded(scene), "WANTED": _embedded(targets)}
     return re.sub(r"@([A-Z]+)@", lambda found: parts.get(found[1], found[0]), asset("still.html"))
@@ -83,7 +91,7 @@ def _exact(layer: U8) -> str:
 
 
 def _stored(pictures: Sequence[U8], room: int) -> tuple[list[str], float]:
-    """Targets as data URLs, within `room` bytes if possible; mean squared error of the coding (full scale 1)."""
+    """Pictures as data URLs, within `room` bytes if possible; mean squared error of the coding (full scale 1)."""
     urls: list[str] = []
     for quality in QUALITIES:
         coder = partial(_url, format="AVIF", quality=quality, speed=8, subsampling="4:4:4")

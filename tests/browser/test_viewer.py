@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import io
 import json
 import os
 import re
@@ -15,6 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 import phasestack
 from runtime.browser.still import asset, stack_table, viewer_html
@@ -199,6 +201,23 @@ def test_a_page_is_no_larger_than_its_layers_files_and_60_kib(tmp_path: Path, wi
         assert np.array_equal(decoded, layer)
     stored_db = float(re.search(r"compressed to (\d+) dB", page)[1])  # type: ignore[index]
     assert stored_db >= 35
+
+
+def test_a_page_of_more_than_8_mb_has_its_layers_compressed_and_says_so() -> None:
+    stack = replace(STACK, width_px=1280, height_px=720)
+    random = np.random.default_rng(3)
+    coarse = random.integers(0, 256, (3, 90, 160, 3)).astype(np.uint8)
+    layers = np.stack([cv2.resize(each, (1280, 720), interpolation=cv2.INTER_CUBIC) for each in coarse])
+    layers ^= random.integers(0, 16, layers.shape, np.uint8)  # what no lossless coder can shorten
+    page = viewer_html(layers, (layers[0],) * 2, stack, eyes_m=eyes_at(distance_m=0.6), fov_deg=40.0, title="large")
+    assert len(page.encode()) <= 8_000_000
+    urls = json.loads(re.findall(r'id="layers">(.*?)</script>', page)[0])
+    decoded = [
+        np.asarray(Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))).convert("RGB")) for url in urls
+    ]
+    stored_db = float(re.search(r"Layers .* to (\d+) dB", page)[1])  # type: ignore[index]
+    error = np.subtract(decoded, layers, dtype=np.float32) / 255
+    assert -10 * np.log10(np.mean(error**2)) == pytest.approx(stored_db, abs=0.51) and stored_db > 35
 
 
 def test_the_page_in_the_docs_has_today_s_script() -> None:
