@@ -104,7 +104,7 @@ class Soak:
         return lost
 
     def harm(self, server: XServer) -> None:
-        """Pull a cable for a while, or have the contexts lost, in turn."""
+        """Alternately unplug a cable for a while and lose the GL contexts."""
         while time.monotonic() < self._end_s - 60.0:
             time.sleep(HARM_EVERY_S / 2)
             index = random.randrange(3)

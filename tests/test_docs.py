@@ -85,7 +85,7 @@ def shown_commands() -> list[tuple[str, list[str]]]:
 
 
 def parse(words: list[str]) -> None:
-    """Have the command's own parser take the words, as if they were typed; nothing is run."""
+    """Parse the words with the command's own parser, without running it."""
     command, left, name = CLI, list(words), "phasestack"
     while hasattr(command, "commands") and left and left[0] in command.commands:
         name = f"{name} {left[0]}"

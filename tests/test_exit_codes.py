@@ -140,7 +140,7 @@ main()
     "module", ["runtime.commands.guard", "typer", "runtime.commands.app", "runtime.daemon.supervise", "numpy"]
 )
 def test_an_interrupt_during_an_import_ends_the_command(module: str) -> None:
-    """Seen: `run` went on for ever, for Python drops what is raised while it releases a module's lock."""
+    """`run` once never ended: Python drops exceptions raised while it releases a module's lock."""
     replay = ["run", "--replay", "demo", "--headless", "--max-speed", "--frames", "1", "--scale", "0.1"]
     done = run(module, *replay, code=INTERRUPTED_IMPORT)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")

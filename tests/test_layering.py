@@ -16,7 +16,7 @@ HEAVY = ("torch", "onnx", "onnxruntime", "cv2", "scipy", "matplotlib", "moderngl
 
 
 def circle(imports: dict[str, set[str]]) -> list[str]:
-    """Modules that import each other, by whatever way, the first also last; empty: there are none."""
+    """Cycle of imports, the first module also last; empty: none."""
     try:
         graphlib.TopologicalSorter(imports).prepare()
     except graphlib.CycleError as error:
@@ -46,7 +46,7 @@ def test_no_module_imports_in_a_circle_not_even_inside_a_function() -> None:
     ids=lambda value: " ".join(value[:2]) or "nothing",
 )
 def test_a_command_loads_nothing_heavy_that_it_does_not_use(arguments: list[str], loads: tuple[str, ...]) -> None:
-    """A name that is missing here is as wrong as one too many: it says what a command needs."""
+    """A missing name is as wrong as an extra one: the list is a command's needs."""
     code = (
         "import atexit, sys\n"
         f"atexit.register(lambda: print('loaded:', *[name for name in {HEAVY!r} if name in sys.modules]))\n"

@@ -58,7 +58,7 @@ def test_the_wheel_holds_every_file_of_the_packages_and_the_sdist_too(packages: 
     assert not [name for name in in_wheel if name.startswith(("tests/", "docs/"))]
 
 
-# What docs/contracts.md promises to programs.
+# Promises of docs/contracts.md to programs.
 PROGRAM = """
 import numpy, phasestack, runtime
 left = numpy.random.default_rng(0).integers(0, 256, (108, 192, 3)).astype("uint8").repeat(10, 0).repeat(10, 1)

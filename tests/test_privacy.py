@@ -22,7 +22,7 @@ NAME_SERVICE = "/var/run/nscd/socket"  # the C library asks it for users and gro
 
 
 def run_traced(folder: Path, *arguments: str) -> tuple[list[str], list[str]]:
-    """Run a command with a fresh home; answers what it wrote outside `out`, and the sockets that lead elsewhere."""
+    """Run a command with a fresh home; returns the files it wrote outside `out`, and its outside connections."""
     home, scratch, trace = folder / "home", folder / "tmp", folder / "trace"
     for path in (home, scratch):
         path.mkdir()

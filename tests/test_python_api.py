@@ -199,7 +199,7 @@ def parallel(eye_m: Any, focal_px: float = 330.0) -> np.ndarray:
 
 
 def test_pictures_of_parallel_cameras_are_solved_for_what_they_are() -> None:
-    """They were taken for pictures that look at the middle: 9 dB, and 24 were told."""
+    """Once taken for pictures that look at the middle: 9 dB, reported as 24."""
     eyes_m = ((0.7, -0.05, 0.02), (0.7, 0.05, 0.02))
     cameras = [parallel(eye) for eye in eyes_m]
     pictures = [taken(matrix, 400, 300) for matrix in cameras]
@@ -337,7 +337,7 @@ def test_many_pairs_are_solved_in_turn() -> None:
 
 
 def rectified(shift_px: int) -> tuple[np.ndarray, ...]:
-    """Blocks of strong contrast that all stand before the middle panel, as parallel cameras see them."""
+    """Blocks of strong contrast in front of the middle panel, seen by parallel cameras."""
     levels = np.random.default_rng(4).choice([30, 90, 160, 230], (9, 24, 3)).astype(np.uint8)
     wide = cv2.resize(levels, (480, 180), interpolation=cv2.INTER_NEAREST)
     return tuple(

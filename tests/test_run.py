@@ -215,7 +215,7 @@ def test_a_gap_of_three_seconds_passes_holding_and_flat_once(tmp_path: Path) -> 
     assert max(np.diff([line["present_ns"] for line in lines])) < 1.1 * NS_PER_S / 60
     gap = [line for line in lines if line["present_ns"] / NS_PER_S - lines[0]["present_ns"] / NS_PER_S > 2]
     assert gap[0]["eyes_m"] is None
-    assert gap[0]["true_eyes_m"] is None  # nothing is made up for it
+    assert gap[0]["true_eyes_m"] is None  # not interpolated
 
 
 def states_passed(lines: list[dict[str, Any]]) -> list[str]:

@@ -11,7 +11,7 @@ import pytest
 
 from tests.test_docs import PAGES, ROOT
 
-SHOWN = {"README.md": "result.show()", "python.md": "result.show()"}  # pages whose Python is run, but for this line
+SHOWN = {"README.md": "result.show()", "python.md": "result.show()"}  # pages whose Python is run, except this line
 PICTURES = r"\.(?:png|jpg|webp)$"
 
 

@@ -123,7 +123,7 @@ def pair(stack: phasestack.Stack) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
 
 
 def agreement_db(folder: Path, name: str, layers: np.ndarray, panels: Panels, eyes: np.ndarray, step: int) -> float:
-    """PSNR of what the page shows against the tracer's light, on a sample of both eyes' pixels."""
+    """PSNR of the page's picture against the tracer's light, on a sample of both eyes' pixels."""
     errors = []
     for side, eye in enumerate(eyes):
         seen = cv2.imread(str(folder / f"{name}-{side}.png"))[..., ::-1] / 255

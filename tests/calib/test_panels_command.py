@@ -81,7 +81,7 @@ def test_a_camera_square_to_a_bare_panel_reads_every_mark_exactly(stack: PanelSt
         picture = cv2.copyMakeBorder(board(stack, index), 40, 40, 40, 40, cv2.BORDER_CONSTANT)
         seen = find_marks(cv2.GaussianBlur(picture, (0, 0), 0.8), stack, name="")
         assert seen.marks[index] == sum(seen.marks) == PER_PANEL
-        # Pixel centres lie at halves on a panel and at whole numbers in a picture.
+        # Pixel centres are half-integers on a panel and integers in a picture.
         assert np.abs(seen.image_px - 40 + 0.5 - seen.panel_px).max() < 0.1
 
 

@@ -80,7 +80,7 @@ def test_photographs_from_one_place_are_refused() -> None:
         register(seen)
 
 
-@pytest.mark.parametrize("seed", range(2))  # what does not fit ends elsewhere every time, and on every processor
+@pytest.mark.parametrize("seed", range(2))  # the fit of inconsistent data differs with seed and processor
 def test_panels_in_the_reverse_order_are_told(seed: int) -> None:
     panels = [ideal_panel(STACK, index) for index in (2, 1, 0)]
     seen = photographed(STACK, tuple(panels), count=8, noise_px=0.05, random=np.random.default_rng(seed))

@@ -66,7 +66,7 @@ def test_keys_lead_through_cards_and_boards_on_the_panels(screen: xserver.XServe
                     lambda monitor=monitor, expected=expected: np.array_equal(screen.panel(monitor)[..., 0], expected),
                     within_s=60,
                 )
-            # The photographs are there. They show no board: that is told.
+            # The photographs exist but show no board, which is reported.
             output = running.communicate("\nq\n", timeout=120)[0]
         finally:
             running.kill()

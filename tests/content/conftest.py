@@ -37,7 +37,7 @@ def stack() -> PanelStack:
 
 @pytest.fixture(autouse=True)
 def files_are_read_here(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A process takes a second to start: only tests with the mark `child` have one, and what it would send is sent."""
+    """Read files in this process, except in tests marked `child`: a process takes a second to start."""
 
     def here(work: Callable[..., Any], *given: Any, source: object, seconds: float) -> Any:
         return pickle.loads(pickle.dumps(work(*given), protocol=5))

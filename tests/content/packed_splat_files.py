@@ -105,7 +105,7 @@ def smallest_three(turns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def write_spz(path: Path, table: np.ndarray, *, version: int) -> Path:
-    """As Niantic's: all splats' places, opacities, colours, scales, turns and harmonics."""
+    """File in Niantic's format: all splats' places, opacities, colours, scales, turns and harmonics."""
     count, rgba, rest = len(table), colours(table), rest_of(table)
     dc = columns(table, "f_dc_0", "f_dc_1", "f_dc_2")
     places, xyzw = columns(table, "x", "y", "z"), np.roll(unit_turns(table), -1, axis=1)
@@ -137,7 +137,7 @@ def write_spz(path: Path, table: np.ndarray, *, version: int) -> Path:
 
 
 def write_sog(path: Path, table: np.ndarray) -> Path:
-    """As PlayCanvas's version 2: pictures of bytes, with a palette of one entry a splat. A folder without a suffix."""
+    """PlayCanvas version 2: pictures of bytes, with a palette of one entry a splat. A folder without a suffix."""
     count, rgba, rest, held = len(table), colours(table), rest_of(table), dict[str, bytes]()
 
     def picture(name: str, rows: np.ndarray, width: int) -> list[str]:

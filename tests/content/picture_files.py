@@ -59,7 +59,7 @@ def _box(kind: bytes, content: bytes) -> bytes:
 
 
 def _shifted(meta: bytes, *, by: int) -> bytes:
-    """A meta box whose places in the file (iloc, version 0, with a base of four bytes) lie farther on."""
+    """A meta box whose places in the file (iloc, version 0, with a base of four bytes) are offset."""
     at = meta.index(b"iloc") + 4
     assert meta[at] == 0 and meta[at + 4 : at + 6] == b"\x44\x40"
     count, place, out = int.from_bytes(meta[at + 6 : at + 8], "big"), at + 8, bytearray(meta)
@@ -75,7 +75,7 @@ def profiled(path: Path, codes: U8, profile: bytes) -> Path:
 
 
 def swapped_profile() -> bytes:
-    """sRGB's profile with red and green exchanged: what it does is seen at once."""
+    """sRGB's profile with red and green exchanged: its effect is obvious."""
     from PIL import ImageCms
 
     data = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())

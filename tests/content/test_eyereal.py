@@ -70,7 +70,7 @@ def test_at_its_own_eyes_a_pair_is_what_the_scene_was(tmp_path: Path, context: A
 def test_pictures_look_at_the_scene_s_origin_wherever_the_display_stands(
     tmp_path: Path, context: Any, stack: PanelStack, name: str
 ) -> None:
-    """Orchids' middle panel stands 0.7 m behind the scene's origin, chair's 4.5 cm before it."""
+    """Orchids' middle panel is 0.7 m behind the scene's origin, chair's 4.5 cm before it."""
     scene_from_stack = drawn_scene_from_stack(name)
     origin = np.linalg.solve(scene_from_stack, [0.0, 0.0, 0.0, 1.0])[:3]
     assert np.linalg.norm(origin) > 0.005

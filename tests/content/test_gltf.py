@@ -386,7 +386,7 @@ def test_a_front_alone_is_seen_through_unless_it_has_two_sides(tmp_path: Path, c
         assert seen[0] == pytest.approx(255 * covers, abs=3)
 
 
-# Parts, and what is left out
+# Parts, and skipped contents
 
 
 @pytest.mark.parametrize("pictured", [False, True])

@@ -316,7 +316,7 @@ def test_an_animation_over_the_limit_is_a_still_and_says_so(tmp_path: Path, monk
     assert "its first frame is shown as a still: it has 3 frames of 160 x 90 pixels" in caplog.text
 
 
-# What is refused
+# Refusals
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "avif", "heic", "gif", "tif"])

@@ -68,7 +68,7 @@ def test_a_narrow_picture_has_the_background_beside_it(tmp_path: Path, context: 
 
 
 def test_a_quilt_gives_each_eye_the_view_nearest_in_angle(tmp_path: Path, context: Any, stack: PanelStack) -> None:
-    """Views run from the bottom left, rightwards, upwards; their grey levels tell which one is seen."""
+    """Views run from the bottom left, rightwards, upwards; their grey levels identify them."""
     views = [solid((10 * index, 0, 0), 32, 18) for index in range(15)]
     rows = [np.concatenate(views[row * 5 : row * 5 + 5], axis=1) for row in range(3)]
     path = tmp_path / "a_qs5x3a1.78.png"
@@ -181,7 +181,7 @@ def test_an_rgbd_picture_without_depth_is_told(tmp_path: Path, context: Any, sta
 
 
 def drawn_size(path: Path, context: Any, stack: PanelStack) -> tuple[int, int]:
-    """Columns and rows of what is drawn on the display."""
+    """Columns and rows covered on the display."""
     source = opened(path, context, stack)
     picture = source.render(panel_view(EYES[0], stack.panel(1)), time_ns=0)
     rows, columns = np.nonzero(picture[..., 3] > 127)
@@ -226,7 +226,7 @@ def test_beside_an_edge_there_is_no_hole_and_no_stretched_foreground(
     assert (picture[..., 3] == 255).all()
     green = picture[..., 1] > 200
     ground = (picture[..., 2] > 200) & (picture[..., 1] < 40)
-    assert (green | ground).mean() > 0.985  # but for the outline's own smoothing
+    assert (green | ground).mean() > 0.985  # except for the outline's smoothing
     expected = (60 * 480 / 320) ** 2  # 0.55 m from the eye it is drawn as large as it was from 0.6
     assert green.sum() == pytest.approx(expected, rel=0.08)
 

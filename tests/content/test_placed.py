@@ -21,7 +21,7 @@ EYE = (0.6, 0.02, 0.03)
 
 
 def middle_of(picture: np.ndarray) -> np.ndarray:
-    """Columns and rows of the middle of what is drawn."""
+    """Column and row of the drawing's middle."""
     rows, columns = np.nonzero(picture[..., 3] == 255)
     return np.array([columns.mean() + 0.5, rows.mean() + 0.5])
 
@@ -55,7 +55,7 @@ def test_a_turn_about_the_axis_out_of_the_screen_turns_the_picture(tmp_path: Pat
     write_png(tmp_path / "a.png", picture)
     source = open_content(ContentSettings(scene=str(tmp_path / "a.png"), rotation_deg=(90, 0, 0)), square, context)
     seen = source.render(panel_view((0.6, 0, 0), square.panel(1)), time_ns=0)
-    # From +y (right) towards +z (up): what was above right is above left.
+    # From +y (right) towards +z (up): the upper right becomes the upper left.
     assert seen[50, 50, :3].tolist() == [255, 0, 0]
     assert seen[50, 150, :3].tolist() == [255, 255, 255]
     assert source.info.flat_x_m == 0.0

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from runtime.content.presets import axes_matrix, drawn_scene_from_stack, preset_file, stack_from_preset
 
-# Of the published code's table: scale per cm, thickness in cm, out axis, up axis; ground (digital units) or its
+# The published code's table: scale per cm, thickness in cm, out axis, up axis; ground (digital units) or its
 # coefficient. One scene of each kind.
 PLACES = {
     "chair": (0.055, 9.09, "+y", "+z", 0, None), "matrixcity": (0.23, 5, "+z", "+y", 0, None),

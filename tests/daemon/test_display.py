@@ -54,7 +54,7 @@ def test_it_shows_scenes_survives_a_lost_monitor_and_stops_in_order(daemon: Any,
     assert (status["panels"], status["scene"]) == ("windows", "demo")
     assert status["skew_ms"]["p50"] >= 0
     demo = x[0].panel(1)
-    for scene in ("texture", "demo", "texture"):  # drawn in the content's context, whichever windows there are
+    for scene in ("texture", "demo", "texture"):  # drawn in the content's context, with any windows
         assert ask([daemon.socket], {"command": "scene", "value": scene})["ok"]
     assert eventually(lambda: daemon.status()["scene"] == "texture")
     assert eventually(lambda: bool(np.mean(x[0].panel(1).astype(float) != demo) > 0.5))
@@ -83,7 +83,7 @@ def test_after_the_x_server_dies_a_restarted_daemon_waits_for_it(daemon: Any, x:
     again.mkdir()
     second = Daemon(again, config=CONFIG, headless=False, watchdog_s=2.0)  # as systemd does
     try:
-        assert second.hears("READY=1")  # waiting is a state: nobody waits for the daemon
+        assert second.hears("READY=1")  # waiting counts as ready: nothing blocks on the daemon
         assert second.hears("WATCHDOG=1")
         assert second.status()["state"] == "starting"
         assert "no X server" in second.status()["reason"]

@@ -1,4 +1,4 @@
-"""Files that never get ready: a model of 2^62 turns of a loop, a scene that takes all memory. Nothing hangs."""
+"""Files that never load: a model with a loop of 2^62 turns, a scene that takes all memory. The daemon does not hang."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ def rig(running: Rig) -> Iterator[Rig]:
 
 @pytest.fixture
 def steady() -> Iterator[Rig]:
-    """Running rig with limits so long that a busy machine causes no fault by itself."""
+    """Running rig with limits that even a busy machine does not exceed."""
     with Rig(
         late_s=60.0,
         abandon_s=600.0,

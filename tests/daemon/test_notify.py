@@ -136,7 +136,7 @@ def test_a_supervisor_that_does_not_listen_blocks_nobody(
         clock.advance_ns(1000 * NS_PER_MS)
         notifier.refreshed(State.TRACKING, (), presented=True)
     heard = supervisor.heard()
-    assert 0 < len(heard) < 5000  # what did not fit was left out, and nobody waited
+    assert 0 < len(heard) < 5000  # messages that did not fit were dropped without waiting
     assert set(heard) == {"WATCHDOG=1"}
     notifier.close()
     notifier.close()

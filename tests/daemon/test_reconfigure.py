@@ -93,7 +93,7 @@ class Bench:
         assert change.finished
 
     def solve(self) -> Any:
-        """Two steps, without a fault: the flat picture, where there is none, and the solution, where it is another."""
+        """Run two steps without a fault: a missing flat picture, and a changed solution."""
         request = SolveRequest(0, EYES, "predicted", 0.001, flat_wanted=False)
         steps = [self.parts.step(request), self.parts.step(request)]
         assert not any(step.missing for step in steps)

@@ -102,7 +102,7 @@ class Refusing:
         raise SensorLost("open it was")
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing."""
 
 
 @pytest.mark.parametrize(("number", "opened"), [(errno.EMFILE, True), (errno.ENOMEM, True), (errno.ENOENT, False)])

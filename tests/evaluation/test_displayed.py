@@ -140,7 +140,7 @@ def test_transparency_lets_white_through_in_every_format_that_has_it(tmp_path: P
     path = tmp_path / f"a.{suffix}"
     cv2.imwrite(str(path), bgra, [cv2.IMWRITE_WEBP_QUALITY, 101] if suffix == "webp" else [])
     if suffix == "webp":
-        bgra = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)  # it may drop what nobody sees
+        bgra = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)  # it may drop invisible colours
     bgra = bgra >> (8 * bgra.itemsize - 8)
     expected = [
         [[round((c * a + 255 * (255 - a)) / 255) for c in (r, g, b)] for b, g, r, a in row]

@@ -126,7 +126,7 @@ def test_without_depth_the_distance_is_as_good_as_eye_separations_are_alike() ->
     assert errors[0] < 2.5 * sigmas[0] and 0.01 < sigmas[0] < 0.05
     assert errors[1] < 2.5 * sigmas[1] and sigmas[1] < 0.02
     seen = eyes[0].eyes_m / eyes[0].eyes_m[:, 2:]
-    np.testing.assert_allclose(seen, truth / truth[:, 2:], atol=0.003)  # sideways nothing is lost
+    np.testing.assert_allclose(seen, truth / truth[:, 2:], atol=0.003)  # no sideways error
 
 
 def test_sigma_is_told_along_the_line_of_sight_and_across_it() -> None:

@@ -72,7 +72,7 @@ def test_the_command_makes_any_of_them(tmp_path: Path, rate_hz: int) -> None:
     np.testing.assert_allclose(steps, 1.0, atol=1e-6)
     pose = demo_stack_from_sensor()
     off = [np.abs(f.eyes.eyes_m @ pose[:3, :3].T + pose[:3, 3] - f.true_eyes_m).max() for f in frames if f.eyes]
-    assert np.median(off) < 1e-6  # without noise what is measured is the truth, outliers apart
+    assert np.median(off) < 1e-6  # without noise, measurements equal the truth, except outliers
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ def watched(
     seed: int = 0,
     outliers: float = 0.0,
 ) -> list[tuple[float, np.ndarray, np.ndarray | None]]:
-    """(time, true eyes, place) after each sample of a head that moves aside as it is told."""
+    """(time, true eyes, place) after each sample of a head that moves sideways as given."""
     random = np.random.default_rng(seed)
     watch = RestWatch(max_drift_m=MOST_M)
     told = []

@@ -144,7 +144,7 @@ def test_a_hasty_head_is_followed_at_its_second_sample() -> None:
     tracker, last = fed()
     told = [tracker.update(points(far), capture_ns=last + k * PERIOD) for k in range(1, 17)]
     assert told == [ELSEWHERE] * 15 + [""]
-    np.testing.assert_allclose(tracker.at(last + 16 * PERIOD + 20 * MS).eyes_m, far, atol=1e-9)  # and at once
+    np.testing.assert_allclose(tracker.at(last + 16 * PERIOD + 20 * MS).eyes_m, far, atol=1e-9)  # and immediately
 
 
 # --- uncertainty
@@ -212,7 +212,7 @@ def test_eyes_that_return_are_followed_within_two_samples_and_without_a_jump(los
             tracker.update(points(elsewhere), capture_ns=back_ns + k * PERIOD)
         shown.append((ns, tracker.at(ns + ahead)))
     y = np.array([a.eyes_m[0, 1] for _, a in shown])
-    assert np.abs(np.diff(y)).max() < 0.045  # of 80 mm: no frame shows more than about half of the way at once
+    assert np.abs(np.diff(y)).max() < 0.045  # of 80 mm: no frame shows more than about half of the way
     arrived = next(ns for ns, a in shown if abs(a.eyes_m[0, 1] - elsewhere[0, 1]) < 0.015)
     assert arrived - back_ns <= 2 * PERIOD + PERIOD // 3
 

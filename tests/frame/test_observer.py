@@ -329,7 +329,7 @@ def test_live_quality_is_one_mean_squared_error_in_whatever_state(content: Conte
         observer.sampled(sample(seen.account.photon_ns, y_m=0.004))
         observer.refreshed(seen)
     observer.finish()
-    observer.refreshed(refreshes[3])  # nobody knows where the eyes are: not a viewer's
+    observer.refreshed(refreshes[3])  # unknown eyes do not count as a viewer
     decibels = [live_db(content, seen, aside(0.004)) for seen in refreshes[:3]]
     errors = [10 ** (-each / 10) for each in decibels]
     assert observer.summary()["live_db"] == pytest.approx(-10 * np.log10(np.mean(errors)), abs=0.1)

@@ -146,7 +146,7 @@ def test_a_deliberately_skipped_refresh_keeps_its_slot_and_is_not_missed() -> No
     for _ in range(20):
         _, now_ns = refresh(paced, display, now_ns, work_ns=NS_PER_MS // 4)
     missed, last = paced.missed, None
-    for _ in range(200):  # nothing changes: the sink swaps nothing, and tells no blank
+    for _ in range(200):  # unchanged: the sink does not swap and reports no blank
         timing = paced.predict(now_ns)
         woke_ns = max(now_ns, timing.wake_ns)
         now_ns = woke_ns + NS_PER_MS // 10

@@ -86,7 +86,7 @@ def test_eyes_behind_the_panels_are_none_and_the_picture_goes_flat(stage: Stage)
     stage.refresh(60)
     assert stage.presenter.last.account.eyes_label == "none"
     assert stage.presenter.last.frame.flatness == 1.0
-    assert "not in front of the panels" in stage.presenter.machine.reason  # told, not a silent flat picture
+    assert "not in front of the panels" in stage.presenter.machine.reason  # reported, instead of a silent flat picture
 
 
 def test_an_eye_that_the_solution_was_not_made_for_moves_nothing(stage: Stage) -> None:
@@ -271,7 +271,7 @@ def test_a_lost_sensor_is_named(stage: Stage) -> None:
 
 
 def test_no_refresh_waits_for_the_solver() -> None:
-    """Nothing is handed over for ten seconds: as many refreshes as there are slots, each with its own eyes."""
+    """No task is handed over for ten seconds: as many refreshes as there are slots, each with its own eyes."""
     stage = Stage()
     stage.solver.hand_over(flat=solution(1, None))
     stage.solver.hand_over(solved=solution(2))

@@ -13,7 +13,7 @@ from runtime.frame.run_state import RunCell
 
 
 class Part:
-    """Stands for content or a model: only which one it is counts here."""
+    """Stand-in for content or a model, compared by identity."""
 
 
 @pytest.fixture

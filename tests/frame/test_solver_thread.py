@@ -284,7 +284,7 @@ def test_memory_of_a_solver_that_ended_goes_back_to_the_system(shop: Workshop) -
     keep_freed_memory()
 
     def fail(request: SolveRequest) -> SolverUpdate:
-        blocks = [np.ones(1 << 20) for _ in range(48)]  # of 8 MiB, as pictures are; malloc keeps what was freed
+        blocks = [np.ones(1 << 20) for _ in range(48)]  # of 8 MiB, as pictures are; malloc keeps freed blocks
         held.append(blocks.pop())
         raise ContextLost("the panels have lost their OpenGL context")
 

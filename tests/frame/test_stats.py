@@ -79,7 +79,7 @@ def test_a_refresh_without_its_picture_is_dropped_and_splits_the_interval() -> N
     stats = told([account(k, presented=k != 5) for k in range(11)])
     summary = stats.summary(stale_inputs=0)
     assert (summary["presented"], summary["dropped"]) == (10, 1)
-    assert summary["interval_ms"]["p99"] == 20.0  # none of 40 ms is made up
+    assert summary["interval_ms"]["p99"] == 20.0  # no interval of 40 ms is invented
 
 
 def test_overhead_leaves_out_the_first_refresh() -> None:

@@ -23,22 +23,22 @@ SECONDS, RATE_HZ, REFRESH_HZ = 12.0, 30, 60
 ARRIVAL_NS, LIGHT_NS = 15 * NS_PER_MS, 45 * NS_PER_MS
 OTHER_M = np.array([0.12, 0.35, 0.05])  # where another person's head is, seen from the viewer's
 
-Tamper = Callable[[int, F64, np.random.Generator], EyePoints | None]  # number, eyes (2, 3) -> what the sensor says
+Tamper = Callable[[int, F64, np.random.Generator], EyePoints | None]  # number, eyes (2, 3) -> the sensor's sample
 
 
 @dataclass(frozen=True, slots=True)
 class Served:
     """Eyes that refreshes were aligned to, after the first two seconds."""
 
-    error_mm: F64  # (n,) mean of both eyes; infinite where nobody was served
-    sigma_mm: F64  # (n,) as told
+    error_mm: F64  # (n,) mean of both eyes; infinite without eyes
+    sigma_mm: F64  # (n,) as reported
     viewer: Viewer
 
     def p95_mm(self) -> float:
         return float(np.percentile(self.error_mm, 95))
 
     def sigma_share(self) -> float:
-        """Sigma as told over the true error, both as root mean squares."""
+        """Reported sigma over the true error, both as root mean squares."""
         return float(np.sqrt((self.sigma_mm**2).mean()) / np.sqrt((self.error_mm**2).mean()))
 
 
@@ -69,7 +69,7 @@ def serve(motion: str, tamper: Tamper, *, noise_mm: float = 2.0, seed: int = 0, 
 
 
 def uncertain(share: float) -> Tamper:
-    """Blinks: little confidence, and eyes that lie elsewhere."""
+    """Blinks: little confidence, and displaced eyes."""
 
     def tamper(k: int, eyes: F64, random: np.random.Generator) -> EyePoints:
         if random.random() < share:
@@ -92,7 +92,7 @@ def outliers(share: float) -> Tamper:
 
 
 def another_person(share: float) -> Tamper:
-    """Somebody beside the viewer, who stands still."""
+    """A second person next to the viewer, standing still."""
 
     def tamper(k: int, eyes: F64, random: np.random.Generator) -> EyePoints:
         if k and random.random() < share:
@@ -142,10 +142,10 @@ def test_a_viewer_who_left_makes_way_for_another_within_a_second() -> None:
         return EyePoints(eyes if k < 4 * RATE_HZ else eyes + OTHER_M, np.ones(2))
 
     served = serve("still", relieved)
-    since = served.error_mm[round(3.0 * REFRESH_HZ) :]  # one second after, of what is kept from two seconds on
+    since = served.error_mm[round(3.0 * REFRESH_HZ) :]  # one second later; errors are kept from two seconds on
     assert np.abs(since - np.linalg.norm(OTHER_M) * 1000).max() < 15.0
     between = served.error_mm[: round(3.0 * REFRESH_HZ)]
-    assert not ((between > 30.0) & (between < 340.0)).any()  # nobody was served who is neither
+    assert not ((between > 30.0) & (between < 340.0)).any()  # every eye served belongs to one of the two
 
 
 def test_one_s_left_with_the_other_s_right_is_refused_and_said(caplog: pytest.LogCaptureFixture) -> None:

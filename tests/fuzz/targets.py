@@ -65,7 +65,7 @@ EYES = EyePoints(np.array([[0.03, 0.0, 0.6], [-0.03, 0.0, 0.6]]), np.ones(2))
 
 @dataclass(frozen=True)
 class Target:
-    """One reader. `read` raises PhasestackError for what it refuses, and nothing else."""
+    """One reader. `read` raises only PhasestackError, for files it refuses."""
 
     seeds: Callable[[], list[bytes]]
     read: Callable[[bytes, Path], object]

@@ -19,7 +19,7 @@ from tests.fuzz.targets import LOW, TARGETS
 CORPUS = Path(__file__).parent / "corpus"
 KEPT = sorted(path for path in CORPUS.glob("*/*") if path.is_file())
 EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "40"))  # of each reader; `make fuzz` tries thousands
-HEAVY = {"checkpoint", "model"}  # what they stand on takes seconds to load, or belongs to their own tests
+HEAVY = {"checkpoint", "model"}  # their packages take seconds to load, or belong to their own tests
 CASE_S, CASE_MIB = 10, 400  # that one file may take
 
 

@@ -1,4 +1,4 @@
-"""Golden runs from the command line: compare (the default), renew on purpose, make the recordings anew."""
+"""Golden runs from the command line: compare (the default), renew on purpose, rewrite the recordings."""
 
 from __future__ import annotations
 

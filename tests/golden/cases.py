@@ -13,7 +13,7 @@ from runtime.frame.presenter import Presenter
 from tests.golden.recordings import path_to
 
 Action = Callable[[Presenter], None]
-LOADED_WITHIN_S = 60.0  # of the machine's time; the simulated clock stands meanwhile
+LOADED_WITHIN_S = 60.0  # real time; the simulated clock is stopped meanwhile
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,7 +21,7 @@ class Case:
     """One golden run."""
 
     recording: str
-    tables: dict[str, dict[str, Any]] = field(default_factory=dict)  # settings beside SMALL
+    tables: dict[str, dict[str, Any]] = field(default_factory=dict)  # settings in addition to SMALL
     actions: dict[int, Action] = field(default_factory=dict)  # before the refresh of that number
     pictures: tuple[int, ...] = ()  # refreshes whose panels are kept
 
@@ -55,7 +55,7 @@ SLOW: dict[str, Any] = {
 
 
 def change_scene(name: str) -> Action:
-    """`ctl scene`, complete before the simulated clock goes on."""
+    """`ctl scene`, complete before the simulated clock continues."""
 
     def do(presenter: Presenter) -> None:
         present = presenter.run_cell.state.settings

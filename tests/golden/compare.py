@@ -43,7 +43,7 @@ TOLERANCES = {
     "psnr_db_true_eyes": DECIBEL,
     "ssim": SIMILARITY,
 }
-# Of a picture. Without AVX2 and IPP the runs differ by 0.02 codes and 0.001 dB.
+# Limits for pictures. Without AVX2 and IPP the runs differ by 0.02 codes and 0.001 dB.
 PICTURE_MEAN = 0.2  # codes, of the absolute difference
 PICTURE_FAR = 4  # codes
 PICTURE_FAR_SHARE = 0.002  # of values that may be farther off

@@ -23,7 +23,7 @@ from runtime.records import U8, SensorFrame
 from tests.golden.cases import Case
 from tests.panels.drawn import DrawnPanels
 
-DIGITS = 7  # of what is stored: a tenth of a micrometre, a tenth of the least tolerance
+DIGITS = 7  # stored digits: a tenth of a micrometre, a tenth of the least tolerance
 
 SUMMARY = (
     "frames", "presented", "dropped", "stale_inputs", "inferences", "seconds", "fps", "solutions_per_s", "stage_ms",

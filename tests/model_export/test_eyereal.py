@@ -92,7 +92,7 @@ def test_a_published_checkpoint_is_imported_with_every_weight(published: Path) -
 def test_a_checkpoint_that_carries_code_is_refused_and_its_code_not_run(
     published: Path, tmp_path: Path, where: str
 ) -> None:
-    """The allow-list holds the table that `args` is, and nothing that could stand in it."""
+    """The allow-list holds the table that `args` is, and no type that it might contain."""
     ran = tmp_path / "ran"
 
     class Evil:
@@ -149,7 +149,7 @@ def official(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("place", EYES)
 def test_the_forward_is_the_official_one(official: Path, place: str) -> None:
-    """Aligned corners, padding on the one side that is left over, skip before upsampled, sigmoid less 0.2."""
+    """Aligned corners, padding on the remaining side, skip before upsampled, sigmoid less 0.2."""
     with torch.no_grad():
         ours = load_eyereal(official)(torch.from_numpy(golden(f"{place}_x"))[None])[0].numpy()
     assert golden(f"{place}_y").min() < -0.15, "the case must need the clip"
@@ -167,7 +167,7 @@ def pair_of(folder: Path, place: str) -> Pair:
 def predictor_of(official: Path, folder: Path) -> StepPredictor:
     path = folder / "eyereal.onnx"
     path.write_bytes(eyereal_file(official, width_px=SIZE[0], height_px=SIZE[1], eye_order="right-left"))
-    # The published code's panels of lego_bulldozer: with square pixels, whatever their shape.
+    # The published code's panels of lego_bulldozer, with square pixels.
     stack = PanelStack(0.5184, 0.5184 * SIZE[1] / SIZE[0], (-0.06, 0.0, 0.06), *SIZE)
     session = ModelSession(path, threads=1)
     return StepPredictor(stack, PictureProposal(session, stack, source=path), (), name=session.contract.name)
@@ -177,7 +177,7 @@ def predictor_of(official: Path, folder: Path) -> StepPredictor:
 def test_the_network_s_input_and_output_layers_are_the_official_code_s(
     official: Path, tmp_path: Path, place: str
 ) -> None:
-    """All 18 channels of one pair: panel by panel, `_0` before `_1`, red before green before blue, black beside."""
+    """All 18 channels of one pair: panel by panel, `_0` before `_1`, red before green before blue, black outside."""
     pair = pair_of(tmp_path, place)
     predictor = predictor_of(official, tmp_path)
     pictures = [read_image(path) for path in pair.paths]
@@ -191,7 +191,7 @@ def test_the_network_s_input_and_output_layers_are_the_official_code_s(
     assert np.quantile(codes, 0.99) < 8  # OpenCV samples at 1/32 of a pixel, and in 8 bits
     with torch.no_grad():
         answer = load_eyereal(official)(torch.from_numpy(fed.copy())[None])[0].numpy()
-    # Of the same answer the same grey levels: clipped, rounded half up.
+    # Equal outputs give equal grey levels: clipped, rounded half up.
     shown = np.floor(np.clip(answer, 0, 1) * 255 + 0.5).reshape(3, 3, *SIZE[::-1]).transpose(0, 2, 3, 1)
     assert np.abs(done.layers[..., :3] - shown).mean() < 0.02  # by way of sixteenths of a code
     apart = done.layers[..., :3].astype(float) - golden(f"{place}_layers")

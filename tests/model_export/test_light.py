@@ -71,7 +71,7 @@ def test_content_on_the_centre_panels_pixels_is_seen_there() -> None:
 
 
 def plain_light(codes: np.ndarray, stack: PanelStack, eye: np.ndarray, size: tuple[int, int], rays: int) -> np.ndarray:
-    """(h, w, C) what an eye sees of even boxes, and nan where a ray is lost: no matrix, one line after another."""
+    """(h, w, C) an eye's view of uniform boxes, nan where a ray is lost, computed line by line without matrices."""
     height, width = size
     pose = image_from_stack(eye, width_px=width, height_px=height, fov_deg=40.0)
     v, u = ((np.arange(n * rays) + 0.5) / rays for n in size)
@@ -103,7 +103,7 @@ def still() -> tuple[PanelStack, Any]:
 
 
 def test_steps_raise_the_light_of_real_pixels_and_say_how_much(still: tuple[PanelStack, Any]) -> None:
-    """From grey. Of what is displayed then, `light` says nearly what rays through even boxes do, `traced` the same."""
+    """From grey. For the displayed result `light` nearly equals rays through uniform boxes, `traced` exactly."""
     stack, targets = still
     views, random = views_of(stack), torch.Generator().manual_seed(1)
     x = y = torch.full((3, 3, 54, 96), 0.5, dtype=torch.float64)

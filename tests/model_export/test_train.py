@@ -125,7 +125,7 @@ def test_training_raises_the_light_that_eyes_get_and_leaves_its_files(tmp_path: 
     assert read_image(tmp_path / "curve.png").shape[2] == 3
     table = load_checkpoint(tmp_path / "checkpoint.pth")
     assert table["training"]["options"] == SHORT["options"]
-    # Of the very pair, by the exact rays: from where it began to what it learned.
+    # Light of the training pair by exact rays: before and after.
     pairs = TrainingPairs(Form(), seed=1, width_px=96, height_px=64, eye_sigma_mm=0.0, count=1)
     batch = torch.utils.data.default_collate([pairs[0]])
     before, after = make_network(SHORT["arch"], SHORT["options"], seed=1), make_network(SHORT["arch"], SHORT["options"])

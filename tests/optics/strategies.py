@@ -25,7 +25,7 @@ def eyes(draw: st.DrawFn, *, nearest_m: float = 0.1, farthest_m: float = 4.0, of
 
 @st.composite
 def stacks(draw: st.DrawFn, *, panels: tuple[int, int] = (2, 4), pixels: tuple[int, int] = (16, 64)) -> PanelStack:
-    """A stack whose frontmost panel stands at most at 3 cm, so that eyes from 0.1 m and 70 degrees are before it."""
+    """Stack whose front panel is at most at x = 3 cm, so that eyes from 0.1 m and 70 degrees are in front of it."""
     gaps = draw(st.lists(floats(0.005, 0.05), min_size=panels[0] - 1, max_size=panels[1] - 1))
     front = draw(floats(0.0, 0.03))
     x_m = [front]

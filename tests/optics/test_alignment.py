@@ -1,4 +1,4 @@
-"""Layers aligned to eyes that have moved: every ray of the middle meets on each panel what the old one met."""
+"""Layers aligned to moved eyes: every ray of the middle meets the same panel values as before."""
 
 from __future__ import annotations
 

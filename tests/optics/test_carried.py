@@ -24,7 +24,7 @@ from tests.optics.carried_rays import seen_along
 from tests.optics.strategies import floats
 
 SIZE = (17, 11)  # of the pictures, pixels
-STACKS = (  # no line of sight lies in an edge between pixels, where the nearest one is anybody's choice
+STACKS = (  # no line of sight is on an edge between pixels, where the nearest one is ambiguous
     PanelStack(0.5, 0.3, (-0.06, 0.0, 0.06), 33, 21),
     PanelStack(0.5, 0.3, (-0.05, 0.02), 24, 16),
     PanelStack(0.4, 0.4, (-0.07, -0.03, 0.01, 0.03), 20, 20),

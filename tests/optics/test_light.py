@@ -62,7 +62,7 @@ def traced(
 def crossed(start: F64, direction: F64, stack: PanelStack, index: int) -> tuple[F64, F64]:
     """Columns and rows of a panel's layer where rays cross it."""
     x_m, point = stack.x_m[index], start + direction * ((stack.x_m[index] - start[..., :1]) / direction[..., :1])
-    if stack.tilt is not None:  # the panel stands at x = x_m + d + r·y + u·z; its layer is what `seen_from_m` sees
+    if stack.tilt is not None:  # the panel is at x = x_m + d + r·y + u·z; its layer is what `seen_from_m` sees
         d, r, u = stack.tilt.depth[index]
         normal, origin = np.array([1.0, -r, -u]), np.array(stack.tilt.seen_from_m)
         point = start + direction * ((x_m + d - start @ normal) / (direction @ normal))[..., None]

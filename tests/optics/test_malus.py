@@ -58,13 +58,13 @@ def test_single_precision_stays_single(dtype: type) -> None:
     phase = phase_from_intensity(value)
     assert phase.dtype == dtype
     assert intensity_from_phase(phase).dtype == dtype
-    # Where the slope of sin² is 1 at most, the error of the phase is that of the intensity.
+    # With a slope of sin² of at most 1, the phase's error bounds the intensity's.
     assert np.abs(intensity_from_phase(phase) - value).max() < 4 * np.finfo(dtype).eps
 
 
 @pytest.mark.parametrize("dtype", [bool, np.int8, np.int32, np.int64])
 def test_whole_numbers_are_taken_as_numbers_and_not_rounded_to_their_type(dtype: type) -> None:
-    """Seen: pi/2 became 1 in an integer's type, and sin²(1) was told for white."""
+    """Once pi/2 became 1 in an integer type, and white was sin²(1)."""
     np.testing.assert_allclose(intensity_from_phase(np.array([0, 1], dtype)), [0.0, 1.0], atol=1e-15)  # type: ignore[type-var]
     np.testing.assert_allclose(phase_from_intensity(np.array([0, 1], dtype), 1), [0.0, 1.0], atol=1e-15)  # type: ignore[type-var]
     np.testing.assert_allclose(phase_from_intensity(np.array([0, 1], dtype), 2), [2.0, 1.0], atol=1e-15)  # type: ignore[type-var]

@@ -47,7 +47,7 @@ class DrawnPanels(OffscreenPanels):
 
     def close(self) -> None:
         if self._painters:
-            # moderngl binds the last framebuffer again on later calls: it must not be one that is no more.
+            # moderngl binds the last framebuffer again on later calls: it must not be a deleted one.
             self._context.detect_framebuffer(0).use()
         for painter in self._painters:
             painter.release()

@@ -12,7 +12,7 @@ def block(*, serial_text: str = "", serial_number: int = 0, name: str = "CG2700X
     data = b"\x00\xff\xff\xff\xff\xff\xff\x00"
     data += maker.to_bytes(2, "big") + (0x2B7A).to_bytes(2, "little") + serial_number.to_bytes(4, "little")
     data += bytes([10, 33, 1, 4]) + bytes(54 - 20)
-    data += bytes(18)  # a detailed timing is no text
+    data += bytes(18)  # a detailed timing is not text
     data += text(0xFF, serial_text) if serial_text else bytes(18)
     data += text(0xFC, name) + bytes(18) + b"\x00"
     return data + bytes([-sum(data) % 256])

@@ -104,7 +104,7 @@ def test_configured_panels_are_shown_as_mounted_and_keys_step_through_them(x: XS
     with started(x, "--config", config) as running:
         try:
             assert eventually(turned, within_s=20.0)
-            # Rear to front lie on monitors 2, 1, 0.
+            # Rear to front are monitors 2, 1, 0.
             for monitor, key in ((2, "n"), (1, "n"), (0, "p"), (1, "q")):
                 assert eventually(lambda monitor=monitor: lit(x) == [n == monitor for n in range(3)], within_s=20.0)
                 running.stdin.write(key)
@@ -117,7 +117,7 @@ def test_configured_panels_are_shown_as_mounted_and_keys_step_through_them(x: XS
 @pytest.mark.parametrize("rotation_deg", [0, 90, 180, 270])
 @pytest.mark.parametrize("mirror", ["none", "horizontal"])
 def test_the_mounting_that_is_answered_shows_the_card_upright(rotation_deg: int, mirror: str) -> None:
-    """A card sent bare to a panel that is so mounted, and what the arrow on it does: the answer gives the mounting."""
+    """An unrotated card on a mounted panel: the arrow's direction gives the mounting."""
     card_points_up = np.array([0.0, -1.0])
     seen = panel_from_screen(screen_width_px=4, screen_height_px=3, rotation_deg=rotation_deg, mirror=mirror)
     direction = tuple(np.rint(seen[:2, :2] @ card_points_up).astype(int))

@@ -153,7 +153,7 @@ def test_a_registered_panel_is_aligned_first_then_warped_by_its_registration(con
     sink.present(frame)
     picture = codes(sink.read_back())
     assert np.abs(picture[:, :-3, 5:] - codes(shown_layers(frame))[:, 3:, :-5]).max() <= 2
-    assert not picture[:, :, :5].any() and not picture[:, -3:].any()  # beside the panel there is nothing, not even even
+    assert not picture[:, :, :5].any() and not picture[:, -3:].any()  # outside the panel is black, not mid-grey
     sink.close()
 
 

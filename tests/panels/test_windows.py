@@ -26,7 +26,7 @@ STACK = PanelStack(0.5, 0.28, (-0.06, 0.0, 0.06), WIDTH_PX, HEIGHT_PX)
 
 
 def picture(number: int, index: int) -> np.ndarray:
-    """A layer that tells its panel, its frame and its orientation: no rotation or mirroring of it looks alike."""
+    """Layer that encodes its panel, frame and orientation: no rotation or mirroring looks alike."""
     layer = np.zeros((HEIGHT_PX, WIDTH_PX, 4), np.uint8)
     layer[..., 0] = np.linspace(0, 255, WIDTH_PX).astype(np.uint8)
     layer[..., 1] = np.linspace(0, 255, HEIGHT_PX).astype(np.uint8)[:, None]
@@ -135,7 +135,7 @@ def test_the_pacer_gets_the_time_and_period_of_vertical_blanks(opened: Callable[
     first, second = sink.present(moved(0)), sink.present(moved(1))
     assert first.vblank_ns < second.vblank_ns <= second.present_ns
     assert second.vblank_ns == pytest.approx(second.present_ns - 1e6 * second.skew_ms, abs=2)
-    assert sink.present(moved(1), unchanged=True).vblank_ns is None  # nothing was swapped
+    assert sink.present(moved(1), unchanged=True).vblank_ns is None  # no swap
 
 
 def test_a_fault_while_drawing_leaves_the_new_frame_on_no_panel(

@@ -113,7 +113,7 @@ class XServer:
     def plug(self, index: int) -> None:
         """Monitor `index` at its place."""
         self.xrandr("--output", f"DUMMY{index}", "--mode", MODE, "--pos", f"{WIDTH_PX * index}x0")
-        self.xrandr("--query")  # the dummy driver looks at what is connected only when it is asked
+        self.xrandr("--query")  # the dummy driver detects connections only on a query
 
     def unplug(self, index: int) -> None:
         """Disconnect monitor `index`."""
@@ -187,7 +187,7 @@ class XServer:
         x11.XCloseDisplay(display)
 
     def stop(self) -> None:
-        """End it, as a crash would: at once. This process, which may be connected to it, lets go first."""
+        """Kill the server, as a crash would. This process, which may be connected to it, disconnects first."""
         from runtime.panels import display
 
         if display.watch is not None:

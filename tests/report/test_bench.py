@@ -131,4 +131,4 @@ def test_on_a_busy_machine_times_are_not_compared_and_that_is_said(tmp_path: Pat
     done = CliRunner().invoke(app, ["compare", *paths, "--json"])
     assert json.loads(done.stdout)["times_compared"] is False
     busy["methods"][0]["memory_mib"] = 300.0
-    assert texts(quiet, busy) == [(True, "1.50 times the memory")]  # what is no time is
+    assert texts(quiet, busy) == [(True, "1.50 times the memory")]  # other figures are compared

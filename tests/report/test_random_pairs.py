@@ -23,7 +23,7 @@ def seen_as(pair: StillPair) -> dict[str, Any]:
 def test_what_lies_behind_the_eye_is_not_seen() -> None:
     red = np.zeros((8, 8, 4), np.uint8)
     red[...] = (255, 0, 0, 255)
-    # A wall beside the eye: it begins far before it and ends as far behind it.
+    # A wall next to the eye, from far in front of it to as far behind it.
     wall = Plane(red, np.array([-2.0, 0.3, 0.5]), np.array([4.0, 0.0, 0.0]), np.array([0.0, 0.0, -1.0]))
     size = {"width_px": 64, "height_px": 36}
     image = draw((wall,), image_from_stack(np.array([0.6, 0.0, 0.0]), **size, fov_deg=90.0), **size)

@@ -107,7 +107,7 @@ def method(name: str, kind: str, ms: float, light: float) -> MethodResult:
 
 
 def report_page() -> Page:
-    """The report's sections on made-up measurements: what is looked at here is the page."""
+    """The report's sections from invented measurements, for tests of the page."""
     methods = [
         method("fast", "network", 20, 36),
         method("balanced", "network", 40, 41),

@@ -99,7 +99,7 @@ def test_a_motion_replaces_only_a_motion_and_a_sensor_replaces_nothing(tmp_path:
     motion, sensor = ["--motion", "still", "--seconds", "1"], ["--seconds", "0.5"]
 
     def made(*arguments: str) -> bool:
-        """False: refused, and what was there stays."""
+        """False: refused, and the existing file stays."""
         before = out.read_bytes() if out.exists() else b""
         answer = CliRunner().invoke(app, [*arguments, "--out", str(out)])
         if answer.exit_code == 0:
@@ -109,7 +109,7 @@ def test_a_motion_replaces_only_a_motion_and_a_sensor_replaces_nothing(tmp_path:
         return False
 
     assert made(*motion) and not made(*sensor)
-    assert made(*motion, "--seed", "5")  # it is made again from its seed
+    assert made(*motion, "--seed", "5")  # reproducible from its seed
     out.unlink()
     assert made(*sensor) and not made(*motion)
     out.write_bytes(b"something else")

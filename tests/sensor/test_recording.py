@@ -238,7 +238,7 @@ def test_without_a_sample_an_older_file_stays_and_nothing_new_is_left(tmp_path: 
     assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [("a.mcap", b"older")]
 
 
-# A process of its own, with nothing imported that it does not need.
+# A separate process with no unneeded imports.
 RECORDER = """
 import pathlib, resource, sys, time
 import numpy as np
@@ -270,7 +270,7 @@ def test_a_killed_recorder_leaves_all_but_its_last_chunk(tmp_path: Path) -> None
 
 def test_a_full_disk_is_named_and_what_was_written_can_be_read(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    # A measurement of coverage would write a file of its own.
+    # A measurement of coverage would write its own file.
     environment = {name: value for name, value in os.environ.items() if not name.startswith("COVERAGE_")}
     command = [sys.executable, "-c", RECORDER, str(path), "30000"]
     answer = subprocess.run(command, capture_output=True, text=True, env=environment)
@@ -326,7 +326,7 @@ def test_a_small_chunk_that_becomes_a_large_one_takes_no_memory(tmp_path: Path) 
 def test_two_recorders_into_one_file_are_one_too_many(tmp_path: Path) -> None:
     path = tmp_path / "o.mcap"
     with recording_to(path, RecordingHeader("test")) as writer:
-        for _ in range(2):  # before the file has its name, and after; a lock is of an open file, whoever has it
+        for _ in range(2):  # before the file has its name, and after; a lock belongs to an open file, in any process
             second = recording_to(path, RecordingHeader("second"))
             with pytest.raises(InputError, match="is being recorded by another process"), second:
                 pass

@@ -310,7 +310,7 @@ def camera(monkeypatch: pytest.MonkeyPatch) -> Any:
 def test_future_stamps_are_rejected_and_a_persistent_sensor_counts_as_lost(
     camera: SensorWorker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After the first sample nobody looked: 105 mm off, and sure to 2 mm."""
+    """Once later samples were ignored: 105 mm off, with a sigma of 2 mm."""
     monkeypatch.setattr(Camera, "ahead_ns", 900_000_000)
     camera.take()
     assert eventually(lambda: camera.state is SensorState.LOST)
@@ -326,7 +326,7 @@ def test_future_stamps_are_rejected_and_a_persistent_sensor_counts_as_lost(
 def test_a_sensor_whose_samples_never_change_is_lost_until_they_do(
     camera: SensorWorker, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
-    """Frozen eyes were at rest, and sure to 0.7 mm. Colour that lives does not hide depth that does not."""
+    """Frozen eyes were once at rest with a sigma of 0.7 mm. Changing colour does not hide frozen depth."""
     monkeypatch.setattr("runtime.sensor.worker.FROZEN_NS", 100_000_000)
     monkeypatch.setattr(Camera, "frozen", what)
     assert eventually(lambda: camera.state is SensorState.LOST)

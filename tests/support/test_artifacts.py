@@ -84,7 +84,7 @@ os.write(2, b"its own\\n")
 
 
 def test_lines_of_a_library_are_held_back() -> None:
-    # In a process of its own: a worker of the suite has threads.
+    # In a separate process: the suite's workers have threads.
     answer = subprocess.run([sys.executable, "-c", HELD], capture_output=True, text=True, check=True)
     assert answer.stderr == "its own\n"
 
@@ -118,7 +118,7 @@ with OutputFolder(Path(sys.argv[1])) as folder:
 
 
 def test_of_staged_files_only_a_killed_process_s_are_removed(tmp_path: Path) -> None:
-    """A folder of somebody's, and what a container was at, went with it."""
+    """Another user's folder, and a container's files, were once deleted with it."""
 
     def writer() -> subprocess.Popen[str]:
         command = [sys.executable, "-c", HOLDS, str(tmp_path)]

@@ -101,7 +101,7 @@ def test_a_reader_that_never_reads_blocks_nobody(pipe: Pipe) -> None:
         begin_s = time.monotonic()
         say(f"line {number} " + "x" * 100)
         longest_s = max(longest_s, time.monotonic() - begin_s)
-    assert longest_s < 2.0  # without the thread the first full pipe would hold it for ever
+    assert longest_s < 2.0  # without the thread a full pipe would block it forever
     pipe.read_until(f"line {QUEUED_MAX} x")
     say("and on")
     pipe.read_until("and on")

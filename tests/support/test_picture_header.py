@@ -22,7 +22,7 @@ WHOLE = coded(".png")
 def test_whole_pictures_and_those_with_something_behind_them_are_not_cut_off() -> None:
     assert not is_cut_off(WHOLE)
     assert not is_cut_off(WHOLE + b"something else")
-    assert not is_cut_off(coded(".jpg")[:100])  # of other formats nothing is said
+    assert not is_cut_off(coded(".jpg")[:100])  # other formats are not judged
 
 
 @given(st.integers(len(PNG), len(WHOLE) - 1))

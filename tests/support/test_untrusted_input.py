@@ -18,7 +18,7 @@ from runtime.errors import InputError
 from runtime.support import untrusted_input
 from runtime.support.untrusted_input import parsed_json, whole_from_text
 
-HANG_S = 20  # on a busy machine; what hangs takes minutes, or for ever
+HANG_S = 20  # on a busy machine; a hang takes minutes, or never ends
 
 
 def refused(call: Callable[..., Any], *arguments: Any, **named: Any) -> str:
