@@ -104,7 +104,7 @@ def _turns(packed: U32) -> F32:
 
 
 def with_largest(three: NDArray[np.floating[Any]], number: NDArray[np.integer[Any]]) -> F32:
-    """(n, 4) unit quaternions, of (n, 3) and the largest, which has that number; 0 where there is none of it."""
+    """(n, 4) unit quaternions from three components and the largest one's index; zeros if above 3."""
     largest = np.sqrt(np.maximum(1 - (three**2).sum(1), 0))
     found = np.zeros((len(three), 4), np.float32)
     for place in range(4):
