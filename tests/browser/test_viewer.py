@@ -203,7 +203,7 @@ def test_a_page_is_no_larger_than_its_layers_files_and_60_kib(tmp_path: Path, wi
     assert stored_db >= 35
 
 
-def test_a_page_of_more_than_8_mb_has_its_layers_compressed_and_says_so() -> None:
+def test_a_page_above_8_mb_has_compressed_layers_and_says_so() -> None:
     stack = replace(STACK, width_px=1280, height_px=720)
     random = np.random.default_rng(3)
     coarse = random.integers(0, 256, (3, 90, 160, 3)).astype(np.uint8)
