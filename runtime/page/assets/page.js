@@ -276,6 +276,7 @@ function gone(why, hangs = false) {
   setText($("gone"), `${hangs ? "The daemon hangs." : "No daemon is running."} ${why}`);
   setText($("state"), hangs ? "hangs" : "no daemon");
   $("state").dataset.state = "gone";
+  document.body.dataset.known = "last";
   setText($("reason"), "");
   setText($("eyes-told"), "unknown");
   $("above").replaceChildren();
@@ -288,12 +289,14 @@ function show(status) {
     for (const told of document.querySelectorAll('[data-kind="bad"]')) setText(told, "");
   }
   running = true;
+  document.body.dataset.known = "now";
   const hangs = status.turn_age_s > 5;
   $("gone").hidden = !hangs;
   if (hangs) setText($("gone"), `the display loop has hung for ${number(status.turn_age_s, 0)} s`);
-  setText($("state"), hangs ? "hangs" : status.state ?? "starting");
-  $("state").dataset.state = hangs ? "gone" : (status.state ?? "starting").split(":")[0];
-  setText($("reason"), status.reason ?? "");
+  const reason = status.reason ?? "", late = /solutions take|has not answered for/.test(reason);
+  setText($("state"), hangs ? "hangs" : late ? "late" : status.state ?? "starting");
+  $("state").dataset.state = hangs ? "gone" : late ? "holding" : (status.state ?? "starting").split(":")[0];
+  setText($("reason"), late ? `${reason}: use the model "fast", or fewer pixels; the panels still follow the eyes` : reason);
   if (status.state === undefined) return; // before the first refresh
   document.querySelector('[data-command="pause"]').setAttribute("aria-pressed", String(status.paused));
   document.querySelector('[data-command="flat"]').setAttribute("aria-pressed", String(status.flat_asked));
