@@ -1,4 +1,4 @@
-"""Recordings in MCAP with small chunks: a crash loses at most one, and the rest stays readable."""
+"""Recordings in MCAP with small chunks: after a crash all whole samples in the file are readable."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import fcntl
 import json
 import logging
 import os
+import struct
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -28,8 +29,16 @@ INDEX_SHARE = 1.1  # size with chunk indices over size without
 SUMMARY_BYTES = 10_000  # with the schemas
 MAX_S, MAX_BYTES = 600.0, 2 << 30  # a recording ends before it is longer or larger
 MAGIC = b"\x89MCAP0\r\n"
+RECORD, CHUNK = struct.Struct("<BQ"), b"\x06"  # a record's kind and length; the kind of a chunk
+CHUNK_HEAD = struct.Struct("<BQQQQII")  # with times, size, checksum, and the length of the compression's name
+EXPANDED_MOST = 8  # of a cut-off chunk: unpacked bytes for each byte
+WINDOW_BYTES = 1 << 27  # of zstandard
 NEEDED = "one to replay has it and `/eyes` (docs/sensors.md); others are read by a driver of your own"
-ROS1 = " (a bag of ROS 1: `mcap convert` makes one of it)"
+KINDS = {  # other files, by their first bytes
+    b"#ROSBAG ": " (a bag of ROS 1: `mcap convert` makes one of it)",
+    b"SQLite f": " (a bag of ROS 2 in SQLite: `ros2 bag convert` makes one of it)",
+    b"version ": " (a pointer of Git LFS: `git lfs pull` fetches the file itself)",
+}
 
 SYNCED_WITHIN_S = 30.0  # that closing a file waits for a slow disk
 SYNC_EVERY_NS = 2 * NS_PER_S  # most that a power cut loses of a recording, on a disk that keeps up
@@ -113,7 +122,7 @@ class RecordingWriter:
 def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -> Iterator[RecordingWriter]:
     """Open a writer whose file appears under its name, replacing an older one, with the first sample.
 
-    Until then an older file of that name stays; after a crash it is readable up to its last whole chunk.
+    Until then an older file of that name stays; after a crash it is readable up to its last whole sample.
     One with pictures is its owner's alone. Raises InputError if it can't be written, or another process writes it.
     """
     part, file = path.with_name(f".{path.name}.part"), None
@@ -203,7 +212,7 @@ class Recording:
         try:
             if (begin := file.read(len(MAGIC))) != MAGIC:
                 problem = "is not an MCAP recording" if begin else "is empty"
-                raise InputError(self.path, "", problem + ROS1 * (begin == b"#ROSBAG "))
+                raise InputError(self.path, "", problem + KINDS.get(begin, ""))
             file.seek(0)
             yield from _mcap_records(file, source=self.path, max_bytes=LIMITS.chunk_bytes)
         except (InputError, ImportError):
@@ -239,36 +248,67 @@ def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[
     """Records in order, those within chunks too, until the footer: the unpacked size of a chunk is checked.
 
     max_bytes: limit for a record, and for an unpacked chunk. Raises InputError for a chunk over the limit, and errors
-    of mcap or a decompressor for a damaged file.
+    of mcap or a decompressor for a damaged file, after the whole records of a chunk that the file's end cuts off.
     """
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader, breakup_chunk
 
-    for record in StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=max_bytes).records:
-        if isinstance(record, Chunk):
-            data = _unpacked(record, source=source, max_bytes=max_bytes)
-            yield from breakup_chunk(replace(record, compression="", data=data), validate_crc=True)
-        else:
-            yield record
+    end = len(MAGIC)  # of the last whole record
+    try:
+        for record in StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=max_bytes).records:
+            end = file.tell()
+            if isinstance(record, Chunk):
+                data = _unpacked(record, source=source, max_bytes=max_bytes)
+                yield from breakup_chunk(replace(record, compression="", data=data), validate_crc=True)
+            else:
+                yield record
+    except InputError:
+        raise
+    except Exception:  # mcap, lz4 and zstandard have their own
+        file.seek(end)
+        if data := _cut_off_chunk(file.read(max_bytes)):
+            yield from breakup_chunk(Chunk("", data, 0, 0, 0, len(data)))
+        raise
+
+
+def _cut_off_chunk(data: bytes) -> bytes:
+    """The whole records of a chunk at the end of a file, uncompressed; empty for anything else."""
+    if data[:1] != CHUNK or RECORD.unpack_from(data.ljust(RECORD.size, b"\0"))[1] <= len(data) - RECORD.size:
+        return b""
+    name = CHUNK_HEAD.unpack_from(data.ljust(CHUNK_HEAD.size, b"\0"))[-1]
+    compression = data[CHUNK_HEAD.size : CHUNK_HEAD.size + name].decode("ascii", "replace")
+    held = _expanded(compression, data[CHUNK_HEAD.size + name + 8 :], room=len(data) * EXPANDED_MOST)
+    place = 0
+    while place + RECORD.size <= len(held):
+        end = place + RECORD.size + RECORD.unpack_from(held, place)[1]
+        if end > len(held):
+            break
+        place = end
+    return held[:place]
 
 
 def _unpacked(chunk: Any, *, source: Path, max_bytes: int) -> bytes:
     """A chunk's records as bytes. Raises InputError over the limit, else the unpacker's exception."""
     declared: int = chunk.uncompressed_size
     room = min(declared, max_bytes) + 1  # unpackers allocate up to their limit
-    data: bytes = chunk.data
-    if chunk.compression == "lz4":
-        import lz4.frame
-
-        data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=room)
-    elif chunk.compression == "zstd":
-        import zstandard
-
-        with zstandard.ZstdDecompressor(max_window_size=max(1024, max_bytes)).stream_reader(data) as stream:
-            data = stream.read(room)
+    data = _expanded(chunk.compression, chunk.data, room=room)
     if len(data) > max_bytes:
         size = f"a chunk of {len(chunk.data)} bytes unpacks to {max(declared, len(data)) / MIB:.1f} MiB"
         raise InputError(source, "", f"{size}; at most {max_bytes / MIB:g}")
     if len(data) != declared:
         raise ValueError(f"a chunk does not unpack to the declared {declared} bytes")
+    return data
+
+
+def _expanded(compression: str, data: bytes, *, room: int) -> bytes:
+    """At most `room` bytes that are packed in data, which may be cut off."""
+    if compression == "lz4":
+        import lz4.frame
+
+        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=room))
+    if compression == "zstd":
+        import zstandard
+
+        with zstandard.ZstdDecompressor(max_window_size=WINDOW_BYTES).stream_reader(data) as stream:
+            return bytes(stream.read(room))
     return data
