@@ -25,7 +25,7 @@ WEBP_MAX_PX = 16383
 EXTRA_BYTES = 60 << 10  # a page's size beyond its layers as PNG files
 PAGE_BYTES = 8_000_000  # a page's size at most
 LAYERS_BYTES = 6_400_000  # of these for layers; larger ones (4K) are not stored exactly
-QUALITIES = (98, 92, 84, 76, 66, 54)  # AVIF qualities: the first that fits is used
+QUALITIES = (92, 84, 76, 66, 54)  # AVIF qualities: the first that fits is used
 
 
 def asset(name: str) -> str:
@@ -52,12 +52,11 @@ def viewer_html(
     """
     scene = {"stack": stack_table(stack), "eyes_m": eyes_m, "fov_deg": fov_deg, "title": title, "follows": follows}
     parts = {"TITLE": html.escape(title), "CSS": asset("look.css"), "SCRIPT": _script()}
-    room, coded = PAGE_BYTES, 0.0
-    stored = parallel_map(_exact, list(layers))
-    if sum(map(len, stored)) > LAYERS_BYTES:
-        stored, coded = _stored(list(layers), LAYERS_BYTES)
-    else:
-        room = min(room, EXTRA_BYTES + sum(map(len, parallel_map(png_bytes, list(layers)))))
+    png_size = sum(map(len, parallel_map(png_bytes, list(layers))))
+    room, coded = min(PAGE_BYTES, EXTRA_BYTES + png_size), 0.0
+    stored = parallel_map(_exact, list(layers)) if png_size < 2 * LAYERS_BYTES else []
+    if not stored or sum(map(len, stored)) > LAYERS_BYTES:
+        stored, coded = _stored(list(layers), LAYERS_BYTES, qualities=(98, *QUALITIES))
     parts["LAYERS"] = _embedded(stored)
     targets, error = _stored(wanted, room - len("".join(parts.values())) - 2048) if wanted else ([], 0.0)
     named = (("Targets", error), ("Layers (exact in their PNG files)", coded))
@@ -90,10 +89,10 @@ def _exact(layer: U8) -> str:
     return _url(layer, **(how if max(layer.shape) <= WEBP_MAX_PX else {"format": "PNG"}))
 
 
-def _stored(pictures: Sequence[U8], room: int) -> tuple[list[str], float]:
+def _stored(pictures: Sequence[U8], room: int, *, qualities: Sequence[int] = QUALITIES) -> tuple[list[str], float]:
     """Pictures as data URLs, within `room` bytes if possible; mean squared error of the coding (full scale 1)."""
     urls: list[str] = []
-    for quality in QUALITIES:
+    for quality in qualities:
         coder = partial(_url, format="AVIF", quality=quality, speed=8, subsampling="4:4:4")
         urls = parallel_map(coder, list(pictures))
         if sum(map(len, urls)) <= room:
