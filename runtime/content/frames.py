@@ -15,7 +15,7 @@ import numpy as np
 
 from runtime.clock import NS_PER_MS, NS_PER_S
 from runtime.config import ContentSettings
-from runtime.content.layout import MONO, PAIR, Layout, hint, layout_of
+from runtime.content.layout import MONO, PAIR, Layout, hint, layout_of, of_film
 from runtime.content.placing import DARK
 from runtime.errors import ContentFailure, InputError
 from runtime.records import U8
@@ -176,7 +176,7 @@ class Video(Frames):
 
 def layout_in(header: Header, path: Path, settings: ContentSettings, folder: Path | None = None) -> Layout:
     """The layout of a picture as it is read: of a file with two views, else as it or its folder is named."""
-    layout = layout_of(path, settings)
+    layout = layout_of(path, settings, stated=header.layout)
     if header.is_around:
         layout = replace(layout, span_deg=360)
     if len(header.views) == 1:
@@ -190,7 +190,11 @@ def open_frames(path: Path, settings: ContentSettings) -> Frames:
     """A picture, an animation, a video, or a folder of pictures. Raises InputError."""
     if not path.is_dir():
         if path.suffix.lower() in VIDEOS:
-            return Video(path, layout_of(path, settings))
+            video = Video(path, layout_of(path, settings))
+            if settings.layout == "auto":
+                height, width = video.frame(0).shape[:2]
+                video.layouts = [of_film(video.layouts[0], path, width_px=width, height_px=height)]
+            return video
         return Animation(path, settings) if header_of_file(path).is_animated else PictureFiles([path], settings)
     paths = sorted(item for item in path.iterdir() if item.suffix.lower() in (*PICTURES, *NOT_READ))
     if not paths:
@@ -217,7 +221,7 @@ def read_pair(path: Path, settings: ContentSettings) -> list[U8]:
     views = read_views(path)
     if len(views) == 2:
         return views
-    layout = layout_of(path, settings)
+    layout = layout_of(path, settings, stated=header_of_file(path).layout)
     views = layout.views(views[0])
     if len(views) != 2:
         raise InputError(path, "layout", f"holds {len(views)} view{'s' * (len(views) > 1)}: give --right, or --layout")

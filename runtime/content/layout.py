@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -33,6 +33,8 @@ LAST_MARKS = {  # ambiguous words: accepted only at the end, before words with d
     "top-bottom": "ou|tb|tab|top bottom|1x2",
 }
 COPY = re.compile(r"( copy)?( ?\([0-9]+\))?$")  # suffix added by a browser or desktop to a second download
+NARROW, LOW = 2.5, 1.28  # width over height below and above which a film of two views has squeezed ones
+FULL = re.compile(r"(^|[^a-z])(full|fsbs|ftb|fou)")  # in the name of a film whose views are not
 ALIKE = 0.8  # correlation above which halves may be two views
 SMALL_PX = (64, 48)  # size of halves for comparison
 SHIFT_PX = 6  # largest shift between views, in these pixels
@@ -93,11 +95,11 @@ class Layout:
 MONO, PAIR = Layout("mono"), Layout("side-by-side", columns=2)  # one view; two, as a file of two pictures is read
 
 
-def layout_of(path: Path, settings: ContentSettings) -> Layout:
-    """The arrangement of views in a file, by the setting or by its name. Raises InputError."""
+def layout_of(path: Path, settings: ContentSettings, *, stated: str = "") -> Layout:
+    """The arrangement of views in a file, by the setting, as the file states it, or by its name. Raises InputError."""
     named = settings.layout
     if named == "auto":
-        named = _named(path)
+        named = stated or _named(path)
     if found := QUILT.search(named):
         columns, rows, aspect = int(found[1]), int(found[2]), float(found[3] or 0)
         if not columns or not rows:
@@ -111,6 +113,14 @@ def layout_of(path: Path, settings: ContentSettings) -> Layout:
     span_deg = _span_deg(path) if kind in ("mono", "side-by-side", "top-bottom") else 0
     is_half = named.startswith("half-") and not span_deg
     return Layout(kind, columns, rows, half=is_half, right_first=named.endswith("cross-eyed"), span_deg=span_deg)
+
+
+def of_film(layout: Layout, path: Path, *, width_px: int, height_px: int) -> Layout:
+    """The layout of a film that is named so: its two views are squeezed if the whole has one view's shape."""
+    aspect = width_px / height_px
+    squeezed = {"side-by-side": aspect < NARROW, "top-bottom": aspect > LOW}.get(layout.kind, False)
+    is_half = squeezed and not layout.span_deg and not FULL.search(path.stem.lower())
+    return replace(layout, half=layout.half or is_half)
 
 
 def _named(path: Path) -> str:

@@ -29,6 +29,9 @@ ORIENTATION = 0x0112  # EXIF's tag
 TURNED = (5, 6, 7, 8)  # by a quarter: width and height are exchanged
 MP_ENTRIES, MP_NUMBER = 0xB002, 0xB101  # tags of an MPO: its pictures; which viewpoint one is, from the left
 DISPARITY, UNDEFINED = "Multi-Frame Image: (Disparity)", "Undefined"
+JPS, JPS_BYTES = b"_JPSJPS_", 14  # mark of a stereo header, and its bytes up to the kind of picture
+JPS_LAYOUTS = {2: "side-by-side", 3: "top-bottom", 4: "anaglyph"}
+JPS_HALF_HEIGHT, JPS_HALF_WIDTH, JPS_LEFT_FIRST = 1, 2, 4
 GAIN_MAP = (b"hdrgm", b"21496-1")  # marks of a gain map, a second picture with the brightness of the first
 HEAD_BYTES = 512  # read to identify a file
 UNDECODED = "is not an image that can be decoded"
@@ -64,6 +67,7 @@ class Header:
     is_animated: bool
     is_around: bool = False  # its XMP declares a sphere of 360 by 180 degrees
     warning: str = ""  # missing second view
+    layout: str = ""  # of the views in one picture, by its own stereo header
 
 
 @contextmanager
@@ -109,7 +113,7 @@ def header_of(coded: bytes | IO[bytes], *, name: str = "") -> Header:
             is_animated = image.format in ANIMATED and bool(getattr(image, "is_animated", False))
             views, warning = _views(image, is_named_so=name.lower().endswith(".mpo"))
             is_around = b"equirectangular" in _xmp(image)
-            return Header(image.format, width, height, views, is_animated, is_around, warning)
+            return Header(image.format, width, height, views, is_animated, is_around, warning, _jps_layout(image))
     except Exception as error:  # each of Pillow's formats raises its own
         raise ValueError(undecodable(_all(coded), error)) from None
 
@@ -139,6 +143,20 @@ def _views(image: Any, *, is_named_so: bool) -> tuple[tuple[int, ...], str]:
     if image.size != size or image.layers != 3 or any(mark in extra for mark in GAIN_MAP):
         return (0,), ""
     return ((1, 0) if _viewpoint(image) == 1 else (0, 1)), ""
+
+
+def _jps_layout(image: Any) -> str:
+    """The layout that a JPEG's stereo header (JPS) states, in the syntax of `content.layout`; empty without one."""
+    for name, data in getattr(image, "applist", ()):
+        if name == "APP3" and data[:8] == JPS and len(data) >= JPS_BYTES:
+            flags, kind, is_stereo = data[11], JPS_LAYOUTS.get(data[12], ""), data[13] == 1
+            if not is_stereo or (kind == "top-bottom" and not flags & JPS_LEFT_FIRST):
+                return ""
+            if kind == "side-by-side" and not flags & JPS_LEFT_FIRST:
+                return "cross-eyed"
+            is_half = flags & (JPS_HALF_WIDTH if kind == "side-by-side" else JPS_HALF_HEIGHT)
+            return f"half-{kind}" if is_half and kind != "anaglyph" else kind
+    return ""
 
 
 def _xmp(image: Any) -> bytes:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
+import struct
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -136,6 +139,48 @@ def test_a_cross_eyed_picture_and_an_anaglyph_reach_the_eyes(tmp_path: Path, con
     assert near(left, BLUE) and near(right, RED)
     write_png(tmp_path / "a_anaglyph.png", solid((200, 40, 40)))
     assert shown(tmp_path / "a_anaglyph.png", context, stack) == [[200] * 3, [40] * 3]
+
+
+@pytest.mark.parametrize(
+    ("told", "layout"),
+    [
+        ((0, 4, 2, 1), "side-by-side"),
+        ((0, 0, 2, 1), "cross-eyed"),
+        ((0, 6, 2, 1), "half-side-by-side"),
+        ((0, 5, 3, 1), "half-top-bottom"),
+        ((0, 4, 4, 1), "anaglyph"),
+        ((0, 4, 2, 0), "cross-eyed"),
+    ],
+)
+def test_a_stereo_header_states_the_layout(tmp_path: Path, told: tuple[int, ...], layout: str) -> None:
+    """Separation, flags, layout and kind of picture; a picture that is not stereo leaves it to the name."""
+    file = io.BytesIO()
+    Image.new("RGB", (32, 16)).save(file, "JPEG")
+    segment = b"_JPSJPS_" + bytes([0, 4, *told, 0, 0])
+    data = file.getvalue()
+    (tmp_path / "a.jps").write_bytes(data[:2] + b"\xff\xe3" + struct.pack(">H", len(segment) + 2) + segment + data[2:])
+    assert open_frames(tmp_path / "a.jps", AUTO).layouts == [layout_of(Path("a"), ContentSettings(layout=layout))]
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "is_half"),
+    [
+        ("a_sbs.avi", (192, 108), True),
+        ("a_sbs.avi", (384, 108), False),
+        ("a_full_sbs.avi", (192, 108), False),
+        ("a_tb.avi", (192, 108), True),
+        ("a_tb.avi", (96, 108), False),
+        ("a_vr180_sbs.avi", (192, 96), False),
+        ("a.avi", (192, 108), False),
+    ],
+)
+def test_a_film_as_wide_as_one_view_holds_two_squeezed_ones(
+    tmp_path: Path, name: str, size: tuple[int, int], is_half: bool
+) -> None:
+    writer = cv2.VideoWriter(str(tmp_path / name), cv2.VideoWriter.fourcc(*"MJPG"), 10, size)
+    writer.write(np.full((*size[::-1], 3), 90, np.uint8))
+    writer.release()
+    assert open_frames(tmp_path / name, AUTO).layouts[0].half == is_half
 
 
 @pytest.mark.parametrize("axis", [0, 1])
