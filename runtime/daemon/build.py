@@ -32,7 +32,7 @@ from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
 from runtime.panels.registry import BrowserPanels, open_panels
 from runtime.plan.savings import Saving
-from runtime.records import RefreshAccount
+from runtime.records import Effort, RefreshAccount
 from runtime.sensor.base import Sensor
 from runtime.sensor.browser import BrowserCamera, BrowserEyes
 from runtime.sensor.registry import open_sensor
@@ -65,6 +65,7 @@ class RunOptions:
     out: Path | None = None  # folder for the run's files
     browser: BrowserLink | None = None  # a page shows the panels, and may be the sensor
     until: Callable[[], str] = str  # reason to stop, or empty
+    fixed: Effort | None = None  # of every solution, instead of all of the model's (with model.effort = "full")
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,6 +226,7 @@ def build_run(
         stage_ms=stage_ms,
         supervisor=host,
         observers=[observer] if host.recorder is None else [observer, host.recorder],
+        fixed=options.fixed,
     )
     if host.recorder is not None:
         host.recorder.watches(presenter, in_stack_frame=in_stack_frame)

@@ -22,8 +22,9 @@ WORTH = 0.995  # refine only if the expected error drops below this share of the
 class Aim:
     """Builds the solver requests of one run. Single-threaded; never reads a clock."""
 
-    def __init__(self, viewer: Viewer, solver: SolverHost, *, period_ns: int) -> None:
-        self._viewer, self._solver, self._period_ns = viewer, solver, period_ns
+    def __init__(self, viewer: Viewer, solver: SolverHost, *, period_ns: int, fixed: Effort | None = None) -> None:
+        """fixed: effort of every solution where the settings say `full`, instead of all of the model's."""
+        self._viewer, self._solver, self._period_ns, self._fixed = viewer, solver, period_ns, fixed
         self._chooser = EffortChooser()
         self._rested_ns: int | None = None  # start of the head's present rest
         self._expected: dict[int, float] = {}  # by target instant: expected squared distance from those eyes, m²
@@ -43,7 +44,7 @@ class Aim:
         """Return the next request. eyes: at the display time of this refresh; shown: the newest solution."""
         self._learn(shown, eyes)
         predictor, refined = state.predictor, None
-        whole = Effort(1, predictor.steps)
+        whole = self._fixed or Effort(1, predictor.steps)
         effort, expected_m2 = whole, 0.0
         if eyes.eyes_m is not None and state.settings.model.effort == "auto":
             outlook, horizon_s = self._outlook(timing, eyes), self._horizon_s(timing, eyes)

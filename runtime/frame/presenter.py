@@ -30,6 +30,7 @@ from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
 from runtime.plan.savings import selected_eyes
 from runtime.records import (
+    Effort,
     EyesEstimate,
     FrameTiming,
     PanelFrame,
@@ -125,14 +126,15 @@ class Presenter:
         stage_ms: dict[str, float],
         supervisor: Supervisor | None = None,
         observers: Sequence[Observer] = (),
+        fixed: Effort | None = None,
     ) -> None:
-        """stage_ms: duration of each refresh stage on a simulated clock."""
+        """stage_ms: duration of each refresh stage on a simulated clock; fixed: effort under `full` (`Aim`)."""
         self.run_cell, self.stack, self.clock = run, stack, clock
         self.pacer, self.samples, self.viewer, self.solver, self.panels = pacer, samples, viewer, solver, panels
         self._stage_ms = stage_ms
         self._supervisor, self._observers = supervisor or Supervisor(), observers
         self._adopted = run.state.version
-        self._aim = Aim(viewer, solver, period_ns=pacer.period_ns)
+        self._aim = Aim(viewer, solver, period_ns=pacer.period_ns, fixed=fixed)
         self.stats = RunStats()
         self.machine = StateMachine(now_ns=clock.now_ns())
         self._lateness = Lateness(pacer.period_ns)

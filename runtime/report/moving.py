@@ -1,4 +1,4 @@
-"""Live quality for moving viewers: simulated runs for every motion and several solver times."""
+"""Live quality for moving viewers: simulated runs for every motion, with fixed efforts and the loop's own choice."""
 
 from __future__ import annotations
 
@@ -9,94 +9,92 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from runtime.config import Settings, validated
 from runtime.daemon.build import RunOptions, build_run
 from runtime.errors import FatalError
 from runtime.evaluation.motion_recording import write_motion
-from runtime.evaluation.refresh_quality import view_error_mm
-from runtime.optics.quality import psnr_db
-from runtime.records import U8
+from runtime.evaluation.refresh_quality import Pictures
+from runtime.records import U8, Effort
 
-MOTIONS = ("still", "lean", "walk", "stop-and-go")
-SOLVER_MS = (33.0, 150.0)
-SECONDS = 4.0
-SETTLED_S = 1.0  # start of the run that is skipped: the tracker has just begun
-EVERY = 11  # refreshes between samples: not a multiple of a solution's refreshes
-# Shares of a solver's stages in its time; only their sum matters here.
-SHARES = {"render": 0.3, "prepare": 0.2, "inference": 0.1, "finish": 0.4}
+SCENES = {"still": "demo", "lean": "demo", "walk": "demo", "stop-and-go": "demo", "film": "moving"}  # by motion
+FULL = Effort(1, 4)  # `balanced` whole: the effort of every solution before the loop chose
+FIXED = (FULL, Effort(1, 0), Effort(2, 0), Effort(3, 0), Effort(4, 0))
+COSTS_MS = {"render": 44, "prepare": 40, "inference": 31, "finish": 38, "step": 85}  # full raster, a slow processor
+SECONDS, NOISE_MM, SEED = 6.0, 0.3, 5
+EVERY = 23  # refreshes between samples: not a multiple of a solution's refreshes
 
 
 @dataclass(frozen=True, slots=True)
 class Moving:
-    """One motion with a solver of some speed."""
+    """One motion with one effort."""
 
     motion: str
-    solver_ms: float
+    effort: str  # a fixed one's name, or `auto`
     live_db: float  # docs/contracts.md, Error
-    refreshes: int  # measured
-    tracker_mm: tuple[float, float]  # p50 and p95, true eyes to those that the tracker predicted
     view_error_mm: tuple[float, float]  # p50 and p95, true eyes to those that the layers were solved for
+    efforts: Mapping[str, float]  # seconds on the panels, by name
+    refreshes: int  # measured
 
 
-class Lines:
-    """Output of a run that keeps the lines of frames.jsonl in memory."""
+class KeptInMemory:
+    """Output of a run that keeps lines, and light with its true pictures, in memory."""
 
     def __init__(self) -> None:
         self.lines: list[Mapping[str, Any]] = []
+        self.layers: dict[int, U8] = {}  # by refresh
+        self.true: dict[int, tuple[Mapping[str, Any], Pictures]] = {}  # what light.json says, and both pictures
 
     def refresh(self, line: Mapping[str, Any]) -> None:
         self.lines.append(line)
 
     def light(self, frame: int, *, layers: U8) -> None:
-        """Keep no layers."""
+        self.layers[frame] = layers
 
-    def light_targets(self, frame: int, **targets: Any) -> None:
-        """Keep no pictures."""
+    def light_targets(self, frame: int, *, info: Mapping[str, Any], drawn: Any, true: Pictures | None) -> None:
+        if true is not None:
+            self.true[frame] = info, true
 
 
-def simulated_run(settings: Settings, *, scale: float) -> tuple[list[Mapping[str, Any]], dict[int, float]]:
-    """Lines of frames.jsonl, and live errors by refresh, of a simulated run. Raises FatalError."""
-    output = Lines()
+def simulated_run(
+    settings: Settings, *, scale: float, fixed: Effort | None = None, keep_light: int = 0
+) -> tuple[dict[str, Any], KeptInMemory]:
+    """summary.json of a simulated run, and what it kept. Raises FatalError."""
+    output = KeptInMemory()
+    options = RunOptions(max_speed=True, measure=True, scale=scale, fixed=fixed, keep_light=keep_light)
     with ExitStack() as cleanup:
-        run = build_run(settings, RunOptions(max_speed=True, measure=True, scale=scale), cleanup, output=output)
+        run = build_run(settings, options, cleanup, output=output)
         run.observer.measure_only_live()
         run.presenter.run()
         run.observer.finish()
-    return output.lines, run.observer.live_errors
+        return run.summary(), output
 
 
-def settings_for(recording: Path, *, solver_ms: float) -> Settings:
-    """Default settings for a recording, with a solver that takes `solver_ms` on the simulated clock."""
+def settings_for(recording: Path, *, scene: str, effort: str) -> Settings:
+    """Default settings for a recording, on a simulated clock with COSTS_MS."""
     table = Settings().model_dump()
     table["sensor"] |= {"driver": "replay", "source": str(recording), "loop": False}
+    table["content"]["scene"] = scene
     table["loop"]["evaluate_every"] = EVERY
-    table["model"]["effort"] = "full"  # the solver takes as long as is said
-    table["loop"]["simulated_stage_ms"] |= {stage: share * solver_ms for stage, share in SHARES.items()}
+    table["loop"]["simulated_stage_ms"] |= COSTS_MS
+    table["model"] |= {"effort": effort, "threads": 1}  # runs go side by side
     return validated(Settings, table, source="settings")
 
 
-def moving_run(motion: str, solver_ms: float, *, seconds: float = SECONDS, scale: float = 0.5) -> Moving:
-    """Run one motion with one solver, in a separate process. Raises FatalError without any result."""
+def moving_run(
+    motion: str, effort: Effort | None, *, seconds: float = SECONDS, scale: float = 0.5, seed: int = SEED
+) -> Moving:
+    """Run one motion with one effort (None: the loop chooses), in a separate process. Raises FatalError without any
+    result.
+    """
     with tempfile.TemporaryDirectory(prefix="phasestack-") as folder:
         recording = Path(folder) / "motion.mcap"
-        write_motion(recording, motion, seconds=seconds, seed=1)
-        settings = settings_for(recording, solver_ms=solver_ms)
-        lines, errors = simulated_run(settings, scale=scale)
-    first = SETTLED_S * settings.loop.rate_hz
-    live = [error for frame, error in errors.items() if frame >= first]
-    known = [line for line in lines if line["frame"] >= first and line["true_eyes_m"] is not None]
-    tracked_mm, stale_mm = (
-        [view_error_mm(line["true_eyes_m"], line[eyes]) for line in known if line[eyes] is not None]
-        for eyes in ("eyes_m", "solved_for_m")
-    )
-    if not live or not tracked_mm or not stale_mm:
-        raise FatalError(f"the motion {motion} with a solver of {solver_ms:g} ms gave no measurement")
-    live_db = psnr_db(float(np.mean(live)))
-    return Moving(motion, solver_ms, live_db, len(live), _quantiles(tracked_mm), _quantiles(stale_mm))
-
-
-def _quantiles(values: list[float]) -> tuple[float, float]:
-    p50, p95 = map(float, np.percentile(values, (50, 95)))
-    return p50, p95
+        head = "still" if motion == "film" else motion
+        write_motion(recording, head, seconds=seconds, seed=seed, noise_mm=NOISE_MM)
+        settings = settings_for(recording, scene=SCENES[motion], effort="full" if effort else "auto")
+        summary, _ = simulated_run(settings, scale=scale, fixed=effort)
+    view_error_mm, live_db = summary["view_error_mm"], summary["live_db"]
+    name = effort.name if effort else "auto"
+    if view_error_mm is None or live_db is None:
+        raise FatalError(f"the motion {motion} with the effort {name} gave no measurement")
+    both_mm = view_error_mm["p50"], view_error_mm["p95"]
+    return Moving(motion, name, live_db, both_mm, summary["efforts"], summary["live_frames"])

@@ -9,7 +9,7 @@ import numpy as np
 
 from runtime.report.focal import CARDS_M, DISTANCE_M, PUPIL_M, FocalStack
 from runtime.report.frontier import QUOTED, SHIPPED, MethodResult
-from runtime.report.moving import Moving
+from runtime.report.moving import COSTS_MS, FIXED, NOISE_MM, SECONDS, SEED, Moving
 from runtime.report.page import Figure, PageSection, Table, drawing, png
 
 KINDS = {"shipped": ("o-", "C0"), "added": ("D", "C2"), "iterative": ("s-", "C1")}
@@ -99,41 +99,57 @@ def method_table(results: Sequence[MethodResult]) -> Table:
 
 
 def moving_section(found: Sequence[Moving]) -> PageSection:
-    """Live quality for every measured motion and solver, with the view error and the tracker's."""
+    """Live quality and view error for every motion and effort measured so far."""
+    costs = ", ".join(f"{stage} {ms}" for stage, ms in COSTS_MS.items())
     text = [
         "A solution takes longer than a refresh, and the head keeps moving. At every refresh the outer panels are "
         "shifted and scaled to the eyes, which removes ghosts but not the age of the view. Live quality counts both: "
         "the light at the true eyes against what they should see from there at that refresh. The view error is the "
-        "distance from the true eyes to those that the layers were solved for. These are the daemon's own runs on the "
-        "simulated clock: refreshes, solver and sensor take the times given here, which are configured, not measured. "
-        "Heads at 0.6 m, 30 samples a second, 3 mm of noise, outliers and dropouts."
+        "distance from the true eyes to those that the layers were solved for.",
+        "An effort is a raster and a number of steps: 1/2+1 has half the rows and columns, and one step. Fixed, every "
+        "solution has it; auto is the loop's own choice. These are the daemon's own runs on the simulated clock, which "
+        f"takes for a solution on the full raster (ms): {costs}; a coarser one costs less as it has fewer pixels. "
+        f"Heads at 0.6 m, 30 samples a second, {NOISE_MM} mm of noise, outliers and dropouts, {SECONDS:g} s, seed "
+        f"{SEED}; film: the content moves and the head rests.",
     ]
-    headings = ["motion", "solver ms", "live dB", "view error p50 mm", "p95 mm", "tracking error p50 mm", "p95 mm"]
+    headings = ["motion", "effort", "live dB", "view error p50 mm", "p95 mm", "on the panels"]
     rows = [
-        [one.motion, f"{one.solver_ms:g}", f"{one.live_db:.1f}"]
-        + [f"{mm:.1f}" for mm in (*one.view_error_mm, *one.tracker_mm)]
+        [one.motion, one.effort, f"{one.live_db:.1f}", *(f"{mm:.1f}" for mm in one.view_error_mm), most_used(one)]
         for one in found
     ]
     return PageSection("What a moving viewer sees", text, [moving_plot(found)], [Table(headings, rows)])
 
 
+def most_used(one: Moving) -> str:
+    """The efforts that were on the panels for a tenth of the time or more, the longest first."""
+    seconds = sorted(one.efforts.items(), key=lambda item: -item[1])
+    total_s = sum(one.efforts.values())
+    return ", ".join(f"{name} {100 * s / total_s:.0f}%" for name, s in seconds if s >= total_s / 10)
+
+
 def moving_plot(found: Sequence[Moving]) -> Figure:
-    """Bars of live quality, grouped by motion, one for each solver time."""
-    motions, times = (list(dict.fromkeys(getattr(one, name) for one in found)) for name in ("motion", "solver_ms"))
-    with drawing(9.6, 3.6) as figure:
-        axes = figure.add_subplot()
-        for index, time in enumerate(times):
-            own = {one.motion: one.live_db for one in found if one.solver_ms == time}
-            x = np.arange(len(motions)) + (index - (len(times) - 1) / 2) * 0.3
-            bars = axes.bar(x, [own.get(motion, 0.0) for motion in motions], width=0.28)
-            bars.set_label(f"solver of {time:g} ms")
-            axes.bar_label(bars, fmt="%.1f", fontsize=8.5)
-        axes.set_xticks(range(len(motions)), motions)
-        axes.set(ylabel="live quality, dB")
-        axes.grid(visible=False, axis="x")
-        axes.margins(y=0.2)
-        axes.legend(ncols=len(times))
-    return Figure("moving-viewer", png(figure), "Live quality of each run after its first second.")
+    """Live quality above the view error: a curve over the fixed efforts and a star for `auto`, for every motion."""
+    motions = list(dict.fromkeys(one.motion for one in found))
+    efforts = [*(effort.name for effort in FIXED), "auto"]
+    with drawing(9.6, 6.4) as figure:
+        above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+        for axes, values in ((above, [one.live_db for one in found]), (below, [one.view_error_mm[0] for one in found])):
+            for number, motion in enumerate(motions):
+                own = {one.effort: value for one, value in zip(found, values, strict=True) if one.motion == motion}
+                if fixed := [(x, own[name]) for x, name in enumerate(efforts) if name in own and name != "auto"]:
+                    axes.plot(*zip(*fixed, strict=True), "o-", color=f"C{number}", markersize=5, label=motion)
+                if "auto" in own:
+                    axes.plot(len(FIXED), own["auto"], "*", color=f"C{number}", markersize=13)
+                    axes.axhline(own["auto"], color=f"C{number}", linewidth=0.8, linestyle=":")
+        above.set(ylabel="live quality, dB")
+        above.legend(ncols=len(motions), loc="lower center", bbox_to_anchor=(0.5, 1.0))
+        below.set(
+            yscale="log", ylabel="view error, median, mm", xlabel="raster + steps of every solution; auto: chosen"
+        )
+        below.yaxis.set_major_formatter("{x:g}")
+        below.set_xticks(range(len(efforts)), efforts)
+    told = "Live quality and view error with fixed efforts, dearest first, and as the loop chooses (stars, dotted)."
+    return Figure("moving-viewer", png(figure), told)
 
 
 def focal_section(stack: FocalStack) -> PageSection:
