@@ -33,7 +33,6 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import stack_from_eye
 from runtime.records import F64, U8
 from runtime.report.moving import (
-    COSTS_MS,
     FULL,
     NOISE_MM,
     SECONDS,
@@ -60,16 +59,19 @@ PICTURES = {  # in docs/images: what the commands leave, and what is made here
     "moving-viewer.png": "report/moving-viewer.png",
     "focal-slices.jpg": "report/focal-slices.png",
 }
-MOVING = """\
+MOVING = f"""\
 The daemon's own loop on the simulated clock, with the costs of a slow processor (ms on the full raster: render 44,
-prepare 40, inference 31, finish 38, a step 85), panels of 960x540, 0.3 mm of sensor noise, 12 s; *film* is moving content
-before a resting head. *Live* is [defined in contracts](contracts.md#error): the light at the true eyes against what they
-should see from there at that refresh, so that a stale view counts. *View* is how far the true eyes are from those that
-the picture was drawn for: median and 95th percentile. With `model.effort = "full"` every solution is the whole model;
-with `"auto"`, the default, the loop [chooses](mathematics.md#effort) raster and steps for each. *Best fixed*: of the
-efforts in the picture.
+prepare 40, inference 31, finish 38, a step 85), panels of 960x540, {NOISE_MM} mm of sensor noise, {SECONDS:g} s;
+*film*: moving content, a resting head. *Live* ([contracts](contracts.md#error)): light at the true eyes against what
+they should see from there at that refresh. *View*: distance of the true eyes from those that the picture was drawn for,
+median and 95th percentile; between solutions the picture is [reprojected](mathematics.md#reprojection) by its depth.
+*Full*: every solution is the whole model; *auto*, the default: the loop [chooses](mathematics.md#effort) raster and
+steps for each.
 """
-LEANING = """"""
+LEANING = """\
+A leaning head at 0.6 m, its left eye, every fourth refresh: with `model.effort = "full"`, with `"auto"`, and the true
+view. Both are reprojected by depth.
+"""
 HEAD = """\
 <!-- Written by `make gallery`: change docs/make_gallery.py, not this page. -->
 
@@ -214,7 +216,11 @@ def leaning(folder: Path) -> None:
         eye_m, fov_deg = info["true_eyes_m"][0], info["fov"]
         pictures = [light_of(eye_m, run.layers[frame], stack, fov_deg=fov_deg) for run in runs]
         away_mm = [view_error_mm(info["true_eyes_m"], run.true[frame][0]["solved_for_m"]) for run in runs]
-        texts = [f"before: drawn for eyes {away_mm[0]:.0f} mm away", f"now: {away_mm[1]:.0f} mm away", "as it should be"]
+        texts = [
+            f"before: drawn for eyes {away_mm[0]:.0f} mm away",
+            f"now: {away_mm[1]:.0f} mm away",
+            "as it should be",
+        ]
         for column, (picture, text) in enumerate(zip([*pictures, true[0]], texts, strict=True)):
             small = Image.fromarray(picture).resize(FILM_PX, Image.Resampling.BOX)
             sheet.paste(small, (column * width, 0))
@@ -226,10 +232,12 @@ def leaning(folder: Path) -> None:
 def light_of(eye_m: F64, layers: U8, stack: PanelStack, *, fov_deg: float) -> U8:
     """An eye's picture: the mean over its pupil; what misses a panel is black."""
     points = pupil_points(PUPIL_MM / 1000) @ stack_from_eye(eye_m)[:3, :2].T
-    seen = average([
-        np.where(retina.mask[..., None], retina.image, 0)
-        for retina in (seen_by(eye_m + point, layers, stack, fov_deg=fov_deg) for point in points)
-    ])
+    seen = average(
+        [
+            np.where(retina.mask[..., None], retina.image, 0)
+            for retina in (seen_by(eye_m + point, layers, stack, fov_deg=fov_deg) for point in points)
+        ]
+    )
     return as_codes(seen)
 
 

@@ -6,11 +6,13 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from runtime.config import ModelSettings, StackGeometry
 from runtime.model.predictor import load_predictor
+from runtime.records import Effort
 from runtime.report import focal, moving
 from runtime.report.benchmark import too_busy, yardstick_ms
 from runtime.report.frontier import Method, MethodResult, apart, measure, shipped_and_references
@@ -118,11 +120,14 @@ def _frontier(
 
 def _moving(page: GrowingPage, *, quick: bool) -> None:
     """Measure all motions; runs on a simulated clock may go side by side."""
-    runs = [(motion, effort) for motion in moving.SCENES for effort in (None, *moving.FIXED)]
+    fixed = (moving.FULL, Effort(2, 0)) if quick else moving.FIXED
+    runs = [(motion, effort) for motion in moving.SCENES for effort in (None, *fixed)]
+    small = partial(moving.moving_run, scale=0.15, seconds=2.5)
+    measure: Callable[..., moving.Moving] = small if quick else moving.moving_run
     results: list[moving.Moving] = []
     page.doing("what a moving viewer sees")
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        done = pool.map(lambda run: apart(moving.moving_run, *run, scale=0.25 if quick else 0.5), runs)
+        done = pool.map(lambda run: apart(measure, *run), runs)
         for result in done:
             page.doing(f"what a moving viewer sees: {result.motion}, {result.effort} is done")
             results.append(result)

@@ -20,7 +20,7 @@ from runtime.model.predictor import model_path
 from runtime.report import sections
 from runtime.report.assemble import GrowingPage, whole_report
 from runtime.report.frontier import MethodResult, PairResult
-from runtime.report.moving import Moving, moving_run
+from runtime.report.moving import FULL, Moving, moving_run
 from runtime.report.page import Page, PageSection, Table, describe
 from runtime.report.sections import frontier_section, moving_section, rising
 from tests.report.test_pairs import case_folder
@@ -90,7 +90,7 @@ def test_the_whole_report_is_made_in_one_run(tmp_path: Path) -> None:
         assert method["psnr_db_off_eye"].keys() == {"2mm", "4mm", "6mm"}
         if method["name"] != "theirs":  # random weights
             assert method["light_db"]["0"] > method["light_db"]["1"] > method["light_db"]["2"]
-    assert {one["motion"] for one in record["moving"]} == {"still", "lean", "walk", "stop-and-go"}
+    assert {one["motion"] for one in record["moving"]} == {"still", "lean", "walk", "stop-and-go", "film"}
     assert len(record["focal"]["cards"]) == 3
     page = (tmp_path / "index.html").read_text()
     assert len(list(tmp_path.glob("*.png"))) == page.count("data:image/png;base64,") == 3
@@ -114,9 +114,9 @@ def report_page() -> Page:
         method("SART-10", "iterative", 900, 40),
     ]
     moving = [
-        Moving(motion, solver_ms, 27.0 - solver_ms / 20, 9, (3.0, 7.0), (solver_ms / 4, solver_ms))
+        Moving(motion, effort, live_db, (3.0, 7.0), {effort: 5.0}, 9)
         for motion in ("still", "lean")
-        for solver_ms in (33.0, 150.0)
+        for effort, live_db in (("1/1+4", 20.0), ("auto", 25.0))
     ]
     parts = [frontier_section(methods, title="Frontier", name="test"), moving_section(moving)]
     return Page("Light against run time", "A lead.", parts, describe(), "phasestack report")
@@ -154,16 +154,16 @@ def test_texts_are_escaped() -> None:
 SCALE = 0.15
 
 
-def test_only_a_moving_head_sees_less_of_a_slow_solver() -> None:
-    quick, slow, rests = (
-        moving_run(motion, solver_ms, seconds=2.5, scale=SCALE)
-        for motion, solver_ms in (("lean", 20.0), ("lean", 200.0), ("still", 200.0))
+def test_chosen_efforts_serve_a_moving_head_better_than_the_whole_model() -> None:
+    chosen, whole, rests = (
+        moving_run(motion, effort, seconds=2.5, scale=SCALE)
+        for motion, effort in (("lean", None), ("lean", FULL), ("still", FULL))
     )
-    assert quick.refreshes == slow.refreshes > 5
-    assert slow.view_error_mm[0] > 2 * quick.view_error_mm[0] > 0
-    assert quick.live_db > slow.live_db + 3
-    assert rests.live_db > slow.live_db + 3
-    assert slow.tracker_mm == quick.tracker_mm  # the tracker does not know of the solver
+    assert chosen.refreshes == whole.refreshes > 3
+    assert whole.view_error_mm[0] > 2 * chosen.view_error_mm[0] > 0
+    assert chosen.live_db > whole.live_db + 1
+    assert rests.live_db > whole.live_db + 1
+    assert set(whole.efforts) == {FULL.name} and FULL.name not in chosen.efforts
 
 
 def test_a_curve_goes_only_to_what_is_slower_and_better() -> None:
