@@ -170,7 +170,7 @@ def boards() -> Image.Image:
 
 
 def moving_text(found: Sequence[Moving]) -> str:
-    """What was measured of moving viewers, and where `auto` is not the best of the efforts."""
+    """Table of the measured motions, and where `auto` is not the best of the efforts."""
     rows, worse = [], []
     for motion in dict.fromkeys(one.motion for one in found):
         own = {one.effort: one for one in found if one.motion == motion}
@@ -198,9 +198,7 @@ def look_into(folder: Path) -> None:
 
 
 def leaning(folder: Path) -> None:
-    """`leaning.webp`: what the left eye of a leaning head sees with all of the model at every solution, with chosen
-    efforts, and what it should see.
-    """
+    """Write `leaning.webp`: a leaning head's left eye with the whole model, with chosen efforts, and the true view."""
     recording = folder / "lean.mcap"
     write_motion(recording, "lean", seconds=FILM_S[1], seed=SEED, noise_mm=NOISE_MM)
     runs: list[KeptInMemory] = []

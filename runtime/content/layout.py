@@ -96,7 +96,7 @@ MONO, PAIR = Layout("mono"), Layout("side-by-side", columns=2)  # one view; two,
 
 
 def layout_of(path: Path, settings: ContentSettings, *, stated: str = "") -> Layout:
-    """The arrangement of views in a file, by the setting, as the file states it, or by its name. Raises InputError."""
+    """Arrangement of the views in a file: as set, as the file states it, or by its name. Raises InputError."""
     named = settings.layout
     if named == "auto":
         named = stated or _named(path)
@@ -116,7 +116,7 @@ def layout_of(path: Path, settings: ContentSettings, *, stated: str = "") -> Lay
 
 
 def of_film(layout: Layout, path: Path, *, width_px: int, height_px: int) -> Layout:
-    """The layout of a film that is named so: its two views are squeezed if the whole has one view's shape."""
+    """The layout of a film by its name: squeezed views if the whole has one view's shape."""
     aspect = width_px / height_px
     squeezed = {"side-by-side": aspect < NARROW, "top-bottom": aspect > LOW}.get(layout.kind, False)
     is_half = squeezed and not layout.span_deg and not FULL.search(path.stem.lower())

@@ -1,4 +1,4 @@
-"""Live quality for moving viewers: simulated runs for every motion, with fixed efforts and the loop's own choice."""
+"""Live quality for moving viewers: simulated runs with fixed efforts and with the loop's choice."""
 
 from __future__ import annotations
 
@@ -83,9 +83,7 @@ def settings_for(recording: Path, *, scene: str, effort: str) -> Settings:
 def moving_run(
     motion: str, effort: Effort | None, *, seconds: float = SECONDS, scale: float = 0.5, seed: int = SEED
 ) -> Moving:
-    """Run one motion with one effort (None: the loop chooses), in a separate process. Raises FatalError without any
-    result.
-    """
+    """Run one motion with one effort (None: the loop chooses). Raises FatalError without any result."""
     with tempfile.TemporaryDirectory(prefix="phasestack-") as folder:
         recording = Path(folder) / "motion.mcap"
         head = "still" if motion == "film" else motion

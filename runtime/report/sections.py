@@ -128,7 +128,7 @@ def most_used(one: Moving) -> str:
 
 
 def moving_plot(found: Sequence[Moving]) -> Figure:
-    """Live quality above the view error: a curve over the fixed efforts and a star for `auto`, for every motion."""
+    """Live quality and view error over the fixed efforts, with a star for `auto`, for every motion."""
     motions = list(dict.fromkeys(one.motion for one in found))
     efforts = [*(effort.name for effort in FIXED), "auto"]
     with drawing(9.6, 6.4) as figure:
