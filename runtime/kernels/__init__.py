@@ -23,7 +23,7 @@ _pointer, _int, _long, _float, _double = (
 
 
 class Image(ctypes.Structure):
-    """Rows of 16-bit elements, channels beside each other."""
+    """Rows of 16-bit elements, interleaved channels."""
 
     _fields_ = (("data", _pointer), ("stride", _long), ("rows", _int), ("width", _int), ("ring", _int))
 
@@ -40,7 +40,7 @@ class Panel(ctypes.Structure):
 
 
 class Problem(ctypes.Structure):
-    """What a step is about."""
+    """Arguments of a step."""
 
     _fields_ = (
         ("panels", _int), ("sets", _int), ("channels", _int), ("height", _int), ("width", _int),
@@ -51,7 +51,7 @@ class Problem(ctypes.Structure):
 
 
 class Warp(ctypes.Structure):
-    """Where a raster's pixels lie in an image, and how far beside it (less than `EDGE_PX` there) its edge goes on."""
+    """Map from a raster to an image, and the distance up to which its edge is clamped (less than `EDGE_PX`)."""
 
     _fields_ = (
         ("image_from_raster", _double * 9), ("image_bend", _double), ("image_middle", _double),

@@ -1,4 +1,4 @@
-// Bilinear samples of images along the rows of a raster that lies a homography away: the one sampler of all kernels.
+// Bilinear samples of images along the rows of a raster, through a homography: the one sampler of all kernels.
 #pragma once
 
 #include <algorithm>
@@ -6,7 +6,7 @@
 #include <cstdint>
 #include <cstring>
 
-// Functions that the linker calls are compiled for each of three processors, and what they inline with them.
+// Exported functions are compiled for each of three processors, together with the functions that they inline.
 #if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
 #define FOR_EVERY_CPU extern "C" __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
 #else
@@ -15,17 +15,17 @@
 #define INLINE static inline __attribute__((always_inline))
 #define VECTORISED _Pragma("GCC ivdep")
 
-constexpr int LANES = 32;     // elements that loops work on together, whatever a processor makes of that
-constexpr int TILE_PX = 256;  // pixels of a row that are sampled at once: what they need stays in the first-level cache
+constexpr int LANES = 32;     // elements of a vector in the loops; the compiler splits it for the processor
+constexpr int TILE_PX = 256;  // pixels of a row that are sampled together: their data fits the first-level cache
 constexpr int EDGE_PX = 4;    // beyond an image, that may be looked at
 constexpr int MAX_PANELS = 5;
 constexpr int MAX_CHANNELS = 3;
-constexpr int TILE = TILE_PX * MAX_CHANNELS + 2 * LANES;  // elements; what follows the last one may be written over
+constexpr int TILE = TILE_PX * MAX_CHANNELS + 2 * LANES;  // elements; those after the last one may be overwritten
 constexpr int SOURCE = 2 * TILE + MAX_CHANNELS * LANES;
 constexpr int FIELDS = 2;  // sampled together, at most
 constexpr float WEIGHT_UNIT = 16384;
 
-// An image of 16-bit elements, channels beside each other. Whole vectors are read behind a row's end.
+// An image of 16-bit elements with interleaved channels. Whole vectors are read past the end of a row.
 struct Image {
   int16_t *data;
   int64_t stride;  // elements
@@ -41,7 +41,7 @@ struct Ramp {  // the pixel that an element belongs to
 };
 constexpr Ramp RAMP;
 
-// A row of a raster through a homography: where its pixel u lies in an image, whose pixels' centres are at integers.
+// A row of a raster through a homography: position of its pixel u in an image with pixel centres at integers.
 struct Line {
   double x0, xu, y0, yu, w0, wu;
   Line() = default;
@@ -70,7 +70,7 @@ INLINE void at_least_zero(double slope, double offset, double &low, double &high
   else if (offset < 0) high = -1;
 }
 
-// Pixels of a row of so many whose places are `near` of an image's pixels or more inside its edges.
+// Pixels of a row of `count` whose positions are at least `near` pixels inside the image's edges.
 INLINE Span inside(const Line &line, int count, const Image &image, double near) {
   constexpr double rounded = 1e-6;  // a place on an edge is inside, however it was worked out
   const double right = image.width - near, below = image.rows - near;
@@ -146,7 +146,7 @@ INLINE void sample(const Image *images, const AnyLine &line, int first, int last
     }
   }
   if (straight) return;
-  for (int f = 0; f < F; ++f) {  // an image's edges go on
+  for (int f = 0; f < F; ++f) {  // clamp to edge
     int16_t *source = work.source[f] + LANES;
     for (int beyond = 1; beyond <= EDGE_PX; ++beyond)
       for (int c = 0; c < C; ++c) {
@@ -157,8 +157,8 @@ INLINE void sample(const Image *images, const AnyLine &line, int first, int last
   const double half = 0.5 * steps, middle = steps > 1 ? line.x(first + half) : 0.5 * (xs + xe);
   const double bend = steps > 1 ? (xs + xe - 2 * middle) / (half * half) * 0.5 : 0;  // along a tile: a parabola
   const double scale = steps > 0 ? (xe - xs) / steps - bend * steps : 1;  // where it begins
-  // At most so many elements at once that the source gains less than three pixels on them (two with one channel: over 32
-  // pixels the rounding of a weight's growth adds up), and that a chord stands for the parabola.
+  // As many elements per vector as keep the source's gain below three pixels (two with one channel: over 32 pixels the
+  // rounding of a weight's growth adds up) and a chord close to the parabola.
   constexpr double gains = C == 1 ? 1.9 : 2.9;
   const double most = std::max(std::abs(scale - 1), std::abs(scale - 1 + 2 * bend * steps));
   int at_once = LANES;
@@ -193,7 +193,7 @@ INLINE void sample(const Image *images, const AnyLine &line, int first, int last
   }
 }
 
-// How long a tile of a line may be: short enough that a parabola is a hundredth of a pixel off, with room for its source.
+// Length of a tile of a line: short enough that a parabola is a hundredth of a pixel off, with room for its source.
 INLINE int tile_px(const Line &line, Span span) {
   const double nearest = std::min(std::abs(line.w0 + line.wu * span.first), std::abs(line.w0 + line.wu * span.last));
   const double turn = std::max(std::abs(line.wu) / nearest, 1e-9);

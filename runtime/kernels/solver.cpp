@@ -13,7 +13,7 @@ constexpr int FULL = 255 * 16;   // of a panel that shows 1: sixteenths of a cod
 constexpr float UNIT = 8100;     // of 1 in phasors: rounding takes no product of theirs beyond 8191
 constexpr float PI = 3.14159265f;
 constexpr double NEAR_PX = 0.5;  // rays count that cross every panel at least this far inside its edges
-constexpr double BESIDE_PX = 2;  // border ray bundles are extended this many pixels beyond the picture (clamp to edge)
+constexpr double EDGE_CLAMP_PX = 2;  // border ray bundles are extended this many pixels beyond the picture (clamp to edge)
 constexpr int MAX_SETS = 4;      // of rays, whose sums of squared slopes, 7830 each, fit 16 bits
 static_assert(FIELDS * MAX_SETS <= 2 * MAX_PANELS, "tiles of work that all sets are gathered in");
 
@@ -198,7 +198,7 @@ struct Back {
   Back(const Problem &problem, const Share &share, int n, int q) {
     for (int set = 0; set < problem.sets; ++set) {
       line[set] = Line(problem.rays_from_panels + (set * problem.panels + n) * 9, q);
-      span[set] = inside(line[set], problem.panel[n].ahead.width, share.image(problem, set, 0), -BESIDE_PX);
+      span[set] = inside(line[set], problem.panel[n].ahead.width, share.image(problem, set, 0), -EDGE_CLAMP_PX);
     }
   }
 };

@@ -3,7 +3,7 @@
 
 namespace {
 
-constexpr int BENT_TILE_PX = 64;   // a parabola stands for a law's curve
+constexpr int BENT_TILE_PX = 64;   // a parabola approximates a law's curve
 constexpr int SOURCE_PX = 480;     // that a tile's source has room for; near a law's end columns are wide
 constexpr double BEYOND = 1e-9;    // where a law has no column
 
@@ -16,18 +16,18 @@ struct Columns {  // column u of a raster is t = middle + (1 - exp(-bend (u - mi
 struct Warp {
   double image_from_raster[9];
   Columns image, raster;
-  double reach_px;  // beside the image, to which its edge goes on: less than EDGE_PX
+  double reach_px;  // outside the image, up to which it is clamped to its edge: less than EDGE_PX
 };
 
 struct WarpedLine {
-  Line line;  // between what the laws make of columns
+  Line line;  // between the columns by both laws
   Columns image, raster;
   double t(double u) const { return raster.to(u + 0.5) - 0.5; }
   double x(double u) const { return image.from(line.x(t(u)) + 0.5) - 0.5; }
   double y(double u) const { return line.y(t(u)); }
 };
 
-// Pixels of a line that lie in an image, or beside it by no more than so much: there its edge goes on.
+// Pixels of a line inside an image or at most reach_px outside, where it is clamped to its edge.
 INLINE Span reaches(const WarpedLine &at, int count, const Image &image, double reach_px) {
   const Line &line = at.line;
   const double left = at.image.to(-reach_px), right = at.image.to(image.width + reach_px), below = image.rows + reach_px;
@@ -44,15 +44,15 @@ INLINE Span reaches(const WarpedLine &at, int count, const Image &image, double 
 }
 
 template <int C>
-INLINE void warp_rows(const Image &image, const Image &result, const Warp &warp, int beside, int begin, int end_row) {
+INLINE void warp_rows(const Image &image, const Image &result, const Warp &warp, int outside, int begin, int end_row) {
   Work work{};
   const bool bent = warp.image.bend != 0 || warp.raster.bend != 0;
   for (int r = begin; r < end_row; ++r) {
     const WarpedLine line{Line(warp.image_from_raster, r), warp.image, warp.raster};
     const Span span = reaches(line, result.width, image, warp.reach_px);
     int16_t *row = result.data + int64_t(r) * result.stride;
-    std::fill(row, row + int64_t(span.first) * C, int16_t(beside));
-    std::fill(row + int64_t(span.last) * C, row + int64_t(result.width) * C, int16_t(beside));
+    std::fill(row, row + int64_t(span.first) * C, int16_t(outside));
+    std::fill(row + int64_t(span.last) * C, row + int64_t(result.width) * C, int16_t(outside));
     if (span.first == span.last) continue;
     const int length = std::min(tile_px(line.line, span), bent ? BENT_TILE_PX : TILE_PX);
     for (int u = span.first, end; u < span.last; u = end) {
@@ -67,10 +67,10 @@ INLINE void warp_rows(const Image &image, const Image &result, const Warp &warp,
 
 }  // namespace
 
-// Rows of a result: bilinear samples of an image whose elements are 8191 at most, either way; `beside` where it has none.
-FOR_EVERY_CPU void warp(const Image *image, const Image *result, const Warp *by, int channels, int beside, int first, int end) {
-  if (channels == 3) warp_rows<3>(*image, *result, *by, beside, first, end);
-  else warp_rows<1>(*image, *result, *by, beside, first, end);
+// Rows of a result: bilinear samples of an image with elements within +-8191; `outside` where it has none.
+FOR_EVERY_CPU void warp(const Image *image, const Image *result, const Warp *by, int channels, int outside, int first, int end) {
+  if (channels == 3) warp_rows<3>(*image, *result, *by, outside, first, end);
+  else warp_rows<1>(*image, *result, *by, outside, first, end);
 }
 
 extern "C" { extern const int32_t warp_bytes = sizeof(Warp); }

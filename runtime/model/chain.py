@@ -4,7 +4,7 @@ With +g on the front and -g on the rear panel, the difference between the eyes' 
 D(p) = 2·[g(p + s) - g(p - s)]. On a raster whose columns make s a whole number K, columns 2K apart form chains
 that don't interact: D = A·g along each, with one bidiagonal A for all of them.
 
-Where one eye is nearer to the panels than the other, s is no constant: seen through a plane parallel to the panels,
+Where one eye is nearer to the panels than the other, s varies: seen through a plane parallel to the panels,
 an outer panel is scaled about the point F where the line through the eyes meets that plane, by as much for one eye as
 the other way for the other. On columns that are spaced by the logarithm of the distance from F, and rows that run
 towards it, the scale is a shift again.
@@ -38,7 +38,7 @@ Columns = NDArray[np.floating[Any]]
 class ColumnLaw:
     """Spacing of a raster's columns: t = middle + (1 - exp(-bend·(u - middle)))/bend.
 
-    t is what a homography takes for u; bend 0: even columns.
+    t is the homography's coordinate for u; bend 0: even columns.
     """
 
     bend: float = 0.0  # per column
@@ -113,7 +113,7 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int)
     """The raster for two eyes (2, 3), left and right, frame `stack`.
 
     Columns are scaled so that the outer panels' parallax is `cell_px` columns; rows are `reduction` panel
-    rows high and sheared along the line of the eyes. It covers what both see of all panels, and a margin.
+    rows high and sheared along the line of the eyes. It covers the part of all panels that both see, and a margin.
     Raises ValueError where the eyes have no horizontal separation, or the raster would be too tall.
     """
     between_m, half_m = eyes_m.mean(axis=0), (eyes_m[1] - eyes_m[0]) / 2
@@ -134,7 +134,7 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int)
     middle_column = cells * cell_px
     bend, (bend_y_m, bend_z_m) = line.nearer_m * per_column, line.towards_f_m2 * per_column
     columns = ColumnLaw(float(bend), float(middle_column))
-    # In the raster's middle, what is to be seen at either end of its rows.
+    # In the raster's middle, the extent to be seen at either end of its rows.
     ends = columns.homography_from_column(np.array([0.0, 2.0 * middle_column])) - middle_column
     reached_m = [z * (1 - bend * end) + bend_z_m * end for z in (window.bottom_m, window.top_m) for end in ends]
     row_m = window.height_m / (stack.height_px / reduction)
@@ -182,7 +182,7 @@ class _Window:
 class _LineOfEyes:
     """Intersection of the eyes' line with the plane: F = towards_f_m2 / nearer_m, up to infinity."""
 
-    nearer_m: float  # half of what the right eye is farther from the plane than the left; 0 where F counts as infinite
+    nearer_m: float  # half the difference of the eyes' distances from the plane, right minus left; 0 where F counts as infinite
     towards_f_m2: F64  # (2,) y, z
     from_f_m2: F64  # (2,) from F to the window's middle, by nearer_m
     nearness: float  # the window's half width by its middle's distance from F; 0 where F counts as infinite

@@ -89,7 +89,7 @@ class ChainProposal:
             to_plane = local.plane_from_local @ frame.plane_from_frame(local.eyes_m[side], x_m=middle_x_m)
             own, other = (
                 warp(
-                    codes, from_plane @ to_plane, size=(frame.rows, frame.width_px), beside=UNSEEN,
+                    codes, from_plane @ to_plane, size=(frame.rows, frame.width_px), outside=UNSEEN,
                     reach_px=min(REACH_PX, EDGE_SHARE * min(codes.shape[:2])), result_columns=frame.columns, threads=1,
                 )
                 for codes, from_plane in (pictures[local.order[side]], pictures[local.order[1 - side]])
@@ -134,7 +134,7 @@ class ChainProposal:
         columns = ColumnLaw(frame.columns.bend, frame.columns.middle + frame.cell_px)
         matrix = begin @ to_frame @ seen_from_layer @ raster.plane_from_raster()
         size = raster.height_px, raster.width_px
-        codes = warp(np.clip(answer, 0, FULL), matrix, size=size, beside=EVEN, image_columns=columns, threads=1)
+        codes = warp(np.clip(answer, 0, FULL), matrix, size=size, outside=EVEN, image_columns=columns, threads=1)
         if max(geometry.taper_px) > 0:
             weights = _wave_taper(geometry, raster, middle_m)
             weights = weights[..., None] if codes.ndim == 3 else weights

@@ -57,7 +57,7 @@ def picture_on(
     view: TargetView, middle: PlaneRaster, *, middle_from_result: F64, edge: int, size: tuple[int, int]
 ) -> U8:
     """(rows, columns, 3 or 4) a view's picture on a raster of (rows, columns) that a homography takes to the middle
-    panel's pixels; the picture itself where it lies there. edge: OpenCV's border mode."""
+    panel's pixels; the picture itself if it is there already. edge: OpenCV's border mode."""
     picture_from_result = np.linalg.inv(view.plane_from_picture) @ middle.plane_from_raster() @ middle_from_result
     picture_from_result = picture_from_result / picture_from_result[2, 2]
     if view.picture.shape[:2] == size and np.abs(picture_from_result - np.eye(3)).max() < SNAPPED:
@@ -81,16 +81,16 @@ def warp(
     image_from_result: F64,
     *,
     size: tuple[int, int],
-    beside: int,
+    outside: int,
     reach_px: float = REACH_PX,
     image_columns: ColumnLaw = EVEN_COLUMNS,
     result_columns: ColumnLaw = EVEN_COLUMNS,
     threads: int | None = None,
 ) -> I16:
     """`resample` of an image (h, w[, 3]) of LARGEST at most either way, several times as fast, through a homography
-    between what the two laws make of columns. One of them is even.
+    between the columns by both laws. One of them is even.
 
-    beside: what lies farther beside the image than reach_px (REACH_PX at most), to which its edge goes on. threads:
+    outside: value more than reach_px (REACH_PX at most) outside the image; nearer, it is clamped to its edge. threads:
     OpenCV's number, unless given.
     """
     x, y, w = image_from_result @ (result_columns.middle or size[1] / 2, size[0] / 2, 1.0)
@@ -109,7 +109,7 @@ def warp(
     images = [Image.of(x.reshape(len(x), -1), rows=x.shape[0], width=x.shape[1]) for x in (source, result)]
     loops = library()
     on_rows(
-        lambda first, end: loops.warp(*map(byref, (*images, by)), channels, beside, first, end),
+        lambda first, end: loops.warp(*map(byref, (*images, by)), channels, outside, first, end),
         size[0],
         threads=threads,
     )

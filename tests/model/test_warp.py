@@ -47,7 +47,7 @@ def test_any_scale(size: tuple[int, int], channels: int, scale: float) -> None:
     image = np.random.default_rng(0).integers(0, 4081, (*size, channels)).astype(np.int16)
     matrix = scaled(scale, size)
     expected, within = bilinear(image, matrix, size)
-    found = warp(image[..., 0] if channels == 1 else image, matrix, size=size, beside=BESIDE, reach_px=0.0)
+    found = warp(image[..., 0] if channels == 1 else image, matrix, size=size, outside=BESIDE, reach_px=0.0)
     off = np.abs(found.reshape(expected.shape) - expected)[within]
     assert off.size
     assert off.max() < TOLERANCE
@@ -58,7 +58,7 @@ def test_pixels_on_pixels_are_the_images_own(shift_px: tuple[float, float]) -> N
     image = np.random.default_rng(1).integers(0, 4081, (40, 333, 3)).astype(np.int16)
     matrix = np.array([[1.0, 0, shift_px[0]], [0, 1.0, shift_px[1]], [0, 0, 1.0]])
     expected, within = bilinear(image, matrix, (40, 333))
-    found = warp(image, matrix, size=(40, 333), beside=BESIDE, reach_px=0.0)
+    found = warp(image, matrix, size=(40, 333), outside=BESIDE, reach_px=0.0)
     assert np.abs(found - expected)[within].max() <= (0.5 if shift_px[1] % 1 else 0)
     assert (found[~within] == BESIDE).all()
 
@@ -70,5 +70,5 @@ def test_perspective_along_rows(turn: float) -> None:
     image = np.repeat((2040 + 1500 * np.sin(columns / 5) * np.cos(rows / 7))[..., None], 3, axis=2).astype(np.int16)
     matrix = np.array([[0.9, 0.01, 20], [0.004, 0.95, 2], [turn, 0, 1.0 - 388 * turn]])
     expected, within = bilinear(image, matrix, (90, 777), near_px=1.0)
-    found = warp(image, matrix, size=(90, 777), beside=BESIDE, reach_px=0.0)
+    found = warp(image, matrix, size=(90, 777), outside=BESIDE, reach_px=0.0)
     assert np.abs(found - expected)[within].max() < 4

@@ -11,7 +11,7 @@ vec4 weights = vec4(0.0), sums = vec4(0.0);
 
 void gather(mat3 rays_from, sampler2D weight, sampler2D residual) {
     vec2 at = place(rays_from);
-    if (!inside(at, rays, -BESIDE_PX)) return;
+    if (!inside(at, rays, -EDGE_CLAMP_PX)) return;
     weights += sampled(weight, at, rays);
     sums += signed_number(sampled(residual, at, rays));
 }

@@ -17,7 +17,7 @@ vec4 curved = vec4(0.0), slope = vec4(0.0);
 
 void gather(mat3 rays_from, sampler2D of_curvature, sampler2D of_gradient) {
     vec2 at = place(rays_from);
-    if (!inside(at, rays, -BESIDE_PX)) return;
+    if (!inside(at, rays, -EDGE_CLAMP_PX)) return;
     curved += sampled(of_curvature, at, rays);
     slope += signed_number(sampled(of_gradient, at, rays));
 }

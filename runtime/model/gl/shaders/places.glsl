@@ -1,6 +1,6 @@
 // Places in images: pixels, centres at halves. An image is the first pixels of a texture.
 const float FULL = 4080.0;  // of a panel that shows 1, sixteenths of a code
-const float BESIDE_PX = 2.0;  // of a picture, its edge goes on: its outermost bundles cover panels' pixels there
+const float EDGE_CLAMP_PX = 2.0;  // border ray bundles are extended this many pixels beyond the picture (clamp to edge)
 
 vec2 place(mat3 homography) {
     vec3 at = homography * vec3(gl_FragCoord.xy - origin, 1.0);
