@@ -182,7 +182,7 @@ class _Window:
 class _LineOfEyes:
     """Intersection of the eyes' line with the plane: F = towards_f_m2 / nearer_m, up to infinity."""
 
-    nearer_m: float  # half the difference of the eyes' distances from it, right minus left; 0 where F counts as infinite
+    nearer_m: float  # half the difference of the eyes' distances from it, right minus left; 0: F counts as infinite
     towards_f_m2: F64  # (2,) y, z
     from_f_m2: F64  # (2,) from F to the window's middle, by nearer_m
     nearness: float  # the window's half width by its middle's distance from F; 0 where F counts as infinite
