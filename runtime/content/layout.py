@@ -96,7 +96,7 @@ MONO, PAIR = Layout("mono"), Layout("side-by-side", columns=2)  # one view; two,
 
 
 def layout_of(path: Path, settings: ContentSettings, *, stated: str = "") -> Layout:
-    """Arrangement of the views in a file: as set, as the file states it, or by its name. Raises InputError."""
+    """Arrangement of a file's views: as set, as the file states it, or by its name. Raises InputError."""
     named = settings.layout
     if named == "auto":
         named = stated or _named(path)

@@ -265,8 +265,10 @@ def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[
     except InputError:
         raise
     except Exception:  # mcap, lz4 and zstandard have their own
+        file.seek(-len(MAGIC), os.SEEK_END)
+        is_whole = file.read() == MAGIC  # damaged, then: lengths in it mean nothing
         file.seek(end)
-        if data := _cut_off_chunk(file.read(max_bytes)):
+        if not is_whole and (data := _cut_off_chunk(file.read(max_bytes))):
             yield from breakup_chunk(Chunk("", data, 0, 0, 0, len(data)))
         raise
 

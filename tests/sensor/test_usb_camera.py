@@ -40,7 +40,7 @@ def test_without_depth_the_eyes_direction_is_right_with_sigma_along_it(film: str
     find = EyeFinder(Settings(sensor=sensor)).find
     with driver:
         frames = [searched(driver.read_newest(1.0), find) for _ in range(5)]
-        with pytest.raises(SensorLost, match="no more pictures"):
+        with pytest.raises(SensorLost, match="stopped delivering pictures"):
             driver.read_newest(1.0)
     assert [frame.sequence for frame in frames] == [1, 2, 3, 4, 5]
     middle = frames[-1].eyes.eyes_m.mean(axis=0)
