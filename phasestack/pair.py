@@ -336,7 +336,7 @@ def _checked(
     pair = _Pair(tuple(pictures), eyes, stack, fov_deg, is_resampled=cameras is not None)
     black = np.zeros((stack.count, stack.height_px, stack.width_px, 3), np.uint8)
     if not all(seen_by(eye, black, stack, fov_deg=fov_deg, width_px=64, height_px=64).mask.any() for eye in eyes):
-        raise ValueError("eyes_m: nothing of the display can be seen from there")
+        raise ValueError("eyes_m: no part of the display is visible from there")
     return pair
 
 

@@ -131,9 +131,9 @@ class ModelSession:
                     raise InputError(path, f"{field}.{item.name}", problem)
 
     def check_fits(self, source: Path, feeds: Mapping[str, Shape], answers: Mapping[str, Shape]) -> None:
-        """Raise InputError, naming the port, where the graph does not make such answers of such feeds.
+        """Raise InputError, naming the port, if the graph's inputs and outputs do not have these names and shapes.
 
-        It is run once where its declared shapes leave that open.
+        If its declared shapes do not tell, it is run once.
         """
         is_open = False
         for field, items, shapes in (

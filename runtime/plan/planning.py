@@ -78,7 +78,7 @@ def plan_for(
 
 
 def _check_viewer(eyes_m: F64, stack: PanelStack, *, fov_deg: float) -> None:
-    """Raise InputError for eyes (2, 3) from which nothing of the display can be seen."""
+    """Raise InputError for eyes (2, 3) from which no part of the display is visible."""
     nearest_m = float(eyes_m[:, 0].min())
     if nearest_m <= max(stack.x_m):
         raise InputError(
@@ -88,4 +88,4 @@ def _check_viewer(eyes_m: F64, stack: PanelStack, *, fov_deg: float) -> None:
     coarse = replace(stack, width_px=64, height_px=36)
     blank = np.zeros((stack.count, coarse.height_px, coarse.width_px, 3), np.uint8)
     if not any(seen_by(eye_m, blank, coarse, fov_deg=fov_deg).mask.any() for eye_m in eyes_m):
-        raise InputError("sensor.fixed_eyes_m", "", "nothing of the display can be seen from there")
+        raise InputError("sensor.fixed_eyes_m", "", "no part of the display is visible from there")
