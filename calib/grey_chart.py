@@ -194,5 +194,6 @@ def measure(pictures: list[F64], stack: PanelStack, panel: int, *, source: str) 
     if falls.size:
         lower, upper = GREYS[int(falls[0])], GREYS[int(falls[0]) + 1]
         problem = f"grey {upper} is darker than grey {lower}: not a grey curve"
-        raise InputError(source, "greys", f"{problem} (possible causes: a reflection, a change of exposure, the wrong LUT)")
+        causes = "possible causes: a reflection, a change of exposure, the wrong LUT"
+        raise InputError(source, "greys", f"{problem} ({causes})")
     return np.clip(levels, 0.0, 1.0), float(np.median(np.abs(fit.fun)))
