@@ -6,7 +6,7 @@ import logging
 import math
 import queue
 import threading
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -86,8 +86,7 @@ class SolverThread(SolverHost):
 
     @property
     def costs(self) -> Costs:
-        assert self._costs is not None, "the solver is not ready"
-        return self._costs
+        return self._costs or Costs(defaultdict(dict))  # a run that is stopped while it starts asks once, too
 
     def post(self, request: SolveRequest) -> None:
         with self._lock:

@@ -121,7 +121,7 @@ def test_a_signal_at_any_stage_of_the_start_ends_it_cleanly(
     daemon.process.send_signal(number)
     code, errors = daemon.ends()
     # Before our handlers are there a signal kills; 130 is what shells make of an interrupt.
-    assert code in (0, 130, -number)
+    assert code in (0, 130, -number), errors
     assert "Traceback" not in errors
 
 
