@@ -69,8 +69,8 @@ median and 95th percentile; between solutions the picture is [reprojected](mathe
 steps for each.
 """
 LEANING = """\
-A leaning head at 0.6 m, its left eye, every fourth refresh: with `model.effort = "full"`, with `"auto"`, and the true
-view. Both are reprojected by depth.
+A leaning head at 0.6 m, its left eye, every fourth refresh: with `model.effort = "full"` ("before"), with `"auto"`
+("now"), and the true view. Both are reprojected by depth.
 """
 HEAD = """\
 <!-- Written by `make gallery`: change docs/make_gallery.py, not this page. -->

@@ -174,7 +174,7 @@ def test_the_example_that_bounds_what_panels_could_show_runs(tmp_path: Path, sti
     ]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
-        [*command, *eyes, "--width", "96", "--iterations", "200"],
+        [*command, *eyes, "--width", "96", "--iterations", "400"],
         cwd=tmp_path,
         env=environment,
         capture_output=True,
