@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 from typing import IO, Any
 
@@ -213,7 +214,6 @@ class Recording:
             if (begin := file.read(len(MAGIC))) != MAGIC:
                 problem = "is not an MCAP recording" if begin else "is empty"
                 raise InputError(self.path, "", problem + KINDS.get(begin, ""))
-            file.seek(0)
             yield from _mcap_records(file, source=self.path, max_bytes=LIMITS.chunk_bytes)
         except (InputError, ImportError):
             raise
@@ -254,6 +254,8 @@ def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[
     from mcap.stream_reader import StreamReader, breakup_chunk
 
     end = len(MAGIC)  # of the last whole record
+    indexed = _indexed_chunks(file, max_bytes=max_bytes)
+    file.seek(0)
     try:
         for record in StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=max_bytes).records:
             end = file.tell()
@@ -262,6 +264,9 @@ def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[
                 yield from breakup_chunk(replace(record, compression="", data=data), validate_crc=True)
             else:
                 yield record
+            # mcap skips a record of an unknown kind
+            if end in indexed and os.pread(file.fileno(), len(CHUNK), end) != CHUNK:
+                raise ValueError(f"the chunk at byte {end} is not marked as one")
     except InputError:
         raise
     except Exception:  # mcap, lz4 and zstandard have their own
@@ -271,6 +276,24 @@ def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[
         if not is_whole and (data := _cut_off_chunk(file.read(max_bytes))):
             yield from breakup_chunk(Chunk("", data, 0, 0, 0, len(data)))
         raise
+
+
+def _indexed_chunks(file: IO[bytes], *, max_bytes: int) -> set[int]:
+    """Where the file's summary says that chunks begin; empty for a file with no readable summary."""
+    from mcap.reader import FOOTER_SIZE
+    from mcap.records import ChunkIndex
+    from mcap.stream_reader import StreamReader
+
+    def records(data: bytes) -> Iterator[Any]:
+        yield from StreamReader(BytesIO(data), skip_magic=True, emit_chunks=True, record_size_limit=max_bytes).records
+
+    try:
+        end = file.seek(-(FOOTER_SIZE + len(MAGIC)), os.SEEK_END)
+        begin = file.seek(next(records(file.read())).summary_start)
+        summary = records(file.read() if end - begin < max_bytes else b"")
+        return {record.chunk_start_offset for record in summary if isinstance(record, ChunkIndex)}
+    except Exception:  # cut off, damaged, or of another kind
+        return set()
 
 
 def _cut_off_chunk(data: bytes) -> bytes:

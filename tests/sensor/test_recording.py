@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from runtime.errors import InputError
@@ -81,8 +82,6 @@ def test_a_file_tells_its_sensor_and_all_its_samples(tmp_path: Path) -> None:
 
 
 def test_other_tools_open_it(tmp_path: Path) -> None:
-    from mcap.reader import make_reader
-
     write(tmp_path / "a.mcap", [sample(k) for k in range(50)])
     with (tmp_path / "a.mcap").open("rb") as file:
         found = [(s.name, s.encoding, c.topic, json.loads(m.data)) for s, c, m in make_reader(file).iter_messages()]
@@ -153,6 +152,28 @@ def test_a_damaged_byte_loses_no_sample_before_it_and_never_invents_one(
     assert [eyes_message(f) for f in found] == DEMO[: len(found)]
 
 
+@pytest.mark.parametrize("kind", [0, 2, 4, 5, 7, 8, 11, 14, 15, 22, 70, 134, 255])
+def test_a_chunk_whose_kind_is_damaged_ends_the_recording_with_a_line(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, kind: int
+) -> None:
+    """MCAP's readers skip records of unknown kinds, and take other kinds' fields out of the chunk's bytes."""
+    with demo_recording_path().open("rb") as file:
+        starts = [index.chunk_start_offset for index in make_reader(file).get_summary().chunk_indexes]
+    for start in (starts[0], starts[len(starts) // 2], starts[-1]):
+        path, data = tmp_path / "a.mcap", bytearray(DEMO_BYTES)
+        data[start] = kind
+        path.write_bytes(bytes(data))
+        before = sum(DEMO_BYTES.index(message) < start for message in DEMO)
+        caplog.clear()
+        if not before:
+            with pytest.raises(InputError, match=r"a\.mcap"):
+                Recording(path)
+            continue
+        recording = Recording(path)
+        assert [eyes_message(frame) for frame in recording.samples()] == DEMO[:before]
+        assert not recording.is_whole and f"the chunk at byte {start} is not marked as one" in caplog.text
+
+
 def test_a_recording_of_another_program_or_version_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "other.mcap"
     for name, metadata in (("else", {}), ("phasestack.recording", {"schema_version": "99"})):
@@ -189,8 +210,6 @@ def test_another_program_s_recording_is_called_so_with_what_one_must_hold(tmp_pa
 
 def test_a_recording_with_its_metadata_at_the_end_is_played(tmp_path: Path) -> None:
     """Repair tools write such files."""
-    from mcap.reader import make_reader
-
     path = tmp_path / "mended.mcap"
     with demo_recording_path().open("rb") as old, path.open("wb") as file:
         reader, writer = make_reader(old), Writer(file)
