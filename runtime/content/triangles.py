@@ -16,7 +16,6 @@ from runtime.content.base import ContentInfo, View
 from runtime.content.canvas import CanvasSource
 from runtime.content.fringe import CORNER_ENDS, edges_of, ramps, silhouette
 from runtime.content.parts import OPAQUE_FROM, OUTLINED_MAX, Part, Sampler
-from runtime.content.shapes import I32
 from runtime.optics.rect import PixelRect
 from runtime.records import F32, F64, U8
 from runtime.support.background import raise_if_abandoned
@@ -25,7 +24,8 @@ from runtime.support.gl import DrawnPicture
 PROJECTED_MAX = 5000  # vertices of a part that are projected to find its extent; beyond, its box is
 DRAWN_AT_ONCE = 20_000  # triangles
 UPLOADED_AT_ONCE = 8 << 20  # bytes
-OUTLINE_BYTES = 6 * (5 + 9) * 4  # two triangles an edge: clip coordinates and coverage, then the attributes
+ATTRIBUTES = ("in_normal", "in_uv", "in_colour")
+OUTLINE_FLOATS = 5 + 9  # a corner: clip coordinates and coverage, then the attributes
 OVER = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA)
 
 ANY_ALPHA = 2.0  # beyond every alpha
@@ -157,19 +157,14 @@ class DrawnPart:
         """(v, 3) at present."""
         return self.vertices[:, :3]
 
-    def upload(self, context: Any, surface_program: Any, outline_program: Any, textures: list[Any]) -> None:
-        """Make its GL objects; programs and textures are the source's, and shared."""
-        self.surface_program, self.outline_program, self.textures = surface_program, outline_program, textures
+    def upload(self, context: Any, surface_program: Any, outline: Any, textures: list[Any]) -> None:
+        """Make its GL objects; program, outline (a vertex array) and textures are the source's, and shared."""
+        self.surface_program, self.outline, self.textures = surface_program, outline, textures
         self._buffer, self._triangles = (_uploaded(context, array) for array in (self.vertices, self.triangles))
         if self.edges is None and not self.is_projected:  # hundreds of MiB that are no longer read
             self.vertices, self.triangles = self.vertices[:0].copy(), self.triangles[:0].copy()
-        names = ("in_normal", "in_uv", "in_colour")
-        layout = _layout(surface_program, self._buffer, ("in_position", *names), (3, 3, 2, 4))
+        layout = _layout(surface_program, self._buffer, ("in_position", *ATTRIBUTES), (3, 3, 2, 4))
         self.surface = context.vertex_array(surface_program, [layout], index_buffer=self._triangles)
-        size = max(len(self.edges.faces) if self.edges else 0, 1) * OUTLINE_BYTES
-        self._outline_buffer = context.buffer(reserve=size, dynamic=True)
-        layout = _layout(outline_program, self._outline_buffer, ("in_clip", "in_coverage", *names), (4, 1, 3, 2, 4))
-        self._outline = context.vertex_array(outline_program, [layout])
 
     def draw_surface(self) -> None:
         """In pieces: a software rasteriser holds Python's lock for as long as a call takes."""
@@ -177,15 +172,9 @@ class DrawnPart:
             raise_if_abandoned()
             self.surface.render(first=first, vertices=min(3 * DRAWN_AT_ONCE, self.corner_count - first))
 
-    def draw_outline(self, corners: F32, vertices: I32) -> None:
-        """Ramps (k, 6, 5) along its outline, each corner with the attributes of a vertex (k, 6)."""
-        packed = np.concatenate([corners.reshape(-1, 5), self.vertices[vertices.reshape(-1), 3:]], axis=1)
-        self._outline_buffer.write(packed)
-        self._outline.render(vertices=len(packed))
-
     def release(self) -> None:
         """Release its GL objects, except shared ones; a vertex array does not release its buffers."""
-        for held in (self.surface, self._buffer, self._triangles, self._outline, self._outline_buffer):
+        for held in (self.surface, self._buffer, self._triangles):
             held.release()
 
 
@@ -205,8 +194,8 @@ class _Look:
     def set(self, program: Any, part: DrawnPart) -> None:
         """Set a program's uniforms and textures for a part."""
         for name, matrix in (("stack_from_part", self._normals), ("clip_from_part", self._clip)):
-            if name in program:
-                program[name].write(matrix)
+            if (uniform := program.get(name, None)) is not None:
+                uniform.write(matrix)
         _set_uniforms(program, colour=part.colour, glow=part.glow, glow_picture=len(part.textures) - 1)
         for unit, texture in enumerate(part.textures):
             texture.use(unit)
@@ -234,11 +223,15 @@ class TriangleSource(CanvasSource):
         self._still: tuple[F64, F64] | None = None
         self._programs: dict[tuple[str, ...], Any] = {}
         self._textures: dict[tuple[int, Sampler], Any] = {}
+        edges = sum(len(part.edges.faces) for part in self.parts if part.edges is not None)
+        self._outline_buffer = context.buffer(reserve=max(edges, 1) * 6 * OUTLINE_FLOATS * 4, dynamic=True)
+        self._outlines: dict[tuple[str, ...], Any] = {}
         for part in self.parts:
-            programs = self._program(part.features), self._program((*part.features, "OUTLINE"))
             pictures = [picture for picture in part.pictures if picture is not None]
-            part.upload(context, *programs, [self._texture(picture, part.sampler) for picture in pictures])
-        self.held += [*self.parts, *self._textures.values(), *self._programs.values()]
+            textures = [self._texture(picture, part.sampler) for picture in pictures]
+            part.upload(context, self._program(part.features), self._outline(part.features), textures)
+        self.held += [*self.parts, *self._outlines.values(), self._outline_buffer]
+        self.held += [*self._textures.values(), *self._programs.values()]
 
     def places(self, time_ns: int) -> Sequence[F64]:
         """4x4 stack_from_part of every part; moving scenes compute it for each time."""
@@ -314,6 +307,15 @@ class TriangleSource(CanvasSource):
             self._programs[features] = self.context.program(**shaders)
         return self._programs[features]
 
+    def _outline(self, features: tuple[str, ...]) -> Any:
+        """The vertex array of outlines of parts with these features."""
+        if features not in self._outlines:
+            program = self._program((*features, "OUTLINE"))
+            names = ("in_clip", "in_coverage", *ATTRIBUTES)
+            layout = _layout(program, self._outline_buffer, names, (4, 1, 3, 2, 4))
+            self._outlines[features] = self.context.vertex_array(program, [layout])
+        return self._outlines[features]
+
     def _texture(self, picture: U8, sampler: Sampler) -> Any:
         key = (id(picture), sampler)
         if key not in self._textures:
@@ -341,27 +343,32 @@ class TriangleSource(CanvasSource):
             return
         # For all parts at once: most have few edges.
         size = {"width_px": view.width_px, "height_px": view.height_px}
-        packed, kept = ramps(np.concatenate(points), **size, ramp_px=1 / view.reduction)
+        corners, kept = ramps(np.concatenate(points), **size, ramp_px=1 / view.reduction)
         ends_before = np.cumsum([0, *map(len, vertices)])
         first = np.searchsorted(kept, ends_before)
+        packed = np.empty((len(kept), 6, OUTLINE_FLOATS), np.float32)
+        packed[..., :5] = corners
+        for n, (part, _) in enumerate(outlined):
+            own = slice(first[n], first[n + 1])
+            packed[own, :, 5:] = part.vertices[vertices[n][kept[own] - ends_before[n]][:, CORNER_ENDS], 3:]
+        self._outline_buffer.write(packed)
         context, framebuffer = self.context, self.context.fbo
         context.enable_only(context.DEPTH_TEST | context.BLEND)
         context.blend_func = OVER
         framebuffer.depth_mask = False
         for n, (part, look) in enumerate(outlined):
-            own = slice(first[n], first[n + 1])
-            if own.stop > own.start:
-                look.set(part.outline_program, part)
-                _set_uniforms(part.outline_program, kept=(part.cutoff, ANY_ALPHA))
-                part.draw_outline(packed[own], vertices[n][kept[own] - ends_before[n]][:, CORNER_ENDS])
+            if first[n + 1] > first[n]:
+                look.set(part.outline.program, part)
+                _set_uniforms(part.outline.program, kept=(part.cutoff, ANY_ALPHA))
+                part.outline.render(first=6 * int(first[n]), vertices=6 * int(first[n + 1] - first[n]))
         framebuffer.depth_mask = True
 
 
 def _set_uniforms(program: Any, **values: Any) -> None:
     """Those that the compiler has kept."""
     for name, value in values.items():
-        if name in program:
-            program[name] = value
+        if (uniform := program.get(name, None)) is not None:  # `in` would try one name after another
+            uniform.value = value
 
 
 def _uploaded(context: Any, array: Any) -> Any:
