@@ -28,6 +28,7 @@ HORIZON_S = 1.0  # time over which head and content are assumed to continue as t
 EQUAL = 1.03  # of efforts whose expected errors differ by less, the fastest is chosen
 PREFERRED = 0.93  # switch effort only if its expected error is below this share of the present one's
 GAIN = 0.2  # weight of the newest measurement in a running mean
+KEPT_SOLUTIONS = 100  # a raster's times are forgotten after this many solutions on others: the load has changed
 # Squared error in light after k steps, relative to no steps: solver `best`, mean of the scenes demo and texture at
 # 960x540, with a tracking error of 2 mm.
 STEP_SHARES = (1.0, 0.77, 0.61, 0.58, 0.53, 0.53, 0.51, 0.51, 0.51)
@@ -67,15 +68,18 @@ def simulated_costs(stage_ms: Mapping[str, float], reductions: Iterable[int]) ->
 
 
 class CostBook:
-    """Running means of the stage times of solutions, by raster."""
+    """Running means of the stage times of solutions, by raster. Those of a raster long unused are forgotten."""
 
     def __init__(self, first: Mapping[int, Mapping[str, float]]) -> None:
         """first: times by reduction and stage, measured with full pictures before the first refresh."""
         self._first = first
         self._measured: dict[int, dict[str, float]] = {}
+        self._unused: dict[int, int] = {}  # by reduction: solutions on other rasters since its last one
 
     def learn(self, effort: Effort, stage_ms: Mapping[str, float]) -> None:
         """Update the means with the stage times of one solution."""
+        self._unused = {by: count + 1 for by, count in self._unused.items()} | {effort.reduction: 0}
+        self._measured = {by: means for by, means in self._measured.items() if self._unused[by] < KEPT_SOLUTIONS}
         means = self._measured.setdefault(effort.reduction, {})
         steps = effort.steps - (effort.continued_from or 0)
         for stage in SOLVING_STAGES:
@@ -87,16 +91,24 @@ class CostBook:
             means[stage] = means.get(stage, spent_ms) + GAIN * (spent_ms - means.get(stage, spent_ms))
 
     def costs(self) -> Costs:
-        """Return the current costs; rasters not yet measured are scaled like the measured ones."""
+        """Return the current costs.
+
+        Rasters without measurements are scaled like the measured ones, and taken to be cheaper than the next finer
+        one by at least the ratio of their widths: a first time that other work delayed must not exclude them.
+        """
         measured_ms = sum(sum(stages.values()) for stages in self._measured.values())
         first_ms = sum(self._first.get(by, {}).get(s, 0.0) for by, stages in self._measured.items() for s in stages)
         scale = measured_ms / first_ms if first_ms > 0 and measured_ms > 0 else 1.0
-        return Costs(
-            {
-                by: {stage: scale * ms for stage, ms in stages.items()} | self._measured.get(by, {})
-                for by, stages in self._first.items()
-            }
-        )
+        costs: dict[int, dict[str, float]] = {}
+        finer: tuple[int, dict[str, float]] | None = None
+        for by, first in sorted(self._first.items()):
+            costs[by] = {stage: scale * ms for stage, ms in first.items()}
+            if finer is not None:
+                most = {stage: ms * finer[0] / by for stage, ms in finer[1].items()}
+                costs[by] = {stage: min(ms, most.get(stage, ms)) for stage, ms in costs[by].items()}
+            costs[by] |= self._measured.get(by, {})
+            finer = by, costs[by]
+        return Costs(costs)
 
 
 @dataclass(frozen=True, slots=True)

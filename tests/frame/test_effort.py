@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from runtime.frame.effort import (
     BLUR_M,
+    KEPT_SOLUTIONS,
     CostBook,
     Costs,
     EffortChooser,
@@ -122,6 +123,23 @@ def test_measured_costs_replace_first_ones_and_scale_those_of_other_rasters() ->
     costs = book.costs()
     assert costs.ms(Effort(2, 0)) == pytest.approx(153.0 / 12)
     assert costs.ms(Effort(1, 0)) == pytest.approx(153.0 / 3)
+
+
+def test_a_first_time_that_other_work_delayed_does_not_exclude_a_raster() -> None:
+    first = {by: {"render": 100.0 / by**2} for by in REDUCTIONS} | {3: {"render": 90.0}}
+    costs = CostBook(first).costs()
+    assert costs.ms(Effort(3, 0)) == pytest.approx(25.0 * 2 / 3)
+    assert costs.ms(Effort(4, 0)) == pytest.approx(100.0 / 16)
+
+
+def test_times_of_a_raster_long_unused_are_forgotten() -> None:
+    book = CostBook({by: {"render": 100.0 / by**2} for by in REDUCTIONS})
+    for _ in range(20):  # measured while other work slowed everything
+        book.learn(Effort(3, 0), {"render": 50.0})
+    assert book.costs().ms(Effort(3, 0)) == pytest.approx(50.0)
+    for _ in range(KEPT_SOLUTIONS):
+        book.learn(Effort(2, 0), {"render": 25.0})
+    assert book.costs().ms(Effort(3, 0)) == pytest.approx(100.0 / 9)
 
 
 def test_a_continued_solution_teaches_nothing_of_drawing() -> None:
