@@ -249,10 +249,11 @@ def test_real_and_simulated_time_pass_the_same_states(tmp_path: Path) -> None:
 
 def test_the_demo_ends_in_time_and_names_its_simulated_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("runtime.commands.demo.LONGEST_S", 0.0)
+    monkeypatch.setattr("runtime.commands.demo.LEAST", 4)
     with pytest.raises(SystemExit):
         app(["demo", "--out", str(tmp_path)])
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["frames"] == 1 and "0 s are up" in summary["stopped"]
+    assert summary["frames"] == 4 and summary["light_db"] and "0 s are up" in summary["stopped"]
     assert (summary["clock"], summary["scene"]) == ("simulated", "room")
 
 
