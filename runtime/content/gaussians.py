@@ -6,6 +6,7 @@ import logging
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -31,6 +32,9 @@ DOTS, MOST_DOTS = 500, 200_000  # of a line, and of all lines together
 FINEST_POINT, LARGEST_POINT = 5e-4, 0.01  # standard deviation of a point, in units of the scene's extent
 FLAT_HARMONIC = 0.28209479177387814  # of degree 0
 COEFFICIENTS = (0, 9, 24, 45)  # f_rest properties: of harmonics to degree 0, 1, 2, 3
+SOLID = 0.3  # alpha from which a splat counts as a surface: two such hide half
+SQUARE = 0.89  # half the side of a square with a disc's area, in units of the disc's radius
+LARGEST_STEP = 7  # half sides of squares in blocks: 0, 1, 2, 4 to 64
 PACKED = [0, 1, 2, 4, 5, 8]  # of a 3x3 matrix, row by row
 
 I64 = NDArray[np.int64]
@@ -56,6 +60,7 @@ class Splats:
     minor_px: F32  # (m, 2)
     reach: F32  # (m,) standard deviations at which alpha falls to 1/255
     opacities: F32  # (m,)
+    nearness: F32  # (m,) 1/m, inverse of the view's third coordinate
 
 
 def load_gaussians(header: PlyHeader) -> Gaussians:
@@ -216,7 +221,31 @@ def seen_splats(gaussians: Gaussians, view: View, *, nearest_m: float = 1e-3) ->
         minor_px=np.column_stack([-sine, cosine]) * shorter[:, None],
         reach=reach[keep],
         opacities=opacity[keep],
+        nearness=weight[keep].astype(np.float32),
     )
+
+
+def nearest_blocks(splats: Splats, view: View, *, every: int, first: tuple[int, int]) -> F32:
+    """(h, w) 1/m as of `ContentSource.nearness`: of the nearest splat whose alpha there is over `SOLID`.
+
+    Each is taken as a square of that area, or up to half as wide, at its centre's distance.
+    """
+    shape = -(-(view.height_px + first[1]) // every), -(-(view.width_px + first[0]) // every)
+    solid = np.flatnonzero(splats.opacities > SOLID)  # farthest first
+    (a, b), (c, d) = splats.major_px[solid].T, splats.minor_px[solid].T
+    half_px = SQUARE * np.sqrt(abs(a * d - b * c) * 2 * np.log(splats.opacities[solid] / np.float32(SOLID)))
+    step = np.clip(np.log2(half_px / np.float32(every)) + 1, 0, LARGEST_STEP).astype(np.int8)
+    column, row = np.floor((splats.centres_px[solid] + np.array(first, np.float32)).T / np.float32(every))
+    found = np.zeros(shape, np.float32)
+    for number in np.flatnonzero(np.bincount(step)):
+        some, reach = np.flatnonzero(step == number), (1 << number) >> 1
+        u, v = np.clip(column[some], 0, shape[1] - 1), np.clip(row[some], 0, shape[0] - 1)
+        near = (abs(u - column[some]) <= reach) & (abs(v - row[some]) <= reach)
+        u, v, some = u[near].astype(np.intp), v[near].astype(np.intp), some[near]
+        layer = np.zeros(shape, np.float32)
+        layer[v, u] = splats.nearness[solid[some]]  # of several at a place the last, the nearest
+        np.maximum(found, cv2.dilate(layer, np.ones((2 * reach + 1,) * 2, np.uint8)), out=found)
+    return found
 
 
 def harmonic_basis(directions: F32, count: int) -> F32:

@@ -10,14 +10,23 @@ import moderngl
 import numpy as np
 
 from runtime.content.base import ContentInfo, View
-from runtime.content.canvas import CanvasSource
+from runtime.content.canvas import SIDES, CanvasSource
 from runtime.content.compressed_splats import load_compressed_splats
-from runtime.content.gaussians import Gaussians, bounds, colours_towards, load_gaussians, moved, seen_splats
+from runtime.content.gaussians import (
+    Gaussians,
+    Splats,
+    bounds,
+    colours_towards,
+    load_gaussians,
+    moved,
+    nearest_blocks,
+    seen_splats,
+)
 from runtime.content.packed_splats import load_compressed, load_splat
 from runtime.content.placing import SceneFile
 from runtime.content.ply import read_header
 from runtime.optics.rect import PixelRect
-from runtime.records import F64
+from runtime.records import F32, F64
 from runtime.support.gl import DrawnPicture
 
 OVER = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA)
@@ -68,6 +77,7 @@ class SplatSource(CanvasSource):
     def __init__(self, gaussians: Gaussians, *, stack_from_scene: F64, context: Any, info: ContentInfo) -> None:
         super().__init__(context, info=info, deep=True)
         self._gaussians = moved(gaussians, stack_from_scene)
+        self._seen: list[Splats | None] = [None] * SIDES  # of each side's newest picture
         linear = stack_from_scene[:3, :3]
         self._scene_from_stack_rotation = (np.linalg.inv(linear) * np.cbrt(np.linalg.det(linear))).astype(np.float32)
         self._program = context.program(vertex_shader=VERTEX, fragment_shader=FRAGMENT)
@@ -85,7 +95,8 @@ class SplatSource(CanvasSource):
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
         """Every splat that the eye can see, farthest first."""
-        count = self._prepare(view)
+        splats = self._seen[view.side] = seen_splats(self._gaussians, view)
+        count = self._prepare(view, splats)
 
         def paint() -> None:
             self.context.enable_only(self.context.BLEND)
@@ -95,9 +106,12 @@ class SplatSource(CanvasSource):
         whole = PixelRect(0, 0, view.width_px, view.height_px if count else 0)
         return self.drawn(view, whole, paint)
 
-    def _prepare(self, view: View) -> int:
+    def nearness(self, view: View, *, every: int, first: tuple[int, int]) -> F32 | None:
+        splats = self._seen[view.side]
+        return None if splats is None else nearest_blocks(splats, view, every=every, first=first)
+
+    def _prepare(self, view: View, splats: Splats) -> int:
         """Fill the vertex buffer for a view; returns how many splats it holds."""
-        splats = seen_splats(self._gaussians, view)
         count = len(splats.index)
         directions = self._gaussians.centres[splats.index] - view.eye_m.astype(np.float32)
         directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), np.float32(1e-9))

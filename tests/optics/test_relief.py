@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import drawn_job, retina_pictures
 from runtime.records import F64, PanelFrame
 from runtime.support.gl import offscreen_context
+from tests.content.test_splat import splat_table, written
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 480, 270)
 EYES_M = np.array([[0.6, -0.031, 0.0], [0.6, 0.031, 0.0]])
@@ -85,12 +87,34 @@ def test_without_a_movement_or_a_middle_panel_nothing_is_displaced() -> None:
     assert displacement(None, parallax(STACK, old_m=middle, new_m=middle + 0.01), 0) is None
 
 
-@pytest.mark.parametrize("step_m", [(0.0, 0.02, 0.0), (0.0, -0.02, 0.01), (0.05, 0.0, 0.0)])
-def test_a_moved_eye_sees_its_own_view_in_light(step_m: tuple[float, float, float]) -> None:
+def sheets(folder: Path) -> Path:
+    """Splats that reach over three upright sheets, 8 cm apart, each with waves of its own colour."""
+    random, each = np.random.default_rng(0), 7000
+    table = splat_table(3 * each, degree=0)
+    for number, half_m in enumerate((0.26, 0.11, 0.07)):
+        rows = slice(number * each, (number + 1) * each)
+        across, up = random.uniform(-1, 1, (2, each))
+        table["x"][rows], table["y"][rows] = across * half_m + (0.0, -0.1, 0.12)[number], up * half_m * 0.56
+        table["z"][rows] = 0.08 * (1 - number)  # -z is to the viewer
+        for channel, colour in enumerate((0.6, -0.2, 0.2)):
+            wave = np.sin(10 * across) * np.sin(6 * up)
+            table[f"f_dc_{channel}"][rows] = 0.5 * wave + colour * (1 - number)
+            table[f"scale_{channel}"][rows] = np.log(1.8 * half_m / np.sqrt(each))
+    table["opacity"] = 0.8
+    return written(folder, table)
+
+
+@pytest.mark.parametrize(
+    ("scene", "step_m"),
+    [("demo", (0.0, 0.02, 0.0)), ("demo", (0.0, -0.02, 0.01)), ("demo", (0.05, 0.0, 0.0)), ("", (0.0, -0.02, 0.01))],
+    ids=["right", "left and up", "back", "splats"],
+)
+def test_a_moved_eye_sees_its_own_view_in_light(tmp_path: Path, scene: str, step_m: tuple[float, float, float]) -> None:
     """Of the error that 2 cm of staleness add, at least half goes: against pictures drawn for where the eyes are."""
     now_m = EYES_M + np.array(step_m)
     with offscreen_context() as context:
-        content = open_content(with_options(Settings(), scene="demo").content, STACK, context)
+        scene = scene or str(sheets(tmp_path))
+        content = open_content(with_options(Settings(), scene=scene).content, STACK, context)
         predictor = load_predictor("balanced", STACK)
         targets = retina_pictures(content, now_m, STACK, fov_deg=FOV_DEG, time_ns=0)
         fresh = predictor.solve(drawn_job(predictor, content, now_m, time_ns=0)).layers
