@@ -68,7 +68,7 @@ def simulated_costs(stage_ms: Mapping[str, float], reductions: Iterable[int]) ->
 
 
 class CostBook:
-    """Running means of the stage times of solutions, by raster. Those of a raster long unused are forgotten."""
+    """Running means of stage times by raster; those of rasters long unused are forgotten."""
 
     def __init__(self, first: Mapping[int, Mapping[str, float]]) -> None:
         """first: times by reduction and stage, measured with full pictures before the first refresh."""

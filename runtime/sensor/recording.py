@@ -279,7 +279,7 @@ def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[
 
 
 def _indexed_chunks(file: IO[bytes], *, max_bytes: int) -> set[int]:
-    """Where the file's summary says that chunks begin; empty for a file with no readable summary."""
+    """Return the offsets of the chunks by the summary; empty for a file without a readable one."""
     from mcap.reader import FOOTER_SIZE
     from mcap.records import ChunkIndex
     from mcap.stream_reader import StreamReader
