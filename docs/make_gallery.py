@@ -60,44 +60,44 @@ PICTURES = {  # in docs/images: what the commands leave, and what is made here
     "focal-slices.jpg": "report/focal-slices.png",
 }
 MOVING = f"""\
-The daemon's own loop on the simulated clock, with the costs of a slow processor (ms on the full raster: render 44,
-prepare 40, inference 31, finish 38, a step 85), panels of 960x540, {NOISE_MM} mm of sensor noise, {SECONDS:g} s;
-*film*: moving content, a resting head. *Live* ([contracts](contracts.md#error)): light at the true eyes against what
-they should see from there at that refresh. *View*: distance of the true eyes from those that the picture was drawn for,
-median and 95th percentile; between solutions the picture is [reprojected](mathematics.md#reprojection) by its depth.
-*Full*: every solution is the whole model; *auto*, the default: the loop [chooses](mathematics.md#effort) raster and
-steps for each.
+The daemon's own loop runs on the simulated clock with the costs of a slow processor (ms on the full raster: render 44,
+prepare 40, inference 31, finish 38, a step 85), panels of 960x540 and {NOISE_MM} mm of sensor noise, for {SECONDS:g} s.
+*Film* is moving content for a resting head. *Live* ([contracts](contracts.md#error)) is the light at the true eyes,
+compared with what they should see from there at that refresh. *View* is the distance of the true eyes from those that
+the picture was drawn for (median and 95th percentile); between solutions the picture is
+[reprojected](mathematics.md#reprojection) by its depth. *Full* uses the whole model for every solution. *Auto*, the
+default, [chooses](mathematics.md#effort) the raster and the number of steps for each solution.
 """
 LEANING = """\
-A leaning head at 0.6 m, its left eye, every fourth refresh: with `model.effort = "full"` ("before"), with `"auto"`
-("now"), and the true view. Both are reprojected by depth.
+The left eye's view while a head leans at 0.6 m, at every fourth refresh: with `model.effort = "full"` ("before"), with
+`"auto"` ("now"), and the true view. The first two are reprojected by depth.
 """
 HEAD = """\
 <!-- Written by `make gallery`: change docs/make_gallery.py, not this page. -->
 
 # Performance: light against run time
 
-    phasestack report --out report            # the page is there within a minute, and grows
-    phasestack report --pairs DIR --focal     # on your own pairs too, and with focal parallax
-    phasestack bench --out new.json           # the regression file
+    phasestack report --out report            # the page appears within a minute and is then completed
+    phasestack report --pairs DIR --focal     # also with your own pairs and focal parallax
+    phasestack bench --out new.json           # figures for regression tests
     phasestack bench compare old.json new.json
 
-**Quote light, at a tracking error of 1 mm** (`light_db`, `"1"`). It, *one ray* (`psnr_db`) and *carried* are
-[defined in contracts](contracts.md#error); *time* is that of a whole solution, from two decoded pictures to 8-bit
-layers. Every method runs in a separate process, whose peak is its memory. Times hold for one machine and hour:
-compare ratios. The published network (`eyereal`), exported from its checkpoint, is compared as `--model FILE.onnx`.
+**Quote light at a tracking error of 1 mm** (`light_db`, `"1"`). [Contracts](contracts.md#error) defines it, *one ray*
+(`psnr_db`) and *carried*. *Time* is that of a whole solution, from two decoded pictures to 8-bit layers. Every method
+runs in a separate process; its memory is that process's peak. Run times depend on the machine and its load, so
+compare ratios. To include the published network (`eyereal`), export its checkpoint and pass `--model FILE.onnx`.
 
-`bench compare` divides times by a yardstick of the same run, does not compare them where the machine was busy, and
-exits with 1 if a model got slower by more than the noise, lost 0.1 dB or took 15% more memory.
+`bench compare` divides times by a reference measured in the same run and skips them if the machine was busy. It exits
+with 1 if a model got slower by more than the noise, lost 0.1 dB or took 15% more memory.
 
-A [case file](contracts.md#cases-pairs-calibration) is any `*.json` in DIR like this one; `off` (optional) is what
-should be seen `mm` away from an eye:
+`report --pairs` reads every [case file](contracts.md#cases-pairs-calibration) in DIR. The optional `off` lists pictures
+that should be seen `mm` away from an eye:
 
     {"panels": {"width_m": 0.5184, "height_m": 0.2916, "x_m": [-0.06, 0.0, 0.06]},
      "eyes": [[0.78, -0.03, 0.24], [0.78, 0.03, 0.24]], "images": ["left.png", "right.png"], "fov": 40.0,
      "off": [{"mm": 2, "eye": [0.78, -0.028, 0.24], "image": "left-2mm-right.png"}]}
 
-![what the demo leaves: layers, and what each eye should see, sees, and the difference](images/contact-sheet.jpg)
+![result of the demo: layers, and for each eye the target, the view and their difference](images/contact-sheet.jpg)
 
 """
 
@@ -128,10 +128,10 @@ def page(report: dict[str, Any]) -> str:
             "![a leaning head, before, now, and what it should see](images/leaning.webp)\n",
             LEANING,
             "## Focal parallax\n",
-            "Three cards, seen by a pupil of 4 mm: where the eyes converge on each, where its picture is sharpest\n"
-            "through the layers, and where in truth.\n",
+            "Three cards seen through a pupil of 4 mm: the distance at which the eyes converge on each card, at which its\n"
+            "picture through the layers is sharpest, and at which the card itself is sharpest.\n",
             _table(["card at, mm", "sharpest through the layers", "sharpest in truth"], cards),
-            "![focused behind, in and before the panels](images/focal-slices.jpg)",
+            "![focused behind, on and in front of the panels](images/focal-slices.jpg)",
             "",
         ]
     )
@@ -180,7 +180,7 @@ def moving_text(found: Sequence[Moving]) -> str:
         if now.live_db < best.live_db - 0.5:
             worse.append(f"{motion} ({best.live_db - now.live_db:.1f} dB below {best.effort})")
     headings = ["motion", "full, dB", "view, mm", "95%", "best fixed, dB", "auto, dB", "view, mm", "95%", "efforts"]
-    told = f"below the best fixed effort by more than 0.5 dB: {', '.join(worse) or 'nowhere'}"
+    told = f"more than 0.5 dB below the best fixed effort: {', '.join(worse) or 'nowhere'}"
     return f"{MOVING}\n{_table(headings, rows)}\n`auto` is {told}.\n"
 
 

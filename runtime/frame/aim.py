@@ -16,6 +16,7 @@ from runtime.records import F64, Effort, EyesEstimate, EyesLabel, FrameTiming, S
 HORIZON_NS = NS_PER_S // 8  # longest prediction beyond this refresh's display time
 SPEED_NS = NS_PER_S // 2  # time constant of the running mean of a head's squared speed
 REQUESTS_KEPT = 256
+CALM_M_S = 0.02  # a seated head sways more slowly; one that moves on purpose is faster
 WORTH = 0.995  # refine only if the expected error drops below this share of the present one
 
 
@@ -26,7 +27,7 @@ class Aim:
         """fixed: effort of every solution where the settings say `full`, instead of all of the model's."""
         self._viewer, self._solver, self._period_ns, self._fixed = viewer, solver, period_ns, fixed
         self._chooser = EffortChooser()
-        self._rested_ns: int | None = None  # start of the head's present rest
+        self._calm_ns: int | None = None  # since when the head has been slower than CALM_M_S
         self._expected: dict[int, float] = {}  # by target instant: expected squared distance from those eyes, m²
         self._speed2 = 0.0  # (m/s)², running mean
         self._learned: int | None = None  # number of the newest solution whose measures have been used
@@ -47,7 +48,8 @@ class Aim:
         whole = self._fixed or Effort(1, predictor.steps)
         effort, expected_m2 = whole, 0.0
         if eyes.eyes_m is not None and state.settings.model.effort == "auto":
-            outlook, horizon_s = self._outlook(timing, eyes), self._horizon_s(timing, eyes)
+            outlook = self._outlook(timing, eyes)
+            horizon_s = self._horizon_s(timing, speed_m_s=outlook(0.0).speed_m_s)
             error = self._shown_error(eyes, shown, time_ns=timing.photon_ns)
             period_ms = self._period_ns / NS_PER_MS
             costs = self._solver.costs
@@ -114,14 +116,14 @@ class Aim:
 
         return outlook
 
-    def _horizon_s(self, timing: FrameTiming, eyes: EyesEstimate) -> float:
-        """Return the time the present motion is assumed to continue; for a resting head, as long as it has rested."""
-        if eyes.label != "rested":
-            self._rested_ns = None
+    def _horizon_s(self, timing: FrameTiming, *, speed_m_s: float) -> float:
+        """Return the time the present motion is assumed to continue; for a calm head, as long as it has been calm."""
+        if speed_m_s > CALM_M_S:
+            self._calm_ns = None
             return HORIZON_S
-        if self._rested_ns is None:
-            self._rested_ns = timing.photon_ns
-        return max(HORIZON_S, (timing.photon_ns - self._rested_ns) / NS_PER_S)
+        if self._calm_ns is None:
+            self._calm_ns = timing.photon_ns
+        return max(HORIZON_S, (timing.photon_ns - self._calm_ns) / NS_PER_S)
 
     def _usual_speed_m_s(self, moved_m: float, eyes: EyesEstimate) -> float:
         """Return the larger of the head's speed and its recent RMS, which covers turning points and lost eyes."""
