@@ -1,1 +1,1 @@
-"""Two eyes in the `stack` frame: from pictures or samples, calibrated, tracked and predicted."""
+"""Finds both eyes in pictures or samples, transforms them to the `stack` frame, and tracks and predicts them."""

@@ -1,4 +1,4 @@
-"""The calibration from the sensor's frame to the stack's: load, check, apply, and estimate its error.
+"""Calibration from the sensor's frame to the stack's: loading, checking, applying, error estimate.
 
 Its seven parameters are a rotation vector (3, rad, about the axes of `stack`), a shift (3, m) and a log scale (1),
 about a pivot w0 (the pairs' centre, in `stack`), which makes them nearly uncorrelated. A small change d moves a point
@@ -33,19 +33,19 @@ Row7 = tuple[Number, Number, Number, Number, Number, Number, Number]
 
 
 class Lenient(Section):
-    """A table that ignores unknown keys, of other programs or later versions."""
+    """A table that ignores unknown keys, which other programs or later versions may have written."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
 
 class Residuals(Lenient):
-    """`[residuals]`: fit of the pairs to the matrix, metres, in `stack`."""
+    """`[residuals]`: distances between the pairs after calibration, in metres, in `stack`."""
 
     rms_m: Annotated[float, Field(ge=0)]
 
 
 class CovarianceTable(Lenient):
-    """`[covariance]` of the seven parameters."""
+    """`[covariance]`: covariance of the seven parameters."""
 
     pivot_m: Vector3
     matrix: tuple[Row7, Row7, Row7, Row7, Row7, Row7, Row7]
@@ -93,7 +93,7 @@ class Calibration:
         )
 
     def position_error_m(self, stack_m: ArrayLike) -> F64 | None:
-        """(...) RMS error, m, of points (..., 3) in `stack` due to the calibration alone; None if unknown."""
+        """(...) RMS error in metres at points (..., 3) in `stack` due to the calibration; None if unknown."""
         if self.file.covariance is None:
             return None
         jacobian = position_jacobian(stack_m, pivot_m=self.file.covariance.pivot_m)
@@ -102,16 +102,16 @@ class Calibration:
         return error_m
 
     def serial_warning(self, serial: str) -> str:
-        """One-line warning if the sensor is not the calibrated one; empty otherwise."""
+        """Return a one-line warning if this is not the calibrated sensor, else an empty string."""
         calibrated = self.file.sensor_serial
         if not calibrated or serial == calibrated:
             return ""
-        actual = f"the sensor is {serial}" if serial else "the sensor reports no serial"
+        actual = f"the sensor is {serial}" if serial else "the connected sensor reports no serial number"
         return f"{self.source}: calibrated for sensor {calibrated}, but {actual}: calibrate again"
 
 
 def position_jacobian(stack_m: ArrayLike, *, pivot_m: ArrayLike) -> F64:
-    """(..., 3, 7) derivative of points (..., 3) in `stack` by the seven parameters about the pivot."""
+    """(..., 3, 7) derivative of points (..., 3) in `stack` with respect to the seven parameters."""
     arm = np.asarray(stack_m, dtype=np.float64) - np.asarray(pivot_m, dtype=np.float64)
     jacobian = np.zeros((*arm.shape, 7))
     jacobian[..., 0, 1], jacobian[..., 0, 2] = arm[..., 2], -arm[..., 1]
@@ -125,7 +125,7 @@ def position_jacobian(stack_m: ArrayLike, *, pivot_m: ArrayLike) -> F64:
 def similarity_defect(matrix: ArrayLike) -> float:
     """Distance of the upper left 3x3 from a scaled rotation: max |A^T A / s² - I|.
 
-    0: exactly a similarity (or a reflection of one); infinite for a zero matrix.
+    It is 0 for an exact similarity (or a reflected one) and infinite for a zero matrix.
     """
     linear = np.asarray(matrix, dtype=np.float64)[:3, :3]
     largest = float(np.abs(linear).max())
@@ -136,7 +136,7 @@ def similarity_defect(matrix: ArrayLike) -> float:
 
 
 def check_similarity(matrix: F64, *, source: str | Path) -> None:
-    """Raise InputError, naming the field, unless a 4x4 is a plausible similarity.
+    """Raise InputError, naming the field, unless the 4x4 matrix is a plausible similarity transform.
 
     The determinant must be positive, the scale within `SCALE`, and the sensor within `MAX_DISTANCE_M`.
     """
@@ -148,7 +148,7 @@ def check_similarity(matrix: F64, *, source: str | Path) -> None:
     defect = similarity_defect(matrix)
     if not defect <= SIMILARITY_TOLERANCE:
         raise InputError(
-            source, name, f"must be rotation times one scale (off by {defect:.2g}, allowed {SIMILARITY_TOLERANCE})"
+            source, name, f"must be a rotation times one scale (off by {defect:.2g}, allowed {SIMILARITY_TOLERANCE})"
         )
     largest = float(np.abs(matrix[:3, :3]).max())
     volume = float(np.linalg.det(matrix[:3, :3] / largest))
@@ -159,7 +159,7 @@ def check_similarity(matrix: F64, *, source: str | Path) -> None:
         raise InputError(source, name, f"has scale {scale:.3g}: with both frames in metres it must be about 1")
     distance_m = float(np.linalg.norm(matrix[:3, 3]))
     if distance_m > MAX_DISTANCE_M:
-        problem = f"puts the sensor {distance_m:.4g} m from the display; at most {MAX_DISTANCE_M:g} m"
+        problem = f"puts the sensor {distance_m:.4g} m from the display; the maximum is {MAX_DISTANCE_M:g} m"
         raise InputError(source, name, problem)
 
 
@@ -180,7 +180,7 @@ def _warnings(matrix: F64, source: str) -> tuple[str, ...]:
 
 
 def load_calibration(path: Path | None) -> Calibration:
-    """Load and check a calibration file; None: the built-in one of the demo recording.
+    """Load and check a calibration file, or the demo recording's built-in one if `path` is None.
 
     Raises InputError, naming file and field, if it is missing, malformed, of the wrong shape, not finite, not a
     similarity, or mirrored. A scale far from 1 only warns (`Calibration.warnings`).
@@ -188,7 +188,7 @@ def load_calibration(path: Path | None) -> Calibration:
     file = DEMO_FILE if path is None else path
     table = read_table(file)
     if "stack_from_sensor" not in table:
-        raise InputError(file, "stack_from_sensor", "is missing (four rows of four numbers)")
+        raise InputError(file, "stack_from_sensor", "missing; four rows of four numbers are required")
     parsed = validated(CalibrationFile, table, source=file)
     matrix = np.array(parsed.stack_from_sensor, dtype=np.float64)
     check_similarity(matrix, source=file)
@@ -197,10 +197,10 @@ def load_calibration(path: Path | None) -> Calibration:
 
 
 def demo_stack_from_sensor() -> F64:
-    """4x4 rigid transform of the demo's sensor, which looks along +x and 10 degrees down."""
+    """4x4 rigid transform for the demo's sensor, which faces +x and is tilted 10 degrees down."""
     return load_calibration(None).stack_from_sensor
 
 
 def demo_sensor_from_stack() -> F64:
-    """4x4 inverse of `demo_stack_from_sensor`."""
+    """Return the 4x4 inverse of `demo_stack_from_sensor`."""
     return np.asarray(np.linalg.inv(demo_stack_from_sensor()), np.float64)

@@ -1,4 +1,4 @@
-"""Eye positions from a sensor's pictures: the viewer's pupils, their distance, and the covariance."""
+"""Eye positions, with their covariance, from a sensor's pictures: the viewer's pupils and how far away they are."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ log = logging.getLogger(__name__)
 
 
 class EyeFinder:
-    """Finds one viewer's eyes.
+    """Finds the eyes of one viewer in a sensor's pictures.
 
     `choice`: how the viewer was chosen; `reason`: why the last frame gave no eyes.
     """
 
     def __init__(self, settings: Settings | None = None) -> None:
-        """Use the viewer's eye distance from `settings.calibration`, if it is known."""
+        """Use the viewer's eye separation from `settings.calibration`, if known."""
         settings = settings or Settings()
         self._new_depth = partial(FaceDepth, eye_distance_m=settings.calibration.ipd_m)
         self._finder = PupilFinder(lock_ns=LOCK_NS)
         self._depth, self._viewer = self._new_depth(), 0
         self.reason = ""
-        self.pupils: Pupils | None = None  # of the last frame, even if their distance is unknown
+        self.pupils: Pupils | None = None  # pupils in the last frame, even if their distance is unknown
 
     def forget(self) -> None:
         """Reset: treat the next frame as the first."""
@@ -46,9 +46,9 @@ class EyeFinder:
         return self._finder.choice
 
     def find(self, frame: SensorFrame) -> EyePoints | None:
-        """The viewer's eyes in the `sensor` frame, or None with the reason in `reason`.
+        """Return the viewer's eyes in the `sensor` frame, or None, with the cause in `reason`.
 
-        Needs colour and intrinsics; depth, if the sensor has it, must be registered to colour.
+        The frame must have colour and intrinsics. Depth is optional, but must be registered to colour.
         """
         self.pupils = None
         if frame.colour is None:
@@ -60,14 +60,14 @@ class EyeFinder:
             self._depth, self._viewer = self._new_depth(), self._finder.viewer
         self.reason = self._finder.reason
         if pupils is None or frame.intrinsics is None:
-            self.reason = self.reason or "the camera has no intrinsics: the eyes' distance is unknown"
+            self.reason = self.reason or "the camera reports no intrinsics, so the eyes' distance is unknown"
             return None
         scale = np.ones(2)
         if frame.depth_mm is not None:  # registered pictures may differ in size
             scale = np.array(frame.depth_mm.shape[::-1]) / np.array(frame.colour.shape[1::-1])
         depths = self._depth.at(pupils, frame.depth_mm, frame.intrinsics, scale)
         if frame.depth_mm is not None and not self._depth.has_measured:
-            self.reason = "the depth on the face does not fit a person's size"
+            self.reason = "the depth measured on the face does not match a person's size"
             return None
         if depths.eyes_m.mean() > RANGE_MAX_M:
             self.reason = f"the face is {depths.eyes_m.mean():.1f} m away, beyond {RANGE_MAX_M:g} m"
@@ -89,9 +89,9 @@ def _eye_points(pupils: Pupils, depths: EyeDepths, intrinsics: Intrinsics) -> Ey
 
 
 def covariance(point: F64, line: F64, sideways_m: float, up_m: float, along_m: float) -> F64:
-    """(3, 3) m², from standard deviations across and along the line of sight to a point.
+    """(3, 3) covariance, m², from the standard deviations across and along the line of sight to a point.
 
-    line: (3,) between the eyes; its component across the line of sight is the sideways direction.
+    line: (3,) vector between the eyes; its component perpendicular to the line of sight defines sideways.
     """
     sight = point / np.linalg.norm(point)
     sideways = line - (line @ sight) * sight

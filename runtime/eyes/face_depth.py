@@ -1,9 +1,9 @@
 """Distance from the camera to a viewer's eyes, measured on the rigid face and averaged over time.
 
-The filter estimates one number: the viewer's eye separation in metres, as depth measurements show it. Distance is that
-number times the focal length over the separation in pixels (measured along the line between the eyes in space, from
-the mesh). So holes and bad frames do no harm, and depth noise is averaged without lag. Without depth the separation
-comes from the settings, or is learnt from the size of the irises.
+The filter estimates one number: the viewer's eye separation in metres, from depth measurements. Distance is that
+number times the focal length over the separation in pixels (measured along the line between the eyes in space, from the
+mesh). Holes and bad frames therefore do no harm, and averaging reduces depth noise without lag. Without depth, the
+separation comes from the settings, or is learnt from the size of the irises.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ PICTURE_SHARE, TURN_SHARE = 0.0007, 0.3  # relative uncertainty added per pictur
 
 @dataclass(frozen=True, slots=True)
 class EyeDepths:
-    """Distances along the camera's axis, m."""
+    """Distances from the camera along its optical axis, in metres."""
 
     eyes_m: F64  # (2,) left, right
     sigma_m: float  # standard deviation of their middle
 
 
 class FaceDepth:
-    """Estimator of one viewer's face depth; each viewer needs a new one."""
+    """Estimates the depth of one viewer's face; every new viewer needs a new instance."""
 
     def __init__(self, *, eye_distance_m: float = 0.0) -> None:
-        """eye_distance_m: this viewer's, if known; 0: learn it."""
+        """eye_distance_m: this viewer's eye separation, or 0 to learn it."""
         self._known = eye_distance_m > 0
         self._distance, sigma = (eye_distance_m, KNOWN_SIGMA_M) if self._known else EYE_DISTANCE_M
         self._variance = sigma**2
@@ -54,9 +54,9 @@ class FaceDepth:
         self.has_measured = False
 
     def at(self, pupils: Pupils, depth_mm: U16 | None, intrinsics: Intrinsics, depth_from_colour: F64) -> EyeDepths:
-        """Estimate the eyes' distances in one picture.
+        """Estimate both eyes' distances from the camera in one picture.
 
-        depth_mm: (h, w), 0 if there is no measurement; depth_from_colour: (2,) depth pixels per colour pixel.
+        depth_mm: (h, w), 0 where nothing was measured; depth_from_colour: (2,) depth pixels per colour pixel.
         """
         relief = pupils.mesh_px[:, 2]
         eyes = np.array([relief[list(corners)].mean() for corners in CORNERS])
@@ -88,14 +88,14 @@ class FaceDepth:
         return EyeDepths(middle + relief_m + shape, float(sigma))
 
     def _predict(self, foreshortening: float) -> None:
-        """Add the uncertainty of one picture, and of a turn of the head since the previous one."""
+        """Increase the uncertainty for one more picture, and for any turn of the head since the previous one."""
         turn = TURN_SHARE * (foreshortening - self._foreshortening)
         self._foreshortening = foreshortening
         if self.has_measured:
             self._variance += (PICTURE_SHARE**2 + turn**2) * self._distance**2
 
     def _learn(self, ratio: float) -> None:
-        """Estimate the eye distance without depth, from irises, which vary less between people than faces."""
+        """Estimate the eye separation without depth, from the irises, whose size varies less than a face's."""
         self._irises = [*self._irises[-99:], ratio]
         iris = IRIS_M * float(np.median(self._irises))
         weights = np.array([EYE_DISTANCE_M[1], IRIS_SIGMA * iris]) ** -2.0
@@ -146,7 +146,7 @@ class FaceDepth:
         self.has_measured = True
 
     def _fit_relief(self, depths: F64, shape: F64) -> None:
-        """Update the ratio of this face's relief to the mesh's; a printed face is flat."""
+        """Update the ratio of this face's relief to the mesh's, which is near 0 for a printed face."""
         off = shape - shape.mean()
         seen = float(np.clip(off @ (depths - depths.mean()) / max(float(off @ off), 1e-12), 0, RELIEF_MAX))
         self._reliefs = min(self._reliefs + 1, RELIEF_PICTURES)
@@ -154,7 +154,7 @@ class FaceDepth:
 
 
 def _sampled(depth_mm: U16, points: F64) -> F64:
-    """(n,) depths in m at continuous pixels; 0 outside the picture."""
+    """Return the (n,) depths in metres at continuous pixels, 0 outside the picture."""
     height, width = depth_mm.shape
     x, y = np.floor(points).astype(int).T
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
@@ -163,7 +163,7 @@ def _sampled(depth_mm: U16, points: F64) -> F64:
 
 
 def _window(depth_mm: U16, centre: F64, radius: float) -> F64:
-    """(n,) depths in m of the pixels around a point."""
+    """Return the (n,) depths in metres of the pixels around a point."""
     height, width = depth_mm.shape
     x0, y0 = np.clip(np.floor(centre - radius), 0, [width, height]).astype(int)
     x1, y1 = np.clip(np.floor(centre + radius) + 1, 0, [width, height]).astype(int)

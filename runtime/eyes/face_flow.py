@@ -1,7 +1,7 @@
-"""Motion of a face between pictures, to 1/50 pixel, from the optical flow of its rigid parts.
+"""Motion of a face between pictures, accurate to 1/50 pixel, from the optical flow of its rigid parts.
 
 The networks' errors are independent from picture to picture; optical flow between two pictures is far more precise.
-So pupils follow the flow and the networks correct them slowly.
+The pupils therefore follow the flow, and the networks correct them slowly.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ POINTS_MIN, INLIERS_MIN = 10, 8
 
 
 class FaceFlow:
-    """The motion of a remembered face between pictures."""
+    """Measures how a remembered face moves between pictures."""
 
     def __init__(self) -> None:
         self._grey: Any = None
@@ -37,14 +37,14 @@ class FaceFlow:
         self._mesh = np.zeros((0, 2))
 
     def remember(self, picture: U8, mesh: F64, eye_distance: float) -> None:
-        """Store the face of this picture. mesh: (468, 3) px; eye_distance: px."""
+        """Store this picture's face. mesh: (468, 3) px; eye_distance: px."""
         scale = EYE_DISTANCE / eye_distance
         offset = SIZE / 2 - scale * mesh[BRIDGE, :2]
         self._crop_from_picture = np.array([[scale, 0, offset[0]], [0, scale, offset[1]]])
         self._grey, self._mesh = self._crop(picture), mesh[RIGID, :2].copy()
 
     def moved(self, picture: U8, mesh: F64) -> F64 | None:
-        """(2, 3) similarity from the remembered face's pixels to the new picture's; None if unknown."""
+        """Return the (2, 3) similarity from the remembered face's pixels to the new picture's, None if unknown."""
         grey = self._crop(picture)
         matrix = self._crop_from_picture
         start = (transformed(matrix, self._mesh) - 0.5).astype(np.float32)
@@ -68,7 +68,7 @@ class FaceFlow:
 
 
 def _flow(before: Any, after: Any, start: Any, guess: Any) -> tuple[Any, Any]:
-    """(n, 2) positions in `after` of points in `before`, and an (n, 1) mask of those found. Overwrites `guess`."""
+    """(n, 2) positions in `after` of points in `before`, and an (n, 1) mask of the points found. Overwrites `guess`."""
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
     ends, is_found, _ = cv2.calcOpticalFlowPyrLK(
         before, after, start, guess,

@@ -1,11 +1,11 @@
-"""Interacting multiple models (Blom and Bar-Shalom 1988): Kalman filters of different agility.
+"""Interacting multiple models (Blom and Bar-Shalom 1988): Kalman filters that differ in agility.
 
-Each model uses Singer's acceleration (1970): it decays with a time constant and is driven by noise, whose strength
+Each model uses Singer's acceleration (1970), which decays with a time constant and is driven by noise whose strength
 differs between models. A still head needs heavy filtering, a fast one light filtering, and heads change between these
 within a tenth of a second. Measurement noise is a covariance matrix: a camera measures right and up twenty times as
 precisely as depth.
 
-A state has nine numbers: position, velocity and acceleration, each along x, y, z; metres and seconds.
+A state has nine numbers: position, velocity and acceleration, each along x, y and z, in metres and seconds.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ class Belief(NamedTuple):
 
 
 def _response(times_s: F64) -> F64:
-    """(3, n) position, velocity and acceleration that a unit acceleration at time 0 has led to."""
+    """(3, n) position, velocity and acceleration that result from a unit acceleration at time 0."""
     x = times_s / FADE_S
     gone = -np.expm1(-x)
     return np.array([FADE_S**2 * (x - gone), FADE_S * gone, 1 - gone])
 
 
 def _of_each_axis(matrix: F64) -> F64:
-    """(9, 9) matrix that applies a (3, 3) to x, y and z alike: its Kronecker product with the identity."""
+    """(9, 9) matrix that applies a (3, 3) matrix to each of x, y and z: its Kronecker product with the identity."""
     return (matrix[:, None, :, None] * _AXES[:, None, :]).reshape(9, 9)
 
 
 @lru_cache(maxsize=8)
 def _transition(dt_s: float) -> F64:
-    """(9, 9) matrix from the current state to the state after dt_s."""
+    """(9, 9) transition matrix from the current state to the state dt_s later."""
     step = np.eye(3)
     step[0, 1] = dt_s
     step[:, 2] = _response(np.array([dt_s]))[:, 0]
@@ -59,16 +59,16 @@ def _transition(dt_s: float) -> F64:
 def _noise(dt_s: float) -> F64:
     """(9, 9) covariance that acceleration noise of 1 m/s² (standard deviation) adds in dt_s.
 
-    Integrated by Gauss-Legendre quadrature, which stays positive where the closed form cancels.
+    It is integrated by Gauss-Legendre quadrature, which stays positive where the closed form suffers from cancellation.
     """
     response = _response(dt_s * (_NODES + 1) / 2)
     return _of_each_axis((response * (_SHARES * dt_s / FADE_S)) @ response.T)
 
 
 def started(place: F64, *, noise: F64, speed: float, acceleration: Sequence[float]) -> Belief:
-    """Belief after a first measurement (3,) with covariance (3, 3), with zero mean velocity.
+    """Return the belief after a first measurement (3,) with covariance (3, 3); its mean velocity is zero.
 
-    speed, m/s, and acceleration, m/s², one for each model, are standard deviations per axis.
+    speed (m/s) and acceleration (m/s², one value per model) are standard deviations per axis.
     """
     count = len(acceleration)
     state, covariance = np.zeros((count, 9)), np.zeros((count, 9, 9))
@@ -80,7 +80,7 @@ def started(place: F64, *, noise: F64, speed: float, acceleration: Sequence[floa
 
 
 def predicted(belief: Belief, dt_s: float, *, acceleration: Sequence[float], stay_s: float) -> Belief:
-    """Belief predicted dt_s >= 0 ahead: models mix, then move. stay_s: mean time in one model."""
+    """Predict the belief dt_s >= 0 ahead: mix the models, then move them. stay_s: mean time in one model."""
     count = len(belief.weight)
     leave = -math.expm1(-dt_s / stay_s) / count  # to each model with equal probability, this one included
     change = np.full((count, count), leave) + (1 - count * leave) * np.eye(count)
@@ -98,12 +98,12 @@ def predicted(belief: Belief, dt_s: float, *, acceleration: Sequence[float], sta
 
 
 def surprise(belief: Belief, measured: F64, *, noise: F64) -> float:
-    """Least squared Mahalanobis distance of a measurement from any model (chi² of three axes)."""
+    """Smallest squared Mahalanobis distance of a measurement from any model (chi² of three axes)."""
     return float(_chi2(measured - belief.state[:, :3], _total(belief, noise)).min())
 
 
 def _total(belief: Belief, noise: F64) -> F64:
-    """(n, 3, 3) covariance of the innovation, kept from becoming singular by rounding after jumps of metres."""
+    """(n, 3, 3) covariance of the innovation, regularized: after jumps of metres, rounding can make it singular."""
     total = belief.covariance[:, :3, :3] + noise
     spread: F64 = np.trace(total, axis1=1, axis2=2)[:, None, None] * ROUNDING
     return np.asarray(total + spread * np.eye(3), np.float64)
@@ -116,7 +116,7 @@ def _chi2(off: F64, covariance: F64) -> F64:
 
 
 def corrected(belief: Belief, measured: F64, *, noise: F64) -> Belief:
-    """Belief updated with a measurement (3,) of covariance (3, 3)."""
+    """Return the belief updated with a measurement (3,) whose covariance is (3, 3)."""
     total = _total(belief, noise)
     gain = np.linalg.solve(total, belief.covariance[:, :3, :]).transpose(0, 2, 1)
     off = measured - belief.state[:, :3]
@@ -131,7 +131,7 @@ def corrected(belief: Belief, measured: F64, *, noise: F64) -> Belief:
 
 
 def _positive(covariance: F64) -> F64:
-    """(n, 9, 9) the covariance, with eigenvalues raised to be positive if rounding (after jumps of metres) broke it."""
+    """(n, 9, 9) covariance, its eigenvalues made positive if rounding (after jumps of metres) left any negative."""
     try:
         np.linalg.cholesky(covariance)
     except np.linalg.LinAlgError:
@@ -143,7 +143,7 @@ def _positive(covariance: F64) -> F64:
 
 
 def ahead(belief: Belief, dt_s: float) -> F64:
-    """(3,) position predicted dt_s ahead: the mean over the models, weighted by their probability."""
+    """(3,) position predicted dt_s ahead: the mean over all models, weighted by probability."""
     position: F64 = _transition(dt_s)[:3] @ (belief.weight @ belief.state)
     return position
 

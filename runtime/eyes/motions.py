@@ -1,4 +1,4 @@
-"""Simulated head motions and a depth camera's samples of them, for benchmarks and tests."""
+"""Simulated head motions, and a depth camera's simulated samples of them, for benchmarks and tests."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Motion = Callable[[F64], tuple[F64, F64]]  # times (n,) s -> neck (n, 3) m, fram
 
 
 def minimum_jerk(times_s: F64, *, knots_s: F64, values: F64) -> F64:
-    """Point-to-point movements that stop at each knot (Flash and Hogan 1985); values (k, ...)."""
+    """Minimum-jerk movements that stop at each knot (Flash and Hogan 1985); values: (k, ...)."""
     index = np.clip(np.searchsorted(knots_s, times_s, side="right") - 1, 0, len(knots_s) - 2)
     s = np.clip((times_s - knots_s[index]) / (knots_s[index + 1] - knots_s[index]), 0, 1)
     blend = s**3 * (10 + s * (6 * s - 15))
@@ -36,20 +36,20 @@ def minimum_jerk(times_s: F64, *, knots_s: F64, values: F64) -> F64:
 
 
 def _still(times_s: F64) -> tuple[F64, F64]:
-    """A seated head: breathing and sway of a few millimetres."""
+    """Seated viewer: breathing and a sway of a few millimetres."""
     sway = [0.0015 * np.sin(1.7 * times_s), 0.002 * np.sin(0.9 * times_s + 1), 0.0015 * np.sin(1.6 * times_s)]
     return np.stack(sway, 1), np.zeros_like(times_s)
 
 
 def _lean(times_s: F64) -> tuple[F64, F64]:
-    """Side to side by 30 cm and back, without a stop: 0.3 m/s at most."""
+    """Lean from side to side by 30 cm without stopping, at 0.3 m/s at most."""
     phase = 2 * np.pi * times_s / 3.2
     neck, pitch = _still(times_s)
     return neck + np.stack([0.03 * np.cos(phase), 0.15 * np.sin(phase), -0.03 * np.sin(phase) ** 2], 1), pitch
 
 
 def _nod(times_s: F64) -> tuple[F64, F64]:
-    """A nod of 12 degrees at 1 Hz, three at a time, then a pause."""
+    """Three nods of 12 degrees at 1 Hz, then a pause, repeatedly."""
     neck, _ = _still(times_s)
     within = times_s % 5.0
     envelope = np.clip(np.minimum(within, 3.0 - within) / 0.5, 0, 1)
@@ -57,7 +57,7 @@ def _nod(times_s: F64) -> tuple[F64, F64]:
 
 
 def _walk(times_s: F64) -> tuple[F64, F64]:
-    """Back and forth in front of the display, 2.4 m at up to 1 m/s, bobbing with steps at 1.9 Hz."""
+    """Walk back and forth in front of the display over 2.4 m, at up to 1 m/s, bobbing at 1.9 steps a second."""
     knots = np.arange(0.0, times_s.max() + 4.0, 3.5)
     side = minimum_jerk(times_s, knots_s=knots, values=np.where(np.arange(len(knots)) % 2, 1.0, -1.0))
     bob = 0.02 * np.sin(2 * np.pi * 1.9 * times_s)
@@ -66,7 +66,7 @@ def _walk(times_s: F64) -> tuple[F64, F64]:
 
 
 def _stop_and_go(times_s: F64) -> tuple[F64, F64]:
-    """Quick moves of 10 to 30 cm in half a second to a second, separated by similar pauses."""
+    """Quick moves of 10 to 30 cm, each lasting half a second to a second, separated by pauses of similar length."""
     random = np.random.default_rng(7)
     knots, places, place = [0.0], [np.zeros(3)], np.zeros(3)
     while knots[-1] <= times_s.max():
@@ -84,7 +84,7 @@ MOTIONS: dict[str, Motion] = {"still": _still, "lean": _lean, "nod": _nod, "walk
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """One viewer's variation of a motion: phase, speed, extent and initial direction."""
+    """One viewer's variant of a motion: its phase, speed, extent and initial direction."""
 
     start_s: float = 0.0
     pace: float = 1.0
@@ -96,7 +96,7 @@ BENCHMARK_PATH = Path()
 
 
 def path_of(seed: int) -> Path:
-    """Random path for a seed; seed 0 is the benchmark's path."""
+    """Return the random path of a seed; seed 0 gives the benchmark's path."""
     if seed == 0:
         return BENCHMARK_PATH
     random = np.random.default_rng([seed, 0x70617468])
@@ -133,7 +133,7 @@ def observe(
 ) -> list[Observation]:
     """Simulate a sensor's samples of a motion; `seed` selects the noise.
 
-    Outliers put one eye or both 4 to 20 cm off; `dropout_every_s` of 0 disables dropouts.
+    Outliers displace one or both eyes by 4 to 20 cm. If `dropout_every_s` is 0, there are no dropouts.
     """
     random = np.random.default_rng([seed, *motion.encode(), round(rate_hz)])
     times_s = np.arange(round(seconds * rate_hz)) / rate_hz

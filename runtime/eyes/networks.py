@@ -1,4 +1,4 @@
-"""The three networks for faces, and the square crops that are their input.
+"""The three face networks, and the square crops that they take as input.
 
 Pixels are continuous: the centre of the first one is (0.5, 0.5). *Left* is the viewer's own left, on the right of an
 unmirrored picture; it comes first. `docs/sensors.md` gives the models' origin.
@@ -24,9 +24,9 @@ CROP_BLUR = 0.45  # standard deviation of the anti-aliasing filter, in the crop'
 
 
 def load_network(name: str) -> Any:
-    """Load an onnxruntime session with one thread and warm it up: a first run is several times slower.
+    """Load a single-threaded onnxruntime session and warm it up: its first run is several times slower.
 
-    name: a file in `models`.
+    name: a file name in the `models` folder.
     """
     ort = onnxruntime()
     options = ort.SessionOptions()
@@ -46,12 +46,12 @@ def transformed(matrix: F64, points: F64) -> F64:
 
 
 def inverse(matrix: F64) -> F64:
-    """Inverse of an affine (2, 3) matrix."""
+    """Return the inverse of an affine (2, 3) matrix."""
     return np.asarray(cv2.invertAffineTransform(matrix), np.float64)
 
 
 def resampled(picture: U8, size: tuple[int, int], crop_from_picture: F64) -> U8:
-    """Warp a picture by an affine (2, 3) of continuous pixels, antialiased, clamped to the edge."""
+    """Warp a picture by an affine (2, 3) of continuous pixels, antialiased and clamped to the edge."""
     ratio = 1 / np.sqrt(abs(np.linalg.det(crop_from_picture[:, :2])))  # picture pixels per crop pixel
     corners = np.array([[0, 0], [size[0], 0], [0, size[1]], [size[0], size[1]]], np.float64)
     seen = transformed(inverse(crop_from_picture), corners)
@@ -69,20 +69,20 @@ def resampled(picture: U8, size: tuple[int, int], crop_from_picture: F64) -> U8:
 
 @dataclass(frozen=True, slots=True)
 class Square:
-    """A square region of a picture, rotated with the face in it."""
+    """A square region of a picture, rotated to align with the face in it."""
 
     centre: F64  # (2,) px
     side: float  # px
     angle: float  # of its lower edge, radians clockwise on the screen
 
     def picture_from_crop(self, size: int, *, mirrored: bool = False) -> F64:
-        """(2, 3) matrix from continuous pixels of a crop of `size` pixels to those of the picture."""
+        """(2, 3) matrix from continuous pixels of a `size`-pixel crop to continuous pixels of the picture."""
         c, s = np.cos(self.angle) * self.side / size, np.sin(self.angle) * self.side / size
         matrix = np.array([[-c if mirrored else c, -s], [-s if mirrored else s, c]])
         return np.column_stack([matrix, self.centre - matrix @ [size / 2, size / 2]])
 
     def crop(self, picture: U8, size: int, *, mirrored: bool = False) -> tuple[F32, F64]:
-        """(1, size, size, 3) crop with values in [0, 1], and its `picture_from_crop`."""
+        """Return a (1, size, size, 3) crop with values in [0, 1], and its `picture_from_crop` matrix."""
         matrix = self.picture_from_crop(size, mirrored=mirrored)
         pixels = resampled(picture, (size, size), inverse(matrix))
         return np.divide(pixels[None], 255, dtype=np.float32), matrix
@@ -98,11 +98,11 @@ class FoundFace:
 
     @property
     def size(self) -> float:
-        """Side of a square with the box's area, px."""
+        """Side length in pixels of a square with the same area as the box."""
         return float(np.sqrt(self.box[2] * self.box[3]))
 
     def square(self) -> Square:
-        """Input region for the mesh network."""
+        """Region to use as input for the mesh network."""
         eyes, mouth = self.points[:2].mean(axis=0), self.points[3:].mean(axis=0)
         line = self.points[1] - self.points[0]
         size = max(np.linalg.norm(line), 0.95 * np.linalg.norm(mouth - eyes))
@@ -116,7 +116,7 @@ class FaceNetwork:
         self._session = load_network("yunet.onnx")
 
     def find(self, picture: U8, *, longest_px: int, score_min: float) -> list[FoundFace]:
-        """Faces in an (h, w, 3) RGB picture, reduced to `longest_px` if larger, best score first."""
+        """Return the faces in an (h, w, 3) RGB picture, reduced to `longest_px` if larger, best first."""
         height, width = picture.shape[:2]
         scale = min(1.0, longest_px / max(height, width))
         small = picture
@@ -132,7 +132,7 @@ class FaceNetwork:
 
     @staticmethod
     def _decoded(outputs: list[F32], width: int, score_min: float) -> list[FoundFace]:
-        """Decode the grids' cells with a face; among overlapping ones keep the best score."""
+        """Decode the grid cells that contain a face; among overlapping faces keep the best score."""
         faces = []
         for level, stride in enumerate(STRIDES):
             classes, objects, boxes, points = (outputs[kind * len(STRIDES) + level][0] for kind in range(4))
@@ -149,7 +149,7 @@ class FaceNetwork:
 
 
 class MeshNetwork:
-    """Finds 468 points of the face in a square of the picture, numbered as in MediaPipe."""
+    """Finds 468 face points, numbered as in MediaPipe, in a square region of the picture."""
 
     SIZE = 192
 
@@ -157,7 +157,7 @@ class MeshNetwork:
         self._session = load_network("face_mesh.onnx")
 
     def points(self, picture: U8, square: Square) -> tuple[F64, float]:
-        """(468, 3) x, y and z in px, z away from the camera; and the probability that this is a face."""
+        """Return (468, 3) points, px, z away from the camera, and the probability that this is a face."""
         crop, matrix = square.crop(picture, self.SIZE)
         mesh, presence = self._session.run(None, {"input_1": crop})
         points = mesh.reshape(468, 3).astype(np.float64)
@@ -166,7 +166,7 @@ class MeshNetwork:
 
 
 class IrisNetwork:
-    """Finds the iris in a square around an eye; trained on a picture's left eye, the other is mirrored."""
+    """Finds the iris in a square around an eye; trained on left eyes in pictures, so others are mirrored."""
 
     SIZE = 64
 
@@ -174,7 +174,7 @@ class IrisNetwork:
         self._session = load_network("iris.onnx")
 
     def points(self, picture: U8, square: Square, *, is_left: bool) -> tuple[F64, F64]:
-        """(5, 2) px centre and edge points of the iris; (16, 2) px edges of the lids, lower first."""
+        """Return (5, 2) centre and edge points of the iris and (16, 2) lid points, lower lid first; px."""
         crop, matrix = square.crop(picture, self.SIZE, mirrored=is_left)
         names = ["output_iris", "output_eyes_contours_and_brows"]
         iris, lids = self._session.run(names, {"input_1": crop})

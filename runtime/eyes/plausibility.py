@@ -1,6 +1,6 @@
-"""Reasons why two points cannot be a viewer's eyes: exchanged, in millimetres, behind the display.
+"""Checks for points that cannot be a viewer's eyes: swapped, in millimetres, or behind the display.
 
-Uses no clock. Eyes are in frame `stack` (+x out of the screen, +y the viewer's right, +z up), metres.
+Nothing here reads a clock. Eyes are in metres in frame `stack` (+x out of the screen, +y the viewer's right, +z up).
 """
 
 from __future__ import annotations
@@ -11,20 +11,20 @@ from collections.abc import Mapping
 
 from runtime.records import F64
 
-NOT_NEWER = "no newer than the sample before"
+NOT_NEWER = "not newer than the previous sample"
 NOT_A_NUMBER = "not a number"
 MILLIMETRES = "in millimetres, not metres"
 TOO_CLOSE = "too close together for a person"
 TOO_FAR_APART = "too far apart for a person"
 BEHIND = "not in front of the panels"
-TOO_DISTANT = "too distant for a viewer"
-EXCHANGED = "left and right exchanged"
+TOO_DISTANT = "too far away for a viewer"
+EXCHANGED = "left and right swapped"
 
 IPD_MIN_M, IPD_MAX_M = 0.050, 0.078  # a person's eye separation
 WINDOW = 30  # samples: a second of a common depth camera
 SAMPLES_MIN = 10  # before any reason is reported
 WARNING_SHARE = 0.5  # of the window, refused for one reason, that raises a warning
-UNIT_SLACK = 1.25  # a separation of 40 to 98 must be in millimetres
+UNIT_SLACK = 1.25  # a separation between 40 and 98 can only be in millimetres
 DISTANT_M = 20.0  # from the display: no sensor sees a face from there
 UPSIDE_DOWN_COSINE = -0.5  # a roll of more than 120 degrees means exchanged eyes
 
@@ -32,16 +32,16 @@ MISTAKES = (NOT_NEWER, NOT_A_NUMBER, MILLIMETRES, TOO_CLOSE, TOO_FAR_APART, BEHI
 _HINTS = {
     NOT_NEWER: "the driver must report each sample's capture time",
     MILLIMETRES: "the driver must deliver metres",
-    EXCHANGED: "`left` must be the viewer's own left, and the camera's picture must not be mirrored",
+    EXCHANGED: "`left` must be the viewer's own left eye, and the camera's picture must not be mirrored",
     BEHIND: "calibrate again; the calibration may be for another sensor",
     TOO_DISTANT: "calibrate again; the calibration may be for another sensor",
 }
 
 
 def reason_against(eyes_m: F64, *, in_front_m: float = 0.0) -> str:
-    """Reason why (2, 3) points can't be a viewer's eyes, else empty. in_front_m: minimum x.
+    """Return why (2, 3) points can't be a viewer's eyes, or an empty string. in_front_m: minimum x.
 
-    Eyes count as exchanged if the line from left to right points to the viewer's left.
+    Eyes count as swapped if the line from left to right points to the viewer's left.
     """
     (lx, ly, lz), (rx, ry, rz) = eyes_m.tolist()
     if not all(map(math.isfinite, (lx, ly, lz, rx, ry, rz))):
@@ -62,7 +62,7 @@ def reason_against(eyes_m: F64, *, in_front_m: float = 0.0) -> str:
 
 
 class RefusalWatch:
-    """Counts refused samples by reason; warns once if one reason applies to most samples."""
+    """Counts refused samples by reason, and warns once if most samples are refused for the same reason."""
 
     def __init__(self) -> None:
         self._last: deque[str] = deque(maxlen=WINDOW)
@@ -75,7 +75,7 @@ class RefusalWatch:
         return self._counts
 
     def update(self, reason: str) -> str:
-        """Count a sample's refusal (empty: accepted). Returns a line to log when the warning changes."""
+        """Count a sample by its refusal (empty: accepted). Returns a line to log if the warning changes."""
         self._last.append(reason if reason in MISTAKES else "")
         if reason:
             self._counts[reason] += 1

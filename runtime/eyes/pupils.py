@@ -54,7 +54,7 @@ SIGMA_PERSON, SIGMA_PICTURE_PX, SIGMA_SURPRISE = 0.0088, 0.14, 0.5
 
 @dataclass(frozen=True, slots=True)
 class Pupils:
-    """A viewer's pupils in one picture."""
+    """One viewer's pupils in one picture."""
 
     eyes_px: F64  # (2, 2) left, right; continuous pixels
     sigma_px: float  # standard deviation of one pupil along one axis
@@ -71,7 +71,7 @@ class Pupils:
 
 @dataclass(frozen=True, slots=True)
 class _Look:
-    """The networks' estimates of one face in one picture."""
+    """The networks' estimates for one face in one picture."""
 
     mesh: F64  # (468, 3) px
     presence: float
@@ -85,36 +85,36 @@ class _Look:
         return float(np.linalg.norm(self.eyes[0] - self.eyes[1]))
 
     def are_human(self) -> bool:
-        """Return True if both irises have the size of a person's."""
+        """Return True if both irises have a human size."""
         sizes = self.iris / self.eye_distance
         in_range = IRIS_RANGE[0] < sizes.min() and sizes.max() < IRIS_RANGE[1]
         return bool(in_range and sizes.max() < IRIS_RATIO_MAX * sizes.min())
 
 
 class PupilFinder:
-    """Finds and follows one viewer.
+    """Finds one viewer's pupils and follows them from picture to picture.
 
     `reason`: why the last picture gave no pupils; `choice`: how the viewer was chosen.
     """
 
     def __init__(self, *, lock_ns: int = 0) -> None:
-        """lock_ns: a viewer not seen for longer may be replaced by another."""
+        """lock_ns: time unseen after which another viewer may take over."""
         self._faces, self._meshes, self._irises = FaceNetwork(), MeshNetwork(), IrisNetwork()
         self._flow, self._lock_ns = FaceFlow(), lock_ns
-        self.viewer = 0  # counts up with every new one
+        self.viewer = 0  # incremented with every new viewer
         self.forget()
 
     def forget(self) -> None:
         """Reset: treat the next picture as the first."""
-        self._looks: F64 | None = None  # of the viewer, also while unseen
-        self._last: _Look | None = None  # at the viewer in the previous picture
+        self._looks: F64 | None = None  # the viewer's face, kept while unseen
+        self._last: _Look | None = None  # where the viewer was in the previous picture
         self._eyes = np.zeros((2, 2))  # px, returned for the previous picture
         self._steps = self._carried = 0  # pictures averaged in `_eyes`; consecutive ones with a hidden eye
         self._seen_ns = 0
         self.reason, self.choice = "", "no viewer yet"
 
     def find(self, picture: U8, *, time_ns: int = 0) -> Pupils | None:
-        """The viewer's pupils in an (h, w, 3) RGB picture, or None with the reason in `reason`."""
+        """Return the viewer's pupils in an (h, w, 3) RGB picture, or None, with the cause in `reason`."""
         if self._looks is not None and time_ns - self._seen_ns > self._lock_ns:
             self.forget()
             self.choice = "none: the viewer left"
@@ -183,7 +183,7 @@ class PupilFinder:
         return _Look(mesh, presence, eyes, iris, openness, _looks(picture, mesh, float(np.linalg.norm(line))))
 
     def _steadied(self, picture: U8, look: _Look, seen: Seen) -> Pupils:
-        """Steady the networks' pupils by moving those of the previous picture, if any, with the face."""
+        """Reduce the networks' jitter by moving the previous picture's pupils, if any, along with the face."""
         eyes, surprise, hidden = look.eyes.copy(), np.zeros(2), np.zeros(2, bool)
         last = self._last if self._steps else None
         if last is not None:
@@ -219,13 +219,13 @@ class PupilFinder:
 
 
 def _worth(face: FoundFace, middle: F64) -> float:
-    """Score of a face as the viewer's: its size, reduced towards the picture's edges."""
+    """Score for choosing this face as the viewer's: its size, reduced towards the picture's edges."""
     away = np.abs(face.box[:2] + face.box[2:] / 2 - middle) / middle
     return face.size * (1 - FARTHEST_OUT * float(np.linalg.norm(away) / np.sqrt(2)))
 
 
 def _square_of(mesh: F64) -> Square:
-    """Input region for the mesh network, from a mesh."""
+    """Region of the next input to the mesh network, from a previous mesh."""
     line = mesh[CORNERS[0][1], :2] - mesh[CORNERS[1][0], :2]
     angle = float(np.arctan2(line[1], line[0]))
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -235,7 +235,7 @@ def _square_of(mesh: F64) -> Square:
 
 
 def _looks(picture: U8, mesh: F64, eye_distance: float) -> F64:
-    """(468,) grey values at the mesh's points, mean 0 and length 1: similar for one person in any light."""
+    """(468,) grey values at the mesh's points, of mean 0 and norm 1: for one person similar in any light."""
     margin = max(2, round(eye_distance / 4))
     height, width = picture.shape[:2]
     x0, y0 = np.clip(mesh[:, :2].min(axis=0).astype(int) - margin, 0, [width - 1, height - 1])
@@ -251,7 +251,7 @@ def _looks(picture: U8, mesh: F64, eye_distance: float) -> F64:
 
 
 def _similarity(last: F64, mesh: F64) -> F64:
-    """(2, 3) similarity that moves the corners of the eyes."""
+    """(2, 3) similarity that maps the old corners of the eyes to the new ones."""
     corners = np.ravel(CORNERS)
     matrix, _ = cv2.estimateAffinePartial2D(last[corners, :2], mesh[corners, :2], method=cv2.LMEDS)
     return np.eye(2, 3) if matrix is None else np.asarray(matrix, np.float64)
@@ -263,7 +263,7 @@ def _still_finder() -> PupilFinder:
 
 
 def find_eyes(picture: U8) -> Pupils | None:
-    """The foremost viewer's pupils in an (h, w, 3) uint8 RGB picture; None if there is no viewer."""
+    """Return the nearest viewer's pupils in an (h, w, 3) uint8 RGB picture, None without a viewer."""
     finder = _still_finder()
     finder.forget()
     return finder.find(picture)

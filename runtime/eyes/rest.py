@@ -1,7 +1,8 @@
 """Detection of a head at rest, from the accepted samples.
 
-The tracker's predictions jitter by several times the sensor's noise, because the horizon multiplies the noise of the
-speed. A head at rest has no speed: the median of its samples is its position, and the picture can stand still.
+The tracker's predictions jitter by several times the sensor's noise, because the prediction horizon amplifies the
+noise in the estimated velocity. A head at rest has zero velocity, so the median of its samples is the best estimate
+of its position, and the picture can stand still.
 """
 
 from __future__ import annotations
@@ -30,15 +31,15 @@ NEAREST_M = 0.1  # nearest distance from the display; smaller ones are raised to
 
 
 class RestWatch:
-    """Detects a resting head and its position from accepted samples. Single thread, no clock."""
+    """Detects a resting head, and its position, from accepted samples. Not thread-safe; reads no clock."""
 
     def __init__(self, *, max_drift_m: float) -> None:
-        """max_drift_m: drift beyond the noise that updates a resting head's position."""
+        """max_drift_m: drift, in excess of the noise, that updates a resting head's position."""
         self._max_drift_m = max_drift_m
         self._times = np.zeros(2 * KEPT, np.int64)
         self._eyes = np.zeros((2 * KEPT, 2, 3))
         self._count = 0
-        self.place: F64 | None = None  # (2, 3) the resting eyes, one array per rest; None: they move
+        self.place: F64 | None = None  # (2, 3) the resting eyes, a new array for each rest; None while they move
         self.noise_m = np.zeros(6)  # standard deviation of one sample, as `_shifts` measures it
         self.sigma_m = 0.0  # standard deviation of `place` along an axis, undetected drift included
 
@@ -65,7 +66,7 @@ class RestWatch:
             self._settle(capture_ns - DRIFT_NS)
 
     def forget(self) -> None:
-        """Reset after a lost face or a clock jump."""
+        """Reset after the face was lost or the clock jumped."""
         self._count, self.place = 0, None
 
     def _append(self, eyes_m: F64, capture_ns: int) -> None:
@@ -81,7 +82,7 @@ class RestWatch:
         self._count = count
 
     def _since(self, time_ns: int) -> F64:
-        """(n, 2, 3) samples from `time_ns` on, and earlier ones if there are fewer than `FEWEST`."""
+        """Return (n, 2, 3) samples from `time_ns` onwards, plus earlier ones if there are fewer than `FEWEST`."""
         first = min(int(np.searchsorted(self._times[: self._count], time_ns)), self._count - FEWEST)
         return self._eyes[first : self._count]
 
@@ -95,7 +96,7 @@ class RestWatch:
         self.sigma_m = float(np.hypot(median_sigma_m, drift_m / 2**0.5))  # drift mostly goes in one direction
 
     def _measure_noise(self) -> None:
-        """Measure noise by each sample's distance from the line between its neighbours, immune to even motion."""
+        """Measure noise as each sample's distance from the line between its neighbours: steady motion adds none."""
         first = max(0, self._count - KEPT // 2)
         times, shifts = self._times[first : self._count], _shifts(self._eyes[first : self._count], self._eyes[first])
         later = ((times[1:-1] - times[:-2]) / (times[2:] - times[:-2]))[:, None]  # neighbours may be missing
@@ -105,7 +106,7 @@ class RestWatch:
         self.noise_m = np.tile([max(right, up), max(right, up), deep], 2)
 
     def _stands(self) -> bool:
-        """Return True if the two halves of the last second agree, and the newest samples with them."""
+        """Return True if both halves of the last second agree with each other and with the newest samples."""
         now_ns = int(self._times[self._count - 1])
         if now_ns - self._times[0] < REST_NS:
             return False
@@ -119,7 +120,7 @@ class RestWatch:
         return not self._left(np.median(recent, axis=0))
 
     def _left(self, place: F64) -> bool:
-        """Return True if the newest samples are farther off than noise explains."""
+        """Return True if the newest samples deviate by more than noise can explain."""
         shifts = _shifts(self._eyes[self._count - 5 : self._count], place)
         if (np.abs(np.median(shifts, axis=0)) > MEDIAN_OF_FIVE * self.noise_m + GRACE_M).any():
             return True
@@ -142,9 +143,9 @@ class RestWatch:
 
 
 def _shifts(eyes_m: F64, place: F64) -> F64:
-    """(n, 6) displacements of samples (n, 2, 3) from a place (2, 3) by their effect on the display, metres at the eyes.
+    """(n, 6) displacements, m, of samples (n, 2, 3) from a place (2, 3), weighted by their effect on the display.
 
-    For each eye: right and up, seen from the display's middle, and the effect of its distance on points off the middle.
+    For each eye: right and up as seen from the display's centre, and the effect of its distance on off-centre points.
     """
     away = eyes_m - place
     distance = np.maximum(place[:, :1], NEAREST_M)

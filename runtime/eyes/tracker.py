@@ -1,4 +1,4 @@
-"""The tracker: gating, filtering, history and prediction of the eyes."""
+"""Tracker of the eyes: gating, filtering, history and prediction."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from runtime.records import F64, EyePoints, EyesEstimate, EyesLabel
 
 HISTORY = 256  # filtered samples kept: four seconds at 60 Hz
 CONFIDENCE_MIN = 0.3  # less certain samples (a blink) are refused
-CHI2_GATE = 21.1  # of three axes: refuses one good sample in 10 000
+CHI2_GATE = 21.1  # chi² with three degrees of freedom; refuses one good sample in 10 000
 CHI2_DOUBT = 11.3  # 1 % gate: a sample beyond it is rolled back if the next two fit better without it
 ACCELERATION = (0.05, 0.4, 2.0)  # m/s², standard deviations for a calm, a moving and a fast head
 STAY_S = 1.0  # mean time that a head stays calm, moving or fast
@@ -41,11 +41,11 @@ PANEL_M = (0.5184, 0.2916)  # default width and height
 NO_JUMP = np.zeros((2, 3))
 
 UNCERTAIN = "uncertain"
-ELSEWHERE = "elsewhere than the viewer"
+ELSEWHERE = "not where the viewer is"
 
 
 class _Head(NamedTuple):
-    """One head's motion after its newest sample."""
+    """Estimated motion of one head after its newest sample."""
 
     capture_ns: int
     middle: imm.Belief  # between the eyes, frame `stack`
@@ -57,13 +57,13 @@ class _Head(NamedTuple):
         return (time_ns - self.capture_ns) / NS_PER_S
 
     def eyes_m(self, ahead_s: float) -> F64:
-        """(2, 3) left and right eye, `ahead_s` seconds after the newest sample."""
+        """Return (2, 3) left and right eye, `ahead_s` seconds after the newest sample."""
         middle, half = imm.ahead(self.middle, ahead_s), imm.ahead(self.half, ahead_s)
         return np.array([middle - half, middle + half])
 
 
 class _Sample(NamedTuple):
-    """A measurement that passed the plausibility checks."""
+    """One measurement that passed the plausibility checks."""
 
     capture_ns: int
     middle_m: F64  # (3,)
@@ -77,7 +77,7 @@ class _Sample(NamedTuple):
         return _Head(self.capture_ns, middle, half, 1, 0.0)
 
     def continued(self, head: _Head) -> _Head | None:
-        """Update a head with this sample; None if the sample can't be of that head."""
+        """Update a head with this sample; None if the sample cannot belong to that head."""
         age_s = head.age_s(self.capture_ns)
         if age_s > KEEP_S:
             return None
@@ -98,7 +98,7 @@ class _Sample(NamedTuple):
         )
 
     def is_within_reach_of(self, head: _Head) -> bool:
-        """Return True if a head can have moved here since its newest sample."""
+        """Return True if a head could have moved here since its newest sample."""
         age_s = head.age_s(self.capture_ns)
         reach_m = min(REACH_SPEED * age_s, REACH_ACCELERATION * age_s**2 / 2)
         noise_m = math.sqrt(np.trace(self.noise_m2 + head.middle.covariance[0, :3, :3]))
@@ -108,14 +108,14 @@ class _Sample(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Shown:
-    """The viewer's head after a sample, and the jump that is being hidden."""
+    """The viewer's head after a sample, and the jump that is still being smoothed out."""
 
     head: _Head
     jump_m: F64  # (2, 3) from the measured eyes back to those last shown, at `jump_ns`; decays afterwards
     jump_ns: int
 
     def eyes_m(self, ahead_s: float, time_ns: int) -> F64:
-        """(2, 3) eyes shown at `time_ns`, predicted `ahead_s` seconds ahead."""
+        """Return the (2, 3) eyes to show at `time_ns`, predicted `ahead_s` seconds ahead."""
         eyes = self.head.eyes_m(ahead_s)
         if self.jump_m is not NO_JUMP:
             fraction = min(max((time_ns - self.jump_ns) / NS_PER_S / REVIVE_S, 0.0), 1.0)
@@ -124,17 +124,17 @@ class _Shown:
 
 
 class _Other(NamedTuple):
-    """A head at another position than the viewer's."""
+    """A head seen somewhere other than the viewer's position."""
 
     head: _Head
-    may_be_viewer: bool  # the viewer can have moved there
+    may_be_viewer: bool  # whether the viewer could have moved there
 
 
 class Tracker:
     """Tracks one viewer's eyes. `update` takes samples as they arrive; `at` returns the eyes at any time.
 
-    The first person seen is the viewer for as long as they are seen. When eyes return after a loss, the output moves
-    smoothly from the last position shown to the measured one; a change to another person is abrupt.
+    The first person seen remains the viewer for as long as they are visible. When eyes return after a loss, the output
+    moves smoothly from the last position shown to the measured one; a change to another person is abrupt.
     """
 
     def __init__(
@@ -144,7 +144,7 @@ class Tracker:
         panel_m: tuple[float, float] = PANEL_M,
         in_front_m: float = 0.0,
     ) -> None:
-        """panel_m: width and height, which weigh an error in depth; in_front_m: minimum x of a viewer's eye."""
+        """panel_m: (width, height), which sets the weight of depth errors; in_front_m: minimum x of an eye."""
         self.settings = settings or TrackerSettings()
         self._panel_m, self._in_front_m = panel_m, in_front_m
         self._history: deque[_Shown] = deque(maxlen=HISTORY)
@@ -154,11 +154,11 @@ class Tracker:
         self._asked_ns = 0  # latest time that `at` was called for: that of the last picture shown
 
     def update(self, points: EyePoints | None, *, capture_ns: int) -> str:
-        """Take in a sample in the `stack` frame; None: the sensor saw no face.
+        """Add a sample in the `stack` frame, or None if the sensor saw no face.
 
-        Returns the reason for a refusal, else an empty text. Samples are refused if they are old, uncertain (a blink),
+        Returns the reason for a refusal, or an empty string. Samples are refused if they are old, uncertain (a blink),
         implausible for a person, or away from the viewer. The second consecutive sample at a position that the viewer
-        can have reached is accepted; another person's only once the viewer is gone.
+        could have reached is accepted; another person's samples are accepted only once the viewer has gone.
         """
         if capture_ns <= self._newest_ns:
             if self._newest_ns - capture_ns < CLOCK_RESET_NS:
@@ -182,7 +182,7 @@ class Tracker:
         self._newest_ns, self._asked_ns = -1, 0
 
     def _noise(self, points: EyePoints) -> F64:
-        """(3, 3) covariance of the middle between the eyes, m²: the driver's, with a floor, or the settings'."""
+        """Return the (3, 3) covariance, m², of the eyes' midpoint: the driver's, with a floor, or the settings'."""
         noise: F64 = self.settings.noise_m**2 / 2 * np.eye(3)
         if points.covariance_m2 is not None and np.isfinite(points.covariance_m2).all():
             variances, axes = np.linalg.eigh((points.covariance_m2 + points.covariance_m2.T) / 2)
@@ -222,7 +222,7 @@ class Tracker:
         return ""
 
     def _follow(self, head: _Head, *, is_return: bool = False) -> None:
-        """Make `head` the viewer's. is_return: after a loss or a jump, so blend from the last position shown."""
+        """Make `head` the viewer's. is_return: it follows a loss or a jump, so blend from the last position shown."""
         jump_m, jump_ns = (self._history[-1].jump_m, self._history[-1].jump_ns) if self._history else (NO_JUMP, 0)
         if is_return:
             jump_ns = max(self._asked_ns, head.capture_ns)
@@ -234,18 +234,18 @@ class Tracker:
             self._other = None
 
     def ahead(self, time_ns: int) -> EyesEstimate:
-        """Estimate as `at` does, for a time that is not (yet) shown, without affecting later calls of `at`."""
+        """Estimate as `at` does, for a time that is not shown (yet), without affecting later calls to `at`."""
         asked_ns = self._asked_ns
         estimate = self.at(time_ns)
         self._asked_ns = asked_ns
         return estimate
 
     def at(self, time_ns: int) -> EyesEstimate:
-        """Eyes at a display time, on the samples' clock.
+        """Return the eyes at a display time, given on the samples' clock.
 
-        Labels: exact, at a sample; interpolated, between two samples; predicted, after the newest by at
-        most `HORIZON_S`; held, the face is lost and the eyes slow to rest; none, never seen, lost for longer than
-        `hold_s`, or forgotten.
+        Labels: `exact` at a sample; `interpolated` between two samples; `predicted` at most `HORIZON_S` after the
+        newest; `held` when the face is lost and the eyes slow to rest; `none` if they were never seen, were lost for
+        longer than `hold_s`, or were forgotten.
         """
         if not self._history or time_ns < self._history[0].head.capture_ns:
             return EyesEstimate(time_ns, 0, None, "none")
@@ -277,7 +277,7 @@ class Tracker:
         return self._estimate(time_ns, after.head, eyes_m, "interpolated")
 
     def _estimate(self, time_ns: int, head: _Head, eyes_m: F64, label: EyesLabel) -> EyesEstimate:
-        """Add the standard deviation of `eyes_m`, from how the head can have moved since its newest sample."""
+        """Add the standard deviation of `eyes_m`, based on how far the head may have moved since its newest sample."""
         age_s = min(max(head.age_s(time_ns), 0.0), SIGMA_AHEAD_S)
         middle_m, half_m = (eyes_m[0] + eyes_m[1]) / 2, (eyes_m[1] - eyes_m[0]) / 2
         if label in ("exact", "interpolated"):
@@ -289,10 +289,11 @@ class Tracker:
 
 
 def sideways_sigma_m(error_m2: F64, eye_m: F64, *, panel_m: tuple[float, float]) -> float:
-    """Sideways standard deviation with the same effect on the picture as an eye's (3, 3) covariance.
+    """Sideways standard deviation that affects the picture as much as an eye's (3, 3) covariance does.
 
-    For a point of the display at distance u from the foot of the eye's perpendicular, an eye at distance x that is d
-    nearer than estimated acts like one displaced sideways by d·u/x; averaged as a mean square over the display.
+    An eye that is d nearer than its estimated distance x affects a display point like a sideways displacement of
+    d·u/x, where u is the distance from that point to the foot of the eye's perpendicular. The mean square over the
+    display is used.
     """
     x, y, z = max(float(eye_m[0]), NEAREST_M), float(eye_m[1]), float(eye_m[2])
     lever2 = (y * y + z * z + (panel_m[0] ** 2 + panel_m[1] ** 2) / 12) / (x * x)

@@ -1,4 +1,4 @@
-"""The driver interface (open, capabilities, read the newest, close), and device clocks."""
+"""Interface of sensor drivers (open, capabilities, read_newest, close); conversion of device clocks."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ WINDOW_NS = 5_000_000_000  # for estimating a device clock's offset
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:
-    """Kinds of data that a sensor delivers."""
+    """Capabilities of a sensor: the kinds of data that it delivers."""
 
     colour: bool = False
     depth: bool = False
     eye_points: bool = False  # it finds the eyes itself, without our detector
     in_stack_frame: bool = False  # its eye points are in frame `stack` already: no calibration is applied
-    may_pause: bool = False  # gaps and constant samples are no fault (a recording)
+    may_pause: bool = False  # gaps and constant samples are not faults (a recording)
 
 
 class Sensor(ABC):
     """One depth sensor, eye tracker or recording.
 
-    A constructor only stores settings; `open` acquires the device and cleans up after itself if it fails. One thread
-    uses a driver; that thread may be abandoned if an SDK hangs.
+    The constructor only stores settings; `open` acquires the device, and cleans up after itself if it fails. Only one
+    thread uses a driver, and that thread may be abandoned if an SDK hangs.
 
-    A user's class is configured by `sensor.driver = "module:Class"` and constructed as `Class(options, clock=clock)`,
+    A custom class is configured by `sensor.driver = "module:Class"` and constructed as `Class(options, clock=clock)`,
     with `options` an `Options` validated from `[sensor.options]` and `clock` the run's clock, on which capture times
-    must be.
+    must be based.
     """
 
     Options: ClassVar[type[BaseModel]] = Section  # of a user's class: the schema of [sensor.options]
@@ -45,29 +45,29 @@ class Sensor(ABC):
     name: str
     capabilities: Capabilities
     serial: str = ""  # known after `open`; empty if the device has none. If set before, `open` takes only that device
-    skipped: int = 0  # samples that `read_newest` skipped for a newer one
+    skipped: int = 0  # samples that `read_newest` skipped in favour of newer ones
 
     @abstractmethod
     def open(self) -> None:
-        """Acquire the device. Raises SensorLost (not there; retry), FatalError (don't retry)."""
+        """Acquire the device. Raises SensorLost if it is absent (retry), FatalError for anything permanent."""
 
     @abstractmethod
     def read_newest(self, timeout_s: float) -> SensorFrame:
-        """Return the newest unread frame, with its capture time; waits up to `timeout_s` for one.
+        """Return the newest unread frame, with its capture time, waiting up to `timeout_s` for one.
 
         Raises SensorTimeout (nothing new), SensorLost (close and reopen), EndOfRecording.
         """
 
     def read_arrived(self, timeout_s: float) -> list[SensorFrame]:
-        """Return all unread frames, oldest first; waits up to `timeout_s` for one.
+        """Return all unread frames, oldest first, waiting up to `timeout_s` for the first one.
 
-        By default only the newest. Raises as `read_newest` does.
+        By default this returns only the newest. Raises the same exceptions as `read_newest`.
         """
         return [self.read_newest(timeout_s)]
 
     @abstractmethod
     def close(self) -> None:
-        """Release everything. May be called twice, and after a failed `open`; never raises."""
+        """Release everything. Never raises; may be called twice, or after a failed `open`."""
 
     def __enter__(self) -> Self:
         self.open()
@@ -80,9 +80,9 @@ class Sensor(ABC):
 
 
 class SteppedSensor(Sensor):
-    """A driver that can also deliver every sample without waiting, for runs on a simulated clock.
+    """A driver that can also deliver each sample without waiting, for runs on a simulated clock.
 
-    `read_newest` and `read_arrived` return what has arrived by its clock.
+    `read_newest` and `read_arrived` return the samples that have arrived according to its clock.
     """
 
     _clock: Clock
@@ -97,7 +97,7 @@ class SteppedSensor(Sensor):
 
     @abstractmethod
     def available_ns(self, frame: SensorFrame) -> int:
-        """Arrival time of a sample on the run's clock, until which the caller advances its clock."""
+        """Return the sample's arrival time on the run's clock; the caller advances its clock to this time."""
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
         *overtaken, newest = self.read_arrived(timeout_s)
@@ -129,9 +129,9 @@ class SteppedSensor(Sensor):
 
 
 class DeviceClock:
-    """Converts a device's time to the host's clock, with the offset from the fastest recent delivery.
+    """Converts device timestamps to the host's clock, using the offset of the fastest recent delivery.
 
-    Every delivery has some delay, whose minimum over a window is nearly constant. A new window every few seconds
+    Every delivery is delayed, but the minimum delay over a window is nearly constant. A new window every few seconds
     follows the drift between the two clocks.
     """
 

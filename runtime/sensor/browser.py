@@ -1,4 +1,4 @@
-"""Driver `browser`: a web page's pointer as the head, with noise and latency, or its camera."""
+"""Driver `browser`: a web page's pointer acts as the head, with noise and latency; or its camera."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PICTURE_MAX_PX = 2048  # longer side of a page's camera picture
 
 
 class BrowserEyes(Sensor):
-    """Delivers samples as pages send them, and repeats the last one between them."""
+    """Delivers the samples that pages send, and repeats the last one in between."""
 
     name = "browser"
     capabilities = Capabilities(eye_points=True, in_stack_frame=True, may_pause=True)
@@ -84,7 +84,7 @@ class BrowserEyes(Sensor):
 
 
 class BrowserCamera(Sensor):
-    """Delivers pictures of a page's camera. Without depth, the eyes' separation gives their distance."""
+    """Delivers pictures from a page's camera. Without depth, distance follows from the eye separation."""
 
     name = "browser"
     capabilities = Capabilities(colour=True)
@@ -99,13 +99,13 @@ class BrowserCamera(Sensor):
     def read_newest(self, timeout_s: float) -> SensorFrame:
         message = self._link.picture(timeout_s)
         if message is None:
-            raise SensorTimeout("the page sends no camera picture")
+            raise SensorTimeout("the page has not sent a camera picture")
         coded, page_ms = message
         capture_ns = self._times.host_ns(round(page_ms * NS_PER_MS), arrival_ns=self._clock.now_ns())
         self._link.captured(capture_ns, page_ms)
         picture: Any = cv2.imdecode(np.frombuffer(coded, np.uint8), cv2.IMREAD_COLOR)
         if picture is None or max(picture.shape) > PICTURE_MAX_PX:
-            raise SensorTimeout("the page sends an invalid camera picture")
+            raise SensorTimeout("the page sent an invalid camera picture")
         self._number += 1
         self._captured_ns = max(capture_ns, self._captured_ns + 1)
         height, width = picture.shape[:2]

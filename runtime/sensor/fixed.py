@@ -1,4 +1,4 @@
-"""Driver `fixed`: eyes at a configured position. No sensor, no calibration."""
+"""Driver `fixed`: eyes at a configured position, without a sensor or a calibration."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class FixedDriver(SteppedSensor):
     capabilities = Capabilities(eye_points=True, in_stack_frame=True, may_pause=True)
 
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
-        """Raise InputError if the settings have no eyes."""
+        """Raise InputError if the settings contain no eye positions."""
         if settings.fixed_eyes_m is None:
             raise InputError("sensor", "fixed_eyes_m", "is required by the driver `fixed`")
         self._eyes = EyePoints(np.array(settings.fixed_eyes_m, dtype=np.float64), np.ones(2))

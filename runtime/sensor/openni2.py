@@ -41,16 +41,16 @@ class _Picture(NamedTuple):
 
 
 class OpenNI2Driver(Sensor):
-    """Delivers depth in millimetres, registered to colour if the camera supports that, and colour.
+    """Delivers colour, and depth in millimetres, registered to colour if the camera supports that.
 
-    The library is called on a thread that outlives the calling one (`_PersistentThread`).
+    Calls into the library run on a thread that outlives the calling one (`_PersistentThread`).
     """
 
     name = "openni2"
     capabilities = Capabilities(colour=True, depth=True)
 
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
-        """settings.source: `demo` or empty for the only camera, a serial number, a device URI, or a .oni file."""
+        """settings.source: empty or `demo` for the only camera, a serial number, a device URI, or a .oni file."""
         self._settings, self._clock = settings, clock
         self._thread: _PersistentThread | None = None  # while open
         self._openni: Any = None
@@ -129,7 +129,7 @@ class OpenNI2Driver(Sensor):
         self._times, self._newest, self._index = DeviceClock(), {}, 0
 
     def _read_intrinsics(self, stream: Any) -> Intrinsics | None:
-        """Centred pinhole from the field of view of the camera or else the settings; None if unknown."""
+        """Return a centred pinhole with the camera's field of view, else the settings'; None if unknown."""
         mode = stream.video_mode
         width, height = mode.resolutionX, mode.resolutionY
         try:  # files have the property but deny it
@@ -183,14 +183,14 @@ class OpenNI2Driver(Sensor):
         return "depth" if "depth" in self._streams else "colour"
 
     def _lacks_colour(self) -> bool:
-        """Return True if the colour picture for the newest depth may still arrive."""
+        """Return True if the colour picture that belongs to the newest depth may still arrive."""
         colour = self._newest.get("colour")
         return "colour" in self._streams and (
             colour is None or self._newest[self._main].time_us - colour.time_us > PAIR_APART_US
         )
 
     def _take(self, timeout_s: float) -> bool:
-        """Copy one frame of any stream that has one; returns False if none arrived in time."""
+        """Copy one frame from whichever stream has one. Returns False if none arrived in time."""
         try:
             # The library reports an error for a wait of 0 on some devices.
             stream = self._openni.wait_for_any_stream(list(self._streams.values()), max(timeout_s, 0.001))
@@ -232,7 +232,7 @@ class OpenNI2Driver(Sensor):
 
 
 def _quietly(call: Callable[[], object]) -> None:
-    """Call a function that may fail on an unplugged camera, and log its error."""
+    """Call a function that may fail if the camera is unplugged, and log the error."""
     try:
         call()
     except Exception as error:
@@ -240,7 +240,7 @@ def _quietly(call: Callable[[], object]) -> None:
 
 
 def _serial(device: Any) -> str:
-    """Serial number of a device; empty if it has none."""
+    """Return a device's serial number, or an empty string if it has none."""
     import ctypes
 
     if not device.is_property_supported(SERIAL_PROPERTY):
@@ -250,13 +250,13 @@ def _serial(device: Any) -> str:
 
 
 def _text(error: Exception) -> str:
-    """Library's error message, without the package's wrapping."""
+    """Return the library's error message, without the package's wrapping."""
     words = error.args[1] if len(error.args) > 1 else str(error) or type(error).__name__
     return words.decode(errors="replace").strip() if isinstance(words, bytes) else str(words)
 
 
 def _pixels(frame: Any) -> U8 | U16:
-    """Copy a frame's pixels: depth as (h, w) uint16 mm, colour as (h, w, 3) RGB. Raises ValueError."""
+    """Copy a frame's pixels: depth as (h, w) uint16 millimetres, colour as (h, w, 3) RGB. Raises ValueError."""
     pixel_format, height, width = frame.videoMode.pixelFormat.value, frame.height, frame.width
     data = np.frombuffer(frame.get_buffer_as_uint8(), np.uint8)
     kinds = {DEPTH_1_MM: (2, 1), DEPTH_100_UM: (2, 1), RGB888: (1, 3), GRAY8: (1, 1)}
@@ -264,7 +264,7 @@ def _pixels(frame: Any) -> U8 | U16:
         raise ValueError(f"pixel format {pixel_format} is not supported")
     size, channels = kinds[pixel_format]
     if data.size < height * frame.stride or frame.stride < width * size * channels:
-        raise ValueError("a frame has fewer bytes than its size requires")
+        raise ValueError("a frame contains fewer bytes than its size requires")
     rows = data[: height * frame.stride].reshape(height, frame.stride)[:, : width * size * channels]
     if size == 2:
         depth = np.ascontiguousarray(rows).view("<u2").astype(np.uint16)
@@ -277,8 +277,8 @@ def _pixels(frame: Any) -> U8 | U16:
 class _PersistentThread:
     """Runs calls one at a time on a thread that lives as long as the process; callers wait for the result.
 
-    At exit OpenNI2 accesses every thread that called it, and crashes if one has ended and its stack was freed. Threads
-    of a `ThreadPoolExecutor` won't do: Python ends them earlier, and waits for one that hangs in a call.
+    At exit OpenNI2 accesses every thread that ever called it, and crashes if one has ended and its stack was freed. A
+    `ThreadPoolExecutor` is not suitable: Python ends its threads earlier, and waits for one that hangs in a call.
     """
 
     def __init__(self, name: str) -> None:

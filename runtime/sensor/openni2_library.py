@@ -1,8 +1,8 @@
-"""Find and load libOpenNI2 with its drivers.
+"""Finding and loading libOpenNI2 and its drivers.
 
 The `openni` package expects a folder with `libOpenNI2.so` and `OpenNI2/Drivers/`. Distributions install them under
 other names, so a folder of links is created. Drivers are pinned in memory, because some leave threads running after
-closing a device, which would crash the process when the library unloads their code.
+closing a device, and the process would crash when the library unloads their code.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ _loaded = False
 
 
 def find_library(folder: str = "") -> tuple[Path, Path]:
-    """Find the library's file and the folder of its drivers. Raises MissingPart."""
+    """Find the library file and the folder of its drivers. Raises MissingPart."""
     for place in (folder,) if folder else LIBRARY_FOLDERS:
         drivers = Path(place) / "OpenNI2" / "Drivers"
         for library in sorted(Path(place).glob("libOpenNI2.so*")):
             if drivers.is_dir():
                 return library, drivers
-    raise MissingPart(f"{folder}: has no libOpenNI2.so next to OpenNI2/Drivers" if folder else INSTALL)
+    raise MissingPart(f"{folder}: libOpenNI2.so is missing next to OpenNI2/Drivers" if folder else INSTALL)
 
 
 def load(folder: str = "") -> Any:

@@ -1,6 +1,6 @@
-"""Driver `realsense`: RealSense depth cameras through their SDK, and the SDK's recordings.
+"""Driver `realsense`: RealSense depth cameras, and recordings made with their SDK.
 
-Tested with recordings played back by the SDK (tests/sensor/test_realsense.py), not yet with a camera.
+It has been tested with recordings that the SDK plays (tests/sensor/test_realsense.py), not yet with a camera.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ log = logging.getLogger(__name__)
 
 
 class RealSenseDriver(Sensor):
-    """Delivers colour, depth in millimetres aligned to it by the SDK, and the camera's intrinsics."""
+    """Delivers colour, depth in millimetres (aligned to colour by the SDK), and the camera's intrinsics."""
 
     name = "realsense"
     capabilities = Capabilities(colour=True, depth=True)
 
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
-        """settings.source: `demo` or empty for the only camera, a serial number, or a recording (`FILES`)."""
+        """settings.source: empty or `demo` for the only camera, a serial number, or a recording (`FILES`)."""
         import pyrealsense2
 
         self._rs, self._settings, self._clock = pyrealsense2, settings, clock
@@ -72,7 +72,7 @@ class RealSenseDriver(Sensor):
         self._times, self._number = DeviceClock(), -1
 
     def _serial_to_open(self) -> str:
-        """Serial number of the configured camera, or of the only one. Raises SensorLost."""
+        """Return the serial number of the configured camera, or of the only one. Raises SensorLost."""
         source = self._settings.source
         configured = self.serial or ("" if source in ("", "demo", "any") else source)
         info = self._rs.camera_info.serial_number
@@ -100,13 +100,13 @@ class RealSenseDriver(Sensor):
             aligned = self._align.process(frames)
             depth, colour = aligned.get_depth_frame(), aligned.get_color_frame()
             if not (depth and colour):
-                raise SensorTimeout("RealSense: depth without colour")
+                raise SensorTimeout("RealSense: a depth picture arrived without colour")
             return self._frame(depth, colour)
         except RuntimeError as error:
             raise SensorLost(f"RealSense: {error}") from None
 
     def _next(self, deadline_ns: int) -> Any:
-        """Wait for frames with an unread depth picture. Raises SensorTimeout, EndOfRecording, RuntimeError."""
+        """Wait for frames that contain an unread depth picture. Raises SensorTimeout, EndOfRecording, RuntimeError."""
         while True:
             remaining_ms = max(1, (deadline_ns - self._clock.now_ns()) // NS_PER_MS)
             done, frames = self._pipeline.try_wait_for_frames(remaining_ms)
@@ -122,7 +122,7 @@ class RealSenseDriver(Sensor):
         return self._playback is not None and not self._settings.loop and self._playback.current_status() != playing
 
     def _is_new(self, frames: Any) -> bool:
-        """Return True for a new depth picture; the SDK pairs the same one with several colour pictures."""
+        """Return True if the depth picture is new: the SDK may pair one with several colour pictures."""
         depth = frames.get_depth_frame()
         if not depth or not frames.get_color_frame() or depth.get_frame_number() == self._number:
             return False
@@ -141,7 +141,7 @@ class RealSenseDriver(Sensor):
         )
 
     def _capture_ns(self, frame: Any) -> int:
-        """Capture time of the depth picture, from the SDK's timestamp on the host's clock or else the device's."""
+        """Return when the depth picture was captured: the SDK's host timestamp, or else the device's."""
         now_ns, stamp_ns = self._clock.now_ns(), round(frame.get_timestamp() * NS_PER_MS)
         age_ns: int = time.time_ns() - stamp_ns
         on_host = frame.get_frame_timestamp_domain() != self._rs.timestamp_domain.hardware_clock
@@ -159,7 +159,7 @@ class RealSenseDriver(Sensor):
 
 
 def _rgb(frame: Any) -> U8:
-    """Copy as (h, w, 3) RGB. Raises SensorLost for a format not in `COLOURS`."""
+    """Copy a colour frame as (h, w, 3) RGB. Raises SensorLost if its format is not in `COLOURS`."""
     kind = frame.profile.format().name
     if kind not in COLOURS:
         raise SensorLost(f"RealSense: colour is {kind}, not {', '.join(COLOURS)}")
@@ -167,7 +167,7 @@ def _rgb(frame: Any) -> U8:
 
 
 def _millimetres(frame: Any) -> U16:
-    """Copy as (h, w) millimetres; 0: no measurement."""
+    """Copy a depth frame as (h, w) millimetres, 0 where nothing was measured."""
     raw: U16 = np.asanyarray(frame.get_data())
     unit_mm = float(frame.get_units()) * 1e3
     if abs(unit_mm - 1) < 1e-4:
@@ -177,5 +177,5 @@ def _millimetres(frame: Any) -> U16:
 
 
 def _intrinsics(camera: Any) -> Intrinsics:
-    """Convert intrinsics; the SDK's pixel centres are whole numbers, ours half-integers."""
+    """Convert the SDK's intrinsics, whose pixel centres are integers, to ours, whose centres are half-integers."""
     return Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.ppx + 0.5, camera.ppy + 0.5)

@@ -1,4 +1,4 @@
-"""Recordings in MCAP with small chunks: after a crash all whole samples in the file are readable."""
+"""Recordings as MCAP files with small chunks: after a crash every complete sample is readable."""
 
 from __future__ import annotations
 
@@ -34,21 +34,21 @@ RECORD, CHUNK = struct.Struct("<BQ"), b"\x06"  # a record's kind and length; the
 CHUNK_HEAD = struct.Struct("<BQQQQII")  # with times, size, checksum, and the length of the compression's name
 EXPANDED_MOST = 8  # of a cut-off chunk: unpacked bytes for each byte
 WINDOW_BYTES = 1 << 27  # of zstandard
-NEEDED = "one to replay has it and `/eyes` (docs/sensors.md); others are read by a driver of your own"
+NEEDED = "a recording for replay has it and `/eyes` (docs/sensors.md); to read others, write a driver"
 KINDS = {  # other files, by their first bytes
-    b"#ROSBAG ": " (a bag of ROS 1: `mcap convert` makes one of it)",
-    b"SQLite f": " (a bag of ROS 2 in SQLite: `ros2 bag convert` makes one of it)",
-    b"version ": " (a pointer of Git LFS: `git lfs pull` fetches the file itself)",
+    b"#ROSBAG ": " (a ROS 1 bag; convert it with `mcap convert`)",
+    b"SQLite f": " (a ROS 2 bag in SQLite; convert it with `ros2 bag convert`)",
+    b"version ": " (a Git LFS pointer; fetch the file with `git lfs pull`)",
 }
 
-SYNCED_WITHIN_S = 30.0  # that closing a file waits for a slow disk
-SYNC_EVERY_NS = 2 * NS_PER_S  # most that a power cut loses of a recording, on a disk that keeps up
+SYNCED_WITHIN_S = 30.0  # maximum wait for a slow disk when closing a file
+SYNC_EVERY_NS = 2 * NS_PER_S  # maximum loss in a power cut, on a disk that keeps up
 
 log = logging.getLogger(__name__)
 
 
 class RecordingWriter:
-    """Writes samples to an open binary file. `write` returns False once a limit is reached."""
+    """Writes samples to an open binary file, until a limit is reached and `write` returns False."""
 
     def __init__(
         self,
@@ -58,7 +58,7 @@ class RecordingWriter:
         max_s: float = MAX_S,
         on_first: Callable[[], object] = lambda: None,
     ) -> None:
-        """on_first: called when the first sample is written."""
+        """on_first: called when the first sample has been written."""
         from mcap.writer import CompressionType, IndexType, Writer
 
         self._file, self._max_ns, self._on_first = file, round(max_s * NS_PER_S), on_first
@@ -84,7 +84,7 @@ class RecordingWriter:
         return self._channels[topic]
 
     def write(self, frame: SensorFrame) -> bool:
-        """Append a sample, its images first; False, without writing, where a limit forbids it."""
+        """Append a sample, its images first. Returns False, without writing, if this would exceed a limit."""
         at = frame.capture_ns
         messages: list[tuple[str, bytes]] = []
         if self._images and frame.intrinsics is not None and frame.intrinsics != self._intrinsics:
@@ -121,10 +121,11 @@ class RecordingWriter:
 
 @contextmanager
 def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -> Iterator[RecordingWriter]:
-    """Open a writer whose file appears under its name, replacing an older one, with the first sample.
+    """Open a writer whose file appears under its name, replacing any older one, at the first sample.
 
-    Until then an older file of that name stays; after a crash it is readable up to its last whole sample.
-    One with pictures is its owner's alone. Raises InputError if it can't be written, or another process writes it.
+    Until then an older file of that name stays. After a crash the file is readable up to its last complete sample. A
+    recording with pictures is readable by its owner alone. Raises InputError if the file can't be written, or if
+    another process is writing it.
     """
     part, file = path.with_name(f".{path.name}.part"), None
     try:
@@ -160,7 +161,7 @@ def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -
 
 
 class Recording:
-    """An open recording. Samples are read lazily, so that images do not fill the memory."""
+    """An open recording. Samples are read lazily, so that images do not fill up the memory."""
 
     def __init__(self, path: Path) -> None:
         """Read the header and the first sample. Raises InputError, naming the file."""
@@ -169,7 +170,7 @@ class Recording:
         self.header = self._read_header()
         first = next(self.samples(), None)
         if first is None:
-            cut_off = "" if self.is_whole else " (it is cut off before the first one ends)"
+            cut_off = "" if self.is_whole else " (the file ends within the first one)"
             raise InputError(path, "", f"contains no complete sample{cut_off}")
         self.first = first
 
@@ -189,12 +190,12 @@ class Recording:
                 except ValueError as error:
                     raise InputError(self.path, fmt.METADATA_NAME, str(error)) from None
         if not foreign and not self.is_whole:
-            raise InputError(self.path, "", "is an MCAP recording that is cut off before its first sample")
+            raise InputError(self.path, "", "is an MCAP recording that ends before its first sample")
         by = ", ".join(filter(None, (*self._written_by, foreign)))
         raise InputError(self.path, fmt.METADATA_NAME, f"is missing from this MCAP recording ({by}): {NEEDED}")
 
     def _records(self) -> Iterator[tuple[str, Any]]:
-        """Yield messages with their topic, and metadata with an empty one, up to the end or a damaged record."""
+        """Yield messages with their topics, and metadata with an empty topic, up to the end or a damaged record."""
         from mcap.records import Channel, Header, Message, Metadata
 
         topics: dict[int, str] = {}
@@ -222,11 +223,11 @@ class Recording:
         except Exception as error:  # mcap, lz4 and zstandard have their own errors for a damaged file
             if self.is_whole:
                 problem = str(error) or type(error).__name__
-                log.warning("%s: is cut off or damaged; reading the intact part (%s)", self.path, problem)
+                log.warning("%s: the file is truncated or damaged; reading the intact part (%s)", self.path, problem)
             self.is_whole = False
 
     def samples(self) -> Iterator[SensorFrame]:
-        """Yield all complete samples in order; a message with eye points completes one. Raises InputError."""
+        """Yield all complete samples in order. A message of eye points completes a sample. Raises InputError."""
         parts: dict[str, Any] = {}
         intrinsics: Intrinsics | None = None
         for topic, message in self._records():
@@ -245,10 +246,11 @@ class Recording:
 
 
 def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[Any]:
-    """Records in order, those within chunks too, until the footer: the unpacked size of a chunk is checked.
+    """Yield all records up to the footer, including those in chunks, whose unpacked sizes are checked.
 
-    max_bytes: limit for a record, and for an unpacked chunk. Raises InputError for a chunk over the limit, and errors
-    of mcap or a decompressor for a damaged file, after the whole records of a chunk that the file's end cuts off.
+    max_bytes: limit for a record, and for an unpacked chunk. Raises InputError for a chunk over the limit. For a
+    damaged file, raises the errors of mcap or a decompressor, but first yields the complete records of a chunk that is
+    truncated by the end of the file.
     """
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader, breakup_chunk
@@ -271,7 +273,7 @@ def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[
         raise
     except Exception:  # mcap, lz4 and zstandard have their own
         file.seek(-len(MAGIC), os.SEEK_END)
-        is_whole = file.read() == MAGIC  # damaged, then: lengths in it mean nothing
+        is_whole = file.read() == MAGIC  # damaged, so its lengths cannot be trusted
         file.seek(end)
         if not is_whole and (data := _cut_off_chunk(file.read(max_bytes))):
             yield from breakup_chunk(Chunk("", data, 0, 0, 0, len(data)))
@@ -279,7 +281,7 @@ def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[
 
 
 def _indexed_chunks(file: IO[bytes], *, max_bytes: int) -> set[int]:
-    """Return the offsets of the chunks by the summary; empty for a file without a readable one."""
+    """Return where chunks begin according to the file's summary; empty if it has no readable summary."""
     from mcap.reader import FOOTER_SIZE
     from mcap.records import ChunkIndex
     from mcap.stream_reader import StreamReader
@@ -297,7 +299,7 @@ def _indexed_chunks(file: IO[bytes], *, max_bytes: int) -> set[int]:
 
 
 def _cut_off_chunk(data: bytes) -> bytes:
-    """The whole records of a chunk at the end of a file, uncompressed; empty for anything else."""
+    """Return the complete records of a truncated chunk at the end of a file, uncompressed, or empty bytes."""
     if data[:1] != CHUNK or RECORD.unpack_from(data.ljust(RECORD.size, b"\0"))[1] <= len(data) - RECORD.size:
         return b""
     name = CHUNK_HEAD.unpack_from(data.ljust(CHUNK_HEAD.size, b"\0"))[-1]
@@ -313,20 +315,20 @@ def _cut_off_chunk(data: bytes) -> bytes:
 
 
 def _unpacked(chunk: Any, *, source: Path, max_bytes: int) -> bytes:
-    """A chunk's records as bytes. Raises InputError over the limit, else the unpacker's exception."""
+    """Return a chunk's records as bytes. Raises InputError over the limit, else the decompressor's exception."""
     declared: int = chunk.uncompressed_size
     room = min(declared, max_bytes) + 1  # unpackers allocate up to their limit
     data = _expanded(chunk.compression, chunk.data, room=room)
     if len(data) > max_bytes:
         size = f"a chunk of {len(chunk.data)} bytes unpacks to {max(declared, len(data)) / MIB:.1f} MiB"
-        raise InputError(source, "", f"{size}; at most {max_bytes / MIB:g}")
+        raise InputError(source, "", f"{size}; the maximum is {max_bytes / MIB:g} MiB")
     if len(data) != declared:
         raise ValueError(f"a chunk does not unpack to the declared {declared} bytes")
     return data
 
 
 def _expanded(compression: str, data: bytes, *, room: int) -> bytes:
-    """At most `room` bytes that are packed in data, which may be cut off."""
+    """Decompress at most `room` bytes from data that may be truncated."""
     if compression == "lz4":
         import lz4.frame
 

@@ -1,4 +1,4 @@
-"""The format of a recording: topics, messages and their schemas, encoded and decoded."""
+"""Format of recordings: topics, messages and their schemas, with encoding and decoding."""
 
 from __future__ import annotations
 
@@ -37,43 +37,43 @@ M = TypeVar("M", bound=BaseModel)
 
 
 class Message(BaseModel):
-    """Numbers are finite ones of JSON: text and booleans are refused."""
+    """A message in which every number is a finite JSON number; strings and booleans are refused."""
 
     model_config = ConfigDict(strict=True, allow_inf_nan=False)
 
 
 class EyeSample(Message):
-    """One sample of an eye-tracking sensor: the viewer's left eye, then the right; metres."""
+    """One sample of an eye-tracking sensor: the viewer's left eye first, in metres."""
 
     model_config = ConfigDict(title="phasestack.EyeSample")
 
-    sequence: Count = Field(description="counts the device's frames; gaps are losses")
-    capture_ns: Count = Field(description="monotonic clock when the light was integrated")
+    sequence: Count = Field(description="the device's frame number; gaps mean lost frames")
+    capture_ns: Count = Field(description="time of exposure, on the monotonic clock")
     eyes_m: tuple[Point, Point] | None = Field(description="frame `sensor` (+x right, +y down, +z away); null: no face")
     confidence: tuple[Unit, Unit] = Field((1.0, 1.0), description="0 to 1, left and right")
     covariance_m2: tuple[Row, Row, Row] | None = Field(
-        None, description="3x3, of the middle between the eyes; where it is known"
+        None, description="3x3 covariance of the midpoint of the eyes, if known"
     )
-    completed: Literal["", "left", "right"] = Field("", description="the eye that was hidden and filled in")
-    true_eyes_m: tuple[Point, Point] | None = Field(None, description="frame `stack`; only where the truth is known")
+    completed: Literal["", "left", "right"] = Field("", description="the eye that was hidden and has been filled in")
+    true_eyes_m: tuple[Point, Point] | None = Field(None, description="frame `stack`; only if the truth is known")
 
 
 class Stamp(Message):
-    """Capture time of a picture."""
+    """Capture time of a picture, as a message holds it."""
 
     sec: Annotated[int, Field(ge=0, le=NUMBER_MAX // NS_PER_S)]
     nsec: Annotated[int, Field(ge=0, lt=NS_PER_S)]
 
 
 class Stamped(Message):
-    """Common fields of picture messages, after Foxglove's schemas."""
+    """Common fields of picture messages, as in Foxglove's schemas."""
 
     timestamp: Annotated[Stamp, WithJsonSchema({"type": "object"})]
     frame_id: str = "sensor"
 
 
 class ColourImage(Stamped):
-    """A JPEG."""
+    """A colour picture as a JPEG."""
 
     model_config = ConfigDict(title="foxglove.CompressedImage")
 
@@ -82,7 +82,7 @@ class ColourImage(Stamped):
 
 
 class DepthImage(Stamped):
-    """Millimetres, 16 bits each, little-endian."""
+    """A depth picture in millimetres, as 16-bit little-endian numbers."""
 
     model_config = ConfigDict(title="foxglove.RawImage")
 
@@ -94,7 +94,7 @@ class DepthImage(Stamped):
 
 
 class Camera(Stamped):
-    """A pinhole without distortion."""
+    """A pinhole camera without distortion."""
 
     model_config = ConfigDict(title="foxglove.CameraCalibration")
 
@@ -118,7 +118,7 @@ SCHEMAS = {topic: message.model_json_schema() for topic, message in MESSAGES.ite
 
 @dataclass(frozen=True, slots=True)
 class RecordingHeader:
-    """Properties of the whole recording."""
+    """Properties of a whole recording."""
 
     driver: str  # name of the driver that delivered it
     serial: str = ""
@@ -126,7 +126,7 @@ class RecordingHeader:
     depth: bool = False
 
     def metadata(self) -> dict[str, str]:
-        """Return MCAP metadata, text to text."""
+        """Return the header as MCAP metadata, which maps text to text."""
         flags = {name: str(int(value)) for name, value in asdict(self).items() if isinstance(value, bool)}
         # `eye_points`: every sample says where the eyes are, or the absence of a face.
         texts = {"schema_version": str(SCHEMA_VERSION), "driver": self.driver, "serial": self.serial, "eye_points": "1"}
@@ -134,7 +134,7 @@ class RecordingHeader:
 
     @classmethod
     def from_metadata(cls, metadata: dict[str, str]) -> RecordingHeader:
-        """Invert `metadata`. Raises ValueError for another version."""
+        """Parse what `metadata` returned. Raises ValueError for another version."""
         version = metadata.get("schema_version", "missing")
         if version != str(SCHEMA_VERSION):
             raise ValueError(f"schema version {version}; this program reads {SCHEMA_VERSION}")
@@ -143,7 +143,7 @@ class RecordingHeader:
 
 
 def _read(kind: type[M], data: bytes) -> M:
-    """Parse a message. Raises ValueError, in one line that names the field."""
+    """Parse a message. Raises ValueError with one line that names the field."""
     try:
         return kind.model_validate_json(data)
     except ValidationError as error:
@@ -188,7 +188,7 @@ def frame_from_eyes_message(data: bytes) -> SensorFrame:
 
 
 def _stamped(capture_ns: int, **values: Any) -> bytes:
-    """Encode a picture message."""
+    """Encode a picture message as JSON."""
     seconds, nanoseconds = divmod(capture_ns, NS_PER_S)
     return json.dumps({"timestamp": {"sec": seconds, "nsec": nanoseconds}, "frame_id": "sensor"} | values).encode()
 
@@ -206,7 +206,7 @@ def colour_from_message(data: bytes, *, max_pixels: int = 1 << 26) -> U8:
     coded = base64.b64decode(_read(ColourImage, data).data)
     width, height = picture_size(coded)
     if max(width, height) > IMAGE_SIDE_MAX_PX or width * height > max_pixels:
-        raise ValueError(f"a colour image has {width} by {height} pixels; at most {max_pixels:,}")
+        raise ValueError(f"a colour image has {width} by {height} pixels; the maximum is {max_pixels:,} pixels")
     image = None if is_cut_off(coded) else cv2.imdecode(np.frombuffer(coded, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
         raise ValueError("a colour image cannot be decoded")
@@ -225,12 +225,12 @@ def depth_from_message(data: bytes) -> U16:
     image = _read(DepthImage, data)
     raw = base64.b64decode(image.data)
     if len(raw) != 2 * image.width * image.height:
-        raise ValueError(f"{image.width} by {image.height} pixels of 16 bits don't have {len(raw)} bytes")
+        raise ValueError(f"{len(raw)} bytes do not match {image.width} by {image.height} pixels of 16 bits")
     return np.frombuffer(raw, "<u2").reshape(image.height, image.width).astype(np.uint16)
 
 
 def calibration_message(intrinsics: Intrinsics, *, capture_ns: int) -> bytes:
-    """Encode pinhole intrinsics; Foxglove's pixel centres are integers, ours half-integers."""
+    """Encode pinhole intrinsics. Foxglove's pixel centres are integers, ours half-integers."""
     i = intrinsics
     matrix = [i.fx_px, 0.0, i.cx_px - 0.5, 0.0, i.fy_px, i.cy_px - 0.5, 0.0, 0.0, 1.0]
     projection = [*matrix[:3], 0.0, *matrix[3:6], 0.0, *matrix[6:], 0.0]

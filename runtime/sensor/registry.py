@@ -1,4 +1,4 @@
-"""Drivers by name. A driver's module and its SDK are imported only when used."""
+"""Sensor drivers by name. A driver's module and its SDK are imported only when they are used."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ DRIVERS = {  # included in phasestack
 
 
 def open_sensor(settings: SensorSettings, clock: Clock, *, latency_ms: float = 0.0) -> Sensor:
-    """Create the configured driver, unopened: an included one, or a user's class (`module:Class`).
+    """Create the configured driver, unopened: a built-in one, or a custom class (`module:Class`).
 
-    latency_ms: from capture to arrival, for replay. Raises InputError for an unknown name or options that the class
-    refuses, MissingPart for an SDK that is not installed.
+    latency_ms: from capture to arrival, for replay. Raises InputError for an unknown name or for options that the class
+    refuses, MissingPart if an SDK is not installed.
     """
     name = settings.driver
     if is_plugin(name):

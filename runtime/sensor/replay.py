@@ -1,4 +1,4 @@
-"""Driver `replay`: plays a recording like a sensor, in real time or as fast as it is read."""
+"""Driver `replay`: plays a recording as if it were a sensor, in real time or as fast as it is read."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ log = logging.getLogger(__name__)
 
 
 def demo_recording_path() -> Path:
-    """Path of the built-in recording."""
+    """Return the path of the built-in recording."""
     return Path(str(files("runtime.sensor") / "data" / "demo.mcap"))
 
 
 class ReplayDriver(SteppedSensor):
-    """Plays a recording with its rates and gaps, on the run's clock from `open`.
+    """Plays a recording with its original rate and gaps, on the run's clock, starting at `open`.
 
-    A sample arrives at its capture time plus the latency. Samples not later than their predecessor are skipped, and the
-    first of these is logged.
+    A sample arrives at its capture time plus the latency. Samples not later than their predecessor are skipped, and
+    the first skipped one is logged.
     """
 
     name = "replay"
@@ -51,23 +51,25 @@ class ReplayDriver(SteppedSensor):
         self._next = next(self._frames, None)
 
     def _ordered(self, recording: Recording) -> Iterator[SensorFrame]:
-        """Yield samples with increasing capture times. Raises InputError for too long a recording."""
+        """Yield samples with increasing capture times. Raises InputError if the recording is too long."""
         last_ns, is_logged = -1, False
         for number, frame in enumerate(recording.samples()):
             if frame.capture_ns <= last_ns:
                 if not is_logged:
-                    log.warning("%s: skipping samples not later than the one before: %d", self.path, frame.sequence)
+                    log.warning(
+                        "%s: skipping samples that are not later than their predecessor: %d", self.path, frame.sequence
+                    )
                 is_logged = True
                 continue
             seconds = (frame.capture_ns - recording.first.capture_ns) / NS_PER_S
             if seconds > LIMITS.recording_s:
-                problem = f"sample {number} is {seconds:.6g} s after the first; at most {LIMITS.recording_s:g}"
+                problem = f"sample {number} is {seconds:.6g} s after the first; the maximum is {LIMITS.recording_s:g} s"
                 raise InputError(self.path, "capture_ns", problem)
             last_ns = frame.capture_ns
             yield frame
 
     def _shifted(self, recording: Recording) -> Iterator[SensorFrame]:
-        """Yield samples on the run's clock; a loop starts over after the recording's last interval."""
+        """Yield samples on the run's clock. A loop starts over after the recording's last interval."""
         last_ns = interval_ns = sequence_shift = last_sequence = shift_ns = 0
         is_first_round = True
         while True:

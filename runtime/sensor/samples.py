@@ -1,4 +1,4 @@
-"""Sources of samples: a sensor thread in real time, or a recording on the simulated clock."""
+"""Sources of samples: a sensor thread in real time, or a recording on a simulated clock."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.base import Sensor, SteppedSensor
 
 FindEyes = Callable[[SensorFrame], EyePoints | None]
-AHEAD_NS = NS_PER_S // 10  # longer than the time from a sample to the display of a refresh that used it
+AHEAD_NS = NS_PER_S // 10  # exceeds the time from a sample to the display of a refresh that used it
 
 
 class Samples(ABC):
     """The presenter's interface to the sensor. No method waits."""
 
     stale_inputs: int  # samples superseded by a newer one before use
-    serial: str  # the sensor's, if known
+    serial: str  # the sensor's serial number, if known
 
     @abstractmethod
     def arrived(self, now_ns: int) -> list[SensorFrame]:
-        """Return samples that arrived since the last call, in order. Raises EndOfRecording, FatalError."""
+        """Return the samples that arrived since the last call, in order. Raises EndOfRecording, FatalError."""
 
     def fault(self) -> str:
-        """Reason why there is no working sensor; empty if there is one."""
+        """Return why there is no working sensor, or an empty string if there is one."""
         return ""
 
     def recorded_ahead(self) -> list[SensorFrame]:
-        """Samples of a recording just after the last refresh, for evaluating it; [] for a live sensor."""
+        """Return a recording's samples just after the last refresh, to evaluate it; [] for a live sensor."""
         return []
 
     @abstractmethod
@@ -39,24 +39,24 @@ class Samples(ABC):
 
 
 def finder(sensor: Sensor, make_find: Callable[[], FindEyes] | None) -> FindEyes | None:
-    """Create the eye finder for an open sensor; None if it delivers eyes itself."""
+    """Create an eye finder for an open sensor, or return None if the sensor delivers eyes itself."""
     return None if sensor.capabilities.eye_points or make_find is None else make_find()
 
 
 def searched(frame: SensorFrame, find: FindEyes | None, *, keep_images: bool = False) -> SensorFrame:
-    """Find the eyes in a sample's pictures, which are then dropped unless `keep_images`."""
+    """Find the eyes in a sample's pictures, then drop the pictures unless `keep_images` is set."""
     if find is not None:
         frame = replace(frame, eyes=find(frame))
     return frame if keep_images else replace(frame, colour=None, depth_mm=None)
 
 
 class RecordedSamples(Samples):
-    """A recording on the simulated clock: each sample arrives at its capture plus the configured latency."""
+    """A recording on the simulated clock: each sample arrives the configured latency after its capture."""
 
     def __init__(self, driver: Sensor) -> None:
-        """Raise InputError if the driver can't be stepped or the recording can't be read."""
+        """Raise InputError if the driver is not a recording's, or if the recording can't be read."""
         if not isinstance(driver, SteppedSensor):
-            raise InputError("run", "--max-speed", f"needs a recording, not the sensor {driver.name}")
+            raise InputError("run", "--max-speed", f"requires a recording, not the sensor {driver.name}")
         self._driver = driver
         self.stale_inputs = 0
         driver.open()

@@ -1,4 +1,4 @@
-"""Driver `usb-camera`: a webcam through V4L2; the eyes' separation gives their distance."""
+"""Driver `usb-camera`: a webcam, through V4L2. The eyes' distance follows from their separation."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from runtime.records import Intrinsics, SensorFrame
 from runtime.sensor.base import Capabilities, Sensor
 from runtime.support.film import open_film
 
-WAITED_NS = 3 * NS_PER_MS  # a picture that arrives sooner was queued in the driver, and newer ones may be too
-QUEUE_MAX = 8  # most pictures taken from the driver's queue in one read
+WAITED_NS = 3 * NS_PER_MS  # a picture that arrives sooner was already queued in the driver, where newer ones may be too
+QUEUE_MAX = 8  # maximum number of pictures taken from the driver's queue in one read
 STAMP_AGE_NS = NS_PER_S  # older timestamps, and future ones, are ignored
 STREAMS = ("rtsp", "rtsps", "http", "https")  # FFmpeg's other protocols may listen or open other files
 
 
 class UsbCameraDriver(Sensor):
-    """Delivers the newest picture, with the kernel's timestamp of the end of exposure."""
+    """Delivers the newest picture, with the kernel's timestamp of when its exposure ended."""
 
     name = "usb-camera"
     capabilities = Capabilities(colour=True)
 
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
-        """settings.source: empty or `demo` (the first camera), a number, a device, a file, or a URL of `STREAMS`.
+        """settings.source: empty or `demo` (the first camera), a number, a device, a file, or a `STREAMS` URL.
 
-        Raises InputError for another URL, or without a field of view, which no webcam reports.
+        Raises InputError for any other URL, or if the field of view, which no webcam reports, is not set.
         """
         if not settings.fov_deg:
-            raise InputError("sensor", "fov_deg", "is required by usb-camera: horizontal field of view, degrees")
+            raise InputError("sensor", "fov_deg", "is required by usb-camera: the horizontal field of view in degrees")
         source = settings.source if settings.source != "demo" else ""
         protocol = re.match(r"([\w+.-]+):", source)
         if protocol is not None and protocol[1] not in STREAMS:
-            raise InputError("sensor", "source", f"{protocol[1]}: is not supported; use {', '.join(STREAMS)}")
+            raise InputError("sensor", "source", f"{protocol[1]}: not supported; use one of {', '.join(STREAMS)}")
         self._source = f"/dev/video{source or 0}" if re.fullmatch(r"\d*", source) else source
         self._fov, self._clock = radians(settings.fov_deg), clock
         self._capture: Any = None
@@ -57,7 +57,7 @@ class UsbCameraDriver(Sensor):
         if not capture.isOpened():
             capture.release()
             raise SensorLost(
-                f"{self._source}: cannot be opened (used by another program, or no permission: group video)"
+                f"{self._source}: cannot be opened (in use by another program, or no permission: join the group video)"
             )
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         self._capture = capture

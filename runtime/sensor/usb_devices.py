@@ -1,4 +1,4 @@
-"""Known USB depth cameras, as reported by `doctor`."""
+"""Known USB depth cameras, for `doctor`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SUPER_SPEED = 4  # libusb's number of USB 3's speed
 
 
 class KnownDevice(NamedTuple):
-    """One USB device, opened by the driver `openni2` or `realsense`."""
+    """A USB device that the driver `openni2` or `realsense` can open."""
 
     vendor_id: int
     product_id: int
@@ -61,12 +61,12 @@ class UsbDevice:
         return f"{self.known.name} ({self.usb_id}, {SPEEDS.get(self.speed, 'unknown')})"
 
     def problems(self) -> list[str]:
-        """Problems that prevent its use, each with its remedy."""
+        """List the problems that prevent its use, each with a remedy."""
         problems = []
         if self.known.needs_usb3 and 0 < self.speed < SUPER_SPEED:
-            problems.append(f"is on {SPEEDS[self.speed]} and needs USB 3: use a blue port and the original cable")
+            problems.append(f"connected at {SPEEDS[self.speed]}, needs USB 3: use a blue port and the original cable")
         if not self.is_accessible:
-            problems.append(f"permission denied: install the udev rule {UDEV_RULE} and plug it in again")
+            problems.append(f"permission denied: install the udev rule {UDEV_RULE} and reconnect the device")
         return problems
 
 
@@ -96,6 +96,6 @@ def find_devices(backend: Any = None) -> list[UsbDevice]:
     except usb.core.NoBackendError:
         raise MissingPart("libusb is not installed (Debian: apt install libusb-1.0-0)") from None
     except usb.core.USBError as error:
-        raise SensorLost(f"the USB bus cannot be listed: {error}") from None
+        raise SensorLost(f"USB devices cannot be listed: {error}") from None
     connected = [_described(device, known) for device, known in pairs if known is not None]
     return sorted(connected, key=lambda d: (d.bus, d.address))

@@ -1,4 +1,4 @@
-"""The sensor's thread: queues samples, reopens lost sensors, and abandons hung SDK calls."""
+"""Sensor thread, which queues samples, reopens lost sensors and abandons SDK calls that hang."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 
 class SensorState(StrEnum):
-    """State of the sensor."""
+    """States of the sensor."""
 
     OPENING = "opening"
     RUNNING = "running"
@@ -48,10 +48,10 @@ class SensorState(StrEnum):
 
 
 class _Attempt:
-    """One thread with one driver. Once `abandoned`, its results are ignored."""
+    """One thread that runs one driver. Once it is `abandoned`, its results are ignored."""
 
     def __init__(self, number: int, run: Callable[[_Attempt], None], *, wait_s: float, deadline_ns: int) -> None:
-        """Start the thread. Raises TransientError if there is none at present."""
+        """Start the thread. Raises TransientError if the system has no thread to spare."""
         self.number, self.abandoned = number, threading.Event()
         self.wait_s, self.deadline_ns = wait_s, deadline_ns
         self.received = 0
@@ -59,7 +59,7 @@ class _Attempt:
 
 
 class SensorWorker(Samples):
-    """Runs a driver in its own thread. No method blocks except `close`, up to its timeout."""
+    """Runs a driver in its own thread. Only `close` blocks, up to its timeout."""
 
     def __init__(
         self,
@@ -70,7 +70,7 @@ class SensorWorker(Samples):
         *,
         keep_images: bool = False,
     ) -> None:
-        """make_driver: creates an unopened driver; make_find: creates an eye finder, for drivers without eye points."""
+        """make_driver: creates an unopened driver; make_find: creates an eye finder for drivers without one."""
         self._make, self._settings, self._clock = make_driver, settings, clock
         self._make_find, self._keep_images = make_find, keep_images
         self._lock, self._watching = threading.Lock(), threading.Lock()
@@ -87,7 +87,7 @@ class SensorWorker(Samples):
         self.error: FatalError | None = None
 
     def start(self) -> None:
-        """Start in the background."""
+        """Start the sensor thread in the background."""
         self._state = SensorState.OPENING
         self._begin(0.0)
 
@@ -122,7 +122,7 @@ class SensorWorker(Samples):
 
     @property
     def state(self) -> SensorState:
-        """State of the sensor; `reason` has the reason."""
+        """Return the sensor's state; `reason` explains it."""
         self._watch()
         return self._state
 
@@ -132,11 +132,11 @@ class SensorWorker(Samples):
 
     @property
     def capabilities(self) -> Capabilities | None:
-        """Capabilities of the driver once opened."""
+        """Return the driver's capabilities, once it is open."""
         return self._driver.capabilities if self._driver else None
 
     def close(self, timeout_s: float = 1.0) -> None:
-        """Close the driver, or abandon it after the timeout."""
+        """Close the driver, or abandon it once the timeout has passed."""
         attempt, self._attempt = self._attempt, None
         if attempt is not None:
             attempt.abandoned.set()
@@ -144,7 +144,7 @@ class SensorWorker(Samples):
         self._state, self.reason = SensorState.STOPPED, ""
 
     def _watch(self) -> None:
-        """Abandon a thread whose call takes too long, and start another."""
+        """Abandon a thread whose call takes too long, and start a new one."""
         if not self._watching.acquire(blocking=False):
             return  # another thread is doing it
         try:
@@ -175,7 +175,7 @@ class SensorWorker(Samples):
                 self._state, self.reason = state, reason
 
     def _account(self, driver: Sensor | None) -> None:
-        """Keep the count of a driver that is about to be discarded."""
+        """Add up the counts of a driver that is about to be discarded."""
         with self._lock:
             if driver is not None and driver is self._driver:
                 self._skipped += driver.skipped
@@ -275,11 +275,11 @@ class SensorWorker(Samples):
                 self._set(attempt, SensorState.RUNNING, "")
 
     def _timely(self, frames: list[SensorFrame], now_ns: int) -> list[SensorFrame]:
-        """Filter frames with plausible capture times. Raises FatalError if none ever had one."""
+        """Return the frames with plausible capture times. Raises FatalError if no frame ever had one."""
         timely = [frame for frame in frames if -AHEAD_NS <= now_ns - frame.capture_ns <= BEHIND_NS]
         if len(timely) < len(frames):
             ahead_s = (frames[-1].capture_ns - now_ns) / NS_PER_S
-            self._untimely = f"capture times are {ahead_s:+.3f} s from now: not on the run's clock"
+            self._untimely = f"capture times are {ahead_s:+.3f} s from the current time: not on the run's clock"
             if not self._was_well:
                 raise FatalError(self._untimely)
             with self._lock:
@@ -289,7 +289,7 @@ class SensorWorker(Samples):
     def _check_changing(self, frame: SensorFrame, now_ns: int) -> None:
         """Raise SensorLost if a picture or the eyes have not changed for `FROZEN_NS`.
 
-        Missing eye points and depth pictures without measurements may last.
+        Missing eye points, or depth pictures without measurements, may persist indefinitely.
         """
         compared = {
             "picture has": None if frame.colour is None else frame.colour[COMPARED, COMPARED],
@@ -302,7 +302,7 @@ class SensorWorker(Samples):
             if array is None or checksum != before or (subject.startswith("depth") and not array.any()):
                 self._delivered[subject] = checksum, now_ns
             elif now_ns - since_ns > FROZEN_NS:
-                raise SensorLost(f"its {subject} not changed for {FROZEN_NS / NS_PER_S:g} s")
+                raise SensorLost(f"the {subject} not changed for {FROZEN_NS / NS_PER_S:g} s")
 
     def _keep(self, frame: SensorFrame) -> None:
         """Queue a sample, dropping the oldest ones if the queue is full."""

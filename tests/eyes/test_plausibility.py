@@ -59,14 +59,14 @@ def test_any_six_numbers_are_judged(numbers: list[float]) -> None:
 def test_the_watch_tells_once_counts_by_reason_and_takes_it_back() -> None:
     watch = p.RefusalWatch()
     told = [watch.update(p.EXCHANGED) for _ in range(100)]
-    assert [line for line in told if line] == [watch.warning] and "left and right exchanged" in watch.warning
+    assert [line for line in told if line] == [watch.warning] and "left and right swapped" in watch.warning
     assert watch.counts == {p.EXCHANGED: 100}
     told = [watch.update("") for _ in range(100)]
     assert [line for line in told if line] == ["sensor: the eyes are plausible again"] and watch.warning == ""
 
 
 @pytest.mark.parametrize(
-    "reasons", [(p.MILLIMETRES, "", "", "", ""), ("uncertain",), ("elsewhere than the viewer", "")]
+    "reasons", [(p.MILLIMETRES, "", "", "", ""), ("uncertain",), ("not where the viewer is", "")]
 )
 def test_a_few_bad_samples_are_counted_and_are_no_fault(reasons: tuple[str, ...]) -> None:
     watch = p.RefusalWatch()

@@ -134,7 +134,7 @@ def test_two_people_in_turn_never_make_a_third_and_the_first_stays(pattern: str,
     served = serve(motion, in_turn(pattern))
     assert served.p95_mm() <= 15.0
     assert served.error_mm.max() < 100.0  # the other is 370 mm away
-    assert served.viewer.refused == {"elsewhere than the viewer": served.viewer.refused["elsewhere than the viewer"]}
+    assert served.viewer.refused == {"not where the viewer is": served.viewer.refused["not where the viewer is"]}
 
 
 def test_a_viewer_who_left_makes_way_for_another_within_a_second() -> None:

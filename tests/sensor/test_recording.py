@@ -129,7 +129,7 @@ def test_a_truncated_file_opens_up_to_its_last_whole_sample(tmp_path: Path, capl
             continue
         found = list(recording.samples())
         assert [f.sequence for f in found] == list(range(1, 1 + len(found)))
-        assert not recording.is_whole and "cut off" in caplog.text
+        assert not recording.is_whole and "truncated" in caplog.text
         counts.append(len(found))
         assert len(found) == (ends <= size).sum()
     assert counts == sorted(counts) and counts[-1] > 280
@@ -198,9 +198,9 @@ def test_another_program_s_recording_is_called_so_with_what_one_must_hold(tmp_pa
         Recording(path)
     for data, told in (
         (b"", "is empty"),
-        (b"#ROSBAG V2.0\n", "a bag of ROS 1: `mcap convert`"),
-        (b"SQLite format 3\0", "a bag of ROS 2 in SQLite: `ros2 bag convert`"),
-        (b"version https://git-lfs", r"a pointer of Git LFS: `git lfs pull`"),
+        (b"#ROSBAG V2.0\n", "a ROS 1 bag; convert it with `mcap convert`"),
+        (b"SQLite format 3\0", "a ROS 2 bag in SQLite; convert it with `ros2 bag convert`"),
+        (b"version https://git-lfs", r"a Git LFS pointer; fetch the file with `git lfs pull`"),
         (b"abc", "is not an MCAP"),
     ):
         path.write_bytes(data)
@@ -229,7 +229,7 @@ def test_a_recording_cut_before_its_first_sample_is_called_cut_off(tmp_path: Pat
     data = demo_recording_path().read_bytes()
     for size in (40, 1000):
         (tmp_path / "a.mcap").write_bytes(data[:size])
-        with pytest.raises(InputError, match="is cut off before"):
+        with pytest.raises(InputError, match="ends before"):
             Recording(tmp_path / "a.mcap")
 
 
@@ -358,7 +358,7 @@ def test_a_small_chunk_that_becomes_a_large_one_takes_no_memory(tmp_path: Path) 
     *told, grown_mib = answer.stdout.splitlines()
     assert int(grown_mib) < 120
     for name, line in zip(names, told, strict=True):
-        assert ("unpacks to 300.0 MiB; at most 32" if name.endswith(f"-{300 << 20}.mcap") else name) in line
+        assert ("unpacks to 300.0 MiB; the maximum is 32 MiB" if name.endswith(f"-{300 << 20}.mcap") else name) in line
 
 
 def test_two_recorders_into_one_file_are_one_too_many(tmp_path: Path) -> None:
