@@ -158,7 +158,7 @@ def test_one_view_is_refused_and_so_is_a_layout_for_two_files(pair: Path) -> Non
     arguments = solve_arguments(pair)
     at = arguments.index("--right")
     assert "left.png: layout: holds 1 view: give --right, or --layout" in refusal(*arguments[:at], *arguments[at + 2 :])
-    assert "solve: --layout: needs one file with both views" in refusal(*arguments, "--layout", "side-by-side")
+    assert "solve: --layout: requires one file with both views" in refusal(*arguments, "--layout", "side-by-side")
     assert "--layout: layout" in refusal("run", "--replay", "demo", "--headless", "--layout", "sideways")
 
 

@@ -1,1 +1,1 @@
-"""A module for each command: arguments on top, everything heavy imported inside."""
+"""One module for each command: arguments at the top, heavy imports inside the functions."""

@@ -1,4 +1,4 @@
-"""All commands by name. A command's own dependencies are imported only when it runs."""
+"""All commands by name. A command's dependencies are imported only when it runs."""
 
 from __future__ import annotations
 
@@ -80,4 +80,4 @@ def options(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and exit")
     ] = False,
 ) -> None:
-    """Options of all commands; typer shows the app's help instead of this text."""
+    """Handle the options that precede a command; typer shows the app's help instead of this text."""

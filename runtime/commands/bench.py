@@ -1,4 +1,4 @@
-"""`phasestack bench`: the frontier's regression file, and comparison of two files."""
+"""`phasestack bench`: write the frontier's regression file, or compare two of them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ app = typer.Typer()
 @app.callback(invoke_without_command=True)
 def bench(
     context: typer.Context,
-    out: Annotated[Path | None, typer.Option(help="write the regression file here (JSON)")] = None,
+    out: Annotated[Path | None, typer.Option(help="regression file to write (JSON)")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
     """Measure time, light and memory of the shipped models at two sizes, or compare two measurements.
@@ -45,7 +45,7 @@ def compare(
     new: Annotated[Path, typer.Argument(help="the later one")],
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
-    """List what became slower or worse beyond noise. Exits with 1 if anything did.
+    """List every figure that became slower or worse by more than noise. Exits with 1 if there is any.
 
     Times are not compared if the machine was too busy during either measurement.
 
@@ -64,12 +64,12 @@ def compare(
         print(to_json({"worse": len(worse), "changes": rows, "times_compared": not busy, "too_busy": busy}))
     else:
         for why in busy:
-            print(f"times are not compared, the machine was too busy: {why}")
+            print(f"times are not compared because the machine was too busy: {why}")
         speed = after.yardstick_ms / before.yardstick_ms
-        print(f"machine: {speed:.2f} times the time of the yardstick; solutions are compared net of it")
+        print(f"machine: the yardstick takes {speed:.2f} times as long; times of solutions are corrected for this")
         for change in sorted(changes, key=lambda change: not change.worse):
             print(f"{'worse ' if change.worse else 'better'} {change.what}: {change.text}")
-        again = ", except times, which cannot be compared: measure again" if busy else ""
+        again = ", except for times, which cannot be compared: measure again" if busy else ""
         ends = f"{len(worse)} worse, {len(changes) - len(worse)} better"
         print(ends if changes else f"no change beyond noise{again}")
     if worse:

@@ -1,12 +1,12 @@
-"""`phasestack config`: every setting with its default and meaning."""
+"""`phasestack config`: all settings with their defaults and meanings."""
 
 from __future__ import annotations
 
 
 def config() -> None:
-    """Print a complete configuration in TOML: every setting with its default and its meaning.
+    """Print a complete configuration in TOML: every setting with its default and meaning.
 
-    Paths in a configuration are relative to its folder. `phasestack doctor --config FILE` checks one.
+    Paths in a configuration are relative to its folder. To check one, run `phasestack doctor --config FILE`.
 
     Example: phasestack config > phasestack.toml
     """

@@ -1,4 +1,4 @@
-"""`phasestack ctl` and `status`: commands to the running daemon, and its state."""
+"""`phasestack ctl` and `status`: control of the running daemon, and its state."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def scene(
     name: Annotated[str, typer.Argument(help="a value of `content.scene`, or `next`: the playlist's next entry")],
     config: Config = None,
 ) -> None:
-    """Show another scene: a built-in one such as `demo`, or a file or folder (`./NAME`) on this machine.
+    """Show another scene: a built-in one such as `demo`, or a file or folder (`./NAME`) on this PC.
 
-    The current scene stays until the new one has loaded. If loading fails, it remains and this exits with 2.
+    The current scene stays until the new one has loaded. If loading fails, it remains, and the exit code is 2.
 
     Example: phasestack ctl scene demo
     """
@@ -81,9 +81,9 @@ PLAIN = {
     "pause": "Freeze the picture until `resume`.",
     "resume": "Follow the viewer again, after `pause` or `flat`.",
     "flat": "Show the flat (2D) picture until `resume`.",
-    "reload": "Read the configuration again. An invalid one is refused and the old one stays in force.\n\n"
+    "reload": "Read the configuration again. An invalid one is refused, and the old one stays in force.\n\n"
     "Scene, model and placement set by `ctl` stay unless the file has a new value for them.",
-    "blackbox": "Write the last minutes (eyes, states, times, log) to an MCAP file, and print its name.",
+    "blackbox": "Write the last two minutes (eyes, states, times, log) to an MCAP file, and print its name.",
 }  # commands without a value
 
 
@@ -98,7 +98,7 @@ for _name, _meaning in PLAIN.items():
 
 
 def tell(request: dict[str, Any], config: Path | None) -> None:
-    """Send one request and print the new state. Exits with 1 if no daemon answers, 2 if it refuses."""
+    """Send one request and print the new state. Exits with 1 if no daemon answers, with 2 if it refuses."""
     from runtime.daemon.client import ANSWERED_WITHIN_S, NotRunning, ask, sockets
     from runtime.errors import InputError
     from runtime.support.figures import lines_of
@@ -115,7 +115,7 @@ def tell(request: dict[str, Any], config: Path | None) -> None:
 
 
 def _advised(error: Exception) -> str:
-    """Error of an unanswered request, with advice for the user."""
+    """Return the error of an unanswered request, with advice for the user."""
     from runtime.daemon.client import unit_advice
 
     advice = unit_advice()
@@ -129,7 +129,7 @@ def status(
 ) -> None:
     """Show the running daemon: state and reason, rates, eyes and their uncertainty, times, faults.
 
-    Exits with 1 if no daemon answers, or its loop has hung for five seconds.
+    Exits with 1 if no daemon answers, or if its loop has hung for five seconds.
 
     Example: phasestack status --json
     """

@@ -1,4 +1,4 @@
-"""`phasestack demo`: the main job on the built-in recording and scene."""
+"""`phasestack demo`: the main job, run on the built-in recording and scene."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LONGEST_S, LEAST = 45.0, 15  # a slower machine shows fewer refreshes, but enoug
 
 def demo(
     out: Annotated[Path, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = Path("out/demo"),
-    frames: Annotated[int, typer.Option(min=1, help="number of refreshes; all 600 take minutes")] = FRAMES,
+    frames: Annotated[int, typer.Option(min=1, help="number of refreshes; all 600 take several minutes")] = FRAMES,
     as_json: Annotated[bool, typer.Option("--json", help="the summary as one JSON object on stdout")] = False,
 ) -> None:
     """Replay a built-in recording of a moving head through the whole pipeline, without a screen.
@@ -29,7 +29,7 @@ def demo(
     from runtime.daemon.drive import drive, print_summary
 
     class InTime(Host):
-        """Ends a short demo in time on slow machines."""
+        """Ends the demo after a time limit on slow machines."""
 
         def __init__(self) -> None:
             self._ends_s = time.monotonic() + LONGEST_S if frames <= FRAMES else float("inf")
@@ -38,7 +38,7 @@ def demo(
         def stop_reason(self) -> str:
             self._asked += 1
             is_over = self._asked >= LEAST and time.monotonic() > self._ends_s
-            return f"{LONGEST_S:g} s are up on this machine" if is_over else ""
+            return f"the time limit of {LONGEST_S:g} s is up" if is_over else ""
 
     every = MEASURED_EVERY if frames <= 4 * FRAMES else 60  # comparing takes as long as ten refreshes
     settings = changed(Settings(), "loop", {"evaluate_every": every}, source="demo")

@@ -1,6 +1,6 @@
 """`phasestack doctor`: check everything that the configuration needs, with a remedy for each fault.
 
-Each check is a small function from the settings to rows of a table.
+Each check is a small function that takes the settings and returns rows of a table.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ NO_DEVICE = ("replay", "fixed")  # drivers that need no device
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One line of the table."""
+    """One row of the table."""
 
     name: str
     state: Verdict
@@ -46,13 +46,13 @@ def doctor(
     config: Annotated[Path | None, typer.Option(help="configuration to check; without one, the defaults")] = None,
     as_service: Annotated[
         bool,
-        typer.Option("--service", help="as the service: its user, groups, environment and configuration (needs root)"),
+        typer.Option("--service", help="check as the service, with its user, groups and configuration (needs root)"),
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout")] = False,
 ) -> None:
-    """Check settings, sensor, permissions, OpenGL, monitors, scene, model, calibration and service.
+    """Check the settings, sensor, permissions, OpenGL, monitors, scene, model, calibration and service.
 
-    Unusual findings are warnings. Exits with 1 if a check fails.
+    Anything unusual is a warning. Exits with 1 if a check fails.
 
     Example: phasestack doctor --config /etc/phasestack/phasestack.toml
 
@@ -76,7 +76,7 @@ def doctor(
 
 
 def _become_service() -> None:
-    """Turn this process into one that systemd would start, except for the unit's sandbox. Raises InputError."""
+    """Turn this process into what systemd would start, except for the unit's sandbox. Raises InputError."""
     import grp
     import pwd
     import shlex
@@ -102,7 +102,7 @@ Check = Callable[["Settings"], Iterator[Row]]
 
 
 def examine(settings: Settings) -> list[Row]:
-    """Run all checks. An unexpected exception becomes a failed row."""
+    """Run all checks. An unexpected exception is reported as a failed row."""
     rows: list[Row] = []
     for name, check in CHECKS.items():
         try:
@@ -118,7 +118,7 @@ def examine(settings: Settings) -> list[Row]:
 
 
 def sensor(settings: Settings) -> Iterator[Row]:
-    """Check that the configured driver opens and delivers."""
+    """Check that the configured driver opens and delivers samples."""
     from runtime.clock import MonotonicClock
     from runtime.errors import EndOfRecording, SensorLost, SensorTimeout
     from runtime.eyes.calibration import load_calibration
@@ -135,7 +135,7 @@ def sensor(settings: Settings) -> Iterator[Row]:
         driver.open()
         frame = driver.read_newest(CHECK_SENSOR_FOR_S)
     except (SensorLost, SensorTimeout, EndOfRecording) as error:
-        remedy = "docs/sensors.md, A driver of your own" if own else "plug it in; see the usb rows and docs/planning.md"
+        remedy = "docs/sensors.md, A driver of your own" if own else "connect it; see the usb rows and docs/planning.md"
         yield Row("sensor", "fail", f"{what}: {error or 'no sample'}", remedy)
         return
     finally:
@@ -146,11 +146,11 @@ def sensor(settings: Settings) -> Iterator[Row]:
     yield Row("sensor", "ok", f"{what} delivers {', '.join(kinds) or 'frames without a face'}{serial}")
     calibrated = load_calibration(Path(settings.calibration.file) if settings.calibration.file else None)
     if warning := calibrated.serial_warning(driver.serial):
-        yield Row("calibration", "fail", warning, "phasestack calibrate capture, then solve, with this sensor")
+        yield Row("calibration", "fail", warning, "run `phasestack calibrate capture`, then `solve`, with this sensor")
 
 
 def usb(settings: Settings) -> Iterator[Row]:
-    """Check depth cameras on USB: port speed, permissions, driver."""
+    """Check depth cameras on USB: port speed, permissions and driver."""
     from runtime.errors import MissingPart
     from runtime.sensor.usb_devices import find_devices
 
@@ -163,8 +163,8 @@ def usb(settings: Settings) -> Iterator[Row]:
         yield Row("usb", absent, str(error), "install it" if needed else "")
         return
     if not devices:
-        remedy = "plug one in; docs/planning.md lists them" if needed else ""
-        yield Row("usb", absent, "no known depth camera is plugged in", remedy)
+        remedy = "connect one; docs/planning.md lists them" if needed else ""
+        yield Row("usb", absent, "no known depth camera is connected", remedy)
     for device in devices:
         problems = device.problems()
         state: Verdict = "ok" if not problems else "fail" if needed else "warn"
@@ -185,7 +185,7 @@ def opengl(settings: Settings) -> Iterator[Row]:
             yield Row("opengl", "warn", f"this user can't open {node}", "join the groups video and render")
     software = any(name in found["renderer"].lower() for name in ("llvmpipe", "softpipe", "swrast"))
     bad = software and (settings.output.kind != "offscreen" or settings.model.backend == "gl")
-    slow = "slow software rendering; install the GPU's driver if there is a GPU" if software else ""
+    slow = "rendering in software is slow; if there is a GPU, install its driver" if software else ""
     yield Row("opengl", "warn" if bad else "ok", f"{found['renderer']}, {found['version']} ({found['vendor']})", slow)
 
 
@@ -200,7 +200,7 @@ def monitors(settings: Settings) -> Iterator[Row]:
         return
     from runtime.panels.display import connected_monitors
 
-    remedy = "phasestack identify shows each monitor's name"
+    remedy = "run `phasestack identify`, which shows each monitor's name"
     try:
         there = connected_monitors()
     except PanelLost as error:
@@ -210,7 +210,12 @@ def monitors(settings: Settings) -> Iterator[Row]:
     named = {panel.connector for panel in panels}
     for monitor in there:
         known = monitor.serial or monitor.connector in named
-        yield Row("monitor", "ok", str(monitor), "" if known else "has no EDID serial: bind it by connector")
+        yield Row(
+            "monitor",
+            "ok",
+            str(monitor),
+            "" if known else "no EDID serial number: bind it by connector",
+        )
     try:
         bound = bind(panels, there)
         check_modes(panels, bound, width_px=settings.stack.width_px, height_px=settings.stack.height_px)
@@ -232,7 +237,7 @@ def content(settings: Settings) -> Iterator[Row]:
 
 
 def model(settings: Settings) -> Iterator[Row]:
-    """Check that the network loads, fits the stack and has its provider; time a solution."""
+    """Check that the network loads, fits the stack and has its provider, and time a solution."""
     import cv2
 
     from runtime.model.backends import choose
@@ -253,14 +258,14 @@ def model(settings: Settings) -> Iterator[Row]:
         rate = _rate(predictor, choice.backend, settings)
         predictor.close()
     other = settings.model.name not in name and "/" not in settings.model.name
-    remedy = f"{settings.model.name} does not fit this stack" if other else ""
+    remedy = f"the network of {settings.model.name} does not fit this stack" if other else ""
     yield Row("model", "warn" if other else "ok", f"{name} on {settings.model.provider}", remedy)
     yield Row("backend", "ok", f"{choice.backend.name} for the solver steps: {choice.why}")
     yield rate
 
 
 def _rate(predictor: Predictor, backend: SolverBackend, settings: Settings) -> Row:
-    """Rate of full solutions on the configured raster, for pictures without plain regions (the slowest)."""
+    """Return the rate of full solutions on the configured raster, for the slowest kind of picture."""
     from dataclasses import replace
 
     from runtime.model.backends import solution_ms
@@ -282,17 +287,17 @@ def _rate(predictor: Predictor, backend: SolverBackend, settings: Settings) -> R
 
 
 def calibration(settings: Settings) -> Iterator[Row]:
-    """Check the calibration file: a similarity, and for a real sensor not the demo's."""
+    """Check that the calibration is a similarity and, for a real sensor, not the demo's."""
     from runtime.eyes.calibration import load_calibration
     from runtime.sensor.base import Sensor
 
     if not settings.calibration.file:
         driver = settings.sensor.driver
         if is_plugin(driver) and plugin_class(driver, Sensor, field="sensor.driver").capabilities.in_stack_frame:
-            yield Row("calibration", "ok", "not needed: this sensor delivers eyes in the stack's frame")
+            yield Row("calibration", "ok", "not needed, since this sensor delivers eyes in the stack's frame")
             return
         real = driver not in NO_DEVICE
-        remedy = "phasestack calibrate capture, then solve, and set calibration.file" if real else ""
+        remedy = "run `phasestack calibrate capture`, then `solve`, and set calibration.file" if real else ""
         yield Row("calibration", "fail" if real else "ok", "the demo recording's built-in calibration", remedy)
         return
     found = load_calibration(Path(settings.calibration.file))
@@ -303,7 +308,7 @@ def calibration(settings: Settings) -> Iterator[Row]:
 
 
 def service(settings: Settings) -> Iterator[Row]:
-    """Check the running daemon, if any."""
+    """Check the running daemon, if there is one."""
     from runtime.daemon.client import HUNG_AFTER_S
 
     answer = _daemon(settings)
@@ -321,7 +326,7 @@ def service(settings: Settings) -> Iterator[Row]:
 
 
 def _daemon(settings: Settings) -> dict[str, Any] | None:
-    """Status of the running daemon; None if no daemon runs."""
+    """Return the running daemon's status, or None if no daemon runs."""
     from runtime.daemon.client import NotRunning, ask, candidates
 
     try:

@@ -1,4 +1,4 @@
-"""`phasestack eyes`: the viewer's pupils in pictures, films, recordings, or in front of the sensor."""
+"""`phasestack eyes`: find the viewer's pupils in pictures, films or recordings, or with the sensor."""
 
 from __future__ import annotations
 
@@ -14,19 +14,20 @@ JSON_S = 2.0  # of the sensor, for one JSON object
 
 def eyes(
     files: Annotated[
-        list[Path] | None, typer.Argument(help="pictures, films, recordings; none: the configured sensor, live")
+        list[Path] | None,
+        typer.Argument(help="pictures, films or recordings; none: the configured sensor, live"),
     ] = None,
-    config: Annotated[Path | None, typer.Option(help="configuration, for its sensor")] = None,
+    config: Annotated[Path | None, typer.Option(help="configuration whose sensor is used")] = None,
     sequence: Annotated[
-        bool, typer.Option("--sequence", help="follow the pictures as successive frames, as the daemon does")
+        bool, typer.Option("--sequence", help="treat the pictures as successive frames, as the daemon does")
     ] = False,
-    rate_hz: Annotated[float, number(0.1, 1000, "Hz", help="rate of such frames, and of films without a rate")] = 30.0,
+    rate_hz: Annotated[float, number(0.1, 1000, "Hz", help="rate of these frames, and of films without one")] = 30.0,
     out: Annotated[Path | None, typer.Option(help="folder for overlays, readable only by you")] = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="one JSON object on stdout; of the sensor, two seconds")
+        bool, typer.Option("--json", help="one JSON object on stdout; a live sensor is observed for two seconds")
     ] = False,
 ) -> None:
-    """Find the viewer's pupils with their uncertainty, and draw them.
+    """Find the viewer's pupils, with their uncertainty, and draw them.
 
     Example: phasestack eyes me.jpg room.mp4 --out out/eyes
     """

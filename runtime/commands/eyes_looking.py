@@ -33,7 +33,7 @@ Row = dict[str, Any]
 
 
 class Watcher:
-    """Eye finder that returns a row for every frame."""
+    """An eye finder that returns one row for every frame."""
 
     def __init__(self, settings: Settings) -> None:
         cv2.setNumThreads(1)  # as in the display's loop
@@ -48,7 +48,10 @@ class Watcher:
         if pupils is not None and frame.intrinsics is None:
             reason = ""  # a picture without intrinsics has no distances
         if frame.colour is None:
-            pupils, reason = None, "this sensor delivers eyes and no pictures" if points else "no eyes in this sample"
+            pupils, reason = (
+                None,
+                "this sensor delivers eyes, not pictures" if points else "no eyes in this sample",
+            )
         row = {
             "file": file,
             "frame": number,
@@ -83,7 +86,7 @@ def look_at_files(
 
 
 def _frames(path: Path, place: int, rate_hz: float) -> Iterator[SensorFrame]:
-    """Yield a file's pictures. place: a still picture's index in a sequence. Raises InputError."""
+    """Yield a file's pictures. place: index of a still picture in a sequence. Raises InputError."""
     kind = path.suffix.lower()
     if kind == RECORDING:
         for frame in Recording(path).samples():
@@ -112,11 +115,11 @@ def _filmed(path: Path, rate_hz: float) -> Iterator[SensorFrame]:
     finally:
         capture.release()
     if not number:
-        raise InputError(path, "", "is not a film that can be decoded")
+        raise InputError(path, "", "cannot be decoded as a film")
 
 
 class _Overlays:
-    """Writer of a file's overlays, as a private picture or film; without a target it does nothing."""
+    """Writes a file's overlays as a private picture or film; does nothing without a target."""
 
     def __init__(self, target: Path | None, is_still: bool, rate_hz: float) -> None:
         self._target, self._is_still, self._rate_hz = target, is_still, rate_hz
@@ -146,7 +149,7 @@ class _Overlays:
 
 
 def drawn(picture: U8, pupils: Pupils | None, row: Row) -> U8:
-    """Return the picture with pupils, face and their figures drawn."""
+    """Return the picture with the pupils, the face and their figures drawn on it."""
     scale = max(1.0, OVERLAY_MIN_PX / max(picture.shape[:2]))
     canvas = np.asarray(cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC), np.uint8)
     bits = 4  # fractional bits of a coordinate
@@ -174,9 +177,9 @@ def drawn(picture: U8, pupils: Pupils | None, row: Row) -> U8:
 def look_at_sensor(
     settings: Settings, report: Callable[[Row], None], *, out: Path | None, seconds: float = np.inf
 ) -> None:
-    """Report every frame of the configured sensor until the time is up, it ends, or Ctrl-C.
+    """Report every frame of the configured sensor until the time is up, its recording ends, or Ctrl-C.
 
-    Leaves the newest overlay in `out`. Raises InputError, SensorLost.
+    The newest overlay remains in `out`. Raises InputError, SensorLost.
     """
     watcher, driver = Watcher(settings), open_sensor(settings.sensor, MonotonicClock())
     end = time.monotonic() + seconds

@@ -1,7 +1,7 @@
-"""Guard around every command: any failure ends in an exit code and at most one line on stderr.
+"""Guard around every command: any failure becomes an exit code and at most one line on stderr.
 
-0 done, 1 a check has failed, 2 bad usage or input, 70 an error of ours (the line names a file with its traceback),
-75 a failure that may pass, 130 Ctrl-C, 141 stdout was closed.
+0: done, 1: a check failed, 2: wrong usage or input, 70: a bug (the line names a file with the traceback), 75: a failure
+that may be temporary, 130: Ctrl-C, 141: stdout was closed.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ INTERRUPTED, BAD_INPUT, OWN_ERROR, MAY_PASS, STDOUT_CLOSED = 130, 2, 70, 75, 141
 
 
 def run_guarded(*, interrupts_leave: bool) -> None:
-    """Run the command named by the arguments; never returns. interrupts_leave: Ctrl-C exits until now."""
+    """Run the command named by the arguments; never returns. interrupts_leave: until now, Ctrl-C exits."""
     _fill_standard_descriptors()
     try:
         from runtime.commands.app import app
@@ -48,7 +48,7 @@ def run_guarded(*, interrupts_leave: bool) -> None:
 
 
 def _interrupted(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt, or exit during an import, where Python would drop it."""
+    """Raise KeyboardInterrupt, or exit if an import is in progress, where Python would drop it."""
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
             os._exit(INTERRUPTED)
@@ -57,7 +57,7 @@ def _interrupted(number: int, frame: FrameType | None) -> None:
 
 
 def _has_hung_thread() -> bool:
-    """True if a solver's thread (`frame.solver_thread`) or a job (`support.background`) still runs."""
+    """Return True if a solver thread (`frame.solver_thread`) or a job (`support.background`) still runs."""
     return any(thread.name.startswith(("solver-", "job ")) for thread in threading.enumerate())
 
 
@@ -72,7 +72,7 @@ def _code_of(app: Any) -> int:
 
 
 def _reported(error: BaseException) -> int:
-    """Print the error that ended a command on one line, and return the exit code."""
+    """Print the error that ended a command, on one line, and return the exit code."""
     from runtime.errors import PhasestackError, TransientError, one_line
     from runtime.support.extras import missing_extra
 
@@ -107,7 +107,7 @@ def _say(line: str) -> None:
 
 
 def _flushed(code: int) -> int:
-    """Flush stdout and return the exit code; at Python's own last flush, a failure is a traceback."""
+    """Flush stdout and return the exit code. (If Python's own final flush fails, it prints a traceback.)"""
     try:
         sys.stdout.flush()
     except OSError as error:
@@ -117,7 +117,7 @@ def _flushed(code: int) -> int:
 
 
 def _fill_standard_descriptors() -> None:
-    """Open /dev/null as stdin, stdout or stderr if closed, so that no later file takes its place."""
+    """Open /dev/null for any closed standard stream, so that no later file takes its descriptor."""
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(number, True)
     for name in ("stdout", "stderr"):

@@ -1,4 +1,4 @@
-"""`phasestack identify`: shows on each panel its name and which way is up."""
+"""`phasestack identify`: show on each panel its name and which way is up."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 def identify(
     config: Annotated[Path | None, typer.Option(help="configuration; without one, every monitor shows a card")] = None,
 ) -> None:
-    """Show on each panel its index, monitor, an arrow that should point up, colour bars and edges.
+    """Show a test card on each panel: index, monitor, an arrow that should point up, colour bars, edges.
 
-    One panel at a time shows its card, and the others are clear. Enter or n: the next panel; p: the previous one; q:
-    quit. Configured panels are rotated, mirrored and registered as in a run. Without any, every monitor shows how to
-    name it in the configuration (`phasestack setup` does this for you).
+    One panel at a time shows its card, and the others are clear. Press Enter or n for the next panel, p for the
+    previous one, q to quit. Configured panels are rotated, mirrored and registered as in a run. If none is configured,
+    every monitor shows the line that names it in a configuration (`phasestack setup` writes it for you).
 
     Exits with 75 if the X server dies.
 
@@ -54,7 +54,7 @@ def identify(
 
 
 def _bound(settings: Settings) -> tuple[PanelSink, list[U8]]:
-    """Open the configured panels and return them with their cards. Raises InputError, PanelLost."""
+    """Open the configured panels. Returns them and their cards. Raises InputError, PanelLost."""
     from runtime.clock import MonotonicClock
     from runtime.panels.card import identity_card
     from runtime.panels.window import WindowPanels
@@ -76,7 +76,7 @@ def _bound(settings: Settings) -> tuple[PanelSink, list[U8]]:
 
 
 def _hold(panels: PanelSink, cards: list[U8], poll: Callable[[], Key | None]) -> None:
-    """Show one card at a time until q; closed windows and lost monitors are opened again."""
+    """Show one card at a time until q is pressed. Closed windows and lost monitors are opened again."""
     import time
 
     from calib.keys import Key

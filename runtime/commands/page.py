@@ -1,4 +1,4 @@
-"""`phasestack page`: the operator's page, in its own process."""
+"""`phasestack page`: serve the operator's page, in a separate process."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ def page(
     config: Annotated[Path | None, typer.Option(help="the daemon's configuration, for its socket")] = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0: any free one")] = DEFAULT_PORT,
     token_file: Annotated[
-        Path | None, typer.Option(help="file with the token, created if missing; default: in the state folder")
+        Path | None, typer.Option(help="file with the token, created if missing; default: a file in the state folder")
     ] = None,
 ) -> None:
-    """Serve the operator's page: the running daemon's live state, and its controls.
+    """Serve the operator's page, which shows the running daemon's live state and controls it.
 
-    The page connects to the daemon's socket, and waits for a daemon if none runs. Browsers log in with the token from
+    The page connects to the daemon's socket, and waits if no daemon is running. Browsers log in with the token in
     the token file.
 
     Example: phasestack page --port 8717
@@ -32,11 +32,11 @@ def page(
     from runtime.support.background import BACKGROUND_NICENESS, set_niceness
     from runtime.support.folders import state_folder
 
-    set_niceness(BACKGROUND_NICENESS)  # before its threads start: the display has priority
+    set_niceness(BACKGROUND_NICENESS)  # lowered before its threads start, because the display has priority
     places = sockets(config)
     path = token_file or state_folder() / "page-token"
     with retry_advised():  # such as a full disk
         token = token_of(path)
     served = listening("page", port)
-    typer.echo(f"the page is at http://{LOOPBACK}:{served.getsockname()[1]}/ - its token is in {path}", err=True)
+    typer.echo(f"page: http://{LOOPBACK}:{served.getsockname()[1]}/ - the token is in {path}", err=True)
     server_of(application(DaemonClient(places), token)).run(sockets=[served])

@@ -1,4 +1,4 @@
-"""`phasestack plan`: the savings for a scene."""
+"""`phasestack plan`: list the work that can be saved for a scene."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ def plan(
     scale: Annotated[float, number(0.05, 2.0, help="scale factor of the panels' pixel counts")] = 1.0,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout")] = False,
 ) -> None:
-    """List the work that this scene makes unnecessary, the reasons, and measured savings and costs.
+    """List the work that this scene makes unnecessary, with reasons and measured savings and costs.
 
-    It draws and solves the scene some twenty times, on the full raster: seconds at 960x540, minutes at 4K without a GPU
+    The scene is drawn and solved about twenty times on the full raster: seconds at 960x540, minutes at 4K without a GPU
     (--scale 0.25 is sixteen times as fast).
 
     Example: phasestack plan --scene sparse

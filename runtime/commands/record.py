@@ -1,4 +1,4 @@
-"""`phasestack record`: samples of the sensor into a file for `--replay`."""
+"""`phasestack record`: write the sensor's samples to a file for `--replay`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def record(
     out: Annotated[Path, typer.Option(help="recording to write, .mcap")],
     config: Annotated[Path | None, typer.Option(help="TOML file; see `phasestack config`")] = None,
     images: Annotated[
-        bool, typer.Option("--images", help="record colour and depth pictures, too: they show faces")
+        bool, typer.Option("--images", help="also record colour and depth pictures, which show faces")
     ] = False,
     seconds: Annotated[
         float | None, number(0.1, RECORD_MOST_S, "s", help="stop after this long; default: 600 s, with --motion 12 s")
@@ -45,7 +45,7 @@ def record(
 ) -> None:
     """Record eye positions with their times, and pictures with --images. Ctrl-C ends the recording.
 
-    With --motion: the simulated heads of the tracker's benchmark, with noise, outliers, dropouts and the true eyes.
+    --motion records a simulated head of the tracker's benchmark, with noise, outliers, dropouts and the true eyes.
 
     Example: phasestack record --out lean.mcap --seconds 20
 
@@ -57,7 +57,7 @@ def record(
     for name, value in meaningless.items():
         if value is not None:
             what = "--motion" if motion is not None else "a sensor"
-            raise InputError("record", f"--{name.replace('_', '-')}", f"has no meaning with {what}")
+            raise InputError("record", f"--{name.replace('_', '-')}", f"cannot be combined with {what}")
     if motion is not None:
         from runtime.evaluation.motion_recording import write_motion
 
@@ -76,16 +76,16 @@ def record(
 
 
 def _refuse_target(out: Path, *, motion: bool) -> None:
-    """Raise InputError for a name without the suffix, or an existing file.
+    """Raise InputError if the name lacks the suffix or the file exists.
 
-    A simulated motion may be replaced by another: its seed gives it back.
+    A simulated motion may be replaced, because its seed can reproduce it.
     """
     from runtime.sensor.recording import Recording
     from runtime.support.untrusted_input import checked_path
 
     checked_path(out, source="record", field="--out")
     if out.suffix.lower() != SUFFIX:
-        raise InputError(out, "--out", f"must end in {SUFFIX}: recordings are MCAP files")
+        raise InputError(out, "--out", f"must end in {SUFFIX}, since recordings are MCAP files")
     if os.path.isdir(out):  # noqa: PTH112 - a Path raises where a folder above it is forbidden
         raise InputError(out, "--out", "is a folder")
     if not os.path.lexists(out):
@@ -98,11 +98,11 @@ def _refuse_target(out: Path, *, motion: bool) -> None:
             return
     except InputError:  # no recording
         pass
-    raise InputError(out, "--out", "exists already: choose another name, or delete it")
+    raise InputError(out, "--out", "already exists: choose another name, or delete it")
 
 
 def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | None) -> dict[str, Any]:
-    """Record until time, a limit, the end of the source or Ctrl-C. Raises FatalError, InputError."""
+    """Record until a time or size limit, the source's end or Ctrl-C. Raises FatalError, InputError."""
     from runtime.clock import NS_PER_S, MonotonicClock
     from runtime.eyes.detect import EyeFinder
     from runtime.sensor.recording import MAX_S, recording_to
@@ -147,20 +147,20 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
                 raise
             stopped = "stopped by hand"
         if writer is None:
-            why = worker.reason or "nothing arrived"
+            why = worker.reason or "no data arrived"
             raise worker.error or FatalError(f"sensor {s.driver}: no sample ({worker.state}: {why})")
     summary = {"file": str(out), "samples": writer.count, "seconds": so_far_s, "stopped": stopped}
     return summary | {"holds": list(holds), "skipped": worker.stale_inputs}
 
 
 def _streams(frame: SensorFrame) -> list[str]:
-    """Return the names of the data in a sample."""
+    """Return the names of the kinds of data in a sample."""
     parts = {"eyes": frame.eyes, "true eyes": frame.true_eyes_m, "colour": frame.colour, "depth": frame.depth_mm}
     return [name for name, value in parts.items() if value is not None]
 
 
 def _samples(worker: SensorWorker, limit_s: float) -> Iterator[SensorFrame]:
-    """Yield samples until the source ends, or for a time that begins with the first sample."""
+    """Yield samples until the source ends, or for the given time after the first sample."""
     import time
 
     deadline_ns, begun = time.monotonic_ns() + round(FIRST_SAMPLE_S * 1e9), False

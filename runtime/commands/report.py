@@ -1,4 +1,4 @@
-"""`phasestack report`: light against run time."""
+"""`phasestack report`: compare light PSNR with run time."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import typer
 
 def report(
     out: Annotated[Path, typer.Option(help="folder for index.html, report.json and the plots")] = Path("report"),
-    pairs: Annotated[Path | None, typer.Option(help="folder of case files: your own pairs to measure on")] = None,
-    focal: Annotated[bool, typer.Option("--focal", help="measure focal parallax through the layers, too")] = False,
+    pairs: Annotated[Path | None, typer.Option(help="folder of case files, to measure on your own pairs")] = None,
+    focal: Annotated[bool, typer.Option("--focal", help="also measure focal parallax through the layers")] = False,
     model: Annotated[list[str] | None, typer.Option(help="an ONNX file to compare as well; may be repeated")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="quarter-size panels, fewer references: a first look")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
-    """Measure light against run time on this machine, and write a page about it. Takes minutes.
+    """Measure light PSNR and run time of every method on this machine, and write a page. Takes minutes.
 
-    The page exists from the first figure on and grows: open it, or stop when it shows enough. To compare the published
+    The page exists from the first figure on, and grows: open it, or stop when it shows enough. To compare the published
     network, make it from its checkpoint by `phasestack export`, and name it by `--model FILE.onnx`.
 
     Example: phasestack report --pairs my-pairs --out report
@@ -42,7 +42,7 @@ def report(
                 progress=tell,
             )
     except KeyboardInterrupt:
-        typer.echo(f"report: stopped; {out / 'index.html'} has the measurements so far", err=True)
+        typer.echo(f"report: stopped; {out / 'index.html'} shows the measurements so far", err=True)
         raise
     if as_json:
         print(to_json(record))

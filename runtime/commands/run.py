@@ -1,4 +1,4 @@
-"""`phasestack run`: the daemon, or a recording through the same code."""
+"""`phasestack run`: run the daemon, or play a recording through the same code."""
 
 from __future__ import annotations
 
@@ -17,20 +17,21 @@ def run(
     replay: Annotated[
         str | None, typer.Option(help="recording to play instead of the sensor; `demo` repeats until stopped")
     ] = None,
-    headless: Annotated[bool, typer.Option("--headless", help="no windows: offscreen panels")] = False,
+    headless: Annotated[bool, typer.Option("--headless", help="use offscreen panels instead of windows")] = False,
     frames: Annotated[int | None, typer.Option(min=1, help="stop after this many refreshes")] = None,
     max_speed: Annotated[
-        bool, typer.Option("--max-speed", help="play a recording on a simulated clock: no waiting, reproducible")
+        bool, typer.Option("--max-speed", help="play a recording on a simulated clock: reproducible, without waiting")
     ] = False,
     out: Annotated[Path | None, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = None,
     scene: Annotated[str | None, typer.Option(help="a built-in scene, a file or folder")] = None,
     layout: Annotated[
-        str | None, typer.Option(help="arrangement of the views in pictures, a value of content.layout")
+        str | None, typer.Option(help="arrangement of the views in pictures: a value of content.layout")
     ] = None,
     model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
     scale: Annotated[float, number(0.05, 2.0, help="scale factor of the pixel counts of offscreen panels")] = 1.0,
     backend: Annotated[
-        str | None, typer.Option(help="device for everything except the network: auto (the faster one here), cpu or gl")
+        str | None,
+        typer.Option(help="device for everything except the network: auto (the faster one), cpu or gl"),
     ] = None,
     keep_light: Annotated[
         int, typer.Option(min=0, help="with --out: write what the panels show every N refreshes; 0: never")

@@ -1,4 +1,4 @@
-"""`phasestack setup`: from the box to a picture, step by step."""
+"""`phasestack setup`: set up a new display, step by step."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ def setup(
     ] = Path("phasestack.toml"),
     out: Annotated[Path, typer.Option(help="folder for pairs, calibration, reports and setup.json")] = Path("setup"),
     photos: Annotated[Path, typer.Option(help="folder for the photographs")] = Path("photos"),
-    simulate: Annotated[bool, typer.Option("--simulate", help="simulate a display, to try the setup")] = False,
+    simulate: Annotated[bool, typer.Option("--simulate", help="try the setup on a simulated display")] = False,
     seed: Annotated[int, typer.Option(min=0, help="seed of the simulated display")] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout at the end")] = False,
 ) -> None:
-    """Set up a display: monitors, sizes, registration by photographs, grey curves, sensor, calibration.
+    """Set up a display: monitors, sizes, registration from photographs, grey curves, sensor, calibration.
 
-    Answer in the terminal, or by keys on the panels' windows. Every step can be skipped and repeated; q stops, and the
-    same command continues there. The result is a valid configuration and the figures of each step.
+    Answer in the terminal, or with keys on the panels' windows. Every step can be skipped or repeated; q stops, and the
+    same command resumes there. The result is a valid configuration, and the figures of each step.
 
     Example: phasestack setup --simulate --config try.toml --out try
     """

@@ -1,4 +1,4 @@
-"""`phasestack solve`: one still stereo pair to layers."""
+"""`phasestack solve`: compute the layers for one still stereo pair."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ def solve(
     ],
     panels: Annotated[Path, typer.Option(help="TOML or JSON: width_m, height_m, x_m")],
     out: Annotated[Path, typer.Option(help="folder for the layers")],
-    right: Annotated[Path | None, typer.Option(help="picture for the right eye; without it, --left holds both")] = None,
-    layout: Annotated[str | None, typer.Option(help="arrangement of the views in --left, as content.layout")] = None,
+    right: Annotated[Path | None, typer.Option(help="picture for the right eye; none: --left contains both")] = None,
+    layout: Annotated[str | None, typer.Option(help="arrangement of both views in --left (see content.layout)")] = None,
     left_eye: Annotated[tuple[float, float, float] | None, place(help="left eye, metres, stack frame")] = None,
     right_eye: Annotated[tuple[float, float, float] | None, place(help="right eye, metres")] = None,
     camera: Annotated[
@@ -34,16 +34,16 @@ def solve(
     model: Annotated[str, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = "balanced",
     repeat: Annotated[int, typer.Option(min=1, max=10000, help="timed runs, after the warm-up")] = 1,
     eye_sigma_mm: Annotated[
-        float, number(0, 1000, "mm", help="tracking error, mm per axis; 1: a good tracker; 0: none")
+        float, number(0, 1000, "mm", help="tracking error, mm per axis; 1 for a good tracker, 0 for known eyes")
     ] = 1.0,
     backend: Annotated[
         str | None,
-        typer.Option(help="device for everything except the network: cpu, gl or auto (timed from --repeat 10)"),
+        typer.Option(help="device for everything except the network: cpu, gl or auto (timed if --repeat >= 10)"),
     ] = None,
     no_plan: Annotated[bool, typer.Option("--no-plan", help="skip no work, even if the pictures allow it")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="solve.json's object on stdout")] = False,
 ) -> None:
-    """Solve the layers for two still pictures and two eyes, and measure the pictures that the eyes see.
+    """Compute the layers for two still pictures and two eyes, and measure the pictures that the eyes see.
 
     Example: phasestack solve --left l.png --right r.png --left-eye 0.6 -0.03 0 --right-eye 0.6 0.03 0 --fov 40
     --panels panels.json --out out/solve

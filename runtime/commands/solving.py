@@ -33,12 +33,12 @@ from runtime.support.picture_file import read_image
 from runtime.support.progress import tell
 from runtime.support.ranges import SEPARATION_MIN_M
 
-MEASURED_FROM = 10  # runs from which measuring the backends pays off
+MEASURED_FROM = 10  # number of runs from which measuring the backends pays off
 
 
 @dataclass(frozen=True, slots=True)
 class Eyes:
-    """Cameras of the pictures, as given by the options."""
+    """Cameras of the pictures, as the options give them."""
 
     left: tuple[float, ...] | None
     right: tuple[float, ...] | None
@@ -48,7 +48,7 @@ class Eyes:
 
 @dataclass(frozen=True, slots=True)
 class Files:
-    """Two picture files, or one that holds both views."""
+    """Two picture files, or one that contains both views."""
 
     left: Path
     right: Path | None
@@ -59,11 +59,11 @@ class Files:
         return self.left.name if self.right is None else f"{self.left.name} and {self.right.name}"
 
     def read(self) -> list[Any]:
-        """Return the left and the right eye's picture. Raises InputError."""
+        """Read the left and the right eye's pictures. Raises InputError."""
         if self.right is None:
             return list(read_pair(self.left, with_options(Settings(), layout=self.layout).content))
         if self.layout is not None:
-            raise InputError("solve", "--layout", "needs one file with both views: omit --right")
+            raise InputError("solve", "--layout", "requires one file with both views: omit --right")
         pictures = [read_image(path) for path in (self.left, self.right)]
         if pictures[0].shape != pictures[1].shape:
             sizes = " and ".join(f"{p.shape[1]}x{p.shape[0]}" for p in pictures)
@@ -83,7 +83,7 @@ def solve_pair(
     backend: str | None,
     plan: bool,
 ) -> dict[str, Any]:
-    """Solve, write the layers and pictures, and return solve.json. Raises InputError."""
+    """Solve, write the layers and pictures, and return the content of solve.json. Raises InputError."""
     watch = Stopwatch()
     settings = with_options(Settings(), model=model, backend=backend).model
     cv2.setNumThreads(settings.threads)
@@ -164,13 +164,13 @@ def solve_pair(
 
 
 def taken(pictures: list[Any], eyes: Eyes, stack: PanelStack) -> tuple[list[Any], F64, float]:
-    """Return pictures and eyes (2, 3) that look at the stack's origin, and the field of view."""
+    """Return pictures whose cameras look at the stack's origin, their eyes (2, 3) and field of view."""
     if eyes.cameras is None:
         if eyes.left is None or eyes.right is None:
-            raise InputError("solve", "--left-eye, --right-eye", "are needed, metres; or --camera")
+            raise InputError("solve", "--left-eye, --right-eye", "are required, in metres, unless --camera is given")
         return pictures, checked_eyes(eyes.left, eyes.right, stack), eyes.fov_deg
     if eyes.left is not None or eyes.right is not None:
-        raise InputError("solve", "--camera", "gives the eyes: omit --left-eye and --right-eye")
+        raise InputError("solve", "--camera", "already gives the eyes: omit --left-eye and --right-eye")
     table = read_table(eyes.cameras)
     try:
         cameras, places_m = as_cameras([table.get("left"), table.get("right")])
@@ -185,8 +185,10 @@ def checked_eyes(left_eye: tuple[float, ...], right_eye: tuple[float, ...], stac
     """Return eyes (2, 3) that can be served. Raises InputError, naming the option."""
     for option, eye in (("--left-eye", left_eye), ("--right-eye", right_eye)):
         if eye[0] <= max(stack.x_m):
-            raise InputError("solve", option, f"x = {eye[0]:g} m : not in front of the panels (x > {max(stack.x_m):g})")
+            raise InputError(
+                "solve", option, f"x = {eye[0]:g} m is not in front of the panels (x > {max(stack.x_m):g})"
+            )
     separation_m = math.dist(left_eye, right_eye)
     if separation_m < SEPARATION_MIN_M:
-        raise InputError("solve", "--right-eye", f"is {separation_m * 1e3:g} mm from the left one; 5 mm is the least")
+        raise InputError("solve", "--right-eye", f"is {separation_m * 1e3:g} mm from the left one; the minimum is 5 mm")
     return np.array([left_eye, right_eye])

@@ -1,4 +1,4 @@
-"""`phasestack stability`: stiff and extreme cases of every numerical step."""
+"""`phasestack stability`: test every numerical step on stiff and extreme cases."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ if TYPE_CHECKING:
 
 def stability(
     out: Annotated[Path | None, typer.Option(help="folder for stability.json")] = None,
-    full: Annotated[bool, typer.Option("--full", help="run the long cases, too: minutes instead of seconds")] = False,
+    full: Annotated[bool, typer.Option("--full", help="also run the long cases: minutes instead of seconds")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
     record: Annotated[
-        Path | None, typer.Option(help="write the errors to a limits file, after a change of a model")
+        Path | None, typer.Option(help="write the errors to a limits file, after a model has changed")
     ] = None,
 ) -> None:
-    """Run every numerical step on stiff and extreme cases, and compare it with references.
+    """Run every numerical step on stiff and extreme cases, and compare the results with references.
 
-    A case without a reference may be at most 5% worse than recorded. Exits with 1 if a case fails.
+    A case without a reference may be at most 5% worse than the recorded limit. Exits with 1 if a case fails.
 
     Example: phasestack stability --out stability
     """
@@ -62,7 +62,7 @@ def stability(
 
 
 def _fits() -> dict[str, Fit]:
-    """Return the calibration's solvers by rule."""
+    """Return the calibration's solvers by the name of their rule."""
     from functools import partial
 
     from calib.robust import fit_robust

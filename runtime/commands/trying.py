@@ -1,4 +1,4 @@
-"""Body of `phasestack try`: the daemon, and a web server that acts as its sensor and panels."""
+"""Body of `phasestack try`: the daemon, with a web server that acts as its sensor and panels."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ MEASURED_EVERY_S = 4.0  # interval between measurements of the light at the eyes
 def settings_of(
     config: Path | None, *, scene: str | None, layout: str | None, model: str | None, webcam: bool
 ) -> Settings:
-    """Settings of `phasestack try`. Raises InputError."""
+    """Return the settings of `phasestack try`. Raises InputError."""
     settings = load_settings(config) if config else changed(Settings(), "stack", SIZE_PX, source="try")
     settings = with_options(settings, scene=scene or (None if config else SCENE), layout=layout, model=model)
     if settings.sensor.driver != "usb-camera" or not webcam:
@@ -57,7 +57,7 @@ def try_display(settings: Settings, *, port: int, opens: bool, seconds: float | 
     def until() -> str:
         if link.wishes:
             return f"the page changed {', '.join(link.wishes)}"
-        return "its time is up" if time.monotonic() > ends_s else ""
+        return "the time is up" if time.monotonic() > ends_s else ""
 
     with tempfile.TemporaryDirectory(prefix="phasestack-") as folder:
         socket = Path(folder) / "status.sock"
@@ -79,7 +79,7 @@ def _as_it_is(settings: Settings) -> Settings:
 
 
 def _as_wished(settings: Settings, link: BrowserLink) -> Settings:
-    """Settings with the gap and sensor that a page chose, and the current scene and model."""
+    """Return settings with the gap and sensor chosen on a page, and with the current scene and model."""
     wishes, link.wishes = link.wishes, {}
     account = link.shown[1]
     settings = with_options(settings, scene=account.get("scene"), model=account.get("model"))
@@ -95,7 +95,7 @@ def _as_wished(settings: Settings, link: BrowserLink) -> Settings:
 
 @contextmanager
 def _served(link: BrowserLink, socket: Path, port: int) -> Iterator[str]:
-    """Serve the page in a thread; yields its address, with the token."""
+    """Serve the page in a thread. Yields its address, including the token."""
     token, served = secrets.token_urlsafe(32), listening("try", port)
     server = server_of(application(DaemonClient((socket,)), token, link=link))
     sockets: dict[str, Any] = {"sockets": [served]}

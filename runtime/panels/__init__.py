@@ -1,1 +1,1 @@
-"""Sinks for panel values (offscreen, windows), the presentation shader, and monitors."""
+"""Outputs for panel values (offscreen, windows, browser), the presentation shader, and monitors."""

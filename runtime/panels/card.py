@@ -1,4 +1,4 @@
-"""The card that `identify` shows on a panel: index, orientation, colours and edges."""
+"""Card that `identify` shows on a panel, for its index, orientation, colours and edges."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def identity_card(width_px: int, height_px: int, *, title: str, lines: Sequence[str]) -> U8:
-    """(height_px, width_px, 4) upright card: title, lines, an arrow up, colour bars, grey steps.
+    """Draw an upright (height_px, width_px, 4) card: title, lines, upward arrow, colour bars, grey steps.
 
-    A line of one pixel runs along every edge: if one is missing, the panel is cropped or misaligned. Text stays away
+    A one-pixel line runs along every edge; if one is missing, the panel is cropped or misaligned. Text stays away
     from the edges, where nearby viewers see a front panel's rim with no lit panel behind it.
     """
     card = np.empty((height_px, width_px, 4), np.uint8)
@@ -41,7 +41,7 @@ def identity_card(width_px: int, height_px: int, *, title: str, lines: Sequence[
 
 
 def alone(cards: Sequence[U8], index: int) -> U8:
-    """(N, H, W, 4) layers with one card, the other panels clear."""
+    """Return (N, H, W, 4) layers with the card on one panel and the other panels clear."""
     layers = np.zeros((len(cards), *cards[index].shape), np.uint8)
     layers[..., 3] = 255
     layers[index] = cards[index]

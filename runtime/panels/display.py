@@ -1,4 +1,4 @@
-"""GLFW on X11: monitors, and windows whose contexts share objects with one root. Main thread only."""
+"""GLFW on X11: monitors, and windows whose GL contexts share one root's objects. Main thread only."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ log = logging.getLogger("phasestack.panels")
 
 glfw: Any = _glfw  # its stubs are wrong about bytes, None and pointers
 
-# By default the binding turns errors into warnings; here all are caught.
+# By default the binding turns errors into warnings; here every error is an exception.
 glfw.ERROR_REPORTING = "exception"
 
 
 @cache
 def gl_function(name: str) -> int:
-    """Address of an OpenGL function, equal for all contexts; 0 if missing.
+    """Return the address of an OpenGL function, which is the same in all contexts, or 0 if it is missing.
 
-    Cached, because moderngl keeps references to all of them, 20 KiB per context.
+    The result is cached, because moderngl keeps references to all of them, 20 KiB per context.
     """
     return int(glfw.get_proc_address(name) or 0)
 
 
 class WindowContext:
-    """Adapter from a GLFW window to moderngl: loads functions and makes the context current."""
+    """Adapts a GLFW window for moderngl: loads functions and makes the context current."""
 
     def __init__(self, window: Any) -> None:
         self._window = window
 
     def load_opengl_function(self, name: str) -> int:
-        """Address of an OpenGL function."""
+        """Return the address of an OpenGL function."""
         return gl_function(name)
 
     load = load_opengl_function
@@ -72,7 +72,7 @@ watch: xlib.ServerWatch | None = None  # of the process's connection
 
 
 def _connect() -> None:
-    """Connect GLFW to the X server, for the life of the process. Raises PanelLost, MissingPart.
+    """Connect GLFW to the X server for the lifetime of the process. Raises PanelLost, MissingPart.
 
     A drawing thread may still have a context of that EGL display current when the panels lose theirs. If GLFW closed
     the display then, Mesa would use freed memory.
@@ -86,21 +86,21 @@ def _connect() -> None:
             glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_X11)
         glfw.init()
     except glfw.GLFWError as error:
-        raise PanelLost(f"no X server: {_text(error)} (set by DISPLAY and XAUTHORITY)") from None
+        raise PanelLost(f"no X server: {_text(error)} (DISPLAY and XAUTHORITY select it)") from None
     if glfw.get_platform() != glfw.PLATFORM_X11:
-        raise MissingPart("GLFW without X11: only X11 can put a window on a chosen monitor")
+        raise MissingPart("GLFW runs without X11, but only on X11 can a window be placed on a chosen monitor")
     xlib.take_over_errors()
     watch = xlib.ServerWatch(_pointer())
 
 
 class Display:
-    """Windows on the X server, with a hidden root window whose objects all others share.
+    """Windows on the X server, including a hidden root window whose GL objects all others share.
 
-    No window outlives `close`. The X server's death ends the process (see `xlib.take_over_errors`).
+    No window outlives `close`. If the X server dies, the process ends (see `xlib.take_over_errors`).
     """
 
     def __init__(self) -> None:
-        """Connect. Raises PanelLost (no X server, or access denied; may be temporary), MissingPart (no X11 library)."""
+        """Connect. Raises PanelLost (no X server or no access; may be temporary), MissingPart (no X11 library)."""
         self.faults: list[str] = []
         self._windows: list[Window] = []
         self._outputs: dict[str, int] = {}
@@ -109,7 +109,7 @@ class Display:
 
     @property
     def root(self) -> Window:
-        """The hidden window, created on first use, because listing monitors needs no OpenGL.
+        """Return the hidden window. It is created on first use, because listing monitors needs no OpenGL.
 
         Raises PanelLost if the X server has no OpenGL.
         """
@@ -123,27 +123,27 @@ class Display:
         return self._windows[0]
 
     def monitors(self) -> tuple[Monitor, ...]:
-        """Active monitors, from left to right."""
+        """Return the active monitors, from left to right."""
         return in_order([monitor for monitor, _ in self._pairs()])
 
     def fullscreen_window(self, monitor: Monitor, *, title: str) -> Window:
-        """Open a borderless window on a whole monitor and make its context current. Raises PanelLost."""
+        """Open a borderless window that fills a monitor, and make its context current. Raises PanelLost."""
         share = self.root.handle
         handles = {connected.connector: handle for connected, handle in self._pairs()}
         if monitor.connector not in handles:
-            raise PanelLost(f"{monitor.connector} has gone")
+            raise PanelLost(f"{monitor.connector} is no longer connected")
         glfw.window_hint(glfw.VISIBLE, True)
         handle = glfw.create_window(monitor.width_px, monitor.height_px, title, handles[monitor.connector], share)
         return self._adopt(handle)
 
     def poll(self) -> str:
-        """Process X events; returns faults that make the windows useless, else an empty text."""
+        """Process X events. Returns any faults that make the windows useless, or an empty string."""
         glfw.poll_events()
         faults = self.faults + [fault for window in self._windows for fault in window.faults]
         return "; ".join(faults)
 
     def close_windows(self) -> None:
-        """Close all but the root."""
+        """Close all windows except the root."""
         self._close_from(1)
         self.faults.clear()
         if self._windows:
@@ -175,12 +175,12 @@ class Display:
         return window
 
     def output_state(self, connector: str) -> xlib.OutputState | None:
-        """Current mode and monitor of an output; None if it is off or gone."""
+        """Return the current mode and monitor of an output, or None if it is off or disconnected."""
         output = self._outputs.get(connector)
         return xlib.output_state(_pointer(), output) if output else None
 
     def window_state(self, window: Window) -> tuple[bool, Rectangle] | None:
-        """Return if a window and its ancestors are mapped, and its position; None if it was destroyed."""
+        """Return whether a window and its ancestors are mapped, and its position; None if it was destroyed."""
         refused = xlib.refusals()
         place = Rectangle(*glfw.get_window_pos(window.handle), *glfw.get_window_size(window.handle))
         is_viewable = bool(glfw.get_window_attrib(window.handle, glfw.VISIBLE))
@@ -216,12 +216,12 @@ class Display:
 
     @property
     def has_windows(self) -> bool:
-        """True if there are windows besides the hidden root."""
+        """Return True if there are windows other than the hidden root."""
         return len(self._windows) > 1
 
 
 def connected_monitors() -> tuple[Monitor, ...]:
-    """Active monitors, from left to right. Raises PanelLost (no X server, no monitor), MissingPart."""
+    """Return the active monitors, left to right. Raises PanelLost (no X server or monitor), MissingPart."""
     display = Display()
     try:
         monitors = display.monitors()

@@ -1,4 +1,4 @@
-"""Parse a monitor's EDID (VESA E-EDID 1.3/1.4, base block)."""
+"""Parser for a monitor's EDID (VESA E-EDID 1.3/1.4, base block)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SERIAL_TAG, NAME_TAG = 0xFF, 0xFC
 
 @dataclass(frozen=True, slots=True)
 class Edid:
-    """Maker, model and serial number of a monitor; the serial is empty if the maker gave none."""
+    """Manufacturer, model and serial number of a monitor. The serial number may be empty."""
 
     maker: str  # three letters
     serial: str  # text descriptor, else the header's number; unique only together with the model
@@ -20,7 +20,7 @@ class Edid:
 
 
 def parse(data: bytes) -> Edid | None:
-    """Parse the base block of an EDID; None if length, header or checksum is wrong."""
+    """Parse the base block of an EDID. Returns None if its length, header or checksum is wrong."""
     block = data[:BLOCK_BYTES]
     if len(block) < BLOCK_BYTES or not block.startswith(HEADER) or sum(block) % 256:
         return None

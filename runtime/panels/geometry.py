@@ -1,4 +1,4 @@
-"""Map a monitor's pixels to a layer's pixels: registration, mirroring, mounting."""
+"""Mapping from a monitor's pixels to a layer's: registration, mirroring and mounting."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from runtime.records import F64
 
 
 def panel_size_px(*, screen_width_px: int, screen_height_px: int, rotation_deg: int) -> tuple[int, int]:
-    """Columns and rows of a panel as the viewer sees it."""
+    """Number of columns and rows of a panel as the viewer sees it."""
     if rotation_deg in (90, 270):
         return screen_height_px, screen_width_px
     return screen_width_px, screen_height_px
 
 
 def panel_from_screen(*, screen_width_px: int, screen_height_px: int, rotation_deg: int, mirror: str) -> F64:
-    """3x3 from a monitor's pixels to the viewer's panel pixels, both continuous, v down.
+    """3x3 from a monitor's pixels to panel pixels as the viewer sees them, both continuous, v down.
 
-    A monitor mounted `rotation_deg` counter-clockwise, seen from the front, gets its picture rotated clockwise.
+    If a monitor is mounted `rotation_deg` counter-clockwise, seen from the front, its picture is rotated clockwise.
     Mirroring applies to the viewer's picture, before the rotation.
     """
     width, height = float(screen_width_px), float(screen_height_px)
@@ -52,9 +52,9 @@ def layer_from_screen(
     mirror: str,
     homography: Sequence[Sequence[float]],
 ) -> F64:
-    """3x3 from the monitor's pixels to layer pixels, up to scale.
+    """3x3 matrix from the monitor's pixels to layer pixels, up to scale.
 
-    homography: from ideal to true pixels at the panel's resolution, independent of the layers'.
+    homography: from ideal to true pixels, at the panel's resolution, whatever the layers' resolution.
     Raises ValueError for a singular homography.
     """
     columns, rows = panel_size_px(
@@ -90,10 +90,10 @@ DIRECTIONS: dict[Arrow, tuple[int, int]] = {"up": (0, -1), "down": (0, 1), "left
 
 
 def mounting_of(arrow: Arrow, *, mirrored: bool) -> tuple[int, str]:
-    """`rotation_deg` and `mirror` of a panel, from its card's arrow and mirrored writing."""
+    """Return a panel's `rotation_deg` and `mirror`, from how the arrow and the text on its card appear."""
     mirror = "horizontal" if mirrored else "none"
     for rotation_deg in ROTATIONS:
         seen = panel_from_screen(screen_width_px=1, screen_height_px=1, rotation_deg=rotation_deg, mirror=mirror)
         if tuple(round(value) for value in seen[:2, :2] @ [0.0, -1.0]) == DIRECTIONS[arrow]:
             return rotation_deg, mirror
-    raise ValueError(f"no mounting makes an arrow point {arrow}")
+    raise ValueError(f"no mounting turns the arrow to point {arrow}")

@@ -1,4 +1,4 @@
-"""Grey curves: the grey level for each phase of a panel."""
+"""Grey curves: the grey level that produces each phase on a panel."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ COLUMNS = ("phase", "red", "green", "blue")
 
 
 def measured_curve(path: Path) -> F32:
-    """(256, 3) grey from a CSV with columns phase, red, green, blue (or phase, grey), all in [0, 1].
+    """Read (256, 3) grey from a CSV with columns phase, red, green, blue (or phase, grey) in [0, 1].
 
-    Needs at least two rows with ascending phases; the curve is linear between them and constant beyond them.
+    The file needs at least two rows with ascending phases. The curve is linear between them and constant beyond them.
     Raises InputError, naming the file and the row or column.
     """
     lines = [line for line in untrusted_input.read_text(path).splitlines() if line.strip() and line[0] != "#"]
     header = tuple(name.strip().lower() for name in lines[0].split(",")) if lines else ()
     if header not in (COLUMNS, ("phase", "grey")):
-        raise InputError(path, "columns", "must be phase, red, green, blue (or phase, grey)")
+        raise InputError(path, "columns", "must have the columns phase, red, green, blue (or phase, grey)")
     if len(lines) < 3:
         raise InputError(path, "phase", "needs at least two rows")
     try:
@@ -42,7 +42,7 @@ def measured_curve(path: Path) -> F32:
 
 
 def curve(*, lut: str, gamma: float) -> F32:
-    """(256, 3) grey in [0, 1] for each 8-bit phase and channel: measured, or for a phase of grey^gamma.
+    """Return (256, 3) grey in [0, 1] by 8-bit phase and channel: measured, or with phase = grey^gamma.
 
     Raises InputError.
     """

@@ -1,4 +1,4 @@
-"""Assign monitors to panels, by EDID serial or connector, and check their modes and rates.
+"""Assignment of monitors to panels by EDID serial or connector, with checks of their modes and rates.
 
 Monitors are never guessed and pictures never rescaled: phases must reach the panels unchanged, at one refresh rate.
 """
@@ -43,12 +43,12 @@ class Monitor:
 
     @property
     def place(self) -> Rectangle:
-        """Region of the X screen that it shows."""
+        """Return the region of the X screen that the monitor shows."""
         return Rectangle(self.x_px, self.y_px, self.width_px, self.height_px)
 
     @property
     def setting(self) -> str:
-        """Line for `[[output.panels]]` that identifies it."""
+        """Return the line for `[[output.panels]]` that identifies this monitor."""
         return f'edid_serial = "{self.serial}"' if self.serial else f'connector = "{self.connector}"'
 
     def __str__(self) -> str:
@@ -63,13 +63,13 @@ def in_order(monitors: Sequence[Monitor]) -> tuple[Monitor, ...]:
 
 
 def bind(panels: Sequence[PanelSettings], monitors: Sequence[Monitor]) -> tuple[Monitor, ...]:
-    """The monitor of each panel, rear to front.
+    """Find the monitor of each panel, rear to front.
 
     A monitor must match both serial and connector if a panel gives both. Two monitors with equal serials are told
     apart by their connectors.
 
-    Raises InputError for a panel without either, since waiting can't help; PanelLost if a panel's monitor is missing,
-    ambiguous or also another panel's. The message names the panel, the criteria and the monitors found.
+    Raises InputError if a panel has neither, since waiting can't help; PanelLost if a panel's monitor is missing,
+    ambiguous or already bound to another panel. The message names the panel, the criteria and the monitors found.
     """
     ordered = in_order(monitors)
     bound: list[Monitor] = []
@@ -92,7 +92,9 @@ def _find(number: int, panel: PanelSettings, monitors: tuple[Monitor, ...]) -> M
         matches = [monitor for monitor in matches if monitor.connector == panel.connector]
     if not criteria:
         raise InputError(
-            "output", f"panels.{number}", "names no monitor: set edid_serial or connector (`phasestack identify`)"
+            "output",
+            f"panels.{number}",
+            "names no monitor: set edid_serial or connector (see `phasestack identify`)",
         )
     if len(matches) == 1:
         return matches[0]
@@ -102,9 +104,9 @@ def _find(number: int, panel: PanelSettings, monitors: tuple[Monitor, ...]) -> M
 
 
 def check_modes(panels: Sequence[PanelSettings], monitors: Sequence[Monitor], *, width_px: int, height_px: int) -> None:
-    """Raise PanelLost if a monitor's mode and the stack differ in resolution.
+    """Raise PanelLost if a monitor's resolution differs from the stack's.
 
-    Rescaling mixes the phases of neighbouring pixels, which destroys both eyes' pictures.
+    Rescaling would mix the phases of neighbouring pixels and destroy both eyes' pictures.
     """
     for number, (panel, monitor) in enumerate(zip(panels, monitors, strict=True)):
         columns, rows = panel_size_px(
@@ -119,10 +121,10 @@ def check_modes(panels: Sequence[PanelSettings], monitors: Sequence[Monitor], *,
 
 
 def refresh_difference(monitors: Sequence[Monitor]) -> str:
-    """One-line warning if the panels' monitors refresh at different rates, else empty; rate 0 is unknown."""
+    """Warn in one line if monitors' refresh rates differ, else return an empty string. 0: unknown rate."""
     known = [monitor for monitor in monitors if monitor.refresh_hz > 0]
     rates = [monitor.refresh_hz for monitor in known]
     if not rates or max(rates) - min(rates) <= REFRESH_TOLERANCE_HZ:
         return ""
     each = ", ".join(f"{monitor.connector} {monitor.refresh_hz:.2f} Hz" for monitor in known)
-    return f"the panels refresh at different rates ({each}): frames do not change on all of them together"
+    return f"the panels refresh at different rates ({each}), so their frames do not change at the same time"

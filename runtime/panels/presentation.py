@@ -1,4 +1,4 @@
-"""The presentation shader: an aligned and mixed layer drawn to a panel's framebuffer."""
+"""Presentation shader, which aligns and mixes a layer and draws it to a panel's framebuffer."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ void main() {
 
 
 class FrameTextures:
-    """The layers of the newest frame, uploaded when their version changes."""
+    """Textures with the newest frame's layers, uploaded whenever their version changes."""
 
     def __init__(self, context: moderngl.Context, size_px: tuple[int, int], *, count: int) -> None:
         """size_px: columns and rows of a panel."""
@@ -126,18 +126,18 @@ class FrameTextures:
 
     @property
     def solved_px(self) -> tuple[int, int]:
-        """Columns and rows of the solution."""
+        """Return the number of columns and rows of the solution."""
         return self._solved[0].size if self._solved else self.size_px
 
     def lacks(self, frame: PanelFrame) -> tuple[bool, bool]:
-        """Return True for the frame's solution, and its flat picture, if visible but not uploaded."""
+        """Return whether the frame's solution, and its flat picture, is visible but not yet uploaded."""
         return (
             shows_solved(frame) and frame.solved_version != self._solved_version,
             shows_flat(frame) and frame.flat_version != self._flat_version,
         )
 
     def upload(self, frame: PanelFrame) -> None:
-        """Upload the frame's visible pictures that are not here yet."""
+        """Upload those of the frame's visible pictures that have not been uploaded yet."""
         lacks_solved, lacks_flat = self.lacks(frame)
         if lacks_solved and frame.solved is not None:
             self._solved_version = None  # until it is here as a whole
@@ -150,7 +150,7 @@ class FrameTextures:
             self._flat_version = frame.flat_version
 
     def use(self, index: int) -> None:
-        """Bind one panel's textures where a Painter looks for them, in the context that is current."""
+        """Bind one panel's textures, in the current context, to the units that a Painter reads."""
         for unit, uploaded in enumerate((self._solved, self._flat)):
             if uploaded:
                 uploaded[index].use(unit)
@@ -175,7 +175,7 @@ class FrameTextures:
         return self._reliefs[key]
 
     def _written(self, kind: str, layers: U8) -> tuple[moderngl.Texture, ...]:
-        """One texture a panel, of the layers' raster; created when the first of that raster come."""
+        """Write layers to one texture per panel, created when the first layers of their size arrive."""
         key = kind, (layers.shape[2], layers.shape[1])
         if key not in self._textures:
             self._textures[key] = tuple(self._context.texture(key[1], 4) for _ in range(self.count))
@@ -198,7 +198,7 @@ def shows_flat(frame: PanelFrame) -> bool:
 
 
 class Painter:
-    """The presentation shader in one context; vertex arrays and framebuffers belong to it."""
+    """The presentation shader in one GL context, which also owns the vertex arrays and framebuffers."""
 
     def __init__(
         self,
@@ -208,7 +208,7 @@ class Painter:
         screen_px: tuple[int, int],
         layer_px: tuple[int, int],
     ) -> None:
-        """Prepare one panel. Raises InputError (curve), ValueError (homography)."""
+        """Prepare one panel. Raises InputError for an invalid curve, ValueError for an invalid homography."""
         matrix = layer_from_screen(
             screen_width_px=screen_px[0],
             screen_height_px=screen_px[1],
@@ -235,7 +235,7 @@ class Painter:
         self._program["exact"] = permutes_pixels(matrix)
 
     def draw(self, textures: FrameTextures, frame: PanelFrame, index: int) -> None:
-        """Panel `index` of the frame that was uploaded, over the whole of the framebuffer in use."""
+        """Draw panel `index` of the uploaded frame over the whole of the bound framebuffer."""
         matrix = frame.solved_from_shown[index] if frame.solved_from_shown else np.eye(3)
         (width, height), (solved_width, solved_height) = textures.size_px, textures.solved_px
         coarse = (width, height) != (solved_width, solved_height)

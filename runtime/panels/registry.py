@@ -1,4 +1,4 @@
-"""Open the configured panels; panels without a screen, for replay and tests."""
+"""Opening of the configured panels, and panels without a screen for replay and tests."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class OffscreenPanels(PanelSink):
-    """Panels without a screen: accepts frames without drawing them."""
+    """Panels without a screen: they accept frames without drawing them."""
 
     name = "offscreen"
 
@@ -47,14 +47,14 @@ class BrowserPanels(PanelSink):
 
 
 def panel_settings(settings: OutputSettings, count: int) -> tuple[PanelSettings, ...]:
-    """One table per panel: as configured, or defaults."""
+    """Return one table of settings per panel: as configured, or the defaults."""
     return settings.panels or tuple(PanelSettings() for _ in range(count))
 
 
 def open_panels(settings: OutputSettings, stack: PanelStack, clock: Clock, context: moderngl.Context) -> PanelSink:
-    """Open the sink configured in `[output]`; `context` is current again after each of its methods.
+    """Open the output configured in `[output]`. `context` is current again after each of its methods.
 
-    Raises InputError (unsuitable settings), PanelLost (a monitor is not there yet: wait and retry).
+    Raises InputError for unsuitable settings, PanelLost if a monitor is not there yet (wait and retry).
     """
     if settings.kind != "offscreen":
         from runtime.panels.window import WindowPanels

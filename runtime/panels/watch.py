@@ -1,4 +1,4 @@
-"""Check that windows and monitors are still as bound, with one query to X at a time.
+"""Checks that windows and monitors are still as they were bound, with one X query at a time.
 
 GLFW reports monitors that come and go, and windows that are closed or resized. It does not report a window that was
 destroyed, unmapped or moved from outside, or a monitor whose position or mode changed. In these cases a picture is on
@@ -20,15 +20,15 @@ REFRESH_TOLERANCE = 1e-3  # relative
 
 
 class PlacementWatch:
-    """Checks one window or monitor per call, each once in EVERY_NS.
+    """Checks one window or monitor per call, and each of them once in EVERY_NS.
 
-    If the X server has refused a request since the last call, something has gone: then it checks all of them.
+    If the X server has refused a request since the last call, something has disappeared, and all of them are checked.
     """
 
     def __init__(self, display: Display, monitors: Sequence[Monitor], windows: Sequence[Window], clock: Clock) -> None:
         """monitors, windows: as bound, one per panel. The first query is after EVERY_NS."""
         self._display, self._clock = display, clock
-        # EDIDs to compare with; a change of place or mode since binding shows as a difference from the monitor.
+        # EDIDs to compare with. A changed position or mode shows as a difference from the monitor as bound.
         self._states = [display.output_state(monitor.connector) for monitor in monitors]
         self._monitors, self._windows = monitors, windows
         self._questions: list[Callable[[], str]] = [
@@ -40,7 +40,7 @@ class PlacementWatch:
         self._refusals = xlib.refusals()
 
     def look(self) -> str:
-        """Return faults, naming the panel; empty without a fault or a due query."""
+        """Return faults, naming the panel; empty if there is no fault or no query is due."""
         if xlib.refusals() != self._refusals:
             faults = [fault for fault in (question() for question in self._questions) if fault]
             self._refusals = xlib.refusals()  # read after the queries, which may be refused too
@@ -73,5 +73,5 @@ class PlacementWatch:
         if monitor.refresh_hz and abs(now.refresh_hz / monitor.refresh_hz - 1.0) > REFRESH_TOLERANCE:
             return f"{subject} changed from {monitor.refresh_hz:.3f} to {now.refresh_hz:.3f} Hz"
         if then is not None and now.edid != then.edid:
-            return f"{subject} has another monitor"
+            return f"a different monitor is connected to {subject}"
         return ""

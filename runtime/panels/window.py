@@ -1,4 +1,4 @@
-"""Panels on monitors: one fullscreen window per panel, or an identity card on every monitor."""
+"""Panels on monitors: a fullscreen window for each panel, or an identity card on every monitor."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from runtime.support.gl import offscreen_context
 log = logging.getLogger("phasestack.panels")
 
 RETRY_NS = NS_PER_S // 2  # between attempts to reopen lost panels
-LOOK_NS = 5 * NS_PER_S  # between looks for monitors without a notification from X
+LOOK_NS = 5 * NS_PER_S  # interval between checks for monitors when X sends no notification
 
 
 class WindowPanels(PanelSink):
@@ -38,8 +38,8 @@ class WindowPanels(PanelSink):
 
     Once a second every window and monitor is compared with its state at binding (one query per refresh, about 0.1 ms).
     If a monitor, window or context is lost or has changed, all windows are closed and `present` raises PanelLost. A
-    later `present` reopens them, after half a second or when X reports a monitor. The shared context of a hidden
-    window survives unless it was lost itself. If the X server dies, the process ends with exit status 75 and must be
+    later `present` reopens them, after half a second or when X reports a monitor. The hidden window's shared context
+    survives unless it was lost itself. If the X server dies, the process ends with exit status 75 and must be
     restarted. GLFW requires the main thread. The `content` context is current again after every call.
     """
 
@@ -49,7 +49,7 @@ class WindowPanels(PanelSink):
         self, panels: tuple[PanelSettings, ...], stack: PanelStack, clock: Clock, content: moderngl.Context, *,
         any_shape: bool = False,
     ) -> None:  # fmt: skip
-        """any_shape: fill monitors in modes other than the stack's (for `identify`) instead of refusing them.
+        """any_shape: accept monitors in modes other than the stack's, and fill them (for `identify`).
 
         Raises InputError (settings); PanelLost (a panel is missing or ambiguous, or there is no X server; both may be
         temporary).
@@ -76,7 +76,7 @@ class WindowPanels(PanelSink):
 
     @property
     def period_ns(self) -> int | None:
-        """Refresh period of the first panel's monitor, whose vertical blank paces the swaps."""
+        """Return the refresh period of the first panel's monitor, whose vertical blank paces the swaps."""
         refresh_hz = self.monitors[0].refresh_hz if self.monitors else 0.0
         return round(NS_PER_S / refresh_hz) if refresh_hz else None
 
@@ -85,13 +85,13 @@ class WindowPanels(PanelSink):
         return [window.handle for window, _ in self._surfaces]
 
     def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
-        """Show a frame on all panels; skip an unchanged one that is still shown. Raises PanelLost."""
+        """Show a frame on all panels, or skip it if it is unchanged and still shown. Raises PanelLost."""
         if not self._surfaces and not self._may_try():
             raise PanelLost(self._lost)
         try:
             if not self._surfaces:
                 self._open()
-                log.info("panels are back: %s", ", ".join(str(monitor) for monitor in self.monitors))
+                log.info("panels are working again: %s", ", ".join(str(monitor) for monitor in self.monitors))
             return self._present(frame, unchanged)
         except (PanelLost, glfw.GLFWError, moderngl.Error) as error:
             self._lost = str(error)
@@ -144,7 +144,7 @@ class WindowPanels(PanelSink):
         return self._clock.now_ns()
 
     def _may_try(self) -> bool:
-        """Return True if it is time to reopen the panels: after a delay, or when a monitor came or went."""
+        """Return True if it is time to reopen the panels: after a delay, or after a monitor came or went."""
         display = self._display
         if display is not None and display.poll():
             display.faults.clear()
@@ -171,7 +171,7 @@ class WindowPanels(PanelSink):
         self._watch = PlacementWatch(display, self.monitors, [window for window, _ in self._surfaces], self._clock)
 
     def _retreat(self) -> None:
-        """Close the windows after a failure; keep the connection and, if intact, the shared context."""
+        """Close the windows after a failure. Keep the connection and, if it is intact, the shared context."""
         if self._display is None or self._context_lost:
             self._drop()
         elif self._display.has_windows:
@@ -208,7 +208,7 @@ class WindowPanels(PanelSink):
                 log.exception("closing the display")
 
     def _forget(self) -> None:
-        """Clear the state of closed windows and schedule reopening."""
+        """Clear the state of the closed windows, and schedule their reopening."""
         self._surfaces, self._textures, self._watch, self._shown = [], None, None, False
         self._retry_ns = self._clock.now_ns() + RETRY_NS
 
@@ -225,18 +225,18 @@ def _error(context: moderngl.Context) -> str:
 
 
 def _reset_status() -> str:
-    """Driver's report of a lost context (GPU reset); empty if intact or not supported."""
+    """Return the driver's report of a lost context (GPU reset); empty if it is intact or cannot be queried."""
     address = gl_function("glGetGraphicsResetStatus")
     status: int = ctypes.CFUNCTYPE(ctypes.c_uint)(address)() if address else 0
     return f"was reset (0x{status:x})" if status else ""
 
 
 def every_monitor() -> tuple[WindowPanels, list[U8], tuple[Monitor, ...]]:
-    """Open windows on all monitors; returns them, the identity cards and the monitors. Raises PanelLost."""
+    """Open windows on all monitors. Returns them, the identity cards and the monitors. Raises PanelLost."""
     monitors = connected_monitors()
     width, height = max(m.width_px for m in monitors), max(m.height_px for m in monitors)
     bound = tuple(PanelSettings(connector=monitor.connector) for monitor in monitors)
-    # A nominal stack: the cards fill monitors of any shape.
+    # The stack is nominal, since the cards fill monitors of any shape.
     stack = PanelStack(1.0, 1.0, tuple(0.01 * index for index in range(len(monitors))), width, height)
     panels = WindowPanels(bound, stack, MonotonicClock(), offscreen_context(), any_shape=True)
     cards = []

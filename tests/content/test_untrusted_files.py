@@ -144,7 +144,7 @@ def test_a_script_under_a_film_s_name_opens_no_other_file(tmp_path: Path) -> Non
     other = video(tmp_path / "secret.mp4", (64, 48))
     for name, text in (("a.mp4", f"ffconcat version 1.0\nfile {other}\n"), ("concat:secret.mp4", "")):
         (tmp_path / name).write_text(text)
-        with pytest.raises(InputError, match="is not a film that can be decoded"):
+        with pytest.raises(InputError, match="cannot be decoded as a film"):
             list(_filmed(tmp_path / name, 30.0))
         with pytest.raises(SensorLost, match="cannot be opened"):
             UsbCameraDriver(SensorSettings(source=str(tmp_path / name), fov_deg=60.0), MonotonicClock()).open()

@@ -105,7 +105,7 @@ def test_another_monitor_at_the_same_connector_is_noticed(x: XServer, opened: Ca
     sink = opened(*BY_CONNECTOR)
     assert presents(sink, 0)
     x.set_edid(0, block(serial_text="OTHER"))
-    assert "panel 1: DUMMY0 has another monitor" in lost(sink)
+    assert "a different monitor is connected to panel 1: DUMMY0" in lost(sink)
     assert eventually(lambda: presents(sink, 7))
     assert sink.monitors[1].serial == "OTHER"
 
