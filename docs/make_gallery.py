@@ -128,8 +128,8 @@ def page(report: dict[str, Any]) -> str:
             "![a leaning head, before, now, and what it should see](images/leaning.webp)\n",
             LEANING,
             "## Focal parallax\n",
-            "Three cards seen through a pupil of 4 mm: the distance at which the eyes converge on each card, at which its\n"
-            "picture through the layers is sharpest, and at which the card itself is sharpest.\n",
+            "Three cards seen through a pupil of 4 mm: the distance at which the eyes converge on each card, at which "
+            "its\npicture through the layers is sharpest, and at which the card itself is sharpest.\n",
             _table(["card at, mm", "sharpest through the layers", "sharpest in truth"], cards),
             "![focused behind, on and in front of the panels](images/focal-slices.jpg)",
             "",
