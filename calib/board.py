@@ -3,8 +3,8 @@
 A mark is a white square with an ArUco marker inside and a smaller white square at each of its corners. Where two
 squares touch there is a saddle point, which is symmetric under half a turn; it is located to a few hundredths of a
 pixel despite blur and the camera's tone curve. The rest of the board is black (phase 0), which lets the other panels'
-marks show through. So one photograph shows the marks of all panels, and no tripod is needed. Marks are scattered, so
-that two that overlap from one viewpoint do not from another.
+marks show through. One photograph therefore shows the marks of all panels, and no tripod is needed. Marks are
+scattered, so that two which overlap from one viewpoint do not overlap from another.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Mark:
 
     @property
     def side_px(self) -> int:
-        """Side of the white square."""
+        """Side length of the white square."""
         return SQUARE * self.unit_px
 
     @property
@@ -59,7 +59,7 @@ class Mark:
 
     @property
     def marker_px(self) -> F64:
-        """(4, 2) corners of the marker itself, in the order of `saddles_px`."""
+        """(4, 2) corners of the marker itself, ordered as in `saddles_px`."""
         inset = QUIET * self.unit_px
         corners: F64 = self.saddles_px + inset * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
         return corners
@@ -67,9 +67,9 @@ class Mark:
 
 @lru_cache(maxsize=8)
 def marks(stack: PanelStack) -> tuple[Mark, ...]:
-    """All marks of all panels. Raises InputError for too many or too small panels."""
+    """Lay out the marks of all panels. Raises InputError if panels are too many or too small."""
     if stack.count * PER_PANEL > DICTIONARY_SIZE:
-        raise InputError("stack", "x_m", f"boards are for {DICTIONARY_SIZE // PER_PANEL} panels at most")
+        raise InputError("stack", "x_m", f"there are boards for at most {DICTIONARY_SIZE // PER_PANEL} panels")
     unit = max(2, round(min(stack.width_px * 9 / 16, stack.height_px) / BITS_ON_SHORT_SIDE))
     tile = TILE * unit
     cell = np.array([stack.width_px / ACROSS, stack.height_px / DOWN])
@@ -87,7 +87,7 @@ def marks(stack: PanelStack) -> tuple[Mark, ...]:
 
 
 def board(stack: PanelStack, panel: int) -> U8:
-    """(H, W) board of one panel, 0 or 255."""
+    """Draw the (H, W) board of one panel, in 0 and 255."""
     picture = np.zeros((stack.height_px, stack.width_px), np.uint8)
     for mark in marks(stack):
         if mark.panel != panel:
@@ -104,5 +104,5 @@ def board(stack: PanelStack, panel: int) -> U8:
 
 
 def boards(stack: PanelStack) -> U8:
-    """(N, H, W) boards of all panels."""
+    """Draw the (N, H, W) boards of all panels."""
     return np.stack([board(stack, index) for index in range(stack.count)])

@@ -2,8 +2,8 @@
 
 The panels' pixel pitch sets the scale. The reference panel, at its ideal pose, defines the stack's frame. A robust fit
 (soft L1) finds outliers; plain least squares of the other points gives an unbiased covariance. Derivatives are exact,
-and the normal equations small: about a hundred unknowns, thousands of coordinates. scipy's `least_squares` comes to the
-same covariance (to 1e-11) in 30 times the time, since it decomposes the whole Jacobian.
+and the normal equations are small: about a hundred unknowns, thousands of coordinates. scipy's `least_squares` gives
+the same covariance (to 1e-11) but takes 30 times as long, since it decomposes the whole Jacobian.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ SQUARE_SIGMA, CENTRE_SIGMA, DISTORTION_SIGMAS = 0.003, 0.03, (0.3, 0.5, 0.005, 0
 
 
 class Undetermined(ValueError):
-    """The photographs do not determine the panels; the text says why."""
+    """Raised when the photographs do not determine the panels; the message explains why."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
-    """Result of a fit."""
+    """Result of a bundle adjustment."""
 
     panels: tuple[PlacedPanel, ...]  # rear to front, frame of the reference panel
     reference: int
@@ -52,7 +52,7 @@ class Bundle:
     photograph: Any  # (K,) index
 
     def sigma_of(self, derived: Any) -> F64:
-        """Return the standard deviation of a function of the panels, to first order; shape of its result."""
+        """Return the standard deviation of a function of the panels, to first order, in the result's shape."""
         columns = []
         for number, step in enumerate(np.sqrt(np.diag(self.covariance)) * 0.1):
             up, down = (np.asarray(derived(self._stepped(number, signed))) for signed in (step, -step))
@@ -61,7 +61,7 @@ class Bundle:
         return np.asarray(np.sqrt(np.einsum("...i,ij,...j->...", slope, self.covariance, slope)), dtype=np.float64)
 
     def _stepped(self, number: int, step: float) -> tuple[PlacedPanel, ...]:
-        """Return the panels after a step of one parameter of `covariance`."""
+        """Return the panels after a small step of one parameter of `covariance`."""
         panels, change = list(self.panels), np.zeros(POSE)
         moving = [index for index in range(len(panels)) if index != self.reference][number // POSE]
         change[number % POSE] = step
@@ -72,7 +72,7 @@ class Bundle:
 
 @dataclass(frozen=True, slots=True)
 class _State:
-    """The unknowns."""
+    """Current values of the unknowns."""
 
     lens: F64  # (9,)
     turns: F64  # (N, 3, 3) stack_from_panel
@@ -87,7 +87,7 @@ class _State:
 
 
 class _Problem:
-    """Detected points. Unknowns of a step: lens, all panels except the reference, camera poses."""
+    """The detected points, and the layout of a step: lens, all panels except the reference, camera poses."""
 
     def __init__(self, seen: Sequence[SeenMarks], stack: PanelStack, *, reference: int) -> None:
         self.stack, self.reference, self.photographs = stack, reference, len(seen)
@@ -120,13 +120,13 @@ class _Problem:
         return np.asarray(seen.reshape(-1, 2) - self.image_px, dtype=np.float64)
 
     def residuals(self, state: _State) -> F64:
-        """Return `residual_px`, and the priors' residuals in standard deviations, (2K + priors,)."""
+        """Return (2K + priors,): `residual_px`, then the priors' residuals in standard deviations."""
         lens = state.lens
         prior = np.concatenate([[lens[0] - lens[1]], lens[2:4] - self.middle, lens[4:]]) * self.prior_scale
         return np.concatenate([self.residual_px(state).ravel(), prior])
 
     def slopes(self, state: _State) -> F64:
-        """Return the derivatives of `residuals` by a step, (2K + priors, unknowns)."""
+        """Return (2K + priors, unknowns) derivatives of `residuals` with respect to a step."""
         count = len(self.local_m)
         slopes = cv2.projectPoints(self.camera_m(state), np.zeros(3), np.zeros(3), state.camera, state.lens[4:])[1]
         by_point = slopes[:, 3:6].reshape(count, 2, 3) @ state.poses[self.photograph, :3, :3]
@@ -147,7 +147,7 @@ class _Problem:
         return matrix
 
     def moved(self, state: _State, step: F64) -> _State:
-        """Return the state after a step."""
+        """Return the state after applying a step."""
         panels, cameras = step[LENS : self.poses_from].reshape(-1, POSE), step[self.poses_from :].reshape(-1, POSE)
         turns, middles_m = state.turns.copy(), state.middles_m.copy()
         turns[self.moving] = Rotation.from_rotvec(panels[:, :3]).as_matrix() @ turns[self.moving]
@@ -159,7 +159,7 @@ class _Problem:
     def start(self, *, reverse: bool = False) -> _State:
         """Return ideal panels with the focal length and camera poses that explain the photographs best.
 
-        reverse: panels in the reverse of the configured order.
+        reverse: assume that the panels are in the reverse of the configured order.
         """
         count, origin_m = self.stack.count, self.stack.x_m[self.reference]
         middles_m = np.zeros((count, 3))
@@ -182,7 +182,7 @@ class _Problem:
 
 
 def _solved(problem: _Problem, state: _State, used: NDArray[np.bool_], *, robust: bool) -> _State:
-    """Minimise by Levenberg-Marquardt; robust: the soft L1 norm, with iteratively renewed weights."""
+    """Minimise by Levenberg-Marquardt; robust: minimise the soft L1 norm, by iterative reweighting."""
     kept = np.concatenate([np.repeat(used, 2), np.ones(len(problem.prior_scale), bool)])
 
     def cost_of(residuals: F64) -> float:
@@ -223,7 +223,7 @@ def _refuse_reverse(problem: _Problem, state: _State) -> None:
         other = _solved(problem, problem.start(reverse=True), everything, robust=True)
         behind = _median_px(problem, other) < NO_FIT_PX
     if behind:
-        raise Undetermined("the panels are in the reverse of the configured order: panel 0 is the rear one")
+        raise Undetermined("the panels are in the reverse of the configured order: panel 0 must be the rear one")
 
 
 def _median_px(problem: _Problem, state: _State) -> float:
@@ -232,7 +232,7 @@ def _median_px(problem: _Problem, state: _State) -> float:
 
 
 def adjust(seen: Sequence[SeenMarks], stack: PanelStack, *, reference: int) -> Bundle:
-    """Fit all panels to the photographs of one camera (of one size). Raises Undetermined."""
+    """Fit all panels to photographs of equal size from one camera. Raises Undetermined."""
     problem = _Problem(seen, stack, reference=reference)
     used = np.ones(len(problem.image_px), bool)
     state = _solved(problem, problem.start(), used, robust=True)
@@ -263,7 +263,7 @@ def adjust(seen: Sequence[SeenMarks], stack: PanelStack, *, reference: int) -> B
 
 
 def _covariance(problem: _Problem, state: _State, used: NDArray[np.bool_], *, sigma: float) -> F64:
-    """Return the covariance of a step for points with noise `sigma`. Raises Undetermined."""
+    """Return the covariance of a step if the points' noise is `sigma`. Raises Undetermined."""
     slopes = problem.slopes(state)
     slopes[: 2 * len(used)] /= sigma
     weighted = slopes[np.concatenate([np.repeat(used, 2), np.ones(len(problem.prior_scale), bool)])]

@@ -1,4 +1,4 @@
-"""`calibrate capture`: guide a person through the viewpoints and store the good pairs."""
+"""`calibrate capture`: guide a person through the viewpoints, and store the accepted pairs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MIN_SAMPLES = 5  # in the window, for a meaningful spread
 
 
 def midpoint(eyes: EyePoints | None) -> F64 | None:
-    """(3,) midpoint of two measured eyes; None if one is missing, uncertain or filled in."""
+    """Return the (3,) midpoint of two measured eyes, or None if one is missing, uncertain or filled in."""
     if eyes is None or eyes.completed or eyes.confidence.min() < CONFIDENCE_MIN:
         return None
     middle = eyes.eyes_m.mean(axis=0)
@@ -38,13 +38,13 @@ def midpoint(eyes: EyePoints | None) -> F64 | None:
 
 
 class EyeWindow:
-    """Samples of the half second up to the newest one."""
+    """Window over the samples of the last half second."""
 
     def __init__(self) -> None:
         self._samples: deque[tuple[int, F64]] = deque()  # capture time, midpoint of the eyes
 
     def add(self, capture_ns: int, eyes: EyePoints | None) -> None:
-        """Take in a sample in frame `sensor`; unusable ones only advance time."""
+        """Add a sample in frame `sensor`. An unusable one only advances the window's time."""
         middle = midpoint(eyes)
         if middle is not None:
             self._samples.append((capture_ns, middle))
@@ -52,7 +52,7 @@ class EyeWindow:
             self._samples.popleft()
 
     def measure(self) -> tuple[F64, float] | None:
-        """Median (3,) of the window, frame `sensor`, and robust RMS spread; None: too few samples."""
+        """Return the window's (3,) median, frame `sensor`, and robust RMS spread; None for too few samples."""
         if len(self._samples) < MIN_SAMPLES:
             return None
         points = np.array([point for _, point in self._samples])
@@ -62,7 +62,7 @@ class EyeWindow:
 
 
 class Walk:
-    """State of a person's walk through the viewpoints. No clock, no threads."""
+    """Progress of a person through the viewpoints. Uses no clock and no threads."""
 
     def __init__(
         self,
@@ -72,7 +72,7 @@ class Walk:
         say: Callable[[str], None],
         chart: Callable[[Viewpoint], None] | None = None,
     ) -> None:
-        """chart: shows a viewpoint's chart; None: the charts are shown elsewhere."""
+        """chart: shows a viewpoint's chart; None if the charts are shown elsewhere."""
         self._file, self._say, self._chart = file, say, chart
         self._left = [v for v in viewpoints if v.name not in file.viewpoints]
         self._window = EyeWindow()
@@ -83,25 +83,25 @@ class Walk:
 
     @property
     def current(self) -> Viewpoint:
-        """Viewpoint currently shown."""
+        """Return the viewpoint that is currently shown."""
         return self._left[self._index]
 
     def begin(self) -> None:
         """Announce the first viewpoint."""
         if self.finished:
-            self._say("every viewpoint has its pair already")
+            self._say("every viewpoint already has its pair")
         else:
             self._announce()
 
     def see(self, capture_ns: int, eyes: EyePoints | None, serial: str) -> None:
-        """Take in a sample in frame `sensor`."""
+        """Add a sample in frame `sensor`."""
         if self.finished:
             return
         self._serial = serial
         self._window.add(capture_ns, eyes)
 
     def press(self, key: Key | None) -> None:
-        """Act on a key; None: no key was pressed."""
+        """Act on a key, if one was pressed."""
         if self.finished:
             return
         match key:
@@ -115,7 +115,7 @@ class Walk:
                 self._go(-1)
 
     def summary(self) -> dict[str, Any]:
-        """Figures for the command's summary."""
+        """Return the figures for the command's summary."""
         names = self._file.viewpoints
         return {
             "file": str(self._file.path),
@@ -127,7 +127,7 @@ class Walk:
     def _accept(self) -> None:
         viewpoint, seen = self.current, self._window.measure()
         if seen is None:
-            self._say(f"{viewpoint.name}: not accepted: the sensor sees no pair of eyes")
+            self._say(f"{viewpoint.name}: not accepted: the sensor does not see both eyes")
             return
         middle_m, spread_m = seen
         spread = f"{spread_m * 1e3:.1f}"
@@ -200,7 +200,7 @@ def capture_recording(out: Path, settings: Settings, *, source: str) -> dict[str
                 name = f"at {frame.capture_ns / NS_PER_S:.3f} s"
                 pairs.append(PairRow.of(middle, frame.true_eyes_m.mean(axis=0), name, serial=samples.serial))
     if not pairs:
-        problem = "gives no pair: no usable eyes" if known else "has no true eye positions"
+        problem = "the sample has no usable eyes" if known else "the recording has no true eye positions"
         raise InputError(source, "", f"{problem}: capture from the live sensor")
     file.accept(*pairs)
     return {"file": str(out), "pairs": len(file), "accepted": len(pairs)}

@@ -1,4 +1,4 @@
-"""Calibration charts: black lines at the thirds of each eye's image (EyeReal, 2.3, figure S4).
+"""Calibration charts with black lines at the thirds of each eye's image (EyeReal, 2.3, figure S4).
 
 One set of layers serves both eyes: at the viewpoint the lines fuse into clean single ones; elsewhere they show ghosts
 and stripes.
@@ -28,7 +28,7 @@ WIDEST_FOV_DEG = 40.0  # horizontal, of the eyes' images, as in the published co
 
 
 def chart_fov_deg(viewpoint: Viewpoint, stack: PanelStack) -> float:
-    """Horizontal field of view of a viewpoint's images: as published, or the display's if smaller.
+    """Horizontal field of view of a viewpoint's images: the published one, or the display's if smaller.
 
     This keeps the lines on the panels at any distance.
     """
@@ -36,29 +36,29 @@ def chart_fov_deg(viewpoint: Viewpoint, stack: PanelStack) -> float:
 
 
 def line_picture(*, width_px: int, height_px: int) -> U8:
-    """(h, w, 3) picture for one eye: lines of 10 pixels at the thirds of width and height."""
+    """(h, w, 3) picture for one eye, with lines 10 pixels wide at the thirds of its width and height."""
     ink = np.maximum(_ink(width_px), _ink(height_px)[:, None])
     return np.repeat(np.rint(255 * (1 - ink)).astype(np.uint8)[..., None], 3, axis=2)
 
 
 def _ink(length_px: int) -> F64:
-    """(length,) share of each pixel covered by lines at the thirds."""
+    """(length,) share of each pixel that lines at the thirds cover."""
     position = np.arange(length_px, dtype=np.float64) + 0.5
     distance = np.minimum(np.abs(position - length_px / 3), np.abs(position - 2 * length_px / 3))
     return np.clip(LINE_PX / 2 - distance + 0.5, 0.0, 1.0)
 
 
 class Charts:
-    """Charts for one stack."""
+    """Draws the charts for one stack."""
 
     def __init__(self, settings: Settings) -> None:
-        """Load the model. Raises InputError, MissingPart."""
+        """Load the model that computes the layers. Raises InputError, MissingPart."""
         self.stack = settings.stack.stack()
         self.ipd_m = settings.calibration.ipd_m or IPD_M
         self._predictor = load_predictor(MODEL, self.stack, settings.model)
 
     def layers(self, viewpoint: Viewpoint) -> U8:
-        """(N, H, W, 4) layers that show the line picture to both eyes at the viewpoint."""
+        """(N, H, W, 4) layers that show the lines to both eyes at the viewpoint."""
         picture = line_picture(width_px=self.stack.width_px, height_px=self.stack.height_px)
         eyes_m, fov_deg = viewpoint.eyes_m(self.ipd_m), chart_fov_deg(viewpoint, self.stack)
         prediction = solve_still(picture, picture, eyes_m=eyes_m, fov_deg=fov_deg, predictor=self._predictor)
@@ -70,7 +70,7 @@ class Charts:
 
 
 def make_charts(out: Path, viewpoints: Sequence[Viewpoint], settings: Settings) -> dict[str, Any]:
-    """Write a PNG per panel and viewpoint, and `charts.json`. Raises InputError, MissingPart."""
+    """Write one PNG per panel and viewpoint, and `charts.json`. Raises InputError, MissingPart."""
     charts = []
     with OutputFolder(out) as folder, closing(Charts(settings)) as drawn:
         for viewpoint in tracked("charts", viewpoints):

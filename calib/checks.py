@@ -22,10 +22,10 @@ NAMED = 8  # pairs named in a message
 
 
 def check_pairs(pairs: Pairs) -> list[str]:
-    """Warnings about pairs before solving. Raises InputError with the pairs' file.
+    """Return warnings about pairs, before solving. Raises InputError, naming the pairs' file.
 
-    Refused: fewer than 3 pairs; coincident or collinear points; points beyond double precision; mirrored axes; mixed
-    units.
+    It refuses fewer than 3 pairs, coincident or collinear points, points beyond double precision, mirrored axes and
+    mixed units.
     """
     if _is_mirrored(pairs):
         raise InputError(
@@ -49,7 +49,7 @@ def check_pairs(pairs: Pairs) -> list[str]:
 
 
 def check_solution(pairs: Pairs, solution: CalibrationSolution, volume_m: F64) -> list[str]:
-    """Warnings about a solution; `volume_m` (..., 3): the viewing volume. Raises InputError."""
+    """Return warnings about a solution. volume_m: (..., 3), the viewing volume. Raises InputError."""
     warnings = []
     check_similarity(solution.similarity.matrix, source=pairs.source)
     axis = "xyz"[int(np.argmax(solution.axis_rms_m))]

@@ -1,4 +1,4 @@
-"""`phasestack calibrate`: panels, grey curves and the sensor's pose. Imports nothing heavy."""
+"""`phasestack calibrate`: panels, grey curves and the sensor's pose. Heavy imports are deferred."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from runtime.support.ranges import SCALE
 if TYPE_CHECKING:
     from runtime.config import Settings
 
-ConfigOption = Annotated[Path | None, typer.Option(help="configuration TOML; default: the built-in defaults")]
+ConfigOption = Annotated[Path | None, typer.Option(help="configuration (TOML); without one, the defaults")]
 JsonOption = Annotated[bool, typer.Option("--json", help="one JSON object on stdout")]
 
 app = typer.Typer(
@@ -30,7 +30,7 @@ app = typer.Typer(
 @app.command()
 def panels(
     out: Annotated[Path | None, typer.Option(help="folder for the registration")] = None,
-    photos: Annotated[Path | None, typer.Option(help="folder of 8 to 20 photographs of the boards")] = None,
+    photos: Annotated[Path | None, typer.Option(help="folder with 8 to 20 photographs of the boards")] = None,
     show: Annotated[bool, typer.Option("--show", help="show the boards on the panels until Enter or q")] = False,
     write: Annotated[bool, typer.Option("--write", help="write distances, tilts and homographies to --config")] = False,
     config: ConfigOption = None,
@@ -38,16 +38,16 @@ def panels(
 ) -> None:
     """Measure every panel's pose from photographs of coded boards, with standard errors.
 
-    First --show: in a dim room, take 8 to 20 hand-held photographs with one camera and one zoom setting, the display
-    filling most of the picture: from the middle, the left, the right, above and below, up to 40 degrees off the axis,
-    a few with the camera rotated to portrait. Then --photos.
+    First show the boards with --show. In a dim room, take 8 to 20 hand-held photographs with one camera and one zoom
+    setting, so that the display fills most of the picture: from the middle, the left, the right, above and below, up to
+    40 degrees off the axis, and a few with the camera rotated to portrait. Then pass their folder as --photos.
 
     Example: phasestack calibrate panels --photos photos --config phasestack.toml --write --out registration
     """
     if show == (photos is not None) or (photos is not None and out is None):
         raise InputError("calibrate panels", "--show", "give either --show, or --photos with --out")
     if write and (config is None or photos is None):
-        raise InputError("calibrate panels", "--write", "needs --config and --photos")
+        raise InputError("calibrate panels", "--write", "requires --config and --photos")
     settings = _settings(config)
     if photos is not None and out is not None:
         from calib.photographs import photographs
@@ -67,15 +67,16 @@ def panels(
 def grey(
     out: Annotated[Path | None, typer.Option(help="the panel's LUT, CSV")] = None,
     panel: Annotated[int, typer.Option(help="0 is the rear panel", min=0)] = 0,
-    photos: Annotated[Path | None, typer.Option(help="folder of two or three photographs of the chart")] = None,
+    photos: Annotated[Path | None, typer.Option(help="folder with two or three photographs of the chart")] = None,
     show: Annotated[bool, typer.Option("--show", help="show the chart on the panel until Enter or q")] = False,
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Measure one panel's grey curve and write its inverse as a LUT.
 
-    First --show: in a dark room, photograph the chart with any camera from two or three positions, with the exposure
-    locked, the whole chart in the picture and no white clipped. Then --photos.
+    First show the chart with --show. In a dark room, photograph it with any camera from two or three positions. Lock
+    the exposure, keep the whole chart in the picture, and avoid clipped whites. Then pass the photographs' folder as
+    --photos.
 
     Example: phasestack calibrate grey --panel 2 --photos photos --out panel-2.csv
     """
@@ -104,7 +105,7 @@ def charts(
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw the calibration charts: lines that fuse only when the eyes are at the chart's viewpoint.
+    """Draw the calibration charts, whose lines fuse only when the eyes are at the chart's viewpoint.
 
     Example: phasestack calibrate charts --out charts
     """
@@ -117,18 +118,18 @@ def charts(
 
 @app.command()
 def capture(
-    out: Annotated[Path, typer.Option(help="CSV of pairs; an existing one is resumed")],
+    out: Annotated[Path, typer.Option(help="CSV file for the pairs; an existing one is resumed")],
     config: ConfigOption = None,
     replay: Annotated[
-        str | None, typer.Option(help="recording to use instead of the sensor; `demo`: the built-in one")
+        str | None, typer.Option(help="recording to use instead of the sensor; `demo` for the built-in one")
     ] = None,
-    show: Annotated[bool, typer.Option("--show", help="show each chart on the panels")] = False,
+    show: Annotated[bool, typer.Option("--show", help="show the charts on the panels")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Pair each chart's viewpoint with the measured eyes; every accepted pair is saved immediately.
+    """Pair each chart's viewpoint with the measured eyes. Every accepted pair is saved immediately.
 
-    Live: at each chart, move until the lines fuse, then press Enter (n: next; p: previous, to replace its pair; q:
-    stop). A recording must contain true eye positions, as the demo does.
+    With a live sensor, move until the lines of the chart fuse, then press Enter. Press n for the next chart, p to go
+    back and replace a pair, q to stop. A recording must contain true eye positions, as the demo does.
 
     Example: phasestack calibrate capture --config /etc/phasestack/phasestack.toml --show --out pairs.csv
     """
@@ -152,16 +153,16 @@ def capture(
 
 @app.command()
 def solve(
-    pairs: Annotated[Path, typer.Option(help="CSV or JSON of sensor_x.., stack_x.. in metres")],
-    out: Annotated[Path, typer.Option(help="calibration TOML; a previous one is kept next to it")],
+    pairs: Annotated[Path, typer.Option(help="CSV or JSON file with sensor_x.., stack_x.. in metres")],
+    out: Annotated[Path, typer.Option(help="calibration file (TOML); a previous one is kept next to it")],
     method: Annotated[
         str, typer.Option(help="seed, least-squares, inverse, robust or fixed-scale; default: the best for the pairs")
     ] = "",
-    scale: Annotated[float, number(*SCALE, help="the known scale of fixed-scale")] = 1.0,
+    scale: Annotated[float, number(*SCALE, help="the known scale for fixed-scale")] = 1.0,
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compute stack_from_sensor from pairs, with its error at the eye; refuse inadequate pairs.
+    """Compute stack_from_sensor from pairs, and its error at the eye. Inadequate pairs are refused.
 
     Example: phasestack calibrate solve --pairs pairs.csv --out calibration.toml
     """
@@ -172,12 +173,12 @@ def solve(
 
 @app.command()
 def report(
-    file: Annotated[Path, typer.Argument(help="a calibration TOML")],
+    file: Annotated[Path, typer.Argument(help="calibration file (TOML)")],
     out: Annotated[Path, typer.Option(help="folder for index.html and its pictures")],
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a page with a calibration's figures and a map of its error.
+    """Write a page with a calibration's figures and a map of its errors.
 
     Example: phasestack calibrate report calibration.toml --out report
     """

@@ -1,4 +1,4 @@
-"""Edit a configuration file: keeps comments and past versions, and writes only valid files."""
+"""Editing of configuration files: keeps comments and past versions, and writes only valid files."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ KEPT_BYTES_MAX = 64 << 20  # largest file that is backed up
 
 
 def save(path: Path, text: str) -> Path | None:
-    """Write a file (or a link's target) atomically and keep the version it replaces.
+    """Write a file (or a link's target) atomically, and keep the version that it replaces.
 
-    Returns the kept version's path; its permissions are those of the file.
+    Returns the path of the kept version, which has the same permissions as the file.
     """
     path, kept = path.resolve(), None
     if untrusted_input.is_there(path):
@@ -47,7 +47,7 @@ def _version(path: Path, number: int) -> Path:
 
 
 def read_document(config: Path) -> TOMLDocument:
-    """Read a configuration; empty if the file does not exist yet. Raises InputError."""
+    """Read a configuration, which is empty if the file does not exist yet. Raises InputError."""
     if not untrusted_input.is_there(config):
         return tomlkit.document()
     load_settings(config)
@@ -58,7 +58,7 @@ def read_document(config: Path) -> TOMLDocument:
 
 
 def rewrite(config: Path, change: Callable[[TOMLDocument], None]) -> Path | None:
-    """Change a configuration if the result is valid; returns the path of the past version.
+    """Change a configuration if the result is valid. Returns the path of the previous version.
 
     Raises InputError.
     """
@@ -80,7 +80,7 @@ def put(document: TOMLDocument, section: str, values: Mapping[str, Any]) -> None
 
 
 def put_panels(document: TOMLDocument, key: str, values: Mapping[int, Any], *, panels: int) -> None:
-    """Set a key in some panels' tables (homography, grey curve), which are created if missing."""
+    """Set a key (homography, grey curve) in some panels' tables, creating those that are missing."""
     output: Any = document.setdefault("output", tomlkit.table())
     if "panels" not in output:
         output["panels"] = tomlkit.aot()

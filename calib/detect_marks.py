@@ -1,4 +1,4 @@
-"""Find the boards' saddle points in a photograph to hundredths of a pixel, or report its fault."""
+"""Detection of the boards' saddle points in a photograph, to hundredths of a pixel."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MIN_DYNAMIC = 24  # code values between black and white
 
 @dataclass(frozen=True, slots=True)
 class SeenMarks:
-    """Saddles found in one photograph."""
+    """Saddle points found in one photograph."""
 
     name: str
     width_px: int
@@ -32,7 +32,7 @@ class SeenMarks:
     panel_px: F64  # (K, 2) position on the panel
     image_px: F64  # (K, 2) position in the photograph; pixel centres at whole numbers
     marks: tuple[int, ...]  # number found, per panel
-    fault: str  # reason why the photograph is unusable; empty: none
+    fault: str  # reason why the photograph is unusable; empty if it is usable
 
 
 def _detector() -> Any:
@@ -46,7 +46,7 @@ def _detector() -> Any:
 
 
 def _markers(picture: U8, known: dict[int, Mark]) -> list[tuple[Mark, F64]]:
-    """Marks with readable codes and their (4, 2) corners in the picture; codes read twice are dropped."""
+    """Return the marks with readable codes and their (4, 2) corners; codes read twice are dropped."""
     scale = min(2.0, DETECTION_PX / max(picture.shape))
     kind = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=kind)
@@ -62,7 +62,7 @@ def _markers(picture: U8, known: dict[int, Mark]) -> list[tuple[Mark, F64]]:
 
 
 def find_marks(picture: U8, stack: PanelStack, *, name: str) -> SeenMarks:
-    """Find the saddles of all panels' boards in a grey photograph (h, w)."""
+    """Find the saddle points of all panels' boards in a grey photograph (h, w)."""
     known = {mark.number: mark for mark in marks(stack)}
     markers = _markers(picture, known)
     panel, panel_px, image_px, edges = [], [np.zeros((0, 2))], [np.zeros((0, 2))], []
@@ -97,7 +97,7 @@ def find_marks(picture: U8, stack: PanelStack, *, name: str) -> SeenMarks:
 
 
 def _mirrored(picture: U8, known: dict[int, Mark], counts: list[int]) -> str:
-    """Fault of a picture whose marks are found only in its mirror image; empty: none."""
+    """Return the fault of a picture whose marks appear only in its mirror image, or an empty string."""
     if min(counts) >= MIN_MARKS:
         return ""
     turned = [mark.panel for mark, _ in _markers(np.ascontiguousarray(picture[:, ::-1]), known)]
@@ -110,9 +110,9 @@ def _mirrored(picture: U8, known: dict[int, Mark], counts: list[int]) -> str:
 
 
 def _unreadable(counts: list[int], edges: list[float], unit_px: float) -> str:
-    """Fault in a picture's sharpness; empty: none. edges: width of each mark's edge in bits of a marker."""
+    """Return a fault in sharpness, or an empty string. edges: width of each mark's edge in marker bits."""
     if sum(counts) == 0:
-        return "shows no mark of the board: blurred, too dark, or not of the board"
+        return "shows no mark of a board: it is blurred, too dark, or of something else"
     edge_bits = float(np.median(edges))
     if edge_bits > BLURRED_BITS:
         return f"is blurred: its edges are {edge_bits * unit_px:.1f} px wide"
@@ -122,7 +122,7 @@ def _unreadable(counts: list[int], edges: list[float], unit_px: float) -> str:
 
 
 def _covered(counts: list[int], places: F64, owners: Any) -> str:
-    """Fault that keeps a panel from being located; empty: none. places: (K, 2) saddles in panel widths and heights."""
+    """Return why a panel can't be located, or an empty string. places: (K, 2) saddles in panel widths and heights."""
     fewest = min(counts)
     if fewest < MIN_MARKS:
         panel = counts.index(fewest)
@@ -135,13 +135,13 @@ def _covered(counts: list[int], places: F64, owners: Any) -> str:
 
 
 def _unit_px(quad: F64) -> float:
-    """Photograph's pixels per bit of a marker, along its shortest side."""
+    """Return the photograph's pixels per bit of a marker, along its shortest side."""
     sides = np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1)
     return float(sides.min()) / MARKER
 
 
 def _refined(picture: U8, guess: F64, quad: F64, *, window: int) -> tuple[Any, F64]:
-    """Mask of points that are saddles (white inside and outside, black to both sides), and sub-pixel positions."""
+    """Return a mask of the saddles (white inside and outside, black at the sides), and their positions."""
     height, width = picture.shape
     inside = (
         (guess[:, 0] > window + 2) & (guess[:, 0] < width - window - 3)
@@ -165,20 +165,20 @@ def _refined(picture: U8, guess: F64, quad: F64, *, window: int) -> tuple[Any, F
 
 
 def _quarter(out: F64, guess: F64) -> F64:
-    """Other diagonal at each corner, from its two neighbours to account for perspective."""
+    """Return the other diagonal at each corner, from its two neighbours, to account for perspective."""
     following, before = np.roll(guess, -1, axis=0) - guess, np.roll(guess, 1, axis=0) - guess
     return np.asarray((following - before) / 10 * 0.9, dtype=np.float64)
 
 
 def _samples(picture: U8, points: F64) -> F64:
-    """Bilinear samples of a picture at (..., 2)."""
+    """Sample a picture bilinearly at (..., 2)."""
     flat = np.ascontiguousarray(points.reshape(-1, 1, 2).astype(np.float32))
     values = cv2.remap(picture, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(values, dtype=np.float64).reshape(points.shape[:-1])
 
 
 def _edge_px(picture: U8, quad: F64) -> float:
-    """Width of a marker's outer edge in photograph pixels: contrast over steepest slope, median over its sides."""
+    """Return the width of a marker's outer edge in pixels: contrast over steepest slope, median over its sides."""
     widths = []
     centre = quad.mean(axis=0)
     for first, second in zip(quad, np.roll(quad, -1, axis=0), strict=True):

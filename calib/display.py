@@ -1,4 +1,4 @@
-"""Panels and their keys while a display is set up."""
+"""Panel windows and keyboard handling during display setup."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class PanelDisplay:
-    """All panels, showing one set of layers until the next, and the keys pressed on them."""
+    """All panels, which show one set of layers until the next, and the keys pressed in their windows."""
 
     def __init__(self, sink: PanelSink) -> None:
         self._sink = sink
@@ -33,7 +33,7 @@ class PanelDisplay:
         self._sink.present(PanelFrame(self._number, layers, self._number))
 
     def key(self) -> Key | None:
-        """Return the next key or None; presents the layers again, which keeps windows responsive.
+        """Return the next key or None. Presents the layers again, which keeps the windows responsive.
 
         Raises PanelLost.
         """
@@ -47,7 +47,7 @@ class PanelDisplay:
 
 
 def open_display(settings: Settings, *, registered: bool = False, grey_curve: bool = True) -> PanelDisplay:
-    """Open the configured panels; registered, grey_curve: False to measure them without correction.
+    """Open the configured panels. registered, grey_curve: False to measure them without correction.
 
     Raises InputError, MissingPart, PanelLost.
     """
@@ -76,5 +76,5 @@ def show_until_key(display: PanelDisplay, layers: U8, title: str) -> None:
 
 
 def grey_layers(pictures: U8) -> U8:
-    """(N, H, W, 4) layers from grey pictures (N, H, W), one per panel."""
+    """Convert grey pictures (N, H, W), one per panel, to (N, H, W, 4) layers."""
     return np.concatenate([np.repeat(pictures[..., None], 3, axis=-1), np.full_like(pictures[..., None], 255)], axis=-1)

@@ -1,8 +1,8 @@
-"""A chart for measuring a panel's grey curve with a camera of unknown tone curve.
+"""Chart for measuring a panel's grey curve with a camera whose tone curve is unknown.
 
-Patches of each grey are scattered over the chart, to separate uneven light from the greys. Patches of black and white
-pixels in known proportions have a known intensity regardless of the panel's grey curve: they calibrate the camera. The
-board's marks between the patches locate them in a photograph.
+The patches of each grey are scattered over the chart, to separate uneven light from the greys. Patches of black and
+white pixels in known proportions have a known intensity regardless of the panel's grey curve: they calibrate the
+camera. The board's marks between the patches locate them in a photograph.
 
 Between crossed polarizers, with the other panels at zero, a panel of phase p shows dark + range·sin²(pi/2·p) (EyeReal,
 (4)). Full white is assumed to be phase 1; intensities cannot reveal a panel that does not reach it.
@@ -55,7 +55,7 @@ class Patch:
 
 @lru_cache(maxsize=8)
 def patches(stack: PanelStack, panel: int) -> tuple[Patch, ...]:
-    """The chart's patches between the board's marks, their kinds scattered in a fixed order."""
+    """Return the chart's patches, between the board's marks, with their kinds scattered in a fixed order."""
     pitch = stack.width_px // PATCHES_ACROSS
     side = pitch * 5 // 6 // 8 * 8  # the measured half holds whole periods of the mixing pattern
     free = [
@@ -85,7 +85,7 @@ def _is_covered(stack: PanelStack, panel: int, left: int, top: int, side: int) -
 
 
 def grey_chart(stack: PanelStack, panel: int) -> U8:
-    """(H, W) chart of the panel, to be shown without resampling or LUT while the others are clear."""
+    """Draw a panel's (H, W) chart, to be shown without resampling or LUT while the others are clear."""
     picture = board(stack, panel)
     for patch in patches(stack, panel):
         area = picture[patch.top_px : patch.top_px + patch.side_px, patch.left_px : patch.left_px + patch.side_px]
@@ -98,7 +98,7 @@ def grey_chart(stack: PanelStack, panel: int) -> U8:
 
 
 def grey_charts(stack: PanelStack, panel: int) -> U8:
-    """(N, H, W) pictures of all panels: the chart on one, the others clear."""
+    """Return (N, H, W) pictures for all panels: the chart on one, the others clear."""
     charts = np.zeros((stack.count, stack.height_px, stack.width_px), np.uint8)
     charts[panel] = grey_chart(stack, panel)
     return charts
@@ -107,7 +107,7 @@ def grey_charts(stack: PanelStack, panel: int) -> U8:
 def lut_from_photographs(
     out: Path, pictures: Iterable[tuple[str, U8]], stack: PanelStack, *, panel: int, source: str
 ) -> dict[str, Any]:
-    """Write a panel's LUT from named photographs (h, w) of its chart. Raises InputError."""
+    """Compute and write a panel's LUT from named photographs (h, w) of its chart. Raises InputError."""
     measured = [histograms(picture, stack, panel, source=f"{source}, {name}") for name, picture in pictures]
     intensity, residual = measure(measured, stack, panel, source=source)
     write_lut(out, intensity)
@@ -125,7 +125,7 @@ def write_lut(out: Path, intensity: F64) -> None:
 
 
 def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F64:
-    """(P, 256) histograms of code values in the middle of every patch in a grey photograph (h, w).
+    """Return (P, 256) histograms of the code values in the middle of each patch of a photograph (h, w).
 
     Raises InputError.
     """
@@ -154,11 +154,11 @@ def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F6
 
 
 def measure(pictures: list[F64], stack: PanelStack, panel: int, *, source: str) -> tuple[F64, float]:
-    """(13,) intensities of `GREYS` from histograms of photographs, and the median residual.
+    """Estimate the (13,) intensities of `GREYS` from photographs' histograms, and the median residual.
 
-    The photographs must have one exposure. Jointly fits the camera's tone curve, each photograph's uneven light (its
-    logarithm is a quadratic) and the greys. The residual is relative, per patch. Raises InputError if the greys do not
-    ascend.
+    All photographs must have the same exposure. Jointly fits the camera's tone curve, each photograph's uneven light
+    (its logarithm is a quadratic) and the greys. The residual is relative, per patch. Raises InputError if the greys do
+    not ascend.
     """
     chart = patches(stack, panel)
     place = np.array([[p.left_px / stack.width_px - 0.5, p.top_px / stack.height_px - 0.5] for p in chart])
@@ -193,7 +193,7 @@ def measure(pictures: list[F64], stack: PanelStack, panel: int, *, source: str) 
     falls = np.flatnonzero(np.diff(levels) < -FALLS)
     if falls.size:
         lower, upper = GREYS[int(falls[0])], GREYS[int(falls[0]) + 1]
-        problem = f"grey {upper} is darker than grey {lower}: not a grey curve"
+        problem = f"grey {upper} is darker than grey {lower}, so this is not a grey curve"
         causes = "possible causes: a reflection, a change of exposure, the wrong LUT"
         raise InputError(source, "greys", f"{problem} ({causes})")
     return np.clip(levels, 0.0, 1.0), float(np.median(np.abs(fit.fun)))

@@ -1,4 +1,4 @@
-"""Hardware used by the setup: keys, monitors, panels, a camera, a depth sensor."""
+"""Hardware that the setup uses: keys, monitors, panels, a camera, a depth sensor."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ CARD_CHARACTERS = 32  # per line of a card
 
 
 class SetupHardware:
-    """A display with its monitors on X11 and its sensor, photographs in a folder, a person at the keys."""
+    """The real hardware: monitors on X11, a sensor, photographs in a folder, and a person at the keys."""
 
     simulated = False
 
     def __init__(self, keys: Poll, *, photos: Path = Path("photos")) -> None:
-        """keys: of the terminal, in addition to those of the panels' windows."""
+        """keys: the terminal's keys, which are used in addition to those of the panels' windows."""
         self._keys, self._photos = keys, photos
         self._clock = MonotonicClock()
         self._display: PanelDisplay | None = None  # owns the open windows, if any
@@ -46,11 +46,11 @@ class SetupHardware:
         self._frames: list[SensorFrame] = []  # received from the worker, not yet returned by `sample`
 
     def poll(self) -> Key | None:
-        """Return a key pressed in the terminal or on a panel's window; polling keeps the windows responsive."""
+        """Return a key pressed in the terminal or in a panel's window. Polling keeps the windows responsive."""
         return self._keys() or (self._display.key() if self._display is not None else None)
 
     def key(self) -> Key:
-        """Wait for a key."""
+        """Wait for a key and return it."""
         while (key := self.poll()) is None:
             self.wait()
         return key
@@ -79,7 +79,7 @@ class SetupHardware:
             self._display.show(alone([*cards[:number], card, *cards[number + 1 :]], number))
 
     def photographs(self, settings: Settings, pictures: U8, *, panel: int | None, say: Say) -> Iterator[Named]:
-        """Show pictures (N, H, W) on the uncorrected panels, wait for photographs of them and yield those.
+        """Show pictures (N, H, W) on the uncorrected panels, wait for photographs of them, and yield these.
 
         The pictures are the boards, or for `panel` its grey chart. Raises InputError, PanelLost.
         """
@@ -92,13 +92,13 @@ class SetupHardware:
             say(f"put {count} into {folder}, then Enter (q: stop)")
             while (key := self.key()) is not Key.ACCEPT:
                 if key is Key.QUIT:
-                    raise InputError("photographs", "", "stopped before any were there")
+                    raise InputError("photographs", "", "stopped before there were any")
         finally:
             self.let_go()
         return photographs(folder)
 
     def open_sensor(self, settings: Settings) -> str:
-        """Start the sensor and wait for it; returns its name. Raises InputError."""
+        """Start the sensor and wait until it works. Returns its name. Raises InputError."""
         self._stop_sensor()
         open_sensor(settings.sensor, self._clock)  # refuses unknown names before anything starts
         worker = SensorWorker(
@@ -120,13 +120,13 @@ class SetupHardware:
             self.wait()
         if worker.capabilities.in_stack_frame:
             self._stop_sensor()
-            raise InputError("sensor", "driver", "its eyes are in the stack's frame already: nothing to calibrate")
+            raise InputError("sensor", "driver", "delivers eyes in the stack's frame; there is nothing to calibrate")
         return f"{settings.sensor.driver} {worker.serial}".strip()
 
     def sample(self, standing_at: Viewpoint) -> Sample | None:
-        """Return the next sample in order, if there is one; slow panels lose none.
+        """Return the next sample in order, if there is one. No sample is lost if the panels are slow.
 
-        standing_at: where the person was asked to stand, which a simulated person does.
+        standing_at: where the person was asked to stand. A simulated person stands exactly there.
         """
         if self._worker is None:
             return None
@@ -140,7 +140,7 @@ class SetupHardware:
         return frame.capture_ns, frame.eyes, self._worker.serial
 
     def chart(self, settings: Settings) -> Callable[[Viewpoint], None] | None:
-        """Return a function that shows a viewpoint's chart; None if charts can't be shown."""
+        """Return a function that shows a viewpoint's chart, or None if charts can't be shown."""
         self.let_go()
         charts, display = Charts(settings), open_display(settings, registered=True)
         self._charts, self._display = charts, display
@@ -152,7 +152,7 @@ class SetupHardware:
         self._stop_sensor()
 
     def let_go(self) -> None:
-        """Close open windows and the model that draws for them."""
+        """Close any open windows, and the model that computes their layers."""
         for part in (self._display, self._charts):
             if part is not None:
                 part.close()

@@ -1,4 +1,4 @@
-"""Keyboard input: lines and single keys in the terminal, single keys on a panel's window."""
+"""Keyboard input: lines and single keys in the terminal, single keys in a panel's window."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from runtime.panels.base import PanelSink
 
 
 class Key(Enum):
-    """Keys and their meaning."""
+    """Keys, named by their meaning."""
 
     ACCEPT = auto()
     NEXT = auto()
@@ -39,7 +39,7 @@ _OF_BYTES = {data: key for key, (_, pieces) in _MEANINGS.items() for data in pie
 
 
 def parse(data: bytes) -> tuple[list[Key], bytes]:
-    """Return the keys in bytes from a terminal, and an incomplete escape sequence at the end."""
+    """Return the keys in a terminal's bytes, and any incomplete escape sequence at the end."""
     keys: list[Key] = []
     while data:
         if data[:1] == b"\x1b" and len(data) < 3 and b"\x1b[".startswith(data[:2]):
@@ -52,10 +52,10 @@ def parse(data: bytes) -> tuple[list[Key], bytes]:
 
 
 class TerminalKeys:
-    """Keys and lines of standard input; a terminal is in character mode between `poll` and `close`."""
+    """Keys and lines from standard input. A terminal is in character mode between `poll` and `close`."""
 
     def __init__(self, descriptor: int | None = None, *, quit_at_end: bool = True) -> None:
-        """quit_at_end: the end of input is `QUIT`; False: there are no more keys."""
+        """quit_at_end: True if the end of input means `QUIT`; False if it means no more keys."""
         self._quit_at_end = quit_at_end
         self._descriptor = _standard_input() if descriptor is None else descriptor
         self._rest = b""
@@ -81,7 +81,7 @@ class TerminalKeys:
         return None
 
     def line(self) -> str:
-        """Wait for the next line; `q` at the end of input."""
+        """Wait for the next line and return it, or `q` at the end of input."""
         self.close()
         data = b""
         while self._descriptor >= 0 and (read := os.read(self._descriptor, 1)) != b"\n":
@@ -100,7 +100,7 @@ class TerminalKeys:
 
 
 def _standard_input() -> int:
-    """Return its descriptor, or -1 without one, as in a service."""
+    """Return the descriptor of standard input, or -1 if there is none, as in a service."""
     try:
         return sys.stdin.fileno()
     except (AttributeError, OSError, ValueError):
@@ -108,7 +108,7 @@ def _standard_input() -> int:
 
 
 class WindowKeys:
-    """Keys pressed in a panel's window, which GLFW delivers when a frame is presented."""
+    """Keys pressed in a panel's window. GLFW delivers them when a frame is presented."""
 
     def __init__(self, sink: PanelSink) -> None:
         self._sink = sink

@@ -1,4 +1,4 @@
-"""Pairs of a measured sensor point and a known stack point: read, check, store."""
+"""Pairs of a measured sensor point and a known stack point: reading, checking and storing."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Number = Annotated[float, BeforeValidator(_no_truth_value), AfterValidator(_boun
 
 
 class PairRow(BaseModel):
-    """One pair as a row of the file, metres, with the informative columns that `capture` adds."""
+    """One pair as a row of the file, in metres, including the informative columns that `capture` adds."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", coerce_numbers_to_str=True)
 
@@ -55,7 +55,7 @@ class PairRow(BaseModel):
 
     @classmethod
     def of(cls, sensor_m: F64, stack_m: F64, viewpoint: str, *, serial: str, spread_mm: str = "") -> PairRow:
-        """Pair of a point (3,) in `sensor` and one in `stack`."""
+        """Create the row for a point (3,) in `sensor` and one in `stack`."""
         sx, sy, sz, wx, wy, wz = np.concatenate([sensor_m, stack_m]).tolist()
         return cls(
             sensor_x=sx, sensor_y=sy, sensor_z=sz, stack_x=wx, stack_y=wy, stack_z=wz,
@@ -68,7 +68,7 @@ COLUMNS = tuple(name for name, field in PairRow.model_fields.items() if field.is
 
 @dataclass(frozen=True, slots=True)
 class Pairs:
-    """K pairs, with names for messages."""
+    """K pairs, with their names for messages."""
 
     sensor_m: F64  # (K, 3)
     stack_m: F64  # (K, 3)
@@ -87,10 +87,10 @@ def read_pairs(path: Path) -> Pairs:
     """
     labels, rows = _read_rows(path)
     if len(rows) > MAX_PAIRS:
-        raise InputError(path, "", f"holds {len(rows)} pairs, more than {MAX_PAIRS}")
+        raise InputError(path, "", f"contains {len(rows)} pairs; the maximum is {MAX_PAIRS}")
     serials = {row.sensor_serial for row in rows} - {""}
     if len(serials) > 1:
-        raise InputError(path, "sensor_serial", f"pairs of different sensors: {', '.join(sorted(serials))}")
+        raise InputError(path, "sensor_serial", f"contains pairs of different sensors: {', '.join(sorted(serials))}")
     names = tuple(
         f"{label} ({row.viewpoint})" if row.viewpoint else label for label, row in zip(labels, rows, strict=True)
     )
@@ -99,7 +99,7 @@ def read_pairs(path: Path) -> Pairs:
 
 
 def _read_rows(path: Path) -> tuple[list[str], list[PairRow]]:
-    """Labels of the pairs (line or number), and the pairs. Raises InputError with the wrong rows and columns."""
+    """Return labels (line or number) and pairs. Raises InputError, naming the wrong rows and columns."""
     text = untrusted_input.read_text(path)
     if path.suffix.lower() == ".json":
         value = untrusted_input.parsed_json(text, source=path)
@@ -139,16 +139,16 @@ def _problem(error: Any) -> str:
 
 
 def points_of(rows: Iterable[PairRow]) -> tuple[F64, F64]:
-    """(K, 3) points in `sensor` and (K, 3) in `stack`."""
+    """Return (K, 3) points in `sensor` and (K, 3) points in `stack`."""
     table = np.array([[getattr(row, name) for name in COLUMNS] for row in rows], dtype=np.float64).reshape(-1, 6)
     return table[:, :3].copy(), table[:, 3:].copy()
 
 
 class PairsFile:
-    """CSV written during capture: every accepted pair is on disk before the next is measured."""
+    """CSV file written during capture. Every accepted pair is on disk before the next one is measured."""
 
     def __init__(self, path: Path) -> None:
-        """Resume an existing file or start one. Raises InputError if it exists but holds no pairs."""
+        """Resume an existing file or start a new one. Raises InputError if the file exists but has no pairs."""
         self.path = path
         self.rows: list[PairRow] = []
         if untrusted_input.is_there(path):
@@ -156,21 +156,21 @@ class PairsFile:
 
     @property
     def viewpoints(self) -> frozenset[str]:
-        """Names of the viewpoints in the file."""
+        """Return the names of the viewpoints in the file."""
         return frozenset(row.viewpoint for row in self.rows)
 
     def __len__(self) -> int:
         return len(self.rows)
 
     def accept(self, *pairs: PairRow) -> None:
-        """Write pairs of one sensor to the file, replacing those of the same viewpoints.
+        """Write one sensor's pairs to the file, replacing those at the same viewpoints.
 
         Raises InputError if the file has pairs of another sensor.
         """
         serial, replaced = pairs[0].sensor_serial, {pair.viewpoint for pair in pairs} - {""}
         others = {row.sensor_serial for row in self.rows} - {"", serial}
         if others and serial:
-            problem = f"the file has pairs of sensor {min(others)}; this one is of {serial}"
+            problem = f"the file has pairs of sensor {min(others)}, but this pair is from {serial}"
             raise InputError(self.path, "sensor_serial", problem)
         self.rows = [row for row in self.rows if row.viewpoint not in replaced] + list(pairs)
         self._write()

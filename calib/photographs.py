@@ -1,4 +1,4 @@
-"""Read a folder of photographs."""
+"""Reading of photographs from a folder."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
 
 
 def photographs(folder: Path) -> Iterator[tuple[str, U8]]:
-    """Yield the names and grey photographs (h, w) of a folder, sorted by name. Raises InputError."""
+    """Yield names and grey pixels (h, w) of a folder's photographs, sorted by name. Raises InputError."""
     if not untrusted_input.is_there(folder, folder=True):
-        raise InputError(folder, "", "is not a folder of photographs")
+        raise InputError(folder, "", "is not a folder")
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
     if not paths:
-        raise InputError(folder, "", "holds no photograph (" + ", ".join(sorted(SUFFIXES)) + ")")
+        raise InputError(folder, "", "contains no photographs (" + ", ".join(sorted(SUFFIXES)) + ")")
     if len(paths) > MAX_PHOTOGRAPHS:
-        raise InputError(folder, "", f"holds {len(paths)} pictures: at most {MAX_PHOTOGRAPHS}")
+        raise InputError(folder, "", f"contains {len(paths)} pictures; the maximum is {MAX_PHOTOGRAPHS}")
     for path in paths:
         yield path.name, read_photograph(path)
 
 
 def read_photograph(path: Path) -> U8:
-    """(h, w) grey pixels as the sensor recorded them; EXIF orientation is ignored. Raises InputError."""
+    """Read (h, w) grey pixels as the sensor recorded them, ignoring EXIF orientation. Raises InputError."""
     data, _ = read_coded(path)
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
     picture = None if is_cut_off(data) else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if picture is None:
-        raise InputError(path, "", "is not a photograph that can be decoded (JPEG or PNG; export HEIC as JPEG)")
+        raise InputError(path, "", "cannot be decoded; use JPEG or PNG (export HEIC as JPEG)")
     return np.asarray(picture)

@@ -1,4 +1,4 @@
-"""Panels at their true poses, and their projections to eyes and cameras.
+"""Panels at their true poses, and their projections into eyes and cameras.
 
 A panel's own frame has its origin at the panel's middle and the axes of `stack`: x out of the screen, y along the
 rows to the viewer's right, z up. Its pixel pitch is the stack's.
@@ -26,13 +26,13 @@ class PlacedPanel:
 
     @property
     def slope(self) -> F64:
-        """(2,) increase of x per metre to the right, and per metre up."""
+        """(2,) increase of x per metre to the right and per metre up."""
         normal = self.rotation[:, 0]
         return np.asarray(-normal[1:] / normal[0], dtype=np.float64)
 
     @property
     def axis_x_m(self) -> float:
-        """Intersection of the panel's plane with the stack's axis y = z = 0."""
+        """x at which the panel's plane intersects the stack's axis y = z = 0."""
         normal = self.rotation[:, 0]
         return float(normal @ self.centre_m / normal[0])
 
@@ -61,7 +61,7 @@ def stack_from_pixels(panel: PlacedPanel, stack: PanelStack) -> F64:
 
 
 def ideal_panel(stack: PanelStack, index: int) -> PlacedPanel:
-    """Nominal pose of a panel: parallel to the others, centred on the stack's axis."""
+    """Return a panel's nominal pose: parallel to the others, and centred on the stack's axis."""
     return PlacedPanel(np.eye(3), np.array([stack.x_m[index], 0.0, 0.0]))
 
 
@@ -69,12 +69,12 @@ def true_from_ideal_seen(panel: PlacedPanel, eye_m: ArrayLike, stack: PanelStack
     """(3, 3) homography from ideal to true pixels as an eye sees them; last entry 1.
 
     An eye's ray crosses the nominal plane of panel `index` at the ideal pixel and the panel itself at the true one.
-    For a panel parallel to the stack and at its x_m the result does not depend on the eye; for a tilted panel it holds
-    for this eye only. Raises ValueError for an eye in the panel's plane.
+    For a panel that is parallel to the stack and at its x_m, the result does not depend on the eye. For a tilted panel
+    it holds for this eye only. Raises ValueError for an eye in the panel's plane.
     """
     eye = np.outer(np.asarray(eye_m, dtype=np.float64), HOMOGENEOUS)
     seen = stack_from_pixels(panel, stack) - eye
     if abs(np.linalg.det(seen)) < 1e-18:
-        raise ValueError("an eye in a panel's plane sees nothing through it")
+        raise ValueError("an eye in a panel's plane cannot see through the panel")
     matrix = np.linalg.solve(seen, stack_from_pixels(ideal_panel(stack, index), stack) - eye)
     return np.asarray(matrix / matrix[2, 2] + 0.0, dtype=np.float64)  # + 0.0: no -0.0 in a file

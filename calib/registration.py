@@ -1,8 +1,8 @@
-"""Registration from photographs of the boards: positions, homographies, standard errors.
+"""Registration of the panels from photographs of their boards: poses, homographies, standard errors.
 
-The stack's frame is that of the reference (middle) panel, whose picture is not resampled. The other panels get their
-true distance, and a homography that moves each pixel to its position on a panel parallel to the reference. That is
-exact for every eye if the panel is parallel, and for an eye at the viewing place if it is tilted. The models know the
+The stack's frame is that of the reference (middle) panel, whose picture is not resampled. Every other panel gets its
+true distance, and a homography that moves each pixel to its position on a panel parallel to the reference. If the panel
+is parallel, this is exact for every eye; if it is tilted, only for an eye at the viewing place. The models know the
 tilts and correct for them at other eye positions.
 """
 
@@ -39,7 +39,7 @@ DOUBTFUL_PX = 0.3  # uncertainty of a corner above which a registration is refus
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """Registered panels with their uncertainties."""
+    """Registered panels, with their uncertainties."""
 
     bundle: Bundle
     stack: PanelStack  # the geometry to configure: true distances, and tilts
@@ -57,7 +57,7 @@ class Registration:
         return np.asarray(np.sqrt((self.corner_sigma_px**2).sum(-1).mean(-1)), dtype=np.float64)
 
     def eye_error_mm(self) -> float:
-        """Displacement of the eye equivalent to the worst panel's uncertainty."""
+        """Displacement of the eye that is equivalent to the worst panel's uncertainty."""
         gap_m = np.abs(np.array(self.stack.x_m) - self.stack.x_m[self.bundle.reference])
         pitch_m, others = self.stack.width_m / self.stack.width_px, gap_m > 0
         return float((self.sigma_panel_px[others] * pitch_m * self.eye_m[0] / gap_m[others]).max()) * 1e3
@@ -69,7 +69,7 @@ def homographies(panels: Sequence[PlacedPanel], stack: PanelStack, eye_m: F64) -
 
 
 def geometry_of(panels: Sequence[PlacedPanel], stack: PanelStack, *, eye_m: F64) -> PanelStack:
-    """Geometry to configure for panels at these poses: positions and tilts, registered for an eye (3,).
+    """Return the geometry to configure for panels at these poses, registered for an eye at (3,).
 
     Raises Undetermined if the panels are not in order.
     """
@@ -82,7 +82,7 @@ def geometry_of(panels: Sequence[PlacedPanel], stack: PanelStack, *, eye_m: F64)
 
 
 def register_photographs(seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m: F64) -> Registration:
-    """Fit the panels' poses and check them. Raises Undetermined with the reason."""
+    """Fit the panels' poses and check them. Raises Undetermined, with the reason."""
     reference = stack.count // 2
     excluded = {s.name: s.fault for s in seen if s.fault}
     excluded |= _other_sizes([s for s in seen if not s.fault])
@@ -94,7 +94,7 @@ def register_photographs(seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m:
         if max(unfit) <= DISAGREES:
             break
         odd = good.pop(int(np.argmax(unfit)))
-        excluded[odd.name] = "does not agree with the others: another stack, or something moved"
+        excluded[odd.name] = "does not agree with the others: it shows another stack, or something moved"
     _refuse_one_place(bundle)
     if bundle.sigma_px > MISFIT_PX:
         raise Undetermined(
@@ -130,7 +130,7 @@ def register_photographs(seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m:
 def _other_sizes(good: Sequence[SeenMarks]) -> dict[str, str]:
     sizes = [(s.width_px, s.height_px) for s in good]
     width, height = max(sizes, key=sizes.count, default=(0, 0))
-    text = f"has another size than the others ({width}x{height}): use one camera with one setting"
+    text = f"differs in size from the others ({width}x{height}): use one camera with one setting"
     return {s.name: text for s, size in zip(good, sizes, strict=True) if size != (width, height)}
 
 
@@ -138,7 +138,7 @@ def _refuse_few(good: int, count: int, excluded: dict[str, str]) -> None:
     if good < MIN_PHOTOGRAPHS:
         reasons = "; ".join(f"{name} {fault}" for name, fault in excluded.items())
         raise Undetermined(
-            f"{good} of {count} photographs can be used, at least {MIN_PHOTOGRAPHS} are needed"
+            f"{good} of {count} photographs are usable; at least {MIN_PHOTOGRAPHS} are needed"
             + (f": {reasons}" if reasons else "")
         )
 
@@ -174,7 +174,7 @@ def _refuse_implausible(bundle: Bundle, stack: PanelStack) -> None:
 def register_photos(
     pictures: Iterable[tuple[str, U8]], source: str, out: Path, settings: Settings, *, config: Path | None
 ) -> dict[str, Any]:
-    """Register from named photographs (h, w), report, and optionally write to `config`.
+    """Register the panels from named photographs (h, w), report, and optionally write to `config`.
 
     Raises InputError, before writing anything.
     """
@@ -201,7 +201,7 @@ def register_photos(
 
 
 def put_registration(document: TOMLDocument, registered: Registration) -> None:
-    """Set distances, tilts and homographies in a configuration."""
+    """Set the distances, tilts and homographies in a configuration."""
     matrices = registered.homographies.tolist()
     put_panels(document, "homography", dict(enumerate(matrices)), panels=len(matrices))
     tilt = registered.stack.tilt
@@ -213,7 +213,7 @@ def put_registration(document: TOMLDocument, registered: Registration) -> None:
 
 
 def registration_summary(registered: Registration) -> dict[str, Any]:
-    """Contents of `registration.json`."""
+    """Return the contents of `registration.json`."""
     stack, bundle = registered.stack, registered.bundle
     rows = np.array([panel.rotation[:, 1] for panel in bundle.panels])
     tilt_deg = np.degrees(np.arctan([panel.slope for panel in bundle.panels]))

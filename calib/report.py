@@ -1,4 +1,4 @@
-"""`calibrate report`: the error at every point (figure S5) and all other figures, on a page."""
+"""`calibrate report`: a page with the error at every point (figure S5) and all other figures."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COLOURS = {"X": "#c0392b", "Y": "#27803b", "Z": "#2260a8"}
 
 
 class StoredPairs(Lenient):
-    """`[data]` of a calibration file: the pairs behind it, where it holds them."""
+    """`[data]` of a calibration file: the pairs that it was computed from, if it contains them."""
 
     sensor_m: tuple[Vector3, ...]
     stack_m: tuple[Vector3, ...]  # known
@@ -32,15 +32,15 @@ class StoredPairs(Lenient):
     def _fit_together(self) -> StoredPairs:
         sizes = {len(column) for column in (self.sensor_m, self.stack_m, self.used, self.names)}
         if len(sizes) > 1 or not any(self.used):
-            raise ValueError("names, used, sensor_m and stack_m do not fit together")
+            raise ValueError("names, used, sensor_m and stack_m differ in length")
         return self
 
 
 class Points(NamedTuple):
-    """The pairs behind a calibration."""
+    """The pairs that a calibration was computed from."""
 
     names: tuple[str, ...]
-    residual_m: F64  # (K, 3) where the calibration puts them less where they are, frame `stack`
+    residual_m: F64  # (K, 3) calibrated minus true positions, frame `stack`
     used: NDArray[np.bool_]  # (K,)
 
 
@@ -55,20 +55,20 @@ def write_report(file: Path, out: Path, *, viewing: CalibrationSettings) -> dict
     if isinstance(table.get("warnings"), list):
         notes += [str(text) for text in table["warnings"]]
     if points is None:
-        notes.append("This file holds no pairs (or too many): the error of each point is not known.")
+        notes.append("This file contains no pairs (or too many), so the error of each point is unknown.")
     else:
         text = "X, Y and Z error of every calibration point (the EyeReal supplement's figure S5)"
         figure = Figure("residuals", residual_figure(points, limit_m=RESIDUAL_LIMIT_M), text)
         sections += [PageSection("Pictures", figures=[figure]), section_of("Points", _point_rows(points))]
     if calibration.file.covariance is None:
-        notes.append("This file holds no covariance: the error at the eye is not known.")
-    lead = "Where the depth camera stands before the stack of panels, and how well that is known."
+        notes.append("This file contains no covariance, so the error at the eye is unknown.")
+    lead = "Pose of the depth camera relative to the stack of panels, with its uncertainty."
     Page(f"Calibration {file.name}", lead, sections, notes=notes).write(out, record="report.json", data=summary)
     return summary
 
 
 def _stored_points(data: Any, calibration: Calibration, *, source: Path) -> Points | None:
-    """The pairs that a calibration file holds in `[data]`; None if it holds none. Raises InputError."""
+    """Return the pairs in a calibration file's `[data]`, or None if there are none. Raises InputError."""
     if not isinstance(data, dict) or "sensor_m" not in data:
         return None
     found = validated(StoredPairs, data, source=f"{source}: data")
@@ -76,7 +76,7 @@ def _stored_points(data: Any, calibration: Calibration, *, source: Path) -> Poin
 
 
 def residual_figure(points: Points, *, limit_m: float) -> bytes:
-    """X, Y, Z error of every calibration point (the EyeReal supplement's figure S5), millimetres."""
+    """Plot the X, Y and Z errors of every calibration point in mm (the EyeReal supplement's figure S5)."""
     residual_m, used = points.residual_m, points.used
     with drawing(9, 6.5) as canvas:
         axes = canvas.subplots(nrows=3, sharex=True, sharey=True)
@@ -86,7 +86,7 @@ def residual_figure(points: Points, *, limit_m: float) -> bytes:
             shown = np.clip(values, -2 * largest, 2 * largest)
             panel.vlines(numbers[used], 0, shown[used], color=colour, linewidth=2, label="used")
             panel.vlines(numbers[~used], 0, shown[~used], color="#bbbbbb", linewidth=2,
-                         label="rejected (may be cut off)")  # fmt: skip
+                         label="rejected (may be outside the plot)")  # fmt: skip
             rms = float(np.sqrt((values[used] ** 2).mean()))
             panel.axhline(0, color="#222222", linewidth=0.8)
             panel.set(ylabel=f"{name} error (mm)", title=f"{name}: RMS {rms:.2f} mm")
@@ -96,12 +96,12 @@ def residual_figure(points: Points, *, limit_m: float) -> bytes:
         if (~used).any():
             axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, fontsize=8, frameon=False)
         axes[-1].set_xlabel("calibration point")
-        canvas.suptitle("What the calibration makes of each point, less where it truly was", fontsize=11)
+        canvas.suptitle("Calibrated minus true position of each point", fontsize=11)
         return png(canvas)
 
 
 def _summary(calibration: Calibration, points: Points | None, volume_m: F64) -> dict[str, Any]:
-    """Contents of `report.json`; None for unknown values."""
+    """Return the contents of `report.json`, with None for unknown values."""
     found: dict[str, Any] = {
         "method": calibration.file.method,
         "date": str(calibration.file.date),

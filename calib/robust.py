@@ -26,21 +26,21 @@ MIN_NOISE = 1e-12  # relative to the points' extent: keeps exact data from rejec
 
 @dataclass(frozen=True, slots=True)
 class RobustFit:
-    """A fit of the pairs that agree."""
+    """A similarity fitted to the pairs that agree."""
 
     similarity: Similarity
     inlier: NDArray[np.bool_]  # (K,)
 
 
 def _residuals(candidate: Similarity, sensor_m: F64, stack_m: F64) -> F64:
-    """(..., K) squared distances, m², divided by the squared scale, so that shrinking does not win."""
+    """(..., K) squared distances, m², divided by the squared scale, so that a small scale is no advantage."""
     squared = ((candidate.points(sensor_m) - stack_m) ** 2).sum(-1)
     residuals: F64 = squared / np.maximum(candidate.scale[..., None], 1e-300) ** 2
     return residuals
 
 
 def _best_half(sensor_m: F64, stack_m: F64, *, random: np.random.Generator) -> NDArray[np.intp]:
-    """Indices of the half of the pairs that agree best, from many starts, each refitted to its best half."""
+    """Find the half of the pairs that agree best, from many starts, each refitted to its best half."""
     count = len(sensor_m)
     keep = min(count, max(3, (count + 5) // 2))
     chosen = np.argsort(random.random((STARTS, count)), axis=1)[:, : min(START_PAIRS, count)]
@@ -56,9 +56,9 @@ def _best_half(sensor_m: F64, stack_m: F64, *, random: np.random.Generator) -> N
 
 
 def fit_robust(sensor_m: F64, stack_m: F64) -> RobustFit:
-    """Fit the pairs that agree; (K, 3) each, K >= 3. Deterministic.
+    """Fit a similarity to the pairs that agree, (K, 3) each, K >= 3. The result is deterministic.
 
-    Up to 5 pairs are too few for a majority: all are kept. Raises Degenerate as `fit` does.
+    Five pairs or fewer cannot form a majority, so all are kept. Raises Degenerate as `fit` does.
     """
     count = len(sensor_m)
     everything = fit(sensor_m, stack_m, rule=RULE)
@@ -92,6 +92,6 @@ def fit_robust(sensor_m: F64, stack_m: F64) -> RobustFit:
 
 
 def _noise(similarity: Similarity, sensor_m: F64, stack_m: F64, inlier: NDArray[np.bool_]) -> float:
-    """Standard deviation of one coordinate in `stack`, with seven degrees of freedom used by the fit."""
+    """Standard deviation of one coordinate in `stack`; the fit uses up seven degrees of freedom."""
     squared = ((similarity.points(sensor_m) - stack_m) ** 2).sum(-1)[inlier].sum()
     return float(np.sqrt(squared / max(3 * int(inlier.sum()) - 7, 1)))

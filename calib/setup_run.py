@@ -1,4 +1,4 @@
-"""`phasestack setup`: lead a person through the steps, resumably, and write the figures."""
+"""`phasestack setup`: lead a person through the steps, which can be resumed, and write the figures."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ MAX_PROGRESS_BYTES = 4 << 20  # of setup.json
 
 
 def progress_path(config: Path) -> Path:
-    """File next to a configuration that records the setup's progress."""
+    """Return the path of the file, next to the configuration, that records the setup's progress."""
     return config.with_name(f"{config.stem}.setup.json")
 
 
 def read_progress(path: Path) -> dict[str, Any]:
-    """Figures of the finished steps, by name. Raises InputError."""
+    """Read the figures of the finished steps, by name. Raises InputError."""
     if not untrusted_input.is_there(path):
         return {}
     try:
         progress = untrusted_input.read_json(path, most_bytes=MAX_PROGRESS_BYTES)
         done = {step.name: dict(progress["done"][step.name]) for step in STEPS if step.name in progress["done"]}
     except (InputError, KeyError, TypeError, ValueError):
-        raise InputError(path, "done", "was not written by setup: remove the file to start over") from None
+        raise InputError(path, "done", "was not written by setup; delete the file to start over") from None
     return done
 
 
 def run_setup(
     config: Path, *, out: Path, photos: Path, simulate: bool, seed: int, to_stderr: bool
 ) -> tuple[dict[str, Any], str]:
-    """Run the setup; returns the summary and its text. Raises InputError."""
+    """Run the setup. Returns the summary and its text. Raises InputError."""
 
     def say(text: str) -> None:
         typer.echo(text, err=to_stderr)
@@ -62,7 +62,7 @@ def run_setup(
 
 
 def walk_through(setup: Setup) -> bool:
-    """Run the steps until the last one or q; returns True if the end was reached."""
+    """Run the steps until the last one or q. Returns True if the end was reached."""
     number = next((n for n, step in enumerate(STEPS) if step.name not in setup.done), 0)
     while number < len(STEPS):
         step = STEPS[number]
@@ -80,7 +80,7 @@ def walk_through(setup: Setup) -> bool:
 
 
 def _is_done(setup: Setup, step: SetupStep) -> bool:
-    """Run a step; returns True if it succeeded."""
+    """Run a step. Returns True if it succeeded."""
     try:
         figures = step.run(setup)
     except (SetupStopped, PhasestackError) as error:
@@ -94,7 +94,7 @@ def _is_done(setup: Setup, step: SetupStep) -> bool:
 
 
 def summarise(setup: Setup, *, finished: bool) -> tuple[dict[str, Any], str]:
-    """Write the figures; returns the summary and a text that ends with the next commands."""
+    """Write the figures. Returns the summary and a text that ends with the next commands."""
     missing = [step.name for step in STEPS if step.name not in setup.done]
     summary: dict[str, Any] = {
         "config": str(setup.config),
@@ -107,7 +107,7 @@ def summarise(setup: Setup, *, finished: bool) -> tuple[dict[str, Any], str]:
     if finished:
         lines += [f"note: {note}" for figures in setup.done.values() for note in figures.get("notes", [])]
         write_json(setup.out / "setup.json", summary)
-        lines.append(f"{setup.out / 'setup.json'} has the figures; {setup.config} is valid")
+        lines.append(f"{setup.out / 'setup.json'} contains the figures; {setup.config} is valid")
         if setup.hardware.simulated:
             lines.append(
                 f"try it: phasestack run --config {setup.config} --replay demo --headless --frames 60 --out run"

@@ -1,4 +1,4 @@
-"""The steps of `phasestack setup`: their questions, changes to the configuration, and reports."""
+"""Steps of `phasestack setup`: their questions, changes to the configuration, and reports."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ YES_NO = {Key.ACCEPT: True, Key.NEXT: False}
 
 
 class SetupStopped(Exception):
-    """Raised when the person stops, to continue later."""
+    """Raised when the person stops the setup, to continue later."""
 
 
 @dataclass
 class Setup:
-    """State shared by all steps."""
+    """State that all steps share."""
 
     config: Path
     out: Path  # folder for reports and for files that the configuration names
@@ -57,7 +57,7 @@ class Setup:
         return load_settings(self.config if untrusted_input.is_there(self.config) else None)
 
     def ask(self, question: str, default: str = "") -> str:
-        """Ask a question; returns the line typed, or `default` for an empty one. Raises SetupStopped for q."""
+        """Ask a question. Returns the line typed, or `default` if it is empty. Raises SetupStopped for q."""
         self.say(f"{question} [{default or 'Enter'}; q: stop]")
         answer = self.line()
         if answer == "q":
@@ -76,7 +76,7 @@ class SetupStep:
 
 
 def identify(setup: Setup) -> Figures:
-    """Step 1: assign monitors to panels and find their mounting, showing a card on one at a time."""
+    """Step 1: assign monitors to panels and find their mounting, with a card on one at a time."""
     hardware, count = setup.hardware, setup.settings.stack.stack().count
     monitors = hardware.monitors()
     if len(monitors) < count:
@@ -107,7 +107,7 @@ def identify(setup: Setup) -> Figures:
 
 
 def _name_of(monitor: Monitor, monitors: Sequence[Monitor]) -> dict[str, Any]:
-    """Keys that identify a monitor in a configuration: its serial number if unique, else its connector."""
+    """Return the keys that identify a monitor: its serial number if unique, else its connector."""
     alone = [m.serial for m in monitors].count(monitor.serial) == 1
     return {"edid_serial": monitor.serial} if monitor.serial and alone else {"connector": monitor.connector}
 
@@ -117,7 +117,7 @@ def geometry(setup: Setup) -> Figures:
     stack, calibration = setup.settings.stack, setup.settings.calibration
 
     def length_m(question: str, value_m: float, unit_m: float = 1e-3) -> float:
-        """Ask for a length, in metres; an empty line returns `value_m` unchanged."""
+        """Ask for a length. Returns metres, or `value_m` unchanged for an empty line."""
         while True:
             answer = setup.ask(f"{question}, {'mm' if unit_m == 1e-3 else 'm'}", f"{value_m / unit_m:.6g}")
             try:
@@ -133,7 +133,7 @@ def geometry(setup: Setup) -> Figures:
     }
     gap_m = (stack.x_m[-1] - stack.x_m[0]) / (len(stack.x_m) - 1)
     typed_m = length_m("from panel to panel", gap_m)
-    if typed_m != gap_m:  # else keep distances that were measured
+    if typed_m != gap_m:  # otherwise keep the measured distances
         middle = (len(stack.x_m) - 1) / 2
         size["x_m"] = [round((index - middle) * typed_m, 7) for index in range(len(stack.x_m))]
     near_m = length_m("nearest viewer", calibration.viewing_m[0], 1.0)
@@ -176,14 +176,14 @@ def grey(setup: Setup) -> Figures:
             known[number] = True
             break
     if not any(known):
-        setup.say("no panel has a curve: the configured gammas stay")
+        setup.say("no panel has a curve, so the configured gammas stay")
         raise SetupStopped
     numbers = ", ".join(str(n) for n, has in enumerate(known) if has)
     return {"text": f"of panels {numbers}, measured to {100 * max(residuals):.2f}%"}
 
 
 def _measure_grey(setup: Setup, panel: int) -> float:
-    """Measure one panel's LUT and configure it; returns the relative error of the curve. Raises InputError."""
+    """Measure and configure one panel's LUT. Returns the relative error of the curve. Raises InputError."""
     settings = setup.settings
     stack = settings.stack.stack()
     pictures = setup.hardware.photographs(settings, grey_charts(stack, panel), panel=panel, say=setup.say)
@@ -196,7 +196,7 @@ def _measure_grey(setup: Setup, panel: int) -> float:
 
 
 def sensor(setup: Setup) -> Figures:
-    """Step 5: choose the depth sensor and try it."""
+    """Step 5: choose the depth sensor and test it."""
     settings = setup.settings
     names = ["replay"] if setup.hardware.simulated else [name for name in DRIVERS if name not in ("replay", "fixed")]
     default = settings.sensor.driver if settings.sensor.driver in names else names[0]
@@ -216,11 +216,11 @@ def sensor(setup: Setup) -> Figures:
 
 
 def calibration(setup: Setup) -> Figures:
-    """Step 6: the sensor's pose, with a person who goes from viewpoint to viewpoint."""
+    """Step 6: the sensor's pose, measured with a person who moves from viewpoint to viewpoint."""
     pairs_path, target = setup.out / "pairs.csv", setup.out / "calibration.toml"
     count = capture_live(pairs_path, setup.settings, setup.hardware, show=True, say=setup.say)["pairs"]
     if count < MIN_PAIRS:
-        setup.say(f"{pairs_path} has {count} pairs; at least {MIN_PAIRS} are needed")
+        setup.say(f"{pairs_path} contains {count} pairs; at least {MIN_PAIRS} are needed")
         raise SetupStopped
     summary = solve_file(pairs_path, target, settings=setup.settings)
     rewrite(setup.config, lambda document: put(document, "calibration", {"file": str(target.resolve())}))
@@ -229,7 +229,7 @@ def calibration(setup: Setup) -> Figures:
 
 
 def service(setup: Setup) -> Figures:
-    """Step 7: gather the service's files in a folder and install them, or give the commands for it."""
+    """Step 7: gather the service's files in a folder, and install them or print the commands for that."""
     folder = (setup.out / "service").resolve()
     files = gather(setup.config, folder)
     sudo = "" if os.geteuid() == 0 else "sudo "
@@ -240,7 +240,7 @@ def service(setup: Setup) -> Figures:
     ]
     listed = "; ".join(commands)
     if setup.hardware.simulated or sudo:
-        setup.say("the service has its own copy of these files; install it with\n  " + "\n  ".join(commands))
+        setup.say("the service uses its own copy of these files; install it with\n  " + "\n  ".join(commands))
         return {"text": f"{len(files)} files; install them with: {listed}"}
     setup.hardware.let_go()  # the service needs the panels
     for command in commands:
@@ -251,7 +251,7 @@ def service(setup: Setup) -> Figures:
 
 
 def gather(config: Path, out: Path) -> list[str]:
-    """Copy the configuration, its calibration and its grey curves to a folder; returns the files' names.
+    """Copy the configuration, calibration and grey curves to a folder. Returns the files' names.
 
     Other files stay in place, with absolute paths. Raises InputError if a file cannot be read.
     """

@@ -28,7 +28,7 @@ POLISH_ABOVE = 1e2  # ratio of the points' two largest extents above which the c
 
 
 class Degenerate(ValueError):
-    """The points do not determine a similarity, or not in double precision; the text gives the reason."""
+    """Raised if the points do not determine a similarity in double precision; the message says why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class Similarity:
 
 
 def _centred(points: F64) -> tuple[F64, F64]:
-    """Points about their mean, and the mean; two passes keep precision with a distant origin."""
+    """Return the centred points and their mean; two passes keep precision with a distant origin."""
     mean = np.zeros((*points.shape[:-2], 1, 3))
     for _ in range(2):
         mean = mean + (points - mean).mean(axis=-2, keepdims=True)
@@ -73,7 +73,7 @@ def _scale(rule: ScaleRule, *, sensor_power: F64, stack_power: F64, correlation:
 
 
 def fit_batch(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
-    """Fit a batch of pairs (..., K, 3) without checks; degenerate ones give infinities or NaN."""
+    """Fit a batch of pairs (..., K, 3) without checks. Degenerate ones give infinities or NaN."""
     sensor, sensor_mean = _centred(sensor_m)
     stack, stack_mean = _centred(stack_m)
     left, values, right = np.linalg.svd(np.swapaxes(sensor, -1, -2) @ stack)
@@ -105,7 +105,7 @@ def fit(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
     """Fit K >= 3 pairs, (K, 3) each, to full double precision.
 
     Raises Degenerate for points that are too few, not finite, coincident, collinear or uncorrelated, or so thin or so
-    far away that rounding alone rotates the result by more than `ROTATION_BOUND_RAD`. Ignores measurement noise.
+    far away that rounding alone rotates the result by more than `ROTATION_BOUND_RAD`. Measurement noise is ignored.
     """
     if len(sensor_m) < 3:
         raise Degenerate(f"{len(sensor_m)} pairs: at least 3 are needed")
@@ -131,7 +131,7 @@ def _refuse_degenerate(name: str, points_m: F64) -> tuple[float, float]:
     if first <= 4 * EPSILON * magnitude:
         raise Degenerate(f"the {name} points coincide")
     if second <= 4 * EPSILON * magnitude or second <= 1e-13 * first:
-        raise Degenerate(f"the {name} points are on one line: the rotation about it is unknown")
+        raise Degenerate(f"the {name} points are on one line, so the rotation about it is unknown")
     bound = 4 * EPSILON * magnitude / second  # measured against 50-digit arithmetic: `phasestack stability`
     if bound > ROTATION_BOUND_RAD:
         raise Degenerate(

@@ -1,4 +1,4 @@
-"""Simulated hardware for `setup --simulate`."""
+"""Hardware simulation for `setup --simulate`."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ SAMPLES_HERE = 16  # sensor samples, at 30 a second, per viewpoint
 
 
 class SimulatedHardware(SetupHardware):
-    """Simulated hardware: shuffled monitors, and a person who stands where asked.
+    """Simulated hardware: monitors in random order, and a person who stands where asked.
 
-    The depth sensor has the pose of the built-in recording's, so that `run` can replay that afterwards.
+    The depth sensor has the same pose as the built-in recording's, so that `run` can replay this afterwards.
     """
 
     simulated = True
@@ -60,7 +60,7 @@ class SimulatedHardware(SetupHardware):
     def photographs(self, settings: Settings, pictures: U8, *, panel: int | None, say: Say) -> Iterator[Named]:
         folder = self._photos if panel is None else self._photos / f"grey-{panel}"
         if not folder.is_dir():
-            raise InputError(folder, "", "holds no photographs: a simulated display has none (n: skip)")
+            raise InputError(folder, "", "contains no photographs: a simulated display has none (n: skip)")
         return photographs(folder)
 
     def open_sensor(self, settings: Settings) -> str:

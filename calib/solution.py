@@ -1,4 +1,4 @@
-"""Calibrations with their errors: the methods, residuals and covariances, and the choice of a method."""
+"""Calibration methods, their residuals and covariances, and the choice among them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MIN_SIGMA = 1e-12  # of the scale's logarithm, for exact pairs
 
 @dataclass(frozen=True, slots=True)
 class CalibrationSolution:
-    """One method's result for K pairs. Parameters and pivot are those of `runtime.eyes.calibration`."""
+    """Result of one method for K pairs. Parameters and pivot are those of `runtime.eyes.calibration`."""
 
     method: Method
     similarity: Similarity
@@ -44,22 +44,22 @@ class CalibrationSolution:
 
     @property
     def rms_m(self) -> float:
-        """RMS distance of the used pairs."""
+        """RMS distance between fitted and known points of the used pairs."""
         return float(np.sqrt((self.residual_m[self.used] ** 2).sum(-1).mean()))
 
     @property
     def max_m(self) -> float:
-        """Largest distance of the used pairs."""
+        """Largest distance between fitted and known points of the used pairs."""
         return float(np.sqrt((self.residual_m[self.used] ** 2).sum(-1)).max())
 
     @property
     def axis_rms_m(self) -> F64:
-        """(3,) RMS along x, y, z of the used pairs."""
+        """(3,) RMS error along x, y, z of the used pairs."""
         return np.asarray(np.sqrt((self.residual_m[self.used] ** 2).mean(0)), dtype=np.float64)
 
     @property
     def scale_sigma(self) -> float:
-        """Standard deviation of the logarithm of the scale."""
+        """Standard deviation of the scale's logarithm."""
         return float(np.sqrt(self.covariance[6, 6]))
 
     def eye_error_m(self, stack_m: F64, *, noise_m: float | None = None) -> F64:
@@ -71,7 +71,7 @@ class CalibrationSolution:
 
 
 def design_covariance(stack_m: F64, *, fixed_scale: bool) -> tuple[F64, F64, float]:
-    """Pivot (3,), parameters' covariance (7, 7) for noise of 1 m, and the design's condition number.
+    """Return the (3,) pivot, the (7, 7) covariance for noise of 1 m, and the design's condition number.
 
     First order, for equal and independent noise in every coordinate; noise in the sensor counts times the scale. A
     design that leaves a parameter undetermined has infinite condition and covariance.
@@ -120,10 +120,10 @@ def solve(
 
 
 def posterior_scale(fitted: float, *, sigma: float, freedom: int) -> tuple[float, float]:
-    """Posterior mean and standard deviation of a log scale, averaged over the kinds of sensors.
+    """Return the posterior mean and standard deviation of a log scale, over the kinds of sensors.
 
     The fitted value's error `sigma` is estimated with `freedom` degrees of freedom, hence Student's likelihood.
-    Averaging avoids a threshold, and does not pull back a sensor that is off by a tenth.
+    Averaging avoids a threshold, and does not correct the scale of a sensor that is off by a tenth.
     """
     shares, widths = SCALE_PRIOR.T
     noise = max(sigma, MIN_SIGMA) ** 2

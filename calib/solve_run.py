@@ -1,4 +1,4 @@
-"""`calibrate solve`: pairs in, a calibration file and every method's figures out."""
+"""`calibrate solve`: compute a calibration file, and every method's figures, from pairs."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ STORED_PAIRS = 500  # more are left in their own file
 def solve_file(
     pairs_path: Path, out: Path, *, settings: Settings, method: str = "", known_scale: float = 1.0
 ) -> dict[str, Any]:
-    """Write the calibration; returns the summary, with every method's figures. Raises InputError.
+    """Write the calibration. Returns the summary, with every method's figures. Raises InputError.
 
-    method: empty: the one with the least error at the eye for such pairs; known_scale: of `fixed-scale`.
+    method: empty for the one with the smallest error at the eye for such pairs; known_scale: for `fixed-scale`.
     """
     if method and method not in METHODS:
         raise InputError("calibrate solve", "--method", f"must be one of {', '.join(METHODS)}, not {method}")
@@ -82,7 +82,7 @@ def _figures(solution: CalibrationSolution, volume_m: F64) -> dict[str, Any]:
 def calibration_text(
     solution: CalibrationSolution, pairs: Pairs, settings: Settings, *, warnings: list[str], volume_m: F64
 ) -> str:
-    """The TOML of a solution; `runtime.eyes.calibration` reads it, `[data]` is the report's."""
+    """Return a solution as TOML for `runtime.eyes.calibration`; the report reads its `[data]`."""
     document = tomlkit.document()
     document.add(tomlkit.comment("Made by `phasestack calibrate solve`. Lengths in metres, angles in radians."))
     document["stack_from_sensor"] = _rows(solution.similarity.matrix)

@@ -51,7 +51,7 @@ def viewing_place_m(viewing: CalibrationSettings) -> F64:
 
 
 def grid(viewing: CalibrationSettings = USUAL) -> tuple[Viewpoint, ...]:
-    """The 27 viewpoints of a viewing range, nearest first; EyeReal's for the default range."""
+    """Return the 27 viewpoints of a viewing range, nearest first. The default range gives EyeReal's."""
     low_deg, high_deg = viewing.viewing_up_deg
     radii_cm = np.rint(100 * np.linspace(*viewing.viewing_m, 3)).astype(int)
     phi_deg = np.rint(90 - np.linspace(high_deg, low_deg, 3)).astype(int)

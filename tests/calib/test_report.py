@@ -57,7 +57,7 @@ def test_the_published_prototype_is_reported_without_its_points(tmp_path: Path) 
     assert told["eye_error_mm"] is None
     page = (tmp_path / "r" / "index.html").read_text()
     assert "far from 1" in page
-    assert "holds no pairs" in page
+    assert "contains no pairs" in page
 
 
 @pytest.mark.parametrize(
