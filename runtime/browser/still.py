@@ -7,6 +7,7 @@ import html
 import io
 import math
 import re
+import zlib
 from collections.abc import Sequence
 from functools import cache, partial
 from importlib.resources import files
@@ -17,7 +18,7 @@ from PIL import Image
 
 from runtime.optics.malus import rest_code
 from runtime.optics.stack import PanelStack
-from runtime.records import F64, U8
+from runtime.records import F32, F64, U8
 from runtime.support.artifacts import png_bytes, to_json
 from runtime.support.threads import parallel_map
 
@@ -25,6 +26,7 @@ WEBP_MAX_PX = 16383
 EXTRA_BYTES = 60 << 10  # a page's size beyond its layers as PNG files
 PAGE_BYTES = 8_000_000  # a page's size at most
 LAYERS_BYTES = 6_400_000  # of these for layers; larger ones (4K) are not stored exactly
+QUALITY_BYTES = 512  # of these for the lines on how well pictures are compressed
 QUALITIES = (92, 84, 76, 66, 54)  # AVIF qualities: the first that fits is used
 
 
@@ -40,30 +42,42 @@ def viewer_html(
     *,
     eyes_m: F64,
     fov_deg: float,
-    title: str,
-    lines: Sequence[str] = (),
+    text: Sequence[str],
+    relief: F32 | None = None,
     follows: bool = True,
 ) -> str:
     """Viewer page of layers (N, h, w, 3 or 4), rear to front, solved for eyes (2, 3) in frame `stack`.
 
     Layers are stored exactly if they fit in `LAYERS_BYTES`, else as AVIF, and the page says how well.
     wanted: target pictures (h, w, 3), one per eye, `fov_deg` wide, compressed into the remaining size; () for none.
-    lines: text below the controls. follows: outer panels follow the head until the user switches that off.
+    text: the title, and lines below the controls. relief: (h, w), of the layers' content (`optics.relief`).
+    follows: outer panels follow the head until the user switches that off.
     """
+    title, *lines = text
     scene = {"stack": stack_table(stack), "eyes_m": eyes_m, "fov_deg": fov_deg, "title": title, "follows": follows}
-    parts = {"TITLE": html.escape(title), "CSS": asset("look.css"), "SCRIPT": _script()}
+    scene["lines"] = lines
+    if relief is not None:
+        deflated = base64.b64encode(zlib.compress(half_floats(relief), 9)).decode()
+        scene["relief"] = {"size": relief.shape[::-1], "deflated": deflated}
+    parts = {"TITLE": html.escape(title), "CSS": asset("look.css"), "SCRIPT": _script(), "SCENE": _embedded(scene)}
     png_size = sum(map(len, parallel_map(png_bytes, list(layers))))
     room, coded = min(PAGE_BYTES, EXTRA_BYTES + png_size), 0.0
     stored = parallel_map(_exact, list(layers)) if png_size < 2 * LAYERS_BYTES else []
     if not stored or sum(map(len, stored)) > LAYERS_BYTES:
         stored, coded = _stored(list(layers), LAYERS_BYTES, qualities=(98, *QUALITIES))
     parts["LAYERS"] = _embedded(stored)
-    targets, error = _stored(wanted, room - len("".join(parts.values())) - 2048) if wanted else ([], 0.0)
+    room -= len("".join((*parts.values(), asset("still.html")))) + QUALITY_BYTES
+    targets, error = _stored(wanted, room) if wanted else ([], 0.0)
     named = (("Targets", error), ("Layers (exact in their PNG files)", coded))
     quality = [f"{name} are compressed to {-10 * math.log10(square):.0f} dB." for name, square in named if square]
     scene |= {"target_error": error, "lines": [*lines, *quality]}
     parts |= {"SCENE": _embedded(scene), "WANTED": _embedded(targets)}
     return re.sub(r"@([A-Z]+)@", lambda found: parts.get(found[1], found[0]), asset("still.html"))
+
+
+def half_floats(relief: F32) -> bytes:
+    """A relief as the script reads it: 16-bit floats, little-endian, row after row."""
+    return np.clip(relief, -1e3, 1e3).astype("<f2").tobytes()
 
 
 def stack_table(stack: PanelStack) -> dict[str, Any]:
@@ -80,7 +94,7 @@ def stack_table(stack: PanelStack) -> dict[str, Any]:
 def _script() -> str:
     """Concatenate the modules into one script, without comments, imports and exports."""
     text = "\n".join(asset(name) for name in ("display.js", "look.js", "still.js"))
-    return re.sub(r"^ *//.*\n|^ +|^export |^import .*\n", "", text, flags=re.MULTILINE)
+    return re.sub(r"^ *//.*\n| +// .*$|^ +|^export |^import .*\n", "", text, flags=re.MULTILINE)
 
 
 def _exact(layer: U8) -> str:

@@ -64,7 +64,7 @@ def _unseen(layers: U8, account: RefreshAccount, run: Run, settings: Settings) -
     eyes_m = eyes_m if account.eyes_m is None else account.eyes_m
     title = "No viewer was seen: the flat picture" if is_flat else "The last refresh, not measured"
     fov_deg = settings.content.fov_deg
-    return viewer_html(layers, (), stack, eyes_m=eyes_m, fov_deg=fov_deg, title=title, follows=not is_flat)
+    return viewer_html(layers, (), stack, eyes_m=eyes_m, fov_deg=fov_deg, text=[title], follows=not is_flat)
 
 
 def print_summary(summary: dict[str, Any], out: Path | None) -> None:

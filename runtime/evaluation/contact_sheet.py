@@ -14,7 +14,7 @@ from runtime.evaluation.displayed import EyeViews
 from runtime.optics.carried import intensities
 from runtime.optics.pupil import PUPIL_MM, TRACKING_SIGMA_MM
 from runtime.optics.retina import as_codes
-from runtime.records import F64, U8
+from runtime.records import F32, F64, U8
 
 TILE_WIDTH = 640  # pixels
 MARGIN = 12  # pixels
@@ -36,6 +36,7 @@ class Moment:
     solution: U8  # (N, h, w, 3 or 4), before alignment
     solved_for_m: F64  # (2, 3) eyes, frame `stack`
     asked_for: tuple[U8, ...]  # (h, w, 3) their targets
+    relief: F32 | None = None  # (h, w) of the solution's content (`optics.relief`)
 
 
 def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, lines: Sequence[str] = ()) -> U8:

@@ -37,10 +37,10 @@ class EyeViews:
     eyes_m: F64  # (2, 3)
     fov_deg: float
 
-    def viewer(self, layers: U8, *, title: str, lines: Sequence[str]) -> str:
-        """Viewer page of the layers, seen from these eyes; it shows `lines` next to the picture."""
+    def viewer(self, layers: U8, text: Sequence[str]) -> str:
+        """Viewer page of the layers, seen from these eyes, with a title and lines next to the picture."""
         wanted, eyes_m = [as_codes(intensities(picture)) for picture in self.wanted], np.asarray(self.eyes_m)
-        return viewer_html(layers, wanted, self.stack, eyes_m=eyes_m, fov_deg=self.fov_deg, title=title, lines=lines)
+        return viewer_html(layers, wanted, self.stack, eyes_m=eyes_m, fov_deg=self.fov_deg, text=text)
 
     def write(self, folder: Path) -> None:
         """Write seen-*.png and wanted-*.png."""

@@ -129,8 +129,8 @@ class RunOutput:
                     look.stack,
                     eyes_m=moment.solved_for_m,
                     fov_deg=look.fov_deg,
-                    title=title,
-                    lines=lines,
+                    text=[title, *lines],
+                    relief=moment.relief,
                 )
             views = None if moment is None else moment.eye_views
             write_png(folder / "contact-sheet.png", contact_sheet(shown, views, headline=title, lines=lines))

@@ -91,7 +91,7 @@ class SolvedPair:
 
     def viewer(self, lines: Sequence[str]) -> str:
         """Viewer page of the layers."""
-        return self.eye_views.viewer(self.layers, title=headline(self.quality.light_db["1"]), lines=lines)
+        return self.eye_views.viewer(self.layers, [headline(self.quality.light_db["1"]), *lines])
 
     def write(self, folder: Path, *, lines: Sequence[str]) -> None:
         """Write layers, eye views, contact sheet and viewer, with `lines` below their headline."""

@@ -153,7 +153,9 @@ class QualitySampler:
         if targets.used is not None:
             aligned = replace(frame, parallax=None)
             carried = shown_layers(aligned), shown_layers(replace(aligned, solved_from_shown=()))
-        return measure_refresh(account, shown_layers(frame), carried, targets, self._stack)
+        quality = measure_refresh(account, shown_layers(frame), carried, targets, self._stack)
+        moment = quality.moment
+        return quality if moment is None else replace(quality, moment=replace(moment, relief=frame.relief))
 
     def _take(self, frame: int, quality: RefreshQuality | None, *, figures: bool = True, live: bool = True) -> None:
         if quality is None:

@@ -12,10 +12,10 @@ import cv2
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from runtime.browser.link import BrowserLink
-from runtime.browser.still import stack_table
+from runtime.browser.still import half_floats, stack_table
 from runtime.optics.carried import intensities
 from runtime.optics.retina import as_codes
-from runtime.records import U8
+from runtime.records import F32, U8
 from runtime.support.artifacts import to_json
 
 PAGES_MAX = 8  # most live pages: each one is sent its own pictures
@@ -74,12 +74,13 @@ class _Page:
             if self._checks and link.moment is not None and link.moment is not self._moment and not self._under_way:
                 await self._send_moment(link.moment)
             if frame is not None and not self._under_way and not self._checks:
-                for kind, layers, version in (
-                    ("flat", frame.flat, frame.flat_version),
-                    ("solved", frame.solved, frame.solved_version),
+                for kind, layers, version, relief in (
+                    ("flat", frame.flat, frame.flat_version, None),
+                    ("solved", frame.solved, frame.solved_version, frame.relief),
                 ):
                     if layers is not None and version != self._sent[kind] and not self._under_way:
-                        await self._send_layers(kind, layers, version, account.get("solved_for_m"))
+                        self._sent[kind], self._under_way = version, True
+                        await self._send_layers(kind, layers, relief, account.get("solved_for_m"))
             if account is not sent:
                 sent = account
                 await self._say({"refresh": sent, "viewer": link.is_viewer(me)})
@@ -89,11 +90,12 @@ class _Page:
             await self.news.wait()
             self.news.clear()
 
-    async def _send_layers(self, kind: str, layers: U8, version: int, solved_for_m: Any) -> None:
-        pixels = await asyncio.to_thread(lambda: layers.tobytes())
-        self._sent[kind], self._under_way = version, True
-        await self._say({"layers": kind, "solved_for_m": solved_for_m, "size": [layers.shape[2], layers.shape[1]]})
-        await self._socket.send_bytes(pixels)
+    async def _send_layers(self, kind: str, layers: U8, relief: F32 | None, solved_for_m: Any) -> None:
+        """Send layers, RGBA, followed by the relief of their content as 16-bit floats, where it is known."""
+        data = await asyncio.to_thread(lambda: layers.tobytes() + (b"" if relief is None else half_floats(relief)))
+        message = {"layers": kind, "solved_for_m": solved_for_m, "size": layers.shape[2:0:-1]}
+        await self._say(message if relief is None else message | {"relief": relief.shape[::-1]})
+        await self._socket.send_bytes(data)
 
     async def _send_moment(self, moment: Any) -> None:
         """Send layers followed by both eyes' targets, all RGBA."""

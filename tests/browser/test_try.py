@@ -78,6 +78,7 @@ class Client:
         )
         self.layers: dict[str, bytes] = {}
         self.sizes: dict[str, list[int]] = {}  # columns and rows; a solution may be coarser than the panels
+        self.relief: np.ndarray | None = None  # of the newest solution
         self.refresh: dict[str, Any] = {}
         self.stack: dict[str, Any] = {}
 
@@ -91,8 +92,13 @@ class Client:
     def look(self) -> None:
         message = json.loads(self.socket.recv(30))
         if "layers" in message:
-            self.layers[message["layers"]] = self.socket.recv(30)
-            self.sizes[message["layers"]] = message["size"]
+            kind, (width, height), received = message["layers"], message["size"], self.socket.recv(30)
+            layers, relief = received[: 12 * width * height], received[12 * width * height :]
+            self.layers[kind], self.sizes[kind] = layers, message["size"]
+            if kind == "solved":
+                self.relief = np.frombuffer(relief, "<f2").reshape(message["relief"][::-1])
+            else:
+                assert "relief" not in message and not relief
             self.socket.send(json.dumps({"drawn": True}))
         self.stack = message.get("stack", self.stack)
         self.refresh = message.get("refresh", self.refresh)
@@ -127,6 +133,7 @@ def test_eyes_go_in_and_layers_come_out_solved_for_them(url: str) -> None:
         assert len(client.layers["solved"]) == 3 * width * height * 4 and client.stack["width_px"] == 320
         assert (width, height) in ((320, 180), (160, 90), (107, 60), (80, 45))
         assert client.sizes["flat"] == [320, 180]
+        assert client.relief is not None and np.isfinite(client.relief).all() and client.relief.std() > 0.01
         assert client.until(
             lambda c: c.refresh["eyes_m"] and np.abs(np.subtract(c.refresh["eyes_m"], eyes)).max() < 1e-3
         )

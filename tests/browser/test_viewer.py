@@ -19,17 +19,18 @@ import pytest
 from PIL import Image
 
 import phasestack
-from runtime.browser.still import asset, stack_table, viewer_html
+from runtime.browser.still import asset, half_floats, stack_table, viewer_html
 from runtime.config import StackGeometry
-from runtime.optics.alignment import align, scale_and_shift
+from runtime.optics.alignment import align, scale_and_shift, shown_layers
 from runtime.optics.light import panels_from_centre
 from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack, Tilt
 from runtime.optics.views import image_from_stack
-from runtime.records import SensorFrame
+from runtime.records import PanelFrame, SensorFrame
 from runtime.report.pairs import PairPainter, eyes_at
 from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
+from runtime.support.artifacts import to_json
 from tests.browser.tracer import Panels, light
 from tests.test_cli import phasestack as phasestack_command
 
@@ -52,6 +53,10 @@ def driven(script: str, *arguments: object) -> dict[str, Any]:
     done = subprocess.run(command, capture_output=True, text=True, timeout=1800, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
     return {told["what"]: told["value"] for told in map(json.loads, done.stdout.splitlines())}
+
+
+def encoded(data: bytes | np.ndarray) -> str:
+    return base64.b64encode(data).decode()
 
 
 def in_node(code: str, given: Any) -> Any:
@@ -86,8 +91,73 @@ def test_the_page_aligns_as_the_runtime_does_to_its_limits(stack: PanelStack) ->
         wanted = align(stack, solved_for_m=solved, eyes_m=eyes)
         np.testing.assert_allclose(one["maps"], [scale_and_shift(m) for m in wanted.solved_from_shown], atol=1e-8)
         assert bool(one["limited"]) == bool(wanted.limited)
+        assert (one["parallax"] is None) == (wanted.parallax is None) == (stack.count % 2 == 0)
+        if wanted.parallax is not None:
+            motion, middles = wanted.parallax, map(scale_and_shift, wanted.parallax.middle_from_shown)
+            np.testing.assert_allclose(one["parallax"]["drift"], [*motion.drift_px, motion.growth], atol=1e-8)
+            np.testing.assert_allclose(one["parallax"]["middles"], list(middles), atol=1e-8)
+            np.testing.assert_allclose(one["parallax"]["weights"], motion.weights, atol=1e-8)
         limited += bool(wanted.limited)
     assert 0 < limited < 40
+
+
+def test_eyes_that_stay_where_they_were_displace_nothing() -> None:
+    eyes = eyes_at(distance_m=0.6).tolist()
+    assert in_node("alignment(...given).parallax", [stack_table(STACK), eyes, eyes]) is None
+
+
+def smooth(*shape: int, seed: int) -> np.ndarray:
+    """(n, h, w, 4) codes that change over some pixels."""
+    coarse = np.random.default_rng(seed).integers(0, 256, (shape[0], shape[1] // 6, shape[2] // 6, 4), np.uint8)
+    layers = np.stack([cv2.resize(one, shape[:0:-1], interpolation=cv2.INTER_CUBIC) for one in coarse])
+    layers[..., 3] = 255
+    return layers
+
+
+def hills(rows: int, columns: int) -> np.ndarray:
+    """A relief with an outline: content before, on and behind the middle panel."""
+    v, u = np.mgrid[0:rows, 0:columns] / max(rows, columns)
+    return np.where(np.hypot(u - 0.5, v - 0.3) < 0.2, 0.2 + 0.1 * u, -0.15 * np.sin(9 * v)).astype(np.float32)
+
+
+@pytest.mark.slow
+def test_panels_in_the_page_show_what_the_reference_shows(tmp_path: Path) -> None:
+    stack, eyes, flat = (
+        replace(STACK, width_px=320, height_px=180),
+        eyes_at(distance_m=0.7, angle_deg=6),
+        smooth(3, 180, 320, seed=2),
+    )
+    cases: list[dict[str, Any]] = []
+    wanted = []
+    for move_m, rows, relief, flatness in (
+        ((0.0, 0.0, 0.0), 180, hills(90, 160), 0.0),
+        ((0.0, 0.0, 0.0), 60, None, 0.0),
+        ((0.01, 0.03, -0.01), 180, hills(180, 320), 0.0),
+        ((0.01, 0.03, -0.01), 90, hills(90, 160), 0.3),
+        ((0.01, 0.03, -0.01), 60, None, 0.0),
+        ((-0.1, -0.09, 0.05), 60, hills(90, 160), 0.0),
+        ((0.0, 5.0, 0.0), 45, hills(90, 160), 0.0),
+    ):
+        layers, moved = smooth(3, rows, rows * 16 // 9, seed=1), align(stack, solved_for_m=eyes, eyes_m=eyes + move_m)
+        frame = PanelFrame(1, layers, 1, moved.solved_from_shown, flat, 1, flatness, (320, 180), relief, moved.parallax)
+        wanted.append(shown_layers(frame))
+        cases.append(
+            {
+                "size": layers.shape[2:0:-1],
+                "layers": encoded(layers),
+                "eyes": [eyes, eyes + move_m],
+                "flatness": flatness,
+            }
+        )
+        cases[-1] |= {} if relief is None else {"relief": encoded(half_floats(relief)), "relief_px": relief.shape[::-1]}
+    given = to_json({"stack": stack_table(stack), "flat": encoded(flat), "cases": cases})
+    script = f"{asset('display.js')}\nconst given = {given};\n{(HERE / 'panels.js').read_text()}"
+    (tmp_path / "panels.html").write_text(f'<script type="module">{script}</script>')
+    told = driven("value.mjs", tmp_path / "panels.html")
+    assert told["errors"] == [] and len(told["value"]) == len(wanted)
+    for one, other in zip(told["value"], wanted, strict=True):
+        off = np.abs(np.frombuffer(base64.b64decode(one), np.uint8).reshape(other.shape) - other.astype(int))[..., :3]
+        assert off.max() <= 4 and (off > 1).mean() < 1e-3  # texture filters have weights of 1/256
 
 
 @pytest.mark.parametrize("stack", STACKS, ids=lambda stack: f"{stack.count} panels")
@@ -163,14 +233,27 @@ def test_the_viewer_shows_the_light_that_a_tracer_finds(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_the_viewer_of_a_run_moves_its_content_by_its_depth(tmp_path: Path) -> None:
+    stack, relief, layers = replace(STACK, width_px=320, height_px=180), hills(90, 160), smooth(3, 180, 320, seed=4)
+    eyes = eyes_at(distance_m=0.7, angle_deg=6, height_m=0.1)
+    page = viewer_html(layers, (), stack, eyes_m=eyes, fov_deg=40, text=["in relief"], relief=relief)
+    (tmp_path / "viewer.html").write_text(page)
+    driven("look.mjs", tmp_path / "viewer.html", 320, 180, json.dumps(MOVE), tmp_path)
+    panels, now = Panels(stack.width_m, stack.height_m, stack.x_m), eyes + MOVE
+    moved = align(stack, solved_for_m=eyes, eyes_m=now)
+    frame = PanelFrame(1, layers, 1, moved.solved_from_shown, relief=relief, parallax=moved.parallax)
+    as_shown, aligned = (shown_layers(one)[..., :3] for one in (frame, replace(frame, relief=None)))
+    assert agreement_db(tmp_path, "aligned", as_shown, panels, now, 2) > 45
+    assert agreement_db(tmp_path, "aligned", aligned, panels, now, 2) < 30
+
+
+@pytest.mark.slow
 def test_tilted_panels_too(tmp_path: Path) -> None:
     tilt = Tilt(tuple((0.0, *slopes) for slopes in TILT), (0.5, 0.0, 0.0))
     stack = replace(STACK, width_px=320, height_px=180, tilt=tilt)
-    random = np.random.default_rng(4)
-    coarse = random.integers(0, 256, (3, 45, 80, 3)).astype(np.uint8)
-    layers = np.stack([cv2.resize(layer, (320, 180), interpolation=cv2.INTER_CUBIC) for layer in coarse])
+    layers = smooth(3, 180, 320, seed=4)[..., :3]
     eyes = eyes_at(distance_m=0.7, angle_deg=6, height_m=0.1)
-    page = viewer_html(layers, (), stack, eyes_m=eyes, fov_deg=40, title="tilted")
+    page = viewer_html(layers, (), stack, eyes_m=eyes, fov_deg=40, text=["tilted"])
     (tmp_path / "viewer.html").write_text(page)
     driven("look.mjs", tmp_path / "viewer.html", 320, 180, json.dumps(MOVE), tmp_path)
     panels = Panels(stack.width_m, stack.height_m, stack.x_m, TILT)
@@ -180,7 +263,7 @@ def test_tilted_panels_too(tmp_path: Path) -> None:
 def test_the_page_is_small_beside_its_pictures_and_asks_for_nothing(tmp_path: Path) -> None:
     layers = np.zeros((3, 36, 64, 3), np.uint8)
     eyes = eyes_at(distance_m=0.6)
-    page = viewer_html(layers, (layers[0],) * 2, STACK, eyes_m=eyes, fov_deg=40, title="</script><b>", lines=["<i>"])
+    page = viewer_html(layers, (layers[0],) * 2, STACK, eyes_m=eyes, fov_deg=40, text=["</script><b>", "<i>"])
     assert len(re.sub(r"data:image/[^\"]*", "", page)) < 60 * 1024
     assert page.count("</script>") == 4 and "<b>" not in page and "<i>" not in page and "import " not in page
     assert not re.search(r"https?://(?!www\.w3\.org/2000/svg)", page)
@@ -209,7 +292,7 @@ def test_a_page_above_8_mb_has_compressed_layers_and_says_so() -> None:
     coarse = random.integers(0, 256, (3, 90, 160, 3)).astype(np.uint8)
     layers = np.stack([cv2.resize(each, (1280, 720), interpolation=cv2.INTER_CUBIC) for each in coarse])
     layers ^= random.integers(0, 16, layers.shape, np.uint8)  # what no lossless coder can shorten
-    page = viewer_html(layers, (layers[0],) * 2, stack, eyes_m=eyes_at(distance_m=0.6), fov_deg=40.0, title="large")
+    page = viewer_html(layers, (layers[0],) * 2, stack, eyes_m=eyes_at(distance_m=0.6), fov_deg=40.0, text=["large"])
     assert len(page.encode()) <= 8_000_000
     urls = json.loads(re.findall(r'id="layers">(.*?)</script>', page)[0])
     decoded = [
@@ -224,7 +307,7 @@ def test_the_page_in_the_docs_has_today_s_script() -> None:
     """Or `make gallery` is due."""
     stack = replace(STACK, width_px=64, height_px=36)
     layers = np.zeros((3, 36, 64, 3), np.uint8)
-    today = viewer_html(layers, (), stack, eyes_m=eyes_at(distance_m=0.6), fov_deg=40.0, title="", lines=[])
+    today = viewer_html(layers, (), stack, eyes_m=eyes_at(distance_m=0.6), fov_deg=40.0, text=[""])
     kept = (Path(__file__).parents[2] / "docs" / "images" / "viewer.html").read_text(encoding="utf-8")
     scripts = [re.findall(r"<script type=\"module\">(.*?)</script>", page, re.DOTALL) for page in (today, kept)]
     assert len(scripts[0]) == 1 and scripts[0] == scripts[1]

@@ -81,8 +81,9 @@ export function panelFromPicture(stack, n, eye, picture, nominal = eye) {
   return mul(pixels(stack), seen ? mul(seen, ideal) : ideal);
 }
 
-// Alignment of solved layers to other eyes (derivation: runtime/optics/alignment.py): for each panel
-// [scale u, scale v, shift u, shift v] to solved pixels from shown ones; `limited`: why they follow only part of the way.
+// Alignment of solved layers to other eyes (derivations: runtime/optics/alignment.py and relief.py): for each panel
+// [scale u, scale v, shift u, shift v] to solved pixels from shown ones; `parallax`: motion of content off the middle panel;
+// `limited`: why they follow only part of the way.
 export function alignment(stack, solved, eyes) {
   const old = middle(solved), now = middle(eyes), step = now.map((v, k) => v - old[k]), r = reference(stack);
   let share = 1, limited = "";
@@ -102,33 +103,60 @@ export function alignment(stack, solved, eyes) {
     limit(step[0] * (1 - MOST_SCALE - weight), (MOST_SCALE - 1) * far, "too far");
     limit(step[0] * (weight + 1 / MOST_SCALE - 1), (1 - 1 / MOST_SCALE) * far, "too far");
   }
+  const went = step.map((v) => v * share);
   const maps = stack.x_m.map((x) => {
-    const [sx, sy, sz] = step.map((v) => v * share), far = old[0] - x, height = old[0] - r, present = far + sx;
+    const [sx, sy, sz] = went, far = old[0] - x, height = old[0] - r, present = far + sx;
     const larger = (sx * (r - x)) / (present * height);
     const shift = [[1, sy], [2, sz]].map(([k, s]) => (((x - r) / height) * (old[k] * sx - s * far)) / present);
-    return [1 + larger, 1 + larger,
-      ((-stack.width_m / 2) * larger + shift[0]) * (stack.width_px / stack.width_m),
-      -((stack.height_m / 2) * larger + shift[1]) * (stack.height_px / stack.height_m)];
+    return mapped(stack, larger, shift);
   });
-  return { maps, limited };
+  return { maps, limited, parallax: parallax(stack, old, old.map((v, k) => v + went[k])) };
 }
 
-export const unaligned = (stack) => stack.x_m.map(() => [1, 1, 0, 0]);
+// A scale by 1 + larger about the panels' centre and a shift right and up in metres, in pixels.
+const mapped = (stack, larger, [right, up]) => [1 + larger, 1 + larger,
+  ((-stack.width_m / 2) * larger + right) * (stack.width_px / stack.width_m), -((stack.height_m / 2) * larger + up) * (stack.height_px / stack.height_m)];
+
+// Null with an even number of panels, none of which is the middle one, or without a movement.
+function parallax(stack, old, now) {
+  if (stack.x_m.length % 2 === 0 || old.every((v, k) => v === now[k])) return null;
+  const r = reference(stack), k = (old[0] - r) / (now[0] - r), growth = 1 - k;
+  const [, , right, down] = mapped(stack, growth, [1, 2].map((n) => k * now[n] - old[n]));
+  const middles = stack.x_m.map((x) => {
+    const larger = (x - r) / (now[0] - x);
+    return mapped(stack, larger, [1, 2].map((n) => -now[n] * larger));
+  });
+  return { drift: [right, down, growth], middles, weights: stack.x_m.map((x) => (old[0] - x) / (old[0] - r)) };
+}
+
+export const unaligned = (stack) => ({ maps: stack.x_m.map(() => [1, 1, 0, 0]), limited: "", parallax: null });
 
 const VERTEX = `#version 300 es
 void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }`;
 
+// A shown pixel's place in the solution, in its pixels. The solution may be coarser than the panels; the relief is 0 without one.
+const SOLVED_AT = `precision highp float; precision highp sampler2D; precision highp sampler2DArray;
+const int PANELS = @PANELS@;
+uniform sampler2D relief; uniform vec4 maps[PANELS], middles[PANELS]; uniform float weights[PANELS], rest; uniform vec3 drift;
+uniform vec2 size, solved_px;
+vec2 solved_at(int n, vec2 px) {
+  vec2 middle = px * middles[n].xy + middles[n].zw;
+  float b = weights[n] * texture(relief, middle / size).r;
+  return (px * maps[n].xy + maps[n].zw + b * (drift.xy + drift.z * middle)) * solved_px / size;
+}`;
+
 // One layer as its panel shows it: aligned, mixed with the flat picture, rounded to 8 bits by its framebuffer.
 const SHOW = `#version 300 es
-precision highp float; precision highp sampler2DArray;
-uniform sampler2DArray solved, flat_picture; uniform int panel; uniform vec4 map; uniform float flatness, rest; uniform vec2 size;
+${SOLVED_AT}
+uniform sampler2DArray layers, flat_picture; uniform int panel, extended; uniform float flatness;
 out vec4 colour;
-vec3 texel(ivec2 at) {
-  bool inside = all(greaterThanEqual(at, ivec2(0))) && all(lessThan(at, ivec2(size)));
-  return inside ? texelFetch(solved, ivec3(at, panel), 0).rgb : vec3(rest);
+vec3 texel(ivec2 at) { // the edge of a coarse solution is extended by a pixel: it does not fade at the panel's
+  ivec2 end = ivec2(solved_px);
+  bool inside = all(greaterThanEqual(at, ivec2(-extended))) && all(lessThan(at, end + extended));
+  return inside ? texelFetch(layers, ivec3(clamp(at, ivec2(0), end - 1), panel), 0).rgb : vec3(rest);
 }
 void main() {
-  vec2 place = clamp(gl_FragCoord.xy * map.xy + map.zw - 0.5, vec2(-2.0), size + 1.0), low = floor(place), w = place - low;
+  vec2 place = clamp(solved_at(panel, gl_FragCoord.xy) - 0.5, vec2(-3.0), solved_px + 2.0), low = floor(place), w = place - low;
   ivec2 at = ivec2(low);
   vec3 code = flatness >= 1.0 ? vec3(0.0) : mix(mix(texel(at), texel(at + ivec2(1, 0)), w.x),
     mix(texel(at + ivec2(0, 1)), texel(at + ivec2(1, 1)), w.x), w.y);
@@ -136,15 +164,27 @@ void main() {
   colour = vec4(code, 1.0);
 }`;
 
-// Layer of a coarse solution enlarged to the panel's pixels.
-const ENLARGE = `#version 300 es
-precision highp float; precision highp sampler2DArray;
-uniform sampler2DArray layers; uniform int panel; uniform vec2 size; out vec4 colour;
-void main() { colour = texture(layers, vec3(gl_FragCoord.xy / size, panel)); }`;
+// A draft: one ray a pixel through the solution itself, between its pixels, with the relief where the ray crosses the middle
+// panel. It takes a tenth of the time of drawing and tracing the panels.
+const QUICK = `#version 300 es
+${SOLVED_AT}
+uniform sampler2DArray layers; uniform mat3 into[PANELS]; uniform vec2 origin; uniform vec3 room;
+out vec4 colour;
+void main() {
+  vec3 p = vec3(gl_FragCoord.x - origin.x, origin.y - gl_FragCoord.y, 1.0), h = into[PANELS / 2] * p, sum = vec3(0.0);
+  vec2 px = h.xy / h.z, off = texture(relief, px / size).r * (drift.xy + drift.z * px), at;
+  bool seen = true;
+#define THROUGH(n) h = into[n] * p; px = h.xy / h.z; at = (px * maps[n].xy + maps[n].zw + weights[n] * off) / size; \\
+  seen = seen && h.z > 0.0 && all(greaterThanEqual(px, vec2(0.0))) && all(lessThan(px, size)); \\
+  sum += clamp(at, 0.0, 1.0) == at ? texture(layers, vec3(at, n)).rgb : vec3(rest);
+  @EACH@
+  vec3 s = sin(sum * 1.5707963267948966);
+  colour = vec4(seen ? s * s : room, 1.0);
+}`;
 
-// Picture that an eye sees: sin² of the summed phases along each ray, averaged over the pixel. Panel pixels are uniform
-// boxes. `rays` > 0: a grid of rays; 0: exact, the pixel is cut at every edge of a panel pixel in it.
-const SEE = `#version 300 es
+// Picture that an eye sees: sin² of the summed phases along each ray, averaged over the pixel by `light`. Panel pixels are uniform
+// boxes.
+const SEE = (light) => `#version 300 es
 precision highp float; precision highp sampler2DArray;
 const int PANELS = @PANELS@;
 uniform sampler2DArray layers; uniform sampler2D target;
@@ -157,6 +197,26 @@ vec3 malus(vec3 phase) {
   vec3 s = sin(phase * 1.5707963267948966);
   return s * s;
 }
+${light}
+void main() {
+  vec2 p = floor(vec2(gl_FragCoord.x - origin.x, origin.y - gl_FragCoord.y)) * stride;
+  vec4 sum = vec4(0.0);
+  for (int k = 0; k < pupils; k++) {
+    off = pupil[k];
+    sum += light(p);
+  }
+  sum /= float(pupils);
+  vec3 seen = sum.rgb + room * (1.0 - sum.a);
+  if (gain > 0) {
+    float coarser = log2(max(1.0, float(textureSize(target, 0).x) / picture.x));
+    vec3 wanted = textureLod(target, (p + 0.5) / picture, coarser).rgb;
+    seen = gain == 1 ? wanted : sum.a > 0.999 ? abs(seen - wanted) * float(gain) : room;
+  }
+  colour = vec4(seen, sum.a);
+}`;
+
+// A grid of `rays` by `rays`.
+const GRID = `
 vec4 ray(vec2 p) { // alpha 1: the ray crosses every panel
   vec3 sum = vec3(0.0);
   for (int n = 0; n < PANELS; n++) {
@@ -166,11 +226,20 @@ vec4 ray(vec2 p) { // alpha 1: the ray crosses every panel
   }
   return vec4(malus(sum), 1.0);
 }
+vec4 light(vec2 p) {
+  float share = 1.0 / float(rays);
+  vec4 sum = vec4(0.0);
+  for (int j = 0; j < rays; j++) for (int i = 0; i < rays; i++) sum += ray(p + (vec2(i, j) + 0.5) * share);
+  return sum * share * share;
+}`;
+
+// Exact: the pixel is cut at every edge of a panel pixel in it.
+const BOXES = `
 float next(float at, float slope) { // distance along the pixel to the next edge
   float edge = slope > 0.0 ? floor(at + 1e-4) + 1.0 : ceil(at - 1e-4) - 1.0;
   return abs(slope) < 1e-6 ? 2.0 : (edge - at) / slope;
 }
-vec4 exact(vec2 p) {
+vec4 light(vec2 p) {
   vec2 at[PANELS], right[PANELS], down[PANELS];
   for (int n = 0; n < PANELS; n++) {
     at[n] = place(n, p + 0.5);
@@ -202,26 +271,6 @@ vec4 exact(vec2 p) {
     v = v1;
   }
   return sum;
-}
-void main() {
-  vec2 p = floor(vec2(gl_FragCoord.x - origin.x, origin.y - gl_FragCoord.y)) * stride;
-  vec4 sum = vec4(0.0);
-  for (int k = 0; k < pupils; k++) {
-    off = pupil[k];
-    if (rays == 0) { sum += exact(p); continue; }
-    float share = 1.0 / float(rays);
-    vec4 part = vec4(0.0);
-    for (int j = 0; j < rays; j++) for (int i = 0; i < rays; i++) part += ray(p + (vec2(i, j) + 0.5) * share);
-    sum += part * share * share;
-  }
-  sum /= float(pupils);
-  vec3 light = sum.rgb + room * (1.0 - sum.a);
-  if (gain > 0) {
-    float coarser = log2(max(1.0, float(textureSize(target, 0).x) / picture.x));
-    vec3 wanted = textureLod(target, (p + 0.5) / picture, coarser).rgb;
-    light = gain == 1 ? wanted : sum.a > 0.999 ? abs(light - wanted) * float(gain) : room;
-  }
-  colour = vec4(light, sum.a);
 }`;
 
 // Panel drawn as a parallelogram: its corner and two edges in clip space, -1 to 1.
@@ -250,13 +299,16 @@ export class Display {
     const { width_px: width, height_px: height, x_m } = stack;
     if (Math.max(width, height) > g.getParameter(g.MAX_TEXTURE_SIZE)) throw new Error("the panels have more pixels than this browser's textures");
     this.programs = {};
-    for (const [name, vertex, fragment] of [["show", VERTEX, SHOW], ["enlarge", VERTEX, ENLARGE], ["see", VERTEX, SEE], ["card", CARD_VERTEX, CARD]])
-      this.programs[name] = this.#program(vertex, fragment.replace("@PANELS@", x_m.length));
-    this.textures = {};
-    for (const name of ["solved", "flat", "shown"]) this.textures[name] = this.#layers(width, height);
+    const each = x_m.map((_, n) => `THROUGH(${n})`).join(" "), sources = { show: SHOW, quick: QUICK, grid: SEE(GRID), boxes: SEE(BOXES) };
+    for (const [name, source] of Object.entries(sources)) this.programs[name] = this.#program(VERTEX, source.replace("@PANELS@", x_m.length).replace("@EACH@", each));
+    this.programs.card = this.#program(CARD_VERTEX, CARD);
+    this.software = /swiftshader|llvmpipe|softpipe|basic render/i.test(g.getParameter(g.getExtension("WEBGL_debug_renderer_info")?.UNMASKED_RENDERER_WEBGL ?? g.RENDERER));
+    this.textures = { flat: this.#layers(width, height), shown: this.#layers(width, height) };
+    this.load("solved", []);
+    this.unfold(null);
     this.targets = [null, null];
     this.framebuffer = g.createFramebuffer();
-    this.maps = null; // maps that `shown` was drawn with; null: not drawn yet
+    this.drawn = null; // alignment that `shown` was drawn with; null: not drawn yet
   }
 
   #layers(width, height) {
@@ -297,28 +349,46 @@ export class Display {
 
   // Load `solved` or `flat`: concatenated RGBA bytes or one picture per panel; a coarse solution gives its own size.
   load(name, layers, [w, h] = [this.stack.width_px, this.stack.height_px]) {
-    const g = this.g, { width_px: width, height_px: height, x_m } = this.stack, coarse = w !== width || h !== height, key = `${w}x${h}`;
+    const g = this.g, key = name === "solved" ? `${w}x${h}` : name;
     g.activeTexture(g.TEXTURE0);
-    if (coarse) this.textures[key] ??= this.#layers(w, h);
-    g.bindTexture(g.TEXTURE_2D_ARRAY, this.textures[coarse ? key : name]);
+    this.textures[key] ??= this.#layers(w, h);
+    if (name === "solved") Object.assign(this.textures, { solved: this.textures[key] }), (this.solved_px = [w, h]);
+    g.bindTexture(g.TEXTURE_2D_ARRAY, this.textures[key]);
     g.pixelStorei(g.UNPACK_COLORSPACE_CONVERSION_WEBGL, g.NONE);
-    if (layers instanceof Uint8Array) g.texSubImage3D(g.TEXTURE_2D_ARRAY, 0, 0, 0, 0, w, h, x_m.length, g.RGBA, g.UNSIGNED_BYTE, layers);
+    if (layers instanceof Uint8Array) g.texSubImage3D(g.TEXTURE_2D_ARRAY, 0, 0, 0, 0, w, h, this.stack.x_m.length, g.RGBA, g.UNSIGNED_BYTE, layers);
     else layers.forEach((image, n) => g.texSubImage3D(g.TEXTURE_2D_ARRAY, 0, 0, 0, n, w, h, 1, g.RGBA, g.UNSIGNED_BYTE, image));
-    if (coarse) this.#enlarge(key, name);
-    this.maps = null;
+    this.drawn = null;
   }
 
-  #enlarge(from, to) {
-    const g = this.g, { width_px: w, height_px: h, x_m } = this.stack, places = this.#use("enlarge", from);
-    g.bindFramebuffer(g.FRAMEBUFFER, this.framebuffer);
-    g.viewport(0, 0, w, h);
+  // Set the solution's relief over the middle panel, 16-bit floats; null: its content stays where it is there.
+  unfold(relief, [w, h] = [1, 1]) {
+    const g = this.g;
+    g.deleteTexture(this.relief);
+    this.relief = g.createTexture();
+    g.activeTexture(g.TEXTURE2);
+    g.bindTexture(g.TEXTURE_2D, this.relief);
+    g.pixelStorei(g.UNPACK_ALIGNMENT, 2);
+    g.texImage2D(g.TEXTURE_2D, 0, g.R16F, w, h, 0, g.RED, g.HALF_FLOAT, relief ?? new Uint16Array(1));
+    g.pixelStorei(g.UNPACK_ALIGNMENT, 4);
+    for (const wrap of [g.TEXTURE_WRAP_S, g.TEXTURE_WRAP_T]) g.texParameteri(g.TEXTURE_2D, wrap, g.CLAMP_TO_EDGE);
+    for (const filter of [g.TEXTURE_MIN_FILTER, g.TEXTURE_MAG_FILTER]) g.texParameteri(g.TEXTURE_2D, filter, g.LINEAR);
+    this.drawn = null;
+  }
+
+  // Give a program an alignment: the solution's place on each panel.
+  #align(places, { maps, parallax }) {
+    const g = this.g, { width_px: w, height_px: h } = this.stack, still = { drift: [0, 0, 0], middles: maps, weights: maps.map(() => 0) };
+    const { drift, middles, weights } = parallax ?? still;
+    g.uniform4fv(places.maps, maps.flat());
+    g.uniform4fv(places.middles, middles.flat());
+    g.uniform1fv(places.weights, weights);
+    g.uniform3f(places.drift, ...drift);
+    g.uniform1f(places.rest, this.stack.rest_code / 255); // outside a shifted solution
     g.uniform2f(places.size, w, h);
-    x_m.forEach((_, n) => {
-      g.framebufferTextureLayer(g.FRAMEBUFFER, g.COLOR_ATTACHMENT0, this.textures[to], 0, n);
-      g.uniform1i(places.panel, n);
-      g.drawArrays(g.TRIANGLES, 0, 3);
-    });
-    g.bindFramebuffer(g.FRAMEBUFFER, null);
+    g.uniform2f(places.solved_px, ...this.solved_px);
+    g.activeTexture(g.TEXTURE2);
+    g.bindTexture(g.TEXTURE_2D, this.relief);
+    g.uniform1i(places.relief, 2);
   }
 
   // Set an eye's target picture; null: none.
@@ -335,59 +405,60 @@ export class Display {
     g.texParameteri(g.TEXTURE_2D, g.TEXTURE_MIN_FILTER, g.LINEAR_MIPMAP_LINEAR);
   }
 
-  // Draw the panels: the solution mapped by `maps`, mixed with the flat picture.
-  show(maps, flatness = 0) {
-    const g = this.g, key = JSON.stringify([maps, flatness]);
-    if (key === this.maps) return;
+  // Draw the panels: the solution aligned, mixed with the flat picture.
+  show(aligned, flatness = 0) {
+    const g = this.g, key = JSON.stringify([aligned, flatness]);
+    if (key === this.drawn) return;
     const { width_px: w, height_px: h } = this.stack, places = this.#use("show", "solved");
+    this.#align(places, aligned);
     g.activeTexture(g.TEXTURE1);
     g.bindTexture(g.TEXTURE_2D_ARRAY, this.textures.flat);
     g.uniform1i(places.flat_picture, 1);
+    g.uniform1i(places.extended, this.solved_px[0] !== w || this.solved_px[1] !== h);
     g.uniform1f(places.flatness, flatness);
-    g.uniform1f(places.rest, this.stack.rest_code / 255); // outside a shifted solution
-    g.uniform2f(places.size, w, h);
     g.bindFramebuffer(g.FRAMEBUFFER, this.framebuffer);
     g.viewport(0, 0, w, h);
-    maps.forEach((map, n) => {
+    aligned.maps.forEach((_, n) => {
       g.framebufferTextureLayer(g.FRAMEBUFFER, g.COLOR_ATTACHMENT0, this.textures.shown, 0, n);
       g.uniform1i(places.panel, n);
-      g.uniform4f(places.map, ...map);
       g.drawArrays(g.TRIANGLES, 0, 3);
     });
     g.bindFramebuffer(g.FRAMEBUFFER, null);
-    this.maps = key;
+    this.drawn = key;
   }
 
   // Draw one eye's picture into a part [x, y, width, height] (y from below) of the bound framebuffer. rays 0: exact boxes.
   // nominal: eye whose picture is carried along on the centre panel. gain 1: the target; above 1: difference times gain.
-  // maps: sample the shifted solution directly, without drawing the panels first (faster).
-  see({ eye, nominal = eye, picture, part, maps = null, rays = 0, pupil_mm = 0, side = 0, gain = 0, stride = [1, 1], room = [0.07, 0.08, 0.1] }) {
-    const g = this.g, { stack } = this, places = this.#use("see", maps ? "solved" : "shown"), count = stack.x_m.length;
+  // quick: an alignment, to sample the solution directly, without drawing the panels first.
+  see({ eye, nominal = eye, picture, part, quick = null, rays = 0, pupil_mm = 0, side = 0, gain = 0, stride = [1, 1], room = [0.07, 0.08, 0.1] }) {
+    const g = this.g, { stack } = this, places = quick ? this.#use("quick", "solved") : this.#use(rays ? "grid" : "boxes", "shown");
     g.viewport(...part);
     const columns = [], apart = [];
-    for (let n = 0; n < count; n += 1) {
-      const ideal = panelFromPicture(stack, n, eye, picture, nominal), [su, sv, tu, tv] = maps?.[n] ?? [1, 1, 0, 0];
-      const m = maps ? mul([su, 0, tu, 0, sv, tv, 0, 0, 1], ideal) : ideal, share = 1 - (stack.x_m[n] - eye[0]) / (centre(stack) - eye[0]);
+    for (let n = 0; n < stack.x_m.length; n += 1) {
+      const m = panelFromPicture(stack, n, eye, picture, nominal), share = 1 - (stack.x_m[n] - eye[0]) / (centre(stack) - eye[0]);
       const scale = 1 / (m[6] * picture.width / 2 + m[7] * picture.height / 2 + m[8] || 1); // in front of the eye: positive
       for (let k = 0; k < 3; k += 1) columns.push(...[m[k], m[3 + k], m[6 + k]].map((v) => v * scale));
       apart.push((share * stack.width_px) / stack.width_m, (-share * stack.height_px) / stack.height_m);
     }
     g.uniformMatrix3fv(places.into, false, columns);
-    g.uniform2fv(places.per_metre, apart);
-    const points = [0, 0], radius = pupil_mm / 2000;
-    for (let k = 0; k < PUPILS - 1; k += 1) points.push(...[Math.cos, Math.sin].map((f) => 0.764 * radius * f((k * Math.PI) / 3)));
-    if (places.pupil) g.uniform2fv(places.pupil, points);
-    g.uniform1i(places.pupils, pupil_mm > 0 ? PUPILS : 1);
-    g.uniform1i(places.rays, rays);
-    g.uniform1i(places.gain, this.targets[side] ? gain : 0);
-    g.uniform2f(places.size, stack.width_px, stack.height_px);
     g.uniform2f(places.origin, part[0], part[1] + part[3]);
-    g.uniform2f(places.stride, ...stride);
-    g.uniform2f(places.picture, picture.width, picture.height);
     g.uniform3f(places.room, ...room);
-    g.activeTexture(g.TEXTURE1);
-    g.bindTexture(g.TEXTURE_2D, this.targets[side]);
-    g.uniform1i(places.target, 1);
+    if (quick) this.#align(places, quick);
+    else {
+      g.uniform2fv(places.per_metre, apart);
+      const points = [0, 0], radius = pupil_mm / 2000;
+      for (let k = 0; k < PUPILS - 1; k += 1) points.push(...[Math.cos, Math.sin].map((f) => 0.764 * radius * f((k * Math.PI) / 3)));
+      if (places.pupil) g.uniform2fv(places.pupil, points);
+      g.uniform1i(places.pupils, pupil_mm > 0 ? PUPILS : 1);
+      g.uniform1i(places.rays, rays);
+      g.uniform1i(places.gain, this.targets[side] ? gain : 0);
+      g.uniform2f(places.size, stack.width_px, stack.height_px);
+      g.uniform2f(places.stride, ...stride);
+      g.uniform2f(places.picture, picture.width, picture.height);
+      g.activeTexture(g.TEXTURE1);
+      g.bindTexture(g.TEXTURE_2D, this.targets[side]);
+      g.uniform1i(places.target, 1);
+    }
     g.drawArrays(g.TRIANGLES, 0, 3);
   }
 

@@ -14,8 +14,10 @@ const MODES = [ // key, name, group, hint
   ["difference", "Difference × 8", "Check", "What each eye sees minus what it should see; black is perfect. For the head position the layers were solved for."],
 ];
 const KEYS = { ArrowLeft: [0, -1, 0], ArrowRight: [0, 1, 0], ArrowUp: [0, 0, 1], ArrowDown: [0, 0, -1], "+": [-2, 0, 0], "-": [2, 0, 0] };
+// Without a GPU, drawing takes the solver's time: a moving head's pictures are fewer and smaller.
+const SOFTWARE = { rays: 1, coarse: 0.5, frame_ms: 60 };
 const STEP_M = 0.005, REACH_M = [0.5, 0.3]; // head movement per key press; across the picture's whole width and height
-const REST_MS = 200, REST_RAYS = 5, STRIPS = 12, WIGGLE_MS = 280, SAMPLED = 12; // light is measured on every SAMPLED-th pixel in each direction
+const REST_MS = 200, REST_RAYS = 5, STRIPS = 12, WIGGLE_MS = 280, REPORT_MS = 120, SAMPLED = 12; // light is measured on every SAMPLED-th pixel in each direction
 const PAGE = `
 <div class="stage"><canvas tabindex="0" aria-label="What the eyes see. Arrow keys move the head, + and - bring it nearer and farther."></canvas>
 <svg class="over" aria-hidden="true"></svg><div class="names" aria-hidden="true"></div><p class="notice" role="status" hidden></p></div>
@@ -38,7 +40,8 @@ export class Look {
     [this.scene, this.stack, this.eyesAt] = [scene, scene.stack, eyesAt];
     this.canvas = this.$("canvas");
     this.display = new Display(this.canvas, this.stack);
-    Object.assign(this, { mode: "parallel", head: [0, 0, 0], aligned: true, pupil: false, point: [0, 0], rays: 3, coarse: 1, frames: 0 });
+    Object.assign(this, { mode: "parallel", head: [0, 0, 0], aligned: true, pupil: false, point: [0, 0], rays: 3, coarse: 1, frame_ms: 0, painted_ms: 0, reported_ms: 0, frames: 0 });
+    if (this.display.software) Object.assign(this, SOFTWARE);
     this.flatness = 0;
     this.used = null; // eyes that the panels are aligned to, if not the true ones
     this.state = ""; // why the picture is not the one two eyes should see
@@ -57,8 +60,8 @@ export class Look {
     return this.eyesAt(this.head);
   }
 
-  get maps() {
-    if (!this.aligned || !this.scene.eyes_m) return { maps: unaligned(this.stack), limited: "" };
+  get alignment() {
+    if (!this.aligned || !this.scene.eyes_m) return unaligned(this.stack);
     return alignment(this.stack, this.scene.eyes_m, this.used ?? this.eyes);
   }
 
@@ -85,6 +88,8 @@ export class Look {
   draw() {
     this.moving = performance.now();
     this.fresh = true;
+    if (this.isMeasured) this.$(".light").textContent = this.display.targets[0] ? "…" : "";
+    this.isMeasured = false;
     this.next ??= requestAnimationFrame((now) => this.#frame(now));
   }
 
@@ -95,28 +100,29 @@ export class Look {
       this.pace = 0.8 * (this.pace ?? 30) + 0.2 * (now - this.before);
       if (this.pace > 50 && this.rays > 1) [this.rays, this.pace] = [this.rays - 1, 30];
       else if (this.pace > 50 && this.coarse > 0.6) [this.coarse, this.pace] = [this.coarse * 0.7, 30];
-      else if (this.pace < 20 && this.rays < 3) [this.rays, this.pace] = [this.rays + 1, 30];
+      else if (this.pace < 20 && this.rays < 3 && !this.display.software) [this.rays, this.pace] = [this.rays + 1, 30];
     }
     this.before = undefined;
+    if (this.fresh && now - this.painted_ms < this.frame_ms) return void (this.next = requestAnimationFrame((then) => this.#frame(then)));
+    this.painted_ms = now;
     this.frames += 1;
     const resting = !this.fresh && performance.now() - this.moving > REST_MS, { width, height, resized } = this.#fitted(resting);
     this.fresh = false;
-    const { maps, limited } = this.mode === "difference" ? { maps: unaligned(this.stack), limited: "" } : this.maps;
-    this.quick = !resting && this.rays === 1 && this.flatness === 0 && !["panels", "apart"].includes(this.mode) ? maps : null;
-    if (!this.quick) this.display.show(maps, this.flatness);
+    const aligned = this.mode === "difference" ? unaligned(this.stack) : this.alignment;
+    this.quick = !resting && this.rays === 1 && this.flatness === 0 && !this.pupil && !["panels", "apart", "target", "difference"].includes(this.mode) ? aligned : null;
+    if (!this.quick) this.display.show(aligned, this.flatness);
     const turning = this.mode === "wiggle";
     if (!resting || turning || ["panels", "apart", "target"].includes(this.mode)) {
       this.strip = undefined;
       this.#paint(width, height, this.rays);
       this.onframe();
       if (!resting) {
-        this.#report(limited);
-        [this.before, this.isMeasured] = [now, false];
+        if (now - this.reported_ms > REPORT_MS) this.#report(aligned.limited), (this.reported_ms = now);
+        this.before = now;
         this.next = requestAnimationFrame((then) => this.#frame(then));
         return;
       }
       if (!this.isMeasured) this.#measure();
-      this.isMeasured = true;
       const again = () => (this.next ??= requestAnimationFrame((then) => this.#frame(then)));
       if (turning) this.turn = setTimeout(again, WIGGLE_MS - (performance.now() % WIGGLE_MS) + 1);
       return;
@@ -168,16 +174,16 @@ export class Look {
       sides.forEach((side, k) => {
         const left = (k % across) * w + ((w - pic.width) >> 1), below = height - (Math.floor(k / across) + 1) * h + ((h - pic.height) >> 1);
         display.see({ eye: this.scene.eyes_m[side], picture: { ...pic, fov_deg: this.scene.fov_deg }, part: [left, below, pic.width, pic.height],
-          rays, pupil_mm, maps: this.quick, side, gain: mode === "target" ? 1 : 8 });
+          rays, pupil_mm, side, gain: mode === "target" ? 1 : 8 });
       });
     } else if (mode === "anaglyph") {
       for (const side of [0, 1]) {
         g.colorMask(side === 0, side === 1, side === 1, true);
-        display.see({ eye: this.eyes[side], picture: this.#picture(w, h), part: [0, 0, w, h], rays, pupil_mm, maps: this.quick });
+        display.see({ eye: this.eyes[side], picture: this.#picture(w, h), part: [0, 0, w, h], rays, pupil_mm, quick: this.quick });
       }
       g.colorMask(true, true, true, true);
     } else {
-      sides.forEach((side, k) => display.see({ eye: this.eyes[side], picture: this.#picture(w, h), rays, pupil_mm, maps: this.quick,
+      sides.forEach((side, k) => display.see({ eye: this.eyes[side], picture: this.#picture(w, h), rays, pupil_mm, quick: this.quick,
         part: [(k % across) * w, height - (Math.floor(k / across) + 1) * h, w, h] }));
     }
     this.#names(mode === "anaglyph" ? [] : sides.map((side, k) => [`${side ? "right" : "left"} eye`, ((k % across) + 0.5) / across, (Math.floor(k / across) + 1) / down]));
@@ -278,17 +284,16 @@ export class Look {
     if (this.state) return void (this.$(".head").textContent = this.state);
     const limit = limited ? `; the outer panels could follow only part of the way: ${limited}` : "";
     this.$(".head").textContent = `${where}${limit}.`;
-    if (this.display.targets[0]) this.$(".light").textContent = "…";
   }
 
   // PSNR of the light at both eyes on sampled pixels; the targets move with the centre panel.
   #measure() {
     const { display, scene } = this;
+    this.isMeasured = true;
     if (!display.targets[0] || this.flatness > 0) return;
     const { width, height } = scene.picture, picture = { width, height, fov_deg: scene.fov_deg };
     const columns = Math.floor(width / SAMPLED), rows = Math.floor(height / SAMPLED);
-    const { maps } = this.maps;
-    display.show(maps, 0);
+    display.show(this.alignment, 0);
     let error = 0, counted = 0;
     for (const side of [0, 1]) {
       const how = { nominal: scene.eyes_m[side], picture, columns, rows, stride: [width / columns, height / rows].map(Math.floor), side };
@@ -388,7 +393,7 @@ export class Look {
         this.draw();
       },
       picture: (eye, width, height, pupil_mm = 0) => {
-        this.display.show(this.maps.maps, this.flatness);
+        this.display.show(this.alignment, this.flatness);
         return this.display.picture({ eye: this.eyes[eye], fov_deg: this.scene.fov_deg, pupil_mm }, width, height);
       },
     };

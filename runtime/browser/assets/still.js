@@ -9,6 +9,11 @@ const image = async (url) => {
   return made;
 };
 
+const halves = async (text) => {
+  const deflated = new Blob([Uint8Array.from(atob(text), (c) => c.charCodeAt(0))]).stream();
+  return new Uint16Array(await new Response(deflated.pipeThrough(new DecompressionStream("deflate"))).arrayBuffer());
+};
+
 async function begin() {
   const scene = read("scene"), layers = await Promise.all(read("layers").map(image));
   const wanted = await Promise.all(read("wanted").map(image)).catch(() => {
@@ -18,6 +23,7 @@ async function begin() {
   if (wanted.length) scene.picture = { width: wanted[0].naturalWidth, height: wanted[0].naturalHeight };
   const look = new Look(document.querySelector("main"), scene, { title: scene.title });
   look.display.load("solved", layers);
+  if (scene.relief) look.display.unfold(await halves(scene.relief.deflated), scene.relief.size);
   wanted.forEach((picture, side) => look.display.target(side, picture));
   look.$(".more").append(...scene.lines.map((line) => Object.assign(document.createElement("p"), { textContent: line })));
   Object.assign(window.phasestack, look.doors);

@@ -176,8 +176,9 @@ function explained({ state, reason }) {
 }
 
 function load(bytes) {
-  const { layers: kind, solved_for_m, target, size: [w, h] } = pending, size = 4 * w * h * look.stack.x_m.length;
+  const { layers: kind, solved_for_m, target, relief, size: [w, h] } = pending, size = 4 * w * h * look.stack.x_m.length;
   look.display.load(kind, new Uint8Array(bytes, 0, size), [w, h]);
+  if (kind === "solved") look.display.unfold(relief ? new Uint16Array(bytes, size, relief[0] * relief[1]) : null, relief);
   if (target) {
     const [width, height] = target, length = 4 * width * height;
     look.scene.picture = { width, height };
