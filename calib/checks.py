@@ -74,7 +74,7 @@ def check_solution(pairs: Pairs, solution: CalibrationSolution, volume_m: F64) -
     if error_m > WARN_EYE_ERROR_M:
         warnings.append(
             f"expect {error_m * 1e3:.0f} mm of error at the eye (condition {solution.condition:.3g}): "
-            "more viewpoints, wider apart, would help"
+            "use more viewpoints, farther apart"
         )
     rejected = np.flatnonzero(~solution.used).tolist()
     if rejected:

@@ -1,4 +1,4 @@
-"""Public names for programs, kept stable (docs/contracts.md, From Python)."""
+"""Public, stable interface for programs (docs/contracts.md, "From Python")."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`python -m phasestack`: the command `phasestack`."""
+"""Entry point of `python -m phasestack`, which is the command `phasestack`."""
 
 from runtime.cli import main
 

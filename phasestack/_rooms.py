@@ -1,6 +1,6 @@
-"""Imports our own `runtime`, `calib` and `model_export`, also next to modules of these names.
+"""Import of phasestack's own `runtime`, `calib` and `model_export`, even next to others so named.
 
-Raises ImportError if the program has imported another module under one of the names: Python holds one for each.
+Raises ImportError if the program has already imported another module under one of these names.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A stereo pair to begin with, drawn by phasestack itself: free of rights."""
+"""A first stereo pair, rendered by phasestack itself and free to use."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SCENE, EYES_M, FOV_DEG = "room", ((0.6, -0.0315, 0.03), (0.6, 0.0315, 0.03)), 40
 
 @dataclass(frozen=True)
 class ExamplePair:
-    """Two pictures, and the eyes, the panels and the field of view that they are for."""
+    """A left/right pair of pictures and the eye positions, stack and field of view that they fit."""
 
     left: U8  # (360, 640, 3)
     right: U8
@@ -38,7 +38,7 @@ class ExamplePair:
 
 
 def example_pair() -> ExamplePair:
-    """Two pictures of a built-in scene, with depth behind and before the panels."""
+    """Render a stereo pair of a built-in scene, with depth behind and in front of the panels."""
     folder = Path(str(files("phasestack") / "data"))
     left, right = (read_image(folder / f"{side}.png") for side in ("left", "right"))
     stack = Stack(0.5184, 0.2916, (-0.06, 0.0, 0.06), width_px=left.shape[1], height_px=left.shape[0])

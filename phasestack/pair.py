@@ -1,4 +1,4 @@
-"""From two pictures, two eyes and a stack to layers, and the quality of any layers."""
+"""Layers for a pair of pictures, eyes and a stack, and the quality of any layers."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from runtime.support.artifacts import OutputFolder, write_json
 from runtime.support.progress import ShownProgress
 from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG, SEPARATION_MIN_M, refusal
 
-EVERY_LEAST = 20  # pixels of a picture that has to be sampled, along its shorter side
+EVERY_LEAST = 20  # along the shorter side: number of pixels below which a picture is too small to resample
 SAME_PLACE_M = 0.001  # an eye and its camera
 _one_at_a_time = Lock()  # a loaded model reuses its buffers
 
@@ -46,7 +46,7 @@ Cameras = Sequence[Sequence[Sequence[float]]] | Sequence[F64] | F64
 
 @dataclass(frozen=True)
 class _Pair:
-    """A checked request: pictures of pinhole eyes that look at the stack's origin."""
+    """A validated request: pictures as seen by pinhole eyes that look at the stack's origin."""
 
     pictures: tuple[Picture, ...]
     eyes_m: F64
@@ -55,22 +55,22 @@ class _Pair:
     is_resampled: bool  # from the caller's cameras
 
     def judged(self, layers: U8) -> SolvedPair:
-        """The layers with the eyes' views of them."""
+        """Return the layers together with the views that the eyes have of them."""
         return SolvedPair(layers, self.pictures, self.stack, self.eyes_m, self.fov_deg)
 
 
 class Measuring(TypedDict, total=False):
     """Options for a cheaper measurement of quality."""
 
-    sigmas_mm: Sequence[float]  # tracking errors, each the cost of four measurements; default: 0, 1 and 2
-    every: int  # every so-manieth pixel of every so-manieth row of the pictures; 1: all
+    sigmas_mm: Sequence[float]  # tracking errors, each at the cost of four measurements; default: 0, 1 and 2
+    every: int  # N: measure every Nth pixel of every Nth row of the pictures; 1: all of them
 
 
 class Result:
-    """Layers for a pair of pictures, with the eyes' views and their quality."""
+    """Layers for a pair of pictures, with the views of both eyes and their quality."""
 
     layers: U8  # (panels, h, w, 3), rear to front
-    model: str  # what solved: a stack that the networks do not serve is solved by `sart`
+    model: str  # the model used: `sart` if the networks do not support the stack
     eye_sigma_mm: float
     total_ms: float  # of this one call
 
@@ -84,16 +84,16 @@ class Result:
 
     @property
     def quality(self) -> PairQuality:
-        """Quality of the eyes' views; measured when first read, which may take longer than solving.
+        """Quality of the eyes' views. It is measured when first read, which may take longer than solving.
 
-        Warns where `notes` has a reason for a bad one.
+        Warns if `notes` explains why the quality is poor.
         """
         self._warn()
         return self._pair.quality
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
-        """Why the eyes see ghosts, where the pictures' disparity is a reason."""
+        """Reasons why the eyes see ghosts, if the pictures' disparity explains that."""
         asked = self._asked
         return tuple(
             disparity_doubts(
@@ -102,7 +102,7 @@ class Result:
         )
 
     def measure(self, **how: Unpack[Measuring]) -> PairQuality:
-        """Quality at less cost: `measure(sigmas_mm=(1,), every=4)`. Raises ValueError, naming the argument."""
+        """Measure quality faster: `measure(sigmas_mm=(1,), every=4)`. Raises ValueError, naming the argument."""
         self._warn()
         return _measured(self._pair, how)
 
@@ -112,7 +112,7 @@ class Result:
 
     @property
     def seen(self) -> U8:
-        """(2, h, w, 3): the eyes' views, left first."""
+        """(2, h, w, 3) views of the eyes, left first."""
         return np.stack(self._pair.seen)
 
     @cached_property
@@ -125,19 +125,19 @@ class Result:
         return line + f"one ray a pixel, as published: {self._pair.quality.psnr_db:.1f} dB"
 
     def show(self) -> Path:
-        """Open the solution's viewer in a browser; returns its file, which is kept."""
+        """Open the solution's viewer in a browser. Returns the path of its file, which is not deleted."""
         path = Path(tempfile.mkdtemp(prefix="phasestack-")) / "viewer.html"
         path.write_text(self._pair.viewer([self._line, *self.notes]), encoding="utf-8")
         webbrowser.open(path.as_uri())
         return path
 
     def _repr_html_(self) -> str:
-        """The viewer, for a notebook."""
+        """Return the viewer as HTML, for a notebook."""
         page = html.escape(self._pair.viewer([self._line, *self.notes]))
         return f'<iframe srcdoc="{page}" style="width: 100%; height: 640px; border: 0"></iframe>'
 
     def save(self, out: str | Path) -> None:
-        """Write what `phasestack solve --out` leaves: layers, pictures, contact sheet, viewer, solve.json."""
+        """Write the files of `phasestack solve --out`: layers, views, contact sheet, viewer, solve.json."""
         with OutputFolder(Path(out)) as folder:
             self._pair.write(folder.staging, lines=[self._line, *self.notes])
             told: dict[str, Any] = {"model": self.model, "eye_sigma_mm": self.eye_sigma_mm, "notes": self.notes}
@@ -156,17 +156,17 @@ def solve(
     model: str | Path = "balanced",
     eye_sigma_mm: float = 1.0,
 ) -> Result:
-    """Solve for layers that show each eye its picture.
+    """Compute layers that show each eye its picture.
 
-    left, right: (h, w, 3 or 4), uint8 or float in 0..1, or Pillow images, as seen by a pinhole camera at each eye that
-    looks at the stack's origin, without roll, `fov_deg` wide.
-    eyes_m: left and right eye, metres, frame `stack` (+x out of the screen, +y the viewer's right, +z up).
+    left, right: (h, w, 3 or 4), uint8 or float in 0..1, or Pillow images, as seen by a pinhole camera at each eye. The
+    cameras look at the stack's origin, without roll, with a horizontal field of view of `fov_deg`.
+    eyes_m: left and right eye in metres, frame `stack` (+x out of the screen, +y the viewer's right, +z up).
     cameras: for pictures of other pinhole cameras (parallel, shifted), two 3x4 matrices from homogeneous metres of the
     stack's frame to pixels, +u right, +v down, pixel centres at half-integers: K·[R | t] with OpenCV's axes, plus half
     a pixel on K's principal point if its pixel centres are integers. They replace `eyes_m` and `fov_deg`; the pictures
     solved for and measured are then resampled to look at the stack's origin and to cover the panels.
-    model: fast, balanced, best, sart or an ONNX file. eye_sigma_mm: tracking error; 1: a good tracker's; 0: none.
-    Raises ValueError, naming the argument; warns about implausible pictures or eyes.
+    model: fast, balanced, best, sart or an ONNX file. eye_sigma_mm: tracking error, 1 for a good tracker, 0 for none.
+    Raises ValueError, naming the argument. Warns about implausible pictures or eyes.
     """
     pair = _checked((left, right), stack=stack, eyes_m=eyes_m, fov_deg=fov_deg, cameras=cameras)
     eye_sigma_mm = _number("eye_sigma_mm", eye_sigma_mm, 0.0, 1000.0, "mm")
@@ -201,10 +201,10 @@ def solve_each(
     eye_sigma_mm: float = 1.0,
     progress: bool = True,
 ) -> Iterator[Result]:
-    """Yield the results of many pairs (left picture, right picture, eyes_m); the rest as for `solve`.
+    """Yield a result for each pair (left picture, right picture, eyes_m). Other arguments: see `solve`.
 
-    Pairs are read one by one, so `pairs` may be a generator that draws or reads. progress: on stderr. Raises
-    ValueError, naming the pair and the argument.
+    Pairs are read one by one, so `pairs` may be a generator. progress: show progress on stderr. Raises ValueError,
+    naming the pair and the argument.
     """
     total = len(pairs) if isinstance(pairs, Sized) else None
     solve_one = partial(solve, stack=stack, fov_deg=fov_deg, model=model, eye_sigma_mm=eye_sigma_mm)
@@ -234,37 +234,39 @@ def evaluate(
     cameras: Cameras | None = None,
     **how: Unpack[Measuring],
 ) -> PairQuality:
-    """Quality of any layers for two eyes, against their target pictures.
+    """Measure the quality of any layers for two eyes, against their target pictures.
 
     layers: (panels, h, w, 3 or 4), rear to front, in the stack's pixels, uint8 or float in 0..1: a panel's value v
     turns light by v·90 degrees, and an eye sees sin² of the summed angle; floats are rounded to the panels' 8 bits.
-    sigmas_mm, every: at less cost, `evaluate(..., sigmas_mm=(1,), every=4)` measures the light of these tracking
-    errors alone, at every 4th pixel of every 4th row, with its standard error; SSIM is then NaN.
-    The rest is as for `solve`. Raises ValueError, naming the argument.
+    sigmas_mm, every: `evaluate(..., sigmas_mm=(1,), every=4)` is faster. It measures light PSNR for these tracking
+    errors alone, at every 4th pixel of every 4th row, with its standard error; SSIM is then NaN. For the other
+    arguments see `solve`. Raises ValueError, naming the argument.
     """
     pair = _checked((left, right), stack=stack, eyes_m=eyes_m, fov_deg=fov_deg, cameras=cameras)
     given = as_array("layers", layers)
     wanted = (pair.stack.count, pair.stack.height_px, pair.stack.width_px)
     if given.ndim != 4 or given.shape[:3] != wanted or given.shape[3] not in (3, 4):
         last = given.ndim == 4 and given.shape[1] in (3, 4) and given.shape[3] not in (3, 4)
-        advice = ": channels come last, np.moveaxis(layers, 1, -1)" if last else ""
-        advice = ": grey ones are np.stack([layers] * 3, -1)" if given.shape == wanted else advice
+        advice = "; channels must come last: np.moveaxis(layers, 1, -1)" if last else ""
+        advice = "; for grey layers use np.stack([layers] * 3, -1)" if given.shape == wanted else advice
         raise ValueError(f"layers: have the shape {given.shape}, the stack's are {(*wanted, 3)}{advice}")
     if np.issubdtype(given.dtype, np.floating) and 1 < given.max() <= np.pi / 2:
-        raise ValueError(f"layers: hold up to {given.max():g}: angles in radians? divide by pi/2")
+        raise ValueError(
+            f"layers: values are up to {given.max():g}, not 1; if they are angles in radians, divide by pi/2"
+        )
     codes = [as_codes(as_picture(f"layers[{n}]", layer[..., :3])) for n, layer in enumerate(given)]
     return _measured(pair.judged(np.stack(codes)), how)
 
 
 def _measured(pair: SolvedPair, how: Measuring) -> PairQuality:
-    """All of the quality, or the requested part. Raises ValueError, naming the argument."""
+    """Measure all figures of quality, or those requested. Raises ValueError, naming the argument."""
     if unknown := sorted(how.keys() - Measuring.__annotations__.keys()):
-        raise TypeError(f"{unknown[0]}: there is no such argument")
+        raise TypeError(f"{unknown[0]}: no such argument")
     if not how:
         return pair.quality
     sigmas_mm, every = how.get("sigmas_mm", SIGMAS_MM), how.get("every", 1)
     if not isinstance(sigmas_mm, Sequence) or not sigmas_mm:
-        raise ValueError(f"sigmas_mm: is {sigmas_mm!r}, not some tracking errors, mm, such as (1,)")
+        raise ValueError(f"sigmas_mm: is {sigmas_mm!r}, not a sequence of tracking errors in mm such as (1,)")
     sigmas = [_number("sigmas_mm", sigma_mm, 0.0, 1000.0, "mm") for sigma_mm in sigmas_mm]
     most = min(pair.pictures[0].shape[:2]) // EVERY_LEAST
     if isinstance(every, bool) or not isinstance(every, int | np.integer) or not 1 <= every <= most:
@@ -275,7 +277,7 @@ def _measured(pair: SolvedPair, how: Measuring) -> PairQuality:
 def camera(eye_m: Sequence[float] | F64, *, width_px: int, height_px: int, fov_deg: float = 40.0) -> F64:
     """(3, 4) pinhole camera at an eye, from homogeneous metres of `stack` to homogeneous pixels.
 
-    It looks at the stack's origin, x parallel to the ground; the default for pictures.
+    It looks at the stack's origin, with x parallel to the ground, and is the default for pictures.
 
     The third coordinate is the distance along the gaze. Raises ValueError, naming the argument.
     """
@@ -284,14 +286,14 @@ def camera(eye_m: Sequence[float] | F64, *, width_px: int, height_px: int, fov_d
         _number(name, size, 1, 1 << 16, "pixels")
     eye = np.asarray(eye_m, np.float64)
     if eye.shape != (3,) or not np.isfinite(eye).all() or not eye.any():
-        raise ValueError("eye_m: must be three finite numbers, metres, not all of them 0")
+        raise ValueError("eye_m: must be three finite numbers in metres, not all 0")
     return image_from_stack(eye, fov_deg=_number("fov_deg", fov_deg, *FOV_RANGE_DEG, "degrees"), **sizes)
 
 
 def project(
     points_m: ArrayLike, *, eye_m: Sequence[float] | F64, width_px: int, height_px: int, fov_deg: float = 40.0
 ) -> F64:
-    """(..., 2) pixels of points (..., 3), frame `stack`, in an eye's picture; NaN behind the eye.
+    """Project points (..., 3), frame `stack`, to (..., 2) pixels of an eye's picture; NaN behind the eye.
 
     Raises ValueError, naming the argument.
     """
@@ -315,19 +317,19 @@ def _checked(
     """Raises ValueError, naming the argument."""
     pictures = [as_picture(name, picture) for name, picture in zip(("left", "right"), given, strict=True)]
     if pictures[0].shape != pictures[1].shape:
-        raise ValueError(f"right: is {pictures[1].shape}, left is {pictures[0].shape}: both must have one size")
+        raise ValueError(f"right: is {pictures[1].shape}, left is {pictures[0].shape}: both must have the same size")
     stack = checked_stack(stack)
     fov_deg = _number("fov_deg", fov_deg, *FOV_RANGE_DEG, "degrees")
     if cameras is None:
         if eyes_m is None:
-            raise ValueError("eyes_m: is needed: the left and the right eye, metres; or cameras, which stand there")
+            raise ValueError("eyes_m: required (left and right eye in metres), unless cameras are given")
         eyes = _eyes(eyes_m, stack)
     else:
         try:
             matrices, places_m = as_cameras(cameras)
             eyes = _eyes(places_m, stack)
             if eyes_m is not None and np.abs(_eyes(eyes_m, stack) - eyes).max() > SAME_PLACE_M:
-                raise ValueError(f"stand at {np.round(eyes, 4).tolist()}, eyes_m are elsewhere: leave those out")
+                raise ValueError(f"stand at {np.round(eyes, 4).tolist()}, but eyes_m are elsewhere: omit eyes_m")
             pictures, fov_deg = looking_at_origin(pictures, matrices, eyes, stack)
         except ValueError as error:
             raise ValueError(f"cameras: {error}") from None
@@ -361,18 +363,18 @@ def _loaded(model: str, stack: PanelStack) -> Predictor:
 
 
 def _eyes(eyes_m: Any, stack: PanelStack) -> F64:
-    """(2, 3) eyes that can be served."""
+    """Return (2, 3) eyes that can be served. Raises ValueError."""
     try:
         eyes = np.asarray(eyes_m, np.float64)
     except (TypeError, ValueError):
-        raise ValueError("eyes_m: must be two points of three numbers, metres") from None
+        raise ValueError("eyes_m: must be two points of three numbers, in metres") from None
     if eyes.shape != (2, 3) or not np.isfinite(eyes).all():
-        raise ValueError(f"eyes_m: has the shape {eyes.shape}; must be two points of three finite numbers, metres")
+        raise ValueError(f"eyes_m: has the shape {eyes.shape}; must be two points of three finite numbers, in metres")
     if np.abs(eyes).max() > EYE_MOST_M:
         raise ValueError(f"eyes_m: {refusal(float(np.abs(eyes).max()), -EYE_MOST_M, EYE_MOST_M, 'm')}")
     if eyes[:, 0].min() <= stack.x_m[-1]:
         raise ValueError(f"eyes_m: x = {eyes[:, 0].min():g} m is not in front of the panels (x > {stack.x_m[-1]:g})")
     apart_m = float(np.linalg.norm(eyes[0] - eyes[1]))
     if apart_m < SEPARATION_MIN_M:
-        raise ValueError(f"eyes_m: are {apart_m * 1e3:g} mm apart; 5 mm is the least")
+        raise ValueError(f"eyes_m: eyes are {apart_m * 1e3:g} mm apart; the minimum is 5 mm")
     return eyes

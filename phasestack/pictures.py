@@ -1,4 +1,4 @@
-"""Pictures as programs have them (arrays of codes or of intensities), and the eyes in them."""
+"""Conversion of pictures from programs (arrays of codes or intensities); finding eyes in them."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from runtime.records import U8
 from runtime.support.picture_file import rgb_of
 
 LEAST_PX = 16
-SLACK = 1e-3  # a quarter of a code, by which rounding goes over or under
-OVERSHOOT = 0.3  # fraction of white by which a sharp resampling overshoots
+SLACK = 1e-3  # a quarter of a code, by which rounding may exceed the range
+OVERSHOOT = 0.3  # fraction of white by which sharp resampling may overshoot
 
 
 def as_picture(name: str, given: Any) -> Picture:
-    """(h, w, 3) uint8, or intensities in [0, 1] as float32; where it is transparent, white shows through.
+    """Return (h, w, 3) uint8, or float32 intensities in [0, 1]. White shows through transparent pixels.
 
-    given: an array or tensor, or an image of Pillow of any kind. Raises ValueError, naming the argument.
+    given: an array, a tensor, or a Pillow image in any mode. Raises ValueError, naming the argument.
     """
     picture: Any = _from_pillow(name, given) if hasattr(given, "getbands") else as_array(name, given)
     if picture.ndim != 3 or picture.shape[2] not in (3, 4) or min(picture.shape[:2]) < LEAST_PX:
-        told = f"has the shape {picture.shape}, not (h, w, 3|4) with {LEAST_PX} pixels at least"
+        told = f"has the shape {picture.shape}, not (h, w, 3|4) with at least {LEAST_PX} pixels"
         raise ValueError(f"{name}: {told}{_advice_on_shape(name, picture)}")
     if picture.dtype != np.uint8:
         if not np.issubdtype(picture.dtype, np.floating):
-            told = f"is of {picture.dtype}, neither uint8 (0..255) nor floating point (0..1)"
+            told = f"has dtype {picture.dtype}, neither uint8 (0..255) nor floating point (0..1)"
             raise ValueError(f"{name}: {told}{_advice_on_type(name, picture)}")
         low, high = (float(bound) for bound in (picture.min(), picture.max()))
         if not (low >= -SLACK and high <= 1 + SLACK):  # nor NaN
-            raise ValueError(f"{name}: holds {low:g} to {high:g}, not 0 to 1{_advice_on_range(name, low, high)}")
+            raise ValueError(f"{name}: values are {low:g} to {high:g}, not 0 to 1{_advice_on_range(name, low, high)}")
         picture = picture.astype(np.float32).clip(0, 1)
     if picture.shape[2] == 3:
         return np.ascontiguousarray(picture)
@@ -46,9 +46,9 @@ def as_picture(name: str, given: Any) -> Picture:
 
 
 def as_array(name: str, given: Any) -> Any:
-    """Return an array or a tensor of any device as a numpy array. Raises ValueError, naming the argument."""
+    """Return an array, or a tensor on any device, as a numpy one. Raises ValueError, naming the argument."""
     if isinstance(given, str | os.PathLike):
-        raise ValueError(f"{name}: is a file's name: read it first, as with PIL.Image.open({os.fspath(given)!r})")
+        raise ValueError(f"{name}: is a file name; read the file first, e.g. with PIL.Image.open({os.fspath(given)!r})")
     if hasattr(given, "detach"):  # torch's, with or without a gradient
         given = given.detach().cpu()
         given = given.float() if given.is_floating_point() else given
@@ -59,26 +59,26 @@ def as_array(name: str, given: Any) -> Any:
     if array.dtype.name == "bfloat16":  # jax's
         array = array.astype(np.float32)
     if array.dtype.kind not in "buif":
-        raise ValueError(f"{name}: is {type(given).__name__}, no array of numbers")
+        raise ValueError(f"{name}: is {type(given).__name__}, not an array of numbers")
     return array
 
 
 def _from_pillow(name: str, image: Any) -> U8:
-    """An image of Pillow as its file is read: palettes, CMYK and profiles become sRGB, EXIF turns it."""
+    """Convert a Pillow image: palettes, CMYK and colour profiles become sRGB, and EXIF rotates it."""
     try:
         return rgb_of(image, name)
     except InputError as error:
         raise ValueError(str(error)) from None
-    except OSError as error:  # a file that is cut off is noticed when its pixels are asked for
+    except OSError as error:  # truncated files are noticed only when their pixels are read
         raise ValueError(f"{name}: cannot be decoded ({error})") from None
 
 
 def _advice_on_shape(name: str, picture: Any) -> str:
     if picture.ndim == 2 or (picture.ndim == 3 and picture.shape[2] == 1):
-        return f": a grey one is np.dstack([{name}] * 3)"
+        return f": for a grey picture use np.dstack([{name}] * 3)"
     if picture.ndim == 3 and picture.shape[0] in (3, 4):
-        return f": channels come last, np.moveaxis({name}, 0, -1)"
-    return f": one picture, {name}[0]" if picture.ndim == 4 and picture.shape[0] == 1 else ""
+        return f": channels must come last; use np.moveaxis({name}, 0, -1)"
+    return f": pass one picture, {name}[0]" if picture.ndim == 4 and picture.shape[0] == 1 else ""
 
 
 def _advice_on_type(name: str, picture: Any) -> str:
@@ -86,12 +86,12 @@ def _advice_on_type(name: str, picture: Any) -> str:
         return f": codes are {name} * np.uint8(255)"
     if picture.min() >= 0 and picture.max() <= 255:
         return f": codes are {name}.astype(np.uint8)"
-    return f": {name} / 65535 if that is white" if picture.dtype == np.uint16 else ": divide by what is white"
+    return f": {name} / 65535 if that is white" if picture.dtype == np.uint16 else ": divide by the value of white"
 
 
 def _advice_on_range(name: str, low: float, high: float) -> str:
     if not np.isfinite([low, high]).all():
-        return ": some are not finite"
+        return ": some values are not finite"
     if low >= -OVERSHOOT and high <= 1 + OVERSHOOT:
         return f": clip it, np.clip({name}, 0, 1)"
     if low >= -1 - OVERSHOOT and high <= 1 + OVERSHOOT:
@@ -102,13 +102,13 @@ def _advice_on_range(name: str, low: float, high: float) -> str:
 
 
 def as_codes(picture: Picture) -> U8:
-    """The nearest 8-bit codes."""
+    """Round to the nearest 8-bit codes."""
     codes: Any = picture if picture.dtype == np.uint8 else np.rint(picture * 255).astype(np.uint8)
     return np.asarray(codes, np.uint8)
 
 
 def find_eyes(picture: ArrayLike) -> Pupils | None:
-    """Find the foremost viewer's pupils in a picture (h, w, 3|4), uint8 or float in 0..1, or None.
+    """Find the nearest viewer's pupils in a picture (h, w, 3|4), uint8 or float in 0..1. None: no viewer.
 
     `eyes_px` is (2, 2): the viewer's left eye first, which is on the right of an unmirrored picture; continuous pixels,
     centres at half-integers. `sigma_px` is their standard deviation. Raises ValueError for anything but a picture.

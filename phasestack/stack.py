@@ -1,4 +1,4 @@
-"""Description of the display in Python."""
+"""The display's geometry, for programs."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ class Stack(PanelStack):
         height_px: int,
         tilt: Tilt | None = None,
     ) -> None:
-        """Raises ValueError, naming the argument, for an impossible display."""
+        """Raise ValueError, naming the argument, if the display is impossible."""
         given = {"width_m": width_m, "height_m": height_m, "width_px": width_px, "height_px": height_px}
         try:
             places = tuple(float(x) for x in x_m)
         except (TypeError, ValueError):
-            raise ValueError(f"x_m: is {x_m!r}; must list the panels' places, such as (-0.03, 0.0, 0.03)") from None
+            raise ValueError(f"x_m: is {x_m!r}; must list the panels' positions, such as (-0.03, 0.0, 0.03)") from None
         try:
             checked = validated(StackGeometry, {**given, "x_m": places}, source="")
         except InputError as error:
@@ -38,7 +38,7 @@ class Stack(PanelStack):
 
 
 def checked_stack(stack: object) -> PanelStack:
-    """Plain copy of a stack. Raises ValueError for anything else."""
+    """Return a plain copy of a stack. Raises ValueError for anything else."""
     if not isinstance(stack, PanelStack):
-        raise ValueError(f"stack: is a {type(stack).__name__}: make a phasestack.Stack")
+        raise ValueError(f"stack: is a {type(stack).__name__}: create a phasestack.Stack")
     return PanelStack(*(getattr(stack, field.name) for field in fields(PanelStack)))

@@ -85,10 +85,10 @@ def test_pictures_are_codes_or_intensities_with_or_without_transparency() -> Non
         ({"eyes_m": ((0.05, -0.03, 0.0), (0.05, 0.03, 0.0))}, "eyes_m"),
         ({"eyes_m": ((0.7, 0.0, 0.0), (0.7, 0.001, 0.0))}, "eyes_m"),
         ({"eyes_m": ((780, -30, 240), (780, 30, 240))}, "eyes_m: .*millimetres"),
-        ({"eyes_m": None}, "eyes_m: is needed"),
-        ({"stack": (0.5, 0.3)}, "stack: is a tuple: make a phasestack.Stack"),
-        ({"left": np.moveaxis(picture(), 2, 0)}, "left: .*channels come last, np.moveaxis"),
-        ({"left": "left.png"}, "left: is a file's name: read it first"),
+        ({"eyes_m": None}, "eyes_m: required"),
+        ({"stack": (0.5, 0.3)}, "stack: is a tuple: create a phasestack.Stack"),
+        ({"left": np.moveaxis(picture(), 2, 0)}, "left: .*channels must come last; use np.moveaxis"),
+        ({"left": "left.png"}, "left: is a file name; read the file first"),
         ({"right": picture().astype(np.float32)}, "right: .*divide by 255"),
         ({"fov_deg": "40"}, "fov_deg: is '40', not a number"),
         ({"model": 3}, "model: is 3"),
@@ -233,13 +233,13 @@ def test_anybody_s_layers_are_evaluated_as_ours_are() -> None:
     how: dict[str, Any] = {"eyes_m": EYES, "stack": STACK}
     assert phasestack.evaluate(result.layers, picture(), picture(3), **how) == result.quality
     assert phasestack.evaluate(result.layers / 255, picture(), picture(3), **how) == result.quality
-    with pytest.raises(ValueError, match=r"layers: .*channels come last, np.moveaxis\(layers, 1, -1\)"):
+    with pytest.raises(ValueError, match=r"layers: .*channels must come last: np.moveaxis\(layers, 1, -1\)"):
         phasestack.evaluate(np.moveaxis(result.layers, 3, 1), picture(), picture(3), **how)
     with pytest.raises(ValueError, match=r"layers: have the shape \(2, "):
         phasestack.evaluate(result.layers[:2], picture(), picture(3), **how)
-    with pytest.raises(ValueError, match=r"layers: have the shape .*grey ones are np.stack"):
+    with pytest.raises(ValueError, match=r"layers: have the shape .*for grey layers use np.stack"):
         phasestack.evaluate(result.layers[..., 0], picture(), picture(3), **how)
-    with pytest.raises(ValueError, match=r"layers: hold up to .*: angles in radians"):
+    with pytest.raises(ValueError, match=r"layers: values are up to .*if they are angles in radians"):
         phasestack.evaluate(result.layers / 255 * np.pi / 2, picture(), picture(3), **how)
 
 

@@ -80,14 +80,14 @@ def test_the_advice_of_a_refusal_makes_a_picture(given: Any, advice: str) -> Non
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        ("a.png", r"is a file's name: read it first, as with PIL.Image.open\('a.png'\)"),
+        ("a.png", r"is a file name; read the file first, e.g. with PIL.Image.open\('a.png'\)"),
         (Path("a.png"), r"PIL.Image.open\('a.png'\)"),
         ([[1, 2], [3]], "is list, no array of numbers"),
         (np.full((20, 30, 3), "a"), "is ndarray, no array of numbers"),
         (None, "is NoneType, no array"),
         (np.full((20, 30, 3), np.nan), "holds nan to nan, not 0 to 1: some are not finite"),
-        (np.zeros((4, 4, 3), np.uint8), "with 16 pixels at least"),
-        (CODES.astype(np.int32) - 9, "divide by what is white"),
+        (np.zeros((4, 4, 3), np.uint8), "with at least 16 pixels"),
+        (CODES.astype(np.int32) - 9, "divide by the value of white"),
     ],
 )
 def test_what_is_no_picture_is_refused_by_its_argument(given: Any, told: str) -> None:

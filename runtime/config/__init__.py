@@ -1,4 +1,4 @@
-"""Validated, frozen settings of one TOML file. Defaults and meanings are in `settings.py`."""
+"""Validated, frozen settings from one TOML file. Defaults and meanings are in `settings.py`."""
 
 from runtime.config.files import load_settings, load_stack
 from runtime.config.overrides import changed, with_options

@@ -1,6 +1,6 @@
-"""Every setting: its type, range, default and meaning.
+"""All settings, each with its type, range, default and meaning.
 
-Ranges are those of displays that can be built, so that a wrong unit is refused with a suggestion.
+Ranges cover displays that can be built, so that a wrong unit is refused, with a suggestion.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Turn = Annotated[float, within(-360.0, 360.0, "degrees")]
 
 
 class StackGeometry(Section):
-    """Geometry of the stack: contents of `--panels FILE` and of the configuration's `[stack]`."""
+    """Geometry of the stack, as in `--panels FILE` and in the configuration's `[stack]`."""
 
     width_m: Annotated[float, within(0.005, 20.0, "m")] = Field(
         0.5184, description="active width of every panel, metres"
@@ -45,24 +45,25 @@ class StackGeometry(Section):
     width_px: Annotated[int, Field(ge=16, le=16384)] = Field(1920, description="columns of every panel")
     height_px: Annotated[int, Field(ge=16, le=16384)] = Field(1080, description="rows of every panel")
     pixel_aspect: Annotated[float, within(0.1, 10.0, "")] = Field(
-        1.0, description="width of a pixel over its height; must agree with the sizes above to 3%"
+        1.0, description="width of a pixel divided by its height; must agree with the sizes above to 3%"
     )
 
     tilt: Annotated[tuple[tuple[Slope, Slope], ...], Field(max_length=PANELS_MOST)] = Field(
         (),
-        description="per panel, slope of x towards the viewer's right, and upwards; "
+        description="slope of x for each panel, to the viewer's right and upwards; "
         "written by `calibrate panels`; empty: parallel panels",
     )
     registered_from_m: Point = Field(
-        (0.5, 0.0, 0.0), description="eye in frame `stack` to whom the homographies make tilted panels look parallel"
+        (0.5, 0.0, 0.0),
+        description="eye, in frame `stack`, from which the homographies make tilted panels look parallel",
     )
 
     @model_validator(mode="after")
     def _tilted(self) -> StackGeometry:
         if len(self.tilt) not in (0, len(self.x_m)):
-            raise ValueError(f"tilt: has {len(self.tilt)} panels, x_m has {len(self.x_m)}")
+            raise ValueError(f"tilt: has {len(self.tilt)} entries, but x_m has {len(self.x_m)}")
         if any(any(slopes) for slopes in self.tilt) and self.registered_from_m[0] <= self.x_m[-1]:
-            raise ValueError("registered_from_m: is not before the front panel")
+            raise ValueError("registered_from_m: must be in front of the front panel")
         return self
 
     @model_validator(mode="after")
@@ -71,11 +72,11 @@ class StackGeometry(Section):
         if any(gap <= 0 for gap in gaps):
             raise ValueError("x_m: must ascend from rear to front")
         if min(gaps) < LEAST_GAP_M:
-            raise ValueError(f"x_m: panels {min(gaps):g} m apart are one panel; {LEAST_GAP_M:g} m is the least")
+            raise ValueError(f"x_m: two panels are {min(gaps):g} m apart; the minimum is {LEAST_GAP_M:g} m")
         return self
 
     def check_pixels(self) -> None:
-        """Raise ValueError where the sizes in metres and in pixels contradict `pixel_aspect`."""
+        """Raise ValueError if the sizes in metres and in pixels contradict `pixel_aspect`."""
         aspect = (self.width_m / self.width_px) / (self.height_m / self.height_px)
         if abs(aspect / self.pixel_aspect - 1) > PIXEL_ASPECT_TOLERANCE:
             square_m = self.width_m / self.width_px * self.height_px / self.pixel_aspect
@@ -97,7 +98,7 @@ class SensorSettings(Section):
     """Sensor that delivers eye positions or images."""
 
     driver: str = Field(
-        "replay", description="replay, openni2, realsense, usb-camera, fixed, or your own class: `module:Class`"
+        "replay", description="replay, openni2, realsense, usb-camera, fixed, or a class of yours: `module:Class`"
     )
     source: str = Field("demo", description="a recording, `demo`, a serial number or a device URI")
     timeout_s: Annotated[float, within(0.001, 600.0, "s")] = Field(
@@ -108,13 +109,13 @@ class SensorSettings(Section):
         "", description="driver `openni2`: folder with libOpenNI2.so and OpenNI2/Drivers; empty: the system's"
     )
     fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
-        0.0, description="horizontal field of view of a camera that does not report its own (usb-camera); 0: unknown"
+        0.0, description="horizontal field of view of a camera that does not report it (usb-camera); 0: unknown"
     )
     fixed_eyes_m: tuple[Point, Point] | None = Field(
         None, description="driver `fixed`: left and right eye in the stack frame"
     )
     options: dict[str, Any] = Field(
-        default_factory=dict, description="options of your own driver, validated by its `Options`"
+        default_factory=dict, description="options of a driver of yours, validated by its `Options`"
     )
 
     @field_validator("source")
@@ -142,23 +143,24 @@ class CalibrationSettings(Section):
 
     file: PathText = Field("", description="calibration TOML; empty: the demo recording's")
     ipd_m: Annotated[float, within(0.04, 0.08, "m", zero=True)] = Field(
-        0.0, description="the viewer's eye separation; 0: unknown; for calibration charts and cameras without depth"
+        0.0, description="the viewer's eye separation, for calibration charts and cameras without depth; 0: unknown"
     )
     viewing_m: tuple[Annotated[float, within(0.05, 20.0, "m")], Annotated[float, within(0.05, 20.0, "m")]] = Field(
-        (0.4, 0.6), description="nearest and farthest viewer, for calibration charts and registration"
+        (0.4, 0.6),
+        description="distance of the nearest and farthest viewer, for calibration charts and registration",
     )
     viewing_side_deg: Annotated[float, Field(ge=2, le=40)] = Field(
-        10.0, description="angle to either side within which viewers stand, from the display's middle"
+        10.0, description="largest angle to either side at which viewers stand, seen from the display's centre"
     )
-    viewing_up_deg: tuple[float, float] = Field((0.0, 20.0), description="elevation of their eyes: lowest, highest")
+    viewing_up_deg: tuple[float, float] = Field((0.0, 20.0), description="lowest and highest elevation of their eyes")
 
     @model_validator(mode="after")
     def _viewing(self) -> CalibrationSettings:
         if self.viewing_m[1] < self.viewing_m[0] * 1.1:
-            raise ValueError("viewing_m: must be the nearest, then the farthest, at least a tenth farther")
+            raise ValueError("viewing_m: must be the nearest, then the farthest distance, at least a tenth larger")
         low, high = self.viewing_up_deg
         if not (-40 <= low < high <= 40 and high - low >= 2):
-            raise ValueError("viewing_up_deg: must be lowest, then highest, between -40 and 40, 2 degrees apart")
+            raise ValueError("viewing_up_deg: must be lowest, then highest, from -40 to 40, at least 2 degrees apart")
         return self
 
 
@@ -168,10 +170,10 @@ LAYOUT = (
 
 
 class ContentSettings(Section):
-    """Content to show, and its placement."""
+    """The content to show, and its placement."""
 
     scene: NameOrPath = Field(
-        "demo", description="a built-in scene, a preset, a file, a folder, or a class `module:Class`"
+        "demo", description="a built-in scene, a preset, a file, a folder, or a class of yours: `module:Class`"
     )
     options: dict[str, Any] = Field(
         default_factory=dict, description="options of a scene that is a class; for `program`: port"
@@ -182,7 +184,7 @@ class ContentSettings(Section):
     background: tuple[Unit, Unit, Unit] | None = Field(
         None, description="colour behind the scene, 0-1; unset: dark, or white for the built-in scenes"
     )
-    file: PathText = Field("", description="data of a preset: its .ply or .glb, or its data-set folder")
+    file: PathText = Field("", description="data of a preset: its .ply or .glb file, or its data-set folder")
     layout: Annotated[str, Field(pattern=LAYOUT)] = Field(
         "auto",
         description="arrangement of views in a picture or video: mono, side-by-side, top-bottom, cross-eyed (the "
@@ -196,15 +198,15 @@ class ContentSettings(Section):
     picture_rate_hz: Annotated[float, within(0.01, 1000.0, "Hz")] = Field(
         30.0, description="frame rate of a folder of pictures"
     )
-    fit: bool = Field(True, description="scale a mesh or splat without a preset to the display, and centre it")
+    fit: bool = Field(True, description="fit a mesh or splat that has no preset to the display, and centre it")
     axes: Annotated[str, Field(pattern=r"^(auto|[+-][xyz] [+-][xyz])$")] = Field(
         "auto",
-        description="axes of a mesh or splat that point up and to the viewer, such as `+z -y`; auto: glTF's own, "
+        description="axes of a mesh or splat that point up and to the viewer, such as `+z -y`; auto: glTF's convention, "
         "otherwise guessed from the extent",
     )
     library: PathText = Field("", description="folder of pictures, films, models and playlists offered on the page")
     scale: Annotated[float, within(0.001, 1000.0, "")] = Field(
-        1.0, description="scale factor of the scene, about the display's middle"
+        1.0, description="scale factor of the scene, about the display's centre"
     )
     offset_m: tuple[Offset, Offset, Offset] = Field(
         (0.0, 0.0, 0.0), description="displacement of the scene: out of the screen, to the right, up; metres"
@@ -214,7 +216,8 @@ class ContentSettings(Section):
         description="rotation of the scene about the axes out of the screen, to the right and up, in this order",
     )
     turntable_per_min: Annotated[float, within(-600.0, 600.0, "turns a minute")] = Field(
-        0.0, description="rotation of the scene about the vertical, turns per minute; negative: the other way"
+        0.0,
+        description="rotation of the scene about the vertical, in turns per minute; negative: backwards",
     )
 
     @model_validator(mode="after")
@@ -227,7 +230,7 @@ class ContentSettings(Section):
 
 
 def _accept_legacy_backend(name: Any) -> Any:
-    """Return the backend's name; old scripts call the processor `opencv`."""
+    """Return the backend's current name. Old scripts call the processor `opencv`."""
     return "cpu" if name == "opencv" else name
 
 
@@ -245,27 +248,28 @@ class ModelSettings(Section):
     )
     backend: Annotated[Literal["auto", "cpu", "gl"], BeforeValidator(_accept_legacy_backend)] = Field(
         "auto",
-        description="device for everything except the network: the processor, or the GPU by OpenGL; "
+        description="device for everything except the network: the processor, or the GPU through OpenGL; "
         "auto: the faster one, measured at the start",
     )
     threads: Annotated[int, Field(ge=0, le=256)] = Field(2, description="inference threads; 0: all cores")
     eye_sigma_mm: Literal["auto"] | NonNegative = Field(
         "auto",
         description="tracking error that solutions allow for: standard deviation of both eyes together, "
-        "millimetres per axis; 0: eyes known exactly; auto: from the tracker",
+        "in mm per axis; 0: eyes known exactly; auto: from the tracker",
     )
     budget_ms: NonNegative = Field(
-        0.0, description="no step of a solution starts later than this after its start, drawing included; 0: no limit"
+        0.0,
+        description="no step of a solution begins later than this after its start, drawing included; 0: no limit",
     )
 
 
 class PanelSettings(Section):
     """One physical panel: its monitor, mounting and grey curve."""
 
-    edid_serial: str = Field("", description="monitor by EDID serial (first choice)")
-    connector: str = Field("", description="monitor by connector name, as HDMI-1 (second choice)")
-    rotation_deg: Literal[0, 90, 180, 270] = Field(0, description="mounting of the panel, counter-clockwise")
-    mirror: Literal["none", "horizontal", "vertical"] = Field("none", description="mirroring, before rotation")
+    edid_serial: str = Field("", description="EDID serial number of the panel's monitor (first choice)")
+    connector: str = Field("", description="connector of the panel's monitor, such as HDMI-1 (second choice)")
+    rotation_deg: Literal[0, 90, 180, 270] = Field(0, description="rotation of the mounted panel, counter-clockwise")
+    mirror: Literal["none", "horizontal", "vertical"] = Field("none", description="mirroring, applied before rotation")
     homography: tuple[tuple[Entry, Entry, Entry], tuple[Entry, Entry, Entry], tuple[Entry, Entry, Entry]] = Field(
         ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
         description="3x3 matrix from ideal to true panel pixels, from `calibrate panels`",
@@ -291,7 +295,7 @@ STAGES = ("sensor", "track", "render", "prepare", "inference", "finish", "step",
 def _check_stages(cost_ms: dict[str, float]) -> dict[str, float]:
     for name in cost_ms:
         if name not in STAGES:
-            raise ValueError(f"{name} is no stage{nearest(name, STAGES)} (stages: {', '.join(STAGES)})")
+            raise ValueError(f"{name} is not a stage{nearest(name, STAGES)} (stages: {', '.join(STAGES)})")
     return cost_ms
 
 
@@ -299,7 +303,7 @@ class LoopSettings(Section):
     """Pacing, and the simulated clock."""
 
     rate_hz: Annotated[float, within(1.0, 1000.0, "Hz")] = Field(
-        60.0, description="refreshes per second, for a display that does not report its own rate"
+        60.0, description="refreshes per second, for a display that does not report its rate"
     )
     sensor_latency_ms: Annotated[float, within(0.0, 10_000.0, "ms")] = Field(
         15.0, description="delay of a replayed sample from capture to arrival"
@@ -321,7 +325,8 @@ class LoopSettings(Section):
         description="cost of each stage on the simulated clock of --max-speed",
     )
     evaluate_every: Annotated[int, Field(ge=0)] = Field(
-        20, description="with --out: refreshes between two measurements of what the eyes see; 0: only the last refresh"
+        20,
+        description="with --out: measure what the eyes see every N refreshes; 0: only at the last refresh",
     )
 
 
@@ -329,7 +334,8 @@ class PlanSettings(Section):
     """Allowed savings."""
 
     enabled: bool = Field(
-        True, description="skip work made unnecessary by the scene or a resting head; false: draw and solve everything"
+        True,
+        description="skip work that the scene or a resting head makes unnecessary; false: do all work",
     )
     align: bool = Field(True, description="shift and scale the panels at every refresh to follow the eyes")
 
@@ -362,5 +368,5 @@ class Settings(Section):
         self.stack.check_pixels()
         tables, panels = len(self.output.panels), len(self.stack.x_m)
         if tables not in (0, panels):
-            raise ValueError(f"output.panels: has {tables} of {panels} tables: one per panel, rear to front")
+            raise ValueError(f"output.panels: has {tables} tables, needs {panels}: one per panel, rear to front")
         return self
