@@ -201,8 +201,8 @@ class ContentSettings(Section):
     fit: bool = Field(True, description="fit a mesh or splat that has no preset to the display, and centre it")
     axes: Annotated[str, Field(pattern=r"^(auto|[+-][xyz] [+-][xyz])$")] = Field(
         "auto",
-        description="axes of a mesh or splat that point up and to the viewer, such as `+z -y`; auto: glTF's convention, "
-        "otherwise guessed from the extent",
+        description="axes of a mesh or splat that point up and to the viewer, such as `+z -y`; "
+        "auto: glTF's convention, otherwise guessed from the extent",
     )
     library: PathText = Field("", description="folder of pictures, films, models and playlists offered on the page")
     scale: Annotated[float, within(0.001, 1000.0, "")] = Field(
