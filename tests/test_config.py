@@ -38,7 +38,7 @@ PANEL = '[[output.panels]]\nconnector = "DP-{}"\n'
         ("[content]\ndepth_m = [-50, 50]", "content.depth_m.0", "did you mean millimetres (-0.05)?"),
         ("[loop]\nrate_hz = 60000", "loop.rate_hz", "the range is 1 to 1000 Hz"),
         ("[loop]\nsimulated_stage_ms = { render = -1 }", "loop.simulated_stage_ms.render", "greater than or equal"),
-        ("[loop.simulated_stage_ms]\nrendr = 1", "loop.simulated_stage_ms", "rendr is not a stage: did you mean render?"),
+        ("[loop.simulated_stage_ms]\nrendr = 1", "loop.simulated_stage_ms", "not a stage: did you mean render?"),
         ("[model]\neffort = 'half'", "model.effort", "'auto' or 'full'"),
         ("[[output.panels]]\ngamma = 1e308", "output.panels.0.gamma", "beyond 10"),
         ("[[output.panels]]\nhomography = [[1, 0, 0], [0, 1, 0]]", "output.panels.0.homography.2", "required"),
