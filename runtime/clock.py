@@ -1,4 +1,4 @@
-"""One clock: monotonic, integer nanoseconds, injected."""
+"""Monotonic clocks in integer nanoseconds, passed to whatever needs the time."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ class Clock(Protocol):
     """The only source of time in the runtime."""
 
     def now_ns(self) -> int:
-        """Nanoseconds of one monotonic clock; its zero has no meaning."""
+        """Return the time in nanoseconds on a monotonic clock whose zero has no meaning."""
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Return at or after the deadline, without waiting if it has passed."""
+        """Sleep until the deadline; return at once if it has passed."""
 
 
 class MonotonicClock:
@@ -44,17 +44,17 @@ class SimulatedClock:
         self._now_ns = max(self._now_ns, deadline_ns)
 
     def advance_ns(self, duration_ns: int) -> None:
-        """Let simulated time pass; raises ValueError for a negative duration."""
+        """Let simulated time pass. Raises ValueError for a negative duration."""
         if duration_ns < 0:
-            raise ValueError("a monotonic clock does not run backwards")
+            raise ValueError("a monotonic clock cannot run backwards")
         self._now_ns += duration_ns
 
 
 class Stopwatch:
-    """Milliseconds of named stages, each from the end of the one before, on the machine's clock."""
+    """Measures the milliseconds of named stages, each from the end of the previous one, in real time."""
 
     def __init__(self, *stages: str) -> None:
-        """stages: stages to list even if they never occur."""
+        """stages: names to list even if they never occur."""
         self.stage_ms = dict.fromkeys(stages, 0.0)
         self._last_ns = time.perf_counter_ns()
 

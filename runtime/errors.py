@@ -1,4 +1,4 @@
-"""Errors are transient (hold, degrade, retry) or fatal (refuse to start, exit 2)."""
+"""Error classes: transient (hold, degrade, retry) or fatal (refuse to start, exit 2)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PASSING = frozenset(
 
 
 def without_secrets(text: str) -> str:
-    """Return the text without user names and passwords of addresses (before an `@`).
+    """Return the text with user names and passwords (before an `@`) removed from addresses.
 
     >>> without_secrets("rtsp://user:a@b@host/door"), without_secrets("/etc/rtsp:/user:a@host/door")
     ('rtsp://host/door', '/etc/rtsp:/host/door')
@@ -27,7 +27,7 @@ def without_secrets(text: str) -> str:
 
 
 def one_line(text: str, *, most: int = PART_CHARACTERS_MAX) -> str:
-    r"""Return the text on one printable line, without secrets; `...` replaces the middle of a long one.
+    r"""Return the text as one printable line without secrets; `...` replaces the middle of a long one.
 
     >>> one_line("a\nb"), one_line("x" * 9, most=7)
     ('a?b', 'xx...xx')
@@ -64,7 +64,7 @@ class InputError(FatalError):
 
 
 class MissingPart(FatalError):
-    """An optional package is needed and not installed; the text names it."""
+    """A required optional package is not installed; the message names it."""
 
 
 class TransientError(PhasestackError):
@@ -72,7 +72,7 @@ class TransientError(PhasestackError):
 
 
 class SensorLost(TransientError):
-    """The sensor is gone, hangs or delivers nonsense: close it and reopen it with back-off."""
+    """The sensor is gone, hangs or delivers invalid data: close it and reopen it with back-off."""
 
 
 class SensorTimeout(TransientError):
@@ -84,15 +84,15 @@ class EndOfRecording(TransientError):
 
 
 class ContentFailure(TransientError):
-    """The content source could not draw this frame: the last good picture stays."""
+    """The content source could not draw this frame. The last good picture stays."""
 
 
 class ModelFailure(TransientError):
-    """Inference failed or answered something that is not a picture: the last good layers stay."""
+    """Inference failed or returned something other than a picture. The last good layers stay."""
 
 
 class EyesNotServed(ModelFailure):
-    """The model cannot serve these two eyes: wait for a viewer to move, refuse an option."""
+    """The model cannot serve these two eyes. Wait for a viewer to move; refuse an option."""
 
 
 class ContextLost(TransientError):
@@ -100,16 +100,16 @@ class ContextLost(TransientError):
 
 
 class PanelLost(TransientError):
-    """A panel's window, monitor or GL context is lost: rebuild it; the loop continues without."""
+    """A panel's window, monitor or GL context is lost: rebuild it; the loop continues without it."""
 
 
 class Stopped(PhasestackError):
-    """A request to stop during the start."""
+    """Raised when the daemon is asked to stop during its start."""
 
 
 @contextmanager
 def retry_advised() -> Iterator[None]:
-    """Turn an error that may pass into a TransientError: exit 75, another start may help."""
+    """Turn an error that may be temporary into a TransientError: exit 75, since another start may help."""
     try:
         yield
     except Exception as error:
@@ -119,7 +119,7 @@ def retry_advised() -> Iterator[None]:
 
 
 def is_retryable(error: BaseException | None) -> bool:
-    """True if an exception or its context is a passing failure of the machine, and not of its input.
+    """Return True if an exception, or its context, is a temporary failure of the machine, not bad input.
 
     Readers turn a system error into an InputError that names the file; the system error is still its context.
     """

@@ -1,1 +1,1 @@
-"""The daemon: building, supervising and reconfiguring a run; socket, signals, notifications."""
+"""Daemon: builds, supervises and reconfigures a run; socket, signals, notifications."""

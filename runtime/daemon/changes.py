@@ -1,4 +1,4 @@
-"""Changes by operators: the configuration, choices that override it, and the change being loaded."""
+"""Operators' changes: the configuration, choices that override it, and the change being loaded."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NEEDS_RESTART = ("stack", "sensor", "output", "service", "loop", "model.backend"
 
 @dataclass(frozen=True, slots=True)
 class Choices:
-    """The configuration as last read, and an operator's choices, which override it."""
+    """The configuration as it was last read, and an operator's choices, which override it."""
 
     configured: Settings
     chosen: dict[tuple[str, str], Any] = field(default_factory=dict)  # by section and key
@@ -38,11 +38,11 @@ class Choices:
         return settings
 
     def choosing(self, section: str, **values: Any) -> Choices:
-        """Return the choices with some of one section added."""
+        """Return the choices, with some choices of one section added."""
         return replace(self, chosen=self.chosen | {(section, key): value for key, value in values.items()})
 
     def another_scene(self, scene: str) -> Choices:
-        """Return the choices with another scene, placed as configured and not as the one before was moved."""
+        """Return the choices with another scene, placed as configured rather than as the last one was moved."""
         kept = {setting: value for setting, value in self.chosen.items() if setting[1] not in PLACING}
         return replace(self, chosen=kept).choosing("content", scene=scene)
 
@@ -51,7 +51,7 @@ class Choices:
         settings, before = read(), self.configured
         frozen = [name for name in NEEDS_RESTART if attrgetter(name)(settings) != attrgetter(name)(before)]
         if frozen:
-            raise InputError("reload", ", ".join(frozen), "a change needs a restart of the service")
+            raise InputError("reload", ", ".join(frozen), "changing this requires a restart of the service")
         same = {at: value for at, value in self.chosen.items() if _value(settings, at) == _value(before, at)}
         return Choices(settings, same)
 
@@ -62,7 +62,7 @@ def _value(settings: Settings, at: tuple[str, str]) -> Any:
 
 @dataclass(slots=True)
 class _Change:
-    """A change of settings for a command."""
+    """A change of settings, made for a command."""
 
     command: Command
     choose: Callable[[Choices], Choices]  # on the loading thread; raises InputError
@@ -70,7 +70,7 @@ class _Change:
     choices: Choices | None = None  # set by the loading thread before its job is done
 
     def settings(self, before: Choices) -> Settings:
-        """Choose, and return the new settings. Raises InputError."""
+        """Apply the choice and return the new settings. Raises InputError."""
         self.choices = self.choose(before)
         return self.choices.settings()
 
@@ -78,8 +78,8 @@ class _Change:
 class Changes:
     """Changes to a run, loaded one at a time. Only the presenter's thread uses this object.
 
-    Work on other threads is handed all it needs, and its outcome comes back through a queue: settings are read and
-    loaded by a job (`Reconfiguration`), and a scene is moved on the solver's thread.
+    Work on other threads receives all it needs, and its outcome comes back through a queue: a job reads and loads
+    settings (`Reconfiguration`), and the solver's thread moves the scene.
     """
 
     def __init__(self, presenter: Presenter) -> None:
@@ -92,11 +92,11 @@ class Changes:
 
     @property
     def loading(self) -> Reconfiguration | None:
-        """The change that is loading."""
+        """Return the change that is being loaded."""
         return None if self._loading is None else self._loading[1]
 
     def carry_on(self) -> None:
-        """Finish what other threads have done, and begin what waits; once a refresh."""
+        """Finish the work that other threads have done, and begin work that waits. Called once per refresh."""
         finished = self._loading is not None and self._loading[1].finished
         while not self._outcomes.empty():  # those from before a scene was replaced, first
             self._outcomes.get()()
@@ -109,9 +109,9 @@ class Changes:
             self.attempt(change.command, partial(self._load, change))
 
     def begin(self, command: Command, choose: Callable[[Choices], Choices], *, reload_content: bool = False) -> None:
-        """Begin a change, or have it wait until the one that is loading has been abandoned.
+        """Begin a change, or let it wait until the one being loaded has been abandoned.
 
-        choose: the new choices, on the loading thread; reload_content: also if its settings are the same.
+        choose: computes the new choices, on the loading thread; reload_content: even if its settings are unchanged.
         """
         change = _Change(command, choose, reload_content)
         if self._loading is None:
@@ -120,7 +120,7 @@ class Changes:
         (current, loading), waiting = self._loading, self._next
         for skipped in (None if loading.abandoned else current, waiting):
             if skipped is not None:
-                self.answer(skipped.command, "skipped: a newer change came")
+                self.answer(skipped.command, "skipped in favour of a newer change")
         loading.abandon()
         self._next = change
 
@@ -146,20 +146,20 @@ class Changes:
 
         def skip(parts: Any) -> str:
             skipped = parts.run.state.content.skip(time_ns=self._presenter.clock.now_ns())
-            return "" if skipped else "there is no next entry: the scene is no playlist, or shows its last one"
+            return "" if skipped else "there is no next entry: the scene is not a playlist, or shows its last entry"
 
         self._between_steps(command, skip)
 
     def attempt(self, command: Command, work: Callable[[], None]) -> None:
-        """Do the work; a failure refuses the command and does not end the run."""
+        """Do the work. If it fails, the command is refused and the run continues."""
         if problem := _problem_of(command, work):
             self.answer(command, problem)
 
     def answer(self, command: Command, problem: str) -> None:
-        """Report the outcome of a change to its client, the log and the status; problem: why it was refused."""
+        """Report a change's outcome to its client, the log and the status. problem: why it was refused."""
         self.refused = problem
         if problem:
-            log.error("refused, nothing has changed: %s", problem)
+            log.error("change refused, nothing has changed: %s", problem)
             command.refuse(problem)
         else:
             command.done(**status.holds(self._presenter))
@@ -172,7 +172,7 @@ class Changes:
         self._presenter.solver.do(loading.advance)
 
     def _finish(self, change: _Change, loading: Reconfiguration) -> None:
-        """Adopt the choices of a change that took effect, and answer its command."""
+        """Adopt the choices of a change that has taken effect, and answer its command."""
         if not loading.problem and change.choices is not None:
             state = self._presenter.run_cell.state
             moved = moved_since(loading.settings.content, state.settings.content)  # while it was loading
@@ -185,7 +185,7 @@ class Changes:
     ) -> None:
         """Do the work on the solver's thread between two solutions, then answer on this one.
 
-        work: returns why it was refused, or nothing; succeeded: runs on the presenter's thread.
+        work: returns the reason for a refusal, or nothing; succeeded: runs on the presenter's thread.
         """
 
         def finish(problem: str) -> None:
@@ -203,7 +203,7 @@ class Changes:
 
 
 def _problem_of(command: Command, work: Callable[[], None]) -> str:
-    """Do the work; return what went wrong, or an empty text. Unexpected errors are logged."""
+    """Do the work, and return what went wrong or an empty string. Unexpected errors are logged."""
     try:
         work()
     except PhasestackError as error:

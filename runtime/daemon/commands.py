@@ -1,4 +1,4 @@
-"""Commands to the running daemon, checked before they reach the loop."""
+"""Operators' commands to the running daemon, which are checked before they reach the loop."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ PLACING = ("scale", "offset_m", "rotation_deg", "turntable_per_min")  # of `plac
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """An operator's command. The loop begins it between two refreshes and answers it exactly once.
+    """An operator's command, which the loop begins between two refreshes and answers exactly once.
 
-    It is run only after `take` returned True: a command whose client has given up is never run.
+    It may be run only after `take` returned True, so that a command whose client has given up is never run.
     `flat` shows the 2D picture until `resume`; `pause` freezes the picture until `resume`.
     """
 
@@ -26,32 +26,32 @@ class Command:
     answer: Future[dict[str, Any]] = field(default_factory=Future)
 
     def take(self) -> bool:
-        """Claim the command for execution. False: its client has given up; do not run it."""
+        """Claim the command for execution. Returns False if its client has given up: do not run it."""
         return self.answer.set_running_or_notify_cancel()
 
     def done(self, **state: Any) -> None:
-        """Answer success, with the new state."""
+        """Report success to the client, with the new state."""
         self.answer.set_result({"ok": True, **state})
 
     def refuse(self, why: str) -> None:
-        """Answer a refusal, after which the state is as before."""
+        """Report a refusal to the client; the state is unchanged."""
         self.answer.set_result({"ok": False, "error": why or "refused"})
 
 
 def parse(request: Any) -> Command:
-    """Return the command of a request from the socket. Raises ValueError with one line."""
+    """Parse the command in a request from the socket. Raises ValueError with a one-line message."""
     if not isinstance(request, dict):
-        raise ValueError("a request is one JSON object")
+        raise ValueError("a request must be one JSON object")
     name, value = request.get("command"), request.get("value")
     if name not in NAMES:
-        raise ValueError(f"command: unknown; one of status, {', '.join(NAMES)}")
+        raise ValueError(f"command: unknown command; must be one of status, {', '.join(NAMES)}")
     if name in ("scene", "model") and not (isinstance(value, str) and value):
-        raise ValueError(f"value: {name} needs a name")
+        raise ValueError(f"value: {name} requires a name")
     if name == "place":
         value = value if value is not None else {}
         if not isinstance(value, dict):
-            raise ValueError("value: place needs an object of settings, or null for the configured ones")
+            raise ValueError("value: place requires an object of settings, or null for the configured ones")
         for key in value:
             if key not in PLACING:
-                raise ValueError(f"value.{shown(key)}: place takes {', '.join(PLACING)}")
+                raise ValueError(f"value.{shown(key)}: place accepts only {', '.join(PLACING)}")
     return Command(name, value if name in ("scene", "model", "place") else None)

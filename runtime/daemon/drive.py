@@ -1,4 +1,4 @@
-"""Common part of `demo` and `run`: run the loop, show progress, write files and summary."""
+"""Common part of `demo` and `run`: runs the loop, shows progress, writes the files and the summary."""
 
 from __future__ import annotations
 
@@ -57,31 +57,29 @@ def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> 
 
 
 def _unseen(layers: U8, account: RefreshAccount, run: Run, settings: Settings) -> str:
-    """Return a viewer page of the last refresh, for a run that measured nothing."""
+    """Return a viewer page of the last refresh, for a run in which nothing was measured."""
     stack, is_flat = run.presenter.stack, account.solved_for_m is None
     away_m = max(USUAL_M, stack.x_m[-1] + USUAL_M / 2)
     eyes_m = np.array([[away_m, -IPD_M / 2, 0.0], [away_m, IPD_M / 2, 0.0]])
     eyes_m = eyes_m if account.eyes_m is None else account.eyes_m
-    title = "No viewer was seen: the flat picture" if is_flat else "The last refresh, not measured"
+    title = "Flat picture (no viewer was seen)" if is_flat else "Last refresh (not measured)"
     fov_deg = settings.content.fov_deg
     return viewer_html(layers, (), stack, eyes_m=eyes_m, fov_deg=fov_deg, text=[title], follows=not is_flat)
 
 
 def print_summary(summary: dict[str, Any], out: Path | None) -> None:
-    """Print the summary for a person: measured figures first, and which one to quote."""
+    """Print the summary for people: measured figures first, and the one to quote."""
     configured = summary["configured"]
     for line in lines_of({name: value for name, value in summary.items() if name not in (*configured, "configured")}):
         print(line)
     if configured:
-        print("on the simulated clock, as configured (not measured):")
+        print("configured for the simulated clock (not measured):")
         for line in lines_of({name: summary[name] for name in configured}):
             print(f"  {line}")
     if summary["live_db"] is not None:
-        print(
-            "live_db (light at the true eyes against their targets at each refresh) is the figure to quote for motion"
-        )
+        print("live_db (light PSNR at the true eyes, against each refresh's target) is the figure to quote for motion")
     if summary["light_db"] is not None:
-        print("light_db (pupils at the eyes used, tracking error 1 mm) is the figure to quote for a head at rest")
+        print("light_db (pupils at the eyes used, 1 mm of tracking error) is the figure to quote for a head at rest")
     if not summary["inferences"]:
         print("no solution was shown: no viewer was seen, or the run ended before the first solution (--frames)")
     if out is not None:

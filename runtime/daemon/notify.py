@@ -1,4 +1,4 @@
-"""Notifications to systemd (sd_notify, watchdog). Without a supervisor every call does nothing."""
+"""Notifications to systemd (sd_notify, watchdog). Without a supervisor, every call does nothing."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from runtime.clock import Clock
 from runtime.records import State
 
 NS_PER_US = 1000
-START_STEP_S = 60.0  # longest step of a start, on the slowest machine
+START_STEP_S = 60.0  # duration of the longest step of a start, on the slowest machine
 SETTLED_AFTER = 100  # presented refreshes: the first ones compile shaders, for seconds each on a slow machine
 
 
 class Notifier:
-    """The daemon's messages to systemd. Never blocks, never raises."""
+    """Sends the daemon's messages to systemd. Never blocks, never raises."""
 
     def __init__(self, clock: Clock, environment: Mapping[str, str] = os.environ) -> None:
-        """environment: has the watchdog's period (sd_watchdog_enabled)."""
+        """environment: contains the watchdog's period (sd_watchdog_enabled)."""
         self._clock = clock
         self._channel: Any = None
         if "NOTIFY_SOCKET" in os.environ:  # otherwise sdnotify would leave a socket open
@@ -35,25 +35,25 @@ class Notifier:
 
     @property
     def supervised(self) -> bool:
-        """True under a supervisor: wait for missing parts rather than refuse to start."""
+        """Return True under a supervisor, where a start waits for missing parts instead of failing."""
         return self._channel is not None and self._channel.socket is not None
 
     def ready(self) -> None:
-        """Report that the first frame is shown, or that panels are awaited. Later calls do nothing."""
+        """Report that the first frame is shown, or that the daemon waits for panels. Later calls do nothing."""
         if not self._ready:
             self._ready = True
             self._send("READY=1")
             self.starting()
 
     def status(self, text: str) -> None:
-        """Set the line in `systemctl status`; sent when it changes."""
+        """Set the status line of `systemctl status`. It is sent only when it changes."""
         line = " ".join(text.split())
         if line != self._status:
             self._status = line
             self._send(f"STATUS={line}")
 
     def starting(self) -> None:
-        """Report progress of the start: extends its timeout, or the watchdog's."""
+        """Report progress of the start, which extends its timeout or the watchdog's."""
         step_us = round(START_STEP_S * 1e6)
         if not self._ready:
             self._send(f"EXTEND_TIMEOUT_USEC={step_us}")
@@ -81,7 +81,7 @@ class Notifier:
             self._send("WATCHDOG=1")
 
     def reloading(self) -> None:
-        """Report that the configuration is being read; `reloaded` ends it. Silent before the first READY."""
+        """Report that the configuration is being read, until `reloaded`. Silent before the first READY."""
         if self._ready:
             self._send(f"RELOADING=1\nMONOTONIC_USEC={self._clock.now_ns() // NS_PER_US}")
 
@@ -91,7 +91,7 @@ class Notifier:
             self._send("READY=1")
 
     def stopping(self, reason: str) -> None:
-        """Report that the daemon stops on purpose."""
+        """Report that the daemon is stopping deliberately."""
         self._send(f"STOPPING=1\nSTATUS=stopping: {' '.join(reason.split())}")
 
     def close(self) -> None:
@@ -106,6 +106,6 @@ class Notifier:
 
 
 def watchdog_ns(environment: Mapping[str, str]) -> int:
-    """Return the watchdog's period; 0 without one for this process."""
+    """Return the watchdog's period, or 0 if this process has no watchdog."""
     ours = int(environment.get("WATCHDOG_PID", os.getpid())) == os.getpid()
     return int(environment.get("WATCHDOG_USEC", "0")) * NS_PER_US if ours else 0

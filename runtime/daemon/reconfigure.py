@@ -1,4 +1,4 @@
-"""A change of settings during a run: loaded in the background, adopted between two solutions."""
+"""Change of settings during a run: loaded in the background, adopted between two solutions."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Ready = tuple[Opener | None, Predictor | None]  # None: stays as it is
 
 
 class Reconfiguration:
-    """One change of settings, all or nothing, which takes effect once everything is loaded.
+    """A change of settings that takes effect, as a whole or not at all, once everything is loaded.
 
     A job loads; then `advance`, a task of the solver's thread, adopts the result. The presenter's thread polls
     `finished`, then reads `problem`.
@@ -39,16 +39,16 @@ class Reconfiguration:
     def __init__(
         self, read: Callable[[], Settings], old: Settings, stack: PanelStack, *, reload_content: bool = False
     ) -> None:
-        """Start loading. read: the new settings, called by the job; may raise InputError.
+        """Start loading. read: returns the new settings; called by the job; may raise InputError.
 
-        reload_content: also if its settings are the same.
+        reload_content: even if its settings are unchanged.
         """
         self._read, self._old, self._stack, self._reload_content = read, old, stack, reload_content
         self.settings = old
         self._calibration: Calibration
         self.abandoned = False
         self._begun_s = time.monotonic()
-        self.progress = ""  # the present stage of loading, for the status
+        self.progress = ""  # the current stage of loading, for the status
         self.problem = ""  # one line if it was refused
         self._adopter: RunningSolver | None = None  # the solver that adopts it
         self._finished = False
@@ -59,7 +59,7 @@ class Reconfiguration:
         self.abandoned = True
 
     def advance(self, parts: Any) -> bool:
-        """Adopt loaded parts on the solver's thread. Return True when adopted, refused or abandoned."""
+        """Adopt the loaded parts, on the solver's thread. Returns True once adopted, refused or abandoned."""
         assert isinstance(parts, RunningSolver)
         if not self._job.done:
             return False
@@ -79,14 +79,14 @@ class Reconfiguration:
 
     @property
     def finished(self) -> bool:
-        """True once adopted or refused, or if the solver hangs in it or it hangs after being abandoned."""
+        """Return True once it is adopted or refused, or if the solver, or the abandoned change, hangs."""
         if not self._finished and self._adopter is not None and not self._adopter.is_newest:
             self.problem, self._finished = LEFT_BEHIND, True
         is_stuck = self.abandoned and time.monotonic() - self._begun_s > LIMITS.load_s
         return self._finished or is_stuck
 
     def _make_ready(self) -> Ready:
-        """Load everything that takes long; on the job's thread."""
+        """Load everything that takes a long time, on the job's thread."""
         opener = predictor = None
         self.settings = settings = self._read()
         file = settings.calibration.file
@@ -108,12 +108,12 @@ class Reconfiguration:
 
     def _listen(self, what: str, done: int, total: int | None) -> None:
         if self.abandoned:
-            raise Stopped("a newer change came")
+            raise Stopped("superseded by a newer change")
         if what:
             self.progress = f"{what}: {done} of {total}" if total else f"{what}: {done}" if done else what
 
     def _take_over(self, parts: RunningSolver, opener: Opener | None, predictor: Predictor | None) -> None:
-        """Replace the state and close the replaced parts; if the upload fails, keep everything."""
+        """Replace the state and close the replaced parts. If the upload fails, keep everything."""
         now, moved = parts.run.state.settings.content, {}
         if now.scene == self.settings.content.scene:  # another scene is placed as configured
             moved = moved_since(self._old.content, now)
@@ -136,7 +136,7 @@ class Reconfiguration:
             except PhasestackError as error:
                 self.problem = str(error)
                 return
-            except (Exception, SystemExit) as error:  # from a GL driver or a library: the present scene continues
+            except (Exception, SystemExit) as error:  # from a GL driver or a library: the current scene continues
                 self.problem = f"{self.settings.content.scene}: {written(error)}"
                 return
             undo.pop_all()
@@ -147,15 +147,15 @@ class Reconfiguration:
 
 
 def _tried(settings: Settings) -> None:
-    """Load an untrusted model and solve with it, in a child process that it may crash."""
+    """Load an untrusted model and solve with it in a child process, which it may crash."""
     ready_predictor(settings, settings.stack.stack()).close()
 
 
 def moved_since(before: ContentSettings, now: ContentSettings) -> dict[str, Any]:
-    """Return the settings of a scene's placement that have changed, with their new values."""
+    """Return the settings of the scene's placement that have changed, with their new values."""
     return {key: getattr(now, key) for key in PLACING if getattr(now, key) != getattr(before, key)}
 
 
 def _model_part(settings: Settings) -> Any:
-    """Return the model settings that need another predictor, without those that each solution reads."""
+    """Return the model settings whose change requires a new predictor."""
     return settings.model.model_copy(update={"budget_ms": 0.0, "eye_sigma_mm": "auto"})

@@ -1,4 +1,4 @@
-"""A solver with its GL context, content and model; one thread creates, uses and releases it."""
+"""Solver with its GL context, content and model. One thread creates, uses and releases it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ log = logging.getLogger("phasestack.solver")
 
 @dataclass(eq=False)
 class RunningSolver:
-    """`SolverParts` of a real run; created and used on one thread."""
+    """`SolverParts` of a real run, created and used on a single thread."""
 
     run: RunCell
     solver: Solver
@@ -45,24 +45,24 @@ class RunningSolver:
 
     @property
     def is_newest(self) -> bool:
-        """False once another solver has begun; then this one must not change anything."""
+        """Return False once another solver has begun, after which this one must not change anything."""
         return self.run.generation == self.generation
 
     def replace(self, **changes: Any) -> RunState:
-        """Call `RunCell.replace` for this solver; raises Stopped if another has begun."""
+        """Call `RunCell.replace` for this solver. Raises Stopped if another solver has begun."""
         before = self.run.replace(self.generation, **changes)
         self._owned = replace(before, **changes)
         return before
 
     @property
     def content(self) -> ContentSource:
-        """The present content."""
+        """Return the current content."""
         return self.run.state.content
 
     def step(self, request: SolveRequest) -> SolverUpdate:
         if self.contexts_lost() != self._lost_before:
             raise ContextLost("the panels have lost their OpenGL context")
-        state = self.run.state  # before looking whether it is another solver's
+        state = self.run.state  # before checking whether it belongs to another solver
         if not self.is_newest:
             raise Stopped("this solver was abandoned")
         self._owned = state
@@ -81,11 +81,11 @@ class RunningSolver:
             try:
                 release()
             except Exception as error:  # a lost context has nothing to release
-                log.warning("solver: closing it: %s", error)
+                log.warning("closing the solver: %s", error)
 
 
 class SolverMaker:
-    """Creates a solver on the calling thread; after a hang, another one with the present settings."""
+    """Creates a solver on the calling thread and, after a hang, another one with the current settings."""
 
     def __init__(
         self,
@@ -95,7 +95,7 @@ class SolverMaker:
         *,
         contexts_lost: Callable[[], int] = lambda: 0,
     ) -> None:
-        """contexts_lost: number lost by the panels; called on any thread."""
+        """contexts_lost: returns how many GL contexts the panels have lost; called on any thread."""
         self._settings, self._stack, self._calibration = settings, stack, calibration
         self.run: RunCell | None = None  # from the first solver on
         self.parts: RunningSolver | None = None  # the newest
@@ -104,7 +104,7 @@ class SolverMaker:
         self._prepared: tuple[ContentSettings, Opener] | None = None  # content that was read but not yet opened
 
     def __call__(self, *, context: Any = None, simulated: bool = False) -> RunningSolver:
-        """context: shared with the panels; None: a new one. Raises FatalError, leaving nothing open."""
+        """context: shared with the panels, or None for a new one. Raises FatalError, leaving nothing open."""
         own = context is None
         generation = self.run.begin() if self.run is not None else 0
         settings = self.run.state.settings if self.run is not None else self._settings
@@ -140,16 +140,16 @@ class SolverMaker:
         return parts
 
     def _opener(self, content: ContentSettings) -> Opener:
-        """Return the content that was read; the previous solver's if that did not get to open it."""
+        """Return content that has been read: the previous solver's, if that solver never opened it."""
         prepared = self._prepared
         if prepared is None or prepared[0] != content:
             prepared = self._prepared = content, prepare_content(content, self._stack)
         return prepared[1]
 
     def _chosen(self, predictor: Predictor, context: Any, *, simulated: bool) -> Choice:
-        """Choose the device; a restarted solver keeps the first choice.
+        """Choose the device. A restarted solver keeps the first choice.
 
-        Simulated time gains nothing from a faster one, and its runs must be identical to the byte.
+        On a simulated clock a faster device gains nothing, and runs must be identical to the byte.
         """
         device = "cpu" if simulated and self._device == "auto" else self._device
         choice = choose(device, predictor, lambda: context)

@@ -1,4 +1,4 @@
-"""Answers of the socket about a run: status, constant facts and pictures."""
+"""Answers of the socket about a run: its status, constant facts and pictures."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def placing_in(settings: Settings) -> dict[str, Any]:
 
 
 def holds(presenter: Presenter) -> dict[str, Any]:
-    """Return the operator's present choices, the answer to every command."""
+    """Return the operator's current choices, which are the answer to every command."""
     state = presenter.run_cell.state
     return {
         "scene": state.settings.content.scene,
@@ -51,7 +51,7 @@ def holds(presenter: Presenter) -> dict[str, Any]:
 
 
 def shown(presenter: Presenter, account: RefreshAccount, link: BrowserLink) -> dict[str, Any]:
-    """Return the figures of a refresh for a page that shows the panels."""
+    """Return a refresh's figures, for a page that shows the panels."""
     assert presenter.last is not None
     frame, solution = presenter.last.frame, presenter.last.solution
     return {
@@ -92,7 +92,7 @@ def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
         "eyes_label": account.eyes_label,
         "eye_sigma_now_mm": account.eye_sigma_mm,
         "solution": account.solution,
-        # A solution for an instant after this display time has no age yet.
+        # If the solution is for a later instant than this display time, it has no age yet.
         "solution_age_now_ms": None if account.solution_age_ms is None else max(0.0, account.solution_age_ms),
         "effort": account.effort,
         "light_db": None if run.observer.moment is None else run.observer.moment.light_db,
@@ -107,7 +107,7 @@ def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
 
 
 def _view_error_now_mm(account: RefreshAccount) -> float | None:
-    """Distance from the tracker's eyes to those solved for; None: no viewer, or no solution is shown."""
+    """Distance from the tracked eyes to those solved for; None without a viewer or a solution."""
     if account.eyes_m is None or account.solved_for_m is None:
         return None
     return round(view_error_mm(account.eyes_m, account.solved_for_m), 2)
@@ -130,7 +130,7 @@ def about(run: Run) -> dict[str, Any]:
 def library_scenes(settings: ContentSettings) -> tuple[str, ...]:
     """Return the paths of the library folder's scenes, up to the page's limit.
 
-    Names that are not printable UTF-8 are skipped: no setting can hold them.
+    Names that are not printable UTF-8 are skipped, because no setting can contain them.
     """
     if not settings.library:
         return ()
@@ -144,7 +144,7 @@ def library_scenes(settings: ContentSettings) -> tuple[str, ...]:
 
 
 def pictures(run: Run) -> dict[str, Any]:
-    """Return the pictures shown now, as JPEGs in base64, for the page."""
+    """Return the current pictures, as JPEGs in base64, for the page."""
     refresh = run.presenter.last
     if refresh is None:
         return {"frame": None, "jpegs": {}}
@@ -160,8 +160,8 @@ JPEG_QUALITY = 80  # of the page's small pictures
 def pictures_of(refresh: Refresh, stack: PanelStack, *, fov_deg: float) -> dict[str, bytes]:
     """Return JPEGs of a refresh: `layer-0` (rear) onwards, `seen-left`, `seen-right`.
 
-    Layers are those of the solution, reduced, and seen from the eyes solved for: exact ones would take longer than a
-    refresh.
+    The layers are the solution's, reduced, and the views are from the eyes solved for: exact ones would take longer
+    than a refresh.
     """
     frame, account = refresh.frame, refresh.account
     is_flat = frame.solved is None or (frame.flat is not None and frame.flatness > 0.5)

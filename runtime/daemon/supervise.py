@@ -1,4 +1,4 @@
-"""The supervised run: signals, systemd, the status socket and operators' commands."""
+"""Supervised run: signals, systemd, the status socket and operators' commands."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from runtime.support.memory import keep_freed_memory
 
 log = logging.getLogger("phasestack.daemon")
 
-PANEL_RETRY_S = 1.0  # between two looks for a panel that is missing at the start
+PANEL_RETRY_S = 1.0  # interval between checks for a panel that is missing at the start
 
 
 class Daemon(Host):
-    """Supervisor of a run: between two refreshes it takes in signals and commands and passes on the news.
+    """Supervises a run: between refreshes it handles signals and commands and publishes the status.
 
-    Only the presenter's thread calls its methods and touches its attributes. The status server's thread calls the
+    Only the presenter's thread calls its methods and accesses its attributes. The status server's thread calls the
     functions in `lookups` and the last published snapshot, which read frozen values and thread-safe counters.
     """
 
@@ -51,7 +51,7 @@ class Daemon(Host):
         recorder: Recorder | None = None,
         options: RunOptions | None = None,
     ) -> None:
-        """read_settings: reads the present configuration, on the loading thread; raises InputError."""
+        """read_settings: reads the current configuration, on the loading thread; raises InputError."""
         self._until = (options or RunOptions()).until
         self._link = (options or RunOptions()).browser
         self._read_settings = read_settings
@@ -98,7 +98,7 @@ class Daemon(Host):
             self._server.lookups |= {"log": self.recorder.look_at_log} if self.recorder is not None else {}
 
     def wait_for_panel(self, why: str) -> bool:
-        """Report that a panel is missing and wait a second, as a service; by hand, refuse."""
+        """As a service, report that a panel is missing and wait a second; in a run by hand, refuse."""
         if not self._notifier.supervised or self._signals.stop:
             return False
         if why != self._waits_for:
@@ -145,7 +145,7 @@ class Daemon(Host):
                 self._write_black_box(command)
 
     def _write_black_box(self, command: Command) -> None:
-        """Write the black box to a file; its writer's thread answers the command."""
+        """Write the black box to a file. The writer's thread answers the command."""
         if self.recorder is None:
             command.refuse("this run has no black box")
             return
@@ -160,7 +160,7 @@ class Daemon(Host):
 
 
 def _news(loading: Reconfiguration | None, refused: str, recorder: Recorder | None) -> dict[str, Any]:
-    """Return the status entries about the change that is loading, the last refusal and the black box."""
+    """Return the status entries about the change being loaded, the last refusal and the black box."""
     news: dict[str, Any] = {} if loading is None else {"loading": loading.progress}
     if refused:
         news["refused"] = refused
@@ -171,7 +171,7 @@ def _news(loading: Reconfiguration | None, refused: str, recorder: Recorder | No
 def run_daemon(read_settings: Callable[[], Settings], options: RunOptions) -> dict[str, Any]:
     """Run `phasestack run` from start to stop, and return the summary.
 
-    Raises FatalError for a wrong configuration or file, TransientError where another start may help.
+    Raises FatalError for a wrong configuration or file, TransientError if another start may help.
     """
     keep_freed_memory()  # before anything starts threads
     settings = read_settings()

@@ -1,4 +1,4 @@
-"""Figures of the status in Prometheus's text format, under their names in JSON."""
+"""The status's figures in Prometheus's text format, under their JSON names."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ TEXTS = ("state", "effort", "model", "scene")
 
 
 def exposition(status: Mapping[str, Any]) -> str:
-    """All numbers of a status, with labels for quantiles, tables and texts; nulls are skipped."""
+    """Format all numbers of a status, with labels for quantiles, tables and texts. Nulls are skipped."""
     return "".join(f"{line}\n" for line in _lines(status))
 
 
@@ -33,7 +33,7 @@ def _lines(status: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _key(field: str, key: str) -> str:
-    """Label of an entry: `p95` is the quantile 0.95, `max` the quantile 1."""
+    """Return an entry's label: `p95` is the quantile 0.95, `max` the quantile 1."""
     if field in TABLES:
         return _label(TABLES[field], key)
     if key[:1] == "p" and key[1:].isdigit():

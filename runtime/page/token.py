@@ -17,7 +17,7 @@ MOST_BYTES = 4096  # read from its file
 
 
 def token_of(path: Path) -> str:
-    """Return the token in a file, created if missing. Raises InputError, naming the file."""
+    """Return the token in a file, which is created if missing. Raises InputError, naming the file."""
     token, name = secrets.token_urlsafe(TOKEN_BYTES), ""
     try:
         if not os.path.lexists(path):
@@ -49,10 +49,16 @@ def _read(path: Path) -> str:
         if status.st_uid != os.geteuid():
             raise InputError(path, "", f"belongs to another user (number {status.st_uid}), who knows the token")
         if status.st_mode & 0o077:
-            raise InputError(path, "", f"others may read it (mode {status.st_mode & 0o777:o}): chmod 600, or delete it")
+            raise InputError(
+                path, "", f"others may read it (mode {status.st_mode & 0o777:o}): chmod it to 600, or delete it"
+            )
         token = (opened.read(MOST_BYTES) or b"").decode("ascii", "replace").strip()
     if len(token) < LEAST_CHARACTERS or not token.isprintable() or " " in token:
-        raise InputError(path, "", f"holds no token: at least {LEAST_CHARACTERS} characters on one line; or delete it")
+        raise InputError(
+            path,
+            "",
+            f"contains no token of at least {LEAST_CHARACTERS} characters on one line",
+        )
     return token
 
 

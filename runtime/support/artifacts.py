@@ -1,4 +1,4 @@
-"""Write files and pictures atomically: under a temporary name, synced and renamed."""
+"""Atomic writing of files and pictures: under a temporary name, then synced and renamed."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def put_in_place(part: Path, path: Path) -> None:
 def write_bytes(path: Path, data: bytes, *, like: Path | None = None) -> None:
     """Write a file atomically, creating its parents. Raises InputError.
 
-    like: file whose owner and mode to copy; None: the file replaced, if there is one.
+    like: file whose owner and mode are copied; None for the replaced file, if there is one.
     """
     like = like or path
     try:
@@ -78,7 +78,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def to_json(value: Any) -> str:
-    """Format as JSON; arrays become lists, non-finite numbers null."""
+    """Format as JSON. Arrays become lists, and non-finite numbers become null."""
     try:
         return json.dumps(value, allow_nan=False, default=_listed)
     except (ValueError, TypeError):  # a non-finite number, or a key that is not a string
@@ -86,10 +86,10 @@ def to_json(value: Any) -> str:
 
 
 def _listed(item: Any) -> Any:
-    """Convert objects unknown to the encoder."""
+    """Convert objects that the encoder does not know."""
     if isinstance(item, np.ndarray | np.generic):
         return item.tolist()
-    raise TypeError(f"{type(item).__name__} can't be written as JSON")
+    raise TypeError(f"objects of type {type(item).__name__} can't be written as JSON")
 
 
 def _finite(item: Any) -> Any:
@@ -126,8 +126,8 @@ def write_png(path: Path, image: U8) -> None:
 class OutputFolder:
     """A folder whose new files appear together at the end, or not at all.
 
-    A context manager: write to `staging`. On success all files are renamed into `target`, replacing those of the same
-    names; on an error no new file remains. The next writer removes a killed process's staged files.
+    It is a context manager: write to `staging`. On success all files are renamed into `target`, replacing files of the
+    same names; after an error no new file remains. Staged files of a killed process are removed by the next writer.
     """
 
     def __init__(self, target: Path) -> None:
@@ -190,7 +190,7 @@ class OutputFolder:
 
 
 def _sweep(target: Path) -> None:
-    """Remove staging folders of killed processes: those that are not locked, which works across namespaces."""
+    """Remove staging folders of killed processes, recognised by their missing lock, even across namespaces."""
     for stale in target.glob(f"{STAGING}*"):
         with suppress(OSError):
             opened = os.open(stale, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
@@ -202,14 +202,14 @@ def _sweep(target: Path) -> None:
 
 
 def _check_free(place: Path, *, within: Path) -> None:
-    """Raise InputError if a folder is in a file's place, or a file in the place of a folder it needs."""
+    """Raise InputError if a folder is in a file's place, or a file in a folder's place."""
     for folder in place.parents:
         if folder == within:
             break
         if folder.exists() and not folder.is_dir():
-            raise InputError(folder, "", "is not a folder, and is in the way of an output")
+            raise InputError(folder, "", "is not a folder, and blocks an output")
     if place.is_dir():
-        raise InputError(place, "", "is a folder, and is in the way of an output")
+        raise InputError(place, "", "is a folder, and blocks an output of that name")
 
 
 @contextmanager

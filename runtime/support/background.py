@@ -19,7 +19,7 @@ PRESENTER_NICENESS = -10
 SOLVER_NICENESS = 5
 BACKGROUND_NICENESS = 10
 MEASURING_NICENESS = 15  # of measurements and files, which are not urgent
-STOPS_WITHIN_S = 1.2  # after a stop request; the rest of the two seconds is for calls without a timeout
+STOPS_WITHIN_S = 1.2  # limit after a stop request; the rest of the two seconds is for calls without a timeout
 T = TypeVar("T")
 
 _ends_by_s = math.inf
@@ -34,7 +34,7 @@ def ends_by(at_s: float) -> None:
 
 
 def patience_s(most_s: float) -> float:
-    """Timeout for a thread that may be abandoned: `most_s`, or the time to the deadline if that is less."""
+    """Return the timeout for a thread that may be abandoned: `most_s` or the time to the deadline."""
     return max(0.0, min(most_s, _ends_by_s - time.monotonic()))
 
 
@@ -61,12 +61,12 @@ class ThreadAbandoned(BaseException):
 
 
 def abandon(thread: threading.Thread) -> None:
-    """Have a thread end its work at the next `raise_if_abandoned`."""
+    """Make a thread end its work at its next `raise_if_abandoned`."""
     _abandoned.add(thread)
 
 
 def raise_if_abandoned() -> None:
-    """Raise ThreadAbandoned on an abandoned thread; for calls between operations like drawing.
+    """Raise ThreadAbandoned on an abandoned thread; called between operations such as drawing.
 
     An asynchronous exception could arrive inside a call to moderngl, which would crash.
     """
@@ -75,7 +75,7 @@ def raise_if_abandoned() -> None:
 
 
 class BackgroundJob(Generic[T]):
-    """A job that starts on construction; `done`, `problem` and `take` never block."""
+    """A job that starts on construction. `done`, `problem` and `take` never block."""
 
     def __init__(self, name: str, work: Callable[[], T], *, niceness: int = BACKGROUND_NICENESS) -> None:
         self._name, self._work, self._niceness = name, work, niceness
@@ -94,7 +94,7 @@ class BackgroundJob(Generic[T]):
             self._thread.join(patience_s(timeout_s))
 
     def take(self) -> T | None:
-        """Hand over the result; None if there is none yet or it was already taken."""
+        """Hand over the result, or None if there is none yet or it has already been taken."""
         result, self._result = self._result, None
         return result
 
@@ -115,7 +115,7 @@ class BackgroundJob(Generic[T]):
 
 @contextmanager
 def niceness(value: int) -> Iterator[None]:
-    """Set the calling thread's niceness within a block and restore it afterwards."""
+    """Set the calling thread's niceness within a block, and restore it afterwards."""
     before = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
     set_niceness(value)
     try:

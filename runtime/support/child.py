@@ -1,6 +1,6 @@
-"""Process untrusted files in a child process with limits on memory and time.
+"""Processing of untrusted files in a child process with limits on memory and time.
 
-Parsers hold Python's lock, and a small file may make them use all memory. A result's arrays return in shared memory;
+Parsers hold Python's lock, and a small file may make them use all memory. The result's arrays return in shared memory;
 progress, log lines and errors are forwarded as if the work ran in this process.
 """
 
@@ -42,7 +42,7 @@ T = TypeVar("T")
 def in_child(
     work: Callable[..., T], *args: Any, source: str | Path, seconds: float, memory_bytes: int | None = None
 ) -> T:
-    """Call `work(*args)`, a module's function, in a child process and return its result.
+    """Call `work(*args)`, a module-level function, in a child process, and return its result.
 
     memory_bytes: limit; None: `MEMORY_MAX`. The child is killed if the progress listener raises. Raises phasestack's
     errors from `work`; InputError, naming `source`, if it exceeds a limit, fails or ends the process; TransientError
@@ -65,7 +65,7 @@ def in_child(
         )
     except OSError as error:
         os.close(memory)
-        raise TransientError(f"{source}: no process can be started for it ({error.strerror})") from error
+        raise TransientError(f"{source}: no process can be started to read it ({error.strerror})") from error
     finally:
         theirs.close()
     with child, ours:
@@ -83,7 +83,7 @@ def in_child(
 
 
 def _outcome(channel: Connection, source: str, seconds: float) -> tuple[bytes, list[int]] | None:
-    """Pickle of the result and sizes of its arrays; None if the child ended without a result."""
+    """Return the pickled result and its arrays' sizes, or None if the child ended without a result."""
     end_s, step = time.monotonic() + seconds, (f"reading {Path(source).name}", 0, None)
     while True:
         try:
@@ -105,7 +105,7 @@ def _outcome(channel: Connection, source: str, seconds: float) -> tuple[bytes, l
 
 
 def _mapped(memory: int, sizes: list[int]) -> list[memoryview | bytearray]:
-    """Map the arrays copy-on-write; small ones are copied, so as not to keep the whole mapping alive."""
+    """Map the arrays copy-on-write. Small ones are copied, so that they don't keep the mapping alive."""
     total = sum(map(_room, sizes))
     whole = memoryview(mmap.mmap(memory, total, flags=mmap.MAP_PRIVATE) if total else b"")
     ends = [sum(map(_room, sizes[: number + 1])) for number in range(len(sizes))]
@@ -175,7 +175,7 @@ def main(channel: Connection, memory: int) -> None:
 
 
 def _passing(error: BaseException | None) -> OSError | None:
-    """Transient system error that caused a refusal, for `is_retryable`.
+    """Return the transient system error that caused a refusal, for `is_retryable`.
 
     Ends the process on a MemoryError, which means that it hit its limit.
     """

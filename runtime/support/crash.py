@@ -1,4 +1,4 @@
-"""Report an unexpected exception: the traceback in a file, one line for people."""
+"""Report of an unexpected exception: the traceback in a file, one line for people."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ KEPT = 20  # newest files kept per folder, so that a service that fails repeated
 
 
 def written(error: BaseException) -> str:
-    """Write an exception's report; returns one line that names the file. Never raises."""
+    """Write an exception's report. Returns one line that names the file. Never raises."""
     from runtime.support.version import version
 
     summary = one_line(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__)
@@ -50,7 +50,7 @@ def written(error: BaseException) -> str:
 
 
 def watch_threads() -> None:
-    """Report exceptions that end a thread, and those that Python can't raise, in one line."""
+    """Report, in one line, exceptions that end a thread and exceptions that Python can't raise."""
     threading.excepthook = lambda hook: _say(hook.exc_value, hook.exc_type)
     sys.unraisablehook = lambda hook: _say(hook.exc_value, hook.exc_type)
 

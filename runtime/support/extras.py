@@ -1,4 +1,4 @@
-"""Find the extra of phasestack that installs a missing optional package."""
+"""Lookup of the extra of phasestack that installs a missing optional package."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ NOT_TO_RUN = frozenset({"all", "docs", "test"})
 
 
 def missing_extra(error: BaseException) -> MissingPart | None:
-    """Error with the extra to install for a failed import; None if no extra has the package."""
+    """Return an error that names the extra to install, or None if no extra contains the package."""
     if not isinstance(error, ModuleNotFoundError) or not error.name:
         return None
     module = error.name.partition(".")[0]
@@ -23,7 +23,7 @@ def missing_extra(error: BaseException) -> MissingPart | None:
 
 
 def _extras_with(package: str) -> list[str]:
-    """Extras that name a package, in pyproject.toml's order."""
+    """Return the extras that contain a package, in the order of pyproject.toml."""
     try:
         lines = requires("phasestack") or []
     except PackageNotFoundError:

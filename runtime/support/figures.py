@@ -1,4 +1,4 @@
-"""Format a record as lines for people, under the same names as in JSON."""
+"""Formatting of a record as lines for people, with the same names as in JSON."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ def shown(record: Mapping[str, Any], *, as_json: bool) -> str:
 
 
 def lines_of(record: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a line per field, or per object of a list, without null, false and empty values.
+    """Yield one line per field, or one per object in a list, skipping null, false and empty values.
 
-    Line breaks in values are replaced.
+    Line breaks within values are replaced.
     """
     for name, value in record.items():
         is_list = isinstance(value, list | tuple) and all(isinstance(item, dict) for item in value)
@@ -29,7 +29,7 @@ def lines_of(record: Mapping[str, Any]) -> Iterator[str]:
 
 
 def in_words(value: Any) -> str:
-    """Format a value on one line; empty for null and false."""
+    """Format a value on one line. Null and false give an empty string."""
     match value:
         case None | False:
             return ""

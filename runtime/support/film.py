@@ -1,4 +1,4 @@
-"""Open films with OpenCV's FFmpeg backend, restricted to the named file."""
+"""Opening of films with OpenCV's FFmpeg backend, restricted to the named file."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _alone = threading.Lock()
 
 
 def open_film(path: Path) -> cv2.VideoCapture:
-    """Open a film. FFmpeg's and OpenCV's own messages are suppressed; ours name the file.
+    """Open a film. FFmpeg's and OpenCV's messages are suppressed, because ours name the file.
 
-    The restrictions matter because a playlist or script with a film's suffix, or a name that looks like a URL, would
-    make FFmpeg open other files and connections. Raises InputError for anything but a file.
+    FFmpeg is restricted because a playlist or script with a film's suffix, or a name that looks like a URL, would make
+    it open other files and connections. Raises InputError for anything but a file.
     """
     untrusted_input.open_regular(path).close()
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")

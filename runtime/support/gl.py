@@ -1,4 +1,4 @@
-"""The offscreen OpenGL context: EGL with any driver (Mesa's llvmpipe at least)."""
+"""Offscreen OpenGL context, through EGL with any driver (at least Mesa's llvmpipe)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ EGL: dict[str, Any] = {"backend": "egl", "libegl": "libEGL.so.1", "libgl": "libG
 
 
 def offscreen_context() -> moderngl.Context:
-    """Create an offscreen context, current on this thread; content and offscreen panels share it.
+    """Create an offscreen context and make it current. Content and offscreen panels share it.
 
     Use it on one thread only. Raises MissingPart, naming Debian's packages, if EGL has no OpenGL 3.3.
     """
@@ -43,7 +43,7 @@ def offscreen_context() -> moderngl.Context:
 
 
 def leave_context() -> None:
-    """Make no context current on this thread: releasing the current one would leak it."""
+    """Make no context current on this thread, because releasing the current one would leak it."""
     egl, pointer = ctypes.CDLL(EGL["libegl"]), ctypes.c_void_p
     egl.eglGetCurrentDisplay.restype, egl.eglMakeCurrent.argtypes = pointer, [pointer] * 4
     egl.eglMakeCurrent(egl.eglGetCurrentDisplay(), None, None, None)
@@ -85,6 +85,6 @@ class DrawnPicture:
 
 
 def describe(context: moderngl.Context) -> dict[str, str]:
-    """Vendor, renderer and version as reported by the driver."""
+    """Return the vendor, renderer and version that the driver reports."""
     info = context.info
     return {"vendor": str(info["GL_VENDOR"]), "renderer": str(info["GL_RENDERER"]), "version": str(info["GL_VERSION"])}

@@ -1,6 +1,6 @@
 """Log lines for people and for journald.
 
-Repeated faults are rate-limited, messages can't forge lines, and logging never blocks on a slow reader.
+Repeated messages are rate-limited, messages can't forge lines, and logging never blocks on a slow reader.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ PRIORITY = {
     logging.CRITICAL: "<2>",
 }
 ROOTS = ("phasestack", "runtime")  # loggers named by subject, and by module
-BURST = 5  # equal messages passed in `QUIET_NS`
+BURST = 5  # number of equal messages passed within `QUIET_NS`
 REMEMBERED = 1000  # different messages counted
 QUIET_NS = 30 * NS_PER_S  # after which a suppressed message passes again
 QUEUED_MAX = 4096  # lines waiting for a reader
@@ -39,7 +39,7 @@ LINE_MAX = 4000  # characters
 
 
 class TextFormat(logging.Formatter):
-    """Format messages with a priority under journald (which adds the time), else with time and level."""
+    """Formats messages with a priority under journald, which adds the time, else with time and level."""
 
     def __init__(self, *, journald: bool) -> None:
         super().__init__()
@@ -56,7 +56,7 @@ class TextFormat(logging.Formatter):
 
 
 class RateLimit(logging.Filter):
-    """Passes five equal messages in half a minute; the next one gives the number suppressed.
+    """Passes five equal messages in half a minute. The next one that passes gives the number suppressed.
 
     Records with `extra={"always": True}` (state transitions) always pass.
     """
@@ -86,14 +86,14 @@ class RateLimit(logging.Filter):
 
 
 class _Lines(logging.Handler):
-    """Writes lines to a descriptor, blocking on its reader: used on the listener's thread."""
+    """Writes lines to a descriptor, and blocks if its reader is slow; used on the listener's thread."""
 
     def __init__(self, descriptor: int) -> None:
         super().__init__()
         self._descriptor = descriptor
 
     def createLock(self) -> None:
-        """Use no lock: only one thread writes, and shutting logging down must not block on it."""
+        """Use no lock, because only one thread writes, and shutting down logging must not block."""
         self.lock = None
 
     def emit(self, record: logging.LogRecord) -> None:
@@ -102,7 +102,7 @@ class _Lines(logging.Handler):
 
 
 class QueuedLines(QueueHandler):
-    """Puts records into a bounded queue for a writer thread; drops lines when it is full."""
+    """Puts records into a bounded queue for a writer thread, and drops lines when the queue is full."""
 
     def __init__(self, descriptor: int, form: logging.Formatter) -> None:
         self.queue: queue.Queue[Any] = queue.Queue(QUEUED_MAX)
@@ -113,7 +113,7 @@ class QueuedLines(QueueHandler):
         self._listener.start()
 
     def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
-        """Format the message now, and leave the exception, which takes longer, to the listener."""
+        """Format the message now, but leave the exception, which takes longer, to the listener."""
         prepared = copy.copy(record)
         prepared.msg, prepared.args = record.getMessage(), None
         return prepared
@@ -123,7 +123,7 @@ class QueuedLines(QueueHandler):
             self.queue.put_nowait(record)
 
     def flush(self) -> None:
-        """Wait up to `CLOSE_S` for queued lines."""
+        """Wait up to `CLOSE_S` until queued lines are written."""
         deadline_s = time.monotonic() + CLOSE_S
         while self.queue.unfinished_tasks and time.monotonic() < deadline_s:
             time.sleep(0.005)
@@ -153,6 +153,6 @@ def configure(
 
 
 def flush() -> None:
-    """Wait up to `CLOSE_S` for queued lines, before ending the process without Python's clean-up."""
+    """Wait up to `CLOSE_S` until queued lines are written, before a process ends without clean-up."""
     for handler in logging.getLogger(ROOTS[0]).handlers:
         handler.flush()

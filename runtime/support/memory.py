@@ -1,4 +1,4 @@
-"""Keep freed memory for the next frame, or return it to the system."""
+"""Control of freed memory: keep it for the next frame, or return it to the system."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ def give_back() -> None:
 
 @cache
 def keep_freed_memory() -> bool:
-    """Make glibc's malloc keep large blocks for the next frame; returns False with another C library.
+    """Make glibc's malloc keep large blocks for the next frame. Returns False with another C library.
 
-    By default every picture gets a new mapping and faults on the first use of each page, which takes a quarter of the
-    time of a prediction at 1920x1080. All threads share `ARENAS` heaps, because each heap keeps up to `MOST_KEPT`; so
-    call this before starting threads.
+    By default every picture gets a new mapping, and the page faults on first use take a quarter of the time of a
+    prediction at 1920x1080. All threads share `ARENAS` heaps, because each heap keeps up to `MOST_KEPT`. Call this
+    before starting threads.
     """
     if sys.platform != "linux":
         return False

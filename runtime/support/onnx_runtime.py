@@ -1,4 +1,4 @@
-"""The runtime's only import of onnxruntime, with telemetry disabled."""
+"""Import of onnxruntime with telemetry disabled; nothing else in the runtime imports it."""
 
 from __future__ import annotations
 

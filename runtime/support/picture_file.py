@@ -1,4 +1,4 @@
-"""Read picture files as upright 8-bit sRGB over a colour: stills, stereo pairs, animations."""
+"""Reading of picture files as upright 8-bit sRGB over a colour: stills, stereo pairs, animations."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def read_image(path: Path, *, background: Colour = WHITE) -> U8:
 
 
 def read_views(path: Path, *, background: Colour = WHITE) -> list[U8]:
-    """Read one picture, or the left and right eye's if the file has both, as `read_image` does."""
+    """Read one picture, or the left and right eye's if the file contains both, as `read_image` does."""
     data, header = read_coded(path)
     if header.warning:
         log.warning("%s: %s", path, header.warning)
@@ -99,7 +99,9 @@ def rgb_of(image: Any, source: object, *, background: Colour = WHITE) -> U8:
     profile = image.info.get("icc_profile")
     image = _upright(image)
     if image.mode == "F" or (image.mode == "I" and image.format not in (None, "PPM")):
-        raise InputError(str(source), "", "holds values without a range (32 bits): save it with 8 or 16 bits a channel")
+        raise InputError(
+            str(source), "", "its 32-bit values have no defined range: save it with 8 or 16 bits per channel"
+        )
     colours = "CMYK" if image.mode == "CMYK" else "L" if image.mode in ("1", "L", "LA", *DEEP) else "RGB"
     to_srgb = _to_srgb(profile, colours, source) if profile else None
     is_clear = image.has_transparency_data
@@ -139,7 +141,7 @@ def _eight_bits(image: Any) -> Any:
 
 
 def _to_srgb(profile: bytes, colours: str, source: object) -> Any:
-    """A function from an image in the profile's colours to sRGB; None for sRGB itself or a broken profile."""
+    """Return a function that converts from a profile's colours to sRGB; None for sRGB or a broken profile."""
     try:
         transform = ImageCms.buildTransform(
             ImageCms.ImageCmsProfile(io.BytesIO(profile)),

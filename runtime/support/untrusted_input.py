@@ -1,4 +1,4 @@
-"""Untrusted input (paths, files, JSON, numbers), read in one place and within limits.
+"""Reading of untrusted input (paths, files, JSON, numbers), in one place and within limits.
 
 Every reader of untrusted bytes uses this module. A fault is an InputError, one line that names the file and the
 field; a value over a limit is reported with the limit.
@@ -50,7 +50,7 @@ def checked_path(path: str | Path, *, source: str | Path = "", field: str = "") 
     try:
         os.lstat(path)
     except ValueError:
-        raise InputError(source or str(path), field, "the path holds a NUL character, or is not UTF-8") from None
+        raise InputError(source or str(path), field, "the path contains a NUL character, or is not UTF-8") from None
     except OSError as error:
         if error.errno == errno.ENAMETOOLONG:
             raise InputError(source or str(path), field, f"is not a valid path ({error.strerror})") from None
@@ -58,7 +58,7 @@ def checked_path(path: str | Path, *, source: str | Path = "", field: str = "") 
 
 
 def is_there(path: str | Path, *, folder: bool = False) -> bool:
-    """Return True if something, or a folder, is at a path. Raises InputError if that cannot be asked."""
+    """Return True if something (or a folder) exists at a path. Raises InputError if that is unknown."""
     checked = checked_path(path)
     try:
         return checked.is_dir() if folder else checked.exists()
@@ -84,7 +84,7 @@ def open_regular(
         if not stat.S_ISREG(status.st_mode):
             raise InputError(name, field, f"is {_kind(status.st_mode)}, not a file")
         if most_bytes is not None and status.st_size > most_bytes:
-            raise InputError(name, field, f"has {_size(status.st_size)}; at most {_size(most_bytes)}")
+            raise InputError(name, field, f"has {_size(status.st_size)}; the maximum is {_size(most_bytes)}")
         return os.fdopen(number, "rb")
     except BaseException:
         os.close(number)

@@ -334,4 +334,4 @@ def test_a_run_that_saw_nobody_can_be_looked_into_too(tmp_path: Path) -> None:
     options = ["--config", config, "--replay", tmp_path / "r.mcap", "--headless", "--max-speed", "--out", out]
     assert phasestack_command("run", *options).returncode == 0
     page = (out / "viewer.html").read_text()
-    assert "No viewer was seen" in page and page.count("data:image/webp;base64,") == 3 and '"follows": false' in page
+    assert "no viewer was seen" in page and page.count("data:image/webp;base64,") == 3 and '"follows": false' in page

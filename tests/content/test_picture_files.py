@@ -307,7 +307,7 @@ def test_every_mode_of_colours_is_read(tmp_path: Path, mode: str) -> None:
 
 def test_values_without_a_range_are_refused(tmp_path: Path) -> None:
     Image.fromarray(np.full((20, 20), 0.5, np.float32)).save(tmp_path / "a.tif")
-    with pytest.raises(InputError, match=r"a\.tif: holds values without a range"):
+    with pytest.raises(InputError, match=r"a\.tif: its 32-bit values have no defined range"):
         read_image(tmp_path / "a.tif")
 
 

@@ -285,7 +285,7 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
         "uri: gone.bin does not exist",
     ),
     "nothing": (gltf(meshes=[], nodes=[], scenes=[{"nodes": []}]), "faces: there are none"),
-    "a URI with NUL": (gltf(buffers=[{"byteLength": 48, "uri": "a%00b.bin"}]), "uri: the path holds a NUL"),
+    "a URI with NUL": (gltf(buffers=[{"byteLength": 48, "uri": "a%00b.bin"}]), "uri: the path contains a NUL"),
     "a long name": (
         gltf(buffers=[{"byteLength": 48, "uri": "a" * 300}]),
         "uri: is not a valid path (File name too long)",

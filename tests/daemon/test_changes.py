@@ -179,7 +179,7 @@ def test_a_newer_scene_overtakes_one_that_is_being_loaded(served: Served, gate: 
     first, answers = loading(served, "texture")
     assert served.asked("scene", "sparse", meanwhile=gate.set)["ok"]
     first.join(30.0)
-    assert answers == [{"ok": False, "error": "skipped: a newer change came"}]
+    assert answers == [{"ok": False, "error": "skipped in favour of a newer change"}]
     assert served.rig.content.info.name == "sparse"
 
 
@@ -248,7 +248,7 @@ def test_a_reload_refuses_what_is_read_only_at_the_start(
     """`[loop]` and `calibration.ipd_m` were accepted, and changed nothing."""
     served.config.write_text(configuration(**change))
     answer = served.asked("reload")
-    assert answer == {"ok": False, "error": f"reload: {name}: a change needs a restart of the service"}
+    assert answer == {"ok": False, "error": f"reload: {name}: changing this requires a restart of the service"}
 
 
 def test_only_the_presenter_s_thread_writes_what_was_chosen(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -411,7 +411,9 @@ def test_changes_load_one_at_a_time_and_only_the_newest_waits(served: Served, mo
     asking.start()
     served.rig.refresh_until(lambda: len(answers) == len(names))
     assert at_once[1] == 1 and len(begun) <= 4
-    assert [answer.get("error", "") for answer in answers].count("skipped: a newer change came") == len(names) - 1
+    assert [answer.get("error", "") for answer in answers].count("skipped in favour of a newer change") == len(
+        names
+    ) - 1
     assert served.status()["model"] == "sart"
 
 

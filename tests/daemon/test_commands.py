@@ -139,5 +139,5 @@ def test_every_command_arrives(
 
 
 def test_a_refusal_is_bad_input(server: StatusServer) -> None:
-    with pytest.raises(InputError, match="place needs an object"):
+    with pytest.raises(InputError, match="place requires an object"):
         ctl.tell({"command": "place", "value": 1e8}, configuration(server.path))

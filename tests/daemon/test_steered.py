@@ -38,8 +38,8 @@ def test_a_scene_is_moved_at_once_and_put_back(tmp_path: Path) -> None:
 
 def test_a_place_that_is_none_is_refused_and_the_scene_stays(tmp_path: Path) -> None:
     refusals = [
-        ({"offset": 1}, "value.offset: place takes scale"),
-        ("left", "value: place needs an object"),
+        ({"offset": 1}, "value.offset: place accepts only scale"),
+        ("left", "value: place requires an object"),
         ({"scale": "large"}, "place: scale:"),
         ({"scale": 1e9}, "place: scale:"),
         ({"offset_m": [0, 0]}, "place: offset_m.2:"),
@@ -70,7 +70,7 @@ def test_a_playlist_is_shown_and_gone_through(tmp_path: Path) -> None:
         answer = served.asked("scene", str(path))  # seen: a number that nothing can hold ended the daemon
         assert not answer["ok"] and "show[0].seconds: " in answer["error"]
         assert served.asked("scene", "flat")["ok"]
-        assert "no playlist" in served.asked("next")["error"]
+        assert "not a playlist" in served.asked("next")["error"]
 
 
 def test_the_library_is_offered_with_the_scenes(tmp_path: Path) -> None:

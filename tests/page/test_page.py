@@ -154,7 +154,7 @@ def test_wishes_reach_the_daemon_and_its_refusals_the_page(page: Page, loop: Loo
     code, answer = page.tell("scene", "missing")
     assert (code, answer["error"]) == (409, "nobody knows 'missing'")
     code, answer = page.tell("place", "much")
-    assert (code, answer["error"]) == (409, "value: place needs an object of settings, or null for the configured ones")
+    assert (code, answer["error"]) == (409, "value: place requires an object of settings, or null for the configured ones")
     assert loop.told == [("scene", "grey"), ("place", {"scale": 2.0}), ("scene", "missing")]
 
 
@@ -241,7 +241,7 @@ def test_connections_that_ask_nothing_shut_nobody_out(page: Page, loop: Loop) ->
 
 @pytest.mark.parametrize(
     ("text", "mode", "problem"),
-    [("a" * 40, 0o640, "others may read it"), ("short", 0o600, "holds no token"), ("", 0o600, "holds no token")],
+    [("a" * 40, 0o640, "others may read it"), ("short", 0o600, "contains no token"), ("", 0o600, "contains no token")],
 )
 def test_a_token_file_that_is_none_is_refused(tmp_path: Path, text: str, mode: int, problem: str) -> None:
     path = tmp_path / "token"
