@@ -154,7 +154,10 @@ def test_wishes_reach_the_daemon_and_its_refusals_the_page(page: Page, loop: Loo
     code, answer = page.tell("scene", "missing")
     assert (code, answer["error"]) == (409, "nobody knows 'missing'")
     code, answer = page.tell("place", "much")
-    assert (code, answer["error"]) == (409, "value: place requires an object of settings, or null for the configured ones")
+    assert (code, answer["error"]) == (
+        409,
+        "value: place requires an object of settings, or null for the configured ones",
+    )
     assert loop.told == [("scene", "grey"), ("place", {"scale": 2.0}), ("scene", "missing")]
 
 
