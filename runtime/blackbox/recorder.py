@@ -1,4 +1,4 @@
-"""The last minutes of a run in memory, written to an MCAP file on request or after a fault.
+"""Black box: keeps a run's last minutes, and writes them to MCAP on request or after a fault.
 
 Every few seconds new messages go to a journal on the disk, which an orderly end of the run deletes. After a power cut
 or a kill the next run finds it and renames it to a file of the kind `cut`.
@@ -173,7 +173,7 @@ class Recorder(logging.Handler):
         _sweep(folder)
 
     def watches(self, presenter: Presenter, *, in_stack_frame: bool) -> None:
-        """Begin recording. in_stack_frame: points arrive in frame `stack`; they are written in `sensor`."""
+        """Begin recording. in_stack_frame: points arrive in frame `stack`, but are written in `sensor`."""
         self._presenter = presenter
         if in_stack_frame:
             self._sensor_from_stack = np.asarray(np.linalg.inv(presenter.run_cell.state.calibration.stack_from_sensor))
@@ -238,7 +238,7 @@ class Recorder(logging.Handler):
     def save(self, kind: str, saved: Saved = lambda problem, path: None) -> None:
         """Write the kept messages to a file in the background, then call `saved`. kind: `asked` or a fault."""
         if not self._most_ns or self._presenter is None:
-            saved("nothing is kept in memory (service.blackbox_minutes is 0)", None)
+            saved("the black box is switched off (service.blackbox_minutes is 0)", None)
             return
         header, settings = self._head()
         with self._kept_lock:
@@ -283,7 +283,7 @@ class Recorder(logging.Handler):
             pending.report("", path)
 
     def look_at_log(self) -> dict[str, Any]:
-        """Return the newest log lines and states, oldest first; times since 1970."""
+        """Return the newest log lines and states, oldest first, with times since 1970."""
         return {"lines": list(self._lines), "states": list(self._passed)}
 
     def describe(self) -> dict[str, Any]:
@@ -326,9 +326,9 @@ class Recorder(logging.Handler):
 
 
 def write_file(folder: Path, kind: str, kept: list[BlackBoxMessage], header: RecordingHeader, settings: str) -> Path:
-    """Write a new file atomically, readable only by its owner: it shows who was here. Raises OSError.
+    """Write a new file atomically, readable only by its owner, as it shows who was here. Raises OSError.
 
-    Its number is higher than all others in the folder: the wall clock may be set back.
+    Its number is higher than all others in the folder, because the wall clock may be set back.
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = _next_name(folder, kind, datetime.now(UTC))
@@ -431,7 +431,7 @@ def _find_cut(folder: Path) -> None:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             at = datetime.fromtimestamp(journal.stat().st_mtime, UTC)
             journal.rename(path := _next_name(folder, CUT, at))
-            log.warning("the previous run was killed: its last minutes are in %s", path)
+            log.warning("the previous run was killed; its last minutes are in %s", path)
 
 
 def make_room(folder: Path) -> None:

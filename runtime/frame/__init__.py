@@ -1,1 +1,1 @@
-"""One frame: solver, presenter, pacing, policy, timing, states and statistics."""
+"""Everything that happens in one frame: solver, presenter, pacing, policy, states and statistics."""

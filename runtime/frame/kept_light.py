@@ -1,4 +1,4 @@
-"""Kept light: the panel layers of every N-th refresh and the target pictures to compare them with."""
+"""Kept light: the panels' layers at every N-th refresh, and the target pictures for comparison."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ WRITTEN_WITHIN_S = 10.0  # timeout for writing the last refresh's layers
 
 
 class Output(Protocol):
-    """Destination of a run's files."""
+    """Destination for a run's files."""
 
     def refresh(self, line: dict[str, Any]) -> None:
         """Add a line to frames.jsonl."""
@@ -44,7 +44,7 @@ class _Kept:
 
 
 class KeptLight:
-    """Keeps the layers of every `every`-th refresh (0: none)."""
+    """Keeps the layers of every `every`-th refresh; 0 keeps none."""
 
     def __init__(self, every: int, output: Output, drawer: TargetDrawer, truth: TrueEyes, *, simulated: bool) -> None:
         self._every, self._output, self._drawer, self._truth = every, output, drawer, truth
@@ -90,7 +90,7 @@ class KeptLight:
             while not drawn.is_set() and not stopped():
                 drawn.wait(LOOK_S)
             if not drawn.is_set():
-                log.warning("stopped: no pictures for %d of %d refreshes with kept light", total - done, total)
+                log.warning("stopped: %d of %d refreshes with kept light have no target pictures", total - done, total)
                 for rest in self._kept[done:]:
                     self._write(rest, RefreshTargets(self._drawer.fov_deg()))
                 return

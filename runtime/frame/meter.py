@@ -23,7 +23,7 @@ EVERY = 4  # residual and detail are measured in one of this many solutions of a
 
 
 class SolutionMeter:
-    """Measures solutions, comparing each with samples of the previous pictures."""
+    """Measures solutions, and compares each with samples of the previous pictures."""
 
     def __init__(self) -> None:
         self._before: tuple[tuple[int, ...], list[U8], Job, int] | None = None  # raster and window, pictures, time
@@ -31,7 +31,7 @@ class SolutionMeter:
         self._places = np.random.default_rng(1).random((2, RAYS, 2))
 
     def measure(self, job: Job, layers: U8, effort: Effort, *, time_ns: int) -> Measures | None:
-        """Measure one solution; None if its pictures exist only as textures."""
+        """Measure one solution. Returns None if its pictures exist only as textures."""
         if any(isinstance(view.picture, DrawnPicture) for view in job.views):
             return None
         key = Effort(effort.reduction, effort.steps)
@@ -60,7 +60,7 @@ class SolutionMeter:
 
 
 def sampled_light(layers: U8, job: Job, places: F64, *, boxes: bool) -> float | None:
-    """Return the squared error of light in sampled pixels of both pictures; None: no ray counts.
+    """Return the squared error of light at sampled pixels of both pictures, or None if no ray counts.
 
     places: (2, K, 2) as fractions of the picture's size; both rays of a pair fall into the same pixel, so the mean
     product of their errors is unbiased (docs/contracts.md: light). Rays that miss a panel are ignored. boxes: panel
@@ -90,7 +90,7 @@ def sampled_light(layers: U8, job: Job, places: F64, *, boxes: bool) -> float | 
 
 
 def lost_detail(picture: U8) -> Mapping[int, float]:
-    """Return by reduction the squared error of a picture (h, w, 3 or 4) reduced and enlarged bilinearly."""
+    """Return the squared error of a picture (h, w, 3 or 4) reduced and enlarged bilinearly, by reduction."""
     height = picture.shape[0]
     bands = [picture[first : first + BAND_ROWS, :, :3] for first in (height // 3, 2 * height // 3)]
     return {

@@ -32,7 +32,7 @@ class RunObserver:
     ) -> None:
         """evaluate_every: measure quality at every N-th refresh and the last; 0: only the last; None: never.
 
-        keep_light: keep the light of every N-th refresh; 0: never.
+        keep_light: keep the light of every N-th refresh; 0 keeps none.
         """
         self._measures, self._simulated, self._on_account = evaluate_every is not None, simulated, on_account
         self.last: Refresh | None = None
@@ -43,17 +43,17 @@ class RunObserver:
 
     @property
     def moment(self) -> Moment | None:
-        """The newest refresh whose quality was measured."""
+        """Return the newest refresh whose quality was measured."""
         return self._sampler.moment
 
     @property
     def measured(self) -> dict[str, list[float]]:
-        """Quality of the sampled refreshes, by name."""
+        """Return the sampled refreshes' quality, by name."""
         return self._sampler.measured
 
     @property
     def live_errors(self) -> dict[int, float]:
-        """Mean squared error of the light at the true eyes, by refresh number."""
+        """Return the mean squared error of light at the true eyes, by refresh number."""
         return self._sampler.live
 
     def measure_only_live(self) -> None:
@@ -81,7 +81,7 @@ class RunObserver:
     def finish(self, stopped: Callable[[], bool] = lambda: False) -> None:
         """Write and measure everything queued, draw the kept refreshes' pictures, measure the last refresh.
 
-        In real time the last is measured only if no other was. stopped: returns True after a stop request.
+        In real time the last refresh is measured only if no other was. stopped: returns True after a stop request.
         """
         self.truth.end()
         self._advance()
@@ -94,7 +94,7 @@ class RunObserver:
                 self._sampler.finish(last)
 
     def live(self) -> dict[str, Any]:
-        """Return the live figures (contract 5.5) up to now, for the status."""
+        """Return the live figures (contract 5.5) so far, for the status."""
         return {"live_db": self._sampler.live_db, "view_error_mm": self._lines.view_error_mm.of("p50", "p95")}
 
     def summary(self) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Pacing: wake, present and display times of refreshes, predicted from vertical blanks.
 
-Pure: callers pass in times and events; it never reads a clock. The scheme follows Monado's compositor pacing:
+It is pure: callers pass in times and events, and it never reads a clock. The scheme follows Monado's compositor pacing:
 predict, report events, learn the phase of the blanks and the time a refresh needs before one.
 """
 
@@ -18,13 +18,13 @@ MARGIN_MIN_NS = NS_PER_MS
 
 
 class Pacer:
-    """Schedules refreshes on a grid of one period; slots that can't be met are counted as missed.
+    """Schedules refreshes on a grid of one period. Slots that can't be met are counted as missed.
 
     A refresh skipped on purpose (unchanged picture) keeps its slot and does not count as missed.
     """
 
     def __init__(self, *, period_ns: int, photon_ns: int, work_ns: int = 0) -> None:
-        """photon_ns: from presenting to the middle of the light; work_ns: initial estimate of waking to presented."""
+        """photon_ns: from presenting to the middle of the light; work_ns: initial estimate, waking to presenting."""
         if period_ns <= 0:
             raise ValueError("a period must be positive")
         self.period_ns, self._photon_ns = period_ns, photon_ns

@@ -1,4 +1,4 @@
-"""Decisions on what to solve and show (flat, solved, reuse): pure, without clock or I/O.
+"""Decisions on what to solve and show (flat, solved, reuse): pure functions without clock or I/O.
 
 Stillness is decided in one place, by the rest watch on the sensor's samples (`eyes.rest`): eyes labelled `rested` are
 solved for once; any other change of position gets a new solution.
@@ -55,7 +55,7 @@ class FramePolicy:
         solved: SolutionKey | None,
         flat: SolutionKey | None,
     ) -> Decision:
-        """plan: allowed savings; solved, flat: newest results; revision: content's at `request.time_ns`."""
+        """plan: allowed savings; solved, flat: newest results; revision: the content's at `request.time_ns`."""
         if request.flat_wanted and not self._flat_wanted:
             self.episode += 1
         self._flat_wanted = request.flat_wanted
@@ -79,7 +79,7 @@ class FramePolicy:
     def _eyes_to_solve(
         self, request: SolveRequest, plan: Plan | None, *, state_version: int, revision: int, solved: SolutionKey | None
     ) -> F64 | None:
-        """Return the eyes to solve for; None if the newest solution still holds or no eyes are known."""
+        """Return the eyes to solve for, or None if the newest solution is still valid or no eyes are known."""
         if request.eyes_m is None:
             return None
         eyes_m = request.eyes_m if plan is None else selected_eyes(request.eyes_m, plan.eyes)
@@ -103,7 +103,7 @@ def wants_flat(eyes: EyesEstimate, *, flat_asked: bool, flatness: float) -> bool
 
 @dataclass(slots=True)
 class Flatness:
-    """Mixing weight of the flat picture, 0 to 1, which moves at a constant rate."""
+    """Mixing weight of the flat picture, 0 to 1, which changes at a constant rate."""
 
     value: float = 1.0
     since_ns: int = -1

@@ -1,4 +1,4 @@
-"""The presenter's loop: receive, map, predict, align, present, account; it waits only for its slot.
+"""Presenter's loop: receive, map, predict, align, present, account. It waits only for its slot.
 
 The solver works alongside it (`solver_host`) and hands over complete solutions; every refresh shows the newest one,
 aligned to the eyes' predicted position at its display time.
@@ -49,14 +49,14 @@ class Supervisor:
     """Hooks that connect the presenter to the outside, called once per refresh; they must not wait."""
 
     def stop_reason(self) -> str:
-        """Return the reason to stop; empty: continue."""
+        """Return the reason to stop, or an empty string to continue."""
         return ""
 
     def carry_out_commands(self, presenter: Presenter) -> None:
         """Carry out the operator's commands received since the last refresh."""
 
     def refreshed(self, presenter: Presenter, account: RefreshAccount) -> None:
-        """One refresh is complete."""
+        """Handle a complete refresh."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,10 +72,10 @@ class Observer(Protocol):
     """Observer of refreshes (files, sampled quality); must return quickly."""
 
     def sampled(self, sample: SensorFrame) -> None:
-        """A sample arrived."""
+        """Handle a sample that has arrived."""
 
     def refreshed(self, refresh: Refresh) -> None:
-        """A refresh is complete."""
+        """Handle a complete refresh."""
 
 
 class RefreshTimes:
@@ -110,7 +110,7 @@ class RefreshTimes:
 
 
 class Presenter:
-    """Presents one run. Its parts are passed in and owned by the caller; it owns only its counters."""
+    """Presents one run. The caller owns the parts that it passes in; the presenter only its counters."""
 
     def __init__(
         self,
@@ -149,7 +149,7 @@ class Presenter:
         self._aligned: tuple[int, bytes, Alignment] | None = None  # solution, eyes
 
     def run(self, *, frames: int | None = None) -> str:
-        """Refresh until the recording ends, `frames` are done or a stop is requested; return why."""
+        """Refresh until the recording ends, `frames` are done or a stop is requested. Returns the reason."""
         reason = ""
         while not reason:
             try:
@@ -240,7 +240,7 @@ class Presenter:
         return frame, alignment.limited
 
     def _alignment(self, eyes: EyesEstimate, solution: Solution | None) -> Alignment:
-        """Return the alignment to the eyes; without eyes the last one, and without matrices if none is needed."""
+        """Return the alignment to the eyes; without eyes, the last one; without matrices, if none is needed."""
         plan = self.run_cell.state.settings.plan
         if solution is None or solution.solved_for_m is None or not plan.align:
             return Alignment(())
@@ -255,7 +255,7 @@ class Presenter:
         return last[2]
 
     def _present(self, frame: PanelFrame) -> tuple[PresentReport | None, str]:
-        """Present a frame; (None, reason) if a panel is lost, (None, "") before the first picture."""
+        """Present a frame. Returns (None, reason) if a panel is lost, (None, "") before the first picture."""
         if frame.solved is None and frame.flat is None:
             return None, ""
         unchanged = self.last is not None and self.last.account.presented and _same(frame, self.last.frame)

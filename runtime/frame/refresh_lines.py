@@ -1,4 +1,4 @@
-"""Lines of frames.jsonl and the view error; both need the true eyes at the display time."""
+"""Lines of frames.jsonl, and the view error. Both require the true eyes at the display time."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LINE = (
 
 
 class RefreshLines:
-    """Writes refreshes in order, each as soon as its true eyes are known or known to be missing."""
+    """Writes refreshes in order, each as soon as its true eyes are known, or known to be missing."""
 
     def __init__(self, truth: TrueEyes, write: Callable[[dict[str, Any]], None] | None) -> None:
         self._truth, self._write = truth, write

@@ -1,4 +1,4 @@
-"""The immutable state of a run at one moment, replaced as a whole on reconfiguration."""
+"""Immutable state of a run at one moment, which a reconfiguration replaces as a whole."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from runtime.errors import Stopped
 from runtime.eyes.calibration import Calibration
 from runtime.model.predictor import Predictor
 
-LEFT_BEHIND = "content or model took too long to load and the solver was restarted: nothing has changed"
+LEFT_BEHIND = "content or model took too long to load, so the solver was restarted; nothing has changed"
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,13 +44,13 @@ class RunCell:
             return next(self._numbers)
 
     def begin(self) -> int:
-        """Start a new solver generation and return it; the previous one can no longer change the state."""
+        """Start a new solver generation and return it. The previous one can no longer change the state."""
         with self._lock:
             self.generation += 1
             return self.generation
 
     def replace(self, generation: int | None = None, **changes: Any) -> RunState:
-        """Replace fields of the state; return the previous state, whose parts the caller must close.
+        """Replace fields of the state. Returns the previous state, whose parts the caller must close.
 
         generation: the calling solver's. Raises Stopped and changes nothing if a newer one has begun.
         """

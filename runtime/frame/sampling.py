@@ -40,7 +40,7 @@ class _Sample:
 
 
 class QualitySampler:
-    """Measures every `every`-th refresh (0: none) and, with `finish`, the last one."""
+    """Measures every `every`-th refresh (0: none) and, in `finish`, the last one."""
 
     def __init__(
         self,
@@ -64,7 +64,7 @@ class QualitySampler:
         self._drawing = False
 
     def refreshed(self, refresh: Refresh) -> None:
-        """Queue a refresh if it is due; in real time it may replace a queued one."""
+        """Queue a refresh if it is due. In real time it may replace a queued one."""
         is_sample = self._every and refresh.account.frame % self._every == self._every - 1
         if not is_sample or not refresh.account.presented:
             return
@@ -99,7 +99,7 @@ class QualitySampler:
             self._begin(sample)
 
     def finish(self, last: Refresh) -> None:
-        """Measure the run's last refresh; it enters the means only if no other was measured."""
+        """Measure the run's last refresh, which enters the means only if no other was measured."""
         queue: SimpleQueue[RefreshTargets | None] = SimpleQueue()
         true_m = self._truth.at(last.account.photon_ns)
         self._drawer.draw(self._wanted(last, true_m), None, queue.put)
@@ -132,7 +132,7 @@ class QualitySampler:
         self._drawer.draw(wanted, sample.content, compare)
 
     def _wanted(self, refresh: Refresh, true_m: F64 | None) -> dict[str, tuple[F64, int]]:
-        """Return the eyes and instants to draw targets for."""
+        """Return the eyes and instants for which to draw targets."""
         account, solution = refresh.account, refresh.solution
         wanted: dict[str, tuple[F64, int]] = {}
         if true_m is not None:

@@ -1,4 +1,4 @@
-"""Solver: draws content and computes layers for the predicted eyes, on its GL context's thread."""
+"""Solver, which draws content and computes layers for the predicted eyes, on its GL context's thread."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ FLAT_EYE_M = (0.7, 0.0, 0.0)  # viewpoint of the flat picture before any viewer 
 
 @dataclass(frozen=True, slots=True)
 class SolverUpdate:
-    """The result of one request; as news, the newest results up to now."""
+    """Result of one request; in the news, the newest results so far."""
 
     solution: Solution | None = None  # new solution for two eyes
     flat: Solution | None = None  # a new flat picture
@@ -61,7 +61,7 @@ class Solver:
     def step(self, request: SolveRequest, state: RunState | None = None) -> SolverUpdate:
         """Carry out a request. Failed parts are named in the result; earlier results stay valid.
 
-        state: to draw and solve with; None: the newest. Raises ContextLost when this solver can't be used any longer.
+        state: the state to draw and solve with; None for the newest. Raises ContextLost if this solver is unusable.
         """
         state = state or self.run.state
         self._replan(state, request.eyes_m)
@@ -135,7 +135,7 @@ class Solver:
         return SolverUpdate(solution=solution)
 
     def _drawn(self, state: RunState, request: SolveRequest, eyes_m: F64, reduction: int) -> Job:
-        """Draw the targets; keep a resting head's, so that its solution can be refined."""
+        """Draw the targets, and keep those of a resting head, so that its solution can be refined."""
         job = drawn_job(
             state.predictor,
             state.content,

@@ -1,4 +1,4 @@
-"""Solver hosts: the presenter's interface to a solver, and the host on a simulated clock."""
+"""Solver hosts: the presenter's interface to a solver, and the host for a simulated clock."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class SolverParts(Protocol):
         """Carry out one request."""
 
     def simulated_costs(self) -> Costs:
-        """Return the present costs of solutions on a simulated clock."""
+        """Return the current costs of solutions on a simulated clock."""
 
     def first_costs(self) -> Mapping[int, Mapping[str, float]]:
-        """Return stage times by reduction, in milliseconds, measured while warming up."""
+        """Return the stage times in milliseconds, by reduction, measured while warming up."""
 
     def close(self) -> None:
         """Release everything that no newer solver uses, on the thread that created it."""
@@ -37,12 +37,12 @@ Task = Callable[[SolverParts], bool]  # called on the solver's thread between st
 
 
 class SolverHost(ABC):
-    """Interface to a solver: the presenter posts requests and reads `news`; neither waits."""
+    """Interface to a solver: the presenter posts requests and reads `news`, without waiting."""
 
     @property
     @abstractmethod
     def costs(self) -> Costs:
-        """The present costs of solutions."""
+        """Return the current costs of solutions."""
 
     @abstractmethod
     def post(self, request: SolveRequest) -> None:
@@ -67,7 +67,7 @@ def taken_in(news: SolverUpdate, step: SolverUpdate) -> SolverUpdate:
 
 
 class SimulatedSolver(SolverHost):
-    """Solves immediately; publishes a result once the simulated clock has advanced by its cost."""
+    """Solves immediately, and publishes the result once the simulated clock has advanced by its cost."""
 
     def __init__(self, parts: SolverParts, clock: Clock) -> None:
         self._parts, self._clock = parts, clock

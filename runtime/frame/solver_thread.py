@@ -1,4 +1,4 @@
-"""The solver's thread: publishes complete solutions; abandoned and replaced if a call hangs."""
+"""Solver thread, which publishes complete solutions, and is abandoned and replaced if a call hangs."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class _Attempt:
         self.thread: threading.Thread | None = None
 
     def leave(self) -> None:
-        """Abort a step between two drawings, because a drawing thread keeps taking the GIL."""
+        """Abandon a step between two drawing calls, because a drawing thread keeps taking the GIL."""
         if self.thread is not None and self.thread is not threading.current_thread():
             abandon(self.thread)
 
@@ -56,7 +56,7 @@ class SolverThread(SolverHost):
     """Runs a solver alongside the presenter. `post`, `news` and `watch` never wait."""
 
     def __init__(self, make: Callable[[], SolverParts], clock: Clock) -> None:
-        """make: creates a solver with a separate GL context on the calling thread; called again after a hang."""
+        """make: creates a solver with its own GL context on the calling thread; called again after a hang."""
         self._make, self._clock = make, clock
         self._late_ns, self._abandon_ns = round(LATE_S * NS_PER_S), round(ABANDON_S * NS_PER_S)
         self._lock = threading.Condition()
@@ -71,7 +71,7 @@ class SolverThread(SolverHost):
         self._attempt = self._begin(1)
 
     def wait_ready(self, go_on: Callable[[], bool] = lambda: True, *, max_s: float = math.inf) -> None:
-        """Wait until the solver accepts requests. go_on: polled; False: stop waiting.
+        """Wait until the solver accepts requests. go_on: polled; returns False to stop waiting.
 
         Raises the error that prevented the start, and FatalError after `max_s`.
         """
@@ -80,7 +80,7 @@ class SolverThread(SolverHost):
             if not go_on():
                 return
             if self._clock.now_ns() - begun_ns > max_s * NS_PER_S:
-                raise FatalError(f"content and model: not ready after {max_s:g} s")
+                raise FatalError(f"content and model: still not ready after {max_s:g} s")
         if self._attempt.error is not None:
             raise self._attempt.error
 
@@ -145,7 +145,7 @@ class SolverThread(SolverHost):
                     attempt.abandoned.set()
                 self._hung.append(attempt)
                 self.restarts += 1
-                log.error("solver: no answer for %.1f s: abandoned; starting a new one", busy_ns / NS_PER_S)
+                log.error("solver: no answer for %.1f s; it is abandoned, and a new one started", busy_ns / NS_PER_S)
         busy_ms = busy_ns // NS_PER_MS // ANSWER_STEP_MS * ANSWER_STEP_MS
         return f"the solver {'has not answered' if attempt.ready.is_set() else 'has been restarting'} for {busy_ms} ms"
 

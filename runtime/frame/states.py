@@ -1,4 +1,4 @@
-"""The daemon's state as a pure function of its conditions; detection of late refreshes."""
+"""Daemon states as a pure function of the conditions, and detection of late refreshes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PARTS: tuple[Part, ...] = ("sensor", "content", "model", "panel")
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """Conditions observed in one turn of the loop."""
+    """Conditions that are observed in one turn of the loop."""
 
     eyes: EyesLabel
     missing: dict[Part, str]  # failed parts, with a short reason; empty: all is well
@@ -40,7 +40,7 @@ def judge(conditions: Conditions) -> tuple[State, str]:
         return State.DEGRADED, why
     late = [conditions.late] if conditions.late else []
     if conditions.flat_wanted:
-        return State.FLAT, "; ".join(["asked for", *late])
+        return State.FLAT, "; ".join(["requested", *late])
     if conditions.eyes == "none":
         return State.FLAT, "; ".join(["no viewer", *late])
     remarks = [*late, *(["the picture is paused"] if conditions.paused else [])]
@@ -52,7 +52,7 @@ def judge(conditions: Conditions) -> tuple[State, str]:
 
 
 class StateMachine:
-    """The current state, and the time spent in each."""
+    """Current state of the daemon, and the time spent in each state."""
 
     def __init__(self, *, now_ns: int) -> None:
         self.state = State.STARTING
@@ -63,11 +63,11 @@ class StateMachine:
 
     @property
     def name(self) -> str:
-        """The state as people read it: `tracking`, `degraded: sensor, panel`."""
+        """Return the state as people read it: `tracking`, `degraded: sensor, panel`."""
         return f"{self.state}: {', '.join(self.missing)}" if self.state is State.DEGRADED else str(self.state)
 
     def update(self, conditions: Conditions, *, now_ns: int) -> bool:
-        """Update from one turn; return True if the state or the missing parts changed. Stopping is final."""
+        """Update from one turn. Returns True if the state or the missing parts changed. Stopping is final."""
         self._held_ns[self.state] += now_ns - self._counted_ns
         self._counted_ns = now_ns
         if self.state is State.STOPPING:
@@ -79,7 +79,7 @@ class StateMachine:
         return self.name != before
 
     def seconds(self, *, now_ns: int) -> dict[str, float]:
-        """Return the seconds spent in each state up to now, without states never entered."""
+        """Return the seconds spent so far in each state that was ever entered."""
         held = dict(self._held_ns)
         held[self.state] += now_ns - self._counted_ns
         return {str(state): held_ns / NS_PER_S for state, held_ns in held.items() if held_ns > 0}
@@ -92,7 +92,7 @@ REFRESHES_MAX = 1024  # most refreshes in the window
 
 
 class Lateness:
-    """Detects lateness, updated once per refresh: a full second of too few refreshes in the window."""
+    """Detects lateness: a full second with too few refreshes in the window. Updated once per refresh."""
 
     def __init__(self, period_ns: int) -> None:
         self._wanted = WINDOW_NS / period_ns
@@ -103,7 +103,7 @@ class Lateness:
         self._told_ns = 0
 
     def update(self, *, presented: bool, now_ns: int) -> str:
-        """Return "" if on time, else `late: 38 of 60 refreshes a second`, updated once a second."""
+        """Return "" if on time, otherwise `late: 38 of 60 refreshes a second`, updated once a second."""
         if self._begun_ns is None:
             self._begun_ns = now_ns
         if presented:

@@ -1,4 +1,4 @@
-"""Statistics of a run in bounded memory, on the run's clock (`overhead_ms`: the machine's)."""
+"""Statistics of a run in bounded memory, on the run's clock (`overhead_ms` on the machine's)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ OVERHEAD_STAGES = ("sensor", "track")
 
 
 class Quantiles:
-    """Quantiles over a whole run; beyond `size` values every other one is dropped. The maximum is exact."""
+    """Quantiles over a whole run. Beyond `size` values every other one is dropped; the maximum is exact."""
 
     def __init__(self, size: int = WINDOW) -> None:
         self._values = np.zeros(size)
@@ -39,7 +39,7 @@ class Quantiles:
         self._count += 1
 
     def of(self, *names: str) -> dict[str, float] | None:
-        """Return the named quantiles (`p50`, `p95`, `p99`, `max`, ...); None before the first value."""
+        """Return the named quantiles (`p50`, `p95`, `p99`, `max`, ...), or None before the first value."""
         held = self._values[: -(-self._count // self._every)]
         if held.size == 0:
             return None
@@ -64,7 +64,7 @@ class RunStats:
         self._recent: deque[tuple[int, bool, bool]] = deque(maxlen=NOW_KEPT)  # time, presented, shows a new solution
 
     def add(self, account: RefreshAccount, *, overhead_ms: float, missed_blanks: int = 0) -> None:
-        """Count a refresh. overhead_ms: its time without presenting and waiting, on the machine's clock."""
+        """Count a refresh. overhead_ms: its duration on the machine's clock, without presenting and waiting."""
         now_ns, ran = account.present_ns, account.inference == "ran"
         self._first_ns = now_ns if self._first_ns < 0 else self._first_ns
         if self._effort is not None:
@@ -102,7 +102,7 @@ class RunStats:
         return (self._last_ns - self._first_ns) / NS_PER_S if self.frames else 0.0
 
     def reuse_saves_ms(self) -> float | None:
-        """Return the solver time a refresh saves by reusing a solution; None before any was reused."""
+        """Return the solver time that a refresh saves by reusing a solution; None before any was reused."""
         medians = [self._stages[stage].of("p50") for stage in SHOWN_STAGES]
         known = [median["p50"] for median in medians if median is not None]
         return sum(known) if known and self.presented > self.solutions > 0 else None

@@ -27,7 +27,7 @@ class TargetDrawer:
         fov_deg: Callable[[], float],
         shown_content: Callable[[], object | None] = lambda: None,
     ) -> None:
-        """fov_deg: returns the targets' present field of view, which a reload may change.
+        """fov_deg: returns the targets' current field of view, which a reload may change.
 
         shown_content: returns the run's current content, or None if it is never replaced.
         """
@@ -35,7 +35,7 @@ class TargetDrawer:
         self.shown_content = shown_content
 
     def draw(self, wanted: Wanted, content: object | None, then: Callable[[RefreshTargets | None], None]) -> None:
-        """Draw and pass the pictures to `then` on the solver's thread.
+        """Draw the pictures and pass them to `then`, on the solver's thread.
 
         content: the run's content at that refresh; None: the current one. `then` gets None if drawing failed (the
         state gives the reason) or the content has been replaced.

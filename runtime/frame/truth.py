@@ -20,7 +20,7 @@ class TrueEyes:
 
     @property
     def is_recorded(self) -> bool:
-        """True once any sample had true eyes; a live sensor never provides them."""
+        """Return True once any sample has had true eyes, which a live sensor never provides."""
         return bool(self._known)
 
     def add(self, capture_ns: int, eyes_m: F64) -> None:
@@ -29,15 +29,15 @@ class TrueEyes:
             self._known.append((capture_ns, eyes_m))
 
     def end(self) -> None:
-        """Declare that no more samples will come."""
+        """Record that no more samples will come."""
         self._ended = True
 
     def may_come(self, time_ns: int) -> bool:
-        """True while an instant's truth is unknown but later samples may give it."""
+        """Return True while an instant's truth is unknown but may follow from later samples."""
         return bool(self._known) and time_ns > self._known[-1][0] and not self._ended
 
     def at(self, time_ns: int) -> F64 | None:
-        """Return the true eyes (2, 3) at an instant; None: unknown."""
+        """Return the true eyes (2, 3) at an instant, or None if unknown."""
         if not self._known or time_ns > self._known[-1][0]:
             return None
         after_ns, after_m = self._known[-1]

@@ -1,4 +1,4 @@
-"""Viewer's eyes at any instant from sensor samples: calibrate, track, detect rest."""
+"""Viewer's eyes at any instant, from sensor samples: calibration, tracking, detection of rest."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Viewer:
         self._captures_ns: deque[int] = deque(maxlen=64)
 
     def adopt(self, settings: Settings, calibration: Calibration) -> None:
-        """Adopt new settings; the tracker is reset only if its own have changed."""
+        """Adopt new settings. The tracker is reset only if its own settings have changed."""
         before, self._settings, self._calibration = self._settings, settings, calibration
         if settings.tracker != before.tracker:
             self._tracker = self._new_tracker()
@@ -51,23 +51,23 @@ class Viewer:
 
     @property
     def warning(self) -> str:
-        """Reason most recent samples are implausible (eyes swapped, millimetres, ...); else empty."""
+        """Return why most recent samples are implausible (eyes swapped, millimetres, ...), or ""."""
         return self._refusals.warning
 
     @property
     def refused(self) -> Mapping[str, int]:
-        """Number of rejected samples, by reason; each counts once."""
+        """Return the number of rejected samples by reason. Each counts once."""
         return self._refusals.counts
 
     @property
     def rate_hz(self) -> float | None:
-        """Samples per second, from recent capture times; None before there are two."""
+        """Return the number of samples per second, from recent capture times; None before there are two."""
         if len(self._captures_ns) < 2 or self._captures_ns[-1] <= self._captures_ns[0]:
             return None
         return round((len(self._captures_ns) - 1) * NS_PER_S / (self._captures_ns[-1] - self._captures_ns[0]), 2)
 
     def take(self, frame: SensorFrame, *, serial: str) -> None:
-        """Process a sample; one that the tracker rejects is only counted."""
+        """Process a sample. If the tracker rejects it, it is only counted."""
         self._captures_ns.append(frame.capture_ns)
         points = frame.eyes
         if points is not None and not self._in_stack_frame:
@@ -104,5 +104,5 @@ class Viewer:
 
 
 def _rest_watch(settings: Settings) -> RestWatch | None:
-    """Create the rest watch; None if the plan may not reuse a picture for nearly unchanged eyes."""
+    """Create the rest watch, or return None if the plan may not reuse a picture for nearly unchanged eyes."""
     return RestWatch(max_drift_m=MAX_REST_DRIFT_M) if settings.plan.enabled else None
