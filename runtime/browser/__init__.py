@@ -1,1 +1,1 @@
-"""The browser as a viewer's eyes and a display's light: its script, and a solution as one page."""
+"""The browser as viewer and display: its scripts, and pages that show one solution."""

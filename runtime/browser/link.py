@@ -22,7 +22,7 @@ OVERLAY_PX = 320  # width of the camera picture sent to pages
 
 @dataclass(frozen=True, slots=True)
 class SeenEyes:
-    """Eyes that a page reports."""
+    """Eye positions that a page reports."""
 
     eyes_m: F64 | None  # (2, 3), frame `stack`; None: no viewer
     page_ms: float  # time on the page's clock
@@ -51,7 +51,7 @@ class BrowserLink:
     _captures: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=CAPTURES_MAX))
 
     def is_viewer(self, page: object) -> bool:
-        """Return True if this page is the viewer: the one connected longest."""
+        """Return True if this page is the viewer, that is, the one that has been connected longest."""
         return next(iter(self.news), None) is page
 
     def see(self, eyes_m: Any, page_ms: float) -> None:
@@ -60,13 +60,13 @@ class BrowserLink:
         if eyes_m is not None:
             eyes = np.array(eyes_m, np.float64)
             if eyes.shape != (2, 3) or not np.isfinite(eyes).all() or eyes[:, 0].min() <= self.stack.x_m[-1]:
-                raise ValueError("eyes: two points in front of the front panel, metres")
+                raise ValueError("eyes: must be two points in front of the front panel, in metres")
         with self._arrived:
             self._samples.append(SeenEyes(eyes, float(page_ms)))
             self._arrived.notify()
 
     def seen(self, timeout_s: float) -> list[SeenEyes]:
-        """Take the unread samples, oldest first; waits for one."""
+        """Take the unread samples, oldest first, waiting for the first one."""
         with self._arrived:
             if not self._samples:
                 self._arrived.wait(timeout_s)
@@ -75,13 +75,13 @@ class BrowserLink:
         return samples
 
     def send_picture(self, coded: bytes, page_ms: float) -> None:
-        """Store the newest camera picture; an unread one is dropped."""
+        """Store the newest camera picture, dropping an unread one."""
         with self._arrived:
             self._picture = coded, page_ms
             self._arrived.notify()
 
     def picture(self, timeout_s: float) -> tuple[bytes, float] | None:
-        """Take the newest unread picture; waits for one."""
+        """Take the newest unread picture, waiting for one."""
         with self._arrived:
             if self._picture is None:
                 self._arrived.wait(timeout_s)
@@ -89,7 +89,7 @@ class BrowserLink:
         return taken
 
     def reporting(self, finder: Any) -> Callable[[SensorFrame], EyePoints | None]:
-        """Eye finder for a page's camera whose results are also sent to the pages."""
+        """Wrap an eye finder for a page's camera, so that its results are also sent to the pages."""
 
         def find(frame: SensorFrame) -> EyePoints | None:
             eyes: EyePoints | None = finder.find(frame)
@@ -112,11 +112,11 @@ class BrowserLink:
         self._captures.append((capture_ns, page_ms))
 
     def page_ms_of(self, capture_ns: int) -> float | None:
-        """Page time of the newest sample captured by `capture_ns`."""
+        """Return the page time of the newest sample captured by `capture_ns`."""
         return next((page_ms for ns, page_ms in reversed(tuple(self._captures)) if ns <= capture_ns), None)
 
     def refreshed(self, account: dict[str, Any]) -> None:
-        """Publish a refresh: the panels show `frame`; account: the figures known about it."""
+        """Publish a refresh. frame: what the panels show; account: its figures, as far as they are known."""
         self.shown = self.frame, account
         self._notify()
 

@@ -1,4 +1,4 @@
-"""A solution as one self-contained HTML file: its layers and the script that traces what eyes see."""
+"""Self-contained HTML file of a solution: its layers, and the script that traces what eyes see."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ QUALITIES = (92, 84, 76, 66, 54)  # AVIF qualities: the first that fits is used
 
 
 def asset(name: str) -> str:
-    """Text of one of the browser's files."""
+    """Return the text of one of the browser's files."""
     return (files("runtime.browser") / "assets" / name).read_text(encoding="utf-8")
 
 
@@ -46,9 +46,9 @@ def viewer_html(
     relief: F32 | None = None,
     follows: bool = True,
 ) -> str:
-    """Viewer page of layers (N, h, w, 3 or 4), rear to front, solved for eyes (2, 3) in frame `stack`.
+    """Return a viewer page of layers (N, h, w, 3 or 4), rear to front, for eyes (2, 3) in frame `stack`.
 
-    Layers are stored exactly if they fit in `LAYERS_BYTES`, else as AVIF, and the page says how well.
+    Layers are stored losslessly if they fit in `LAYERS_BYTES`, otherwise as AVIF; the page states the PSNR.
     wanted: target pictures (h, w, 3), one per eye, `fov_deg` wide, compressed into the remaining size; () for none.
     text: the title, and lines below the controls. relief: (h, w), of the layers' content (`optics.relief`).
     follows: outer panels follow the head until the user switches that off.
@@ -81,7 +81,7 @@ def half_floats(relief: F32) -> bytes:
 
 
 def stack_table(stack: PanelStack) -> dict[str, Any]:
-    """Geometry of the stack and rest code of its panels, as a table for the script."""
+    """Return the stack's geometry and its panels' rest code as a table for the script."""
     fields = ("width_m", "height_m", "x_m", "width_px", "height_px")
     table: dict[str, Any] = {name: getattr(stack, name) for name in fields}
     table["rest_code"] = rest_code(stack.count)
@@ -123,5 +123,5 @@ def _url(picture: U8, **how: Any) -> str:
 
 
 def _embedded(value: Any) -> str:
-    """JSON that can't end a script element."""
+    """Encode as JSON that can't end a script element."""
     return to_json(value).replace("<", "\\u003c")

@@ -1,1 +1,1 @@
-"""Results of a run or a solution: displayed quality, files, the contact sheet."""
+"""Results of a run or a solution: displayed quality, files and the contact sheet."""

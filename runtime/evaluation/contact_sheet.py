@@ -27,7 +27,7 @@ PAPER = 246
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """One refresh of a run, for its sheet, and its unaligned solution, for the viewer."""
+    """One refresh of a run, for the contact sheet, and its unaligned solution, for the viewer."""
 
     layers: U8  # (N, h, w, 3 or 4), as the panels showed them: aligned
     eye_views: EyeViews
@@ -40,9 +40,9 @@ class Moment:
 
 
 def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, lines: Sequence[str] = ()) -> U8:
-    """(h, w, 3) RGB: a row of layers, and for each eye a row of target, retina image and error.
+    """Draw an (h, w, 3) RGB sheet: a row of layers, then for each eye target, retina image and error.
 
-    headline: the figure to quote; lines: written below it.
+    headline: sentence with the figure to quote; lines: text below it.
     """
     height, width = layers.shape[1:3]
     tile = (TILE_WIDTH, round(TILE_WIDTH * height / width))
@@ -79,9 +79,9 @@ def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, line
 
 
 def headline(light_db: float | None) -> str:
-    """Sentence with the figure to quote."""
+    """Return the sentence with the figure to quote."""
     if light_db is None or math.isnan(light_db):
-        return "the light at these eyes was not measured"
+        return "light PSNR at these eyes was not measured"
     conditions = f"pixels as squares, pupil {PUPIL_MM:g} mm, tracking error {TRACKING_SIGMA_MM:g} mm"
     return f"PSNR {light_db:.1f} dB at the eyes ({conditions})"
 

@@ -28,7 +28,7 @@ SIGMAS_MM = (0.0, 1.0, 2.0)  # tracking errors: none, a good tracker's, twice th
 
 @dataclass(frozen=True, slots=True)
 class EyeViews:
-    """Retina images of both eyes through some layers, and their targets."""
+    """Retina images of both eyes, seen through some layers, and their targets."""
 
     seen: tuple[Retina, ...]
     wanted: tuple[Picture, ...]
@@ -38,7 +38,7 @@ class EyeViews:
     fov_deg: float
 
     def viewer(self, layers: U8, text: Sequence[str]) -> str:
-        """Viewer page of the layers, seen from these eyes, with a title and lines next to the picture."""
+        """Return a viewer page of the layers seen from these eyes, with a title and lines of text."""
         wanted, eyes_m = [as_codes(intensities(picture)) for picture in self.wanted], np.asarray(self.eyes_m)
         return viewer_html(layers, wanted, self.stack, eyes_m=eyes_m, fov_deg=self.fov_deg, text=text)
 
@@ -52,7 +52,7 @@ class EyeViews:
 def displayed(
     layers: U8, wanted: Sequence[Picture], stack: PanelStack, *, eyes_m: F64, fov_deg: float, similarity: bool = True
 ) -> EyeViews:
-    """Retina images of eyes (2, 3), frame `stack`, through layers, with a target for each eye.
+    """Compute retina images of eyes (2, 3), frame `stack`, through layers, with a target for each eye.
 
     layers: (N, H, W, 3 or 4), rear to front. Targets are `fov_deg` wide; those of the panels' aspect are compared at
     the panels' resolution, others at their own, or reduced to as many pixels as a panel has.
@@ -74,8 +74,8 @@ def expected_db(
 ) -> dict[str, float]:
     """Expected PSNR (docs/contracts.md, Error) by tracking error in millimetres: "0", "1", "2".
 
-    light: pupils and square pixels, otherwise one ray a pixel of every `every`-th pixel of every `every`-th row. NaN
-    where such an error would move an eye to a place that sees no part of the panels.
+    light: use pupils and square pixels; otherwise one ray for every `every`-th pixel of every `every`-th row. NaN
+    if such an error would move an eye to where it sees no part of the panels.
     """
     psnrs_db = light_psnrs_db if light else partial(expected_psnrs_db, sampling=ONE_RAY._replace(step=every))
     values = dict.fromkeys(sigmas_mm, math.nan)
@@ -94,7 +94,7 @@ def expected_db(
 def sampled_db(
     eye_views: EyeViews, layers: U8, *, sigmas_mm: Sequence[float], every: int
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Light of every `every`-th pixel of every `every`-th row, and its standard error in dB."""
+    """Light PSNR from every `every`-th pixel of every `every`-th row, and its standard error in dB."""
     values = dict.fromkeys(sigmas_mm, (math.nan, math.nan))
     with contextlib.suppress(ValueError):
         values |= sampled_light_db(
@@ -111,9 +111,9 @@ def sampled_db(
 
 
 def on_panels_raster(picture: Picture, stack: PanelStack) -> Picture:
-    """A picture at the panels' resolution if their aspect agrees, otherwise with at most as many pixels.
+    """Resample a picture to the panels' resolution if the aspects agree, else to at most as many pixels.
 
-    Detail finer than the panels' pixels cannot be shown, and takes time and memory to measure.
+    Detail finer than the panels' pixels cannot be shown, and would take time and memory to measure.
     """
     height_px, width_px = picture.shape[:2]
     size = (stack.width_px, stack.height_px)

@@ -1,6 +1,6 @@
-"""`phasestack record --motion`: a benchmark motion as a recording, with its true eyes.
+"""`phasestack record --motion`: write a benchmark motion as a recording, with its true eyes.
 
-The true eyes are in the file, so that a run's summary has the displayed quality at them. The sensor's pose is that of
+The file contains the true eyes, so that a run's summary has the displayed quality at them. The sensor's pose is that of
 the demo's calibration, the default.
 """
 
@@ -32,9 +32,9 @@ def write_motion(
     rate_hz: float = RATE_HZ,
     noise_mm: float = NOISE_MM,
 ) -> dict[str, Any]:
-    """Write the recording and return its description. `seed`: for path and noise; 0: the benchmark's.
+    """Write the recording and return its description. seed: selects path and noise; 0: the benchmark's.
 
-    Raises InputError for a motion that is not known, a length out of range, or a file that can't be written.
+    Raises InputError for an unknown motion, a length out of range, or a file that can't be written.
     """
     if motion not in MOTIONS:
         raise InputError("record", "--motion", f"unknown: {motion!r}; known: {', '.join(MOTIONS)}")

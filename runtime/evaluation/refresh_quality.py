@@ -1,4 +1,4 @@
-"""Quality of one sampled refresh, at the eyes it was aligned to and, *live*, at the true eyes."""
+"""Quality of one sampled refresh, at the eyes that it was aligned to and, *live*, at the true eyes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Pictures = tuple[U8, U8]  # (h, w, 3) retina pictures of the left and right eye,
 
 @dataclass(frozen=True, slots=True)
 class RefreshTargets:
-    """Target pictures for a refresh; None: not drawn."""
+    """Target pictures for a refresh; None if not drawn."""
 
     fov_deg: float  # horizontal, of every picture
     solved: Pictures | None = None  # for the eyes and the instant of the solution
@@ -64,7 +64,7 @@ def live_error(layers: U8, targets: Pictures, stack: PanelStack, *, eyes_m: F64,
 def measure_refresh(
     account: RefreshAccount, layers: U8, carried: tuple[U8, U8] | None, targets: RefreshTargets, stack: PanelStack
 ) -> RefreshQuality:
-    """Measure a refresh as far as its targets were drawn; skip eyes that see no part of the panels.
+    """Measure a refresh as far as its targets were drawn, skipping eyes that see no part of the panels.
 
     account: with its true eyes, where they are known; layers: (N, h, w, 4), as the panels showed them;
     carried: the layers aligned as if all content were on the middle panel, and before alignment; None where

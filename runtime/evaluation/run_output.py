@@ -1,4 +1,4 @@
-"""Files of a run (docs/contracts.md). A failure to write them does not stop the run."""
+"""Output files of a run (docs/contracts.md). A failure to write them does not stop the run."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ WAITING_PICTURES = 4  # most of those with a refresh's pictures, 25 MB at 1080p
 
 
 class RunOutput:
-    """Writes a run's files into a folder, where they appear together on a clean exit.
+    """Writes a run's files into a folder, where they appear together after a clean exit.
 
     A background thread writes, so that no refresh waits for the disk. If the disk fails during the run (full, gone,
     permission lost), the files are abandoned: `problem` gives the reason, one line is logged, and the run continues.
     """
 
     def __init__(self, target: Path, *, every_one: bool = True) -> None:
-        """every_one: wait for a slow disk; otherwise drop lines and pictures it can't keep up with."""
+        """every_one: wait for a slow disk, instead of dropping lines and pictures that it can't keep up with."""
         self._folder = OutputFolder(target)
         self._target, self._every_one = target, every_one
         self._lines: TextIO | None = None
@@ -65,7 +65,7 @@ class RunOutput:
         self._attempt(lambda: self._folder.__exit__(kind, error, trace))
 
     def refresh(self, line: Mapping[str, Any]) -> None:
-        """Write a line of frames.jsonl. Its arrays must not be changed afterwards."""
+        """Write one line of frames.jsonl. The account's arrays must not be changed afterwards."""
         self._later(lambda: self._line(line))
 
     def light(self, frame: int, *, layers: U8) -> None:
@@ -100,7 +100,7 @@ class RunOutput:
         return self._folder.staging / "light" / str(frame)
 
     def run_is_over(self) -> None:
-        """Wait for the disk from now on, as no refresh depends on it any longer."""
+        """From now on wait for the disk, since no refresh depends on it any longer."""
         self._every_one = True
 
     def finish(
@@ -160,7 +160,7 @@ class RunOutput:
         return True
 
     def _write(self) -> None:
-        """Body of the writer's thread: run queued jobs in order, until None."""
+        """Run queued jobs in order, until None; the body of the writer's thread."""
         set_niceness(MEASURING_NICENESS)
         while (queued := self._work.get()) is not None:
             work, then = queued
@@ -180,7 +180,7 @@ class RunOutput:
         if self.problem:
             return
         self.problem = why
-        log.warning("output: abandoned; nothing new in %s: %s", self._target, why, exc_info=trace)
+        log.warning("output abandoned; nothing new was written to %s: %s", self._target, why, exc_info=trace)
         self._folder.discard()  # now: these files may be what fills the disk
 
     def _line(self, line: Mapping[str, Any]) -> None:
@@ -189,7 +189,7 @@ class RunOutput:
 
 
 def in_one_line(summary: dict[str, Any]) -> str:
-    """A run's summary in one line, for its contact sheet."""
+    """Return a run's summary in one line, for its contact sheet."""
     line = f"The run: {summary['presented']} of {summary['frames']} refreshes presented, model {summary['model']}"
     if summary.get("live_db") is not None:
         line += f"; live {summary['live_db']:.1f} dB at the true eyes, over {summary['live_frames']} refreshes"

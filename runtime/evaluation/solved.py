@@ -1,4 +1,4 @@
-"""A solved still pair: retina images of its layers, their quality, and the files of a result."""
+"""Solved still pair: retina images of its layers, their quality, and the files of a result."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WHOLE_PX = 1920 * 1200  # largest picture whose light is measured at every pixel
 class PairQuality:
     """Quality at the eyes (docs/contracts.md, Error), by tracking error: "0", "1", "2" mm.
 
-    NaN if not requested, or if such an error takes an eye to where it sees nothing.
+    NaN if not requested, or if such an error moves an eye to where it sees nothing.
     """
 
     light_db: BySigma  # with real pixels and pupils; "1", a good tracker's, is the figure to quote
@@ -34,7 +34,7 @@ class PairQuality:
     standard_error_db: BySigma = field(default_factory=dict)  # of `light_db`, if sampled
 
     def table(self) -> dict[str, Any]:
-        """Entries of solve.json."""
+        """Return the entries for solve.json."""
         return {
             "light_db": _rounded(self.light_db),
             "psnr_db": round(self.psnr_db, 3),
@@ -48,7 +48,7 @@ class PairQuality:
 class SolvedPair:
     """Layers, retina images and quality, the latter two computed on first access.
 
-    Access raises ValueError where an eye sees nothing of the display.
+    Access raises ValueError if an eye sees no part of the display.
     """
 
     layers: U8  # (N, h, w, 3 or 4), rear to front
@@ -64,13 +64,13 @@ class SolvedPair:
 
     @cached_property
     def quality(self) -> PairQuality:
-        """Measured quality; above `WHOLE_PX`, light is sampled and has a standard error."""
+        """Measured quality. Above `WHOLE_PX`, light is sampled, and has a standard error."""
         height_px, width_px = self.eye_views.wanted[0].shape[:2]
         every = 1 if height_px * width_px <= WHOLE_PX else 4 * math.ceil(height_px / 2160)
         return self._measured(self.eye_views, sigmas_mm=SIGMAS_MM, every=every)
 
     def sampled(self, *, sigmas_mm: Sequence[float], every: int) -> PairQuality:
-        """Light of every `every`-th pixel each way, with its standard error; no SSIM."""
+        """Measure light from every `every`-th pixel each way, with its standard error, and no SSIM."""
         views = displayed(
             self.layers, self.pictures, self.stack, eyes_m=self.eyes_m, fov_deg=self.fov_deg, similarity=False
         )
@@ -90,7 +90,7 @@ class SolvedPair:
         return tuple(retina.codes() for retina in self.eye_views.seen)
 
     def viewer(self, lines: Sequence[str]) -> str:
-        """Viewer page of the layers."""
+        """Return a viewer page of the layers."""
         return self.eye_views.viewer(self.layers, [headline(self.quality.light_db["1"]), *lines])
 
     def write(self, folder: Path, *, lines: Sequence[str]) -> None:

@@ -1,4 +1,4 @@
-"""Timer for trials: warm up, repeat, alternate; median."""
+"""Timing of repeated trials: warm-up, repetition, alternation and median."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def timed(
 ) -> Timed[T]:
     """Time a warm function: at least `runs` times, then until `enough_s` or `most` runs.
 
-    slow_s: a first run longer than this counts and is the only one.
+    slow_s: if the first run takes longer than this, it counts and is the only one.
     """
     answer, took_ms = _timed(call)
     if took_ms >= slow_s * 1e3:

@@ -1,1 +1,1 @@
-"""The display's optics: pure functions of arrays, with frames, units and equation numbers."""
+"""Optics of the display: pure functions of arrays, with frames, units and equation numbers."""

@@ -1,4 +1,4 @@
-"""Alignment of layers solved for earlier eyes to the present eyes.
+"""Alignment of layers, solved for earlier eyes, to the current eyes.
 
 Parallel planes seen from one point differ by a scale and a shift. A ray from the middle between the eyes through
 point c of the reference plane (x = r) meets panel n (x = a) at c·k + m·(1 - k), k = (m_x - a) / (m_x - r). A point p
@@ -35,7 +35,7 @@ ROWS = 32  # rows resampled together, so that their float32 pixels fit a core's 
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Maps that draw every panel for the present eyes."""
+    """Maps with which each panel is drawn for the current eyes."""
 
     solved_from_shown: tuple[F64, ...]  # per panel (3, 3), a scale and a shift: pixels of the solved layer from shown
     limited: str = ""  # why it is at its limit, with the eyes too far from those solved for; empty: it is not
@@ -49,12 +49,12 @@ def reference_x_m(stack: PanelStack) -> float:
 
 
 def align(stack: PanelStack, *, solved_for_m: F64, eyes_m: F64) -> Alignment:
-    """The alignment of layers solved for eyes (2, 3) to eyes (2, 3) somewhere else; both frame `stack`.
+    """Align layers solved for eyes (2, 3) to eyes (2, 3) at another position, both in frame `stack`.
 
     It ends where an eye comes within `NEAREST_M` of the front panel, where a panel's middle would move by more than
-    `MOST_SHIFT` of its size, or where a panel would be drawn `MOST_SCALE` times larger or smaller: then it is that of
-    the furthest allowed place on the straight way from the old eyes to the new ones, continuously. Eyes that
-    are not finite leave the layers as they are. Never raises for any values.
+    `MOST_SHIFT` of its size, or where a panel would be drawn `MOST_SCALE` times larger or smaller. Beyond that limit it
+    is the alignment at the farthest allowed point on the straight line from the old eyes to the new ones, so that it is
+    continuous. Eyes that are not finite leave the layers as they are. Never raises.
     """
     if not (np.abs(solved_for_m).max() <= FARTHEST_M and np.abs(eyes_m).max() <= FARTHEST_M):  # nor NaN
         return Alignment(_as_they_are(stack), "the eyes' positions are not finite")
@@ -73,29 +73,29 @@ def align(stack: PanelStack, *, solved_for_m: F64, eyes_m: F64) -> Alignment:
 
 
 def scale_and_shift(matrix: F64) -> tuple[float, float, float, float]:
-    """(scale_u, scale_v, shift_u, shift_v) of a 3x3. Raises ValueError for any other matrix."""
+    """Return (scale_u, scale_v, shift_u, shift_v) of a 3x3. Raises ValueError for any other matrix."""
     (su, a, tu), (b, sv, tv), last = matrix.tolist()
     if a or b or last != [0.0, 0.0, 1.0]:
-        raise ValueError("an alignment is a scale and a shift")
+        raise ValueError("an alignment must be a scale and a shift")
     return su, sv, tu, tv
 
 
 def is_identity(matrix: F64) -> bool:
-    """True where shown pixels are the solved ones: nothing is resampled."""
+    """Return True if the shown pixels are the solved ones, so that nothing is resampled."""
     return scale_and_shift(matrix) == (1.0, 1.0, 0.0, 0.0)
 
 
 def shown_layers(frame: PanelFrame) -> U8:
-    """(N, h, w, 4): exactly what the panels show, before a panel's own curve, rotation and mirroring.
+    """Return (N, h, w, 4) exactly as shown, before each panel's curve, rotation and mirroring.
 
-    The reference for the presentation shader: bilinear with exact weights (for moved eyes bicubic was never better by
-    more than 0.05 dB: docs/mathematics.md), a coarse solution enlarged in the same pass, panels at rest outside the
-    solution, mixed with the flat picture before rounding. The frame's own array where there is nothing to do.
-    Raises ValueError for a frame that has nothing to show.
+    This is the reference for the presentation shader: bilinear with exact weights (for moved eyes bicubic was never
+    better by more than 0.05 dB: docs/mathematics.md), a coarse solution enlarged in the same pass, panels at rest
+    outside the solution, mixed with the flat picture before rounding. If there is nothing to do, the result is the
+    frame's array itself. Raises ValueError for a frame that has nothing to show.
     """
     flatness = 1.0 if frame.solved is None else frame.flatness
     if flatness > 0.0 and frame.flat is None:
-        raise ValueError("a frame without its flat picture")
+        raise ValueError("the frame has no flat picture")
     flat = None if flatness <= 0.0 else frame.flat
     if flatness >= 1.0 or frame.solved is None:
         assert flat is not None
@@ -151,11 +151,11 @@ def _solved_from_shown(stack: PanelStack, index: int, *, old: F64, step: F64) ->
 def _limits(
     stack: PanelStack, solved_for_m: F64, eyes_m: F64, *, old: F64, new: F64
 ) -> Iterator[tuple[float, float, str]]:
-    """(most, least, why): the share of the way that may be gone is limited by share · most <= least."""
+    """Return (most, least, why): the share of the movement that is allowed obeys share · most <= least."""
     front_m = stack.x_m[-1]
     for name, before, after in zip(("left", "right"), solved_for_m, eyes_m, strict=True):
         room_m = before[0] - front_m - NEAREST_M
-        why = f"the {name} eye is {after[0] - front_m:.3g} m before the front panel, the nearest is {NEAREST_M} m"
+        why = f"the {name} eye is {after[0] - front_m:.3g} m in front of the front panel; the minimum is {NEAREST_M} m"
         yield before[0] - after[0], room_m, why
         if room_m < 0.0:
             return
@@ -164,7 +164,7 @@ def _limits(
     for n, x_m in enumerate(stack.x_m):
         if x_m == reference_m:
             continue
-        why = f"the eyes are {moved_m:.3g} m from where the layers were solved for: panel {n} is no longer in line"
+        why = f"the eyes are {moved_m:.3g} m from where the layers were solved for, too far to align panel {n}"
         distance_m, weight = old[0] - x_m, (x_m - reference_m) / (old[0] - reference_m)
         for axis, size_m in ((1, stack.width_m), (2, stack.height_m)):
             shift = abs(weight * (old[axis] * step[0] - step[axis] * distance_m))
@@ -175,7 +175,7 @@ def _limits(
 
 
 def _places(count: int, shown: int, *, scale: float, shift: float) -> tuple[NDArray[np.intp], F32]:
-    """Padded source pixel before each of `shown` pixels (0: the resting one outside), and its distance past that."""
+    """Return the padded source pixel before each of `shown` pixels (0: the resting border) and the distance past it."""
     place = np.clip((np.arange(shown) + 0.5) * scale + shift - 0.5, -1.0, count)
     first = np.minimum(np.floor(place), count - 1.0)
     return first.astype(np.intp) + 1, (place - first).astype(np.float32)
@@ -243,7 +243,7 @@ def _displaced(
 
 
 def _between(low: F32, high: F32, weight: F32) -> F32:
-    """low · (1 - weight) + high · weight, in `low`."""
+    """Compute low · (1 - weight) + high · weight in `low`."""
     high -= low
     high *= weight
     low += high

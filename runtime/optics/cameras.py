@@ -1,4 +1,4 @@
-"""Pictures of cameras at the eyes, resampled as if they looked at the stack's origin."""
+"""Resampling of pictures from cameras at the eyes as if these looked at the stack's origin."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Picture = U8 | F32  # (h, w, 3)
 
 
 def as_cameras(matrices: Any) -> tuple[F64, F64]:
-    """(2, 3, 4) right-handed projections from `stack` to pixels, and the (2, 3) camera positions.
+    """Return (2, 3, 4) right-handed projections from `stack` to pixels, and (2, 3) camera positions.
 
     Raises ValueError for anything but two invertible 3x4 matrices.
     """
@@ -36,7 +36,7 @@ def as_cameras(matrices: Any) -> tuple[F64, F64]:
         raise ValueError("must be two 3x4 matrices, left and right, from metres of the stack's frame to pixels")
     turns = np.linalg.det(cameras[:, :, :3])
     if not (np.abs(turns) > 0).all():
-        raise ValueError("are not cameras with a position: their left 3x3 parts have no inverse")
+        raise ValueError("must be cameras with a position, but their left 3x3 parts have no inverse")
     cameras = cameras * np.sign(turns)[:, None, None]  # positive third coordinate in front of the camera
     places_m = -np.linalg.solve(cameras[:, :, :3], cameras[:, :, 3:])[..., 0]
     return cameras, np.asarray(np.round(places_m, DIGITS), np.float64)
@@ -72,7 +72,7 @@ def looking_at_origin(
 
     for name, matrix in zip(NAMES, pixels_from_gaze, strict=True):
         if not _within(matrix, np.zeros(2), width, height):
-            raise ValueError(f"the {name} picture does not show the middle of the stack")
+            raise ValueError(f"the {name} picture does not show the centre of the stack")
     both = _most(lambda share: shown(np.array([share, share])))
     share = np.array([both, both])
     share[0] = _most(lambda wider: shown(np.array([wider, share[1]])), least=both)
@@ -103,7 +103,7 @@ def _within(matrix: F64, half: F64, width: int, height: int) -> bool:
 
 
 def _most(holds: Any, least: float = 0.0) -> float:
-    """Largest number from `least` to 1 for which the monotonic condition `holds`."""
+    """Find the largest number from `least` to 1 for which the monotonic condition `holds`."""
     most = 1.0
     if holds(most):
         return most
@@ -119,12 +119,14 @@ def _slope(matrix: F64) -> F64:
 
 
 def doubts(eyes_m: ArrayLike, stack: PanelStack, *, fov_deg: float, size: tuple[int, int]) -> list[str]:
-    """Probable mistakes in eyes and picture sizes (width, height), one line each, naming the argument."""
+    """List probable mistakes in eyes and picture sizes (width, height), a line each, naming the argument."""
     eyes, warnings = np.asarray(eyes_m, np.float64), []
     if fov_deg <= math.pi:
-        warnings.append(f"fov_deg: {fov_deg:g} degrees looks like radians (of {math.degrees(fov_deg):.1f} degrees)")
+        warnings.append(
+            f"fov_deg: {fov_deg:g} degrees looks like radians ({math.degrees(fov_deg):.1f} degrees)"
+        )
     if (eyes[1] - eyes[0]) @ stack_from_eye(eyes.mean(0))[:3, 0] < 0:
-        warnings.append("eyes_m: the left eye is to the viewer's right of the right one: exchanged?")
+        warnings.append("eyes_m: the left eye is on the right of the right eye; are they swapped?")
     width_px, height_px = 64, max(2, round(64 * size[1] / size[0]))
     shares = []
     for eye in eyes:

@@ -1,8 +1,8 @@
-"""Quality at eyes other than those solved for: carried, expected and light (docs/contracts.md).
+"""Carried, expected and light quality, at eyes other than those solved for (docs/contracts.md).
 
 The picture that the layers were solved for is carried along on the centre panel: the ray of each of its pixels is
 replaced by the ray from the true eye through the same point of that panel. Ghosts and colour fringes count as errors.
-The parallax between nominal and true eye, which no shift of the layers can add, does not: a stale view is not counted,
+The parallax between nominal and true eye, which no shift of the layers can add, does not count. A stale view is
 only live quality counts it (`evaluation.refresh_quality`).
 """
 
@@ -33,7 +33,7 @@ def carried_db(
     eyes_m: ArrayLike,
     fov_deg: float,
 ) -> float:
-    """PSNR, with one ray per pixel, at eyes (2, 3) of layers solved for other eyes (2, 3).
+    """Return the PSNR, with one ray per pixel, at eyes (2, 3) of layers solved for other eyes (2, 3).
 
     layers: (N, H, W, 3 or 4) code values, exactly as displayed; drawn: an (h, w, 3) picture for each eye of
     `solved_for_m`, as retina pictures of horizontal field of view `fov_deg`, code values or float in [0, 1].
@@ -48,7 +48,7 @@ def carried_db(
 
 
 class AtEyes(TypedDict):
-    """Eyes of an expected quality."""
+    """Eyes at which an expected quality is measured."""
 
     eyes_m: ArrayLike  # (2, 3) that the layers were solved for
     fov_deg: float  # of the pictures
@@ -64,7 +64,7 @@ def expected_psnrs_db(
     sampling: Sampling = ONE_RAY,
     **at: Unpack[AtEyes],
 ) -> dict[float, float]:
-    """PSNR of the carried squared error, expected over normal tracking errors (docs/contracts.md).
+    """Return the PSNR of the carried squared error, expected over normal tracking errors.
 
     For each standard deviation to the right and up, by five points: no error with weight 1/2, two standard deviations
     to either side with 1/8 each, which is exact for second moments. drawn: an (h, w, 3) picture for each of the eyes
@@ -114,7 +114,7 @@ def _expected(
 def light_psnrs_db(
     layers: U8, drawn: Sequence[U8 | F32], stack: PanelStack, *, sampling: Sampling | None = None, **at: Unpack[AtEyes]
 ) -> dict[float, float]:
-    """Light quality by tracking error, expected as in `expected_psnrs_db`: the figure to quote.
+    """Return light PSNR by tracking error, expected as in `expected_psnrs_db`: the figure to quote.
 
     Without a sampling, a picture of fewer values than `PLENTY` gets four times as many rays a pixel.
     """
@@ -126,7 +126,7 @@ def light_psnrs_db(
 def sampled_light_db(
     layers: U8, drawn: Sequence[U8 | F32], stack: PanelStack, *, every: int, **at: Unpack[AtEyes]
 ) -> dict[float, tuple[float, float]]:
-    """Light and its standard error, dB, from every `every`-th pixel of every `every`-th row.
+    """Return light PSNR and its standard error, dB, from every `every`-th pixel of every `every`-th row.
 
     The standard error comes from ten interleaved groups of rows. The other arguments are those of `light_psnrs_db`.
     """

@@ -1,9 +1,9 @@
-"""Mean squared error of displayed layers at the eyes (docs/contracts.md, Error).
+"""Mean squared error that displayed layers cause at the eyes (docs/contracts.md, Error).
 
-*Light*, the figure to quote: a panel's pixel is a square of one colour, and a pixel of the eye's picture gets the mean
-intensity over that pixel and over the pupil, which is focused on the centre panel. Two independent sets of random rays
-estimate it. The mean of the product of both sets' errors is an unbiased estimate of the squared error; the mean of one
-set's squares would include the variance of its rays. *One ray*, as in published evaluations: through the centres of
+For *light*, the figure to quote, a panel's pixel is a square of one colour, and a pixel of the eye's picture gets the
+mean intensity over that pixel and over the pupil, which is focused on the centre panel. Two independent sets of random
+rays estimate it. The mean of the product of both sets' errors is an unbiased estimate of the squared error; the mean of
+one set's squares would include the variance of its rays. *One ray*, as in published evaluations: through the centres of
 pixel and pupil, with panels sampled bilinearly.
 """
 
@@ -33,7 +33,7 @@ TABLE = 16  # entries a code value in the table of intensity, for bilinear rays
 
 
 class Sampling(NamedTuple):
-    """Rays that the squared error is measured along."""
+    """The rays along which the squared error is measured."""
 
     rays: int = 2  # across and down a pixel, in each of the two sets; 0: one ray, bilinear
     pupil_mm: float = PUPIL_MM  # diameter; 0: a point
@@ -64,12 +64,12 @@ def squared_error(
     fov_deg: float,
     sampling: Sampling,
 ) -> float:
-    """Mean squared error at eyes (2, 3) against the carried pictures of the eyes solved for.
+    """Return the mean squared error at eyes (2, 3) against the carried pictures of the eyes solved for.
 
     layers: (N, H, W, 3 or 4) code values, rear to front; targets: (h, w, 3) intensities for each eye solved for, of
-    pictures `fov_deg` wide. A pixel counts if all its rays cross every panel half a pixel inside. For nearly perfect
-    light the result can be below 0, by the rays' noise.
-    Raises ValueError for an eye behind a panel, or where no pixel counts.
+    pictures `fov_deg` wide. A pixel counts if all its rays cross every panel half a pixel inside its edge. For nearly
+    perfect light the result can be below 0, by the rays' noise. Raises ValueError for an eye behind a panel, or where
+    no pixel counts.
     """
     sums = _sums(
         layers,
@@ -95,9 +95,9 @@ def group_errors(
     fov_deg: float,
     sampling: Sampling,
 ) -> F64:
-    """(GROUPS + 1,) mean squared error of all rows, then of interleaved groups.
+    """Return (GROUPS + 1,) mean squared errors: of all rows, then of interleaved groups of rows.
 
-    Their scatter gives its standard error.
+    The groups' scatter gives the standard error.
 
     Arguments and errors are those of `squared_error`.
     """
@@ -140,7 +140,7 @@ def _sums(
     with ThreadPoolExecutor(cores) as pool:
         sums = np.array(list(pool.map(error, calls)), np.float64)
     if not sums[:, 1].any():
-        raise ValueError("no ray of these eyes crosses every panel")
+        raise ValueError("no ray from these eyes crosses every panel")
     return sums
 
 
@@ -168,7 +168,7 @@ def _squared_error(
 def view_of(
     side: int, nominal_m: F64, true_m: F64, target: F32, stack: PanelStack, *, fov_deg: float, pupil_mm: float
 ) -> LightView:
-    """Rays of one eye. Raises ValueError for an eye behind a panel."""
+    """Return the rays of one eye. Raises ValueError for an eye behind a panel."""
     height, width = target.shape[:2]
     rays = Rays.of_eye(checked_eye(nominal_m, stack), width_px=width, height_px=height, fov_deg=fov_deg)
     centre = panel_from_image(rays.from_stack, stack.panel(stack.count // 2))
@@ -178,12 +178,12 @@ def view_of(
 
 
 def first_ray(side: int) -> int:
-    """Number of an eye's first ray; both eyes' numbers are disjoint."""
+    """Return the number of an eye's first ray. The two eyes' ray numbers are disjoint."""
     return side << 40
 
 
 def panels_from_centre(true_m: F64, stack: PanelStack) -> F64:
-    """(..., N, 3, 3) homographies from the centre panel's pixels to each layer, for eyes (..., 3)."""
+    """Return (..., N, 3, 3) homographies from the centre panel's pixels to each layer, for eyes (..., 3)."""
     centre = stack.panel(stack.count // 2)
     x, y, z = np.moveaxis(true_m[..., None], -2, 0)
     share = (np.array(stack.x_m) - x) / (centre.x_m - x)

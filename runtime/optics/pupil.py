@@ -1,4 +1,4 @@
-"""Defaults of an eye: the pupil's diameter and the tracking error (docs/mathematics.md, Light)."""
+"""Default pupil diameter and tracking error of an eye (docs/mathematics.md, Light)."""
 
 PUPIL_MM = 4.0  # diameter
 TRACKING_SIGMA_MM = 1.0  # of a good tracker: standard deviation of the eyes' common position along an axis

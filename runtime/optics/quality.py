@@ -24,7 +24,7 @@ class Quality:
 
 
 def psnr_db(mean_squared_error: float) -> float:
-    """Peak signal to noise ratio for intensities in [0, 1]; 120 dB at most."""
+    """Peak signal-to-noise ratio for intensities in [0, 1], limited to 120 dB."""
     return float(-10 * np.log10(max(mean_squared_error, 1e-12)))
 
 
@@ -54,7 +54,7 @@ def ssim(a: F32, b: F32, mask: Mask) -> float:
 
 
 def squared_error(image: F32, target: F32, mask: Mask) -> tuple[float, int]:
-    """Sum of squared differences over the counted rays and channels, and the number of terms."""
+    """Sum the squared differences over the counted rays and channels. Also returns the number of terms."""
     total, counted = 0.0, 0
     for rows in strips(len(mask)):
         difference = (image[rows] - target[rows])[mask[rows]].astype(np.float64).ravel()
@@ -63,7 +63,7 @@ def squared_error(image: F32, target: F32, mask: Mask) -> tuple[float, int]:
 
 
 def quality(seen: Sequence[F32], targets: Sequence[F32], masks: Sequence[Mask], *, similarity: bool = True) -> Quality:
-    """Pooled displayed quality over eyes. Raises ValueError if no ray of an eye crosses every panel.
+    """Displayed quality pooled over the eyes. Raises ValueError if no ray of an eye crosses every panel.
 
     similarity: compute SSIM; otherwise it is NaN.
     """
@@ -71,7 +71,7 @@ def quality(seen: Sequence[F32], targets: Sequence[F32], masks: Sequence[Mask], 
     for image, target, mask in zip(seen, targets, masks, strict=True):
         squared, counted = squared_error(image, target, mask)
         if counted == 0:
-            raise ValueError("no ray of this eye crosses every panel")
+            raise ValueError("no ray from this eye crosses every panel")
         errors, weights = errors + squared, weights + counted
         per_eye.append(psnr_db(squared / counted))
         similarities.append(ssim(image, target, mask) if similarity else np.nan)

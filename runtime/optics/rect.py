@@ -1,4 +1,4 @@
-"""Rectangles of whole pixels: the region of a raster that is drawn, solved or shown."""
+"""Rectangles of whole pixels, such as the region of a raster that is drawn, solved or shown."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Depth of the content across the display, and the movement of its picture with the eyes.
+"""Depth of the content across the display, and the resulting movement of its picture with the eyes.
 
 A point of the content on the plane x is seen from the middle between the eyes, o, through a point c of the middle
 panel's plane (x = r). With c relative to the plane's origin, relief b = (x - r) / (o_x - x) and the middle n that the
@@ -30,12 +30,12 @@ Pixels = NDArray[np.floating[Any]]
 
 
 def block_px(width_px: int) -> int:
-    """Side, in pixels of a raster `width_px` wide, of the block that one pixel of its relief covers."""
+    """Side length, in pixels of a raster `width_px` wide, of the block that one relief pixel covers."""
     return -(-width_px // WIDEST_PX)
 
 
 def relief_of(nearness: Sequence[F32], *, distance_m: Sequence[float]) -> F32:
-    """(h, w) relief of what both eyes see.
+    """Combine both eyes' depth into one (h, w) relief.
 
     nearness: per eye (h, w), 1/m, the inverse distance along x, 0: the background alone, which has no relief;
     distance_m: per eye, from the middle panel. Of both eyes' reliefs, the one farther from 0 counts.
@@ -50,9 +50,9 @@ def relief_of(nearness: Sequence[F32], *, distance_m: Sequence[float]) -> F32:
 
 
 def parallax(stack: PanelStack, *, old_m: F64, new_m: F64) -> Parallax | None:
-    """Motion of content on the panels when the middle between the eyes (3,) moves; frame `stack`.
+    """Return the motion of content on the panels when the eyes' midpoint (3,) moves; frame `stack`.
 
-    None: with an even number of panels, none of which is the middle one, or without a movement.
+    Returns None if there is no middle panel (an even number of panels) or no movement.
     """
     if stack.count % 2 == 0 or np.array_equal(old_m, new_m):
         return None
@@ -88,7 +88,7 @@ class Displacement:
     weight: float
 
     def at(self, columns: Pixels, rows: Pixels, *, size_px: tuple[int, int]) -> tuple[F32, F32]:
-        """(rows, columns) each, pixels of the panel right and down, for pixels (centres at half-integers)."""
+        """Return two (rows, columns) arrays: panel pixels right and down, for pixels centred at half-integers."""
         scale_u, scale_v = self.middle_from_shown[0, 0], self.middle_from_shown[1, 1]
         u = columns * scale_u + self.middle_from_shown[0, 2]
         v = rows * scale_v + self.middle_from_shown[1, 2]
@@ -106,7 +106,7 @@ class Displacement:
 
 
 def displacement(relief: F32 | None, parallax: Parallax | None, panel: int) -> Displacement | None:
-    """A panel's; None without a relief or a movement."""
+    """Return a panel's displacement, or None without a relief or a movement."""
     if relief is None or parallax is None:
         return None
     return Displacement(
@@ -115,7 +115,7 @@ def displacement(relief: F32 | None, parallax: Parallax | None, panel: int) -> D
 
 
 def _between_centres(place: Pixels, count: int) -> tuple[NDArray[np.intp], F32]:
-    """The pixel whose centre is before each place, and the distance past it; clamped to the edge."""
+    """Return the pixel whose centre is before each place, and the distance past it, clamped to the edge."""
     inside = np.clip(place - 0.5, 0.0, count - 1.0)
     low = np.floor(inside)
     return low.astype(np.intp), (inside - low).astype(np.float32)

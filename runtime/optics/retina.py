@@ -1,4 +1,4 @@
-"""Simulated retinas: images of an eye through the layers, as a pinhole or with a finite pupil."""
+"""Simulated retinas: an eye's images through the layers, for a pinhole or a finite pupil."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STRIP_ROWS = 32  # of a picture processed together: they fit the cache
 
 @dataclass(frozen=True, slots=True)
 class Retina:
-    """An eye's image, and a mask of rays that cross every panel at least half a pixel inside its edge."""
+    """An eye's image, and a mask of the rays that cross every panel half a pixel inside its edge."""
 
     image: F32  # (h, w, 3) in [0, 1]
     mask: Mask  # (h, w)
@@ -80,7 +80,7 @@ def _mix(a: F32, b: F32, weight: F32) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Rays:
-    """The rays of an eye's image that looks at the stack's origin."""
+    """Rays of the image of an eye that looks at the stack's origin."""
 
     from_stack: F64  # (3, 4) `image_from_stack`
     u: F64  # (w,) columns
@@ -88,7 +88,7 @@ class Rays:
 
     @classmethod
     def of_eye(cls, eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg: float) -> Rays:
-        """Rays of an eye (3,), frame `stack`, for an image of this size and horizontal field of view."""
+        """Create the rays of an eye (3,), frame `stack`, for an image of this size and field of view."""
         return cls(
             image_from_stack(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg),
             np.arange(width_px, dtype=np.float64) + 0.5,
@@ -113,7 +113,7 @@ class Rays:
             return (h[0, 0] * u + h[0, 1] * v + h[0, 2]) / weight, (h[1, 0] * u + h[1, 1] * v + h[1, 2]) / weight
 
     def toward_panels(self) -> Mask:
-        """(h, w) True if the ray goes towards the panels, not away behind the eye."""
+        """Return (h, w), True where the ray goes towards the panels and not backwards."""
         toward = self.toward()
         result: Mask = toward[0] * self.u + toward[1] * self.v + toward[2] < 0.0
         return result
@@ -142,7 +142,7 @@ def seen_by(
     width_px: int | None = None,
     height_px: int | None = None,
 ) -> Retina:
-    """Image of a pinhole eye: sin² of the panel values summed along each ray (supplement, (6), (7)).
+    """Compute a pinhole eye's image: sin² of the values summed along each ray (supplement, (6), (7)).
 
     layers: (N, H, W, 3 or 4), rear to front, uint8 code values or float in [0, 1]; a fourth channel is ignored.
     The image has the layers' size by default.
@@ -175,10 +175,10 @@ def checked_eye(eye_m: ArrayLike, stack: PanelStack) -> F64:
 def through_layers(
     layers: U8 | F32, positions: Callable[[slice], Iterable[tuple[F64, F64]]], mask: Mask, stack: PanelStack
 ) -> Retina:
-    """Image along rays with given positions on each panel.
+    """Compute an image along rays whose positions on each panel are given.
 
     positions: returns (h, w) u and v on every panel, rear to front, for some rows of the image; mask: (h, w) rays that
-    may count. Of them, those count that cross every panel half a pixel inside its edge.
+    may count. Of these, the ones that cross every panel half a pixel inside its edge do count.
     """
     image, counted = np.empty((*mask.shape, 3), np.float32), mask.copy()
     planes = [_planes(layer[..., :3]) for layer in layers]
@@ -218,5 +218,5 @@ def average(images: Iterable[F32]) -> F32:
         total = image.copy() if total is None else total + image
         count += 1
     if total is None:
-        raise ValueError("a pupil needs at least one point")
+        raise ValueError("a pupil must have at least one point")
     return total / np.float32(count)

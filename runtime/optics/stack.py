@@ -1,4 +1,4 @@
-"""The stack of panels, and rasters on planes parallel to them."""
+"""Geometry of the stack of panels, and rasters on planes parallel to them."""
 
 from __future__ import annotations
 
@@ -70,19 +70,19 @@ class PanelStack:
 
     @property
     def is_evenly_spaced(self) -> bool:
-        """True if the gaps are even enough for the shipped networks."""
+        """Return True if the gaps are even enough for the shipped networks."""
         gaps = np.diff(self.x_m)
         return bool(gaps.size == 0 or np.ptp(gaps) <= UNEVEN_MOST * gaps.mean())
 
     def reduced(self, reduction: int) -> PanelStack:
-        """Divide the numbers of rows and columns by `reduction`, to at least one."""
+        """Return the stack with `reduction` times fewer rows and columns (at least one)."""
         if reduction == 1:
             return self
         width_px, height_px = (max(1, round(px / reduction)) for px in (self.width_px, self.height_px))
         return replace(self, width_px=width_px, height_px=height_px)
 
     def transposed(self) -> PanelStack:
-        """Exchange rows and columns: down (-z) becomes right (+y), and right becomes down."""
+        """Return the stack with rows and columns swapped: down (-z) becomes right (+y), and vice versa."""
         tilt = self.tilt
         if tilt is not None:
             x, y, z = tilt.seen_from_m

@@ -17,7 +17,7 @@ def stack_from_eye(eye_m: ArrayLike) -> F64:
     Axes: x right and parallel to the ground, y up, z from the scene towards the eye. On the vertical
     axis, where the limits differ, use the limit from +x: r_x = +y.
 
-    Raises ValueError for an eye that is at the origin or not finite.
+    Raises ValueError if the eye is at the origin or not finite.
     """
     eye = np.asarray(eye_m, dtype=np.float64)
     scale = float(np.abs(eye).max())
@@ -45,7 +45,7 @@ def image_from_camera(*, width_px: int, height_px: int, fov_deg: float) -> F64:
 def image_from_stack(eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg: float) -> F64:
     """3x4 projection of `stack` points to an eye's image: K·diag(1, -1, -1)·R_e^T·[I | -e] ((31)-(39)).
 
-    The third homogeneous coordinate is the distance along the gaze in metres, positive before the eye.
+    The third homogeneous coordinate is the distance along the gaze in metres, positive in front of the eye.
     """
     pose = stack_from_eye(eye_m)
     rotation = np.diag([1.0, -1.0, -1.0]) @ pose[:3, :3].T
@@ -88,6 +88,6 @@ def relative_scale_shift(eye_m: ArrayLike, *, from_x_m: float, to_x_m: float) ->
     eye = np.asarray(eye_m, dtype=np.float64)
     distance_m = eye[0] - from_x_m
     if distance_m == 0.0:
-        raise ValueError("an eye in a panel's plane sees nothing through it")
+        raise ValueError("an eye in a panel's plane cannot see through the panel")
     scale = (eye[0] - to_x_m) / distance_m
     return float(scale), eye[1:] * ((to_x_m - from_x_m) / distance_m)

@@ -74,7 +74,7 @@ def test_eyes_too_far_off_are_aligned_as_far_as_possible(stage: Stage) -> None:
     machine = stage.presenter.machine
     assert machine.state is State.TRACKING
     assert "alignment at its limit" in machine.reason
-    assert "no longer in line" in machine.reason
+    assert "too far to align" in machine.reason
     assert np.isfinite(stage.panels.frame.solved_from_shown[0]).all()
     stage.solver.hand_over(solved=solution(7, aside(3.0)))
     stage.refresh()

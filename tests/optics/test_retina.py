@@ -124,5 +124,5 @@ def test_a_finite_pupil_sees_the_mean_of_what_its_points_see(seed: int) -> None:
 
 
 def test_a_pupil_without_points_is_refused() -> None:
-    with pytest.raises(ValueError, match="needs at least one point"):
+    with pytest.raises(ValueError, match="must have at least one point"):
         average([])
