@@ -3,7 +3,7 @@
 The picture that the layers were solved for is carried along on the centre panel: the ray of each of its pixels is
 replaced by the ray from the true eye through the same point of that panel. Ghosts and colour fringes count as errors.
 The parallax between nominal and true eye, which no shift of the layers can add, does not count. A stale view is
-only live quality counts it (`evaluation.refresh_quality`).
+not counted here; live quality counts it (`evaluation.refresh_quality`).
 """
 
 from __future__ import annotations

@@ -131,7 +131,7 @@ def test_it_becomes_ready_by_presenting_is_steered_and_ends_in_order(started: Ca
     assert daemon.status()["presented"] >= 1
     assert daemon.hears("WATCHDOG=1")
     assert ask([daemon.socket], {"command": "flat"})["ok"]
-    assert daemon.hears("STATUS=flat (asked for)")
+    assert daemon.hears("STATUS=flat (requested)")
     assert ask([daemon.socket], {"command": "resume"})["ok"]
     assert daemon.hears("STATUS=tracking")
     refused = ask([daemon.socket], {"command": "scene", "value": "no-such-scene"})

@@ -165,7 +165,7 @@ def test_flat_can_be_asked_for_and_given_up(stage: Stage) -> None:
     stage.presenter.flat_asked = True
     stage.refresh(30)
     assert stage.panels.frame.flatness == 1.0
-    assert (stage.presenter.machine.state, stage.presenter.machine.reason) == (State.FLAT, "asked for")
+    assert (stage.presenter.machine.state, stage.presenter.machine.reason) == (State.FLAT, "requested")
     assert all(request.flat_wanted for request in stage.solver.requests[-29:])
     assert all(request.eyes_m is not None for request in stage.solver.requests[-29:])  # it is ready to come back
     stage.presenter.flat_asked = False
