@@ -180,8 +180,10 @@ def moving_text(found: Sequence[Moving]) -> str:
         if now.live_db < best.live_db - 0.5:
             worse.append(f"{motion} ({best.live_db - now.live_db:.1f} dB below {best.effort})")
     headings = ["motion", "full, dB", "view, mm", "95%", "best fixed, dB", "auto, dB", "view, mm", "95%", "efforts"]
-    told = f"more than 0.5 dB below the best fixed effort: {', '.join(worse) or 'nowhere'}"
-    return f"{MOVING}\n{_table(headings, rows)}\n`auto` is {told}.\n"
+    verdict = "never more than 0.5 dB below the best fixed effort"
+    if worse:
+        verdict = f"more than 0.5 dB below the best fixed effort for {', '.join(worse)}"
+    return f"{MOVING}\n{_table(headings, rows)}\n`auto` is {verdict}.\n"
 
 
 def _live(one: Moving) -> list[str]:
