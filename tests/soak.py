@@ -40,7 +40,7 @@ from tests.panels.xserver import HEIGHT_PX, WIDTH_PX, XServer
 LOST_EVERY_S = 30.0
 HARM_EVERY_S = 40.0  # a cable, or the panels' contexts
 FAILING = 0.002  # of the solver's steps
-REFUSED = ("in favour of a newer change", "there is no next one", "nobody's", "the loop did not answer", "restarted")
+REFUSED = ("favour of a newer change", "there is no next entry", "nobody's", "no answer from the display", "restarted")
 DELAYS = (
     (solver_parts.RunningSolver, "step", 0.02, 2.5), (solver_parts.RunningSolver, "close", 0.3, 1.5),
     (solver_parts, "prepare_content", 0.3, 2.5), (reconfigure, "prepare_content", 0.3, 2.5),
