@@ -1,4 +1,4 @@
-"""Monotonic clocks in integer nanoseconds, passed to whatever needs the time."""
+"""Monotonic clocks in integer nanoseconds, injected into everything that needs the time."""
 
 from __future__ import annotations
 

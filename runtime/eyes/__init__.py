@@ -1,1 +1,1 @@
-"""Finds both eyes in pictures or samples, transforms them to the `stack` frame, and tracks and predicts them."""
+"""Finding both eyes in pictures or samples, and tracking and predicting them in the `stack` frame."""

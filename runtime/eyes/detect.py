@@ -1,4 +1,4 @@
-"""Eye positions, with their covariance, from a sensor's pictures: the viewer's pupils and how far away they are."""
+"""Eye positions and their covariance from a sensor's pictures: the viewer's pupils and distance."""
 
 from __future__ import annotations
 

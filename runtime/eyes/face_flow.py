@@ -1,4 +1,4 @@
-"""Motion of a face between pictures, accurate to 1/50 pixel, from the optical flow of its rigid parts.
+"""Motion of a face between pictures, to 1/50 pixel, from the optical flow of its rigid parts.
 
 The networks' errors are independent from picture to picture; optical flow between two pictures is far more precise.
 The pupils therefore follow the flow, and the networks correct them slowly.
@@ -44,7 +44,7 @@ class FaceFlow:
         self._grey, self._mesh = self._crop(picture), mesh[RIGID, :2].copy()
 
     def moved(self, picture: U8, mesh: F64) -> F64 | None:
-        """Return the (2, 3) similarity from the remembered face's pixels to the new picture's, None if unknown."""
+        """Return a (2, 3) similarity from the remembered face's pixels to the new picture's, or None."""
         grey = self._crop(picture)
         matrix = self._crop_from_picture
         start = (transformed(matrix, self._mesh) - 0.5).astype(np.float32)

@@ -88,7 +88,7 @@ class Displacement:
     weight: float
 
     def at(self, columns: Pixels, rows: Pixels, *, size_px: tuple[int, int]) -> tuple[F32, F32]:
-        """Return two (rows, columns) arrays: panel pixels right and down, for pixels with half-integer centres."""
+        """Return two (rows, columns) arrays of panel pixels, right and down, for every pixel's centre."""
         scale_u, scale_v = self.middle_from_shown[0, 0], self.middle_from_shown[1, 1]
         u = columns * scale_u + self.middle_from_shown[0, 2]
         v = rows * scale_v + self.middle_from_shown[1, 2]

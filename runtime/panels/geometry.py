@@ -54,7 +54,7 @@ def layer_from_screen(
 ) -> F64:
     """3x3 matrix from the monitor's pixels to layer pixels, up to scale.
 
-    homography: from ideal to true pixels, at the panel's resolution, whatever the layers' resolution.
+    homography: from ideal to true pixels, at the panel's resolution, which may differ from the layers'.
     Raises ValueError for a singular homography.
     """
     columns, rows = panel_size_px(
