@@ -37,7 +37,7 @@ class Form(Section):
     output: Literal["panels"] = "panels"
     branch: Literal[1, 2] = Field(1, description="of phases: their sums are in [0, 1] or in [1, 2]")
     picture_fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
-        0.0, description="horizontal field of view of its pictures, black outside; 0: that of the content"
+        0.0, description="horizontal field of view of its pictures, which are black beyond it; 0: the content's own"
     )
 
     steps: Annotated[int, Field(ge=0, le=STEPS_MOST)] = Field(

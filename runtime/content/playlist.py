@@ -1,6 +1,6 @@
 """A playlist: scenes one after another, each with its time and settings.
 
-Every one of them is loaded before the first is shown: missing files are refused then, and a change takes no time.
+All scenes are loaded before the first is shown, so missing files are refused at the start and changes take no time.
 """
 
 from __future__ import annotations

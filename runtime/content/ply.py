@@ -42,7 +42,7 @@ class PlyHeader:
 
     @property
     def kind(self) -> str:
-        """`splats` or `triangles`: the limit that holds for it."""
+        """Kind of content, which decides the file's limits: `splats` or `triangles`."""
         return "splats" if SPLAT_MARKS & {name for name, _ in self.properties["vertex"]} else "triangles"
 
     @property

@@ -34,7 +34,7 @@ class GrowingPage:
         self.record["yardsticks_ms"] = [yardstick_ms()]
 
     def doing(self, what: str) -> None:
-        """Note the present measurement."""
+        """Record which measurement is in progress."""
         self._progress(what)
         self.record["measuring"] = what
 

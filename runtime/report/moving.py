@@ -37,7 +37,7 @@ class Moving:
 
 
 class KeptInMemory:
-    """Output of a run that keeps lines, and light with its true pictures, in memory."""
+    """Run output kept in memory: the lines, and the displayed light with the true pictures."""
 
     def __init__(self) -> None:
         self.lines: list[Mapping[str, Any]] = []

@@ -64,7 +64,7 @@ def read_animation(path: Path, *, background: Colour = WHITE) -> tuple[list[U8],
     if len(numbers) * header.width_px * header.height_px > LIMITS.pixels:
         size = f"{header.width_px} x {header.height_px}"
         total = f"{len(numbers)} frames of {size} pixels; at most {LIMITS.pixels:,} in all"
-        log.warning("%s: its first frame is shown as a still: it has %s", path, total)
+        log.warning("%s has %s; only its first frame is shown, as a still", path, total)
         numbers = numbers[:1]
     frames = list(_decoded(path, data, header, tuple(numbers), background))
     return [picture for picture, _ in frames], [shown_ms for _, shown_ms in frames]

@@ -51,7 +51,7 @@ def _wrong_field(model: type[BaseModel], error: Any) -> tuple[str, str]:
 
 
 def _keys(model: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
-    """Return the keys that the table at a path of the model may have."""
+    """Return the keys allowed in the model's table at a path."""
     table: Any = model
     for part in path:
         if isinstance(part, str) and part in getattr(table, "model_fields", ()):

@@ -254,7 +254,7 @@ def test_a_compressed_file_stands_by_its_format_s_custom(tmp_path: Path, stack: 
     ("name", "change", "told"),
     [
         ("a.spz", lambda data: data[: len(data) // 2], "is cut off: 600 splats are promised"),
-        ("a.spz", lambda data: gzip.compress(b"NGSP" + bytes(40)), "is no SPZ of version 1 to 4"),
+        ("a.spz", lambda data: gzip.compress(b"NGSP" + bytes(40)), "is not an SPZ file of version 1 to 4"),
         ("a.sog", lambda data: data[:400], "is damaged (File is not a zip file)"),
         ("a.sog", lambda data: data.replace(b'"version": 2', b'"version": 3'), "is damaged (Bad CRC-32"),
         ("a.splat", lambda data: data[:-1], "is cut off, or no .splat: it has 19199 bytes, no multiple of 32"),
