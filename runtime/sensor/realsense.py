@@ -34,7 +34,7 @@ class RealSenseDriver(Sensor):
     capabilities = Capabilities(colour=True, depth=True)
 
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
-        """settings.source: empty or `demo` for the only connected camera; otherwise a serial number or a recording (`FILES`)."""
+        """settings.source: `demo` or empty for the only camera; otherwise a serial number or a recording (`FILES`)."""
         import pyrealsense2
 
         self._rs, self._settings, self._clock = pyrealsense2, settings, clock
