@@ -1,4 +1,4 @@
-"""Checkpoints: read as weights only (no code from the file runs), written atomically."""
+"""Checkpoints, which are read as weights only (no code from the file runs) and written atomically."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WIDTH_KEY = "subnets.in_conv.0.weight"
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """Read a checkpoint's table, which has at least `model`, a table of tensors. Raises InputError.
+    """Read a checkpoint's table, which contains at least `model`, a table of tensors. Raises InputError.
 
     Only plain values, tensors and an `argparse.Namespace` of plain values (saved by the published code) are
     deserialised; no code from the file runs.
@@ -33,20 +33,20 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         raise InputError(path, "", f"is not a checkpoint of plain weights ({one_line(str(error), most=120)})") from None
     state = table.get("model") if isinstance(table, dict) else None
     if not isinstance(state, Mapping) or not state or not all(isinstance(v, Tensor) for v in state.values()):
-        raise InputError(path, "model", 'missing: a checkpoint is {"model": state_dict}')
+        raise InputError(path, "model", 'missing; a checkpoint must contain {"model": state_dict}')
     return table
 
 
 def eyereal_width(state: Mapping[str, Tensor], *, source: Path) -> int:
-    """Width of the published network in a checkpoint. Raises InputError."""
+    """Return the width of the published network in a checkpoint. Raises InputError."""
     first = state.get(WIDTH_KEY)
     if first is None or first.ndim != 4:
-        raise InputError(source, WIDTH_KEY, "missing: not a checkpoint of the published network")
+        raise InputError(source, WIDTH_KEY, "missing, so this is not a checkpoint of the published network")
     return int(first.shape[0])
 
 
 def fill(net: nn.Module, state: Mapping[str, Tensor], *, source: str | Path, arch: str) -> None:
-    """Load a network's weights, all of them and no others. Raises InputError, naming the first wrong one."""
+    """Load exactly the weights that a network has. Raises InputError, naming the first wrong one."""
     expected = net.state_dict()
     missing = [key for key in expected if key not in state]
     # Old checkpoints lack this counter, which inference does not use.
@@ -54,19 +54,19 @@ def fill(net: nn.Module, state: Mapping[str, Tensor], *, source: str | Path, arc
     surplus = [key for key in state if key not in expected]
     if missing or surplus:
         problem = [f"{len(missing)} keys of {arch} are missing"] if missing else []
-        problem += [f"{len(surplus)} keys are not of {arch}"] if surplus else []
+        problem += [f"{len(surplus)} keys do not belong to {arch}"] if surplus else []
         raise InputError(source, (missing or surplus)[0], "; ".join(problem))
     for key, value in state.items():
         if value.shape != expected[key].shape:
             shapes = f"{tuple(value.shape)}, but {arch} has {tuple(expected[key].shape)}"
             raise InputError(source, key, shapes)
         if not torch.isfinite(value).all():
-            raise InputError(source, key, "holds numbers that are not finite")
+            raise InputError(source, key, "contains numbers that are not finite")
     net.load_state_dict({**expected, **state})
 
 
 def save_checkpoint(path: Path, table: dict[str, Any]) -> None:
-    """Write a checkpoint atomically; the table must be readable as weights only."""
+    """Write a checkpoint atomically. The table must be readable as weights only."""
     buffer = io.BytesIO()
     torch.save(table, buffer)
     write_bytes(path, buffer.getvalue())

@@ -1,4 +1,4 @@
-"""Options of `phasestack train`, `export` and `validate`; torch is imported when they run."""
+"""Commands `phasestack train`, `export` and `validate`. Torch is imported only when they run."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ def require(*modules: str) -> None:
             raise MissingPart(f"{module} is not installed: pip install 'phasestack[export]'")
 
 
-Arch = Annotated[str, typer.Option(help="eyereal, unrolled, or module:Class, your torch.nn.Module on Python's path")]
+Arch = Annotated[str, typer.Option(help="eyereal, unrolled, or module:Class for a torch.nn.Module on Python's path")]
 Options = Annotated[
     list[str] | None,
     typer.Option(
         "--option",
         metavar="NAME=VALUE",
-        help="an option of the network, or steps=N for solver steps after it; repeatable",
+        help="an option of the network, or steps=N for the number of solver steps after it; repeatable",
     ),
 ]
 
@@ -39,13 +39,13 @@ def train(
         Path | None, typer.Option(help="folder of pairs in EyeReal's format; default: procedural pairs")
     ] = None,
     scene: Annotated[str, typer.Option(help="scene or file to draw, at random rotations and eye positions")] = "",
-    pairs: Annotated[int, typer.Option(min=0, help="number of different pairs; 0: unlimited")] = 0,
+    pairs: Annotated[int, typer.Option(min=0, help="number of distinct pairs; 0: unlimited")] = 0,
     panels: Annotated[
         Path | None, typer.Option(help="configuration of the panels; default: any three evenly spaced ones")
     ] = None,
     iterations: Annotated[int, typer.Option(min=1, help="total gradient steps")] = 2000,
     batch: Annotated[int, typer.Option(min=1, help="pairs per iteration")] = 1,
-    learning_rate: Annotated[float, number(1e-8, 1, help="initial, with cosine decay to zero")] = 1e-3,
+    learning_rate: Annotated[float, number(1e-8, 1, help="initial learning rate, with cosine decay to zero")] = 1e-3,
     width: Annotated[int, typer.Option(min=32, max=8192, help="of panels and pictures in training, pixels")] = 480,
     height: Annotated[int, typer.Option(min=32, max=8192, help="of panels and pictures in training, pixels")] = 270,
     eye_sigma_mm: Annotated[float, number(0, 20, "mm", help="standard deviation of the tracking error")] = 1.0,
@@ -86,7 +86,7 @@ def train(
 
 
 def options_of(texts: list[str] | None) -> dict[str, Any]:
-    """Parse NAME=VALUE options, each value as JSON or else as text. Raises InputError."""
+    """Parse NAME=VALUE options. Each value is JSON, or else text. Raises InputError."""
     options: dict[str, Any] = {}
     for text in texts or []:
         name, equals, value = text.partition("=")
@@ -136,7 +136,7 @@ def export(
     )
     typer.echo(report.json() if as_json else report.table())
     if not report.passed:
-        typer.echo(f"{out}: not written: a check failed", err=True)
+        typer.echo(f"{out}: not written, because a check failed", err=True)
         raise typer.Exit(1)
 
 

@@ -1,4 +1,4 @@
-"""Endless procedural training pairs: random poses, scenes of planes, views around the eyes."""
+"""Endless procedural training pairs: random poses, scenes made of planes, views around the eyes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LEAST_COMMON = 0.4  # share of the centre panel's size that each eye must see th
 
 @dataclass(frozen=True, slots=True)
 class TrainingPair:
-    """Two pictures and the eyes that they are for."""
+    """A left/right pair of pictures and the eye positions that they are rendered for."""
 
     stack: PanelStack
     eyes_m: F64  # (2, 3) left, right; frame `stack`
@@ -29,7 +29,7 @@ class TrainingPair:
 
 
 def random_stack(random: Random, *, width_px: int, height_px: int) -> PanelStack:
-    """Three evenly spaced panels: the prototype's on a coarser raster, a part of them, or another size."""
+    """Draw random, evenly spaced panels: the prototype's on a coarser raster, part of it, or another size."""
     width_m = PITCH_WIDTH_M * math.exp(random.uniform(math.log(0.25), math.log(1.6)))
     gap_m = math.exp(random.uniform(math.log(0.005), math.log(0.5)))
     if random.random() < 0.6:  # a practical range
@@ -38,7 +38,7 @@ def random_stack(random: Random, *, width_px: int, height_px: int) -> PanelStack
 
 
 def random_eyes(random: Random, stack: PanelStack) -> F64:
-    """(2, 3) random eyes, 0.1 to 4 m from the centre, 0.1 m in front of the panels at least."""
+    """Draw (2, 3) random eyes, 0.1 to 4 m from the centre and at least 0.1 m in front of the panels."""
     front_m = stack.x_m[-1]
     distance_m = math.exp(random.uniform(math.log(0.1 + front_m), math.log(4.0)))
     if random.random() < 0.5:
@@ -76,7 +76,7 @@ def is_served(eyes_m: F64, stack: PanelStack) -> bool:
 def random_place(
     random: Random, *, width_px: int, height_px: int, stack: PanelStack | None = None
 ) -> tuple[PanelStack, F64]:
-    """Panels (`stack`, or random ones) and random eyes (2, 3) that see enough of them."""
+    """Return panels (`stack`, or random ones) and random eyes (2, 3) that see enough of them."""
     while True:
         panels = stack or random_stack(random, width_px=width_px, height_px=height_px)
         eyes = random_eyes(random, panels)
@@ -87,7 +87,7 @@ def random_place(
 def random_pair(
     random: Random, *, width_px: int, height_px: int, stack: PanelStack | None = None, fov_deg: float = 0.0
 ) -> TrainingPair:
-    """Random training pair for `stack` or random panels; fov_deg 0: as wide as the panels."""
+    """Draw a random training pair for `stack` or for random panels. fov_deg 0: as wide as the panels."""
     stack, eyes = random_place(random, width_px=width_px, height_px=height_px, stack=stack)
     scene = random_scene(random, stack, eyes.mean(axis=0))
     fov_deg = fov_deg or filling_fov_deg(stack, eyes.mean(axis=0))

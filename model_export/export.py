@@ -43,7 +43,7 @@ def export_model(
     """Build a model, check it, and write it if all checks pass. Raises InputError."""
     check_known(arch, *SHIPPED)
     if checkpoint is not None and random_init is not None:
-        raise InputError("export", "--random-init", "and --checkpoint exclude one another")
+        raise InputError("export", "--random-init", "and --checkpoint exclude each other")
     for option, value in (("--width", width_px), ("--height", height_px)):
         if value < LEAST_PX or value > 8192 or value % 2:
             raise InputError("export", option, f"{value} must be an even number from {LEAST_PX} to 8192")
@@ -107,20 +107,22 @@ def spectral_model(name: str) -> tuple[bytes, nn.Module]:
 def picture_network(
     arch: str, checkpoint: Path | None, random_init: int | None, options: dict[str, Any]
 ) -> tuple[Network, str]:
-    """Picture network with a checkpoint's weights or untrained, and a digest of their source.
+    """Return a picture network, with a checkpoint's weights or untrained, and a digest of their source.
 
     A checkpoint of `phasestack train` contains the network's options, and must be of network `arch`.
     """
     if checkpoint is None:
         if random_init is None:
-            raise InputError("export", "--checkpoint", f"or --random-init is needed: {arch}'s weights aren't shipped")
+            raise InputError(
+                "export", "--checkpoint", f"or --random-init is required: {arch}'s weights aren't shipped"
+            )
         network = make_network(arch, options, seed=random_init)
         return network, hashlib.sha256(f"{arch} {network.options} random {random_init}".encode()).hexdigest()
     table = load_checkpoint(checkpoint)
     trained = table.get("training")
     if isinstance(trained, dict):
         if trained.get("arch") != arch:
-            raise InputError(checkpoint, "training.arch", f"is a checkpoint of {trained.get('arch')}, not of {arch}")
+            raise InputError(checkpoint, "training.arch", f"is a checkpoint of {trained.get('arch')}, not {arch}")
         options = {**trained.get("options", {}), **options}
     elif arch == "eyereal":
         options = {"width": eyereal_width(table["model"], source=checkpoint), **options}

@@ -113,7 +113,7 @@ def traced(
 def light_db(
     panels: Tensor, targets: Tensor, views: Views, *, rays: int = 3, random: torch.Generator | None = None
 ) -> float:
-    """PSNR of the light that reaches point eyes from panels, against targets (E, C, h, w).
+    """Return the PSNR of light from the panels at point eyes, against targets (E, C, h, w).
 
     The errors of two independent sets of rays are multiplied, so that the mean is an unbiased squared error.
     """

@@ -82,7 +82,7 @@ def blamed(arch: str, field: str) -> Iterator[None]:
 
 
 def check_known(arch: str, *others: str) -> None:
-    """Raise InputError unless `arch` is a network's name or `module:Class`."""
+    """Raise InputError unless `arch` is the name of a network or `module:Class`."""
     if not is_plugin(arch) and arch not in (*others, *KNOWN):
         raise InputError("--arch", "", f"{arch!r} is neither {', '.join([*others, *KNOWN])} nor module:Class")
 
@@ -111,14 +111,14 @@ def probe(network: Network, *, width_px: int, height_px: int) -> None:
     with torch.no_grad(), blamed(arch, f"forward, of {tuple(example.shape)}"):
         answer = network.net.eval()(example)
     if not isinstance(answer, Tensor):
-        raise InputError(arch, "forward", f"returns {type(answer).__name__}; one tensor is needed")
+        raise InputError(arch, "forward", f"returns {type(answer).__name__}; it must return one tensor")
     shape = tuple(answer.shape)
     for axis, size, needed in zip(("batch", "channels", "height", "width"), shape, expected, strict=False):
         if size != needed or len(shape) != len(expected):
-            problem = f"returns {shape}, where {expected} is needed: {axis}"
+            problem = f"returns {shape} instead of {expected}: {axis}"
             raise InputError(arch, "forward", f"{problem} ({PANELS} panels of {COLOURS} colours)")
     if answer.dtype != torch.float32:
-        raise InputError(arch, "forward", f"returns {answer.dtype}; torch.float32 is needed")
+        raise InputError(arch, "forward", f"returns {answer.dtype} instead of torch.float32")
     if not torch.isfinite(answer).all():
         raise InputError(arch, "forward", "returns numbers that are not finite")
 
@@ -131,7 +131,7 @@ def check_static(network: Network, *, width_px: int, height_px: int) -> None:
             torch.export.export(network.net.eval(), (example,), strict=False)
     except Exception as error:  # other failures are reported by the exporter itself
         if "data-dependent" in str(error).lower():
-            problem = "branches on the values of its input, which a graph can't (use torch.where)"
+            problem = "branches on the values of its input, which a graph can't represent (use torch.where)"
             raise InputError(network.arch, "forward", problem) from None
 
 

@@ -1,4 +1,4 @@
-"""Self-contained HTML pages of reports, the style of plots, and a description of the machine."""
+"""Self-contained HTML pages for reports, the style of plots, and a description of the machine."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ class Figure:
 
     @property
     def source(self) -> str:
-        """The picture as a data URI: the page needs no other file."""
+        """Return the picture as a data URI, so that the page needs no other file."""
         return "data:image/png;base64," + base64.b64encode(self.png).decode()
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of texts under headings."""
+    """A table: rows of text under headings."""
 
     headings: Sequence[str]
     rows: Sequence[Sequence[str]]
@@ -47,7 +47,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class PageSection:
-    """A part of the page."""
+    """One section of a page."""
 
     title: str
     text: Sequence[str] = ()  # paragraphs, plain text
@@ -58,7 +58,7 @@ class PageSection:
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """A whole page."""
+    """A complete report page."""
 
     title: str
     lead: str  # the main result in a sentence
@@ -68,7 +68,7 @@ class Page:
     notes: Sequence[str] = ()  # caveats
 
     def html(self) -> str:
-        """HTML of the page: every text escaped, no request to elsewhere."""
+        """Return the page as HTML, with all text escaped and no external requests."""
         from jinja2 import Environment, StrictUndefined
 
         template = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
@@ -76,7 +76,7 @@ class Page:
         return environment.from_string(template).render(page=self)
 
     def figures(self) -> list[Figure]:
-        """All pictures of the page, in order."""
+        """Return all pictures of the page, in order."""
         return [figure for section in self.sections for figure in section.figures]
 
     def write(self, out: Path, *, record: str, data: Any) -> None:
@@ -92,13 +92,13 @@ class Page:
 
 
 def section_of(title: str, rows: Sequence[Sequence[str]]) -> PageSection:
-    """Section of one table; the first row holds the headings."""
+    """Create a section with one table, whose headings are in the first row."""
     return PageSection(title, tables=[Table(rows[0], rows[1:])])
 
 
 @contextmanager
 def drawing(width_in: float, height_in: float) -> Iterator[Any]:
-    """A matplotlib figure in the reports' style, without pyplot's global state."""
+    """Yield a matplotlib figure in the reports' style, without pyplot's global state."""
     from matplotlib import style
     from matplotlib.figure import Figure as Drawing
 
@@ -107,14 +107,14 @@ def drawing(width_in: float, height_in: float) -> Iterator[Any]:
 
 
 def png(figure: Any) -> bytes:
-    """PNG of a figure without time stamps: equal data give equal bytes."""
+    """Return a figure as PNG without time stamps, so that equal data give equal bytes."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})
     return buffer.getvalue()
 
 
 def describe() -> dict[str, str]:
-    """Facts of the machine and versions of installed packages, in a page's order."""
+    """Return facts about the machine and the versions of installed packages, in a page's order."""
     facts = {
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "processor": _processor(),

@@ -1,4 +1,4 @@
-"""Stereo pairs with geometry and pictures off the eyes: case files and built-in scenes."""
+"""Stereo pairs with geometry, and pictures for displaced eyes: case files and built-in scenes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FOV_DEG = 40.0
 
 @dataclass(frozen=True, slots=True)
 class OffView:
-    """Target of an eye that is off its nominal position."""
+    """Target for an eye that is displaced from its nominal position."""
 
     mm: float
     eye_m: F64  # (3,) frame `stack`
@@ -40,7 +40,7 @@ class OffView:
 
 @dataclass(frozen=True, slots=True)
 class StillPair:
-    """Two pictures, the eyes that should see them, and the panels."""
+    """A left/right pair of pictures, the eye positions that they fit, and the panels."""
 
     name: str
     stack: PanelStack
@@ -51,7 +51,7 @@ class StillPair:
 
 
 class OffEntry(BaseModel):
-    """Target of an eye off its nominal position, in a case file."""
+    """Target for a displaced eye, as a case file states it."""
 
     mm: Annotated[float, Field(strict=True, ge=0, le=1000 * EYE_MOST_M)]
     eye: Place
@@ -71,7 +71,7 @@ class CaseFile(BaseModel):
 def read_pairs(folder: Path) -> list[StillPair]:
     """Read every case file in a folder, in order of names; ignore other JSON.
 
-    Raises InputError with file and field for an invalid case, and for a folder without any.
+    Raises InputError, naming file and field, for an invalid case or a folder without cases.
     """
     if not folder.is_dir():
         raise InputError(folder, "", "is not a folder")
@@ -81,7 +81,7 @@ def read_pairs(folder: Path) -> list[StillPair]:
         if {"panels", "eyes", "images"} <= table.keys():
             pairs.append(_case(path, table))
     if not pairs:
-        raise InputError(folder, "", "holds no case file (JSON with panels, eyes, images, fov)")
+        raise InputError(folder, "", "contains no case file (JSON with panels, eyes, images, fov)")
     return pairs
 
 
@@ -105,7 +105,7 @@ def _case(path: Path, table: dict[str, Any]) -> StillPair:
 
 
 def eyes_at(*, distance_m: float, angle_deg: float = 0.0, height_m: float = 0.0, ipd_m: float = 0.063) -> F64:
-    """(2, 3) eyes that face the origin, at a distance from it and an angle from +x towards +y."""
+    """Return (2, 3) eyes that face the origin, at a given distance and angle from +x towards +y."""
     angle = math.radians(angle_deg)
     level = math.sqrt(max(distance_m**2 - height_m**2, 0.0))
     middle = np.array([level * math.cos(angle), level * math.sin(angle), height_m])
@@ -121,7 +121,7 @@ def beside(eye_m: ArrayLike, mm: float) -> list[F64]:
 
 
 class PairPainter:
-    """Draws a built-in scene from anywhere. Owns a GL context: for one thread, to be closed."""
+    """Draws a built-in scene from anywhere. It owns a GL context, so use it on one thread and close it."""
 
     def __init__(self, scene: str | Scene, stack: PanelStack) -> None:
         """Open the scene. Raises InputError for an unknown one, MissingPart without OpenGL."""
@@ -139,21 +139,21 @@ class PairPainter:
         self.context.release()
 
     def draw(self, eye_m: ArrayLike, pixels_from_stack: F64, *, width_px: int, height_px: int) -> U8:
-        """(h, w, 4) picture of the scene through any projection."""
+        """Draw an (h, w, 4) picture of the scene through any projection."""
         from runtime.content.base import View
 
         eye = np.asarray(eye_m, dtype=np.float64)
         return self.content.render(View(eye, 0, pixels_from_stack, width_px, height_px), time_ns=0).copy()
 
     def image(self, eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg: float = FOV_DEG) -> U8:
-        """(h, w, 3) retina picture of an eye that looks at the stack's origin."""
+        """Draw the (h, w, 3) retina picture of an eye that looks at the stack's origin."""
         projection = image_from_stack(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
         return np.ascontiguousarray(self.draw(eye_m, projection, width_px=width_px, height_px=height_px)[..., :3])
 
     def pair(
         self, name: str, eyes_m: F64, stack: PanelStack, *, fov_deg: float = FOV_DEG, off_mm: Sequence[float] = OFF_MM
     ) -> StillPair:
-        """A pair in the stack's resolution, with pictures for positions around both eyes."""
+        """Draw a pair at the stack's resolution, with pictures for positions around both eyes."""
         size = {"width_px": stack.width_px, "height_px": stack.height_px}
         left, right = (self.image(eye, **size, fov_deg=fov_deg) for eye in eyes_m)
         off = tuple(
@@ -173,7 +173,7 @@ PROCEDURAL = (
 
 
 def procedural_pairs(stack: PanelStack) -> Iterator[StillPair]:
-    """The report's pairs: built-in scenes from three positions, with pictures off the eyes."""
+    """Draw the report's pairs: built-in scenes from three positions, with pictures for displaced eyes."""
     for scene, name, place in PROCEDURAL:
         with PairPainter(scene, stack) as painter:
             pair = painter.pair(name, eyes_at(**place), stack)

@@ -17,7 +17,7 @@ NAMES = ("behind the panels", "in the middle panel", "in front of the panels")
 
 
 def frontier_section(results: Sequence[MethodResult], *, title: str, name: str) -> PageSection:
-    """Plot and table of one resolution's methods measured until now."""
+    """Plot and table of the methods measured so far at one resolution."""
     pairs = "; ".join(pair.pair for pair in results[0].pairs)
     text = [
         f"Every method on {pairs}, in one run. Light is the figure to quote: panel pixels are squares, pupils 4 mm "
@@ -30,7 +30,7 @@ def frontier_section(results: Sequence[MethodResult], *, title: str, name: str) 
 
 
 def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
-    """One curve for the shipped models and one for the reference; added models as single points.
+    """Plot one curve for the shipped models, one for the reference, and added models as single points.
 
     More steps are to the right. A curve omits slower points that are no better. Bars: eight runs in ten; small dots:
     single pairs.
@@ -61,12 +61,12 @@ def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter("")
         axes.legend()
-    told = "Times are of this machine and hour: compare their ratios. Bars: eight runs in ten. Dots: single pairs."
+    told = "Times hold for this machine and hour: compare ratios. Bars: eight runs in ten. Dots: single pairs."
     return Figure(name, png(figure), told)
 
 
 def rising(places: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Those of (time, dB) that are better than all quicker ones."""
+    """Return the (time, dB) points that are better than all faster ones."""
     found: list[tuple[float, float]] = []
     for place in sorted(places):
         if not found or place[1] > found[-1][1]:
@@ -75,7 +75,7 @@ def rising(places: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
 
 
 def kind_of(result: MethodResult) -> str:
-    """Curve of a result; an added model belongs to neither."""
+    """Return the curve that a result belongs to; an added model belongs to none."""
     return "shipped" if result.name in SHIPPED else "added" if result.kind == "network" else result.kind
 
 
@@ -121,14 +121,14 @@ def moving_section(found: Sequence[Moving]) -> PageSection:
 
 
 def most_used(one: Moving) -> str:
-    """The efforts that were on the panels for a tenth of the time or more, the longest first."""
+    """List the efforts shown for at least a tenth of the time, longest first."""
     seconds = sorted(one.efforts.items(), key=lambda item: -item[1])
     total_s = sum(one.efforts.values())
     return ", ".join(f"{name} {100 * s / total_s:.0f}%" for name, s in seconds if s >= total_s / 10)
 
 
 def moving_plot(found: Sequence[Moving]) -> Figure:
-    """Live quality and view error over the fixed efforts, with a star for `auto`, for every motion."""
+    """Plot live quality and view error of the fixed efforts, with a star for `auto`, for every motion."""
     motions = list(dict.fromkeys(one.motion for one in found))
     efforts = [*(effort.name for effort in FIXED), "auto"]
     with drawing(9.6, 6.4) as figure:
@@ -144,11 +144,13 @@ def moving_plot(found: Sequence[Moving]) -> Figure:
         above.set(ylabel="live quality, dB")
         above.legend(ncols=len(motions), loc="lower center", bbox_to_anchor=(0.5, 1.0))
         below.set(
-            yscale="log", ylabel="view error, median, mm", xlabel="raster + steps of every solution; auto: chosen"
+            yscale="log",
+            ylabel="view error, median, mm",
+            xlabel="raster + steps of every solution (auto: chosen)",
         )
         below.yaxis.set_major_formatter("{x:g}")
         below.set_xticks(range(len(efforts)), efforts)
-    told = "Live quality and view error with fixed efforts, dearest first, and as the loop chooses (stars, dotted)."
+    told = "Live quality and view error with fixed efforts, slowest first, and with the loop's choice (stars, dotted)."
     return Figure("moving-viewer", png(figure), told)
 
 
@@ -171,7 +173,7 @@ def focal_section(stack: FocalStack) -> PageSection:
 
 
 def slice_picture(stack: FocalStack) -> Figure:
-    """Pictures through the layers above the true ones, focused on each card."""
+    """Draw the pictures through the layers above the true ones, focused on each card."""
     chosen = [min(stack.slices, key=lambda s: abs(s.plane_m - x)) for x in CARDS_M]
     with drawing(9.6, 3.1) as figure:
         axes = figure.subplots(2, 3)

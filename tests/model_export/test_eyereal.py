@@ -123,7 +123,7 @@ def damaged(state: dict[str, object], change: str) -> dict[str, object]:
         ("missing", "subnets.up1.conv.0.weight: 1 keys of eyereal are missing"),
         ("surplus", "subnets.down9.weight: 1 keys are not of eyereal"),
         ("shape", "subnets.up1.conv.0.weight: (2, 2), but eyereal has"),
-        ("nan", "holds numbers that are not finite"),
+        ("nan", "contains numbers that are not finite"),
     ],
 )
 def test_a_damaged_checkpoint_is_refused_by_the_key_that_is_amiss(published: Path, change: str, problem: str) -> None:

@@ -1,1 +1,1 @@
-"""Stiff and extreme cases of every numerical step, against 50 digits or a closed form."""
+"""Stiff and extreme cases of every numerical step, checked to 50 digits or against a closed form."""

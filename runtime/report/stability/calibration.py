@@ -1,4 +1,4 @@
-"""Calibration (supplement, (15)-(28)) from pairs of a known similarity that hardly determine it."""
+"""Cases of calibration (supplement, (15)-(28)) from pairs that hardly determine a known similarity."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def fitted(
     offset_m: tuple[float, float, float] = (0.1, -0.4, 0.3),
     turn: F64 = TURN,
 ) -> Answer:
-    """Compare the similarity fitted to turned, scaled and shifted points.
+    """Compare the similarity fitted to rotated, scaled and shifted points with the true one.
 
     The condition is the points' distance from the origin over the second largest of their extents: the amplification
     of a relative error of the coordinates, rounding included, to a turn of the fit.

@@ -1,4 +1,4 @@
-"""Models on stiff problems, and on extreme pictures, poses and sizes.
+"""Cases of models on stiff problems, and on extreme pictures, poses and sizes.
 
 The stiff part of the two-eye problem is the lowest frequency of the difference between the eyes: one cycle across the
 panels, which the outer panels must carry by their parallax. Its eigenvalue is 3 - |1 + exp(2iks_0) + exp(2iks_2)|. The
@@ -67,7 +67,7 @@ def hats(positions: F64, count: int) -> F64:
 
 @dataclass(frozen=True)
 class StiffProblem:
-    """Two eyes whose targets are a common grey picture and a difference between them."""
+    """Problem with two eyes whose targets are a common grey picture plus a difference between the eyes."""
 
     gap_m: float = 0.06
     ipd_m: float = 0.06
@@ -121,7 +121,7 @@ class StiffProblem:
 
 @lru_cache(maxsize=64)
 def optimum(problem: StiffProblem) -> float:
-    """Return the least residual of panels in range whose rows are all the same, as the targets' are."""
+    """Return the smallest residual of panels in range whose rows are all equal, as the targets' rows are."""
     parts = [problem.rays(side) for side in (0, 1)]
     targets = np.concatenate([target for _, target in parts])
     matrix = np.vstack([np.hstack([columns for _, columns in weights]) for weights, _ in parts])
@@ -130,7 +130,7 @@ def optimum(problem: StiffProblem) -> float:
 
 
 def solved(model: str, problem: StiffProblem) -> Answer:
-    """Compare a model's residual with the least that any panels leave."""
+    """Compare a model's residual with the smallest that any panels could leave."""
     stack = PanelStack(WIDTH_M, HEIGHT_M, (-problem.gap_m, 0.0, problem.gap_m), WIDTH_PX, HEIGHT_PX)
     eyes_m = np.array([[problem.eye_x_m, side * problem.ipd_m / 2, 0.0] for side in (-1, 1)])
     greys = [np.rint(255 * np.sin(np.pi / 2 * problem.target(side)) ** 2).astype(np.uint8) for side in (0, 1)]

@@ -1,4 +1,4 @@
-"""Poses, projections and Malus' law at their singularities (supplement, (1)-(14), (40)-(47)).
+"""Cases of poses, projections and Malus' law at singularities (supplement, (1)-(14), (40)-(47)).
 
 References are other formulas in extended precision: `np.longdouble` has 64 bits or more here, where the tolerances
 are multiples of a double's rounding.
@@ -73,7 +73,7 @@ def panel_position(eye: Any, image: Any, stack: PanelStack, index: int) -> Any:
 
 
 def pose(eye: Sequence[float]) -> Answer:
-    """Compare the rotation; its condition grows as the eye nears the vertical axis."""
+    """Compare an eye's rotation; its condition grows as the eye approaches the vertical axis."""
     error = farthest(stack_from_eye(eye)[:3, :3].T, axes(extended(eye)))
     scale = max(map(abs, eye))
     ground = math.hypot(eye[0] / scale, eye[1] / scale)
@@ -82,7 +82,7 @@ def pose(eye: Sequence[float]) -> Answer:
 
 
 def gaze(eye: Sequence[float]) -> Answer:
-    """Compare the positions of the stack's origin and of a nearby point in the picture."""
+    """Compare where the stack's origin and a nearby point appear in the picture."""
     projection = image_from_stack(eye, width_px=STACK.width_px, height_px=STACK.height_px, fov_deg=FOV_DEG)
     size, error = max(map(abs, eye)), 0.0
     for point in ((0.0, 0.0, 0.0), (0.125 * size, -0.25 * size, 0.0625 * size)):
@@ -92,7 +92,7 @@ def gaze(eye: Sequence[float]) -> Answer:
 
 
 def scale_shift(eye: Sequence[float], to_x_m: float) -> Answer:
-    """Compare the step from the centre panel to another along an eye's ray."""
+    """Compare the mapping from the centre panel to another one along an eye's ray."""
     scale, shift = relative_scale_shift(eye, from_x_m=0.0, to_x_m=to_x_m)
     e, point = extended(eye), extended([0, 0.125, -0.0625])
     truth = (point + to_x_m / e[0] * (e - point))[1:]
@@ -103,7 +103,7 @@ def scale_shift(eye: Sequence[float], to_x_m: float) -> Answer:
 
 
 def followed(eye: Sequence[float], *, index: int = 2, stack: PanelStack = STACK) -> Answer:
-    """Compare M_RPU, at image positions whose rays meet the panel, with ray tracing.
+    """Compare M_RPU with ray tracing, at image positions whose rays meet the panel.
 
     The condition is that of the mapping: how far a relative change of 1 of an image position, or of the eye's own,
     moves the position on the panel, in panel widths.
@@ -125,7 +125,7 @@ def followed(eye: Sequence[float], *, index: int = 2, stack: PanelStack = STACK)
 
 
 def of_intensity(intensity: float, branch: Literal[1, 2]) -> Answer:
-    """Compare the phase of an intensity; its condition goes to infinity towards 1."""
+    """Compare the phase of an intensity; the condition goes to infinity as the intensity approaches 1."""
     root = np.arcsin(np.sqrt(extended(intensity))) * 2 / PI
     truth = root if branch == 1 else 2 - root
     phase = phase_from_intensity(np.array(intensity), branch)
@@ -137,7 +137,7 @@ def of_intensity(intensity: float, branch: Literal[1, 2]) -> Answer:
 
 
 def product(values: Sequence[float]) -> Answer:
-    """Compare sin² of the summed phase, and the product of the panels' Jones matrices."""
+    """Compare sin² of the summed phase with the product of the panels' Jones matrices."""
     truth = np.sin(PI / 2 * extended(values).sum()) ** 2
     by_sum = float(intensity_from_phase(np.array(math.fsum(values))))
     by_product = jones_intensity([value * math.pi / 2 for value in values])

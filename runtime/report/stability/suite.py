@@ -1,4 +1,4 @@
-"""All trials of all stages.
+"""The complete suite: all trials of all stages.
 
 Cases without a closed form, of models and the tracker, are compared with recorded errors in `limits.json`. After a
 change of either, `phasestack stability --full --record FILE` writes them again; the commit says what became worse.
@@ -30,7 +30,7 @@ def every_trial(fits: Mapping[str, Fit], *, full: bool) -> Iterator[Trial]:
 def run(
     trials: list[Trial], *, record: Path | None = None, progress: Callable[[int, int], None] = lambda done, of: None
 ) -> list[Case]:
-    """Run every trial. record: write the limits file again with their errors."""
+    """Run every trial. record: rewrite the limits file with their errors."""
     limits: dict[str, float] = json.loads(LIMITS.read_text(encoding="utf-8"))
     cases = []
     for number, trial in enumerate(trials, 1):

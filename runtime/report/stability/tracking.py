@@ -1,4 +1,4 @@
-"""The tracker at extreme time steps, against a head whose positions are known exactly."""
+"""Cases of the tracker at extreme time steps, for a head whose positions are known exactly."""
 
 from __future__ import annotations
 

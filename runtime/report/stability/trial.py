@@ -1,4 +1,4 @@
-"""A trial is one extreme case; running it gives a Case, even if the code on trial crashes."""
+"""Trials: a trial is one extreme case. Running it gives a Case, even if the tested code crashes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One extreme case, not yet run."""
+    """One extreme case that has not been run yet."""
 
     stage: str
     name: str
@@ -46,7 +46,7 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One extreme case with its outcome: an entry of `stability.json`."""
+    """One extreme case with its outcome, which is an entry of `stability.json`."""
 
     name: str
     stage: str
@@ -75,9 +75,9 @@ def settle(trial: Trial, *, limit: float | None = None) -> Case:
         passed = is_refusal and trial.expected == "refuses"
         return Case(trial.name, trial.stage, inf, nan, nan, "refuses", 0.0, passed, trial.measure, note)
     if trial.expected == "refuses":
-        answer = replace(answer, note="it answered where no answer exists")
+        answer = replace(answer, note="it returned an answer although none exists")
     elif trial.floor is not None and limit is None:
-        answer = replace(answer, tolerance=-1.0, note="no limit is recorded: phasestack stability --record")
+        answer = replace(answer, tolerance=-1.0, note="no limit is recorded; run phasestack stability --record")
     elif trial.floor is not None and limit is not None:
         answer = replace(answer, tolerance=min(answer.tolerance, WORSE * limit + trial.floor))
     backward = answer.forward_error if answer.backward_error is None else answer.backward_error
