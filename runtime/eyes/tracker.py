@@ -210,7 +210,12 @@ class Tracker:
         is_second = again is not None
         if other.may_be_viewer and (self._lost_ns is not None or is_second):
             self._follow(other.head, is_return=True)
-        elif is_second and last.head.surprise > CHI2_DOUBT and (head := sample.continued(self._history[-2].head)):
+        elif (
+            is_second
+            and last.head.surprise > CHI2_DOUBT
+            and len(self._history) > 1
+            and (head := sample.continued(self._history[-2].head))
+        ):
             self._history.pop()  # a mistake: the last two samples fit better without it
             self._follow(head, is_return=True)
         elif age_s > min(ANOTHER_AFTER_S, self.settings.hold_s) or (is_second and last.head.samples < ESTABLISHED):

@@ -17,13 +17,19 @@ const until = async (holds, within_ms = 60000) => {
 const far = (a, b) => Math.hypot(...a.map((v, k) => v - b[k]));
 const off = (a, b) => Math.max(far(a[0], b[0]), far(a[1], b[1]));
 
+const arrived = async (one) => { // eyes of a head that has followed the pointer
+  let before = null, eyes = null;
+  await until(async () => { [before, eyes] = [eyes, await one.evaluate(() => window.phasestack.eyes())]; return before && off(before, eyes) === 0; });
+  return eyes;
+};
+
 let page = await newPage();
 await page.goto(url);
 await page.evaluate(() => window.phasestack.ready);
 say("the token is not in the address", !page.url().includes("token"));
 const before = await status();
 await page.mouse.move(200, 150);
-const eyes = await page.evaluate(() => window.phasestack.eyes());
+const eyes = await arrived(page);
 say("the pointer moved the head", far(eyes[0], [0.6, -0.0315, 0]) > 0.03);
 say("status has the eyes there to 1 mm", await until(async () => { const { eyes_m: found } = await status(); return found && off(found, eyes) < 0.001; }));
 say("another solution", await until(async () => (await status()).solution > before.solution));

@@ -150,6 +150,15 @@ def test_a_hasty_head_is_followed_at_its_second_sample() -> None:
 # --- uncertainty
 
 
+def test_a_head_that_jumps_about_is_no_error() -> None:
+    """The first sample of a head may be a surprise, with none before it to go back to."""
+    tracker = Tracker()
+    for ms, y_m in ((200, 0.302), (233, 0.2), (298, 0.203), (314, 0.3), (330, 0.1)):
+        tracker.update(points(np.add(STILL, [0.0, y_m, 0.0]), covariance_m2=4e-8 * np.eye(3)), capture_ns=ms * MS)
+    eyes_m = tracker.at(330 * MS).eyes_m
+    assert eyes_m is not None and np.isfinite(eyes_m).all()
+
+
 def drawn(covariance_m2: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Errors (n, 3) of the middle 45 ms ahead, and reported sigma (n,), of a leaning head with this noise."""
     random, tracker, off, told = np.random.default_rng(2), Tracker(), [], []

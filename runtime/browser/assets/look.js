@@ -33,11 +33,12 @@ const node = (name, text = "", kind = "") => Object.assign(document.createElemen
 const mm = (metres) => Math.round(Math.abs(metres) * 1000);
 
 export class Look {
-  // scene: stack, fov_deg, and the eyes_m that the layers were solved for; eyesAt: both eyes for a head's displacement.
-  constructor(root, scene, { title, eyesAt = (head) => moved(scene.eyes_m, head) }) {
+  // scene: stack, fov_deg, and the eyes_m that the layers were solved for; eyesAt: both eyes for a head's displacement;
+  // onTheWay: where the head is now on its way to a displacement.
+  constructor(root, scene, { title, eyesAt = (head) => moved(scene.eyes_m, head), onTheWay = (head) => head }) {
     root.innerHTML = PAGE;
     this.$ = (query) => root.querySelector(query);
-    [this.scene, this.stack, this.eyesAt] = [scene, scene.stack, eyesAt];
+    Object.assign(this, { scene, stack: scene.stack, eyesAt, onTheWay });
     this.canvas = this.$("canvas");
     this.display = new Display(this.canvas, this.stack);
     Object.assign(this, { mode: "parallel", head: [0, 0, 0], aligned: true, pupil: false, point: [0, 0], rays: 3, coarse: 1, frame_ms: 0, painted_ms: 0, reported_ms: 0, frames: 0 });
@@ -45,7 +46,7 @@ export class Look {
     this.flatness = 0;
     this.used = null; // eyes that the panels are aligned to, if not the true ones
     this.state = ""; // why the picture is not the one two eyes should see
-    this.onhead = () => {}; // called with the eyes after the head has moved
+    this.onhead = () => {}; // called after the head was moved
     this.onframe = () => {};
     this.onmode = () => {}; // called when a mode is chosen; true: it needs the targets
     this.$("h1").textContent = title;
@@ -57,7 +58,7 @@ export class Look {
   }
 
   get eyes() {
-    return this.eyesAt(this.head);
+    return this.eyesAt(this.onTheWay(this.head));
   }
 
   get alignment() {
@@ -73,7 +74,7 @@ export class Look {
 
   moveTo(head) {
     this.head = head;
-    this.onhead(this.eyes);
+    this.onhead();
     this.draw();
   }
 

@@ -4,6 +4,7 @@ import { ask, token } from "/session.js";
 
 const AGAIN_MS = 500, STATUS_MS = 500, RETRY_MS = 1000, KEPT = 600; // AGAIN_MS: a resting head is sent again; KEPT: latencies in the statistics
 const PLACE_M = [0.6, 0, 0];
+const PEAK_M_S2 = 12, LEAST_S = 0.1, STEP_MS = 12; // a quick head's acceleration, its shortest movement, and the time between its samples
 const CONTROLS = `
 <dl class="figures"></dl>
 <form><label>Scene <input type="text" name="scene" list="scenes" autocomplete="off"></label><datalist id="scenes"></datalist>
@@ -37,11 +38,40 @@ function eyesOf(head) {
 const eyesNow = (head) => (viewer && sensor ? eyesOf(head) : newest?.eyes_m ?? follows ?? eyesOf([0, 0, 0]));
 const say = (message) => { if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message)); };
 
+// The head follows the pointer along the smoothest way from its present motion (least jerk), planned anew whenever the pointer moves:
+// the tracker takes a pointer's jumps for another person's head.
+let way = { begin_ms: 0, seconds: 0, curves: [0, 1, 2].map(() => [0, 0, 0, 0, 0, 0]) }, step = null;
+
+// Position, velocity and acceleration, for each axis.
+function motion(ms) {
+  const t = Math.min((ms - way.begin_ms) / 1000, way.seconds);
+  return way.curves.map(([a, b, c, d, e, f]) => [a + t * (b + t * (c + t * (d + t * (e + t * f)))),
+    b + t * (2 * c + t * (3 * d + t * (4 * e + t * 5 * f))), 2 * c + t * (6 * d + t * (12 * e + t * 20 * f))]);
+}
+const head = () => motion(performance.now()).map(([place]) => place);
+
+function follow() {
+  const now = performance.now(), moving = motion(now), away = Math.hypot(...moving.map(([place], k) => look.head[k] - place));
+  const T = Math.max(LEAST_S, Math.sqrt((5.77 * away) / PEAK_M_S2)); // least jerk peaks at 5.77 times away / T²
+  way = { begin_ms: now, seconds: T, curves: moving.map(([p, v, a], k) => {
+    const rest = look.head[k] - p - v * T - (a * T * T) / 2, speed = -v - a * T;
+    return [p, v, a / 2, (10 * rest) / T ** 3 - (4 * speed) / T ** 2 - a / (2 * T), (-15 * rest) / T ** 4 + (7 * speed) / T ** 3 + a / T ** 2,
+      (6 * rest) / T ** 5 - (3 * speed) / T ** 4 - a / (2 * T ** 3)];
+  }) };
+  step ??= setTimeout(go, STEP_MS);
+}
+
+function go() {
+  step = performance.now() < way.begin_ms + 1000 * way.seconds ? setTimeout(go, STEP_MS) : null;
+  see();
+  look.draw();
+}
+
 function see() {
   if (!look || !viewer || !sensor) return;
   lastSent = performance.now();
   const gone = document.hidden || form("lost").checked;
-  say({ eyes: gone ? null : eyesOf(look.head), page_ms: lastSent });
+  say({ eyes: gone ? null : eyesOf(head()), page_ms: lastSent });
 }
 
 const form = (name) => main.querySelector(`[name=${name}]`);
@@ -64,8 +94,8 @@ function build({ stack, fov_deg }) {
   main.replaceChildren();
   const title = stack.x_m.length > 2 ? `${stack.x_m.length} panels, live` : "two panels, live";
   const picture = { width: stack.width_px, height: stack.height_px };
-  look = new Look(main, { stack, fov_deg, picture, eyes_m: null }, { title, eyesAt: (head) => eyesNow(head) });
-  look.onhead = see;
+  look = new Look(main, { stack, fov_deg, picture, eyes_m: null }, { title, eyesAt: eyesNow, onTheWay: head });
+  look.onhead = follow;
   look.onmode = check;
   main.querySelector(".more").innerHTML = CONTROLS;
   for (const [name, value] of [["noise_mm", 0.2], ["latency_ms", 0], ["ipd_mm", ipd_m * 1000]]) form(name).value = value;
@@ -83,6 +113,7 @@ function build({ stack, fov_deg }) {
   form("camera").addEventListener("change", (event) => film(event.target.checked));
   main.querySelector("form").addEventListener("submit", (event) => event.preventDefault());
   look.onframe = painted;
+  follow();
   about();
 }
 
@@ -276,7 +307,7 @@ async function report() {
 window.phasestack = {
   ready: new Promise((done) => (first = done)).then(() => Object.assign(window.phasestack, look.doors)),
   status,
-  eyes: () => eyesNow(look.head),
+  eyes: () => look.eyes,
   latencies: () => [...latencies],
 };
 setInterval(() => { if (performance.now() - lastSent >= AGAIN_MS) see(); }, AGAIN_MS);
