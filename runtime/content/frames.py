@@ -15,6 +15,7 @@ import numpy as np
 
 from runtime.clock import NS_PER_MS, NS_PER_S
 from runtime.config import ContentSettings
+from runtime.content.film_header import film_header
 from runtime.content.layout import MONO, PAIR, Layout, hint, layout_of, of_film
 from runtime.content.placing import DARK
 from runtime.errors import ContentFailure, InputError
@@ -190,16 +191,24 @@ def open_frames(path: Path, settings: ContentSettings) -> Frames:
     """A picture, an animation, a video, or a folder of pictures. Raises InputError."""
     if not path.is_dir():
         if path.suffix.lower() in VIDEOS:
-            video = Video(path, layout_of(path, settings))
-            if settings.layout == "auto":
-                height, width = video.frame(0).shape[:2]
-                video.layouts = [of_film(video.layouts[0], path, width_px=width, height_px=height)]
-            return video
+            return _open_film(path, settings)
         return Animation(path, settings) if header_of_file(path).is_animated else PictureFiles([path], settings)
     paths = sorted(item for item in path.iterdir() if item.suffix.lower() in (*PICTURES, *NOT_READ))
     if not paths:
         raise InputError(path, "", _why_none(path))
     return PictureFiles(paths, settings, folder=path)
+
+
+def _open_film(path: Path, settings: ContentSettings) -> Video:
+    stated = film_header(path)
+    if stated.left_out and settings.layout == "auto":
+        log.warning("%s: is shown without %s", path, stated.left_out)
+    layout = layout_of(path, settings, stated=stated.layout)
+    video = Video(path, replace(layout, span_deg=stated.span_deg or layout.span_deg))
+    if settings.layout == "auto":
+        height, width = video.frame(0).shape[:2]
+        video.layouts = [of_film(video.layouts[0], path, width_px=width, height_px=height)]
+    return video
 
 
 def _why_none(folder: Path) -> str:

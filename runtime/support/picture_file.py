@@ -15,9 +15,9 @@ from PIL import Image, ImageCms, ImageOps
 from runtime.errors import InputError
 from runtime.records import U8
 from runtime.support.artifacts import held_back
+from runtime.support.coded_colours import stated_profile
 from runtime.support.picture_header import (
     ORIENTATION,
-    Header,
     check_size,
     is_cut_off,
     opened,
@@ -50,7 +50,10 @@ def read_views(path: Path, *, background: Colour = WHITE) -> list[U8]:
     data, header = read_coded(path)
     if header.warning:
         log.warning("%s: %s", path, header.warning)
-    return [picture for picture, _ in _decoded(path, data, header, header.views, background)]
+    if header.other is not None:
+        coded = [(data, data[header.other])[number] for number in header.views]
+        return [picture for one in coded for picture, _ in _decoded(path, one, (0,), background)]
+    return [picture for picture, _ in _decoded(path, data, header.views, background)]
 
 
 def read_animation(path: Path, *, background: Colour = WHITE) -> tuple[list[U8], list[float]]:
@@ -66,13 +69,11 @@ def read_animation(path: Path, *, background: Colour = WHITE) -> tuple[list[U8],
         total = f"{len(numbers)} frames of {size} pixels; at most {LIMITS.pixels:,} in all"
         log.warning("%s has %s; only its first frame is shown, as a still", path, total)
         numbers = numbers[:1]
-    frames = list(_decoded(path, data, header, tuple(numbers), background))
+    frames = list(_decoded(path, data, tuple(numbers), background))
     return [picture for picture, _ in frames], [shown_ms for _, shown_ms in frames]
 
 
-def _decoded(
-    path: Path, data: bytes, header: Header, frames: tuple[int, ...], background: Colour
-) -> Iterator[tuple[U8, float]]:
+def _decoded(path: Path, data: bytes, frames: tuple[int, ...], background: Colour) -> Iterator[tuple[U8, float]]:
     """Yield frames with their durations. Raises InputError, naming the file."""
     if is_cut_off(data):
         raise InputError(path, "", undecodable(data))
@@ -84,6 +85,8 @@ def _decoded(
                     check_size(*image.size, source=path)
                 image.load()
                 shown_ms = float(image.info.get("duration") or 0) or STILL_MS
+                if not image.info.get("icc_profile"):
+                    image.info["icc_profile"] = stated_profile(data)
                 yield rgb_of(image, path, background=background), shown_ms
     except InputError:
         raise

@@ -15,6 +15,7 @@ from typing import IO, Any
 
 from runtime.errors import InputError
 from runtime.support import untrusted_input
+from runtime.support.leia import other_view
 from runtime.support.untrusted_input import LIMITS
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
@@ -68,6 +69,7 @@ class Header:
     is_around: bool = False  # its XMP declares a sphere of 360 by 180 degrees
     warning: str = ""  # missing second view
     layout: str = ""  # of the views in one picture, by its own stereo header
+    other: slice | None = None  # bytes of view 1 of a Leia picture
 
 
 @contextmanager
@@ -112,8 +114,10 @@ def header_of(coded: bytes | IO[bytes], *, name: str = "") -> Header:
                 width, height = height, width
             is_animated = image.format in ANIMATED and bool(getattr(image, "is_animated", False))
             views, warning = _views(image, is_named_so=name.lower().endswith(".mpo"))
-            is_around = b"equirectangular" in _xmp(image)
-            return Header(image.format, width, height, views, is_animated, is_around, warning, _jps_layout(image))
+            is_around, layout, other = b"equirectangular" in _xmp(image), _jps_layout(image), None
+            if image.format == "JPEG" and (found := _leia_view(coded, image.size)):
+                other, views = found[0], (1, 0) if found[1] else (0, 1)
+            return Header(image.format, width, height, views, is_animated, is_around, warning, layout, other)
     except Exception as error:  # each of Pillow's formats raises its own
         raise ValueError(undecodable(_all(coded), error)) from None
 
@@ -143,6 +147,17 @@ def _views(image: Any, *, is_named_so: bool) -> tuple[tuple[int, ...], str]:
     if image.size != size or image.layers != 3 or any(mark in extra for mark in GAIN_MAP):
         return (0,), ""
     return ((1, 0) if _viewpoint(image) == 1 else (0, 1)), ""
+
+
+def _leia_view(coded: bytes | IO[bytes], size: tuple[int, int]) -> tuple[slice, bool] | None:
+    """As `other_view`; None too if the other view is no picture of the same size."""
+    file = io.BytesIO(coded) if isinstance(coded, bytes) else coded
+    if found := other_view(file):
+        file.seek(found[0].start)
+        with suppress(ValueError):
+            if picture_size(file.read(min(found[0].stop - found[0].start, LIMITS.file_bytes))) == size:
+                return found
+    return None
 
 
 def _jps_layout(image: Any) -> str:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import io
+import json
 import struct
 from pathlib import Path
 
+import cv2
+import numpy as np
 from PIL import Image
 
 from runtime.records import U8
@@ -84,3 +87,65 @@ def swapped_profile() -> bytes:
     red, green = rows[b"rXYZ"], rows[b"gXYZ"]
     data[red : red + 4], data[green : green + 4] = data[green : green + 4], data[red : red + 4]
     return bytes(data)
+
+
+def lif(path: Path, own: U8, other: U8, *, own_is_left: bool = True) -> Path:
+    """A JPEG with the fields of a Leia picture behind it, one of them the other view's JPEG."""
+    jpegs = []
+    for picture in (own, other):
+        file = io.BytesIO()
+        Image.fromarray(picture).save(file, "JPEG", quality=95, subsampling=0)
+        jpegs.append(file.getvalue())
+    places = (0.0, 1.0) if own_is_left else (1.0, 0.0)
+    views = [{"albedoId": number, "xLocation": place} for number, place in zip((-1, 1000001), places, strict=True)]
+    held = [(0, b"\0\0\0\4"), (1000001, jpegs[1]), (7, json.dumps({"views": views}).encode())]
+    fields = b"".join(struct.pack(">LL", number, len(content)) + content for number, content in held)
+    path.write_bytes(
+        jpegs[0] + struct.pack(">L", len(held)) + fields + struct.pack(">L", len(fields) + 10) + b"\x1e\x1a"
+    )
+    return path
+
+
+def of_colours(coded: bytes, *, primaries: int, transfer: int) -> bytes:
+    """An AVIF or HEIC that states other colours."""
+    at = coded.index(b"colrnclx") + 8
+    return coded[:at] + struct.pack(">HH", primaries, transfer) + coded[at + 4 :]
+
+
+def film(path: Path, frame: U8, *, added: bytes = b"", mode: int = 0) -> Path:
+    """Three equal frames; with boxes added to an MP4's description of its pictures, or a Matroska's StereoMode."""
+    height, width = frame.shape[:2]
+    writer = cv2.VideoWriter(
+        str(path), cv2.VideoWriter.fourcc(*("MJPG" if path.suffix == ".mkv" else "mp4v")), 10, (width, height)
+    )
+    for _ in range(3):
+        writer.write(np.ascontiguousarray(frame[..., ::-1]))
+    writer.release()
+    data = bytearray(path.read_bytes())
+    if mode:
+        at = data.index(b"\x54\xb2\x81")  # DisplayUnit has the same length
+        data[at : at + 4] = bytes((0x53, 0xB8, 0x81, mode))
+    end = 0
+    for kind in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"mp4v") if added else ():
+        at = data.index(kind, end and data.index(b"moov")) - 4
+        size = int.from_bytes(data[at : at + 4], "big")
+        data[at : at + 4] = (size + len(added)).to_bytes(4, "big")
+        end = at + size
+    data[end:end] = added
+    path.write_bytes(data)
+    return path
+
+
+def st3d(mode: int) -> bytes:
+    return _box(b"st3d", bytes(4) + bytes([mode]))
+
+
+def equirectangular(*, cut: float = 0.0) -> bytes:
+    """cut: of the width, left and right each."""
+    bounds = struct.pack(">LLL", 0, 0, 0) + struct.pack(">LL", *[int(cut * (1 << 32))] * 2)
+    return _box(b"sv3d", _box(b"proj", _box(b"equi", bounds)))
+
+
+def multiview() -> bytes:
+    """What a film of a headset states: both eyes."""
+    return _box(b"vexu", _box(b"eyes", _box(b"stri", bytes(4) + b"\x03")))

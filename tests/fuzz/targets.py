@@ -48,7 +48,7 @@ from runtime.sensor.replay import ReplayDriver
 from runtime.support.untrusted_input import parsed_json
 from tests.content.gltf_files import Buffer
 from tests.content.packed_splat_files import write_compressed, write_sog, write_splat, write_spz
-from tests.content.picture_files import heic_pair, mpo, swapped_profile
+from tests.content.picture_files import equirectangular, film, heic_pair, lif, mpo, st3d, swapped_profile
 from tests.content.test_gltf import square
 from tests.content.test_splat import splat_table
 from tests.content.test_untrusted_files import PNG_URI, gltf, textured
@@ -196,6 +196,7 @@ def pictures() -> list[bytes]:
         made.append(held.getvalue())
     with tempfile.TemporaryDirectory() as folder:
         made.append(mpo(Path(folder) / "a.mpo", *codes).read_bytes())
+        made.append(lif(Path(folder) / "a.jpg", *codes).read_bytes())
         made.append(heic_pair(Path(folder) / "a.heic", list(codes), group=(0, 1)).read_bytes())
     return made
 
@@ -216,6 +217,11 @@ def videos() -> list[bytes]:
                 writer.write(np.full((48, 64, 3), value, np.uint8))
             writer.release()
             made.append((Path(folder) / name).read_bytes())
+        frame = np.full((48, 64, 3), 90, np.uint8)
+        for name, tags in (
+            ("a.mp4", {"added": st3d(2)}), ("a.mp4", {"added": equirectangular()}), ("a.mkv", {"mode": 1})
+        ):  # fmt: skip
+            made.append(film(Path(folder) / name, frame, **tags).read_bytes())
     return made
 
 

@@ -1,0 +1,69 @@
+"""ICC profiles of the colours that an AVIF or HEIC states by numbers (`nclx`, ITU-T H.273)."""
+
+from __future__ import annotations
+
+import re
+import struct
+
+import numpy as np
+
+from runtime.records import F64
+
+NCLX = re.compile(rb"colrnclx(..)(..)", re.DOTALL)
+SEARCHED = 1 << 18  # bytes at a file's beginning
+PQ, HLG = 16, 18  # transfer characteristics; every other one is taken as sRGB's
+PAPER_NITS, PQ_NITS = 203.0, 10_000.0  # what counts as white (ITU-R BT.2408); PQ's largest
+PRIMARIES = {  # XYZ of red, green and blue, adapted to D50; BT.709's are sRGB's own
+    1: ((0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.71410)),
+    9: ((0.67348, 0.27905, -0.00193), (0.16566, 0.67534, 0.02998), (0.12505, 0.04561, 0.79686)),
+    12: ((0.51512, 0.24120, -0.00105), (0.29198, 0.69225, 0.04189), (0.15710, 0.06657, 0.78407)),
+}
+D50 = (0.9642, 1.0, 0.8249)
+SRGB_CURVE = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
+SAMPLES = 4096  # of another curve
+
+
+def stated_profile(coded: bytes) -> bytes:
+    """The profile of a picture's colours; empty: they are sRGB, or unknown."""
+    found = NCLX.search(coded[:SEARCHED]) if coded[4:8] == b"ftyp" else None
+    if found is None:
+        return b""
+    primaries, transfer = (int.from_bytes(code, "big") for code in found.groups())
+    is_bright = transfer in (PQ, HLG)
+    if primaries not in PRIMARIES or (primaries == 1 and not is_bright):
+        return b""
+    curve = _table(transfer) if is_bright else b"para" + bytes(4) + struct.pack(">HH", 3, 0) + _fixed(*SRGB_CURVE)
+    places = (*PRIMARIES[primaries], D50)
+    tags = [(name, b"XYZ " + bytes(4) + _fixed(*xyz)) for name, xyz in zip(("rXYZ", "gXYZ", "bXYZ", "wtpt"), places)]
+    tags += [(name, curve) for name in ("rTRC", "gTRC", "bTRC")]
+    index, body, start = b"", b"", 128 + 4 + 12 * len(tags)
+    for name, content in tags:
+        index += struct.pack(">4sLL", name.encode(), start + len(body), len(content))
+        body += content + bytes(-len(content) % 4)
+    head = struct.pack(">LLL4s4s4s", start + len(body), 0, 0x04300000, b"mntr", b"RGB ", b"XYZ ") + bytes(12) + b"acsp"
+    return (head + bytes(28) + _fixed(*D50)).ljust(128, b"\0") + struct.pack(">L", len(tags)) + index + body
+
+
+def _fixed(*values: float) -> bytes:
+    return b"".join(struct.pack(">l", round(value * 65536)) for value in values)
+
+
+def _table(transfer: int) -> bytes:
+    """A curve from codes to light in units of paper white; what is brighter is white."""
+    code = np.linspace(0.0, 1.0, SAMPLES)
+    light = _pq(code) if transfer == PQ else _hlg(code) / _hlg(np.array(0.75))  # where HLG has paper white
+    values = np.rint(np.clip(light, 0.0, 1.0) * 65535).astype(">u2")
+    return b"curv" + bytes(4) + struct.pack(">L", SAMPLES) + values.tobytes()
+
+
+def _pq(code: F64) -> F64:
+    """SMPTE ST 2084."""
+    root = code ** (1 / 78.84375)
+    shown = np.maximum(root - 0.8359375, 0.0) / (18.8515625 - 18.6875 * root)
+    return np.asarray(shown ** (1 / 0.1593017578125) * (PQ_NITS / PAPER_NITS))
+
+
+def _hlg(code: F64) -> F64:
+    """ARIB STD-B67, with the system gamma of a screen of 1000 nits, channel by channel."""
+    a, b, c = 0.17883277, 0.28466892, 0.55991073
+    return np.asarray(np.where(code <= 0.5, code**2 / 3, (np.exp((code - c) / a) + b) / 12) ** 1.2)
