@@ -149,7 +149,7 @@ def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F6
     if counts[white, 253:].sum(axis=1).mean() > CLIPPED:
         raise InputError(source, "", "is overexposed: white is clipped; expose less")
     if (counts[white] @ np.arange(256)).mean() < 60:
-        raise InputError(source, "", "is too dark: expose more")
+        raise InputError(source, "", "is too dark: increase the exposure")
     return counts
 
 

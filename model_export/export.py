@@ -54,9 +54,8 @@ def export_model(
         data = picture_file(network, origin, eye_order=eye_order, **size)
     else:
         if checkpoint is not None or random_init is not None:
-            raise InputError(
-                "export", "--arch", f"{arch} is built from its recipe, without --checkpoint or --random-init"
-            )
+            problem = f"{arch} is built from its recipe: --checkpoint and --random-init cannot be used with it"
+            raise InputError("export", "--arch", problem)
         data, module = spectral_model(arch)
     report = check_model(data, source=str(out), reference=in_torch(module))
     if report.passed:
@@ -113,9 +112,7 @@ def picture_network(
     """
     if checkpoint is None:
         if random_init is None:
-            raise InputError(
-                "export", "--checkpoint", f"or --random-init is required: {arch}'s weights aren't shipped"
-            )
+            raise InputError("export", "--checkpoint", f"or --random-init is required: {arch}'s weights aren't shipped")
         network = make_network(arch, options, seed=random_init)
         return network, hashlib.sha256(f"{arch} {network.options} random {random_init}".encode()).hexdigest()
     table = load_checkpoint(checkpoint)

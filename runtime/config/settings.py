@@ -176,7 +176,7 @@ class ContentSettings(Section):
         "demo", description="a built-in scene, a preset, a file, a folder, or a class of yours: `module:Class`"
     )
     options: dict[str, Any] = Field(
-        default_factory=dict, description="options of a scene that is a class; for `program`: port"
+        default_factory=dict, description="options for a scene given as a class; the scene `program` takes `port`"
     )
     fov_deg: Annotated[float, within(*FOV_RANGE_DEG, "degrees")] = Field(
         40.0, description="horizontal field of view of the eye images"
@@ -217,7 +217,7 @@ class ContentSettings(Section):
     )
     turntable_per_min: Annotated[float, within(-600.0, 600.0, "turns a minute")] = Field(
         0.0,
-        description="rotation of the scene about the vertical, in turns per minute; negative: backwards",
+        description="rotation speed of the scene about the vertical, in turns per minute; negative values reverse it",
     )
 
     @model_validator(mode="after")

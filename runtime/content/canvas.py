@@ -98,7 +98,7 @@ class CanvasSource(ContentSource):
     """A source that draws with OpenGL into a framebuffer per view size, read back on request.
 
     Only the box that the content may touch is cleared, drawn and resolved with several samples a pixel: on a
-    software rasteriser resolving is the dearest step.
+    software rasteriser resolving is the most expensive step.
     """
 
     def __init__(self, context: Any, *, info: ContentInfo, samples: int = 0, deep: bool = False) -> None:

@@ -40,10 +40,10 @@ class SceneFile:
         return self.settings.background or DARK
 
     def placed(self, low: F64, high: F64, *, custom: tuple[str, str] | None = None, facing: F64 | None = None) -> F64:
-        """4x4 stack_from_scene of what has these corners: the preset's, else fitted, else its own metres.
+        """Return the 4x4 stack_from_scene of content with these corners: preset, fitted, or in its own metres.
 
-        custom: its format's axes up and to the viewer; None: by its name. facing: (3,) the mean normal of its surface,
-        by area; a flat mesh is then turned to the viewer.
+        custom: the up axis and the axis towards the viewer of the file's format; None: chosen by the file name. facing:
+        area-weighted mean normal (3,) of the surface; with it, a flat mesh is turned to face the viewer.
         """
         if self.preset:
             return stack_from_preset(self.preset)

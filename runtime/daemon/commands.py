@@ -26,7 +26,7 @@ class Command:
     answer: Future[dict[str, Any]] = field(default_factory=Future)
 
     def take(self) -> bool:
-        """Claim the command for execution. Returns False if its client has given up: do not run it."""
+        """Claim the command for execution. Return False if its client has given up: then it must not be run."""
         return self.answer.set_running_or_notify_cancel()
 
     def done(self, **state: Any) -> None:

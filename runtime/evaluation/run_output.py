@@ -100,7 +100,7 @@ class RunOutput:
         return self._folder.staging / "light" / str(frame)
 
     def run_is_over(self) -> None:
-        """From now on wait for the disk, since no refresh depends on it any longer."""
+        """Block on disk writes from now on: they can no longer delay a refresh."""
         self._every_one = True
 
     def finish(

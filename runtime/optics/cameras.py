@@ -122,9 +122,7 @@ def doubts(eyes_m: ArrayLike, stack: PanelStack, *, fov_deg: float, size: tuple[
     """List probable mistakes in eyes and picture sizes (width, height), a line each, naming the argument."""
     eyes, warnings = np.asarray(eyes_m, np.float64), []
     if fov_deg <= math.pi:
-        warnings.append(
-            f"fov_deg: {fov_deg:g} degrees looks like radians ({math.degrees(fov_deg):.1f} degrees)"
-        )
+        warnings.append(f"fov_deg: {fov_deg:g} degrees looks like radians ({math.degrees(fov_deg):.1f} degrees)")
     if (eyes[1] - eyes[0]) @ stack_from_eye(eyes.mean(0))[:3, 0] < 0:
         warnings.append("eyes_m: the left eye is on the right of the right eye; are they swapped?")
     width_px, height_px = 64, max(2, round(64 * size[1] / size[0]))

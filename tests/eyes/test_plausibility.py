@@ -65,9 +65,7 @@ def test_the_watch_tells_once_counts_by_reason_and_takes_it_back() -> None:
     assert [line for line in told if line] == ["sensor: the eyes are plausible again"] and watch.warning == ""
 
 
-@pytest.mark.parametrize(
-    "reasons", [(p.MILLIMETRES, "", "", "", ""), ("uncertain",), ("not where the viewer is", "")]
-)
+@pytest.mark.parametrize("reasons", [(p.MILLIMETRES, "", "", "", ""), ("uncertain",), ("not where the viewer is", "")])
 def test_a_few_bad_samples_are_counted_and_are_no_fault(reasons: tuple[str, ...]) -> None:
     watch = p.RefusalWatch()
     assert not any([watch.update(reasons[k % len(reasons)]) for k in range(200)])
