@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -41,6 +42,12 @@ class Intrinsics:
     fy_px: float
     cx_px: float
     cy_px: float
+
+    @classmethod
+    def centred(cls, width_px: int, height_px: int, *, fov_rad: float) -> Intrinsics:
+        """Square pixels about the picture's middle; fov_rad: its horizontal field of view."""
+        focal_px = width_px / 2 / math.tan(fov_rad / 2)
+        return cls(width_px, height_px, focal_px, focal_px, width_px / 2, height_px / 2)
 
 
 @dataclass(frozen=True, slots=True)

@@ -124,20 +124,6 @@ class BlackBoxMessage(NamedTuple):
     sequence: int
 
 
-class _Pending(NamedTuple):
-    """A file to be written."""
-
-    kind: str
-    kept: list[BlackBoxMessage]
-    header: RecordingHeader
-    settings: str
-    listeners: list[Saved]
-
-    def report(self, problem: str, path: Path | None) -> None:
-        for saved in self.listeners:
-            saved(problem, path)
-
-
 class Recorder(logging.Handler):
     """Observer of a run and of its log, from `watches` to `close`.
 
@@ -160,7 +146,7 @@ class Recorder(logging.Handler):
         self._lines: deque[dict[str, Any]] = deque(maxlen=LINES_KEPT)
         self._passed: deque[dict[str, Any]] = deque(maxlen=STATES_KEPT)
         self._waiting_lock, self._is_writing = threading.Lock(), False
-        self._waiting: deque[_Pending] = deque()  # for the writer
+        self._waiting: dict[str, list[Saved]] = {}  # files that the writer has not begun, by kind
         self._writer: BackgroundJob[None] | None = None
         self._fresh = 0  # newest of the kept messages that are not in the journal yet
         self._journal, self._journaled_ns = _Journal(folder), 0
@@ -203,7 +189,7 @@ class Recorder(logging.Handler):
             with self._kept_lock:
                 fresh = list(islice(reversed(self._kept), self._fresh))[::-1]
                 self._fresh = 0
-            work = partial(self._journal.add, fresh, *self._head(), most_ns=self._most_ns)
+            work = partial(self._journal.add, fresh, *_head(self._presenter), most_ns=self._most_ns)
             self._journaling = BackgroundJob("black box's journal", work)  # no refresh waits for a disk
         if self._fault is not None and at_ns - self._fault[0] >= AFTER_FAULT_NS:
             kind, self._fault = self._fault[1], None
@@ -236,51 +222,45 @@ class Recorder(logging.Handler):
             self._fresh = min(self._fresh, len(self._kept))  # a journal that hangs costs no more memory
 
     def save(self, kind: str, saved: Saved = lambda problem, path: None) -> None:
-        """Write the kept messages to a file in the background, then call `saved`. kind: `asked` or a fault."""
+        """Write the kept messages to a file in the background, then call `saved`. kind: `asked` or a fault.
+
+        One file is enough for all requests of a kind that come before it is begun.
+        """
         if not self._most_ns or self._presenter is None:
             saved("the black box is switched off (service.blackbox_minutes is 0)", None)
             return
-        header, settings = self._head()
-        with self._kept_lock:
-            kept = list(self._kept)
         with self._waiting_lock:
-            listeners = [saved]
-            if self._waiting and self._waiting[-1].kind == kind:  # not begun: one file is enough for both
-                listeners = [*self._waiting.pop().listeners, saved]
-            self._waiting.append(_Pending(kind, kept, header, settings, listeners))
+            self._waiting.setdefault(kind, []).append(saved)
             if self._is_writing:
                 return
-            self._writer = BackgroundJob("black box", self._write)
+            self._writer = BackgroundJob("black box", partial(self._write, self._presenter))
             self._is_writing = not self._writer.problem
-            refused = self._waiting.pop() if self._writer.problem else None
-        if refused is not None:
-            refused.report(self._writer.problem, None)
+            if self._is_writing:
+                return
+            del self._waiting[kind]
+        saved(self._writer.problem, None)
 
-    def _head(self) -> tuple[RecordingHeader, str]:
-        """Return the header and the settings written before the messages of a file."""
-        assert self._presenter is not None
-        settings = self._presenter.run_cell.state.settings
-        header = RecordingHeader(settings.sensor.driver, self._presenter.samples.serial)
-        return header, without_secrets(settings.model_dump_json())
-
-    def _write(self) -> None:
-        """Write the pending files; on the writer's thread."""
+    def _write(self, presenter: Presenter) -> None:
+        """Write the files that wait, in the order of their first request; on the writer's thread."""
         while True:
             with self._waiting_lock:
                 self._is_writing = bool(self._waiting)
                 if not self._waiting:
                     return
-                pending = self._waiting.popleft()
+                kind = next(iter(self._waiting))
+                listeners = self._waiting.pop(kind)
+            with self._kept_lock:
+                kept = list(self._kept)
+            problem = ""
             try:
-                path = write_file(self._folder, pending.kind, pending.kept, pending.header, pending.settings)
+                self._last_file = write_file(self._folder, kind, kept, *_head(presenter))
+                log.info("black box written: %s", self._last_file, extra={"always": True})
                 make_room(self._folder)
             except OSError as error:
                 log.error("the black box could not be written: %s", error)
-                pending.report(f"{self._folder}: cannot be written ({error.strerror})", None)
-                continue
-            self._last_file = path
-            log.info("black box written: %s", path, extra={"always": True})
-            pending.report("", path)
+                problem = f"{self._folder}: cannot be written ({error.strerror})"
+            for saved in listeners:
+                saved(problem, None if problem else self._last_file)
 
     def look_at_log(self) -> dict[str, Any]:
         """Return the newest log lines and states, oldest first, with times since 1970."""
@@ -323,6 +303,13 @@ class Recorder(logging.Handler):
             self._journal.close(in_use=self._journaling is not None and not self._journaling.done)
         self._presenter = None
         super().close()
+
+
+def _head(presenter: Presenter) -> tuple[RecordingHeader, str]:
+    """Return the header and the settings written before the messages of a file."""
+    settings = presenter.run_cell.state.settings
+    header = RecordingHeader(settings.sensor.driver, presenter.samples.serial)
+    return header, without_secrets(settings.model_dump_json())
 
 
 def write_file(folder: Path, kind: str, kept: list[BlackBoxMessage], header: RecordingHeader, settings: str) -> Path:

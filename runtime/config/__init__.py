@@ -1,7 +1,6 @@
 """Validated, frozen settings from one TOML file. Defaults and meanings are in `settings.py`."""
 
-from runtime.config.files import load_settings, load_stack
-from runtime.config.overrides import changed, with_options
+from runtime.config.files import changed, load_settings, load_stack, with_options
 from runtime.config.settings import (
     MOST,
     CalibrationSettings,
@@ -16,8 +15,7 @@ from runtime.config.settings import (
     StackGeometry,
     TrackerSettings,
 )
-from runtime.support.sections import Section, validated
-from runtime.support.tables import read_table
+from runtime.support.sections import Section, read_table, validated
 
 __all__ = [
     "MOST",

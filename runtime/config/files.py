@@ -1,14 +1,14 @@
-"""Configuration and panels files."""
+"""Settings from a file, replaced in part by options or an operator's choices; panels files."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from runtime.config.settings import PANELS_MOST, Settings, StackGeometry
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
-from runtime.support.sections import validated
-from runtime.support.tables import read_table
+from runtime.support.sections import Section, read_table, validated
 
 
 def load_settings(path: Path | None) -> Settings:
@@ -28,3 +28,40 @@ def load_stack(path: Path, *, width_px: int, height_px: int) -> PanelStack:
     if not 2 <= len(table["x_m"] if isinstance(table["x_m"], list) else ()) <= PANELS_MOST:
         raise InputError(path, "x_m", f"must list 2 to {PANELS_MOST} panels")
     return validated(StackGeometry, table, source=path).stack()
+
+
+def with_options(
+    settings: Settings,
+    *,
+    replay: str | None = None,
+    loop: bool = False,
+    headless: bool = False,
+    scene: str | None = None,
+    layout: str | None = None,
+    model: str | None = None,
+    backend: str | None = None,
+) -> Settings:
+    """Return the settings with command-line options applied. Raises InputError, naming the option.
+
+    loop: the recording restarts when it ends.
+    """
+    overrides: tuple[tuple[str, str, dict[str, Any] | None], ...] = (
+        ("--replay", "sensor", None if replay is None else {"driver": "replay", "source": replay}),
+        ("--replay", "sensor", {"loop": True} if loop else None),
+        ("--headless", "output", {"kind": "offscreen"} if headless else None),
+        ("--scene", "content", None if scene is None else {"scene": scene}),
+        ("--layout", "content", None if layout is None else {"layout": layout}),
+        ("--model", "model", None if model is None else {"name": model}),
+        ("--backend", "model", None if backend is None else {"backend": backend}),
+    )
+    for option, section, values in overrides:
+        if values is not None:
+            settings = changed(settings, section, values, source=option)
+    return settings
+
+
+def changed(settings: Settings, section: str, values: dict[str, Any], *, source: str) -> Settings:
+    """Return the settings with values of one section replaced. Raises InputError, naming `source`."""
+    old: Section = getattr(settings, section)
+    new = validated(type(old), old.model_dump() | values, source=source)
+    return settings.model_copy(update={section: new})

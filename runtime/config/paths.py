@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import AfterValidator, ValidationInfo
+from pydantic import AfterValidator
 
 from runtime.support.plugins import located
 
@@ -23,13 +23,6 @@ def path_in(folder: Path | None, value: str, *, or_name: bool = False) -> str:
     return located(value, folder) if or_name else str(folder / value)
 
 
-def _resolve_path(value: str, info: ValidationInfo) -> str:
-    return path_in(info.context, value)
-
-
-def _resolve_name_or_path(value: str, info: ValidationInfo) -> str:
-    return path_in(info.context, value, or_name=True)
-
-
-PathText = Annotated[str, AfterValidator(_resolve_path)]
-NameOrPath = Annotated[str, AfterValidator(_resolve_name_or_path)]  # `demo` is a name, `demo.glb` a path
+PathText = Annotated[str, AfterValidator(lambda value, info: path_in(info.context, value))]
+# `demo` is a name, `demo.glb` a path.
+NameOrPath = Annotated[str, AfterValidator(lambda value, info: path_in(info.context, value, or_name=True))]

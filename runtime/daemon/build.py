@@ -74,7 +74,6 @@ class Run:
 
     presenter: Presenter
     observer: RunObserver
-    solver: SolverHost
     maker: SolverMaker
     simulated: bool
 
@@ -236,7 +235,7 @@ def build_run(
         gc.freeze()
         cleanup.callback(gc.unfreeze)
         cleanup.enter_context(niceness(PRESENTER_NICENESS))  # of this thread, after all others were started
-    run = Run(presenter, observer, solver, maker, simulated)
+    run = Run(presenter, observer, maker, simulated)
     host.watches(run)
     return run
 

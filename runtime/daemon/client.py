@@ -18,6 +18,8 @@ from runtime.errors import TransientError
 # `ServiceSettings().socket`, without loading all settings.
 DEFAULT_SOCKET = "/run/phasestack/status.sock"
 UNIT = "phasestack"
+REQUEST_MAX_BYTES = 65536  # of one request, of a client or a page: limits the memory that a client can use
+REQUEST_S = 5.0  # for a whole request to arrive, and for its answer to be read
 LOOKED_UP_AGAIN_S = {"status": 0.2, "pictures": 0.3, "log": 0.5, "about": 2.0}
 LOOKED_UP_WITHIN_S = 3.0  # for an answer without the loop's work; after it, the page shows that the daemon hangs
 LOADED_WITHIN_S = 60.0  # longest wait of the daemon for a scene or model before it answers a command

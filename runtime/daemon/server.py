@@ -1,46 +1,46 @@
-"""Status and control socket: JSON lines over a local socket of mode 0660, on its own thread."""
+"""Status and control socket: JSON lines over a local socket, served on its own thread.
+
+Slow, hanging or numerous clients cannot block it: requests and answers have time limits, no client costs a thread, and
+when all connections are in use, a new client replaces the one that has waited longest to complete its request.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import fcntl
-import grp
 import json
 import logging
 import os
 import queue
 import select
-import socket
-import stat
-import struct
+import threading
 import time
 from asyncio import StreamReader, StreamWriter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from runtime.clock import NS_PER_S, Clock
 from runtime.config import ServiceSettings
-from runtime.daemon.client import DEFAULT_SOCKET, LOADED_WITHIN_S, user_socket
+from runtime.daemon.client import DEFAULT_SOCKET, LOADED_WITHIN_S, REQUEST_MAX_BYTES, REQUEST_S, user_socket
 from runtime.daemon.commands import Command, parse
-from runtime.daemon.listener import LIMITED, Listener, Refusal
-from runtime.errors import InputError, TransientError, without_secrets
+from runtime.daemon.socket_file import BACKLOG, SocketInUse, listening_socket
+from runtime.errors import InputError, one_line, without_secrets
 from runtime.support.artifacts import to_json
+from runtime.support.background import BACKGROUND_NICENESS, begin, patience_s, set_niceness
 
 log = logging.getLogger("phasestack.service")
 
-GROUP = "phasestack"  # members may use the socket
+CLIENTS_MAX = 64  # simultaneous connections
 LOOP_ANSWERS_WITHIN_S = 5.0  # a command not begun by then is refused
 LOOKED_AGAIN_S = 0.1  # between checks whether the client is still connected
-LOCKED_WITHIN_S = 2.0  # to wait for the folder's lock, which is only held briefly
 
 
-class SocketInUse(TransientError):
-    """Another phasestack owns the socket; the text names it."""
+class Refusal(Exception):
+    """Reason for disconnecting a client."""
 
 
-class StatusServer(Listener):
+class StatusServer:
     """Answers `status` from the last published snapshot, and queues commands for the loop.
 
     The presenter's loop calls `publish` and takes `commands`, and never waits for a client. `status` also answers when
@@ -48,33 +48,22 @@ class StatusServer(Listener):
     """
 
     def __init__(self, path: Path, *, clock: Clock) -> None:
-        """Raises SocketInUse if a running daemon owns the socket, InputError if it cannot be created."""
+        """Start serving. Raises SocketInUse, InputError, TransientError."""
         self.path = path
         self.commands: queue.SimpleQueue[Command] = queue.SimpleQueue()
         self.lookups: dict[str, Callable[[], dict[str, Any]]] = {}  # called on the server's thread
         self._clock = clock
         self._started_ns = clock.now_ns()
         self._snapshot: tuple[int, Callable[[], dict[str, Any]]] = (self._started_ns, dict)
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with _locked(path.parent):
-                _check_dead(path)
-                # By the mask, not by chmod: the mode must be right from the first moment.
-                mask = os.umask(0o117)
-                try:
-                    super().__init__("status", lambda serve: asyncio.start_unix_server(serve, path, **LIMITED))
-                finally:
-                    os.umask(mask)
-                self._own = path.lstat().st_ino
-        except OSError as error:
-            raise InputError("service", "socket", f"{path} cannot be created ({error.strerror or error})") from error
-        try:
-            group = grp.getgrnam(GROUP).gr_gid
-            if path.lstat().st_gid != group:  # a service's sandbox may refuse even a chown without effect
-                os.chown(path, -1, group)
-        except (KeyError, PermissionError):
-            log.info("only this user can use the status socket: no group %s, or not a member", GROUP)
-        self.start()
+        self._clients: set[asyncio.Task[None]] = set()
+        self._reading: dict[asyncio.Task[None], None] = {}  # waiting for a whole request, longest first
+        listening = listening_socket(path)
+        self._own = path.lstat().st_ino
+        self._loop = asyncio.new_event_loop()
+        self._loop.set_exception_handler(_log_error)
+        serving = asyncio.start_unix_server(self._serve, sock=listening, limit=REQUEST_MAX_BYTES, backlog=BACKLOG)
+        self._server = self._loop.run_until_complete(serving)
+        self._thread: threading.Thread | None = begin("status", self._run)
 
     def publish(self, snapshot: Callable[[], dict[str, Any]]) -> None:
         """Replace the snapshot, once a turn; called on the server's thread when a client asks.
@@ -85,9 +74,11 @@ class StatusServer(Listener):
 
     def close(self) -> None:
         """Answer pending requests, stop, and remove the socket. May be called twice."""
-        if self._thread is None:
+        thread, self._thread = self._thread, None
+        if thread is None:
             return
-        super().close()
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        thread.join(patience_s(2.0))
         with contextlib.suppress(OSError):
             if self.path.lstat().st_ino == self._own:  # otherwise it is another daemon's
                 self.path.unlink()
@@ -121,13 +112,68 @@ class StatusServer(Listener):
 
     # On the server's thread.
 
-    async def converse(self, reader: StreamReader, writer: StreamWriter) -> None:
-        """Answer requests until the client disconnects."""
-        while line := await self.request(reader, b"\n"):
-            await self.send(writer, await self._reply(line, writer))
+    def _run(self) -> None:
+        set_niceness(BACKGROUND_NICENESS)
+        self._loop.run_forever()
+        self._loop.run_until_complete(self._end())
+        self._loop.close()
 
-    def refuse(self, writer: StreamWriter, why: str) -> None:
-        writer.write(_line({"ok": False, "error": why}))
+    async def _end(self) -> None:
+        self._server.close()
+        for _ in range(16):  # lets new clients begin, to be answered, too
+            await asyncio.sleep(0)
+        clients = asyncio.all_tasks() - {asyncio.current_task()}
+        for client in clients:
+            client.cancel("the daemon stops")
+        await asyncio.gather(*clients, return_exceptions=True)
+        await asyncio.sleep(0)  # closes their connections
+
+    async def _serve(self, reader: StreamReader, writer: StreamWriter) -> None:
+        """Answer a client's requests until it disconnects."""
+        task = asyncio.current_task()
+        assert task is not None
+        writer.transport.set_write_buffer_limits(high=0)  # `drain` waits until the whole answer has been sent
+        try:
+            self._make_room()
+            self._clients.add(task)
+            while line := await self._request(reader, task):
+                writer.write(await self._reply(line, writer))
+                async with asyncio.timeout(REQUEST_S):
+                    await writer.drain()
+        except (Refusal, asyncio.CancelledError) as why:
+            writer.write(_line({"ok": False, "error": why.args[0]}))
+        except (OSError, TimeoutError):  # disconnected, or not reading
+            writer.transport.abort()
+        finally:
+            self._clients.discard(task)
+            if writer.transport.get_write_buffer_size():
+                writer.transport.abort()
+            writer.close()
+
+    def _make_room(self) -> None:
+        """Disconnect the client that has waited longest for a request. Raises Refusal if none waits."""
+        if len(self._clients) >= CLIENTS_MAX:
+            longest = next(iter(self._reading), None)
+            if longest is None:
+                raise Refusal("too many clients")
+            self._reading.pop(longest)
+            self._clients.discard(longest)  # now: many may connect before it runs again
+            longest.cancel("too many clients")
+
+    async def _request(self, reader: StreamReader, task: asyncio.Task[None]) -> bytes:
+        """Return the next request including its end, or a partial one at the end of input. Raises Refusal."""
+        self._reading[task] = None
+        try:
+            async with asyncio.timeout(REQUEST_S):
+                return await reader.readuntil(b"\n")
+        except asyncio.IncompleteReadError as cut:
+            return cut.partial
+        except asyncio.LimitOverrunError:
+            raise Refusal("the request is too long") from None
+        except TimeoutError:
+            raise Refusal("the request did not arrive in time") from None
+        finally:
+            self._reading.pop(task, None)
 
     async def _reply(self, line: bytes, writer: StreamWriter) -> bytes:
         try:
@@ -142,6 +188,11 @@ class StatusServer(Listener):
             self.commands.put(answer)
             answer = await _outcome(answer, writer)
         return _line(answer)
+
+
+def _log_error(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Log an error such as a lack of descriptors, after which asyncio retries in a second."""
+    log.warning("status: %s", one_line(f"{context.get('message')} ({context.get('exception')})"))
 
 
 def _line(answer: dict[str, Any]) -> bytes:
@@ -174,43 +225,6 @@ async def _outcome(command: Command, writer: StreamWriter) -> dict[str, Any]:
     if done:
         return answer.result()
     return {"ok": True, "note": f"still loading after {LOADED_WITHIN_S:g} s: see `phasestack status`"}
-
-
-@contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Lock a folder, so that one daemon at a time replaces a dead socket."""
-    opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        until_s = time.monotonic() + LOCKED_WITHIN_S
-        while time.monotonic() < until_s:  # another program may never release it
-            with contextlib.suppress(BlockingIOError):
-                fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            time.sleep(0.01)
-        yield
-    finally:
-        os.close(opened)
-
-
-def _check_dead(path: Path) -> None:
-    """Raise InputError if the path is not a socket, SocketInUse if a daemon listens on it."""
-    if not os.path.lexists(path):
-        return
-    if not stat.S_ISSOCK(path.lstat().st_mode):
-        raise InputError("service", "socket", f"{path} exists and is not a socket")
-    owner = ""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        probe.setblocking(False)
-        try:
-            probe.connect(str(path))
-        except ConnectionRefusedError:
-            return
-        except BlockingIOError:
-            pass  # its backlog is full
-        else:
-            pid, _, _ = struct.unpack("3i", probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
-            owner = f" (pid {pid})"
-    raise SocketInUse(f"service: socket: {path} is in use by another phasestack{owner}")
 
 
 def open_status_server(settings: ServiceSettings, *, clock: Clock, supervised: bool) -> StatusServer | None:

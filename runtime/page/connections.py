@@ -9,7 +9,7 @@ from typing import Any
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from runtime.daemon.listener import REQUEST_MAX_BYTES, REQUEST_S
+from runtime.daemon.client import REQUEST_MAX_BYTES, REQUEST_S
 from runtime.errors import InputError
 
 LOOPBACK = "127.0.0.1"

@@ -23,9 +23,8 @@ from starlette.websockets import WebSocket
 
 from runtime.browser.link import BrowserLink
 from runtime.browser.still import asset as browser_asset
-from runtime.daemon.client import LOOKED_UP_AGAIN_S, DaemonClient
+from runtime.daemon.client import LOOKED_UP_AGAIN_S, REQUEST_MAX_BYTES, REQUEST_S, DaemonClient
 from runtime.daemon.commands import NAMES
-from runtime.daemon.listener import REQUEST_MAX_BYTES, REQUEST_S
 from runtime.errors import InputError
 from runtime.page.live import live
 from runtime.page.metrics import exposition

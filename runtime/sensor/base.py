@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
-from types import TracebackType
 from typing import ClassVar, Self
 
 from pydantic import BaseModel
 
-from runtime.clock import NS_PER_S, Clock
+from runtime.clock import NS_PER_MS, NS_PER_S, Clock
 from runtime.config import Section
-from runtime.errors import SensorTimeout
+from runtime.errors import EndOfRecording, SensorLost, SensorTimeout
 from runtime.records import SensorFrame
 
 ARRIVED_MAX = 1024  # samples returned per call; the rest follow in later calls
@@ -73,31 +73,46 @@ class Sensor(ABC):
         self.open()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.close()
 
 
 class SteppedSensor(Sensor):
     """A driver that can also deliver each sample without waiting, for runs on a simulated clock.
 
-    `read_newest` and `read_arrived` return the samples that have arrived according to its clock.
+    `open` passes the samples to `_begin`. `read_newest` and `read_arrived` return the samples that have arrived by its
+    clock.
     """
 
-    _clock: Clock
+    def __init__(self, source: str, clock: Clock, *, latency_ms: float = 0.0) -> None:
+        """source: for messages; latency_ms: from a sample's capture to its arrival."""
+        self._source, self._clock, self._latency_ns = source, clock, round(latency_ms * NS_PER_MS)
+        self._frames: Iterator[SensorFrame] | None = None  # those after the next; None: not open
+        self._next: SensorFrame | None = None
 
-    @abstractmethod
-    def next_sample(self) -> SensorFrame:
-        """Return the next sample in order, immediately. Raises EndOfRecording, SensorLost."""
+    def _begin(self, frames: Iterator[SensorFrame]) -> None:
+        self._frames, self._next = frames, next(frames, None)
 
-    @abstractmethod
+    def close(self) -> None:
+        self._frames = self._next = None
+
     def peek(self) -> SensorFrame | None:
         """Return the sample that `next_sample` will deliver, or None at the end. Raises SensorLost."""
+        if self._frames is None:
+            raise SensorLost(f"{self._source}: not open")
+        return self._next
 
-    @abstractmethod
+    def next_sample(self) -> SensorFrame:
+        """Return the next sample in order, immediately. Raises EndOfRecording, SensorLost."""
+        frame = self.peek()
+        if frame is None or self._frames is None:
+            raise EndOfRecording(f"{self._source}: no more samples")
+        self._next = next(self._frames, None)
+        return frame
+
     def available_ns(self, frame: SensorFrame) -> int:
         """Return the sample's arrival time on the run's clock; the caller advances its clock to this time."""
+        return frame.capture_ns + self._latency_ns
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
         *overtaken, newest = self.read_arrived(timeout_s)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from math import radians, tan
+from math import radians
 from typing import Any
 
 import cv2
@@ -109,8 +109,7 @@ class BrowserCamera(Sensor):
         self._number += 1
         self._captured_ns = max(capture_ns, self._captured_ns + 1)
         height, width = picture.shape[:2]
-        focal = width / 2 / tan(radians(self._link.camera_fov_deg) / 2)
-        intrinsics = Intrinsics(width, height, focal, focal, width / 2, height / 2)
+        intrinsics = Intrinsics.centred(width, height, fov_rad=radians(self._link.camera_fov_deg))
         colour = np.ascontiguousarray(picture[..., ::-1])
         return SensorFrame(self._number, self._captured_ns, colour=colour, intrinsics=intrinsics)
 

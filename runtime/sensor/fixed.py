@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import count
+
 import numpy as np
 
 from runtime.clock import NS_PER_S, Clock
 from runtime.config import SensorSettings
-from runtime.errors import InputError, SensorLost
+from runtime.errors import InputError
 from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.base import Capabilities, SteppedSensor
 
@@ -23,28 +26,12 @@ class FixedDriver(SteppedSensor):
         """Raise InputError if the settings contain no eye positions."""
         if settings.fixed_eyes_m is None:
             raise InputError("sensor", "fixed_eyes_m", "is required by the driver `fixed`")
+        super().__init__(self.name, clock)
         self._eyes = EyePoints(np.array(settings.fixed_eyes_m, dtype=np.float64), np.ones(2))
-        self._clock = clock
-        self._start_ns: int | None = None
-        self._count = 0
 
     def open(self) -> None:
-        self._start_ns, self._count = self._clock.now_ns(), 0
+        self._begin(self._samples(self._clock.now_ns()))
 
-    def next_sample(self) -> SensorFrame:
-        if self._start_ns is None:
-            raise SensorLost("not open")
-        self._count += 1
-        capture_ns = self._start_ns + (self._count - 1) * PERIOD_NS
-        return SensorFrame(self._count, capture_ns, self._eyes, true_eyes_m=self._eyes.eyes_m)
-
-    def peek(self) -> SensorFrame:
-        frame = self.next_sample()
-        self._count -= 1
-        return frame
-
-    def available_ns(self, frame: SensorFrame) -> int:
-        return frame.capture_ns
-
-    def close(self) -> None:
-        self._start_ns = None
+    def _samples(self, start_ns: int) -> Iterator[SensorFrame]:
+        for number in count():
+            yield SensorFrame(number + 1, start_ns + number * PERIOD_NS, self._eyes, true_eyes_m=self._eyes.eyes_m)

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -130,8 +131,6 @@ class OpenNI2Driver(Sensor):
 
     def _read_intrinsics(self, stream: Any) -> Intrinsics | None:
         """Return a centred pinhole with the camera's field of view, else the settings'; None if unknown."""
-        mode = stream.video_mode
-        width, height = mode.resolutionX, mode.resolutionY
         try:  # files have the property but deny it
             fov_x, fov_y = stream.get_horizontal_fov(), stream.get_vertical_fov()
         except Exception:
@@ -141,9 +140,11 @@ class OpenNI2Driver(Sensor):
         if fov_x == 0.0:
             log.warning("OpenNI2: the camera does not report its field of view: set sensor.fov_deg")
             return None
-        fx = width / 2 / math.tan(fov_x / 2)
-        fy = height / 2 / math.tan(fov_y / 2) if 0 < fov_y < math.pi else fx
-        return Intrinsics(width, height, fx, fy, width / 2, height / 2)
+        mode = stream.video_mode
+        camera = Intrinsics.centred(mode.resolutionX, mode.resolutionY, fov_rad=fov_x)
+        if not 0 < fov_y < math.pi:
+            return camera
+        return replace(camera, fy_px=camera.height_px / 2 / math.tan(fov_y / 2))
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
         if self._thread is None:

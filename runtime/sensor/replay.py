@@ -8,8 +8,8 @@ from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
-from runtime.clock import NS_PER_MS, NS_PER_S, Clock
-from runtime.errors import EndOfRecording, InputError, SensorLost
+from runtime.clock import NS_PER_S, Clock
+from runtime.errors import InputError
 from runtime.records import SensorFrame
 from runtime.sensor.base import Capabilities, SteppedSensor
 from runtime.sensor.recording import Recording
@@ -34,12 +34,9 @@ class ReplayDriver(SteppedSensor):
 
     def __init__(self, source: str, clock: Clock, *, loop: bool = False, latency_ms: float = 0.0) -> None:
         """source: a recording's path, or `demo`. latency_ms: from a sample's capture to its arrival."""
-        self.path = demo_recording_path() if source == "demo" else Path(source)
-        self._clock, self._loop = clock, loop
-        self._latency_ns = round(latency_ms * NS_PER_MS)
+        self.path, self._loop = demo_recording_path() if source == "demo" else Path(source), loop
+        super().__init__(str(self.path), clock, latency_ms=latency_ms)
         self.capabilities = Capabilities(eye_points=True, may_pause=True)
-        self._frames: Iterator[SensorFrame] | None = None
-        self._next: SensorFrame | None = None
 
     def open(self) -> None:
         """Open the recording. Raises InputError if the file is not a recording."""
@@ -47,8 +44,7 @@ class ReplayDriver(SteppedSensor):
         header = recording.header
         self.serial = header.serial
         self.capabilities = Capabilities(header.colour, header.depth, eye_points=True, may_pause=True)
-        self._frames = self._shifted(recording)
-        self._next = next(self._frames, None)
+        self._begin(self._shifted(recording))
 
     def _ordered(self, recording: Recording) -> Iterator[SensorFrame]:
         """Yield samples with increasing capture times. Raises InputError if the recording is too long."""
@@ -87,21 +83,3 @@ class ReplayDriver(SteppedSensor):
             is_first_round = False
             if not self._loop or not delivered:
                 return
-
-    def available_ns(self, frame: SensorFrame) -> int:
-        return frame.capture_ns + self._latency_ns
-
-    def peek(self) -> SensorFrame | None:
-        if self._frames is None:
-            raise SensorLost("the recording is not open")
-        return self._next
-
-    def next_sample(self) -> SensorFrame:
-        frame = self.peek()
-        if frame is None or self._frames is None:
-            raise EndOfRecording(f"{self.path}: no more samples")
-        self._next = next(self._frames, None)
-        return frame
-
-    def close(self) -> None:
-        self._frames = self._next = None

@@ -38,11 +38,6 @@ class Samples(ABC):
         """Release the sensor. May be called twice."""
 
 
-def finder(sensor: Sensor, make_find: Callable[[], FindEyes] | None) -> FindEyes | None:
-    """Create an eye finder for an open sensor, or return None if the sensor delivers eyes itself."""
-    return None if sensor.capabilities.eye_points or make_find is None else make_find()
-
-
 def searched(frame: SensorFrame, find: FindEyes | None, *, keep_images: bool = False) -> SensorFrame:
     """Find the eyes in a sample's pictures, then drop the pictures unless `keep_images` is set."""
     if find is not None:

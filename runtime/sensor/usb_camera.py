@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from math import radians, tan
+from math import radians
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +41,7 @@ class UsbCameraDriver(Sensor):
         if protocol is not None and protocol[1] not in STREAMS:
             raise InputError("sensor", "source", f"{protocol[1]}: not supported; use one of {', '.join(STREAMS)}")
         self._source = f"/dev/video{source or 0}" if re.fullmatch(r"\d*", source) else source
-        self._fov, self._clock = radians(settings.fov_deg), clock
+        self._fov_rad, self._clock = radians(settings.fov_deg), clock
         self._capture: Any = None
         self._number = 0
 
@@ -85,12 +85,11 @@ class UsbCameraDriver(Sensor):
         stamp_ns = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * NS_PER_MS)
         is_stamp = self._is_device and 0 <= now_ns - stamp_ns < STAMP_AGE_NS
         height, width = bgr.shape[:2]
-        focal = width / 2 / tan(self._fov / 2)
         return SensorFrame(
             self._number,
             stamp_ns if is_stamp else now_ns,
             colour=np.ascontiguousarray(bgr[..., ::-1]),
-            intrinsics=Intrinsics(width, height, focal, focal, width / 2, height / 2),
+            intrinsics=Intrinsics.centred(width, height, fov_rad=self._fov_rad),
         )
 
     def close(self) -> None:

@@ -53,12 +53,9 @@ class UsbDevice:
     speed: int  # libusb's number, 0: unknown
     is_accessible: bool
 
-    @property
-    def usb_id(self) -> str:
-        return f"{self.known.vendor_id:04x}:{self.known.product_id:04x}"
-
     def __str__(self) -> str:
-        return f"{self.known.name} ({self.usb_id}, {SPEEDS.get(self.speed, 'unknown')})"
+        usb_id = f"{self.known.vendor_id:04x}:{self.known.product_id:04x}"
+        return f"{self.known.name} ({usb_id}, {SPEEDS.get(self.speed, 'unknown')})"
 
     def problems(self) -> list[str]:
         """List the problems that prevent its use, each with a remedy."""

@@ -15,7 +15,7 @@ from runtime.config import SensorSettings
 from runtime.errors import EndOfRecording, FatalError, SensorLost, SensorTimeout, TransientError, is_retryable
 from runtime.records import SensorFrame
 from runtime.sensor.base import Capabilities, Sensor
-from runtime.sensor.samples import FindEyes, Samples, finder, searched
+from runtime.sensor.samples import FindEyes, Samples, searched
 from runtime.support.background import begin, patience_s
 from runtime.support.extras import missing_extra
 
@@ -239,7 +239,7 @@ class SensorWorker(Samples):
         timeouts, well_ns = 0, self._clock.now_ns()
         if attempt.abandoned.is_set():
             return
-        find = finder(driver, self._make_find)
+        find = None if driver.capabilities.eye_points or self._make_find is None else self._make_find()
         with self._lock:
             self._driver, self.serial = driver, driver.serial
         while not attempt.abandoned.is_set():

@@ -19,7 +19,6 @@ from runtime.support.leia import other_view
 from runtime.support.untrusted_input import LIMITS
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
-JPEG_END = b"\xff\xd9"
 PNG_DEPTH = slice(24, 25)  # where a PNG has its bits a channel
 CHUNK_BYTES = 12  # overhead of a PNG chunk: length, kind, checksum
 SIDE_MAX_PX = 1 << 16  # that a header may claim
@@ -102,10 +101,10 @@ def _formats() -> tuple[str, ...]:
     return (*FORMATS, "HEIF")
 
 
-def header_of(coded: bytes | IO[bytes], *, name: str = "") -> Header:
-    """Return the header of a coded picture. Raises ValueError with the problem.
+def _header_of(path: Path, coded: bytes | IO[bytes]) -> Header:
+    """Return the header of a picture file, from its bytes or the open file. Raises InputError.
 
-    name: of its file: a second picture that an MPO does not call a view is one only where the file is named .mpo.
+    A second picture that an MPO does not call a view is one only where the file is named .mpo.
     """
     try:
         with opened(coded) as image:
@@ -113,13 +112,23 @@ def header_of(coded: bytes | IO[bytes], *, name: str = "") -> Header:
             if _orientation(image) in TURNED:
                 width, height = height, width
             is_animated = image.format in ANIMATED and bool(getattr(image, "is_animated", False))
-            views, warning = _views(image, is_named_so=name.lower().endswith(".mpo"))
+            views, warning = _views(image, is_named_so=path.suffix.lower() == ".mpo")
             is_around, layout, other = b"equirectangular" in _xmp(image), _jps_layout(image), None
             if image.format == "JPEG" and (found := _leia_view(coded, image.size)):
                 other, views = found[0], (1, 0) if found[1] else (0, 1)
-            return Header(image.format, width, height, views, is_animated, is_around, warning, layout, other)
+            kind = image.format
+        head = _beginning(coded, HEAD_BYTES)
     except Exception as error:  # each of Pillow's formats raises its own
-        raise ValueError(undecodable(_all(coded), error)) from None
+        raise InputError(path, "", undecodable(_beginning(coded, LIMITS.file_bytes), error)) from None
+    check_size(width, height, source=path, head=head)
+    return Header(kind, width, height, views, is_animated, is_around, warning, layout, other)
+
+
+def _beginning(coded: bytes | IO[bytes], most_bytes: int) -> bytes:
+    if isinstance(coded, bytes):
+        return coded[:most_bytes]
+    coded.seek(0)
+    return coded.read(most_bytes)
 
 
 def _views(image: Any, *, is_named_so: bool) -> tuple[tuple[int, ...], str]:
@@ -198,21 +207,14 @@ def _viewpoint(image: Any) -> int | None:
     return None
 
 
-def picture_size(coded: bytes | IO[bytes]) -> tuple[int, int]:
+def picture_size(coded: bytes) -> tuple[int, int]:
     """Width and height of a coded picture as it is stored. Raises ValueError with the problem."""
     try:
         with opened(coded) as image:
             width, height = image.size
             return width, height
     except Exception as error:  # each of Pillow's formats raises its own
-        raise ValueError(undecodable(_all(coded), error)) from None
-
-
-def _all(coded: bytes | IO[bytes]) -> bytes:
-    if isinstance(coded, bytes):
-        return coded
-    coded.seek(0)
-    return coded.read(LIMITS.file_bytes)
+        raise ValueError(undecodable(coded, error)) from None
 
 
 def undecodable(data: bytes, error: Exception | None = None) -> str:
@@ -312,22 +314,10 @@ def decoded_picture(coded: bytes, *, source: str | Path, field: str, name: str) 
 def read_coded(path: Path) -> tuple[bytes, Header]:
     """A picture file's undecoded bytes, checked by its header. Raises InputError."""
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
-    try:
-        header = header_of(data, name=path.name)
-    except ValueError as error:
-        raise InputError(path, "", str(error)) from None
-    check_size(header.width_px, header.height_px, source=path, head=data)
-    return data, header
+    return data, _header_of(path, data)
 
 
 def header_of_file(path: Path) -> Header:
     """Return a picture file's header. Raises InputError, also for more pixels than the limit."""
     with untrusted_input.open_regular(path, most_bytes=LIMITS.file_bytes) as file:
-        try:
-            header = header_of(file, name=path.name)
-        except ValueError as error:
-            raise InputError(path, "", str(error)) from None
-        file.seek(0)
-        head = file.read(HEAD_BYTES)
-    check_size(header.width_px, header.height_px, source=path, head=head)
-    return header
+        return _header_of(path, file)

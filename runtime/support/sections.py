@@ -1,14 +1,25 @@
-"""Base class of everything read from a table, and validation with errors that name the field."""
+"""Tables of TOML and JSON files: read, and validated with errors that name the field."""
 
 from __future__ import annotations
 
+import re
+import tomllib
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
 from runtime.errors import InputError, one_line
+from runtime.support import untrusted_input
 from runtime.support.plausible import check_text, nearest
+
+TABLE_BYTES_MAX = 4 << 20
+KEY_PARTS_MAX = 16  # in a dotted key: tomllib's time and memory are quadratic in their number
+STRINGS_AND_COMMENTS = re.compile(
+    r'''"""(?:[^\\]|\\.)*?"""|\'{3}.*?\'{3}|"(?:[^"\\\n]|\\.)*"|'[^'\n]*'|#[^\n]*''', re.DOTALL
+)
+KEY_SEPARATORS = re.compile(r"[\n=,{}\[\]]")
+M = TypeVar("M", bound=BaseModel)
 
 
 class Section(BaseModel):
@@ -22,7 +33,25 @@ class Section(BaseModel):
         return check_text(value) if isinstance(value, str) else value
 
 
-M = TypeVar("M", bound=BaseModel)
+def read_table(path: Path) -> dict[str, Any]:
+    """Return the table in a TOML or JSON file. Raises InputError, naming the file and the line."""
+    text = untrusted_input.read_text(path, most_bytes=TABLE_BYTES_MAX)
+    table = untrusted_input.parsed_json(text, source=path) if path.suffix.lower() == ".json" else _toml(text, path)
+    if not isinstance(table, dict):
+        raise InputError(path, "", "must hold one table")
+    return table
+
+
+def _toml(text: str, path: Path) -> Any:
+    keys = KEY_SEPARATORS.split(STRINGS_AND_COMMENTS.sub("_", text))
+    if max(key.count(".") for key in keys) >= KEY_PARTS_MAX:
+        raise InputError(path, "", f"malformed: a key of more than {KEY_PARTS_MAX} parts")
+    try:
+        return tomllib.loads(text)
+    except ValueError as error:
+        raise InputError(path, "", f"malformed: {error}") from None
+    except RecursionError:
+        raise InputError(path, "", "malformed: nested too deep") from None
 
 
 def validated(model: type[M], table: dict[str, Any], *, source: str | Path, folder: Path | None = None) -> M:

@@ -30,12 +30,8 @@ def parallel_map(work: Callable[[Item], Result], items: Sequence[Item]) -> list[
 
 def on_rows(work: Callable[[int, int], None], rows: int, *, threads: int | None = None) -> None:
     """Split `rows` among `threads` (default: OpenCV's) and call `work(begin, end)` in parallel."""
-    parallel_map(lambda span: work(*span), row_ranges(rows, threads or max(1, cv2.getNumThreads())))
-
-
-def row_ranges(count: int, threads: int) -> list[tuple[int, int]]:
-    """Split `count` rows into `threads` half-open ranges [begin, end)."""
-    return list(pairwise([count * k // threads for k in range(threads + 1)]))
+    parts = threads or max(1, cv2.getNumThreads())
+    parallel_map(lambda span: work(*span), list(pairwise(rows * part // parts for part in range(parts + 1))))
 
 
 @cache

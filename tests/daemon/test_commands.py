@@ -54,18 +54,14 @@ def ask_status(socket: Path, *arguments: str) -> Any:
     return CliRunner().invoke(app, [*arguments, "--config", str(configuration(socket))])
 
 
-def test_people_see_state_reason_rate_eyes_and_faults(server: StatusServer) -> None:
+def test_people_see_state_reason_rate_eyes_and_faults_and_machines_one_object(server: StatusServer) -> None:
     result = ask_status(server.path)
     assert result.exit_code == 0
     told = " ".join(result.stdout.split())
     for words in ("degraded: sensor", "unplugged", "fps 31.25", "dropped 2", "(0.9 -0.03 0)", "held",
                   "inference 12", "faults sensor 4", "warp of the centre panel", "reading a.glb"):  # fmt: skip
         assert words in told
-
-
-def test_machines_get_one_object(server: StatusServer) -> None:
-    result = ask_status(server.path, "--json")
-    assert json.loads(result.stdout)["state"] == "degraded: sensor"
+    assert json.loads(ask_status(server.path, "--json").stdout)["state"] == "degraded: sensor"
 
 
 def test_a_loop_that_stands_still_is_a_failure(server: StatusServer, clock: SimulatedClock) -> None:

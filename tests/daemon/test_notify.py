@@ -55,12 +55,11 @@ def notifier_of() -> Iterator[Callable[..., Notifier]]:
         notifier.close()
 
 
+Makes = Callable[..., Notifier]
 WATCHED = {"WATCHDOG_USEC": "1000000", "WATCHDOG_PID": str(os.getpid())}
 
 
-def test_ready_is_said_once_and_by_no_reload_before_it(
-    supervisor: Supervisor, notifier_of: Callable[..., Notifier]
-) -> None:
+def test_ready_is_said_once_and_by_no_reload_before_it(supervisor: Supervisor, notifier_of: Makes) -> None:
     notifier = notifier_of()
     assert notifier.supervised
     notifier.reloading()
@@ -71,18 +70,14 @@ def test_ready_is_said_once_and_by_no_reload_before_it(
     assert supervisor.heard() == ["READY=1"]
 
 
-def test_the_start_can_be_extended_until_it_is_over(
-    supervisor: Supervisor, notifier_of: Callable[..., Notifier]
-) -> None:
+def test_the_start_can_be_extended_until_it_is_over(supervisor: Supervisor, notifier_of: Makes) -> None:
     notifier = notifier_of(environment=WATCHED)
     notifier.starting()
     notifier.ready()
     assert supervisor.heard() == ["EXTEND_TIMEOUT_USEC=60000000", "READY=1", "WATCHDOG_USEC=60000000\nWATCHDOG=1"]
 
 
-def test_the_watchdog_is_patient_until_refreshes_come_steadily(
-    supervisor: Supervisor, notifier_of: Callable[..., Notifier]
-) -> None:
+def test_the_watchdog_is_patient_until_refreshes_come_steadily(supervisor: Supervisor, notifier_of: Makes) -> None:
     notifier = notifier_of(environment=WATCHED)
     notifier.ready()
     for count in (1, SETTLED_AFTER - 2, 1):
@@ -96,7 +91,7 @@ def test_the_watchdog_is_patient_until_refreshes_come_steadily(
 
 
 def test_presented_frames_feed_the_watchdog_four_times_a_period_at_most(
-    supervisor: Supervisor, notifier_of: Callable[..., Notifier]
+    supervisor: Supervisor, notifier_of: Makes
 ) -> None:
     clock = SimulatedClock()
     notifier = notifier_of(clock, WATCHED)
@@ -107,7 +102,7 @@ def test_presented_frames_feed_the_watchdog_four_times_a_period_at_most(
 
 
 def test_refreshes_that_present_nothing_starve_the_watchdog_unless_a_panel_is_missing(
-    supervisor: Supervisor, notifier_of: Callable[..., Notifier]
+    supervisor: Supervisor, notifier_of: Makes
 ) -> None:
     clock = SimulatedClock()
     notifier = notifier_of(clock, WATCHED)
@@ -121,15 +116,13 @@ def test_refreshes_that_present_nothing_starve_the_watchdog_unless_a_panel_is_mi
 
 @pytest.mark.parametrize("environment", [{}, {"WATCHDOG_USEC": "0"}, {"WATCHDOG_USEC": "9", "WATCHDOG_PID": "1"}])
 def test_a_watchdog_that_is_not_ours_is_not_fed(
-    supervisor: Supervisor, notifier_of: Callable[..., Notifier], environment: dict[str, str]
+    supervisor: Supervisor, notifier_of: Makes, environment: dict[str, str]
 ) -> None:
     notifier_of(environment=environment).refreshed(State.TRACKING, (), presented=True)
     assert supervisor.heard() == []
 
 
-def test_a_supervisor_that_does_not_listen_blocks_nobody(
-    supervisor: Supervisor, notifier_of: Callable[..., Notifier]
-) -> None:
+def test_a_supervisor_that_does_not_listen_blocks_nobody(supervisor: Supervisor, notifier_of: Makes) -> None:
     clock = SimulatedClock()
     notifier = notifier_of(clock, WATCHED)
     for _ in range(5000):  # far more than a datagram socket holds

@@ -19,10 +19,10 @@ import pytest
 
 from runtime.clock import NS_PER_S, SimulatedClock
 from runtime.config import ServiceSettings
-from runtime.daemon import listener
 from runtime.daemon import server as server_module
 from runtime.daemon.client import NotRunning, ask
-from runtime.daemon.server import SocketInUse, StatusServer, open_status_server
+from runtime.daemon.server import StatusServer, open_status_server
+from runtime.daemon.socket_file import SocketInUse
 from runtime.errors import InputError
 from tests.waiting import eventually
 
@@ -43,7 +43,7 @@ def clock() -> SimulatedClock:
 
 @pytest.fixture
 def server(path: Path, clock: SimulatedClock, monkeypatch: pytest.MonkeyPatch) -> Iterator[StatusServer]:
-    monkeypatch.setattr("runtime.daemon.server.GROUP", OWN_GROUP)
+    monkeypatch.setattr("runtime.daemon.socket_file.GROUP", OWN_GROUP)
     made = StatusServer(path, clock=clock)
     yield made
     made.close()
@@ -91,12 +91,12 @@ def test_nonsense_is_refused_and_never_reaches_the_loop(server: StatusServer, li
 
 def test_a_request_without_end_is_cut_off(server: StatusServer, path: Path) -> None:
     with connected(path) as client:
-        client.sendall(b"x" * (listener.REQUEST_MAX_BYTES + 1))
+        client.sendall(b"x" * (server_module.REQUEST_MAX_BYTES + 1))
         assert b"too long" in client.makefile("rb").readline()
 
 
 def test_where_all_places_are_taken_the_one_that_has_waited_longest_goes(server: StatusServer, path: Path) -> None:
-    crowd = [connected(path) for _ in range(listener.CLIENTS_MAX)]
+    crowd = [connected(path) for _ in range(server_module.CLIENTS_MAX)]
     for client in crowd:
         client.sendall(b'{"command": "status"}\n')
         assert b"true" in client.makefile("rb").readline()
@@ -199,7 +199,7 @@ def test_when_the_daemon_stops_waiting_clients_are_told_and_nothing_follows(serv
 
 @pytest.fixture
 def hasty(path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[StatusServer]:
-    monkeypatch.setattr(listener, "REQUEST_S", 0.3)
+    monkeypatch.setattr(server_module, "REQUEST_S", 0.3)
     made = StatusServer(path, clock=SimulatedClock())
     yield made
     made.close()
@@ -255,7 +255,8 @@ TAKES_IT = """
 import sys
 from pathlib import Path
 from runtime.clock import MonotonicClock
-from runtime.daemon.server import SocketInUse, StatusServer
+from runtime.daemon.server import StatusServer
+from runtime.daemon.socket_file import SocketInUse
 print("there", flush=True)
 for line in sys.stdin:
     try:

@@ -40,8 +40,7 @@ def grace() -> Portrait:
 
 
 def camera(width_px: int = 1920, height_px: int = 1080, fov_deg: float = 70.0) -> Intrinsics:
-    focal = width_px / 2 / np.tan(np.radians(fov_deg) / 2)
-    return Intrinsics(width_px, height_px, focal, focal, width_px / 2, height_px / 2)
+    return Intrinsics.centred(width_px, height_px, fov_rad=np.radians(fov_deg))
 
 
 def scene(

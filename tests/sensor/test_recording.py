@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -119,13 +120,13 @@ def test_images_do_not_pile_up_in_memory(tmp_path: Path) -> None:
 def test_a_truncated_file_opens_up_to_its_last_whole_sample(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     whole, path, counts = DEMO_BYTES, tmp_path / "cut.mcap", []
     ends = np.array([whole.index(message) + len(message) for message in DEMO])
-    for size in range(3000, len(whole), 4801):
+    for size in (40, 1000, *range(3000, len(whole), 4801)):
         path.write_bytes(whole[:size])
         caplog.clear()
         try:
             recording = Recording(path)
         except InputError as error:
-            assert "cut.mcap" in str(error) and size < ends[0]
+            assert re.search(r"cut\.mcap: .*ends (before|within) ", str(error)) and size < ends[0]
             continue
         found = list(recording.samples())
         assert [f.sequence for f in found] == list(range(1, 1 + len(found)))
@@ -174,28 +175,20 @@ def test_a_chunk_whose_kind_is_damaged_ends_the_recording_with_a_line(
         assert not recording.is_whole and f"the chunk at byte {start} is not marked as one" in caplog.text
 
 
-def test_a_recording_of_another_program_or_version_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "other.mcap"
-    for name, metadata in (("else", {}), ("phasestack.recording", {"schema_version": "99"})):
+def test_another_program_s_or_version_s_recording_is_called_so(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    foreign = (
+        r"missing from this MCAP recording \(ros2, libmcap 0\.8\.0, topic /camera/image\): .*`/eyes` \(docs/sensors"
+    )
+    for name, told in (("else", foreign), ("phasestack.recording", "schema version 99; this program reads 1")):
         with path.open("wb") as file:
             writer = Writer(file)
-            writer.start()
-            writer.add_metadata(name, metadata)
+            writer.start(profile="ros2", library="libmcap 0.8.0")
+            writer.add_metadata(name, {"schema_version": "99"})
+            writer.add_message(writer.register_channel("/camera/image", "cdr", 0), 1, b"x", 1)
             writer.finish()
-        with pytest.raises(InputError, match="other"):
+        with pytest.raises(InputError, match=told):
             Recording(path)
-
-
-def test_another_program_s_recording_is_called_so_with_what_one_must_hold(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="ros2", library="libmcap 0.8.0")
-        writer.add_message(writer.register_channel("/camera/image", "cdr", 0), 1, b"x", 1)
-        writer.finish()
-    told = r"missing from this MCAP recording \(ros2, libmcap 0\.8\.0, topic /camera/image\): .*`/eyes` \(docs/sensors"
-    with pytest.raises(InputError, match=told):
-        Recording(path)
     for data, told in (
         (b"", "is empty"),
         (b"#ROSBAG V2.0\n", "a ROS 1 bag; convert it with `mcap convert`"),
@@ -223,14 +216,6 @@ def test_a_recording_with_its_metadata_at_the_end_is_played(tmp_path: Path) -> N
             writer.add_metadata(metadata.name, metadata.metadata)
         writer.finish()
     assert [eyes_message(frame) for frame in Recording(path).samples()] == DEMO
-
-
-def test_a_recording_cut_before_its_first_sample_is_called_cut_off(tmp_path: Path) -> None:
-    data = demo_recording_path().read_bytes()
-    for size in (40, 1000):
-        (tmp_path / "a.mcap").write_bytes(data[:size])
-        with pytest.raises(InputError, match="ends before"):
-            Recording(tmp_path / "a.mcap")
 
 
 @pytest.mark.parametrize("limit", [30_000, 200_000])

@@ -1,0 +1,94 @@
+"""The status socket's file, of mode 0660: one daemon owns it, and a crashed daemon's is replaced."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import grp
+import logging
+import os
+import socket
+import stat
+import struct
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from runtime.errors import InputError, TransientError
+
+log = logging.getLogger("phasestack.service")
+
+GROUP = "phasestack"  # members may use the socket
+BACKLOG = 64  # connections waiting to be accepted
+LOCKED_WITHIN_S = 2.0  # to wait for the folder's lock, which is only held briefly
+
+
+class SocketInUse(TransientError):
+    """Another phasestack owns the socket; the text names it."""
+
+
+def listening_socket(path: Path) -> socket.socket:
+    """Return a new listening socket. Raises SocketInUse, InputError if it cannot be created."""
+    made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with _locked(path.parent):
+            _remove_dead(path)
+            # By the mask, not by chmod: the mode must be right from the first moment.
+            mask = os.umask(0o117)
+            try:
+                made.bind(str(path))
+            finally:
+                os.umask(mask)
+            made.listen(BACKLOG)
+    except OSError as error:
+        made.close()
+        raise InputError("service", "socket", f"{path} cannot be created ({error.strerror or error})") from error
+    except BaseException:
+        made.close()
+        raise
+    try:
+        group = grp.getgrnam(GROUP).gr_gid
+        if path.lstat().st_gid != group:  # a service's sandbox may refuse even a chown without effect
+            os.chown(path, -1, group)
+    except (KeyError, PermissionError):
+        log.info("only this user can use the status socket: no group %s, or not a member", GROUP)
+    return made
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Lock a folder, so that one daemon at a time replaces a dead socket."""
+    opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        until_s = time.monotonic() + LOCKED_WITHIN_S
+        while time.monotonic() < until_s:  # another program may never release it
+            with contextlib.suppress(BlockingIOError):
+                fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            time.sleep(0.01)
+        yield
+    finally:
+        os.close(opened)
+
+
+def _remove_dead(path: Path) -> None:
+    """Remove a dead daemon's socket. Raises InputError if it is something else, SocketInUse if a daemon listens."""
+    if not os.path.lexists(path):
+        return
+    if not stat.S_ISSOCK(path.lstat().st_mode):
+        raise InputError("service", "socket", f"{path} exists and is not a socket")
+    owner = ""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect(str(path))
+        except ConnectionRefusedError:
+            path.unlink()
+            return
+        except BlockingIOError:
+            pass  # its backlog is full
+        else:
+            pid, _, _ = struct.unpack("3i", probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+            owner = f" (pid {pid})"
+    raise SocketInUse(f"service: socket: {path} is in use by another phasestack{owner}")
