@@ -29,7 +29,7 @@ class TrainingPair:
 
 
 def random_stack(random: Random, *, width_px: int, height_px: int) -> PanelStack:
-    """Draw random, evenly spaced panels: the prototype's on a coarser raster, part of it, or another size."""
+    """Draw random, evenly spaced panels: the prototype, coarser; part of it; or another size."""
     width_m = PITCH_WIDTH_M * math.exp(random.uniform(math.log(0.25), math.log(1.6)))
     gap_m = math.exp(random.uniform(math.log(0.005), math.log(0.5)))
     if random.random() < 0.6:  # a practical range

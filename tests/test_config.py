@@ -27,7 +27,7 @@ PANEL = '[[output.panels]]\nconnector = "DP-{}"\n'
     [
         ("[stack]\nwidth_m = 518.4", "stack.width_m", "did you mean millimetres (0.5184)?"),
         ("[stack]\nx_m = [-60, 0, 60]", "stack.x_m.0", "did you mean millimetres (-0.06)?"),
-        ("[stack]\nx_m = [0.0, 1e-9, 0.06]", "stack.x_m", "are one panel"),
+        ("[stack]\nx_m = [0.0, 1e-9, 0.06]", "stack.x_m", "apart; the minimum is"),
         ("[stack]\nwidth_m = 1e-30", "stack.width_m", "below 0.005 m"),
         ("[stack]\nwidth_m = 1e308", "stack.width_m", "beyond 20 m"),
         ("[stack]\nheight_m = 0.5", "stack.height_m", "did you mean height_m = 0.2916? (or set stack.pixel_aspect)"),
@@ -42,7 +42,7 @@ PANEL = '[[output.panels]]\nconnector = "DP-{}"\n'
         ("[model]\neffort = 'half'", "model.effort", "'auto' or 'full'"),
         ("[[output.panels]]\ngamma = 1e308", "output.panels.0.gamma", "beyond 10"),
         ("[[output.panels]]\nhomography = [[1, 0, 0], [0, 1, 0]]", "output.panels.0.homography.2", "required"),
-        (PANEL.format(1) + PANEL.format(2), "output.panels", "has 2 of 3 tables"),
+        (PANEL.format(1) + PANEL.format(2), "output.panels", "has 2 tables, needs 3"),
         ("[modle]\nname = 'fast'", "modle", "did you mean model?"),
         ("[[output.panels]]\nedid_seril = 'A'", "output.panels.0.edid_seril", "did you mean edid_serial?"),
         ("[loop]\nzebra = 1", "loop.zebra", "is no setting"),

@@ -93,7 +93,7 @@ def test_pictures_are_codes_or_intensities_with_or_without_transparency() -> Non
         ({"fov_deg": "40"}, "fov_deg: is '40', not a number"),
         ({"model": 3}, "model: is 3"),
         ({"cameras": np.zeros((2, 4, 4))}, "cameras: must be two 3x4 matrices"),
-        ({"cameras": np.zeros((2, 3, 4))}, "cameras: are not cameras"),
+        ({"cameras": np.zeros((2, 3, 4))}, "cameras: must be cameras"),
         ({"cameras": [phasestack.camera(eye, width_px=320, height_px=180) for eye in EYES[::-1]]}, "cameras: stand at"),
         ({"fov_deg": 190.0}, "fov_deg"),
         ({"eye_sigma_mm": float("nan")}, "eye_sigma_mm"),

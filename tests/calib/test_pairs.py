@@ -83,6 +83,6 @@ def test_it_resumes_and_replaces_a_viewpoint_that_is_taken_again(tmp_path: Path)
 def test_a_file_of_another_sensor_is_not_gone_on_with(tmp_path: Path) -> None:
     path = tmp_path / "pairs.csv"
     PairsFile(path).accept(captured("v0"))
-    with pytest.raises(InputError, match="sensor A1; this one is of B2"):
+    with pytest.raises(InputError, match="sensor A1, but this pair is from B2"):
         PairsFile(path).accept(captured("v1", serial="B2"))
     assert len(read_pairs(path)) == 1

@@ -127,7 +127,7 @@ def test_photographs_that_cannot_be_used_are_named_and_nothing_is_written(
     with pytest.raises(InputError) as refused:
         panels("--photos", str(photos), "--out", str(tmp_path / "r"), "--config", str(config), "--write")
     text = str(refused.value)
-    assert "4 of 7 photographs can be used" in text
+    assert "4 of 7 photographs are usable" in text
     for number in (1, 3, 5):
         assert f"{number}.bmp" in text
     assert why in text

@@ -70,5 +70,5 @@ def test_the_image_s_command_page_and_doctor_run_as_its_user(buildah: Buildah) -
     fetch = "from urllib.request import urlopen as get; print(get('http://127.0.0.1:8791/').read().decode())"
     page = inside("sh", "-c", "phasestack page --port 8791 & for _ in $(seq 90); do sleep 1; "
                   f'python -c "{fetch}" 2>/dev/null && break; done; kill $!', check=False)  # fmt: skip
-    assert "the page is at http://127.0.0.1:8791/" in page and "<title>phasestack</title>" in page, page
+    assert "page: http://127.0.0.1:8791/" in page and "<title>phasestack</title>" in page, page
     buildah("rm", container)

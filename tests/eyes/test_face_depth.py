@@ -113,7 +113,7 @@ def test_depth_that_fits_no_person_gives_no_eyes_and_a_reason(depth_mm: int) -> 
     colour, depth, _ = scene(PLACE, intrinsics=CAMERA)
     finder = EyeFinder()
     assert finder.find(frame(colour, np.full_like(depth, depth_mm), CAMERA)) is None
-    assert finder.reason == "the depth on the face does not fit a person's size"
+    assert finder.reason == "the depth measured on the face does not match a person's size"
 
 
 def test_without_depth_the_distance_is_as_good_as_eye_separations_are_alike() -> None:

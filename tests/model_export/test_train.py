@@ -238,7 +238,7 @@ def test_a_network_of_ones_own_is_trained_exported_and_served(tmp_path: Path) ->
     predictor.close()
     assert solved.steps == 0
     assert np.abs(layers - panels.permute(0, 2, 3, 1).numpy()).max() <= 1
-    with pytest.raises(InputError, match="is a checkpoint of my_network:MyNetwork, not of"):
+    with pytest.raises(InputError, match="is a checkpoint of my_network:MyNetwork, not "):
         export_model("tests.model_export.unservable:Even", path, checkpoint=checkpoint)
 
 

@@ -134,7 +134,7 @@ def test_who_listens_ends_it_and_it_is_gone(tmp_path: Path, work: Any) -> None:
 def test_no_process_at_the_moment_passes(monkeypatch: pytest.MonkeyPatch) -> None:
     opened = set(Path("/proc/self/fd").iterdir())
     monkeypatch.setattr(child.sys, "executable", "/nowhere/python")
-    with pytest.raises(TransientError, match=r"a\.glb: no process can be started for it"):
+    with pytest.raises(TransientError, match=r"a\.glb: no process can be started to read it"):
         run(arrays, 1)
     assert set(Path("/proc/self/fd").iterdir()) == opened
 
