@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
 from runtime.browser.still import viewer_html
-from runtime.optics.carried import expected_psnrs_db, intensities, light_psnrs_db, sampled_light_db
-from runtime.optics.light import ONE_RAY
-from runtime.optics.quality import Quality, quality
+from runtime.optics.carried import expected_errors, intensities, standard_error_db
+from runtime.optics.light import Sampling
+from runtime.optics.quality import Quality, psnr_db, quality
 from runtime.optics.retina import Retina, as_codes, seen_by
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8
@@ -69,45 +67,32 @@ def displayed(
     return EyeViews(seen, tuple(wanted), measured, stack, eyes_m, fov_deg)
 
 
-def expected_db(
-    eye_views: EyeViews, layers: U8, *, light: bool = False, sigmas_mm: Sequence[float] = SIGMAS_MM, every: int = 1
-) -> dict[str, float]:
-    """Expected PSNR (docs/contracts.md, Error) by tracking error in millimetres: "0", "1", "2".
+class Expected(NamedTuple):
+    """Expected PSNR (docs/contracts.md, Error) by tracking error in millimetres: "0", "1", "2"."""
 
-    light: use pupils and square pixels; otherwise one ray for every `every`-th pixel of every `every`-th row. NaN
-    if such an error would move an eye to where it sees no part of the panels.
-    """
-    psnrs_db = light_psnrs_db if light else partial(expected_psnrs_db, sampling=ONE_RAY._replace(step=every))
-    values = dict.fromkeys(sigmas_mm, math.nan)
+    db: dict[str, float]  # NaN if such an error would move an eye to where it sees no part of the panels
+    standard_error_db: dict[str, float]  # of groups of rows; empty without groups
+
+
+def expected_quality(
+    eye_views: EyeViews, layers: U8, *, sampling: Sampling | None = None, sigmas_mm: Sequence[float] = SIGMAS_MM
+) -> Expected:
+    """Measure at tracking errors; sampling: None: light, as `expected_errors` samples it."""
+    groups = sampling.groups if sampling else 0
+    errors = dict.fromkeys(sigmas_mm, np.full(1 + groups, np.nan))
     with contextlib.suppress(ValueError):
-        values |= psnrs_db(
+        errors |= expected_errors(
             layers,
             eye_views.wanted,
             eye_views.stack,
+            sampling=sampling,
             eyes_m=eye_views.eyes_m,
             fov_deg=eye_views.fov_deg,
             sigmas_mm=sigmas_mm,
         )
-    return {f"{sigma_mm:g}": value for sigma_mm, value in values.items()}
-
-
-def sampled_db(
-    eye_views: EyeViews, layers: U8, *, sigmas_mm: Sequence[float], every: int
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Light PSNR from every `every`-th pixel of every `every`-th row, and its standard error in dB."""
-    values = dict.fromkeys(sigmas_mm, (math.nan, math.nan))
-    with contextlib.suppress(ValueError):
-        values |= sampled_light_db(
-            layers,
-            eye_views.wanted,
-            eye_views.stack,
-            every=every,
-            eyes_m=eye_views.eyes_m,
-            fov_deg=eye_views.fov_deg,
-            sigmas_mm=sigmas_mm,
-        )
-    light, errors = ({f"{sigma_mm:g}": value[k] for sigma_mm, value in values.items()} for k in (0, 1))
-    return light, errors
+    named = {f"{sigma_mm:g}": error for sigma_mm, error in errors.items()}
+    standard_errors = {name: standard_error_db(error) for name, error in named.items()} if groups else {}
+    return Expected({name: psnr_db(error[0]) for name, error in named.items()}, standard_errors)
 
 
 def on_panels_raster(picture: Picture, stack: PanelStack) -> Picture:

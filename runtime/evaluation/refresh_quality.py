@@ -9,8 +9,8 @@ import numpy as np
 
 from runtime.evaluation.contact_sheet import Moment
 from runtime.evaluation.displayed import displayed
-from runtime.optics.carried import PLENTY, carried_db, intensities, light_psnrs_db
-from runtime.optics.light import Sampling, squared_error
+from runtime.optics.carried import PLENTY, carried_db, expected_psnrs_db, intensities
+from runtime.optics.light import Sampling, squared_errors
 from runtime.optics.pupil import TRACKING_SIGMA_MM
 from runtime.optics.quality import psnr_db
 from runtime.optics.stack import PanelStack
@@ -56,9 +56,10 @@ def live_error(layers: U8, targets: Pictures, stack: PanelStack, *, eyes_m: F64,
     """
     pictures = [intensities(picture) for picture in targets]
     sampling = LIVE_LARGE if pictures[0].size > PLENTY else LIVE
-    return squared_error(
+    errors = squared_errors(
         layers, pictures, stack, solved_for_m=eyes_m, eyes_m=eyes_m, fov_deg=fov_deg, sampling=sampling
     )
+    return float(errors[0])
 
 
 def measure_refresh(
@@ -103,7 +104,7 @@ def _at_aligned_eyes(
         return carried_db(layers, pictures, stack, solved_for_m=drawn_for_m, eyes_m=seen_from_m, fov_deg=fov_deg)
 
     views = displayed(layers, targets.used, stack, eyes_m=eyes_m, fov_deg=fov_deg)
-    light = light_psnrs_db(
+    light = expected_psnrs_db(
         aligned,
         targets.solved,
         stack,

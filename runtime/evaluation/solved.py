@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from runtime.evaluation.contact_sheet import contact_sheet, headline
-from runtime.evaluation.displayed import SIGMAS_MM, EyeViews, Picture, displayed, expected_db, sampled_db
+from runtime.evaluation.displayed import SIGMAS_MM, EyeViews, Picture, displayed, expected_quality
+from runtime.optics.light import LIGHT, ONE_RAY
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 from runtime.support.artifacts import write_png, write_text
 
 BySigma = Mapping[str, float]
+GROUPS = 10  # of rows, for a sampled light's standard error
 WHOLE_PX = 1920 * 1200  # largest picture whose light is measured at every pixel
 
 
@@ -77,12 +79,12 @@ class SolvedPair:
         return self._measured(views, sigmas_mm=sigmas_mm, every=every)
 
     def _measured(self, views: EyeViews, *, sigmas_mm: Sequence[float], every: int) -> PairQuality:
-        if every == 1:
-            light, errors = expected_db(views, self.layers, light=True, sigmas_mm=sigmas_mm), dict[str, float]()
-        else:
-            light, errors = sampled_db(views, self.layers, sigmas_mm=sigmas_mm, every=every)
-        expected, at_eyes = expected_db(views, self.layers, sigmas_mm=sigmas_mm, every=every), views.quality
-        return PairQuality(light, expected, at_eyes.psnr_db, at_eyes.ssim, tuple(at_eyes.eye_psnr_db), errors)
+        sampling = None if every == 1 else LIGHT._replace(step=every, groups=GROUPS)
+        light = expected_quality(views, self.layers, sampling=sampling, sigmas_mm=sigmas_mm)
+        rays = expected_quality(views, self.layers, sampling=ONE_RAY._replace(step=every), sigmas_mm=sigmas_mm)
+        known = views.quality
+        eyes_db = tuple(known.eye_psnr_db)
+        return PairQuality(light.db, rays.db, known.psnr_db, known.ssim, eyes_db, light.standard_error_db)
 
     @property
     def seen(self) -> tuple[U8, ...]:

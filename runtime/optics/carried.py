@@ -9,13 +9,13 @@ not counted here; live quality counts it (`evaluation.refresh_quality`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, NotRequired, TypedDict, Unpack
+from collections.abc import Sequence
+from typing import NotRequired, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from runtime.optics.light import LIGHT, ONE_RAY, Sampling, group_errors, squared_error
+from runtime.optics.light import LIGHT, ONE_RAY, Sampling, squared_errors
 from runtime.optics.quality import psnr_db
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import stack_from_eye
@@ -41,10 +41,10 @@ def carried_db(
     """
     targets = [intensities(picture) for picture in drawn]
     solved_for, eyes = np.asarray(solved_for_m, np.float64), np.asarray(eyes_m, np.float64)
-    error = squared_error(
+    errors = squared_errors(
         layers, targets, stack, solved_for_m=solved_for, eyes_m=eyes, fov_deg=fov_deg, sampling=ONE_RAY
     )
-    return psnr_db(error)
+    return psnr_db(errors[0])
 
 
 class AtEyes(TypedDict):
@@ -56,88 +56,65 @@ class AtEyes(TypedDict):
     seen_from_m: NotRequired[ArrayLike | None]  # (2, 3) true positions of the eyes; by default the same
 
 
-def expected_psnrs_db(
+def expected_errors(
     layers: U8,
     drawn: Sequence[U8 | F32],
     stack: PanelStack,
     *,
-    sampling: Sampling = ONE_RAY,
+    sampling: Sampling | None = None,
     **at: Unpack[AtEyes],
-) -> dict[float, float]:
-    """Return the PSNR of the carried squared error, expected over normal tracking errors.
+) -> dict[float, F64]:
+    """Carried squared error, expected over normal tracking errors (docs/contracts.md), of all rows and of groups.
 
     For each standard deviation to the right and up, by five points: no error with weight 1/2, two standard deviations
     to either side with 1/8 each, which is exact for second moments. drawn: an (h, w, 3) picture for each of the eyes
-    (2, 3) that the layers were solved for. Moved eyes get a quarter of the rays, which is exact to 0.02 dB: in a
-    picture of `PLENTY` every second pixel of every second row, otherwise, for light, two rays instead of four. Other
-    arguments and errors as for `carried_db`.
+    (2, 3) that the layers were solved for. sampling: None: light, the figure to quote, with four times as many rays a
+    pixel in a picture of fewer values than `PLENTY`. Moved eyes get a quarter of the rays, which is exact to 0.02 dB:
+    in a picture of `PLENTY` every second pixel of every second row, otherwise, for light, two rays instead of four.
+    Other arguments and errors as for `carried_db`.
     """
-    errors = _expected(squared_error, layers, drawn, stack, sampling=sampling, **at)
-    return {sigma_mm: psnr_db(float(error)) for sigma_mm, error in errors.items()}
-
-
-def _expected(
-    measured: Callable[..., Any],
-    layers: U8,
-    drawn: Sequence[U8 | F32],
-    stack: PanelStack,
-    *,
-    sampling: Sampling,
-    **at: Unpack[AtEyes],
-) -> dict[float, Any]:
-    """Expected squared error by tracking error; measured: `squared_error` or `group_errors`."""
+    chosen = sampling or (LIGHT if drawn[0].size > PLENTY else LIGHT._replace(rays=2 * LIGHT.rays))
     seen_from_m = at.get("seen_from_m")
     eyes = np.asarray(at["eyes_m"], dtype=np.float64)
     true = eyes if seen_from_m is None else np.asarray(seen_from_m, dtype=np.float64)
     targets = [intensities(picture) for picture in drawn]
     right, up = stack_from_eye(eyes.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
 
-    def error(move_m: F64) -> Any:
-        moved_m = true + move_m
-        return measured(
-            layers, targets, stack, solved_for_m=eyes, eyes_m=moved_m, fov_deg=at["fov_deg"], sampling=sampling
+    def error(move_m: F64) -> F64:
+        return squared_errors(
+            layers, targets, stack, solved_for_m=eyes, eyes_m=true + move_m, fov_deg=at["fov_deg"], sampling=chosen
         )
 
     unmoved = error(np.zeros(3))
-    if targets[0].size > PLENTY * sampling.step**2:
-        sampling = sampling._replace(step=2 * sampling.step)
-    elif sampling.rays > LIGHT.rays:
-        sampling = LIGHT._replace(pupil_mm=sampling.pupil_mm, step=sampling.step)
+    if targets[0].size > PLENTY * chosen.step**2:
+        chosen = chosen._replace(step=2 * chosen.step)
+    elif chosen.rays > LIGHT.rays:
+        chosen = chosen._replace(rays=LIGHT.rays)
     result = {}
     for sigma_mm in at["sigmas_mm"]:
         moves = [side * 2e-3 * sigma_mm * axis for axis in (right, up) for side in (-1, 1)]
-        moved = sum(error(move) for move in moves) / 8 if sigma_mm > 0 else unmoved / 2
+        moved = np.sum([error(move) for move in moves], axis=0) / 8 if sigma_mm > 0 else unmoved / 2
         result[sigma_mm] = unmoved / 2 + moved
     return result
 
 
-def light_psnrs_db(
-    layers: U8, drawn: Sequence[U8 | F32], stack: PanelStack, *, sampling: Sampling | None = None, **at: Unpack[AtEyes]
+def expected_psnrs_db(
+    layers: U8,
+    drawn: Sequence[U8 | F32],
+    stack: PanelStack,
+    *,
+    sampling: Sampling | None = None,
+    **at: Unpack[AtEyes],
 ) -> dict[float, float]:
-    """Return light PSNR by tracking error, expected as in `expected_psnrs_db`: the figure to quote.
-
-    Without a sampling, a picture of fewer values than `PLENTY` gets four times as many rays a pixel.
-    """
-    if sampling is None:
-        sampling = LIGHT if drawn[0].size > PLENTY else LIGHT._replace(rays=2 * LIGHT.rays)
-    return expected_psnrs_db(layers, drawn, stack, sampling=sampling, **at)
+    """PSNR of `expected_errors`, by tracking error."""
+    errors = expected_errors(layers, drawn, stack, sampling=sampling, **at)
+    return {sigma_mm: psnr_db(error[0]) for sigma_mm, error in errors.items()}
 
 
-def sampled_light_db(
-    layers: U8, drawn: Sequence[U8 | F32], stack: PanelStack, *, every: int, **at: Unpack[AtEyes]
-) -> dict[float, tuple[float, float]]:
-    """Return light PSNR and its standard error, dB, from every `every`-th pixel of every `every`-th row.
-
-    The standard error comes from ten interleaved groups of rows. The other arguments are those of `light_psnrs_db`.
-    """
-    errors = _expected(group_errors, layers, drawn, stack, sampling=LIGHT._replace(step=every), **at)
-    return {sigma_mm: (psnr_db(float(error[0])), _standard_error_db(error)) for sigma_mm, error in errors.items()}
-
-
-def _standard_error_db(error: F64) -> float:
-    """Standard error, dB; error: (1 + groups,) mean squared error of all rows, and of each group."""
-    groups = error[1:]
-    relative = float(np.std(groups, ddof=1)) / len(groups) ** 0.5 / max(float(error[0]), 1e-12)
+def standard_error_db(errors: F64) -> float:
+    """Standard error of a PSNR; errors: (1 + groups,) mean squared error of all rows, and of each group."""
+    groups = errors[1:]
+    relative = float(np.std(groups, ddof=1)) / len(groups) ** 0.5 / max(float(errors[0]), 1e-12)
     return float(10 / math.log(10) * relative)
 
 

@@ -28,7 +28,6 @@ from runtime.optics.views import stack_from_eye
 from runtime.records import F32, F64, U8
 
 RINGS = 9  # of points of the pupil, one for each ray: 271 are as good as a disc
-GROUPS = 10  # of rows, for a sampled error's standard error
 TABLE = 16  # entries a code value in the table of intensity, for bilinear rays
 
 
@@ -38,6 +37,7 @@ class Sampling(NamedTuple):
     rays: int = 2  # across and down a pixel, in each of the two sets; 0: one ray, bilinear
     pupil_mm: float = PUPIL_MM  # diameter; 0: a point
     step: int = 1  # every `step`-th pixel of every `step`-th row
+    groups: int = 0  # of rows, for the standard error
 
 
 LIGHT = Sampling()
@@ -54,7 +54,7 @@ class LightView(NamedTuple):
     first_ray: int  # its number
 
 
-def squared_error(
+def squared_errors(
     layers: U8,
     targets: Sequence[F32],
     stack: PanelStack,
@@ -63,67 +63,17 @@ def squared_error(
     eyes_m: F64,
     fov_deg: float,
     sampling: Sampling,
-) -> float:
-    """Return the mean squared error at eyes (2, 3) against the carried pictures of the eyes solved for.
+) -> F64:
+    """(1 + groups,) mean squared error at eyes (2, 3) against the carried pictures of the eyes solved for.
 
     layers: (N, H, W, 3 or 4) code values, rear to front; targets: (h, w, 3) intensities for each eye solved for, of
-    pictures `fov_deg` wide. A pixel counts if all its rays cross every panel half a pixel inside its edge. For nearly
-    perfect light the result can be below 0, by the rays' noise. Raises ValueError for an eye behind a panel, or where
-    no pixel counts.
+    pictures `fov_deg` wide. The first is of all rows, the others are of interleaved groups of them, whose scatter gives
+    its standard error. A pixel counts if all its rays cross every panel half a pixel inside. For nearly perfect light
+    the result can be below 0, by the rays' noise.
+    Raises ValueError for an eye behind a panel, or where no pixel counts.
     """
-    sums = _sums(
-        layers,
-        targets,
-        stack,
-        solved_for_m=solved_for_m,
-        eyes_m=eyes_m,
-        fov_deg=fov_deg,
-        sampling=sampling,
-        parts=4 * len(os.sched_getaffinity(0)),
-    )
-    total, counted = sums.sum(axis=0)
-    return float(total / counted)
-
-
-def group_errors(
-    layers: U8,
-    targets: Sequence[F32],
-    stack: PanelStack,
-    *,
-    solved_for_m: F64,
-    eyes_m: F64,
-    fov_deg: float,
-    sampling: Sampling,
-) -> F64:
-    """Return (GROUPS + 1,) mean squared errors: of all rows, then of interleaved groups of rows.
-
-    The groups' scatter gives the standard error.
-
-    Arguments and errors are those of `squared_error`.
-    """
-    rows = -(-min(len(target) for target in targets) // sampling.step)
-    sums = _sums(
-        layers, targets, stack, solved_for_m=solved_for_m, eyes_m=eyes_m, fov_deg=fov_deg, sampling=sampling, parts=rows
-    )
-    sums = sums.reshape(len(targets), -1, 2).sum(axis=0)
-    groups = np.array([sums[group::GROUPS].sum(axis=0) for group in range(GROUPS)])
-    total, counted = np.concatenate([sums.sum(axis=0)[None], groups]).T
-    return np.asarray(total / np.maximum(counted, 1))
-
-
-def _sums(
-    layers: U8,
-    targets: Sequence[F32],
-    stack: PanelStack,
-    *,
-    solved_for_m: F64,
-    eyes_m: F64,
-    fov_deg: float,
-    sampling: Sampling,
-    parts: int,
-) -> F64:
-    """(eyes x parts, 2) sum of the squared error and number of its terms, by consecutive parts of the rows."""
     cores, step = len(os.sched_getaffinity(0)), sampling.step
+    parts = -(-min(len(target) for target in targets) // step) if sampling.groups else 4 * cores
     codes = np.ascontiguousarray(layers)
     fine = 1 if sampling.rays else TABLE
     table = intensity_from_phase(np.arange(255 * fine * stack.count + 1, dtype=np.float32) / np.float32(255 * fine))
@@ -138,10 +88,14 @@ def _sums(
         return _squared_error(codes, view, table, sampling, first, last)
 
     with ThreadPoolExecutor(cores) as pool:
-        sums = np.array(list(pool.map(error, calls)), np.float64)
+        sums = np.array(list(pool.map(error, calls)), np.float64)  # of squared errors, and of their terms
     if not sums[:, 1].any():
         raise ValueError("no ray from these eyes crosses every panel")
-    return sums
+    if sampling.groups:  # a part is a row
+        sums = sums.reshape(len(targets), -1, 2).sum(axis=0)
+    groups = [sums[group :: sampling.groups].sum(axis=0) for group in range(sampling.groups)]
+    total, counted = np.array([sums.sum(axis=0), *groups]).T
+    return np.asarray(total / np.maximum(counted, 1))
 
 
 def _squared_error(

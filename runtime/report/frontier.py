@@ -20,7 +20,7 @@ from runtime.errors import FatalError, PhasestackError
 from runtime.evaluation.solved import PairQuality, SolvedPair
 from runtime.evaluation.trials import timed
 from runtime.optics.carried import intensities
-from runtime.optics.light import ONE_RAY, squared_error
+from runtime.optics.light import ONE_RAY, squared_errors
 from runtime.optics.quality import psnr_db
 from runtime.records import U8
 from runtime.report.pairs import StillPair
@@ -199,8 +199,8 @@ def pair_result(pair: StillPair, run: MethodRun, *, viewer: Path | None = None) 
         place = view.eye_m[None]
         where: Any = {"solved_for_m": place, "eyes_m": place, "fov_deg": pair.fov_deg, "sampling": sampling}
         with contextlib.suppress(ValueError):  # that eye sees no part of the panels
-            error = squared_error(run.layers, [intensities(view.image)], pair.stack, **where)
-            off.setdefault(f"{view.mm:g}mm", []).append(psnr_db(error))
+            errors = squared_errors(run.layers, [intensities(view.image)], pair.stack, **where)
+            off.setdefault(f"{view.mm:g}mm", []).append(psnr_db(errors[0]))
     beside = {name: float(np.mean(values)) for name, values in off.items()}
     name = ""
     if viewer is not None:

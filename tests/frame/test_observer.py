@@ -20,7 +20,7 @@ from runtime.frame.solver_host import Task
 from runtime.frame.targets import TargetDrawer
 from runtime.model.predictor import Predictor
 from runtime.optics.alignment import align, shown_layers
-from runtime.optics.carried import carried_db, light_psnrs_db
+from runtime.optics.carried import carried_db, expected_psnrs_db
 from runtime.plan.drawing import drawn_job, retina_pictures
 from runtime.records import PanelFrame, RefreshAccount, SensorFrame, Solution, State
 from runtime.support.background import wait_for_all
@@ -297,7 +297,7 @@ def live_db(content: ContentSource, seen: Refresh, true_m: Any, *, time_ns: int 
     """The contract's definition, by the function that `solve` measures light with."""
     pictures = retina_pictures(content, true_m, SMALL, fov_deg=FOV_DEG, time_ns=time_ns)
     layers = shown_layers(seen.frame)
-    light = light_psnrs_db(layers, pictures, SMALL, eyes_m=true_m, fov_deg=FOV_DEG, sigmas_mm=(0.0,))
+    light = expected_psnrs_db(layers, pictures, SMALL, eyes_m=true_m, fov_deg=FOV_DEG, sigmas_mm=(0.0,))
     return light[0.0]
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from runtime.config import ModelSettings
 from runtime.errors import ContextLost, InputError, MissingPart
-from runtime.evaluation.displayed import displayed, expected_db
+from runtime.evaluation.displayed import displayed, expected_quality
 from runtime.model.backends import choose
 from runtime.model.gl.backend import GlBackend
 from runtime.model.gl.state import GlState
@@ -21,7 +21,8 @@ from runtime.model.predictor import SHIPPED, Predictor, load_predictor
 from runtime.model.solver import StepPredictor
 from runtime.model.still import captured_views
 from runtime.model.trim import trim
-from runtime.optics.carried import light_psnrs_db
+from runtime.optics.carried import expected_psnrs_db
+from runtime.optics.light import ONE_RAY
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, Tilt
 from runtime.records import F64, U8
@@ -175,7 +176,7 @@ def test_the_eyes_see_no_less_than_on_the_processor(pose: str, sigma_mm: float, 
     for predictor in both("balanced", STACK, gl):
         layers = layers_of(predictor, pictures, pair, sigma_mm=sigma_mm)
         look = displayed(layers, pictures, STACK, eyes_m=pair, fov_deg=FOV_DEG, similarity=False)
-        expected = expected_db(look, layers)
+        expected = expected_quality(look, layers, sampling=ONE_RAY).db
         shown.append([look.quality.psnr_db, *(value for value in expected.values() if value is not None)])
     assert len(shown[0]) == 4
     assert (np.array(shown[1]) - shown[0] >= LEAST_DB).all()
@@ -188,7 +189,7 @@ def test_at_1920x1080(name: str, gl: GlBackend) -> None:
     pictures = cards(pair, stack)
     found = [layers_of(predictor, pictures, pair) for predictor in both(name, stack, gl)]
     how: Any = {"eyes_m": pair, "fov_deg": FOV_DEG, "sigmas_mm": [1.0]}
-    light_db = [light_psnrs_db(layers, pictures, stack, **how)[1.0] for layers in found]
+    light_db = [expected_psnrs_db(layers, pictures, stack, **how)[1.0] for layers in found]
     assert abs(light_db[1] - light_db[0]) <= 0.05
     assert within_one(*found) >= WITHIN_ONE
 

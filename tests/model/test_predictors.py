@@ -19,7 +19,8 @@ from runtime.model.predictor import load_predictor
 from runtime.model.sart import SartPredictor
 from runtime.model.still import solve_still
 from runtime.optics.carried import expected_psnrs_db
-from runtime.optics.retina import panel_positions
+from runtime.optics.light import ONE_RAY
+from runtime.optics.retina import Rays
 from runtime.optics.stack import PanelStack
 from runtime.report.pairs import eyes_at
 from tests.model.scenes import FOV_DEG, STACK, card_scene, displayed, eyes
@@ -161,7 +162,9 @@ def test_solving_for_sigma_helps_displaced_eyes_and_costs_exact_ones() -> None:
         for sigma_mm in (0.0, 12.0)
     }
     expected = {
-        s: expected_psnrs_db(layers, pictures, STACK, eyes_m=pair, fov_deg=FOV_DEG, sigmas_mm=[12.0])[12.0]
+        s: expected_psnrs_db(layers, pictures, STACK, sampling=ONE_RAY, eyes_m=pair, fov_deg=FOV_DEG, sigmas_mm=[12.0])[
+            12.0
+        ]
         for s, layers in shown.items()
     }
     assert expected[12.0] > expected[0.0] + 0.7
@@ -174,9 +177,8 @@ def test_every_pixel_on_a_ray_through_all_panels_is_solved(pose: str) -> None:
     pair = POSES[pose]
     boxes = visible_boxes(pair, STACK)
     for eye in pair:
-        positions = [
-            panel_positions(eye, STACK, index=n, width_px=480, height_px=270, fov_deg=70) for n in range(STACK.count)
-        ]
+        rays = Rays.of_eye(eye, width_px=480, height_px=270, fov_deg=70)
+        positions = [rays.on(STACK.panel(n)) for n in range(STACK.count)]
         through = np.ones((270, 480), bool)
         for u, v in positions:
             through &= (u > 0.5) & (u < 479.5) & (v > 0.5) & (v < 269.5)

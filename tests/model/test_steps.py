@@ -22,7 +22,7 @@ from runtime.model.predictor import load_predictor, steps_from_even
 from runtime.model.solver import StepPredictor
 from runtime.model.still import captured_views, solve_still
 from runtime.model.targets import FULL, SUBCODE, rest_of, target_table
-from runtime.optics.carried import light_psnrs_db
+from runtime.optics.carried import expected_psnrs_db
 from runtime.optics.stack import PanelStack, Tilt
 from runtime.records import F64, U8
 from tests.model.scenes import FOV_DEG, card_scene, eyes
@@ -187,7 +187,7 @@ def test_every_step_makes_light_better(stack: PanelStack, sigma_mm: float) -> No
     job = Job(Targets(stack, pair, captured_views(pictures, pair, stack, fov_deg=FOV_DEG)), eye_sigma_m=sigma_mm / 1e3)
     for count in (0, 1, 3, solver.steps):
         layers = solver.solve(replace(job, steps=count)).layers
-        light_db = light_psnrs_db(layers, pictures, stack, eyes_m=pair, fov_deg=FOV_DEG, sigmas_mm=[sigma_mm])
+        light_db = expected_psnrs_db(layers, pictures, stack, eyes_m=pair, fov_deg=FOV_DEG, sigmas_mm=[sigma_mm])
         found_db.append(light_db[sigma_mm])
     assert found_db == sorted(found_db)
     assert found_db[-1] > found_db[0] + 2
@@ -200,7 +200,7 @@ def test_panels_that_begin_even_show_both_eyes_a_picture(stack: str) -> None:
     solver = StepPredictor(STACKS[stack], None, steps_from_even(3), name="even")
     how: Any = {"eyes_m": pair, "fov_deg": FOV_DEG}
     layers = solve_still(*pictures, **how, predictor=solver, eye_sigma_mm=0.0).layers
-    assert light_psnrs_db(layers, pictures, STACKS[stack], **how, sigmas_mm=[0.0])[0.0] > 22
+    assert expected_psnrs_db(layers, pictures, STACKS[stack], **how, sigmas_mm=[0.0])[0.0] > 22
 
 
 def test_equal_grey_pictures_and_panels_that_show_them_stay() -> None:
@@ -225,7 +225,7 @@ def test_no_seam_is_seen_along_a_picture_s_edge(code: int, sigma_mm: float) -> N
     predictor = load_predictor("fast", STACK)
     layers = solve_still(*pictures, eyes_m=pair, fov_deg=FOV_DEG, predictor=predictor, eye_sigma_mm=sigma_mm).layers
     predictor.close()
-    light = light_psnrs_db(layers, pictures, STACK, eyes_m=pair, fov_deg=FOV_DEG, sigmas_mm=(0.0,))
+    light = expected_psnrs_db(layers, pictures, STACK, eyes_m=pair, fov_deg=FOV_DEG, sigmas_mm=(0.0,))
     assert light[0.0] > 60  # 40 to 46 where what lies a pixel beyond the edge rests at mid-grey
 
 

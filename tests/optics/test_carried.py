@@ -105,7 +105,7 @@ def test_expected_psnr_is_five_points_of_the_eyes_common_place(stack: PanelStack
             for error in traced_error(eye, eye + move, layers, picture, stack, fov_deg=30)
         ]
         total += weight * sum(errors) / len(errors)
-    how = {"eyes_m": eyes, "fov_deg": 30, "sigmas_mm": (sigma_mm,)}
+    how = {"eyes_m": eyes, "fov_deg": 30, "sigmas_mm": (sigma_mm,), "sampling": ONE_RAY}
     told = expected_psnrs_db(layers, pictures, stack, **how)[sigma_mm]
     assert told == pytest.approx(-10 * math.log10(total), abs=2e-3)
 
@@ -132,7 +132,8 @@ def test_at_the_eyes_solved_for_carried_quality_is_the_exact_one() -> None:
     expected = quality([r.image for r in exact], wanted, [r.mask for r in exact])
     told = carried_db(layers, pictures, STACKS[0], solved_for_m=eyes, eyes_m=eyes, fov_deg=30)
     assert told == pytest.approx(expected.psnr_db, abs=1e-4)
-    sure = expected_psnrs_db(layers, pictures, STACKS[0], eyes_m=eyes, fov_deg=30, sigmas_mm=(0.0,))[0.0]
+    how = {"eyes_m": eyes, "fov_deg": 30, "sigmas_mm": (0.0,), "sampling": ONE_RAY}
+    sure = expected_psnrs_db(layers, pictures, STACKS[0], **how)[0.0]
     assert sure == pytest.approx(expected.psnr_db, abs=1e-4)
 
 

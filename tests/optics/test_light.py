@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from runtime.optics.carried import light_psnrs_db
-from runtime.optics.light import LIGHT, Sampling, squared_error
+from runtime.optics.carried import expected_psnrs_db
+from runtime.optics.light import LIGHT, Sampling, squared_errors
 from runtime.optics.stack import PanelStack, Tilt
 from runtime.records import F32, F64, U8
 
@@ -101,7 +101,7 @@ def test_light_is_what_an_independent_tracer_finds(name: str, sigma_mm: float, p
     stack = STACKS[name]
     layers, pictures = case(stack, 3)
     sampling, how = LIGHT._replace(rays=4, pupil_mm=pupil_mm), {"eyes_m": EYES, "fov_deg": FOV_DEG}
-    told = light_psnrs_db(layers, pictures, stack, **how, sigmas_mm=(sigma_mm,), sampling=sampling)[sigma_mm]
+    told = expected_psnrs_db(layers, pictures, stack, **how, sigmas_mm=(sigma_mm,), sampling=sampling)[sigma_mm]
     assert told == pytest.approx(traced_db(layers, pictures, stack, sigma_mm=sigma_mm, pupil_mm=pupil_mm), abs=0.1)
 
 
@@ -135,4 +135,5 @@ def seen_by_both(layers: U8, *, pupil_mm: float, rays: int) -> list[F64]:
 def error(layers: U8, targets: list[F64], sampling: Sampling) -> float:
     """The runtime's measure, of eyes that are known."""
     single = [target.astype(np.float32) for target in targets]
-    return squared_error(layers, single, THREE, solved_for_m=EYES, eyes_m=EYES, fov_deg=FOV_DEG, sampling=sampling)
+    eyes = {"solved_for_m": EYES, "eyes_m": EYES}
+    return squared_errors(layers, single, THREE, **eyes, fov_deg=FOV_DEG, sampling=sampling)[0]

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from runtime.errors import FatalError, InputError
-from runtime.optics.carried import expected_psnrs_db, intensities, light_psnrs_db
+from runtime.optics.carried import expected_psnrs_db, intensities
+from runtime.optics.light import ONE_RAY
 from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
@@ -33,7 +34,7 @@ def test_the_judgement_is_that_of_the_optics(pair: StillPair) -> None:
     layers = np.random.default_rng(1).integers(0, 256, (3, 108, 192, 3), dtype=np.uint8)
     found = pair_result(pair, MethodRun(layers, (1.0,), 1.0, 0, "fp32"))
     where: Any = {"eyes_m": pair.eyes_m, "fov_deg": pair.fov_deg, "sigmas_mm": (0.0, 1.0, 2.0)}
-    light, rays = (way(layers, pair.images, STACK, **where) for way in (light_psnrs_db, expected_psnrs_db))
+    light, rays = (expected_psnrs_db(layers, pair.images, STACK, sampling=s, **where) for s in (None, ONE_RAY))
     assert list(found.quality.light_db.values()) == pytest.approx(list(light.values()))
     assert list(found.quality.expected_db.values()) == pytest.approx(list(rays.values()))
     for distance in ("2mm", "6mm"):

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from runtime.config import ModelSettings
-from runtime.evaluation.displayed import displayed, expected_db
+from runtime.evaluation.displayed import displayed, expected_quality
 from runtime.model.predictor import Predictor, load_predictor
 from runtime.model.still import solve_still
 from runtime.optics.stack import PanelStack
@@ -189,7 +189,7 @@ def stressed(
     if layers.shape != (3, stack.height_px, stack.width_px, 3) or layers.dtype != np.uint8:
         return Answer(1.0, 0.0, note=f"layers of {layers.shape}, {layers.dtype}")
     seen = displayed(layers, images, stack, eyes_m=eyes_m, fov_deg=FOV_DEG, similarity=False)
-    error_db = expected_db(seen, layers, light=True, sigmas_mm=(0.0,))["0"] if light else seen.quality.psnr_db
+    error_db = expected_quality(seen, layers, sigmas_mm=(0.0,)).db["0"] if light else seen.quality.psnr_db
     return Answer(10 ** (-error_db / 20), 1.0)
 
 
