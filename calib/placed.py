@@ -6,7 +6,7 @@ rows to the viewer's right, z up. Its pixel pitch is the stack's.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -51,18 +51,12 @@ def corner_pixels(stack: PanelStack) -> F64:
 
 def panel_from_pixels(stack: PanelStack) -> F64:
     """(3, 3) matrix from a pixel (u, v, 1) to a point in the panel's frame, metres."""
-    pitch_u, pitch_v = stack.width_m / stack.width_px, stack.height_m / stack.height_px
-    return np.array([[0.0, 0.0, 0.0], [pitch_u, 0.0, -stack.width_m / 2], [0.0, -pitch_v, stack.height_m / 2]])
+    return replace(stack.panel(0), x_m=0.0).stack_from_raster()
 
 
 def stack_from_pixels(panel: PlacedPanel, stack: PanelStack) -> F64:
     """(3, 3) matrix from a true pixel (u, v, 1) of a panel to a point in `stack`, metres."""
     return panel.rotation @ panel_from_pixels(stack) + np.outer(panel.centre_m, HOMOGENEOUS)
-
-
-def ideal_panel(stack: PanelStack, index: int) -> PlacedPanel:
-    """Return a panel's nominal pose: parallel to the others, and centred on the stack's axis."""
-    return PlacedPanel(np.eye(3), np.array([stack.x_m[index], 0.0, 0.0]))
 
 
 def true_from_ideal_seen(panel: PlacedPanel, eye_m: ArrayLike, stack: PanelStack, index: int) -> F64:
@@ -76,5 +70,5 @@ def true_from_ideal_seen(panel: PlacedPanel, eye_m: ArrayLike, stack: PanelStack
     seen = stack_from_pixels(panel, stack) - eye
     if abs(np.linalg.det(seen)) < 1e-18:
         raise ValueError("an eye in a panel's plane cannot see through the panel")
-    matrix = np.linalg.solve(seen, stack_from_pixels(ideal_panel(stack, index), stack) - eye)
+    matrix = np.linalg.solve(seen, stack.panel(index).stack_from_raster() - eye)
     return np.asarray(matrix / matrix[2, 2] + 0.0, dtype=np.float64)  # + 0.0: no -0.0 in a file

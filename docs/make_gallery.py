@@ -12,7 +12,7 @@ import io
 import json
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,11 +22,10 @@ from PIL import Image, ImageDraw, ImageFont
 
 import phasestack
 from calib.board import boards as boards_of
-from calib.placed import ideal_panel
 from runtime.config import StackGeometry, changed
 from runtime.daemon.build import scaled_stack
 from runtime.evaluation.motion_recording import write_motion
-from runtime.evaluation.refresh_quality import view_error_mm
+from runtime.evaluation.refresh_quality import Pictures, view_error_mm
 from runtime.optics.pupil import PUPIL_MM
 from runtime.optics.retina import as_codes, average, pupil_points, seen_by
 from runtime.optics.stack import PanelStack
@@ -37,14 +36,13 @@ from runtime.report.moving import (
     NOISE_MM,
     SECONDS,
     SEED,
-    KeptInMemory,
     Moving,
     settings_for,
     simulated_run,
 )
 from runtime.report.pairs import PairPainter, eyes_at
 from runtime.report.sections import most_used
-from tests.calib.simulator import Camera, camera_from_stack, photograph
+from tests.calib.simulator import Camera, camera_from_stack, ideal_panel, photograph
 
 DOCS = Path(__file__).resolve().parent
 IMAGES = DOCS / "images"
@@ -199,6 +197,25 @@ def look_into(folder: Path) -> None:
     phasestack.solve(*pair.images, eyes_m=eyes, stack=stack).save(folder)
 
 
+class KeptInMemory:
+    """Output of a run that keeps lines, and light with its true pictures, in memory."""
+
+    def __init__(self) -> None:
+        self.lines: list[Mapping[str, Any]] = []
+        self.layers: dict[int, U8] = {}  # by refresh
+        self.true: dict[int, tuple[Mapping[str, Any], Pictures]] = {}  # what light.json says, and both pictures
+
+    def refresh(self, line: Mapping[str, Any]) -> None:
+        self.lines.append(line)
+
+    def light(self, frame: int, *, layers: U8) -> None:
+        self.layers[frame] = layers
+
+    def light_targets(self, frame: int, *, info: Mapping[str, Any], drawn: Any, true: Pictures | None) -> None:
+        if true is not None:
+            self.true[frame] = info, true
+
+
 def leaning(folder: Path) -> None:
     """Write `leaning.webp`: a leaning head's left eye with the whole model, with chosen efforts, and the true view."""
     recording = folder / "lean.mcap"
@@ -207,7 +224,8 @@ def leaning(folder: Path) -> None:
     for effort in ("full", "auto"):
         settings = settings_for(recording, scene="room", effort=effort)
         settings = changed(settings, "content", {"fov_deg": 46.0}, source="gallery")
-        runs.append(simulated_run(settings, scale=0.5, keep_light=FILM_EVERY)[1])
+        runs.append(KeptInMemory())
+        simulated_run(settings, scale=0.5, keep_light=FILM_EVERY, output=runs[-1])
     stack, frames, (width, height) = scaled_stack(settings, 0.5), [], FILM_PX
     for frame, (info, true) in runs[0].true.items():
         if frame < FILM_S[0] * settings.loop.rate_hz:

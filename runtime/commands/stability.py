@@ -65,16 +65,9 @@ def _fits() -> dict[str, Fit]:
     """Return the calibration's solvers by the name of their rule."""
     from functools import partial
 
-    from calib.robust import fit_robust
-    from calib.similarity import ScaleRule, fit
+    from calib.solution import METHODS, Method, solve
 
-    def matrix(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> F64:
-        return fit(sensor_m, stack_m, rule=rule).matrix
+    def matrix(sensor_m: F64, stack_m: F64, *, method: Method) -> F64:
+        return solve(sensor_m, stack_m, method=method).similarity.matrix
 
-    return {
-        "seed": partial(matrix, rule="seed"),
-        "least-squares": partial(matrix, rule="least-squares"),
-        "inverse": partial(matrix, rule="inverse"),
-        "fixed-scale": partial(matrix, rule=1.0),
-        "robust": lambda sensor_m, stack_m: fit_robust(sensor_m, stack_m).similarity.matrix,
-    }
+    return {method: partial(matrix, method=method) for method in METHODS}

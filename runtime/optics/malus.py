@@ -1,13 +1,11 @@
-"""Malus' law and Jones calculus of N rotators between crossed polarizers (supplement, (1)-(7))."""
+"""Malus' law for the summed phase of N panels between crossed polarizers (supplement, (1)-(7))."""
 
 from __future__ import annotations
 
 from typing import Any, Literal, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-
-from runtime.records import F64
+from numpy.typing import NDArray
 
 HALF_PI = np.pi / 2
 Branch = Literal[1, 2]
@@ -24,20 +22,6 @@ def rest_value(panels: int) -> float:
 def rest_code(panels: int) -> int:
     """`rest_value` as an 8-bit code."""
     return int(rest_value(panels) * 255 + 0.5)
-
-
-def jones_rotator(angle_rad: float) -> F64:
-    """2x2 Jones matrix R(-phi) of a panel that rotates the polarization counter-clockwise ((2), (3))."""
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
-    return np.array([[c, -s], [s, c]])
-
-
-def jones_intensity(angles_rad: ArrayLike) -> float:
-    """Intensity transmitted through panels between crossed polarizers, by Jones matrices ((5), (7))."""
-    field = np.array([1.0, 0.0])
-    for angle in np.atleast_1d(np.asarray(angles_rad, dtype=np.float64)):
-        field = jones_rotator(float(angle)) @ field
-    return float(field[1] ** 2)
 
 
 def intensity_from_phase(phase: NDArray[T]) -> NDArray[T]:

@@ -124,15 +124,6 @@ class Rays:
         return np.asarray(np.linalg.inv(self.from_stack[:, :3])[0])
 
 
-def panel_positions(
-    eye_m: ArrayLike, stack: PanelStack, *, index: int, width_px: int, height_px: int, fov_deg: float
-) -> tuple[F32, F32]:
-    """(h, w) u and v, in a layer's pixels, where the rays of an eye's image cross panel `index` (M_RPU)."""
-    rays = Rays.of_eye(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
-    u, v = rays.on(stack.panel(index), moved=_moved(stack, index, np.asarray(eye_m, dtype=np.float64)))
-    return u.astype(np.float32), v.astype(np.float32)
-
-
 def seen_by(
     eye_m: ArrayLike,
     layers: U8 | F32,

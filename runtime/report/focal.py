@@ -22,7 +22,7 @@ from runtime.optics.carried import intensities
 from runtime.optics.pupil import PUPIL_MM
 from runtime.optics.retina import Rays, Retina, average, pupil_points, through_layers
 from runtime.optics.stack import PanelStack
-from runtime.optics.views import image_from_camera, raster_from_stack, stack_from_eye
+from runtime.optics.views import image_from_stack, raster_from_stack, stack_from_eye
 from runtime.records import F32, F64, U8
 from runtime.report.pairs import PairPainter, eyes_at
 
@@ -32,7 +32,6 @@ DISTANCE_M = 0.4
 CARDS_M = (-0.05, 0.0, 0.045)  # x of three cards, frame `stack`
 OFFSETS_M = (-0.043, 0.0, 0.040)  # y of the cards
 PLANES_M = (-0.11, -0.08, -0.05, -0.025, 0.0, 0.022, 0.045, 0.07, 0.095)  # x of the planes in focus
-FLIP = np.diag([1.0, -1.0, -1.0])  # cameras look along +z with y down
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,14 +66,11 @@ def projection(eye_m: F64, point: F64, *, focus_m: float) -> F64:
 
     Its third coordinate is the distance from the eye along the gaze.
     """
-    pose = stack_from_eye(eye_m)
-    rotation = FLIP @ pose[:3, :3].T
-    place = pose[:3, 3] + pose[:3, 0] * point[0] + pose[:3, 1] * point[1]
-    camera = image_from_camera(width_px=WIDTH_PX, height_px=HEIGHT_PX, fov_deg=FOV_DEG)
-    camera[0, 2] += camera[0, 0] * point[0] / focus_m
-    camera[1, 2] -= camera[1, 1] * point[1] / focus_m
-    result: F64 = camera @ np.column_stack([rotation, -rotation @ place])
-    return result
+    centre = image_from_stack(eye_m, width_px=WIDTH_PX, height_px=HEIGHT_PX, fov_deg=FOV_DEG)
+    # In front of the plane in focus a point's picture moves against the pupil's point, behind it with it.
+    focal_px = WIDTH_PX / 2 / math.tan(math.radians(FOV_DEG / 2))
+    out_of_focus = centre[2] / focus_m - [0.0, 0.0, 0.0, 1.0]
+    return centre + np.outer([focal_px * point[0], -focal_px * point[1], 0.0], out_of_focus)
 
 
 def card_windows(eye_m: F64) -> list[tuple[slice, slice]]:

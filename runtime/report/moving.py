@@ -13,8 +13,8 @@ from runtime.config import Settings, validated
 from runtime.daemon.build import RunOptions, build_run
 from runtime.errors import FatalError
 from runtime.evaluation.motion_recording import write_motion
-from runtime.evaluation.refresh_quality import Pictures
-from runtime.records import U8, Effort
+from runtime.frame.kept_light import Output
+from runtime.records import Effort
 
 SCENES = {"still": "demo", "lean": "demo", "walk": "demo", "stop-and-go": "demo", "film": "moving"}  # by motion
 FULL = Effort(1, 4)  # `balanced` whole: the effort of every solution before the loop chose
@@ -36,37 +36,22 @@ class Moving:
     refreshes: int  # measured
 
 
-class KeptInMemory:
-    """Run output kept in memory: the lines, and the displayed light with the true pictures."""
-
-    def __init__(self) -> None:
-        self.lines: list[Mapping[str, Any]] = []
-        self.layers: dict[int, U8] = {}  # by refresh
-        self.true: dict[int, tuple[Mapping[str, Any], Pictures]] = {}  # what light.json says, and both pictures
-
-    def refresh(self, line: Mapping[str, Any]) -> None:
-        self.lines.append(line)
-
-    def light(self, frame: int, *, layers: U8) -> None:
-        self.layers[frame] = layers
-
-    def light_targets(self, frame: int, *, info: Mapping[str, Any], drawn: Any, true: Pictures | None) -> None:
-        if true is not None:
-            self.true[frame] = info, true
-
-
 def simulated_run(
-    settings: Settings, *, scale: float, fixed: Effort | None = None, keep_light: int = 0
-) -> tuple[dict[str, Any], KeptInMemory]:
-    """summary.json of a simulated run, and what it kept. Raises FatalError."""
-    output = KeptInMemory()
+    settings: Settings,
+    *,
+    scale: float,
+    fixed: Effort | None = None,
+    keep_light: int = 0,
+    output: Output | None = None,
+) -> dict[str, Any]:
+    """summary.json of a simulated run. Raises FatalError."""
     options = RunOptions(max_speed=True, measure=True, scale=scale, fixed=fixed, keep_light=keep_light)
     with ExitStack() as cleanup:
         run = build_run(settings, options, cleanup, output=output)
         run.observer.measure_only_live()
         run.presenter.run()
         run.observer.finish()
-        return run.summary(), output
+        return run.summary()
 
 
 def settings_for(recording: Path, *, scene: str, effort: str) -> Settings:
@@ -89,7 +74,7 @@ def moving_run(
         head = "still" if motion == "film" else motion
         write_motion(recording, head, seconds=seconds, seed=seed, noise_mm=NOISE_MM)
         settings = settings_for(recording, scene=SCENES[motion], effort="full" if effort else "auto")
-        summary, _ = simulated_run(settings, scale=scale, fixed=effort)
+        summary = simulated_run(settings, scale=scale, fixed=effort)
     view_error_mm, live_db = summary["view_error_mm"], summary["live_db"]
     name = effort.name if effort else "auto"
     if view_error_mm is None or live_db is None:

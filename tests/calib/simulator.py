@@ -30,6 +30,11 @@ GAMMA = 2.2  # of the camera's tone curve
 HALF_WIDTH_95 = 1.959964
 
 
+def ideal_panel(stack: PanelStack, index: int) -> PlacedPanel:
+    """A panel that is parallel to the others and centred on the stack's axis."""
+    return PlacedPanel(np.eye(3), np.array([stack.x_m[index], 0.0, 0.0]))
+
+
 @dataclass(frozen=True, slots=True)
 class Camera:
     """A pinhole camera; pixel centres at whole numbers."""

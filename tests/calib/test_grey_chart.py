@@ -13,10 +13,9 @@ from typer.testing import CliRunner
 
 from calib.commands import app
 from calib.grey_chart import grey_charts, histograms, measure
-from calib.placed import ideal_panel
 from runtime.config import StackGeometry
 from runtime.panels.lut import measured_curve
-from tests.calib.simulator import Camera, camera_from_stack, photograph
+from tests.calib.simulator import Camera, camera_from_stack, ideal_panel, photograph
 
 STACK = StackGeometry().stack()
 PANEL = 2

@@ -10,11 +10,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib.bundle import Undetermined
-from calib.placed import PlacedPanel, ideal_panel, through, true_from_ideal_seen
+from calib.placed import PlacedPanel, through, true_from_ideal_seen
 from calib.registration import register_photographs
 from runtime.config import StackGeometry
 from runtime.optics.stack import PanelStack
-from tests.calib.simulator import camera_from_stack, errors_of, misplaced, photographed
+from tests.calib.simulator import camera_from_stack, errors_of, ideal_panel, misplaced, photographed
 
 STACK = StackGeometry().stack()
 EYE = np.array([0.5, 0.0, 0.05])

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from runtime.optics.malus import intensity_from_phase, jones_intensity, phase_from_intensity
+from runtime.optics.malus import intensity_from_phase, phase_from_intensity
 from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack, relative_scale_shift, stack_from_eye
@@ -134,6 +134,15 @@ def of_intensity(intensity: float, branch: Literal[1, 2]) -> Answer:
     condition = max(1.0, math.sqrt(intensity / away) / math.pi / max(float(truth), 1e-30))
     back = abs(float(intensity_from_phase(phase)) - intensity)
     return Answer(farthest(phase, truth), 4 * EPS64 * condition, condition, back)
+
+
+def jones_intensity(angles_rad: Sequence[float]) -> float:
+    """Return the intensity through rotators between crossed polarizers, by Jones matrices ((5), (7))."""
+    field = np.array([1.0, 0.0])
+    for angle_rad in angles_rad:
+        c, s = math.cos(angle_rad), math.sin(angle_rad)
+        field = np.array([[c, -s], [s, c]]) @ field
+    return float(field[1] ** 2)
 
 
 def product(values: Sequence[float]) -> Answer:
