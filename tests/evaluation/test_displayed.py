@@ -31,30 +31,12 @@ def smooth(height: int, width: int, *, right_px: float = 0.0) -> np.ndarray:
 
 
 def traced_psnr(layers: np.ndarray, wanted: list[np.ndarray], *, moved_m: tuple[float, ...] = (0, 0, 0)) -> float:
-    """PSNR of both eyes' rays, one at a time in plain floats, in the raster of the pictures (intensities).
-
-    moved_m: the eyes are there instead, and look through the same points of the centre panel.
-    """
-    grey = [(layer[..., k] / 255).tolist() for layer in layers for k in range(3)]
-    squares = []
-    for eye, picture in zip(EYES, wanted, strict=True):
-        true = tuple(eye + np.array(moved_m))
-        height, width = picture.shape[:2]
-        for v in range(height):
-            for u in range(width):
-                ray = reference.ray(tuple(eye), u + 0.5, v + 0.5, width=width, height=height, fov_deg=FOV)
-                through = reference.subtract(reference.hit_plane(tuple(eye), ray, 0.0), true)
-                places = [
-                    reference.panel_pixel(
-                        reference.hit_plane(true, through, x), width_m=0.4, height_m=0.3, width=80, height=60
-                    )
-                    for x in STACK.x_m
-                ]
-                if not all(0.5 < a < 79.5 and 0.5 < b < 59.5 for a, b in places):
-                    continue
-                for k in range(3):
-                    phase = sum(reference.bilinear(grey[3 * n + k], a, b) for n, (a, b) in enumerate(places))
-                    squares.append((math.sin(phase * math.pi / 2) ** 2 - picture[v, u, k]) ** 2)
+    """PSNR of both eyes' rays in the raster of the pictures (intensities); moved_m: the eyes are there instead."""
+    squares = [
+        error
+        for eye, picture in zip(EYES, wanted, strict=True)
+        for error in reference.carried_errors(tuple(eye), tuple(eye + moved_m), layers, picture, STACK, fov_deg=FOV)
+    ]
     return -10 * math.log10(sum(squares) / len(squares))
 
 

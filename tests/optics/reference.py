@@ -1,8 +1,12 @@
-"""Slow references in plain Python floats: no numpy, no code of the product, one ray at a time."""
+"""Slow references in plain Python floats: no numpy, no mathematics of the product, one ray at a time."""
 
 from __future__ import annotations
 
 import math
+from itertools import product
+from typing import Any
+
+from runtime.optics.stack import PanelStack
 
 Vector = tuple[float, float, float]
 
@@ -97,6 +101,30 @@ def traced_pixel(
     return field[1] ** 2, counts, margin
 
 
+def carried_errors(
+    nominal: Vector, true: Vector, layers: Any, picture: Any, stack: PanelStack, *, fov_deg: float
+) -> list[float]:
+    """Squared errors of the pixels that count, seen from `true` through the points of the centre panel seen nominally.
+
+    layers: (N, H, W, 3 or 4) codes; picture: (h, w, 3) intensities for the nominal eye.
+    """
+    height, width = picture.shape[:2]
+    centre_x = stack.x_m[stack.count // 2]
+    grey = [(layer[..., channel] / 255).tolist() for layer in layers for channel in range(3)]
+    size = {"width_m": stack.width_m, "height_m": stack.height_m, "width": stack.width_px, "height": stack.height_px}
+    squares = []
+    for v, u in product(range(height), range(width)):
+        direction = ray(nominal, u + 0.5, v + 0.5, width=width, height=height, fov_deg=fov_deg)
+        through = subtract(hit_plane(nominal, direction, centre_x), true)
+        places = [panel_pixel(hit_plane(true, through, x), **size) for x in stack.x_m]
+        if any(not (0.5 < a < stack.width_px - 0.5 and 0.5 < b < stack.height_px - 0.5) for a, b in places):
+            continue
+        for channel in range(3):
+            phase = sum(bilinear(grey[3 * n + channel], a, b) for n, (a, b) in enumerate(places))
+            squares.append((math.sin(phase * math.pi / 2) ** 2 - picture[v, u, channel]) ** 2)
+    return squares
+
+
 def jones_intensity(angles: list[float], analyser: float) -> float:
     """Seed (3), literally: |R(-xi) P R(xi) R(-phi_N) .. R(-phi_1) (1, 0)|^2 with complex 2x2 matrices."""
 
@@ -106,9 +134,9 @@ def jones_intensity(angles: list[float], analyser: float) -> float:
     def rotation(angle: float) -> list[list[complex]]:
         return [[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]]
 
-    product: list[list[complex]] = [[1, 0], [0, 1]]
+    panels: list[list[complex]] = [[1, 0], [0, 1]]
     for angle in angles:
-        product = times(rotation(-angle), product)
+        panels = times(rotation(-angle), panels)
     polarizer = times(times(rotation(-analyser), [[1, 0], [0, 0]]), rotation(analyser))
-    out = times(polarizer, product)
+    out = times(polarizer, panels)
     return abs(out[0][0]) ** 2 + abs(out[1][0]) ** 2
