@@ -64,7 +64,7 @@ def expected_errors(
     sampling: Sampling | None = None,
     **at: Unpack[AtEyes],
 ) -> dict[float, F64]:
-    """Carried squared error, expected over normal tracking errors (docs/contracts.md), of all rows and of groups.
+    """Carried squared error, expected over normal tracking errors: of all rows, then of groups.
 
     For each standard deviation to the right and up, by five points: no error with weight 1/2, two standard deviations
     to either side with 1/8 each, which is exact for second moments. drawn: an (h, w, 3) picture for each of the eyes

@@ -64,7 +64,7 @@ def squared_errors(
     fov_deg: float,
     sampling: Sampling,
 ) -> F64:
-    """(1 + groups,) mean squared error at eyes (2, 3) against the carried pictures of the eyes solved for.
+    """(1 + groups,) mean squared errors at eyes (2, 3) against carried pictures of the eyes solved for.
 
     layers: (N, H, W, 3 or 4) code values, rear to front; targets: (h, w, 3) intensities for each eye solved for, of
     pictures `fov_deg` wide. The first is of all rows, the others are of interleaved groups of them, whose scatter gives
