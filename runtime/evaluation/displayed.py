@@ -35,10 +35,10 @@ class EyeViews:
     eyes_m: F64  # (2, 3)
     fov_deg: float
 
-    def viewer(self, layers: U8, text: Sequence[str]) -> str:
+    def viewer(self, layers: U8, text: Sequence[str], *, relief: F32 | None = None) -> str:
         """Return a viewer page of the layers seen from these eyes, with a title and lines of text."""
         wanted, eyes_m = [as_codes(intensities(picture)) for picture in self.wanted], np.asarray(self.eyes_m)
-        return viewer_html(layers, wanted, self.stack, eyes_m=eyes_m, fov_deg=self.fov_deg, text=text)
+        return viewer_html(layers, wanted, self.stack, eyes_m=eyes_m, fov_deg=self.fov_deg, text=text, relief=relief)
 
     def write(self, folder: Path) -> None:
         """Write seen-*.png and wanted-*.png."""

@@ -6,10 +6,10 @@ import logging
 import queue
 import threading
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TextIO
 
-from runtime.browser.still import viewer_html
 from runtime.errors import InputError
 from runtime.evaluation.contact_sheet import Moment, contact_sheet, headline
 from runtime.evaluation.refresh_quality import Pictures
@@ -122,16 +122,8 @@ class RunOutput:
             if moment is not None:
                 shown, title, lines = moment.layers, headline(moment.light_db), [*moment.lines, *lines]
                 moment.eye_views.write(folder)
-                look = moment.eye_views
-                page = viewer_html(
-                    moment.solution,
-                    moment.asked_for,
-                    look.stack,
-                    eyes_m=moment.solved_for_m,
-                    fov_deg=look.fov_deg,
-                    text=[title, *lines],
-                    relief=moment.relief,
-                )
+                asked_for = replace(moment.eye_views, wanted=moment.asked_for, eyes_m=moment.solved_for_m)
+                page = asked_for.viewer(moment.solution, [title, *lines], relief=moment.relief)
             views = None if moment is None else moment.eye_views
             write_png(folder / "contact-sheet.png", contact_sheet(shown, views, headline=title, lines=lines))
             write_text(folder / "viewer.html", page)
