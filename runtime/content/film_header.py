@@ -1,4 +1,4 @@
-"""What a film states of its views: `st3d`, `sv3d` or spherical XML in an MP4, StereoMode in a Matroska file."""
+"""View arrangement stated by a film: `st3d`, `sv3d` or spherical XML in MP4, StereoMode in Matroska."""
 
 from __future__ import annotations
 

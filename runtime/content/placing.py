@@ -40,7 +40,7 @@ class SceneFile:
         return self.settings.background or DARK
 
     def placed(self, low: F64, high: F64, *, custom: tuple[str, str] | None = None, facing: F64 | None = None) -> F64:
-        """Return the 4x4 stack_from_scene of content with these corners: preset, fitted, or in its own metres.
+        """Return the 4x4 stack_from_scene of content with these corners: preset, fitted, or in its metres.
 
         custom: the up axis and the axis towards the viewer of the file's format; None: chosen by the file name. facing:
         area-weighted mean normal (3,) of the surface; with it, a flat mesh is turned to face the viewer.

@@ -1,4 +1,4 @@
-"""Find the second view of a Leia picture (LIF): a JPEG with fields behind it, as the Lume Pad writes it.
+"""Search for the second view of a Leia picture (LIF): a JPEG followed by fields, from a Lume Pad.
 
 The file ends with the length of these fields and a mark. Fields: their number, then of each its number, its size and
 its bytes. One field holds the views as JSON, each with its place and the field of its JPEG; -1 is the file itself.
@@ -18,7 +18,7 @@ JSON_BYTES_MAX = 65536
 
 
 def other_view(file: IO[bytes]) -> tuple[slice, bool] | None:
-    """The bytes of the other JPEG of a pair, and whether it is the left eye's; None: no such file, or a damaged one."""
+    """Return a pair's other JPEG and whether it is the left eye's; None for another or damaged file."""
     size = file.seek(0, 2)
     if size < 6:
         return None

@@ -159,7 +159,7 @@ def _views(image: Any, *, is_named_so: bool) -> tuple[tuple[int, ...], str]:
 
 
 def _leia_view(coded: bytes | IO[bytes], size: tuple[int, int]) -> tuple[slice, bool] | None:
-    """As `other_view`; None too if the other view is no picture of the same size."""
+    """Return what `other_view` does, but None if the other view is not a picture of the same size."""
     file = io.BytesIO(coded) if isinstance(coded, bytes) else coded
     if found := other_view(file):
         file.seek(found[0].start)

@@ -38,7 +38,7 @@ function eyesOf(head) {
 const eyesNow = (head) => (viewer && sensor ? eyesOf(head) : newest?.eyes_m ?? follows ?? eyesOf([0, 0, 0]));
 const say = (message) => { if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message)); };
 
-// The head follows the pointer along the smoothest way from its present motion (least jerk), planned anew whenever the pointer moves:
+// The head follows the pointer along the smoothest path from its current motion (minimum jerk), replanned when the pointer moves:
 // the tracker takes a pointer's jumps for another person's head.
 let way = { begin_ms: 0, seconds: 0, curves: [0, 1, 2].map(() => [0, 0, 0, 0, 0, 0]) }, step = null;
 
