@@ -1,7 +1,7 @@
 """Calibration charts with black lines at the thirds of each eye's image (EyeReal, 2.3, figure S4).
 
-One set of layers serves both eyes: at the viewpoint the lines fuse into clean single ones; elsewhere they show ghosts
-and stripes.
+One set of layers serves both eyes. Seen from the viewpoint, the lines fuse into clean single ones; elsewhere, they show
+ghosts and stripes.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Client of the running daemon: finds its socket, sends a JSON line, reads one back."""
+"""Client of the running daemon: finds its socket, sends a JSON line and reads one back."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def sockets(config: Path | None) -> tuple[Path, ...]:
 
 
 class NotRunning(TransientError):
-    """No daemon answers at the socket; the text names the reason and a remedy."""
+    """No daemon answers at the socket; the message gives the reason and a remedy."""
 
     hangs = False  # a daemon is there, but has not answered in time
 
@@ -69,7 +69,7 @@ def ask(paths: Iterable[Path], request: dict[str, Any], *, timeout_s: float = 10
 
 
 def _exchanged(path: Path, request: dict[str, Any], timeout_s: float) -> dict[str, Any]:
-    """Send one line and read one."""
+    """Send one line and read the answer."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as channel:
         channel.settimeout(timeout_s)
         channel.connect(str(path))
@@ -90,7 +90,7 @@ def _advice(error: Exception) -> str:
         case PermissionError():
             return "not permitted (join the group phasestack)"
         case ConnectionRefusedError():
-            return "the daemon has died (its socket is left)"
+            return "the daemon has died, leaving its socket behind"
         case TimeoutError():
             return "no answer in time (the daemon hangs)"
     return str(error) or type(error).__name__

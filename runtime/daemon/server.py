@@ -200,7 +200,7 @@ def _line(answer: dict[str, Any]) -> bytes:
 
 
 def _is_gone(writer: StreamWriter) -> bool:
-    """True if a client has disconnected, and not only stopped sending."""
+    """Return True if a client has disconnected rather than merely stopped sending."""
     if writer.is_closing():
         return True
     hung_up = select.poll()

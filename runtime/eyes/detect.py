@@ -38,7 +38,7 @@ class EyeFinder:
         self.pupils: Pupils | None = None  # pupils in the last frame, even if their distance is unknown
 
     def forget(self) -> None:
-        """Reset: treat the next frame as the first."""
+        """Reset the finder, so that the next frame counts as the first."""
         self._finder.forget()
 
     @property

@@ -162,7 +162,7 @@ def _called(function: Callable[..., T], args: Any, kwargs: Any) -> T:
 
 
 def run_method(method: Method, pair: StillPair, threads: int) -> MethodRun:
-    """Load, warm up and time a method, and note the peak of memory; for a separate process."""
+    """Load, warm up and time a method, and record its peak memory; runs in a separate process."""
     import cv2
 
     from runtime.model.still import solve_still
