@@ -38,13 +38,13 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 from torch.nn import functional
 
+from runtime.kernels import EDGE_CLAMP_PX
 from runtime.optics.light import panels_from_centre
 from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
 
 NEAR_PX = 0.5  # rays count if they are at least this far inside every panel
-BESIDE_PX = 2.0  # border bundles are extended this many pixels beyond the picture (clamp to edge)
 SIZE = 0.8  # of steps after a learned network; larger ones overshoot from poor starts
 MOMENTUM, FLOOR = 0.7, 0.1
 LEAST_ERROR = 1e-6  # squared; caps the PSNR at 60 dB
@@ -141,14 +141,14 @@ def step(
     sets, turns = len(views.panels_from_rays), targets.shape[-2] // views.height_px
     back, size_px = torch.linalg.inv(views.panels_from_rays), y.shape[-2:]
     bundles, counts = _bundles(y, views)
-    gradient, bound = torch.zeros_like(y), torch.zeros_like(y)
+    gradient, curvature = torch.zeros_like(y), torch.zeros_like(y)
     for e, z in enumerate(bundles):
         whole, turn = reduce(torch.mul, z), e // 2 if turns > 1 else 0
         error = (1 - whole.real) / 2 - targets[e % 2][:, turn::turns][:, : views.height_px]
         rays = torch.cat([error * whole.imag, whole.imag.square()]) * counts[e]
-        g, d = _sample(rays.expand(len(y), -1, -1, -1), back[e], size_px, near_px=-BESIDE_PX)[0].chunk(2, dim=1)
-        gradient, bound = gradient + g, bound + d
-    new = (y - size * 2 / (torch.pi * len(y)) * gradient / bound.clamp(min=floor * sets)).clamp(0, 1)
+        g, d = _sample(rays.expand(len(y), -1, -1, -1), back[e], size_px, near_px=-EDGE_CLAMP_PX)[0].chunk(2, dim=1)
+        gradient, curvature = gradient + g, curvature + d
+    new = (y - size * 2 / (torch.pi * len(y)) * gradient / curvature.clamp(min=floor * sets)).clamp(0, 1)
     return new, new + momentum * (new - x)
 
 

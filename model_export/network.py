@@ -8,10 +8,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from runtime.kernels import FULL
+
 INPUTS = ("left", "right", "waves", "shifted_waves", "spectrum", "modes_in", "eye_sigma_px")
 OUTPUTS = ("rear", "front", "check")
 BLOCK_ROWS = 8  # rows transformed together; the raster has whole blocks
-FULL = 255 * 16  # one panel's range in the unit of inputs and outputs, sixteenths of an 8-bit code
 BOX = 0.5  # outer panels start in the middle of their range and may change by this much
 IN_SCALE = 64  # codes per unit of the transformed inputs, which would overflow half precision in codes
 

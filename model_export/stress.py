@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from model_export.data import random_pair
+from runtime.kernels import FULL
 from runtime.model.chain import chain_modes
 from runtime.model.contract import Contract
-from runtime.model.targets import FULL
 from runtime.optics.malus import phase_from_intensity
 from runtime.records import F32
 

@@ -18,10 +18,10 @@ import onnxruntime
 
 from model_export.stress import ORDINARY, Feeds, picture_cases, spectral_cases
 from runtime.errors import InputError, one_line
+from runtime.kernels import FULL
 from runtime.model.contract import VERSION, Contract, parse_contract
 from runtime.model.network import PictureProposal
 from runtime.model.session import ModelSession
-from runtime.model.targets import FULL
 from runtime.optics.stack import PanelStack
 from runtime.support import untrusted_input
 from runtime.support.progress import tracked

@@ -58,9 +58,6 @@ def test_a_command_loads_nothing_heavy_that_it_does_not_use(arguments: list[str]
     assert set(line.split()[1:]) == set(loads), done.stderr
 
 
-SHARED_NAMES = {"Image", "Result", "View"}  # of the compiled kernels' structures, which are to be renamed
-
-
 def test_a_public_class_name_is_in_one_module() -> None:
     modules: dict[str, set[str]] = {}
     for package in ("phasestack", "runtime", "calib", "model_export"):
@@ -69,4 +66,4 @@ def test_a_public_class_name_is_in_one_module() -> None:
                 if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                     modules.setdefault(node.name, set()).add(str(path.relative_to(ROOT)))
     shared = {name: paths for name, paths in modules.items() if len(paths) > 1}
-    assert len(modules) > 250 and shared.keys() <= SHARED_NAMES, shared
+    assert len(modules) > 250 and not shared, shared

@@ -11,7 +11,7 @@ import zlib
 from collections.abc import Sequence
 from functools import cache, partial
 from importlib.resources import files
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from PIL import Image
@@ -28,6 +28,11 @@ PAGE_BYTES = 8_000_000  # a page's size at most
 LAYERS_BYTES = 6_400_000  # of these for layers; larger ones (4K) are not stored exactly
 QUALITY_BYTES = 512  # of these for the lines on how well pictures are compressed
 QUALITIES = (92, 84, 76, 66, 54)  # AVIF qualities: the first that fits is used
+CODINGS: dict[str, dict[str, Any]] = {
+    "png": {},
+    "webp": {"lossless": True, "method": 2},
+    "avif": {"speed": 8, "subsampling": "4:4:4"},
+}
 
 
 def asset(name: str) -> str:
@@ -99,16 +104,14 @@ def _script() -> str:
 
 def _exact(layer: U8) -> str:
     """Lossless data URL of a layer; WebP is a third smaller than PNG, which makes up for base64."""
-    how = {"format": "WEBP", "lossless": True, "method": 2, "quality": 20}
-    return _url(layer, **(how if max(layer.shape) <= WEBP_MAX_PX else {"format": "PNG"}))
+    return _url(layer, "webp" if max(layer.shape) <= WEBP_MAX_PX else "png")
 
 
 def _stored(pictures: Sequence[U8], room: int, *, qualities: Sequence[int] = QUALITIES) -> tuple[list[str], float]:
     """Pictures as data URLs, within `room` bytes if possible; mean squared error of the coding (full scale 1)."""
     urls: list[str] = []
     for quality in qualities:
-        coder = partial(_url, format="AVIF", quality=quality, speed=8, subsampling="4:4:4")
-        urls = parallel_map(coder, list(pictures))
+        urls = parallel_map(partial(_url, kind="avif", quality=quality), list(pictures))
         if sum(map(len, urls)) <= room:
             break
     coded = [Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))).convert("RGB") for url in urls]
@@ -116,10 +119,10 @@ def _stored(pictures: Sequence[U8], room: int, *, qualities: Sequence[int] = QUA
     return urls, float(np.mean(np.square(differences)) / 255**2)
 
 
-def _url(picture: U8, **how: Any) -> str:
-    coded = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(picture[..., :3])).save(coded, **how)
-    return f"data:image/{how['format'].lower()};base64,{base64.b64encode(coded.getvalue()).decode()}"
+def _url(picture: U8, kind: Literal["png", "webp", "avif"], quality: int = 20) -> str:
+    coded, options = io.BytesIO(), CODINGS[kind]
+    Image.fromarray(np.ascontiguousarray(picture[..., :3])).save(coded, format=kind, quality=quality, **options)
+    return f"data:image/{kind};base64,{base64.b64encode(coded.getvalue()).decode()}"
 
 
 def _embedded(value: Any) -> str:

@@ -24,7 +24,7 @@ def plan(
 
     Example: phasestack plan --scene sparse
     """
-    from runtime.plan.planning import plan_for
+    from runtime.plan.measure import plan_for
     from runtime.support.figures import shown
 
     with blame_option("plan", scene=scene, model=model):

@@ -1,6 +1,7 @@
 """The compiled C++ loops, called by `ctypes`, which lets other threads run meanwhile.
 
-The structures below are those of `solver.cpp`, `warp.cpp` and `light.cpp`, field by field.
+The structures below are those of the C++ files, field by field (`KernelImage` is `Image` there, `KernelView` is `View`,
+`ErrorSum` is `Result`); `library` compares their sizes.
 """
 
 from __future__ import annotations
@@ -14,21 +15,26 @@ from typing import Any
 from numpy.typing import NDArray
 
 MAX_PANELS = 5
-MAX_SETS = 4  # of rays, in the loops
-MARGIN = 64  # elements behind an image's rows that loops may touch
+MAX_SETS = 4  # of rays: left and right eye's, at two places
+MARGIN = 64  # elements after an image's rows that loops may touch
+SUBCODE = 16  # fixed point: sixteenths of an 8-bit panel code
+FULL = 255 * SUBCODE  # one panel's whole range, a quarter turn
+EDGE_PX = 4  # pixels outside an image that may be sampled
+EDGE_CLAMP_PX = 2  # pixels outside a picture to which its border ray bundles are extended (clamp to edge)
+TABLE_STEPS = 16  # entries for a code value in the table of intensities, for bilinear rays
 _AGAIN = "install phasestack again (it needs g++)"
 _pointer, _int, _long, _float, _double = (
     ctypes.c_void_p, ctypes.c_int32, ctypes.c_int64, ctypes.c_float, ctypes.c_double
 )  # fmt: skip
 
 
-class Image(ctypes.Structure):
+class KernelImage(ctypes.Structure):
     """Rows of 16-bit elements, interleaved channels."""
 
     _fields_ = (("data", _pointer), ("stride", _long), ("rows", _int), ("width", _int), ("ring", _int))
 
     @classmethod
-    def of(cls, array: NDArray[Any], *, rows: int, width: int) -> Image:
+    def of(cls, array: NDArray[Any], *, rows: int, width: int) -> KernelImage:
         """The first rows and pixels of an int16 array (rows, elements), which must live as long."""
         return cls(array.ctypes.data, array.strides[0] // array.itemsize, rows, width, len(array))
 
@@ -36,7 +42,7 @@ class Image(ctypes.Structure):
 class Panel(ctypes.Structure):
     """One panel between steps."""
 
-    _fields_ = (("ahead", Image), ("moved", Image), ("before", Image), ("last", Image))
+    _fields_ = tuple((name, KernelImage) for name in ("ahead", "moved", "before", "last"))
 
 
 class Problem(ctypes.Structure):
@@ -59,7 +65,7 @@ class Warp(ctypes.Structure):
     )  # fmt: skip
 
 
-class View(ctypes.Structure):
+class KernelView(ctypes.Structure):
     """One eye's view of displayed layers."""
 
     _fields_ = (
@@ -70,15 +76,20 @@ class View(ctypes.Structure):
     )  # fmt: skip
 
 
-class Result(ctypes.Structure):
-    """Sum of a squared error, and of how many numbers."""
+class ErrorSum(ctypes.Structure):
+    """Sum of a squared error, and the number of its terms."""
 
     _fields_ = (("total", _double), ("counted", _long))
 
 
+COMPILED = {
+    "problem_bytes": ctypes.sizeof(Problem), "warp_bytes": ctypes.sizeof(Warp), "view_bytes": ctypes.sizeof(KernelView),
+}  # fmt: skip
+
+
 @cache
 def library() -> Any:
-    """The loops. Raises ImportError where the package was not built for this machine."""
+    """The loops. Raises ImportError where the package was not built for this machine, or from other sources."""
     built = Path(__file__).with_name("compiled" + EXTENSION_SUFFIXES[0])  # another Python's may be a stale one
     if not built.exists():
         raise ImportError(f"runtime.kernels is not compiled for this Python: {_AGAIN}")
@@ -95,11 +106,11 @@ def library() -> Any:
         if function is None:
             raise other
         function.argtypes, function.restype = arguments, None
-    for name, structure in {"problem_bytes": Problem, "warp_bytes": Warp, "view_bytes": View}.items():
+    for name, value in COMPILED.items():
         try:
-            size = _int.in_dll(loops, name).value
+            compiled = _int.in_dll(loops, name).value
         except ValueError:
             raise other from None
-        if size != ctypes.sizeof(structure):
+        if compiled != value:
             raise other
     return loops

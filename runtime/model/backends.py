@@ -18,7 +18,7 @@ from runtime.records import U8
 
 if TYPE_CHECKING:
     from runtime.model.device import SolverBackend
-    from runtime.model.gl.backend import GlBackend
+    from runtime.model.gl.state import GlBackend
 
 log = logging.getLogger("phasestack.model")
 
@@ -39,10 +39,10 @@ class Choice:
 
 
 def choose(wanted: Wanted, predictor: Predictor, context: Callable[[], Any]) -> Choice:
-    """The backend for a model that is loaded. Tells the log what it found.
+    """The backend for a loaded model, logged with the reason.
 
-    context: an OpenGL context, current on this thread, asked for where one is needed; it may raise MissingPart.
-    auto: whichever is faster here, whatever it is called; the processor where OpenGL can't be had or used.
+    context: returns an OpenGL context that is current on this thread, or raises MissingPart; called only if needed.
+    auto: the one that is faster on this machine; the processor if OpenGL can't be used.
     Raises MissingPart (gl without OpenGL), InputError (a panel too large for the driver), ModelFailure.
     """
     if predictor.on_panels(predictor.stack) is None:
@@ -64,7 +64,7 @@ def _cpu() -> SolverBackend:
 
 
 def _gl(context: Any, stack: PanelStack) -> GlBackend:
-    from runtime.model.gl.backend import GlBackend
+    from runtime.model.gl.state import GlBackend
 
     return GlBackend(context, stack)
 
@@ -93,7 +93,7 @@ def solution_ms(predictor: Predictor, stack: PanelStack, backend: SolverBackend,
     solver = predictor.on_panels(stack)
     assert solver is not None
     solver.set_backend(backend)
-    # For known eyes: the extra cost of unsure ones is the same on every backend.
+    # With eyes known exactly: a tracking error costs the same on every backend.
     job = replace(drawn_job([_noise(stack, seed) for seed in (0, 1)], np.array(EYES_M), stack), eye_sigma_m=0.0)
     try:
         solver.solve(job)
@@ -108,7 +108,7 @@ def solution_ms(predictor: Predictor, stack: PanelStack, backend: SolverBackend,
 
 
 def _noise(stack: PanelStack, seed: int) -> U8:
-    """(h, w, 4) in colour: no part of it can be skipped."""
+    """(h, w, 4) in colour, so that no part of it is skipped."""
     noise = np.random.default_rng(seed).integers(0, 256, (stack.height_px, stack.width_px, 4), np.uint8)
     noise[..., 3] = 255
     return noise

@@ -96,17 +96,13 @@ class ChainFrame:
         reach = (stack.x_m[-1] - self.x_m) / (self.middle_m[0] - stack.x_m[-1])
         centre = (self.x_m - stack.x_m[1]) / (self.middle_m[0] - stack.x_m[1])
         moved_m = eye_sigma_m * reach
-        across_m, along_m, down_m = self._steps_m()
+        # Metres to the right and up for a column, and up for a row, in the raster's middle.
+        raster = self.plane_from_raster
+        at = raster @ (self.columns.middle, self.rows / 2, 1.0)
+        (across_m, along_m), (_, down_m) = ((raster[:2, k] - at[:2] / at[2] * raster[2, k]) / at[2] for k in (0, 1))
         columns = moved_m / abs(across_m)
         rows = moved_m * np.hypot(1.0, along_m / across_m) / abs(down_m)
         return np.array([columns, rows, self.cell_px * centre / reach], np.float32)
-
-    def _steps_m(self) -> tuple[float, float, float]:
-        """To the right for a column, up for a column and for a row, in the raster's middle."""
-        raster = self.plane_from_raster
-        at = raster @ (self.columns.middle, self.rows / 2, 1.0)
-        by_column, by_row = ((raster[:2, k] - at[:2] / at[2] * raster[2, k]) / at[2] for k in (0, 1))
-        return float(by_column[0]), float(by_column[1]), float(by_row[1])
 
 
 def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int) -> ChainFrame:
@@ -120,17 +116,14 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int)
     plane_m = _equal_parallax_m(stack, between_m[0])
     ahead_m = between_m[0] - plane_m
     middle_m = between_m - half_m * (half_m[0] / ahead_m)
-    window = _Window(
-        *_common_extent(middle_m, stack, plane_m=plane_m, axis=1), *_panel_extent(middle_m, stack, plane_m=plane_m)
-    )
+    window = _window_of(middle_m, stack, plane_m=plane_m)
     line = _line_of_eyes(between_m, half_m, plane_m=plane_m, window=window)
     per_column = (stack.x_m[-1] - plane_m) / (middle_m[0] - stack.x_m[-1]) / (cell_px * ahead_m)
     column_m = abs(line.from_f_m2[0] * per_column)  # in the window's middle
     if column_m < 1e-12:
-        raise ValueError("the eyes are not beside each other: one is behind or above the other, or in its place")
+        raise ValueError("the eyes are not next to each other: one is behind or above the other, or in its place")
     half_columns = window.half_width_m / column_m * (atanh(line.nearness) / line.nearness if line.nearness else 1.0)
-    cells = CELLS_STEP * ceil((ceil(half_columns / cell_px) + 1) / CELLS_STEP)
-    cells = min(CELLS_MAX, cells)
+    cells = min(CELLS_MAX, CELLS_STEP * ceil((ceil(half_columns / cell_px) + 1) / CELLS_STEP))
     middle_column = cells * cell_px
     bend, (bend_y_m, bend_z_m) = line.nearer_m * per_column, line.towards_f_m2 * per_column
     columns = ColumnLaw(float(bend), float(middle_column))
@@ -145,13 +138,11 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int)
         raise ValueError(f"the eyes stand so unlike a person's that their raster has {rows} rows")
     middle_y_m = window.middle_m[0] - window.half_width_m * line.nearness / (1 + sqrt(1 - line.nearness**2))
     middle_z_m = (min(reached_m) + max(reached_m)) / 2
-    plane_from_raster = np.array(
-        [
-            [-bend_y_m, 0.0, middle_y_m + bend_y_m * middle_column],
-            [-bend_z_m, -row_m, middle_z_m + row_m * rows / 2 + bend_z_m * middle_column],
-            [-bend, 0.0, 1.0 + bend * middle_column],
-        ]
-    )
+    plane_from_raster = np.array([
+        [-bend_y_m, 0.0, middle_y_m + bend_y_m * middle_column],
+        [-bend_z_m, -row_m, middle_z_m + row_m * rows / 2 + bend_z_m * middle_column],
+        [-bend, 0.0, 1.0 + bend * middle_column],
+    ])  # fmt: skip
     return ChainFrame(plane_m, plane_from_raster, columns, cells, cell_px, rows, middle_m)
 
 
@@ -209,26 +200,22 @@ def _equal_parallax_m(stack: PanelStack, eye_x_m: float) -> float:
     return float(stack.x_m[1] + ahead / (2 * far_m + (rear_m - front_m)))
 
 
-def _common_extent(middle: F64, stack: PanelStack, *, plane_m: float, axis: int) -> tuple[float, float]:
-    """(low, high) on the plane, metres, that rays from `middle` through all panels reach; the centre's at least 10%."""
-    half_m = stack.width_m / 2
-    lows, highs = [], []
-    for x_m in stack.x_m:
+def _window_of(middle: F64, stack: PanelStack, *, plane_m: float) -> _Window:
+    """The part of the plane that rays from `middle` through all panels reach across, and the centre panel's height.
+
+    At least 10 % of the panels' width.
+    """
+
+    def extent(x_m: float, size_m: float, axis: int) -> tuple[float, float]:
         t = (x_m - plane_m) / (middle[0] - plane_m)
-        lows.append((-half_m - middle[axis] * t) / (1 - t))
-        highs.append((half_m - middle[axis] * t) / (1 - t))
+        return (-size_m / 2 - middle[axis] * t) / (1 - t), (size_m / 2 - middle[axis] * t) / (1 - t)
+
+    lows, highs = zip(*(extent(x_m, stack.width_m, 1) for x_m in stack.x_m), strict=True)
     low, high = max(lows), min(highs)
     if high - low < stack.width_m / 10:
         centre = (low + high) / 2
         low, high = centre - stack.width_m / 20, centre + stack.width_m / 20
-    return low, high
-
-
-def _panel_extent(middle: F64, stack: PanelStack, *, plane_m: float) -> tuple[float, float]:
-    """(bottom, top) of the centre panel, seen on the plane, metres."""
-    t = (stack.x_m[1] - plane_m) / (middle[0] - plane_m)
-    half_m = stack.height_m / 2
-    return (-half_m - middle[2] * t) / (1 - t), (half_m - middle[2] * t) / (1 - t)
+    return _Window(low, high, *extent(stack.x_m[1], stack.height_m, 2))
 
 
 @lru_cache(maxsize=8)
@@ -237,7 +224,7 @@ def chain_modes(cells: int) -> tuple[F32, F32, F32, F32]:
 
     The difference A (cells, cells + 1), rows [.. -2 2 ..], is U·diag(s)·V^T; the mean B, rows [.. 1/2 1/2 ..], is
     U·diag(cos)·Ũ^T with cos = sqrt(1 - s²/16): sines and cosines of the same frequencies. Returns V and Ũ
-    (cells + 1, cells + 1), s (cells + 1,) and U^T (cells + 1, cells), float32; the first mode of V is what A can't see.
+    (cells + 1, cells + 1), s (cells + 1,) and U^T (cells + 1, cells), float32; A maps the first mode of V to 0.
     """
     angle = np.pi * np.arange(cells + 1) / (cells + 1)
     size = np.sqrt(2 / (cells + 1))

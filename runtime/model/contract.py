@@ -76,7 +76,7 @@ class Contract(Section):
     height_px: Annotated[int, Field(ge=0, le=16384)] = Field(0, description="fixed input height; 0: any")
     inputs: Annotated[tuple[Port, ...], Field(min_length=1, max_length=32)]
     outputs: Annotated[tuple[Port, ...], Field(min_length=1, max_length=32)]
-    graph_sha256: str = Field("", description="of the file but for its metadata; empty: not told")
+    graph_sha256: str = Field("", description="of the file without its metadata; empty: not stated")
     precision: Literal["fp32", "fp16", "int8"] = "fp32"
     parameters: Annotated[int, Field(ge=0)] = 0
     cell_px: Annotated[int, Field(ge=1, le=64)] = Field(
@@ -84,7 +84,7 @@ class Contract(Section):
     )
     reduction: Literal[1, 2, 4] = Field(2, description="chain: the network's raster is so much coarser than a panel")
     picture_fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
-        0.0, description="horizontal view of the pictures it was trained on, black beside them; 0: whatever is drawn"
+        0.0, description="horizontal view of the pictures it was trained on, black outside them; 0: unlimited"
     )
     steps: Steps = ()
 

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.kernels import MARGIN, MAX_SETS, Image, Panel, Problem, library
+from runtime.kernels import MARGIN, MAX_SETS, KernelImage, Panel, Problem, library
 from runtime.model.buffers import LayerBuffer
 from runtime.model.contract import Step
 from runtime.model.geometry import Geometry, inverse
 from runtime.model.job import Job
 from runtime.model.targets import outside_codes, rest_of, target_table, without_alpha
 from runtime.optics.stack import PanelStack
-from runtime.records import F64, I16, U8
+from runtime.records import F64, I16
 from runtime.support.threads import on_rows, parallel_map
 
 WEIGHT, TAPER = 8191, 32767  # of 1 in targets' weights, and in tapers
@@ -89,29 +89,25 @@ class CpuState:
         if outside is None:
             buffer.outside = None
         elif buffer.outside != (key := (outside, geometry.boxes, geometry.kept)):
-            self._fill(layers, outside)
+            for n, layer in enumerate(layers):  # whole pixels at a time
+                pixel = np.array([*outside_codes(self._stack.count, n, outside), 255], np.uint8)
+                layer.view(np.uint32)[..., 0] = pixel.view(np.uint32)[0]
             buffer.outside = key
         for n, box in enumerate(geometry.boxes):
             kept = geometry.kept if n == geometry.middle else box
             if not kept.width_px or not kept.height_px:
                 continue
             first = self._held.last[n, kept.v0 - box.v0 :, (kept.u0 - box.u0) * self._channels :]
-            image = Image.of(first, rows=kept.height_px, width=kept.width_px)
+            image = KernelImage.of(first, rows=kept.height_px, width=kept.width_px)
             pixels = layers[n].view(np.uint32)[kept.v0 :, kept.u0 :, 0]
 
-            def show(first: int, end: int, image: Image = image, pixels: NDArray[Any] = pixels) -> None:
+            def show(first: int, end: int, image: KernelImage = image, pixels: NDArray[Any] = pixels) -> None:
                 loops.show(byref(image), self._channels, pixels.ctypes.data, self._stack.width_px, first, end)
 
             on_rows(show, kept.height_px, threads=self._threads)
 
     def close(self) -> None:
         self._buffers = {}
-
-    def _fill(self, layers: U8, outside: int | tuple[int, ...]) -> None:
-        """All panels at rest, the middle one as if all eyes saw one colour; whole pixels at a time."""
-        for n, layer in enumerate(layers):
-            pixel = np.array([*outside_codes(self._stack.count, n, outside), 255], np.uint8).view(np.uint32)[0]
-            layer.view(np.uint32)[..., 0] = pixel
 
     def _rest_others(self) -> None:
         """Set all panels to rest that have not been set."""
@@ -140,7 +136,9 @@ class CpuState:
         )  # fmt: skip
         for n, box in enumerate(geometry.boxes):
             images = ahead[n], held.moved[n], held.last[n], last[n]
-            problem.panel[n] = Panel(*(Image.of(image, rows=box.height_px, width=box.width_px) for image in images))
+            problem.panel[n] = Panel(
+                *(KernelImage.of(image, rows=box.height_px, width=box.width_px) for image in images)
+            )
         return problem, (seen, back, table)
 
 

@@ -85,9 +85,9 @@ class Geometry:
         return tuple(box.cut(self.stack.panel(n)) for n, box in enumerate(self.boxes))
 
     def panels_from_rays(self, places: Places, eye_sigma_m: float) -> F64:
-        """(2P, N, 3, 3) panel pixels (from the box's first) for P eye places, left and right in turn.
+        """(2P, N, 3, 3) panel pixels (from the box's first), P positions of the head, left and right eye alternately.
 
-        Places take turns from row to row of a picture: row k of place p's rays is the picture's row P·k + p.
+        Positions alternate from row to row of a picture: row k of position p's rays is the picture's row P·k + p.
         """
         right, up = stack_from_eye(self.eyes_m.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
         sure = self.rays.height_px == 1 or self._moved_px(eye_sigma_m) < KNOWN_PX
@@ -145,9 +145,7 @@ def geometry_of(
     kept = kept or box
     middle_from_plane = stack.panel(stack.count // 2).raster_from_plane()
     middle_from_pictures = [_snapped(middle_from_plane @ view.plane_from_picture) for view in views]
-    rays = _looked_through(
-        [np.asarray(np.linalg.inv(m), np.float64) for m in middle_from_pictures], kept, views[0].picture.shape
-    )
+    rays = _looked_through(np.asarray(np.linalg.inv(middle_from_pictures), np.float64), kept, views[0].picture.shape)
     first = np.array([[1.0, 0.0, rays.u0], [0.0, 1.0, rays.v0], [0.0, 0.0, 1.0]])
     to_box = np.array([[1.0, 0.0, -box.u0], [0.0, 1.0, -box.v0], [0.0, 0.0, 1.0]])
     middle_from_rays = np.stack([to_box @ matrix @ first for matrix in middle_from_pictures])
@@ -161,7 +159,7 @@ def _snapped(homography: F64) -> F64:
     return whole if np.abs(normalised - whole).max() < SNAPPED else normalised
 
 
-def _looked_through(pictures_from_middle: Sequence[F64], box: PixelRect, shape: tuple[int, ...]) -> PixelRect:
+def _looked_through(pictures_from_middle: F64, box: PixelRect, shape: tuple[int, ...]) -> PixelRect:
     """Pixels of either picture (h, w, ...) that look through a box of the middle panel."""
     height, width = shape[:2]
     corners = np.array([[box.u0, box.u1, box.u0, box.u1], [box.v0, box.v0, box.v1, box.v1], [1.0] * 4])
@@ -207,14 +205,11 @@ def visible_boxes(eyes_m: F64, stack: PanelStack) -> tuple[PixelRect, ...]:
     for x_m in stack.x_m:
         seen = [relative_scale_shift(eye_m, from_x_m=middle_x_m, to_x_m=x_m) for eye_m in eyes_m]
         corners = [corner * scale + shift for scale, shift in seen for corner in (low, high)]
-        boxes.append(_box(np.min(corners, axis=0), np.max(corners, axis=0), stack))
+        (left_m, bottom_m), (right_m, top_m) = np.min(corners, axis=0), np.max(corners, axis=0)
+        u0, u1 = _span(left_m / stack.width_m + 0.5, right_m / stack.width_m + 0.5, stack.width_px)
+        v0, v1 = _span(0.5 - top_m / stack.height_m, 0.5 - bottom_m / stack.height_m, stack.height_px)
+        boxes.append(PixelRect(u0, v0, u1, v1))
     return tuple(boxes)
-
-
-def _box(low_m: F64, high_m: F64, stack: PanelStack) -> PixelRect:
-    u0, u1 = _span(low_m[0] / stack.width_m + 0.5, high_m[0] / stack.width_m + 0.5, stack.width_px)
-    v0, v1 = _span(0.5 - high_m[1] / stack.height_m, 0.5 - low_m[1] / stack.height_m, stack.height_px)
-    return PixelRect(u0, v0, u1, v1)
 
 
 def _span(low: float, high: float, size: int) -> tuple[int, int]:

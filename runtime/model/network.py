@@ -9,10 +9,10 @@ import numpy as np
 
 from runtime.clock import Stopwatch
 from runtime.errors import InputError, ModelFailure
+from runtime.kernels import FULL
 from runtime.model.geometry import Geometry, panel_from_middle
 from runtime.model.job import Job
 from runtime.model.session import ModelSession
-from runtime.model.targets import FULL
 from runtime.model.warp import picture_on, resample
 from runtime.optics.malus import phase_from_intensity
 from runtime.optics.stack import PanelStack
@@ -78,13 +78,8 @@ class PictureProposal:
         panel_from_mid = panel_from_middle(stack, rasters, eye_m, n) if n != middle else np.eye(3)
         fov_deg = self.session.contract.picture_fov_deg
         edge = cv2.BORDER_CONSTANT if fov_deg else cv2.BORDER_REPLICATE
-        picture = picture_on(
-            view,
-            rasters[middle],
-            middle_from_result=np.asarray(np.linalg.inv(panel_from_mid), np.float64),
-            edge=edge,
-            size=size,
-        )
+        mid_from_panel = np.asarray(np.linalg.inv(panel_from_mid), np.float64)
+        picture = picture_on(view, rasters[middle], middle_from_result=mid_from_panel, edge=edge, size=size)
         if not fov_deg:
             return picture
         # A white picture of that view, bilinear: its edge fades over one pixel as it did in training.

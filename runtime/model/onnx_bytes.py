@@ -8,12 +8,16 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 
-MODEL_GRAPH, MODEL_METADATA, MODEL_FUNCTIONS = 7, 14, 25
-GRAPH_NODE, GRAPH_INITIALIZER, GRAPH_SPARSE = 1, 5, 15
-FUNCTION_NODE = 7
-NODE_ATTRIBUTE = 5
-ATTRIBUTE_TENSORS, ATTRIBUTE_GRAPHS, ATTRIBUTE_SPARSE = (5, 10), (6, 11), (22, 23)
-SPARSE_PARTS = (1, 2)
+MODEL_METADATA = 14
+# Messages in which a tensor may be, and the numbers of their fields that hold such messages.
+PARTS: dict[str, dict[int, str]] = {
+    "model": {7: "graph", 25: "function"},
+    "graph": {1: "node", 5: "tensor", 15: "sparse tensor"},
+    "function": {7: "node"},
+    "node": {5: "attribute"},
+    "attribute": {5: "tensor", 10: "tensor", 6: "graph", 11: "graph", 22: "sparse tensor", 23: "sparse tensor"},
+    "sparse tensor": {1: "tensor", 2: "tensor"},
+}
 TENSOR_EXTERNAL, TENSOR_LOCATION = 13, 14
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
 DEEPEST = 32  # graphs within attributes of graphs
@@ -22,7 +26,7 @@ DEEPEST = 32  # graphs within attributes of graphs
 def fields(data: memoryview) -> Iterator[tuple[int, memoryview, memoryview]]:
     """(number, value, the whole field) of a message, in order; a number's value is empty if it is 0.
 
-    Raises ValueError for bytes that are no such message.
+    Raises ValueError for other bytes.
     """
     at = 0
     while at < len(data):
@@ -58,49 +62,21 @@ def digest(data: bytes) -> str:
 
 def has_external_data(data: bytes) -> bool:
     """Return True if a tensor of the model is stored in another file. Raises ValueError."""
-    for number, value, _ in fields(memoryview(data)):
-        if number == MODEL_GRAPH and _graph(value, DEEPEST):
-            return True
-        if number == MODEL_FUNCTIONS:
-            nodes = (part for field, part, _ in fields(value) if field == FUNCTION_NODE)
-            if any(_node(node, DEEPEST) for node in nodes):
-                return True
-    return False
+    return _refers_to_a_file("model", memoryview(data), DEEPEST)
 
 
-def _graph(data: memoryview, depth: int) -> bool:
+def _refers_to_a_file(message: str, data: memoryview, depth: int) -> bool:
+    if message == "tensor":
+        return any(
+            number == TENSOR_EXTERNAL or (number == TENSOR_LOCATION and bytes(value) == b"\x01")
+            for number, value, _ in fields(data)
+        )
     if not depth:
         raise ValueError("nests too deep")
-    for number, value, _ in fields(data):
-        if number == GRAPH_NODE and _node(value, depth):
-            return True
-        if (number == GRAPH_INITIALIZER and _tensor(value)) or (number == GRAPH_SPARSE and _sparse(value)):
-            return True
-    return False
-
-
-def _node(data: memoryview, depth: int) -> bool:
-    for number, attribute, _ in fields(data):
-        if number != NODE_ATTRIBUTE:
-            continue
-        for field, value, _ in fields(attribute):
-            if (
-                (field in ATTRIBUTE_TENSORS and _tensor(value))
-                or (field in ATTRIBUTE_SPARSE and _sparse(value))
-                or (field in ATTRIBUTE_GRAPHS and _graph(value, depth - 1))
-            ):
-                return True
-    return False
-
-
-def _sparse(data: memoryview) -> bool:
-    return any(_tensor(value) for number, value, _ in fields(data) if number in SPARSE_PARTS)
-
-
-def _tensor(data: memoryview) -> bool:
+    parts = PARTS[message]
+    within = ((parts[number], value) for number, value, _ in fields(data) if number in parts)
     return any(
-        number == TENSOR_EXTERNAL or (number == TENSOR_LOCATION and bytes(value) == b"\x01")
-        for number, value, _ in fields(data)
+        _refers_to_a_file(part, value, depth - (message == "attribute" and part == "graph")) for part, value in within
     )
 
 

@@ -16,7 +16,7 @@ from runtime.support.memory import keep_freed_memory
 __all__ = ["SHIPPED", "Prediction", "Predictor", "load_predictor", "model_path"]
 
 SHIPPED = ("fast", "balanced", "best")
-SUMS = "SHA256SUMS"  # of the files beside it, as sha256sum writes and checks them
+SUMS = "SHA256SUMS"  # of the files next to it, in the format of sha256sum
 
 
 def model_path(name: str) -> Path | None:
@@ -59,7 +59,7 @@ def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None 
     keep_freed_memory()
     try:
         library()
-    except ImportError as error:  # told here, not by the first picture
+    except ImportError as error:  # reported now, not at the first picture
         raise MissingPart(str(error)) from None
     settings = settings or ModelSettings()
     path = model_path(name)

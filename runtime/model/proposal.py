@@ -1,7 +1,7 @@
 """Initial outer panels, proposed by a network along the eyes' baseline.
 
-The network sees the difference of both eyes' pictures on a raster of its own (`chain`), on which an eye's parallax is a
-whole number of columns, and answers with both outer panels there.
+The network gets the difference of both eyes' pictures on a separate raster (`chain`), on which an eye's parallax is a
+whole number of columns, and returns both outer panels there.
 """
 
 from __future__ import annotations
@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 
 from runtime.clock import Stopwatch
 from runtime.errors import EyesNotServed, ModelFailure
+from runtime.kernels import FULL
 from runtime.model.chain import ChainFrame, ColumnLaw, chain_frame, chain_modes
 from runtime.model.geometry import Geometry, TargetView, taper
 from runtime.model.job import Job
 from runtime.model.session import ModelSession
-from runtime.model.targets import FULL, phase_codes, rest_of, without_alpha
+from runtime.model.targets import phase_codes, rest_of, without_alpha
 from runtime.model.warp import REACH_PX, warp
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.tilt import coarse_layer_from_seen

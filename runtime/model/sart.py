@@ -14,14 +14,15 @@ from numpy.typing import NDArray
 
 from runtime.clock import Stopwatch
 from runtime.errors import ModelFailure
+from runtime.kernels import FULL
 from runtime.model.base import STAGES, Prediction, Predictor
-from runtime.model.geometry import TargetView, panel_from_middle
+from runtime.model.geometry import panel_from_middle
 from runtime.model.job import Job
-from runtime.model.targets import FULL, target_table
+from runtime.model.targets import target_table
 from runtime.model.warp import picture_on
 from runtime.optics.malus import rest_value
 from runtime.optics.stack import PanelStack
-from runtime.records import F32, F64, U8
+from runtime.records import F32, F64
 
 ITERATIONS = 10
 RELAXATION = 1.7  # of both eyes' mean residual; found by trial, diverges from 2 on
@@ -40,9 +41,13 @@ class SartPredictor(Predictor):
     def solve(self, job: Job, watch: Stopwatch | None = None) -> Prediction:
         watch, stack = watch or Stopwatch(*STAGES), self.stack
         table = np.ascontiguousarray(target_table(stack.count)[:, 0] / np.float32(FULL))
-        targets = [cv2.LUT(np.ascontiguousarray(self._picture(view)[..., :3]), table) for view in job.views]
-        shape, rest = (stack.height_px, stack.width_px, 3), rest_value(stack.count)
-        panels: list[NDArray[np.float32]] = [np.full(shape, rest, np.float32) for _ in range(stack.count)]
+        middle, size, rest = stack.panel(stack.count // 2), (stack.height_px, stack.width_px), rest_value(stack.count)
+        pictures = [
+            picture_on(view, middle, middle_from_result=np.eye(3), edge=cv2.BORDER_REPLICATE, size=size)
+            for view in job.views
+        ]
+        targets = [cv2.LUT(np.ascontiguousarray(picture[..., :3]), table) for picture in pictures]
+        panels: list[NDArray[np.float32]] = [np.full((*size, 3), rest, np.float32) for _ in range(stack.count)]
         forward = [[self._panel_from_middle(eye, n) for n in range(stack.count)] for eye in job.eyes_m]
         back = [[np.linalg.inv(matrix) for matrix in matrices] for matrices in forward]
         share = np.float32(self._relaxation / (2 * stack.count))
@@ -65,12 +70,6 @@ class SartPredictor(Predictor):
             layers[n, ..., :3] = np.rint(panel * 255)
         watch.lap("finish")
         return Prediction(layers, watch.stage_ms, job.savings, self.iterations)
-
-    def _picture(self, view: TargetView) -> U8:
-        """(h, w, 3 or 4) on the middle panel's pixels."""
-        middle, edge = self.stack.panel(self.stack.count // 2), cv2.BORDER_REPLICATE
-        size = self.stack.height_px, self.stack.width_px
-        return picture_on(view, middle, middle_from_result=np.eye(3), edge=edge, size=size)
 
     def _panel_from_middle(self, eye_m: F64, index: int) -> F64:
         """3x3: a layer's pixels from the middle panel's, as an eye sees them in line; OpenCV's pixel centres."""

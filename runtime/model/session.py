@@ -32,7 +32,7 @@ PROVIDERS = {
     "openvino": ("OpenVINOExecutionProvider", "onnxruntime-openvino"),
 }
 RECORD_NODES = "session.record_ep_graph_assignment_info"
-NODES_TOLD = 5
+NODES_LOGGED = 5
 TYPES = {"tensor(float)": np.float32, "tensor(int16)": np.int16}
 NEWER_OPSET = re.compile(r"(Opset) (\d+) is under development.*till opset (\d+)")
 NEWER_IR = re.compile(r"(IR version): (\d+), max supported IR version: (\d+)")
@@ -71,8 +71,9 @@ class ModelSession:
             raise MissingPart(f"model.provider: {provider} is installed and does not start here: {package}, its driver")
         self.provider: str = provider
         self.fell_back = nodes_elsewhere(self._session, name)  # nodes of the graph that another provider runs
-        if self.fell_back:
-            log.warning("provider %s leaves %s to another: %s", provider, *told_nodes(self.fell_back))
+        if count := len(self.fell_back):
+            names = ", ".join((*self.fell_back[:NODES_LOGGED], *(["..."] if count > NODES_LOGGED else [])))
+            log.warning("provider %s leaves %d node%s to another: %s", provider, count, "s" * (count != 1), names)
         self.contract: Contract = parse_contract(metadata, source=path)
         if self.contract.graph_sha256 and self.contract.graph_sha256 != digest(data):
             raise InputError(path, "contract.graph_sha256", "does not fit: the file was changed after its export")
@@ -133,7 +134,7 @@ class ModelSession:
     def check_fits(self, source: Path, feeds: Mapping[str, Shape], answers: Mapping[str, Shape]) -> None:
         """Raise InputError, naming the port, if the graph's inputs and outputs do not have these names and shapes.
 
-        If its declared shapes do not tell, it is run once.
+        If its declared shapes leave sizes open, it is run once.
         """
         is_open = False
         for field, items, shapes in (
@@ -172,12 +173,6 @@ def nodes_elsewhere(session: Any, provider: str) -> tuple[str, ...]:
         if part.ep_name != provider
         for node in part.get_nodes()
     )
-
-
-def told_nodes(names: tuple[str, ...]) -> tuple[str, str]:
-    """Return the number of nodes and the names of the first, for people."""
-    more = ", ..." if len(names) > NODES_TOLD else ""
-    return f"{len(names)} node{'s' * (len(names) != 1)}", ", ".join(names[:NODES_TOLD]) + more
 
 
 def _checked(path: Path, sha256: str) -> bytes:

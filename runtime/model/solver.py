@@ -21,17 +21,9 @@ from runtime.optics.malus import rest_code
 from runtime.optics.stack import PanelStack
 
 _Done = tuple[int, int | None]  # steps in all; those of them that the solution before had, None: it was not continued
-REDUCTIONS = (
-    1,
-    2,
-    3,
-    4,
-)  # rasters that are solved on: the display's own, and with this many times fewer rows and columns
+REDUCTIONS = (1, 2, 3, 4)  # rasters that are solved on, this many times fewer rows and columns than the display's
 REFINED_STEPS = 8  # a solution is continued up to this many steps, as many as `best` has
-REFINING = (
-    Step(size=0.8, places="falling"),
-    Step(size=0.8, places="rising"),
-)  # alternately, after the model's
+REFINING = (Step(size=0.8, places="falling"), Step(size=0.8, places="rising"))  # alternately, after the model's
 
 
 class StepPredictor(Predictor):
@@ -85,35 +77,21 @@ class StepPredictor(Predictor):
             state = self._backend.state(job.stack, threads=self._threads)
             self._rasters[job.stack] = state, LayerPool(job.stack)
         state, pool = self._rasters[job.stack]
-        buffer = pool.take()
-        if job.window is None:
-            done = self._solve_whole(job, state, buffer, watch)
-        elif not job.window.box.width_px:
-            done = self._show_flat(job, state, buffer)
+        buffer, rest, window = pool.take(), rest_code(job.stack.count), job.window
+        done: _Done = 0, None
+        if window is None:  # all that the eyes see; of a network of whole pictures, all that it proposes
+            geometry = job.targets.visible if self.any_raster else job.targets.every_pixel
+            done = self._improve(job, geometry, state, buffer, watch, outside=rest)
         else:
-            done = self._solve_window(job, state, buffer, watch)
+            if window.colour is None or not window.box.width_px:  # both eyes' common picture on the middle panel
+                self._improved = None
+                with state.begin(job, job.targets.visible):
+                    state.close_middle()
+                    state.write(buffer, rest)
+            if window.box.width_px:
+                done = self._improve(job, job.targets.within(window), state, buffer, watch, outside=window.colour)
         watch.lap("finish")
         return Prediction(buffer.handed_over(), watch.stage_ms, job.savings, *done)
-
-    def _solve_whole(self, job: Job, state: SolverState, buffer: LayerBuffer, watch: Stopwatch) -> _Done:
-        """All that the eyes see; of a network of whole pictures, all that it proposes."""
-        geometry = job.targets.visible if self.any_raster else job.targets.every_pixel
-        return self._improve(job, geometry, state, buffer, watch, outside=rest_code(job.stack.count))
-
-    def _show_flat(self, job: Job, state: SolverState, buffer: LayerBuffer) -> _Done:
-        """Both eyes' common picture on the middle panel, in closed form."""
-        self._improved = None
-        with state.begin(job, job.targets.visible):
-            state.close_middle()
-            state.write(buffer, rest_code(job.stack.count))
-        return 0, None
-
-    def _solve_window(self, job: Job, state: SolverState, buffer: LayerBuffer, watch: Stopwatch) -> _Done:
-        """A window within a background of one colour, or within the flat picture."""
-        assert job.window is not None
-        if job.window.colour is None:
-            self._show_flat(job, state, buffer)
-        return self._improve(job, job.targets.within(job.window), state, buffer, watch, outside=job.window.colour)
 
     def _improve(
         self,

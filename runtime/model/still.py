@@ -34,7 +34,7 @@ def solve_still(
     """Layers for pictures (h, w, 3 or 4) of a left and a right eye (2, 3), frame `stack`.
 
     The pictures' horizontal field of view is `fov_deg`; each eye looks at the stack's origin. The solver looks along
-    their pixels' own rays. trimmed: leave out what the pictures do not need, if the model can (`trim`).
+    their pixels' own rays. trimmed: skip work that the pictures do not need, if the model can (`trim`).
     """
     watch = Stopwatch(*STAGES)
     pictures = [np.ascontiguousarray(picture[..., :3]) for picture in (left, right)]

@@ -7,12 +7,11 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
+from runtime.kernels import FULL, SUBCODE
 from runtime.optics.malus import Branch, phase_from_intensity, rest_code, rest_value
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, I16, U8
 
-SUBCODE = 16  # fixed point: sixteenths of an 8-bit panel code
-FULL = 255 * SUBCODE  # one panel's whole range, a quarter turn
 SLOPE_FLOOR = 0.25  # least weight of a ray, relative to the steepest slope of sin²
 COARSE_STEP = 16  # pixels between samples of the quick look that recognises most coloured pictures
 

@@ -2,7 +2,7 @@
 
 Panels that are cut to a window and moved to its centre are a smaller stack, seen by eyes moved the same way. Where the
 eyes agree, the outer panels rest at mid-range, and the centre panel carries the picture. The outer panels' drive is
-tapered towards the window's edge (`Geometry.tapers`), so that there is no seam.
+tapered towards the window's edge (`Geometry.tapers`), which avoids a seam.
 """
 
 from __future__ import annotations
@@ -158,15 +158,8 @@ def coarse_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES) -> Pixe
     It decides whether the window would be too much of the panel to be worth cutting out.
     """
     few = [np.ascontiguousarray(picture[::COARSE_STEP, ::COARSE_STEP]) for picture in (left, right)]
-    box = _box(few[0], few[1], tolerance)
-    if not box.width_px:
-        return box
-    return PixelRect(
-        box.u0 * COARSE_STEP,
-        box.v0 * COARSE_STEP,
-        (box.u1 - 1) * COARSE_STEP + 1,
-        (box.v1 - 1) * COARSE_STEP + 1,
-    )
+    u0, v0, u1, v1 = (COARSE_STEP * corner for corner in _box(few[0], few[1], tolerance).corners)
+    return PixelRect(u0, v0, u1 - COARSE_STEP + 1, v1 - COARSE_STEP + 1) if u1 > u0 else NOWHERE
 
 
 def _box(left: U8, right: U8, tolerance: int) -> PixelRect:
@@ -181,11 +174,7 @@ def parallax_margin_px(eyes_m: F64, stack: PanelStack) -> F64:
 
     To first order, as at the window's centre. eyes_m: (2, 3) left, right; frame `stack`.
     """
-    middle = stack.x_m[stack.count // 2]
-    gaps_m = np.array(stack.x_m) - middle
-    per_metre = np.array([stack.width_px / stack.width_m, -stack.height_px / stack.height_m])
-    parallax: F64 = eyes_m[:, None, 1:] * (gaps_m[None, :, None] / (eyes_m[:, None, :1] - middle)) * per_metre
-    return parallax
+    return np.asarray(_eyes_px(eyes_m, stack)[:, None] * _weights(eyes_m, stack)[..., None], np.float64)
 
 
 def steepness(codes: U8) -> float:
@@ -217,21 +206,6 @@ def taper_px(eyes_m: F64, stack: PanelStack, *, parallaxes: float) -> tuple[floa
     return float(across), float(down)
 
 
-def room_px(
-    low: float, high: float, parallax: F64, *, eyes_px: F64, weights: F64, parallaxes: float
-) -> tuple[float, float]:
-    """Along one axis: margins before and after a difference from `low` to `high`.
-
-    Pixels from the centre of the panel. parallax: (2, N), one axis of `parallax_margin_px`; eyes_px: (2,) the eyes'
-    positions on this axis; weights: (2, N) position of each panel along the ray from the centre panel to the eye;
-    parallaxes: see `taper_parallaxes`.
-    """
-    before = (weights * (low - eyes_px[:, None])).max()
-    after = (weights * (eyes_px[:, None] - high)).max()
-    room = parallaxes * float(np.abs(parallax[0] - parallax[1]).max()) + MARGIN_PX
-    return PANEL_CROSSINGS * max(float(before), 0.0) + room, PANEL_CROSSINGS * max(float(after), 0.0) + room
-
-
 def whole_rays(box: PixelRect, eyes_m: F64, stack: PanelStack) -> PixelRect:
     """The part of a window in which no eye's ray leaves it on another panel; up to the panels' own edges.
 
@@ -252,16 +226,14 @@ def whole_rays(box: PixelRect, eyes_m: F64, stack: PanelStack) -> PixelRect:
 
 
 def _weights(eyes_m: F64, stack: PanelStack) -> F64:
-    """(2, N): how far along its ray from the centre panel to an eye each panel lies; 1 is the eye."""
-    middle = stack.x_m[stack.count // 2]
-    weights: F64 = (np.array(stack.x_m) - middle)[None] / (eyes_m[:, :1] - middle)
-    return weights
+    """(2, N) each panel's position along an eye's ray, from 0 at the centre panel to 1 at the eye."""
+    middle_m = stack.x_m[stack.count // 2]
+    return np.asarray((np.array(stack.x_m) - middle_m) / (eyes_m[:, :1] - middle_m), np.float64)
 
 
 def _eyes_px(eyes_m: F64, stack: PanelStack) -> F64:
-    """(2, 2): the eyes' places in panel pixels from the panel's centre, columns and rows."""
-    places: F64 = eyes_m[:, 1:] * np.array([stack.width_px / stack.width_m, -stack.height_px / stack.height_m])
-    return places
+    """(2, 2) the eyes' positions in panel pixels from the panel's centre, columns and rows."""
+    return np.asarray(eyes_m[:, 1:] * (stack.width_px / stack.width_m, -stack.height_px / stack.height_m), np.float64)
 
 
 def window_around(box: PixelRect, eyes_m: F64, stack: PanelStack, *, parallaxes: float) -> PixelRect | None:
@@ -272,23 +244,18 @@ def window_around(box: PixelRect, eyes_m: F64, stack: PanelStack, *, parallaxes:
     parallax, weights, eyes_px = parallax_margin_px(eyes_m, stack), _weights(eyes_m, stack), _eyes_px(eyes_m, stack)
     spans: list[tuple[int, int]] = []
     for axis, (start, end, whole) in enumerate(((box.u0, box.u1, stack.width_px), (box.v0, box.v1, stack.height_px))):
-        before, after = room_px(
-            start - whole / 2,
-            end - whole / 2,
-            parallax[..., axis],
-            eyes_px=eyes_px[:, axis],
-            weights=weights,
-            parallaxes=parallaxes,
-        )
-        low, high = max(start - before, 0.0), min(end + after, float(whole))
+        eyes = eyes_px[:, axis, None]  # from the panel's centre, as both ends of the difference here
+        before, after = (weights * (start - whole / 2 - eyes)).max(), (weights * (eyes - (end - whole / 2))).max()
+        room = parallaxes * float(np.abs(parallax[0, :, axis] - parallax[1, :, axis]).max()) + MARGIN_PX
+        low = max(start - (PANEL_CROSSINGS * max(float(before), 0.0) + room), 0.0)
+        high = min(end + (PANEL_CROSSINGS * max(float(after), 0.0) + room), float(whole))
         step = whole / WINDOW_SHARES
         size = min(int(np.ceil(np.ceil((high - low) / step) * step / 8) * 8), whole)
         first = int(np.clip(np.floor((low + high - size) / 2), 0, whole - size))
         spans.append((first, first + size))
     (u0, u1), (v0, v1) = spans
-    if (u1 - u0) * (v1 - v0) > MAX_SHARE * stack.width_px * stack.height_px:
-        return None
-    return PixelRect(u0, v0, u1, v1)
+    too_large = (u1 - u0) * (v1 - v0) > MAX_SHARE * stack.width_px * stack.height_px
+    return None if too_large else PixelRect(u0, v0, u1, v1)
 
 
 def still_fits(held: PixelRect, new: PixelRect) -> bool:

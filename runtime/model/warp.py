@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.kernels import MARGIN, Image, Warp, library
+from runtime.kernels import EDGE_PX, MARGIN, KernelImage, Warp, library
 from runtime.model.chain import EVEN_COLUMNS, ColumnLaw
 from runtime.model.geometry import SNAPPED, TargetView
 from runtime.optics.stack import PlaneRaster
@@ -18,7 +18,7 @@ from runtime.records import F64, I16, U8
 from runtime.support.threads import on_rows
 
 LEAST_PX, MIN_SCALE = 16, 0.25  # of a picture: smaller ones and finer rasters add no information
-REACH_PX = 3.0  # most pixels by which an image's edge is extended: less than the loop's EDGE_PX
+REACH_PX = EDGE_PX - 1.0  # most pixels by which an image's edge is extended
 LARGEST = 8191  # of an element that the compiled loop samples, either way
 _TRANSPOSED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
@@ -100,22 +100,14 @@ def warp(
         image, image_from_result, turned = np.swapaxes(image, 0, 1), _TRANSPOSED @ image_from_result, False
     elif turned:
         image_from_result, size = image_from_result @ _TRANSPOSED, size[::-1]
-    source = _with_margin(image.shape)
+    elements = prod(image.shape)
+    source: I16 = np.empty(elements + MARGIN, np.int16)[:elements].reshape(image.shape)
     np.clip(image, -LARGEST, LARGEST, out=source)
     result = np.empty((*size, *image.shape[2:]), np.int16)
     channels = result.shape[2] if result.ndim == 3 else 1
     laws = image_columns.bend, image_columns.middle, result_columns.bend, result_columns.middle
     by = Warp((c_double * 9)(*image_from_result.ravel()), *laws, reach_px)
-    images = [Image.of(x.reshape(len(x), -1), rows=x.shape[0], width=x.shape[1]) for x in (source, result)]
-    loops = library()
-    on_rows(
-        lambda first, end: loops.warp(*map(byref, (*images, by)), channels, outside, first, end),
-        size[0],
-        threads=threads,
-    )
+    images = [KernelImage.of(x.reshape(len(x), -1), rows=x.shape[0], width=x.shape[1]) for x in (source, result)]
+    loops, arguments = library(), [byref(argument) for argument in (*images, by)]
+    on_rows(lambda first, end: loops.warp(*arguments, channels, outside, first, end), size[0], threads=threads)
     return np.ascontiguousarray(np.swapaxes(result, 0, 1)) if turned else result
-
-
-def _with_margin(shape: tuple[int, ...]) -> I16:
-    """An empty array, behind whose end compiled loops may look."""
-    return np.empty(prod(shape) + MARGIN, np.int16)[: prod(shape)].reshape(shape)

@@ -28,7 +28,6 @@ from runtime.optics.views import stack_from_eye
 from runtime.records import F32, F64, U8
 
 RINGS = 9  # of points of the pupil, one for each ray: 271 are as good as a disc
-TABLE = 16  # entries a code value in the table of intensity, for bilinear rays
 
 
 class Sampling(NamedTuple):
@@ -75,7 +74,7 @@ def squared_errors(
     cores, step = len(os.sched_getaffinity(0)), sampling.step
     parts = -(-min(len(target) for target in targets) // step) if sampling.groups else 4 * cores
     codes = np.ascontiguousarray(layers)
-    fine = 1 if sampling.rays else TABLE
+    fine = 1 if sampling.rays else kernels.TABLE_STEPS
     table = intensity_from_phase(np.arange(255 * fine * stack.count + 1, dtype=np.float32) / np.float32(255 * fine))
     calls = []
     for side, (nominal, true, target) in enumerate(zip(solved_for_m, eyes_m, targets, strict=True)):
@@ -107,14 +106,14 @@ def _squared_error(
     matrices = [
         np.ascontiguousarray(x, np.float64) for x in (view.centre_from_image, view.panels_from_centre, view.toward)
     ]
-    view_arrays = kernels.View(
+    view_arrays = kernels.KernelView(
         layers=codes.ctypes.data, panels=count, height=height, width=width, components=components,
         target=target.ctypes.data, rows=target.shape[0], columns=target.shape[1],
         centre_from_image=matrices[0].ctypes.data, panels_from_centre=matrices[1].ctypes.data,
         toward=matrices[2].ctypes.data, table=table.ctypes.data, first_ray=view.first_ray,
         points=len(view.panels_from_centre), rays=sampling.rays, step=sampling.step,
     )  # fmt: skip
-    result = kernels.Result()
+    result = kernels.ErrorSum()
     kernels.library().squared_error(byref(view_arrays), first, last, byref(result))
     return result.total, result.counted
 

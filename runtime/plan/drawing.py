@@ -118,7 +118,7 @@ def _picture(predictor: Predictor, content: ContentSource, view: View, *, time_n
         picture = content.draw(view, time_ns=time_ns)
     except PhasestackError:
         raise
-    except Exception as error:  # a lost context answers with whatever moderngl has at hand
+    except Exception as error:  # moderngl raises various exceptions for a lost context
         raise ContextLost(f"OpenGL: {error}") from error
     if picture is None:
         return content.render(view, time_ns=time_ns)

@@ -2,41 +2,52 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 
+from runtime.config import load_settings, with_options
 from runtime.content.base import ContentSource
+from runtime.content.registry import open_content
+from runtime.errors import InputError
 from runtime.evaluation.displayed import displayed
 from runtime.evaluation.trials import timed_in_turn
+from runtime.model.backends import choose
 from runtime.model.job import Job
-from runtime.model.predictor import Predictor
+from runtime.model.predictor import Predictor, load_predictor
+from runtime.optics.retina import seen_by
+from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import drawn_job, retina_pictures
-from runtime.plan.savings import Measured, Saving
+from runtime.plan.savings import Measured, Saving, make_plan
 from runtime.records import F64, U8
+from runtime.support.gl import offscreen_context
 from runtime.support.progress import tell
 
+MIDDLE_M = (0.6, 0.0, 0.05)
+HALF_IPD_M = 0.031
 REPEATS = 5
 MAX_DRIFT_M = 0.001  # of a resting head, before its picture is renewed (`eyes.rest`)
 
 
-@dataclass(frozen=True, slots=True)
-class TrialResult:
-    """One way of making the layers."""
+class TrialResult(NamedTuple):
+    """One way of making the layers: time of the median frame, drawing included, and quality."""
 
-    layers: U8
-    times_ms: tuple[float, ...]  # render and solve, frame by frame
+    frame_ms: float
     psnr_db: float
 
-    @property
-    def frame_ms(self) -> float:
-        """Time of the median frame."""
-        return float(np.median(self.times_ms))
+    def saving_over(self, other: TrialResult) -> Saving:
+        """Compare with a way that saves less."""
+        return Saving(other.frame_ms - self.frame_ms, other.psnr_db - self.psnr_db)
 
 
-@dataclass(frozen=True, slots=True)
-class Measurement:
+class Measurement(NamedTuple):
     """A scene with the plan and without, alternately."""
 
     numbers: Measured
@@ -46,6 +57,7 @@ class Measurement:
 
 def measure(predictor: Predictor, content: ContentSource, eyes_m: F64, *, fov_deg: float) -> Measurement:
     """Each saving with and without, for eyes (2, 3)."""
+    stack = predictor.stack
 
     def psnr_db(layers: U8, at_m: F64) -> float:
         targets = retina_pictures(content, at_m, stack, fov_deg=fov_deg, time_ns=0)
@@ -53,42 +65,90 @@ def measure(predictor: Predictor, content: ContentSource, eyes_m: F64, *, fov_de
 
     count = 0
 
-    def frames(made: Callable[[], Job]) -> Callable[[], U8]:
-        def solved() -> U8:
-            nonlocal count
-            tell("measuring solutions with and without the plan", count, len(ways) * (REPEATS + 1))
-            count += 1
-            return predictor.solve(made()).layers
+    def layers_of(job: Callable[[], Job]) -> U8:
+        nonlocal count
+        tell("measuring solutions with and without the plan", count, len(ways) * (REPEATS + 1))
+        count += 1
+        return predictor.solve(job()).layers
 
-        return solved
-
-    stack = predictor.stack
-    job = drawn_job(predictor, content, eyes_m, time_ns=0, trimmed=True)
-    left_out = job.savings
-    ways: Mapping[str, Callable[[], Job]] = {
+    left_out = drawn_job(predictor, content, eyes_m, time_ns=0, trimmed=True).savings
+    ways: dict[str, Callable[[], Job]] = {
         "without": lambda: drawn_job(predictor, content, eyes_m, time_ns=0),
         "one channel": lambda: replace(drawn_job(predictor, content, eyes_m, time_ns=0), channels=left_out.channels),
         "with": lambda: drawn_job(predictor, content, eyes_m, time_ns=0, trimmed=True),
     }
     if left_out.channels == 3:
-        ways = {name: way for name, way in ways.items() if name != "one channel"}
-    calls = {name: frames(way) for name, way in ways.items()}
-    done = {
-        name: TrialResult(way.answer, way.times_ms, psnr_db(way.answer, eyes_m))
-        for name, way in timed_in_turn(calls, runs=REPEATS).items()
-    }
+        del ways["one channel"]
+    timed = timed_in_turn({name: partial(layers_of, way) for name, way in ways.items()}, runs=REPEATS)
     tell("", 0)
+    done = {
+        name: TrialResult(float(np.median(way.times_ms)), psnr_db(way.answer, eyes_m)) for name, way in timed.items()
+    }
     without, with_plan = done["without"], done["with"]
     between = done.get("one channel", without)
-    drifted_db = psnr_db(with_plan.layers, eyes_m + np.array([0.0, MAX_DRIFT_M, 0.0]))
+    drifted_db = psnr_db(timed["with"].answer, eyes_m + np.array([0.0, MAX_DRIFT_M, 0.0]))
     numbers = Measured(
         reuse=Saving(with_plan.frame_ms, with_plan.psnr_db - drifted_db),
-        focus=_saving(between, with_plan),
-        one_channel=_saving(without, between),
+        focus=with_plan.saving_over(between),
+        one_channel=between.saving_over(without),
         left_out=left_out,
     )
     return Measurement(numbers, with_plan, without)
 
 
-def _saving(without: TrialResult, with_it: TrialResult) -> Saving:
-    return Saving(without.frame_ms - with_it.frame_ms, without.psnr_db - with_it.psnr_db)
+def plan_for(config: Path | None, *, scene: str | None, model: str | None, scale: float) -> dict[str, Any]:
+    """Measure and plan one scene; everything that `phasestack plan` prints. Raises PhasestackError."""
+    settings = with_options(load_settings(config), scene=scene, model=model)
+    cv2.setNumThreads(settings.model.threads or -1)
+    stack = settings.stack.stack()
+    stack = replace(
+        stack, width_px=max(16, round(stack.width_px * scale)), height_px=max(16, round(stack.height_px * scale))
+    )
+    middle, half = np.array(MIDDLE_M), np.array([0.0, HALF_IPD_M, 0.0])
+    eyes_m = np.array(settings.sensor.fixed_eyes_m or [middle - half, middle + half])
+    _check_viewer(eyes_m, stack, fov_deg=settings.content.fov_deg)
+    with ExitStack() as cleanup:
+        context = offscreen_context()
+        cleanup.callback(context.release)
+        content = open_content(settings.content, stack, context)
+        cleanup.callback(content.close)
+        predictor = load_predictor(settings.model.name, stack, settings.model)
+        backend = choose(settings.model.backend, predictor, lambda: context).backend
+        cleanup.callback(backend.close)
+        cleanup.callback(predictor.close)  # before its backend
+        predictor.set_backend(backend)
+        measured = measure(predictor, content, eyes_m, fov_deg=settings.content.fov_deg)
+        numbers = measured.numbers
+        planned = make_plan(content.info, settings, eyes_m=eyes_m, measured=numbers, loaded_modules=sys.modules)
+        reused = settings.plan.enabled and not content.info.moving
+        drift_db = numbers.reuse.costs_db if reused else None
+        return {
+            "scene": content.info.name,
+            "model": predictor.name,
+            "backend": predictor.backend,
+            "width_px": stack.width_px,
+            "height_px": stack.height_px,
+            "plan": [asdict(item) for item in planned.items],
+            "active_fraction": round(numbers.left_out.solved_share, 4),
+            "channels": numbers.left_out.channels,
+            "frame_ms": round(measured.with_plan.frame_ms, 2),
+            "frame_ms_without": round(measured.without.frame_ms, 2),
+            "psnr_db": round(measured.with_plan.psnr_db, 3),
+            "psnr_db_without": round(measured.without.psnr_db, 3),
+            "drift_mm": round(1000 * MAX_DRIFT_M, 3),
+            "psnr_db_drifted": None if drift_db is None else round(measured.with_plan.psnr_db - drift_db, 3),
+        }
+
+
+def _check_viewer(eyes_m: F64, stack: PanelStack, *, fov_deg: float) -> None:
+    """Raise InputError for eyes (2, 3) from which no part of the display is visible."""
+    nearest_m = float(eyes_m[:, 0].min())
+    if nearest_m <= max(stack.x_m):
+        raise InputError(
+            "sensor.fixed_eyes_m", "", f"x = {nearest_m:g} m : not in front of the panels (x > {max(stack.x_m):g} m)"
+        )
+    # A coarse raster gives the same answer.
+    coarse = replace(stack, width_px=64, height_px=36)
+    blank = np.zeros((stack.count, coarse.height_px, coarse.width_px, 3), np.uint8)
+    if not any(seen_by(eye_m, blank, coarse, fov_deg=fov_deg).mask.any() for eye_m in eyes_m):
+        raise InputError("sensor.fixed_eyes_m", "", "no part of the display is visible from there")

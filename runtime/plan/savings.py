@@ -117,27 +117,20 @@ def make_plan(
 
 def network_items(info: ContentInfo, numbers: Measured) -> list[PlanItem]:
     """Plan items for the savings of the model."""
-    items = _focus_items(info, numbers)
+    items, share = [], numbers.left_out.solved_share
+    if info.flat_x_m is not None and share == 0.0:
+        why = "everything lies in the centre panel's plane: both eyes see the same"
+        items.append(_item("inference", why, numbers.focus))
+    elif share < 1.0:
+        why = f"the two eyes differ on {share:.0%} of the panel; the rest is filled in closed form"
+        items.append(_item("inference outside the active window", why, numbers.focus))
     if numbers.left_out.channels == 1:
         why = "the pictures are grey: one channel is solved for all three"
         items.append(_item("two of three colour channels", why, numbers.one_channel))
     return items
 
 
-def _focus_items(info: ContentInfo, numbers: Measured) -> list[PlanItem]:
-    if info.flat_x_m is not None and numbers.left_out.solved_share == 0.0:
-        why = "everything lies in the centre panel's plane: both eyes see the same"
-        return [_item("inference", why, numbers.focus)]
-    share = numbers.left_out.solved_share
-    if share < 1.0:
-        why = f"the two eyes differ on {share:.0%} of the panel; the rest is filled in closed form"
-        return [_item("inference beside the active window", why, numbers.focus)]
-    return []
-
-
 def _item(what: str, why: str, saving: Saving) -> PlanItem:
-    return PlanItem(what, why, _rounded(saving.saves_ms, 2), _rounded(saving.costs_db, 3))
-
-
-def _rounded(number: float | None, digits: int) -> float | None:
-    return None if number is None else round(number, digits)
+    saves_ms, costs_db = saving.saves_ms, saving.costs_db
+    rounded_ms = None if saves_ms is None else round(saves_ms, 2)
+    return PlanItem(what, why, rounded_ms, None if costs_db is None else round(costs_db, 3))

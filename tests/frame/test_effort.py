@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from runtime.frame.effort import (
     BLUR_M,
+    FIRST_DETAIL,
     KEPT_SOLUTIONS,
     CostBook,
     Costs,
@@ -21,10 +22,10 @@ from runtime.frame.effort import (
     candidates,
     simulated_costs,
 )
+from runtime.model.solver import REDUCTIONS
 from runtime.records import Effort, Measures
 
 STAGE_MS = {"render": 44.0, "prepare": 40.0, "inference": 31.0, "finish": 38.0, "step": 85.0}
-REDUCTIONS = (1, 2, 3, 4)
 PERIOD_MS = 1000 / 60
 
 
@@ -37,6 +38,12 @@ def chosen(speed_m_s: float, *, sigma_m: float = 5e-4, slower: float = 1.0, show
         shown_error=shown_error,
         period_ms=PERIOD_MS,
     )
+
+
+def test_every_raster_has_a_first_estimate_of_its_lost_detail() -> None:
+    """Without one it counts as sharp as the display's own, and is chosen for every head that moves."""
+    assert tuple(FIRST_DETAIL) == REDUCTIONS
+    assert list(FIRST_DETAIL.values()) == sorted(FIRST_DETAIL.values())
 
 
 def test_costs_of_the_simulated_clock_follow_the_contract() -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from runtime.model.targets import FULL, SUBCODE, flat_layers, phase_codes
+from runtime.kernels import FULL, SUBCODE
+from runtime.model.targets import flat_layers, phase_codes
 from runtime.optics.malus import intensity_from_phase, rest_value
 from runtime.optics.stack import PanelStack
 

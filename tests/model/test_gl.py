@@ -14,8 +14,7 @@ from runtime.config import ModelSettings
 from runtime.errors import ContextLost, InputError, MissingPart
 from runtime.evaluation.displayed import displayed, expected_quality
 from runtime.model.backends import choose
-from runtime.model.gl.backend import GlBackend
-from runtime.model.gl.state import GlState
+from runtime.model.gl.state import GlBackend, GlState
 from runtime.model.job import Job, SolveWindow, Targets, drawn_job
 from runtime.model.predictor import SHIPPED, Predictor, load_predictor
 from runtime.model.solver import StepPredictor

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 from dataclasses import replace
 from typing import Any
 
@@ -12,16 +11,15 @@ import pytest
 import torch
 
 from model_export.light import Views, step
-from runtime import kernels
 from runtime.config import ModelSettings
-from runtime.errors import MissingPart
+from runtime.kernels import FULL, SUBCODE
 from runtime.model.contract import Places, Step
 from runtime.model.cpu import CpuState
 from runtime.model.job import Job, Targets, drawn_job, drawn_views
 from runtime.model.predictor import load_predictor, steps_from_even
 from runtime.model.solver import StepPredictor
 from runtime.model.still import captured_views, solve_still
-from runtime.model.targets import FULL, SUBCODE, rest_of, target_table
+from runtime.model.targets import rest_of, target_table
 from runtime.optics.carried import expected_psnrs_db
 from runtime.optics.stack import PanelStack, Tilt
 from runtime.records import F64, U8
@@ -227,15 +225,3 @@ def test_no_seam_is_seen_along_a_picture_s_edge(code: int, sigma_mm: float) -> N
     predictor.close()
     light = expected_psnrs_db(layers, pictures, STACK, eyes_m=pair, fov_deg=FOV_DEG, sigmas_mm=(0.0,))
     assert light[0.0] > 60  # 40 to 46 where what lies a pixel beyond the edge rests at mid-grey
-
-
-def test_kernels_of_another_layout_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Longer(kernels.View):
-        _fields_ = (("more", ctypes.c_double),)
-
-    monkeypatch.setattr(kernels, "View", Longer)
-    kernels.library.cache_clear()
-    with pytest.raises(MissingPart, match="is of another version"):
-        load_predictor("sart", STACK)
-    monkeypatch.undo()
-    kernels.library()

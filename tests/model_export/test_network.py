@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
-from model_export.network import BOX, FULL, SpectralSolver, _by_rows  # noqa: E402
+from model_export.network import BOX, SpectralSolver, _by_rows  # noqa: E402
+from runtime.kernels import FULL  # noqa: E402
 from runtime.model.chain import chain_modes  # noqa: E402
 from runtime.model.predictor import SHIPPED, model_path  # noqa: E402
 from runtime.records import F64  # noqa: E402

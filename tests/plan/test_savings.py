@@ -29,13 +29,13 @@ def test_a_still_scene_is_presented_again_and_a_moving_one_is_not() -> None:
 
 def test_numbers_are_those_that_were_measured() -> None:
     plan = planned(measured=Measured(focus=Saving(30.0, 0.05), left_out=Savings(0.12)))
-    (item,) = [item for item in plan.items if item.what == "inference beside the active window"]
+    (item,) = [item for item in plan.items if item.what == "inference outside the active window"]
     assert (item.saves_ms, item.costs_db) == (30.0, 0.05)
     assert "12%" in item.why
 
 
 def test_a_whole_active_panel_saves_nothing_and_claims_nothing() -> None:
-    assert not any("inference beside" in name for name in names(planned(measured=Measured())))
+    assert not any("inference outside" in name for name in names(planned(measured=Measured())))
 
 
 def test_flat_content_needs_no_network() -> None:

@@ -47,7 +47,7 @@ def test_the_window_is_solved_alone_and_costs_little(tmp_path: Path, model: str)
     pictures(tmp_path, grey=False)
     planned = solved(tmp_path, model=model)
     (item,) = planned["plan"]
-    assert item["what"] == "inference beside the active window"
+    assert item["what"] == "inference outside the active window"
     plain = solved(tmp_path, "--no-plan", model=model)
     assert plain["plan"] == []
     assert plain["psnr_db"] - planned["psnr_db"] < 0.8  # steps beside the window
@@ -56,7 +56,7 @@ def test_the_window_is_solved_alone_and_costs_little(tmp_path: Path, model: str)
 def test_grey_pictures_are_solved_in_one_channel(tmp_path: Path) -> None:
     pictures(tmp_path, grey=True)
     assert {item["what"] for item in solved(tmp_path)["plan"]} == {
-        "inference beside the active window",
+        "inference outside the active window",
         "two of three colour channels",
     }
 

@@ -12,10 +12,12 @@ from typing import Any
 import moderngl
 
 from runtime.errors import ContextLost, PhasestackError
+from runtime.kernels import EDGE_CLAMP_PX, FULL
 from runtime.support.background import raise_if_abandoned
 
 INCLUDE = re.compile(r'^#include "([a-z_]+\.glsl)"$', re.MULTILINE)
 SHADERS = "runtime.model.gl"
+CONSTANTS = f"FULL {FULL:.1f}", f"EDGE_CLAMP_PX {EDGE_CLAMP_PX:.1f}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +40,7 @@ def source(name: str, *, defines: Sequence[str] = ()) -> str:
         return (resources.files(SHADERS) / "shaders" / file).read_text(encoding="ascii")
 
     first, _, rest = INCLUDE.sub(lambda found: read(found[1]), read(name)).partition("\n")
-    return "\n".join((first, *(f"#define {one}" for one in defines), rest))
+    return "\n".join((first, *(f"#define {one}" for one in (*CONSTANTS, *defines)), rest))
 
 
 class Passes:
@@ -59,7 +61,7 @@ class Passes:
             fault = self.context.error
         except PhasestackError:
             raise
-        except Exception as error:  # a lost context answers with whatever moderngl has at hand
+        except Exception as error:  # moderngl raises various exceptions for a lost context
             raise ContextLost(f"OpenGL: {error}") from error
         if fault != "GL_NO_ERROR":
             raise ContextLost(f"OpenGL: {fault}")
@@ -83,7 +85,8 @@ class Passes:
         for unit, (key, image) in enumerate(inputs.items()):
             image.texture.use(unit)
             self._set(program, held, key, unit)
-        for key, value in uniforms.items():
+        origin = (0.0, 0.0) if at is None else (float(at[0]), float(at[1]))
+        for key, value in {**uniforms, "origin": origin}.items():
             self._set(program, held, key, value)
         target = self.target(outputs)
         target.viewport = at or (0, 0, *outputs[0].size)

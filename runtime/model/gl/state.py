@@ -6,9 +6,8 @@ draws into: one component where there is one channel, else four, of which one is
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -16,12 +15,13 @@ import moderngl
 import numpy as np
 
 from runtime.errors import InputError
+from runtime.kernels import FULL
 from runtime.model.buffers import LayerBuffer
 from runtime.model.contract import Step
 from runtime.model.geometry import Geometry, TargetView, inverse
 from runtime.model.gl.programs import Image, Passes
 from runtime.model.job import Job
-from runtime.model.targets import FULL, outside_codes, rest_of, target_table
+from runtime.model.targets import outside_codes, rest_of, target_table
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, I16
 from runtime.support.gl import DrawnPicture, finish
@@ -29,12 +29,22 @@ from runtime.support.gl import DrawnPicture, finish
 PANELS, MIDDLE = 3, 1
 
 
-@dataclass(frozen=True, slots=True)
-class _Target:
-    """One eye's target, in a texture."""
+class GlBackend:
+    """OpenGL as a backend: one context, whose programs all models on it share. Used on the thread of that context."""
 
-    image: Image
-    first: tuple[int, int]  # its column and row that belong to the first ray
+    name = "gl"
+
+    def __init__(self, context: Any, stack: PanelStack) -> None:
+        """context: released by its maker. Raises InputError where a panel is too large for the driver."""
+        check_size(context, stack)
+        self.context, self.passes = context, Passes(context)
+
+    def state(self, stack: PanelStack, *, threads: int) -> GlState:
+        return GlState(self.passes, stack)
+
+    def close(self) -> None:
+        with suppress(Exception):  # a lost context has nothing to release
+            self.passes.release()
 
 
 class GlState:
@@ -77,11 +87,11 @@ class GlState:
         for side in (0, 1):
             weight, residual = (self._rays(f"{name}{side}") for name in ("weight", "residual"))
             weights = {"rest": 0.5, "missing": self._geometry.missing_weight}
-            targets = {"targets": self._targets[side].image}
+            targets = {"targets": self._targets[side][0]}
             uniforms = {**self._through(seen[side], side), **weights}
-            self._draw("residual", (weight, residual), {**inputs, **targets}, uniforms)
+            self._passes.draw("residual", (weight, residual), {**inputs, **targets}, uniforms)
             gathered |= {f"weight{side}": weight, f"residual{side}": residual}
-        self._draw("fill", (self._panel("spare", MIDDLE),), gathered, self._back(back[:, MIDDLE]))
+        self._passes.draw("fill", (self._panel("spare", MIDDLE),), gathered, self._back(back[:, MIDDLE]))
         self._swap("last", "spare", MIDDLE)
 
     def start(self) -> None:
@@ -95,9 +105,9 @@ class GlState:
         fields: dict[str, Image] = {}
         for number, matrices in enumerate(seen):
             drawn = {f"{name}{number}": self._rays(f"{name} {number}", places) for name in ("curvature", "gradient")}
-            inputs = {**ahead, "targets": self._targets[number % 2].image, **tapers}
+            inputs = {**ahead, "targets": self._targets[number % 2][0], **tapers}
             uniforms = {**self._through(matrices, number % 2), "turn": (places, number // 2)}
-            self._draw("compare", tuple(drawn.values()), inputs, uniforms)
+            self._passes.draw("compare", tuple(drawn.values()), inputs, uniforms)
             fields |= drawn
         update = {
             "size": step.size / (PANELS * np.pi / 2), "momentum": step.momentum, "least": step.floor * len(seen),
@@ -106,7 +116,7 @@ class GlState:
             inputs = {"ahead": ahead[f"ahead{n}"], "last": self._panel("last", n), **fields}
             outputs = self._panel("moved", n), self._panel("spare", n)
             defines = {1: (), 2: ("FOUR_SETS",)}[places]
-            self._draw("move", outputs, inputs, {**self._back(back[:, n], places), **update}, defines=defines)
+            self._passes.draw("move", outputs, inputs, {**self._back(back[:, n], places), **update}, defines=defines)
             self._swap("ahead", "moved", n)
             self._swap("last", "spare", n)
         self._ahead = "ahead"
@@ -122,7 +132,7 @@ class GlState:
             if kept.width_px and kept.height_px:
                 place = {"first": (kept.u0 - box.u0, kept.v0 - box.v0), "grey": self._channels == 1}
                 inputs = {"last": self._panel("last", n)}
-                self._draw("show", (image,), inputs, place, at=(kept.u0, kept.v0, kept.width_px, kept.height_px))
+                self._passes.draw("show", (image,), inputs, place, at=(kept.u0, kept.v0, kept.width_px, kept.height_px))
         finish()
         for texture, layer in zip(layers, buffer.pixels, strict=True):
             self._passes.target((Image(texture, width, height),)).read_into(layer, components=4)
@@ -130,25 +140,25 @@ class GlState:
     def close(self) -> None:
         if not self._closed:
             self._closed = True
-            with suppress(Exception):  # of a context that is lost there is nothing to release
+            with suppress(Exception):  # a lost context has nothing to release
                 for texture in self._textures.values():
                     self._passes.forget(texture)
             self._textures = {}
 
-    def _loaded(self, view: TargetView, side: int) -> _Target:
-        """An eye's target: where it was drawn, or uploaded."""
+    def _loaded(self, view: TargetView, side: int) -> tuple[Image, tuple[int, int]]:
+        """An eye's target, where it was drawn or uploaded, and its column and row that belong to the first ray."""
         rays = self._geometry.rays
         if isinstance(view.picture, DrawnPicture):
             texture = view.picture.texture
-            return _Target(Image(texture, *texture.size), (rays.u0, rays.v0))
+            return Image(texture, *texture.size), (rays.u0, rays.v0)
         seen = np.ascontiguousarray(view.picture[rays.slices])
         rgba = seen if seen.shape[2] == 4 else cv2.cvtColor(seen, cv2.COLOR_RGB2RGBA)
         image = self._ray_image(f"target {side}", 4, "f1")
         image.texture.write(np.ascontiguousarray(rgba), viewport=(0, 0, *image.size))
-        return _Target(image, (0, 0))
+        return image, (0, 0)
 
     def _through(self, matrices: F64, side: int) -> dict[str, Any]:
-        uniforms: dict[str, Any] = {"targets_origin": self._targets[side].first}
+        uniforms: dict[str, Any] = {"targets_origin": self._targets[side][1]}
         for n, (matrix, box) in enumerate(zip(matrices, self._geometry.boxes, strict=True)):
             uniforms |= {f"from_rays{n}": _mat3(matrix), f"size{n}": (box.width_px, box.height_px)}
         return uniforms
@@ -157,28 +167,14 @@ class GlState:
         rays = self._geometry.rays.width_px, self._geometry.rays.height_px // places
         return {"rays": rays, **{f"rays_from{number}": _mat3(matrix) for number, matrix in enumerate(matrices)}}
 
-    def _draw(
-        self,
-        name: str,
-        outputs: tuple[Image, ...],
-        inputs: Mapping[str, Image],
-        uniforms: Mapping[str, Any],
-        *,
-        defines: tuple[str, ...] = (),
-        at: tuple[int, int, int, int] | None = None,
-    ) -> None:
-        origin = {"origin": (0.0, 0.0) if at is None else (float(at[0]), float(at[1]))}
-        self._passes.draw(name, outputs, inputs, {**uniforms, **origin}, defines=defines, at=at)
-
     @property
     def _components(self) -> int:
         return 1 if self._channels == 1 else 4
 
     @property
     def _longest(self) -> int:
-        return max(
-            self._stack.width_px, self._stack.height_px, self._geometry.rays.width_px, self._geometry.rays.height_px
-        )
+        rays = self._geometry.rays
+        return max(self._stack.width_px, self._stack.height_px, rays.width_px, rays.height_px)
 
     def _panel(self, name: str, n: int) -> Image:
         """The box's part of an image as large as a whole panel: boxes follow the viewer, textures don't."""

@@ -5,19 +5,19 @@ uniform vec2 origin;
 uniform sampler2D ahead0, ahead1, ahead2, targets, column_taper, row_taper;
 uniform mat3 from_rays0, from_rays1, from_rays2;
 uniform vec2 size0, size1, size2;
-uniform ivec2 targets_origin, turn;  // turn: of so many places, which; they take turns from row to row of a picture
+uniform ivec2 targets_origin, turn;  // turn: number of head positions, and which; they alternate from row to row of a picture
 layout(location = 0) out vec4 curvature;
 layout(location = 1) out vec4 gradient;
 
-// Mean of exp(i pi x) over a pixel's rays: bilinear, of phasors that no memory has to hold.
+// Mean of exp(i pi x) over a pixel's rays: bilinear, of phasors that are not stored.
 void phasor(sampler2D ahead, vec2 at, vec2 size, out vec4 re, out vec4 im) {
     ivec2 last = ivec2(size) - 1;
     vec2 corner = clamp(at, vec2(0.5), size - 0.5) - 0.5, share = fract(corner);
     re = im = vec4(0.0);
     for (int k = 0; k < 4; ++k) {
-        ivec2 beside = ivec2(k & 1, k >> 1);
-        vec2 side = mix(1.0 - share, share, vec2(beside));
-        vec4 angle = 3.14159265 * panel(texelFetch(ahead, min(ivec2(corner) + beside, last), 0));
+        ivec2 corner_px = ivec2(k & 1, k >> 1);
+        vec2 side = mix(1.0 - share, share, vec2(corner_px));
+        vec4 angle = 3.14159265 * panel(texelFetch(ahead, min(ivec2(corner) + corner_px, last), 0));
         re += side.x * side.y * cos(angle);
         im += side.x * side.y * sin(angle);
     }

@@ -1,5 +1,5 @@
 #version 330 core
-// One eye's rays: how much their targets weigh, and that times what the outer panels leave to the middle one.
+// One eye's rays: the weight of their targets, and its product with the middle panel's residual.
 uniform vec2 origin;
 #include "places.glsl"
 uniform sampler2D last0, last2, targets, table;
