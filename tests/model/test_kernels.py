@@ -66,7 +66,7 @@ def usable_sets() -> list[str]:
 def test_every_instruction_set_makes_the_same_panels(
     stack: str, channels: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Not to the byte: AVX2 and AVX-512 round a product and a sum once, the plain build twice."""
+    """To the byte, although AVX-512 and AVX2 round a product and its sum once, and the plain build twice."""
     made = []
     for instructions in usable_sets():
         loops = clones(instructions)
