@@ -75,7 +75,10 @@ def solve_arguments(folder: Path, **changes: object) -> list[str]:
         ({"right_eye": (0.6, -0.0251, 0.0)}, "--right-eye: is 4.9 mm from the left one"),
         ({"left_eye": (0.061, 40.0, 0.0), "right_eye": (0.061, 40.06, 0.0)}, "--left-eye"),
         ({"left_eye": (0.6, 1e30, 0)}, "--left-eye: 1e+30 m is beyond 50 m"),
-        ({"left_eye": (0.6, 0, 0), "right_eye": (0.66, 0, 0), "model": "fast"}, "--right-eye: the eyes are not beside"),
+        (
+            {"left_eye": (0.6, 0, 0), "right_eye": (0.66, 0, 0), "model": "fast"},
+            "--right-eye: the eyes are not next to",
+        ),
         ({"left_eye": (50, 50, 50), "right_eye": (0.07, -50, -50), "model": "fast"}, "--right-eye: the eyes stand so"),
         ({"fov": 180}, "--fov"),
         ({"fov": 1e-320}, "--fov"),

@@ -247,7 +247,7 @@ def test_anybody_s_layers_are_evaluated_as_ours_are() -> None:
     ("change", "told"),
     [
         ({"fov_deg": 70}, "outside the panels"),
-        ({"eyes_m": EYES[::-1]}, "exchanged"),
+        ({"eyes_m": EYES[::-1]}, "swapped"),
         ({"fov_deg": 0.7}, "looks like radians"),
     ],
 )
@@ -283,7 +283,10 @@ def test_the_command_takes_the_cameras_that_pictures_were_taken_with(
     eyes = ["--left-eye", *map(str, eyes_m[0]), "--right-eye", *map(str, eyes_m[1])]
     app([*command, *eyes, "--fov", "62"], standalone_mode=False)
     assert "outside the panels" in capfd.readouterr().err
-    for given, told in ((eyes[:4], "are needed"), ([*eyes, "--camera", f"{tmp_path}/cameras.json"], "omit --left-eye")):
+    for given, told in (
+        (eyes[:4], "are required"),
+        ([*eyes, "--camera", f"{tmp_path}/cameras.json"], "omit --left-eye"),
+    ):
         with pytest.raises(InputError, match=told):
             app([*command, *given], standalone_mode=False)
 

@@ -327,7 +327,7 @@ def test_a_scene_that_never_loads_is_refused_and_never_shown(
 
     monkeypatch.setattr(LIMITS, "load_s", 0.0)
     answer = served.asked("scene", "slow_scene:Scene", meanwhile=meanwhile)
-    assert not answer["ok"] and "the solver was restarted: nothing has changed" in answer["error"]
+    assert not answer["ok"] and "so the solver was restarted; nothing has changed" in answer["error"]
     rig.refresh_until_solved()
     content, (hung,) = rig.content, solver._hung
     slow.GATE.set()

@@ -330,7 +330,7 @@ def test_a_sensor_whose_samples_never_change_is_lost_until_they_do(
     monkeypatch.setattr("runtime.sensor.worker.FROZEN_NS", 100_000_000)
     monkeypatch.setattr(Camera, "frozen", what)
     assert eventually(lambda: camera.state is SensorState.LOST)
-    assert camera.fault() == f"its {what} not changed for 0.1 s"
+    assert camera.fault() == f"the {what} not changed for 0.1 s"
     for _ in range(30):  # reopened, it is unhealthy for a moment each time
         time.sleep(0.01)
         assert camera.state is SensorState.LOST
