@@ -15,7 +15,7 @@ from scipy.special import logit
 
 from runtime.content.gaussians import COEFFICIENTS, Gaussians, drawable
 from runtime.content.packed_splats import fields_of, with_largest
-from runtime.errors import InputError, one_line
+from runtime.errors import InputError
 from runtime.records import F32, U8
 from runtime.support import untrusted_input
 from runtime.support.picture_header import decoded_picture
@@ -43,8 +43,9 @@ def load_compressed_splats(path: Path) -> Gaussians:
             return _spz(path) if path.suffix.lower() == ".spz" else _sog(path)
     except (InputError, ImportError, MemoryError):
         raise
-    except Exception as error:  # zlib, zipfile, zstandard and JSON of another shape raise their own
-        raise InputError(path, "", f"is damaged ({one_line(str(error) or type(error).__name__)})") from None
+    except Exception:  # zlib, zipfile, zstandard and JSON of another shape raise their own
+        kind = "an SPZ" if path.suffix.lower() == ".spz" else "a SOG"
+        raise InputError(path, "", f"is damaged, or not {kind} file") from None
 
 
 def _spz(path: Path) -> Gaussians:
@@ -58,8 +59,8 @@ def _spz(path: Path) -> Gaussians:
     untrusted_input.within(count, LIMITS.splats, source=path, field="splats")
     rest = (degree + 1) ** 2 - 1
     sizes = [count * each for each in (6 if version == 1 else 9, 1, 3, 3, 3 if version < 3 else 4, 3 * rest)]
-    if zipped:
-        body = zipped.decompress(zipped.unconsumed_tail, sum(sizes) or 1)
+    if version < 4:
+        body = zipped.decompress(zipped.unconsumed_tail, sum(sizes) or 1) if zipped else data[SPZ_SHORT:]
         ends = np.cumsum([0, *sizes])
         blocks = [body[first:end] for first, end in itertools.pairwise(ends)]
     else:
@@ -183,8 +184,8 @@ class _SogFiles:
         return np.asarray(image.convert("RGBA"))
 
     def pixels(self, name: str, count: int) -> U8:
-        """(count, 4) RGBA of the first pixels. Raises ValueError where there are fewer."""
+        """(count, 4) RGBA of the first pixels. Raises InputError where there are fewer."""
         found = self.picture(name).reshape(-1, 4)[:count]
         if len(found) < count:
-            raise ValueError(f"{untrusted_input.shown(name)} has {len(found)} of {count} pixels")
+            raise InputError(self._path, untrusted_input.shown(name), f"has {len(found)} of {count} pixels")
         return found

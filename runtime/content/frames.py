@@ -94,8 +94,8 @@ class PictureFiles(Frames):
         self._held = -1, np.empty((0, 0, 3), np.uint8)
         self._held = 0, self._read(0)
         self.count, self.rate_hz = len(self._paths), settings.picture_rate_hz
-        if folder is None and self.layouts == [MONO] and settings.layout == "auto" and (found := hint(self._held[1])):
-            log.warning("%s: its halves nearly agree: two views? then --layout %s (content.layout)", paths[0], found)
+        if folder is None and self.layouts == [MONO] and settings.layout == "auto":
+            _suggest(paths[0], self._held[1])
 
     def frame(self, index: int) -> U8:
         if index != self._held[0]:
@@ -197,6 +197,14 @@ def open_frames(path: Path, settings: ContentSettings) -> Frames:
     if not paths:
         raise InputError(path, "", _why_none(path))
     return PictureFiles(paths, settings, folder=path)
+
+
+def _suggest(path: Path, picture: U8) -> None:
+    """Log the layout that a picture shown flat may have."""
+    if "quilt" in path.stem.lower():
+        log.warning("%s: a quilt? then --layout qs8x6a0.75: columns, rows, and width over height of a view", path)
+    elif found := hint(picture):
+        log.warning("%s: its halves nearly agree: two views? then --layout %s (content.layout)", path, found)
 
 
 def _open_film(path: Path, settings: ContentSettings) -> Video:

@@ -200,6 +200,13 @@ def test_a_picture_whose_halves_nearly_agree_gets_a_hint(
     assert f"--layout {['top-bottom', 'side-by-side'][axis]}" in caplog.text
 
 
+def test_a_picture_called_a_quilt_without_its_numbers_gets_a_hint(tmp_path: Path, caplog: Any) -> None:
+    for name in ("my-Quilt.png", "quilt_qs2x2.png"):
+        write_png(tmp_path / name, solid(RED))
+        open_frames(tmp_path / name, AUTO)
+    assert caplog.text.count("a quilt? then --layout qs8x6a0.75") == 1 and "my-Quilt.png" in caplog.text
+
+
 # All around
 
 

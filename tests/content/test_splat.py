@@ -214,16 +214,20 @@ def test_every_ply_format_gives_the_same_splats(tmp_path: Path, order: str, kind
 
 
 FORMS = ["compressed", "compressed with harmonics", "splat", "spz 1", "spz 2 with harmonics", "spz 3 with harmonics"]
+FORMS += ["spz 2 unzipped", "spz 4", "spz 4 with harmonics", "sog", "sog folder with harmonics"]
 
 
-@pytest.mark.parametrize("form", [*FORMS, "spz 4", "spz 4 with harmonics", "sog", "sog folder with harmonics"])
+@pytest.mark.parametrize("form", FORMS)
 def test_packed_splats_are_those_that_were_packed(tmp_path: Path, form: str) -> None:
     """To what so few bits hold: places to 1/1000 of a chunk, turns to a hundredth, colours to their code."""
     table = splat_table(600, degree=2 if "harmonics" in form else 0)
     if form == "splat":
         found = load_splat(write_splat(tmp_path / "a.splat", table))
     elif form.startswith("spz"):
-        found = load_compressed_splats(write_spz(tmp_path / "a.spz", table, version=int(form[4])))
+        path = write_spz(tmp_path / "a.spz", table, version=int(form[4]))
+        if "unzipped" in form:
+            path.write_bytes(gzip.decompress(path.read_bytes()))
+        found = load_compressed_splats(path)
     elif form.startswith("sog"):
         found = load_compressed_splats(write_sog(tmp_path / ("a" if "folder" in form else "a.sog"), table))
     else:
@@ -254,9 +258,11 @@ def test_a_compressed_file_stands_by_its_format_s_custom(tmp_path: Path, stack: 
     ("name", "change", "told"),
     [
         ("a.spz", lambda data: data[: len(data) // 2], "is cut off: 600 splats are promised"),
+        ("a.spz", lambda data: gzip.decompress(data)[:-1], "is cut off: 600 splats are promised"),
+        ("a.spz", lambda data: b"NGSP\4\0\0\0\1\0\0\0\0\x0c\0\5\0\0\0\1" + bytes(12), "is damaged, or not an SPZ file"),
         ("a.spz", lambda data: gzip.compress(b"NGSP" + bytes(40)), "is not an SPZ file of version 1 to 4"),
-        ("a.sog", lambda data: data[:400], "is damaged (File is not a zip file)"),
-        ("a.sog", lambda data: data.replace(b'"version": 2', b'"version": 3'), "is damaged (Bad CRC-32"),
+        ("a.sog", lambda data: data[:400], "is damaged, or not a SOG file"),
+        ("a.sog", lambda data: data.replace(b'"version": 2', b'"version": 3'), "is damaged, or not a SOG file"),
         ("a.splat", lambda data: data[:-1], "is cut off, or no .splat: it has 19199 bytes, no multiple of 32"),
         ("a.splat", lambda data: b"", "is cut off, or no .splat: it has 0 bytes"),
         ("a.ply", lambda data: data[:-1], "vertex: the file is cut off: 600 are declared, 599 present"),
