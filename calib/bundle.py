@@ -48,7 +48,7 @@ class Bundle:
     places_m: F64  # (P, 3) positions of the camera, frame `stack`
     covariance: F64  # (6(N-1), 6(N-1)) of rotation about its middle (rad) and shift (m) of each moving panel
     sigma_px: float  # of one coordinate of a saddle in a photograph
-    used: NDArray[np.bool_]  # (K,) points that are no outliers
+    used: NDArray[np.bool_]  # (K,) points that are not outliers
     photograph: Any  # (K,) index
 
     def sigma_of(self, derived: Any) -> F64:

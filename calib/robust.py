@@ -33,7 +33,7 @@ class RobustFit:
 
 
 def _residuals(candidate: Similarity, sensor_m: F64, stack_m: F64) -> F64:
-    """(..., K) squared distances, m², divided by the squared scale, so that a small scale is no advantage."""
+    """(..., K) squared distances, m², divided by the squared scale, so that a small scale gives no advantage."""
     squared = ((candidate.points(sensor_m) - stack_m) ** 2).sum(-1)
     residuals: F64 = squared / np.maximum(candidate.scale[..., None], 1e-300) ** 2
     return residuals

@@ -1,4 +1,4 @@
-"""Checks once a second that windows and monitors are still as they were bound.
+"""Checks that windows and monitors are still as they were bound, with one query to X at a time.
 
 GLFW reports monitors that come and go, and windows that are closed or resized. It does not report a window that was
 destroyed, unmapped or moved from outside, or a monitor whose position or mode changed. In these cases a picture is on
@@ -7,38 +7,51 @@ the wrong panel or on none, although every swap succeeds.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 from runtime.clock import NS_PER_S, Clock
 from runtime.panels import xlib
 from runtime.panels.display import Display, Window
 from runtime.panels.monitors import Monitor
 
-EVERY_NS = NS_PER_S
+EVERY_NS = NS_PER_S  # for one round of all queries
 REFRESH_TOLERANCE = 1e-3  # relative
 
 
 class PlacementWatch:
-    """Checks all windows and monitors every EVERY_NS, and at once if the X server has refused a request."""
+    """Checks one window or monitor per call, each once in EVERY_NS.
+
+    If the X server has refused a request since the last call, something has gone: then it checks all of them.
+    """
 
     def __init__(self, display: Display, monitors: Sequence[Monitor], windows: Sequence[Window], clock: Clock) -> None:
-        """monitors, windows: as bound, one per panel. The first check is after EVERY_NS."""
+        """monitors, windows: as bound, one per panel. The first query is after EVERY_NS."""
         self._display, self._clock = display, clock
         # EDIDs to compare with. A changed position or mode shows as a difference from the monitor as bound.
         self._states = [display.output_state(monitor.connector) for monitor in monitors]
         self._monitors, self._windows = monitors, windows
+        self._questions: list[Callable[[], str]] = [
+            *(partial(self._window_fault, panel) for panel in range(len(windows))),
+            *(partial(self._monitor_fault, panel) for panel in range(len(monitors))),
+        ]
+        self._next = 0
         self._due_ns = clock.now_ns() + EVERY_NS
         self._refusals = xlib.refusals()
 
     def look(self) -> str:
-        """Return faults, naming the panel; empty if there is no fault or no check is due."""
+        """Return faults, naming the panel; empty without a fault or a due query."""
+        if xlib.refusals() != self._refusals:
+            faults = [fault for fault in (question() for question in self._questions) if fault]
+            self._refusals = xlib.refusals()  # read after the queries, which may be refused too
+            return "; ".join(faults)
         now_ns = self._clock.now_ns()
-        if now_ns < self._due_ns and xlib.refusals() == self._refusals:
+        if now_ns < self._due_ns:
             return ""
-        panels = range(len(self._windows))
-        faults = [*map(self._window_fault, panels), *map(self._monitor_fault, panels)]
-        self._due_ns, self._refusals = now_ns + EVERY_NS, xlib.refusals()  # the checks may be refused too
-        return "; ".join(filter(None, faults))
+        self._due_ns = now_ns + EVERY_NS // len(self._questions)
+        question = self._questions[self._next]
+        self._next = (self._next + 1) % len(self._questions)
+        return question()
 
     def _window_fault(self, panel: int) -> str:
         state, bound = self._display.window_state(self._windows[panel]), self._monitors[panel].place

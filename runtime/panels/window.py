@@ -36,7 +36,7 @@ class WindowPanels(PanelSink):
     is the time between the first and the last return from a swap; it does not include the phase between the monitors'
     blanks.
 
-    Once a second every window and monitor is compared with its state at binding (some 0.1 ms each).
+    Once a second every window and monitor is compared with its state at binding (one query per refresh, about 0.1 ms).
     If a monitor, window or context is lost or has changed, all windows are closed and `present` raises PanelLost. A
     later `present` reopens them, after half a second or when X reports a monitor. The hidden window's shared context
     survives unless it was lost itself. If the X server dies, the process ends with exit status 75 and must be
