@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import moderngl
 import numpy as np
 
 from runtime.content.base import WHITE, ContentInfo, ContentSource, View
@@ -36,6 +37,7 @@ void main() {
 }
 """
 SIZES_KEPT = 8
+OVER = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA)
 
 
 @dataclass(slots=True)

@@ -23,16 +23,15 @@ from runtime.records import U8
 from runtime.support import progress
 from runtime.support.film import VIDEOS, open_film
 from runtime.support.picture_file import read_animation, read_views
-from runtime.support.picture_header import Header, check_size, header_of_file
+from runtime.support.picture_header import RAW, Header, camera_set_in, check_size, header_of_file
 
 log = logging.getLogger("phasestack.content")
 
 PICTURES = (
     ".png", ".jpg", ".jpeg", ".jfif", ".mpo", ".jps", ".pns", ".bmp", ".tif", ".tiff", ".webp", ".gif", ".apng",
-    ".avif", ".heic", ".heif", ".hif",
+    ".avif", ".heic", ".heif", ".hif", ".ppm", ".pgm", ".tga",
 )  # fmt: skip
-NOT_READ = (".jxl", ".exr", ".hdr", ".psd", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".svg", ".jp2")
-CAMERA_SET = "such a scene is trained first; its splats (.ply) are drawn, and its folder of pictures as a slideshow"
+NOT_READ = (*RAW, ".jxl", ".exr", ".hdr", ".psd", ".svg", ".jp2", *VIDEOS)  # of a folder: skipped, and logged
 TOLD = 3  # skipped files of a folder that the log names
 TELL_EVERY = 64  # pictures between two reports of progress
 VIDEO_FRAMES_MAX = 1e8  # that a header may claim: five weeks at 30 a second
@@ -80,6 +79,8 @@ class PictureFiles(Frames):
             if number % TELL_EVERY == 0:
                 progress.tell(f"{path.parent.name}: pictures", number, len(paths))
             try:
+                if folder is not None and path.suffix.lower() in VIDEOS:
+                    raise InputError(path, "", "is a film, which is shown by its own name")
                 header = header_of_file(path)  # by its header alone: a long sequence opens quickly
             except InputError as error:
                 refused.append(error)
@@ -221,9 +222,9 @@ def _open_film(path: Path, settings: ContentSettings) -> Video:
 
 def _why_none(folder: Path) -> str:
     """Describe a folder without pictures, for an error message."""
+    if problem := camera_set_in(folder):
+        return problem
     told = "the folder holds no pictures"
-    if sets := sorted(folder.glob("transforms*.json")):
-        return f"{told} but a camera set, as of a NeRF ({sets[0].name}): {CAMERA_SET}"
     for inner in sorted(item for item in folder.iterdir() if item.is_dir()):
         if any(item.suffix.lower() in PICTURES for item in inner.iterdir()):
             return f"{told}; those in {inner.name} are shown by its own name"

@@ -22,7 +22,7 @@ log = logging.getLogger("phasestack.content")
 
 LOW_PASS_PX2 = 0.3  # added to each splat's covariance: none falls between the pixels
 ALPHA_MIN = 1 / 255  # of a splat at a pixel: less changes no code value
-LARGEST_COORDINATE = 1e15  # squares still fit in float32's range
+LARGEST_COORDINATE = 1e15  # products of two or three still fit in float32's range
 LARGEST_RELATIVE_SCALE = 100.0  # of a splat, in units of the scene's extent
 STRAY = 1.0  # percent of the splats at either end of an axis that do not decide the scale
 FAINT = 0.1  # opacity of a splat that decides nothing
@@ -107,7 +107,7 @@ def drawable(path: Path, *, centres: F32, log_scales: F32, quaternions: F32, log
         for values in (quaternions, harmonics.reshape(len(centres), -1)):
             usable &= np.isfinite(values).all(1)
         some = centres[usable]
-        extent = float(np.ptp(np.percentile(some, [1, 99], axis=0), axis=0).max()) if len(some) else 0.0
+        extent = _extent(some) if len(some) else 0.0
         # Minus infinity is a disc, as trainers write it.
         usable &= (log_scales < np.log(LARGEST_RELATIVE_SCALE * (extent or 1.0))).all(1)
     if not usable.all():
@@ -118,6 +118,16 @@ def drawable(path: Path, *, centres: F32, log_scales: F32, quaternions: F32, log
     if not (opacities > ALPHA_MIN).any():
         raise InputError(path, "opacity", "no splat is visible")
     return Gaussians(centres, covariances_of(np.exp(log_scales), quaternions), opacities, harmonics)
+
+
+def _extent(places: F32) -> float:
+    """The longest side of the box around 98 percent of the places along each axis."""
+    return float(np.ptp(np.percentile(places, [1, 99], axis=0), axis=0).max())
+
+
+def flat_harmonics(colours: F32) -> F32:
+    """(n, 1, 3) harmonics of degree 0 that show (n, 3) colours from everywhere."""
+    return np.asarray((colours - np.float32(0.5)) / np.float32(FLAT_HARMONIC), np.float32)[:, None]
 
 
 def dotted(ends: F32, colours: F32) -> tuple[F32, F32]:
@@ -142,12 +152,12 @@ def of_points(places: F32, colours: F32) -> Gaussians:
     colours = np.where(np.isnan(colours), by_place, colours).astype(np.float32)
     some = places[:: max(1, len(places) // SAMPLED)].astype(np.float64)
     apart = np.median(cKDTree(places).query(some, k=2)[0][:, 1]) if len(places) > 1 else 1.0
-    extent = float(np.ptp(np.percentile(places, [1, 99], axis=0), axis=0).max()) or 1.0
+    extent = _extent(places) or 1.0
     sigma = np.clip(apart / 2, extent * FINEST_POINT, extent * LARGEST_POINT)
     covariances = np.zeros((len(places), 6), np.float32)
     covariances[:, [0, 3, 5]] = sigma**2
-    harmonics = ((colours - np.float32(0.5)) / np.float32(FLAT_HARMONIC))[:, None]
-    return Gaussians(places.astype(np.float32), covariances, np.ones(len(places), np.float32), harmonics)
+    opaque = np.ones(len(places), np.float32)
+    return Gaussians(places.astype(np.float32), covariances, opaque, flat_harmonics(colours))
 
 
 def bounds(gaussians: Gaussians) -> tuple[F64, F64]:

@@ -18,6 +18,7 @@ from urllib.parse import unquote_to_bytes
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.content.parts import texture_of
 from runtime.errors import InputError
 from runtime.records import F32, U8
 from runtime.support import untrusted_input
@@ -26,10 +27,9 @@ from runtime.support.untrusted_input import LIMITS
 
 Table = dict[str, Any]
 Array = NDArray[Any]
-Read = Callable[[str], bytes]  # a file in its folder, by its URI
+Read = Callable[[str], bytes]  # a file in its folder, by its URI or name
 
 ELEMENTS_PER_TRIANGLE = 10  # all accessors together, for the limit on triangles
-LARGEST_TEXTURE_PX = 4096
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 SHAPES = {"SCALAR": (1,), "VEC2": (2,), "VEC3": (3,), "VEC4": (4,), "MAT2": (2, 2), "MAT3": (3, 3), "MAT4": (4, 4)}
 PICTURE_EXTENSIONS = ("EXT_texture_webp", "EXT_texture_avif")  # the others' pictures, such as KTX2, are not decoded
@@ -148,9 +148,7 @@ class GltfFile:
         number = self._image_of(texture)
         if number not in self._pictures:
             image = decoded_picture(self._coded(number), source=self.path, field="texture", name=f"images[{number}]")
-            image = image.convert("RGBA")
-            image.thumbnail((LARGEST_TEXTURE_PX, LARGEST_TEXTURE_PX))
-            self._pictures[number] = np.array(image)
+            self._pictures[number] = texture_of(image)
         return self._pictures[number]
 
     def check_pictures(self, textures: list[Table]) -> None:

@@ -13,10 +13,10 @@ from urllib.parse import unquote
 import numpy as np
 
 from runtime.content.base import ContentInfo, ContentSource
-from runtime.content.gaussians import of_points
+from runtime.content.gaussians import LARGEST_COORDINATE, of_points
 from runtime.content.gltf import GltfScene
 from runtime.content.parts import UNCOLOURED, Part, merged
-from runtime.content.placing import SceneFile
+from runtime.content.placing import GLTF, SceneFile
 from runtime.content.ply import read_header
 from runtime.content.shapes import AT_ONCE, Shape, flat_normals
 from runtime.content.splat import SplatSource
@@ -28,10 +28,8 @@ from runtime.support.untrusted_input import LIMITS
 
 log = logging.getLogger("phasestack.content")
 
-GLTF = (".glb", ".gltf")
 STL_HEAD, STL_FACET = 84, 50  # bytes of a binary file's head and of each of its triangles
 UNREAD = ("tristrips", "edge")  # elements of a PLY that are not drawn
-LARGEST_COORDINATE = 1e15  # products of three still fit in float32's range
 OFF_COUNTS = re.compile(rb"^\s*[A-Z4n]*OFF\s+(?:#.*\s+)*(\d{1,18})\s+(\d{1,18})")
 
 
@@ -43,18 +41,8 @@ class MeshData:
     points: tuple[tuple[F32, F32], ...]  # (n, 3) positions and colours, drawn without parts only
     low: F64  # (3,) corner of the box that holds it
     high: F64
+    facing: F64  # (3,) the mean normal of its triangles, by area: length at most 1; 0 if closed
     left_out: tuple[str, ...] = ()  # what of it is not drawn
-
-    @property
-    def facing(self) -> F64:
-        """(3,) the mean normal of its triangles, by area: length at most 1; 0 if closed."""
-        total, area = np.zeros(3), 1e-30
-        for part in self.parts:
-            for first in range(0, len(part.shape.triangles), AT_ONCE):
-                corner = part.shape.positions_m[part.shape.triangles[first : first + AT_ONCE]].astype(np.float64)
-                normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-                total, area = total + normal.sum(0), area + np.linalg.norm(normal, axis=1).sum()
-        return np.asarray(total / area)
 
 
 def prepare(file: SceneFile) -> Callable[..., ContentSource]:
@@ -102,9 +90,17 @@ def load_mesh(path: Path) -> MeshData:
         left_out, points = left_out | {"points and lines"}, []
     places = [*(part.shape.positions_m for part in parts), *(place for place, _ in points)]
     _check(path, parts, places, left_out)
+    total, area = np.zeros(3), 0.0
+    for part in parts:
+        for first in range(0, len(part.shape.triangles), AT_ONCE):
+            corner = part.shape.positions_m[part.shape.triangles[first : first + AT_ONCE]].astype(np.float64)
+            normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+            total, area = total + normal.sum(0), area + float(np.linalg.norm(normal, axis=1).sum())
+    if parts and not area:
+        raise InputError(path, "faces", "none has an area")
     low, high = (np.asarray(end([end(place, 0) for place in places], 0), np.float64) for end in (np.min, np.max))
     said = tuple(untrusted_input.shown(name) for name in sorted(left_out))
-    return MeshData(tuple(parts), tuple(points), low, high, said)
+    return MeshData(tuple(parts), tuple(points), low, high, total / (area or 1.0), said)
 
 
 def folder_reader(path: Path, field: str) -> Callable[[str], bytes]:
@@ -146,15 +142,6 @@ def _check(path: Path, parts: Sequence[Part], places: Sequence[F32], left_out: s
     for part in parts:
         if not np.isfinite(part.shape.uv).all():
             raise InputError(path, "texture coordinates", "are not all finite")
-    if parts and not any(_has_area(part.shape) for part in parts):
-        raise InputError(path, "faces", "none has an area")
-
-
-def _has_area(shape: Shape) -> bool:
-    return any(
-        flat_normals(shape.positions_m[shape.triangles[first : first + AT_ONCE]]).any()
-        for first in range(0, len(shape.triangles), AT_ONCE)
-    )
 
 
 def _check_counts(path: Path, data: bytes) -> None:

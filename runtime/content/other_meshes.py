@@ -7,7 +7,6 @@ import io
 import itertools
 import logging
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,8 @@ from PIL import Image
 
 from runtime.content.base import WHITE, Colour
 from runtime.content.gaussians import dotted
-from runtime.content.parts import UNCOLOURED, Part
+from runtime.content.gltf_file import Read
+from runtime.content.parts import UNCOLOURED, Part, texture_of
 from runtime.content.shapes import Shape, placed
 from runtime.errors import InputError
 from runtime.records import F32, F64, U8
@@ -28,11 +28,9 @@ from runtime.support.untrusted_input import LIMITS
 log = logging.getLogger("phasestack.content")
 
 BOMS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-LARGEST_TEXTURE_PX = 4096
 # Before a texture's name in an MTL: `-s 1 1 1`, `-blendu off`, `-imfchan r`.
 OPTIONS = re.compile(r"(?:-[a-zA-Z]+(?:\s+(?:on|off|[rgbmlz]|[-+.\d]+(?:[eE][-+]?\d+)?))*\s+)+")
 DRIVE = re.compile(r"[A-Za-z]:.*/")  # a path of somebody else's Windows: the name alone is looked for
-Read = Callable[[str], bytes]  # a file in its folder, by its name in the mesh
 
 
 class FolderResolver(trimesh.resolvers.FilePathResolver):
@@ -199,9 +197,7 @@ def _material(material: Any, pictures: dict[int, U8]) -> tuple[U8 | None, Colour
     if image is None:
         return None, UNCOLOURED if diffuse is None else (red, green, blue), opacity
     if id(material) not in pictures:
-        image = image.convert("RGBA")
-        image.thumbnail((LARGEST_TEXTURE_PX, LARGEST_TEXTURE_PX))
-        pictures[id(material)] = np.array(image)
+        pictures[id(material)] = texture_of(image)
     return pictures[id(material)], (red, green, blue) if red or green or blue else WHITE, opacity
 
 

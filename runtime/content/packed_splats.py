@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logit
 
-from runtime.content.gaussians import COEFFICIENTS, FLAT_HARMONIC, Gaussians, drawable
+from runtime.content.gaussians import COEFFICIENTS, Gaussians, drawable, flat_harmonics
 from runtime.content.ply import PlyHeader, read_elements
 from runtime.errors import InputError
 from runtime.records import F32
@@ -46,14 +46,13 @@ def load_compressed(header: PlyHeader) -> Gaussians:
     rgba = fields_of(colour, (8, 8, 8, 8))
     if "min_r" in (bounds.dtype.names or ()):
         rgba[:, :3] = _between(rgba[:, :3], *bounds_of("", "rgb"))
-    dc = ((rgba[:, :3] - np.float32(0.5)) / np.float32(FLAT_HARMONIC))[:, None]
-    harmonics = dc
+    harmonics = flat_harmonics(rgba[:, :3])
     if fields := elements["sh"].dtype.names if "sh" in elements else ():
         rest = np.column_stack([elements["sh"][name] for name in fields])
         if rest.shape[1] not in COEFFICIENTS or len(rest) != len(splats):
             raise InputError(header.path, "sh", "holds no harmonics of degree 1 to 3 for every splat")
         higher = (rest.astype(np.float32) * np.float32(8 / 255) - 4).reshape(len(rest), 3, -1)
-        harmonics = np.concatenate([dc, higher.transpose(0, 2, 1)], axis=1)
+        harmonics = np.concatenate([harmonics, higher.transpose(0, 2, 1)], axis=1)
     return drawable(
         header.path,
         centres=_between(fields_of(place, (11, 10, 11)), *bounds_of("", "xyz")),
@@ -80,7 +79,7 @@ def load_splat(path: Path) -> Gaussians:
         log_scales=np.log(table["scale"]),
         quaternions=np.asarray(table["turn"], np.float32) / np.float32(128) - np.float32(1),
         logits=logit(rgba[:, 3]),
-        harmonics=((rgba[:, :3] - np.float32(0.5)) / np.float32(FLAT_HARMONIC))[:, None],
+        harmonics=flat_harmonics(rgba[:, :3]),
     )
 
 

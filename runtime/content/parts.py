@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,6 +16,7 @@ from runtime.records import F32, U8
 BLACK: Colour = (0.0, 0.0, 0.0)
 UNCOLOURED: Colour = (0.70, 0.74, 0.80)  # of a file without colours
 OPAQUE_FROM = 0.99  # alpha from which a pixel counts as opaque
+LARGEST_TEXTURE_PX = 4096
 OUTLINED_MAX = 200_000  # triangles of a part; beyond, finding its outline costs more than drawing it
 Wrap = Literal["repeat", "clamp", "mirror"]
 
@@ -70,6 +71,13 @@ class Part:
             "MIRROR_V": self.sampler.wrap[1] == "mirror",
         }
         return tuple(name for name, is_on in switches.items() if is_on)
+
+
+def texture_of(image: Any) -> U8:
+    """(h, w, 4) RGBA of Pillow's image, scaled down to the largest texture that is kept."""
+    image = image.convert("RGBA")
+    image.thumbnail((LARGEST_TEXTURE_PX, LARGEST_TEXTURE_PX))
+    return np.array(image)
 
 
 def coded(light: ArrayLike) -> F32:

@@ -16,9 +16,9 @@ from pydantic import Field, field_validator
 from runtime.clock import NS_PER_S
 from runtime.config import ContentSettings, Section, read_table, validated
 from runtime.content.base import ContentInfo, ContentSource, ForwardingSource, View
-from runtime.content.frames import CAMERA_SET
 from runtime.content.placed import FIELDS
 from runtime.errors import InputError
+from runtime.support.picture_header import CAMERA_SET
 from runtime.support.plausible import within
 from runtime.support.plugins import located
 
@@ -62,7 +62,7 @@ def read_playlist(path: Path, settings: ContentSettings) -> Playlist:
     """
     table = read_table(path)
     if "frames" in table and "show" not in table:
-        raise InputError(path, "frames", f"is a camera set, as of a NeRF: {CAMERA_SET}")
+        raise InputError(path, "", f"is a camera set, as of a NeRF: {CAMERA_SET}")
     if path.suffix.lower() == ".json" and "show" not in table:
         raise InputError(path, "show", "is missing: a JSON file as scene is a playlist, with its scenes there")
     file = validated(PlaylistFile, table, source=path)

@@ -34,6 +34,7 @@ HARMLESS = {".png": PNG, ".jpg": JPEG, ".jpeg": JPEG}  # small stills of these f
 HARMLESS_PX = 4096 * 4096
 TO_GLTF, TO_PLY = "export it as glTF (.glb), as Blender does", "save it as PLY, as CloudCompare does"
 TO_SPLATS = "convert it: `npx @playcanvas/splat-transform in{} out.ply`"
+FILMS = (".wmv", ".flv", ".mpg", ".mpeg", ".ts", ".m2ts", ".mts", ".3gp", ".ogv", ".vob")
 OTHER_FILES = {  # by their names: format and the way out
     **dict.fromkeys((".fbx", ".dae", ".blend", ".3ds", ".x3d", ".wrl", ".abc"), ("a 3D scene", TO_GLTF)),
     **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), ("a USD scene", TO_GLTF)),
@@ -41,6 +42,7 @@ OTHER_FILES = {  # by their names: format and the way out
         (".3mf", ".step", ".stp", ".iges", ".igs"), ("a model of CAD or 3D print", "export it as STL or glTF")
     ),
     **dict.fromkeys((".xyz", ".pts", ".pcd", ".las", ".laz", ".e57"), ("a point cloud", TO_PLY)),
+    **dict.fromkeys(FILMS, ("a film", "convert it: `ffmpeg -i in{} out.mp4`")),
     **dict.fromkeys((".ksplat", ".lcc"), ("compressed splats", TO_SPLATS)),
 }
 LFS = b"version https://git-lfs"
@@ -129,7 +131,7 @@ def _is_harmless(file: SceneFile) -> bool:
         if opened.read(len(mark)) != mark:
             return False
     header = header_of_file(file.path)
-    return not header.is_animated and header.width_px * header.height_px <= HARMLESS_PX
+    return not header.is_animated and len(header.views) == 1 and header.width_px * header.height_px <= HARMLESS_PX
 
 
 def _read(file: SceneFile) -> Opener:

@@ -6,11 +6,10 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import moderngl
 import numpy as np
 
 from runtime.content.base import ContentInfo, View
-from runtime.content.canvas import SIDES, CanvasSource
+from runtime.content.canvas import OVER, SIDES, CanvasSource
 from runtime.content.compressed_splats import load_compressed_splats
 from runtime.content.gaussians import (
     Gaussians,
@@ -29,7 +28,6 @@ from runtime.optics.rect import PixelRect
 from runtime.records import F32, F64
 from runtime.support.gl import DrawnPicture
 
-OVER = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA)
 CUSTOM, CUSTOM_SPZ = ("-y", "-z"), ("+y", "+z")  # up, and to the viewer: trainers use OpenCV's camera axes
 FLOATS = 8  # a corner: place in clip space (2), place in standard deviations (2), colour and opacity (4)
 VERTEX = """

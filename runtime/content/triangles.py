@@ -8,12 +8,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import moderngl
 import numpy as np
 
 from runtime.content import camera
 from runtime.content.base import ContentInfo, View
-from runtime.content.canvas import CanvasSource
+from runtime.content.canvas import OVER, CanvasSource
 from runtime.content.fringe import CORNER_ENDS, edges_of, ramps, silhouette
 from runtime.content.parts import OPAQUE_FROM, OUTLINED_MAX, Part, Sampler
 from runtime.optics.rect import PixelRect
@@ -26,7 +25,6 @@ DRAWN_AT_ONCE = 20_000  # triangles
 UPLOADED_AT_ONCE = 8 << 20  # bytes
 ATTRIBUTES = ("in_normal", "in_uv", "in_colour")
 OUTLINE_FLOATS = 5 + 9  # a corner: clip coordinates and coverage, then the attributes
-OVER = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA)
 
 ANY_ALPHA = 2.0  # beyond every alpha
 VERTEX = """

@@ -36,6 +36,9 @@ GAIN_MAP = (b"hdrgm", b"21496-1")  # marks of a gain map, a second picture with 
 HEAD_BYTES = 512  # read to identify a file
 UNDECODED = "is not an image that can be decoded"
 ANOTHER = "save it as PNG, JPEG or AVIF"
+CAMERA_SET = "such a scene is trained first; its splats (.ply) are drawn, and its folder of pictures as a slideshow"
+RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")  # most are TIFFs too
+RAW_KIND = "a camera's raw picture", "develop it and save it as JPEG"
 OTHER_KINDS = (  # unsupported formats: offset and value of the mark, name, way out
     (0, b"\xff\x0a", "JPEG XL", f"{ANOTHER} (djxl in.jxl out.png)"),
     (4, b"JXL \r\n", "JPEG XL", f"{ANOTHER} (djxl in.jxl out.png)"),
@@ -47,8 +50,12 @@ OTHER_KINDS = (  # unsupported formats: offset and value of the mark, name, way 
     (0, b"%!PS", "PostScript", ANOTHER),
     (0, b"DDS ", "a texture (DDS)", ANOTHER),
     (1, b"KTX ", "a texture (KTX)", ANOTHER),
-    (8, b"CR", "a camera's raw picture", "develop it and save it as JPEG"),
-    (0, b"FUJIFILMCCD-RAW", "a camera's raw picture", "develop it and save it as JPEG"),
+    (8, b"CR", *RAW_KIND),
+    (0, b"FUJIFILMCCD-RAW", *RAW_KIND),
+    (0, b"PK\3\4", "a ZIP archive", "unpack it first"),
+    (0, b"7z\xbc\xaf", "a 7z archive", "unpack it first"),
+    (0, b"Rar!", "a RAR archive", "unpack it first"),
+    (0, b"\x89MCAP", "a recording", "it is replayed with --replay"),
     (0, b"version https://git-lfs", "a pointer of Git LFS", "fetch the file itself (git lfs pull)"),
     (0, b"<svg", "SVG", ANOTHER),
     (0, b"<!DOCTYPE html", "a web page", "download the picture itself"),
@@ -106,6 +113,8 @@ def _header_of(path: Path, coded: bytes | IO[bytes]) -> Header:
 
     A second picture that an MPO does not call a view is one only where the file is named .mpo.
     """
+    if path.suffix.lower() in RAW:  # of a TIFF, Pillow would show the thumbnail
+        raise InputError(path, "", "is {}, which is not read: {}".format(*RAW_KIND))
     try:
         with opened(coded) as image:
             width, height = image.size
@@ -231,6 +240,8 @@ def undecodable(data: bytes, error: Exception | None = None) -> str:
             return f"is {name}, which is not read: {way_out}"
     if data[:5] == b"<?xml" and b"<svg" in data[:HEAD_BYTES]:
         return f"is SVG, which is not read: {ANOTHER}"
+    if data.lstrip()[:1] == b"{" and b'"frames"' in data:
+        return f"is a camera set, as of a NeRF: {CAMERA_SET}"
     told = str(error).lower()
     if is_cut_off(data) or _promises_more(data) or "truncated" in told or "end of file" in told:
         return f"{UNDECODED} (it is cut off)"
@@ -311,8 +322,16 @@ def decoded_picture(coded: bytes, *, source: str | Path, field: str, name: str) 
         raise InputError(source, field, f"{name} {undecodable(coded, error)}") from None
 
 
+def camera_set_in(folder: Path) -> str:
+    """Why a folder with cameras of pictures is not drawn; empty without such a file."""
+    sets = sorted(folder.glob("transforms*.json"))
+    return f"holds a camera set, as of a NeRF ({sets[0].name}): {CAMERA_SET}" if sets else ""
+
+
 def read_coded(path: Path) -> tuple[bytes, Header]:
     """A picture file's undecoded bytes, checked by its header. Raises InputError."""
+    if untrusted_input.is_there(path, folder=True) and (problem := camera_set_in(path)):
+        raise InputError(path, "", problem)
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
     return data, _header_of(path, data)
 

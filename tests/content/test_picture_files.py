@@ -260,8 +260,13 @@ def test_a_camera_set_is_called_so_as_file_and_folder(tmp_path: Path, context: A
     (tmp_path / "transforms_train.json").write_text('{"camera_angle_x": 0.7, "frames": [{"transform_matrix": []}]}')
     (tmp_path / "train").mkdir()
     for path in (tmp_path, tmp_path / "transforms_train.json"):
-        with pytest.raises(InputError, match="camera set, as of a NeRF"):
-            opened(path, context, stack)
+        told = set()
+        # As `run`, `solve` and `eyes` read it.
+        for read in (lambda p: opened(p, context, stack), lambda p: read_pair(p, ContentSettings()), read_image):
+            with pytest.raises(InputError, match="camera set, as of a NeRF") as error:
+                read(path)
+            told.add(str(error.value))
+        assert len(told) == 1
     (tmp_path / "transforms_train.json").unlink()
     write_png(tmp_path / "train" / "0.png", solid(RED))
     with pytest.raises(InputError, match="holds no pictures; those in train are shown by its own name"):
@@ -343,8 +348,11 @@ def test_what_a_folder_holds_besides_is_left_out_and_named(tmp_path: Path, caplo
     with pytest.raises(InputError, match=r"a\.jxl: is JPEG XL, which is not read"):
         open_frames(tmp_path, AUTO)
     write_png(tmp_path / "c.png", solid(RED))
-    assert open_frames(tmp_path, AUTO).count == 1
-    assert "2 of 3 pictures are skipped: a.jxl is JPEG XL" in caplog.text and "b.png is not an image" in caplog.text
+    Image.fromarray(solid(RED)).save(tmp_path / "d.tga")
+    (tmp_path / "e.mov").write_bytes(b"\0\0\0\x14ftypqt  ")
+    assert open_frames(tmp_path, AUTO).count == 2
+    assert "3 of 5 pictures are skipped: a.jxl is JPEG XL" in caplog.text and "b.png is not an image" in caplog.text
+    assert "e.mov is a film, which is shown by its own name" in caplog.text
 
 
 @pytest.mark.parametrize(("kind", "first_ms"), [("GIF", 200), ("WEBP", 200), ("PNG", 200), ("AVIF", 200)])
@@ -396,12 +404,22 @@ def test_a_picture_that_ends_too_early_is_called_cut_off(tmp_path: Path, suffix:
         (b"version https://git-lfs.github.com/spec/v1\n", "is a pointer of Git LFS"),
         (b'<?xml version="1.0"?><svg/>', "is SVG"),
         (b"<!DOCTYPE html><html>", "is a web page"),
+        (b"PK\x03\x04", "is a ZIP archive, which is not read: unpack it first"),
+        (b"\x89MCAP0\r\n", "is a recording, which is not read: it is replayed with --replay"),
     ],
 )
 def test_another_kind_is_called_by_its_name_with_the_way_out(tmp_path: Path, data: bytes, told: str) -> None:
     (tmp_path / "a.png").write_bytes(data + bytes(100))
     with pytest.raises(InputError, match=told):
         read_image(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("suffix", ["dng", "NEF", "arw"])
+def test_of_a_raw_picture_the_thumbnail_is_not_shown(tmp_path: Path, suffix: str) -> None:
+    """A raw file is a TIFF whose first picture is small."""
+    Image.fromarray(solid(RED)).save(tmp_path / f"a.{suffix}", "TIFF")
+    with pytest.raises(InputError, match="is a camera's raw picture, which is not read: develop it"):
+        open_frames(tmp_path / f"a.{suffix}", AUTO)
 
 
 def test_without_its_extra_a_heic_is_called_so(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from runtime.content.registry import prepare_content
 from runtime.optics.stack import PanelStack
 from runtime.support.artifacts import write_png
 from tests.content.conftest import panel_view
+from tests.content.picture_files import lif
 from tests.content.test_eyereal import write_pair
 from tests.content.test_pictures import make_video, rgbd_picture, solid
 from tests.content.test_splat import splat_table, written
@@ -54,6 +55,8 @@ def written_as(kind: str, folder: Path, context: Any, stack: PanelStack) -> Path
             return folder / "a_rgbd.png"
         case "mp4":
             return make_video(path, [(200, 30, 60), (10, 200, 60)], codec="mp4v")
+        case "leia":
+            return lif(folder / "a.jpg", solid((10, 120, 60)), solid((90, 20, 60)))
         case "tif":
             cv2.imwrite(str(path), solid((10, 120, 60)))
         case _:
@@ -62,7 +65,7 @@ def written_as(kind: str, folder: Path, context: Any, stack: PanelStack) -> Path
 
 
 @pytest.mark.parametrize(
-    "kind", ["glb", "gltf", "obj", "off", "ply", "stl", "splats", "tif", "depth", "mp4", "a folder", "pairs"]
+    "kind", ["glb", "gltf", "obj", "off", "ply", "stl", "splats", "tif", "leia", "depth", "mp4", "a folder", "pairs"]
 )
 def test_what_was_read_there_is_drawn_as_what_is_read_here(
     kind: str, tmp_path: Path, context: Any, stack: PanelStack, monkeypatch: pytest.MonkeyPatch

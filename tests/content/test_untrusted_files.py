@@ -351,6 +351,7 @@ def test_a_gltf_is_refused_by_what_it_says_of_itself(tmp_path: Path, name: str) 
             "a.LCC",
             "is compressed splats (.lcc), which is not read: convert it: `npx @playcanvas/splat-transform in.lcc",
         ),
+        ("a.wmv", "is a film (.wmv), which is not read: convert it: `ffmpeg -i in.wmv out.mp4`"),
         ("a.glb", "is a pointer of Git LFS: fetch the file itself (git lfs pull)"),
         ("a.ply", "is a pointer of Git LFS"),
     ],

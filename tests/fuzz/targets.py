@@ -18,6 +18,7 @@ import numpy as np
 import onnx
 import tomlkit
 import trimesh
+from mcap.writer import CompressionType, Writer
 from PIL import Image
 
 from calib.pairs import read_pairs
@@ -27,6 +28,7 @@ from runtime.config import ContentSettings, Settings, load_settings, load_stack
 from runtime.content.compressed_splats import load_compressed_splats
 from runtime.content.frames import open_frames
 from runtime.content.gaussians import bounds, load_gaussians, of_points
+from runtime.content.layout import layout_of
 from runtime.content.mesh import load_mesh
 from runtime.content.packed_splats import load_compressed, load_splat
 from runtime.content.parts import merged
@@ -44,13 +46,13 @@ from runtime.panels.edid import parse
 from runtime.panels.lut import measured_curve
 from runtime.records import EyePoints, Intrinsics, SensorFrame
 from runtime.sensor.recording import RecordingWriter
-from runtime.sensor.recording_format import RecordingHeader
+from runtime.sensor.recording_format import METADATA_NAME, RecordingHeader, eyes_message
 from runtime.sensor.replay import ReplayDriver
 from runtime.support.untrusted_input import parsed_json
 from tests.content.gltf_files import Buffer
 from tests.content.packed_splat_files import write_compressed, write_sog, write_splat, write_spz
 from tests.content.picture_files import equirectangular, film, heic_pair, lif, mpo, st3d, swapped_profile
-from tests.content.test_gltf import square
+from tests.content.test_gltf import compressed, square
 from tests.content.test_splat import splat_table
 from tests.content.test_untrusted_files import PNG_URI, gltf, textured
 from tests.panels.edids import block
@@ -104,7 +106,20 @@ def recordings() -> list[bytes]:
             writer.write(SensorFrame(k + 1, 10**9 + k * 33_333_333, **parts))  # type: ignore[arg-type]
         writer.finish()
         made.append(held.getvalue())
-    return made
+    return [*made, *(cut_off_in_a_chunk(kind) for kind in ("LZ4", "ZSTD"))]
+
+
+def cut_off_in_a_chunk(compression: str) -> bytes:
+    """A recording of another program that ended within its only chunk."""
+    held = io.BytesIO()
+    writer = Writer(held, chunk_size=1 << 20, compression=CompressionType[compression])
+    writer.start()
+    writer.add_metadata(METADATA_NAME, RecordingHeader(driver="a").metadata())
+    begin, channel = held.tell(), writer.register_channel("/eyes", "json", 0)
+    for k in range(300):
+        writer.add_message(channel, k, eyes_message(SensorFrame(k, 10**9 + k)), k)
+    writer.finish()
+    return held.getvalue()[: begin + (held.tell() - begin) // 2]
 
 
 def recording(path: Path) -> object:
@@ -191,6 +206,11 @@ def pictures() -> list[bytes]:
         told = {"exif": exif, "icc_profile": swapped_profile()} if mode == "RGB" and kind != "BMP" else {}
         first.convert(mode).save(held, kind, **told)
         made.append(held.getvalue())
+    for kind, mode in (("JPEG", "CMYK"), ("TIFF", "CMYK"), ("TIFF", "I;16"), ("TGA", "RGB"), ("PPM", "RGB")):
+        held = io.BytesIO()
+        first.convert("L" if mode == "I;16" else mode).convert(mode).save(held, kind)
+        made.append(held.getvalue())
+    made.append(made[1][:2] + b"\xff\xe3\0\x10_JPSJPS_\0\4\0\4\2\1" + made[1][2:])  # a stereo header
     for kind in ("GIF", "PNG", "WEBP", "AVIF"):
         held = io.BytesIO()
         first.save(held, kind, save_all=True, append_images=[second], duration=50)
@@ -268,7 +288,9 @@ def skinned() -> dict[str, Any]:
 
 def gltfs() -> list[bytes]:
     held = [gltf(), textured(0, [{"source": 0}], [{"uri": PNG_URI}]), skinned()]
-    return [json.dumps(table).encode() for table in held]
+    with tempfile.TemporaryDirectory() as folder:
+        draco = compressed(Path(folder) / "a.gltf", required=True, fallback=False).read_bytes()
+    return [*(json.dumps(table).encode() for table in held), draco]
 
 
 def mesh(path: Path) -> object:
@@ -306,6 +328,33 @@ def spz_splats() -> list[bytes]:
         table = splat_table(20, degree=1)
         made = [write_spz(Path(folder) / "a.spz", table, version=k).read_bytes() for k in (1, 2, 3, 4)]
         return [*made, gzip.decompress(made[1])]
+
+
+@cache
+def sog_files() -> dict[str, bytes]:
+    """The files of a SOG, unpacked, by their names."""
+    with tempfile.TemporaryDirectory() as folder:
+        made = write_sog(Path(folder) / "a", splat_table(20, degree=1))
+        return {path.name: path.read_bytes() for path in made.iterdir()}
+
+
+def sog_folder(data: bytes, folder: Path) -> object:
+    """They, with other bytes as their table."""
+    for name, held in (sog_files() | {"meta.json": data}).items():
+        at(folder, name, held)
+    return bounds(load_compressed_splats(folder))
+
+
+def names() -> list[bytes]:
+    return [b"a_qs8x6a0.75 (1).png", b"film.3D.HSBS.1080p.mkv", b"vr180_sbs.mp4", b"x_half-top-bottom.jpg", b"a_LR.png"]
+
+
+def named(data: bytes, folder: Path) -> object:
+    """The layout of a picture of this name."""
+    layout = layout_of(Path(data.decode("utf-8", "replace")), ContentSettings())
+    with contextlib.suppress(ValueError):  # too many views for it
+        return layout.views(np.zeros((16, 32, 3), np.uint8))
+    return None
 
 
 def sog_splats() -> list[bytes]:
@@ -373,6 +422,8 @@ TARGETS: dict[str, Target] = {
     "dotsplat": Target(small_splats, file("a.splat", lambda path: bounds(load_splat(path)))),
     "spz": Target(spz_splats, file("a.spz", lambda path: bounds(load_compressed_splats(path)))),
     "sog": Target(sog_splats, file("a.sog", lambda path: bounds(load_compressed_splats(path)))),
+    "sogfolder": Target(lambda: [sog_files()["meta.json"]], sog_folder),
+    "name": Target(names, named),
     "playlist": Target(
         lambda: [PLAYLIST.encode(), b'{"show": [{"scene": "flat", "seconds": 3}]}'],
         file("a.toml", lambda path: read_playlist(path, ContentSettings()), json_marks=b"{"),
