@@ -1,8 +1,9 @@
 """Quality of sampled refreshes, measured once their true eyes are known.
 
 Targets are drawn on the solver's thread. In real time they are compared with the layers on a background thread, one
-refresh at a time, newest first. A few of the samples that arrive meanwhile are queued and measured at the end; the
-rest are dropped. On a simulated clock every sample is measured, in order.
+refresh at a time, newest first, and only for a small share of the time: measuring must not slow down the solutions
+that it measures. A few of the samples that arrive meanwhile are queued and measured at the end; the rest are dropped.
+On a simulated clock every sample is measured, in order.
 """
 
 from __future__ import annotations
@@ -27,7 +28,9 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F64, State
 from runtime.support.background import MEASURING_NICENESS, BackgroundJob
 
-HELD_MAX = 3  # samples queued in real time, with their layers: 25 MB each at 1080p
+HELD_MAX = 5  # samples queued in real time, with their layers
+HELD_BYTES = 200 << 20  # of their layers, at most: 25 MB each at 1080p on the full raster
+MEASURING_SHARE = 0.1  # of a real-time run, spent on measuring
 MEASURED_WITHIN_S = 60.0  # timeout for measuring the queued samples after the run
 LOOK_S = 0.02  # interval between checks for completion
 DRAWN_WITHIN_S = 10.0  # timeout for drawing the last refresh's targets
@@ -62,6 +65,7 @@ class QualitySampler:
         self._job_frame = self._moment_frame = -1
         self._samples = 0
         self._drawing = False
+        self._began_s = self._resumes_s = 0.0  # of the newest measurement; earliest begin of the next, in real time
 
     def refreshed(self, refresh: Refresh) -> None:
         """Queue a refresh if it is due. In real time it may replace a queued one."""
@@ -69,9 +73,13 @@ class QualitySampler:
         if not is_sample or not refresh.account.presented:
             return
         self._samples += 1
-        if not self._simulated and len(self._waiting) == HELD_MAX:
-            del self._waiting[self._samples % HELD_MAX]
         self._waiting.append(_Sample(refresh, self._drawer.shown_content()))
+        while not self._simulated and len(self._waiting) > 1 and self._holds_too_much():
+            del self._waiting[self._samples % (len(self._waiting) - 1)]
+
+    def _holds_too_much(self) -> bool:
+        layers = [sample.refresh.solution.layers for sample in self._waiting if sample.refresh.solution is not None]
+        return len(self._waiting) > HELD_MAX or sum(each.nbytes for each in layers) > HELD_BYTES
 
     @property
     def _is_busy(self) -> bool:
@@ -80,22 +88,30 @@ class QualitySampler:
     def drain(self, stopped: Callable[[], bool]) -> None:
         """Measure the queued samples after a real-time run. stopped: returns True after a stop request."""
         ends_s = time.monotonic() + MEASURED_WITHIN_S
-        self.advance()
+        self.advance(at_once=True)
         while self._is_busy and not stopped() and time.monotonic() < ends_s:
             time.sleep(LOOK_S)
-            self.advance()
+            self.advance(at_once=True)
 
-    def advance(self) -> None:
-        """Collect a finished measurement and start those whose true eyes are now known."""
+    def advance(self, *, at_once: bool = False) -> None:
+        """Collect a finished measurement and start those whose true eyes are now known.
+
+        at_once: begin the next one now; otherwise, in real time, keep to MEASURING_SHARE.
+        """
+        now_s = time.monotonic()
         if self._job is not None and self._job.done:
             job, self._job = self._job, None
             self._take(self._job_frame, job.take())
+            self._resumes_s = now_s + (now_s - self._began_s) * (1 / MEASURING_SHARE - 1)
+        if not (self._simulated or at_once) and now_s < self._resumes_s:
+            return
         while self._waiting and self._job is None and not self._drawing:
             first = 0 if self._simulated else -1
             if self._truth.may_come(self._waiting[first].refresh.account.photon_ns):
                 return
             sample = self._waiting[first]
             del self._waiting[first]
+            self._began_s = now_s
             self._begin(sample)
 
     def finish(self, last: Refresh) -> None:

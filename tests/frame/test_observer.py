@@ -261,17 +261,42 @@ def test_in_real_time_one_measurement_runs_at_a_time_and_delays_nothing(
     assert observer.summary()["quality_frames"] == 1
 
 
+@pytest.mark.parametrize(("share", "begun"), [(1.0, True), (1e-9, False)])
+def test_measuring_takes_only_its_share_of_a_real_time_run(
+    share: float, begun: bool, content: ContentSource, solved: Solution, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sampling, "MEASURING_SHARE", share)
+    solver = Drawing(content, at_once=False)
+    observer, _ = looking(content, solver=solver, simulated=False, evaluate_every=1)
+    observer.refreshed(refresh(0, solved))
+    assert solver.tasks.pop()(solver) is True
+    assert wait_for_all(120.0) == 0
+    observer.refreshed(refresh(1, solved))
+    assert len(solver.tasks) == begun
+
+
+def test_queued_layers_are_few_and_small(
+    content: ContentSource, solved: Solution, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sampling, "HELD_BYTES", 2 * solved.layers.nbytes)
+    observer, _ = looking(content, solver=Drawing(content, at_once=False), simulated=False, evaluate_every=1)
+    for number in range(20):
+        observer.refreshed(refresh(number, solved))
+    assert len(observer._sampler._waiting) == 2
+
+
 def test_a_few_samples_that_came_meanwhile_are_measured_at_the_end(content: ContentSource, solved: Solution) -> None:
     solver = Drawing(content, at_once=False)
     observer, _ = looking(content, solver=solver, simulated=False, evaluate_every=1)
-    for number in range(10):
+    for number in range(2 * sampling.HELD_MAX):
         observer.sampled(sample(NS_PER_S + number * PERIOD_NS))
         observer.refreshed(refresh(number, solved))
     assert solver.tasks.pop()(solver) is True  # the first one's
     solver.at_once = True
     observer.finish()
-    assert set(observer.live_errors) > {0, 9} and len(observer.live_errors) == 1 + sampling.HELD_MAX
-    assert observer.moment is not None and observer.moment.lines[0].startswith("Refresh 9;")
+    last = 2 * sampling.HELD_MAX - 1
+    assert set(observer.live_errors) > {0, last} and len(observer.live_errors) == 1 + sampling.HELD_MAX
+    assert observer.moment is not None and observer.moment.lines[0].startswith(f"Refresh {last};")
 
 
 def test_comparing_is_not_the_presenter_s_nor_the_solver_s_work(
