@@ -1,7 +1,7 @@
 """The compiled C++ loops, called by `ctypes`, which lets other threads run meanwhile.
 
 The structures below are those of the C++ files, field by field (`KernelImage` is `Image` there, `KernelView` is `View`,
-`ErrorSum` is `Result`); `library` compares their sizes.
+`ErrorSum` is `Result`); `library` compares their sizes and the limit of ray sets.
 """
 
 from __future__ import annotations
@@ -84,6 +84,7 @@ class ErrorSum(ctypes.Structure):
 
 COMPILED = {
     "problem_bytes": ctypes.sizeof(Problem), "warp_bytes": ctypes.sizeof(Warp), "view_bytes": ctypes.sizeof(KernelView),
+    "max_sets": MAX_SETS,
 }  # fmt: skip
 
 

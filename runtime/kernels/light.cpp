@@ -54,9 +54,9 @@ INLINE bool see(const View &view, double u, double v, int point, float *seen) {
     const int64_t row = int64_t(y - 0.5), column = int64_t(x - 0.5);
     const float down = float(y - 0.5 - double(row)), right = float(x - 0.5 - double(column));
     for (int corner = 0; corner < 4; ++corner) {
-      const int below = corner > 1, beside = corner & 1;
-      const float part = (below ? down : 1 - down) * (beside ? right : 1 - right) * TABLE_STEPS;
-      const uint8_t *pixel = layer + ((row + below) * view.width + column + beside) * view.components;
+      const int below = corner > 1, to_right = corner & 1;
+      const float part = (below ? down : 1 - down) * (to_right ? right : 1 - right) * TABLE_STEPS;
+      const uint8_t *pixel = layer + ((row + below) * view.width + column + to_right) * view.components;
       for (int k = 0; k < 3; ++k) sums[k] += part * pixel[k];
     }
   }

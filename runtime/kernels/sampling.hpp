@@ -17,7 +17,7 @@
 
 constexpr int LANES = 32;     // elements of a vector in the loops; the compiler splits it for the processor
 constexpr int TILE_PX = 256;  // pixels of a row that are sampled together: their data fits the first-level cache
-constexpr int EDGE_PX = 4;    // beyond an image, that may be looked at
+constexpr int EDGE_PX = 4;    // outside an image, that may be sampled
 constexpr int MAX_PANELS = 5;
 constexpr int MAX_CHANNELS = 3;
 constexpr int TILE = TILE_PX * MAX_CHANNELS + 2 * LANES;  // elements; those after the last one may be overwritten
@@ -72,7 +72,7 @@ INLINE void at_least_zero(double slope, double offset, double &low, double &high
 
 // Pixels of a row of `count` whose positions are at least `near` pixels inside the image's edges.
 INLINE Span inside(const Line &line, int count, const Image &image, double near) {
-  constexpr double rounded = 1e-6;  // a place on an edge is inside, however it was worked out
+  constexpr double rounded = 1e-6;  // a position on an edge is inside, with any rounding error
   const double right = image.width - near, below = image.rows - near;
   double low = 0, high = count - 1;
   at_least_zero(line.wu, line.w0 - 1e-9, low, high);
@@ -102,36 +102,44 @@ struct alignas(2 * LANES) Work {
   int16_t sum[TILE];
 };
 
-// F images alike at pixels first to last of a line (TILE_PX at most, all of them `inside`), into out[f], from element
-// `begin_at` on; a vector and two pixels behind the last may be written over, nothing before the first. Two rows of the
-// image are mixed first, for the pixels between which the line runs: run by run, with weights that grow evenly. Then
-// neighbours of that, a vector at a time: the source's pixels move on by a little more or less than the line's, so that
-// a vector needs two neighbours, or up to three more. Pixels on pixels need none.
-template <int F, int C, typename AnyLine>
-INLINE void sample(const Image *images, const AnyLine &line, int first, int last, Work &work, int16_t (*out)[TILE], int begin_at = 0) {
-  const Image &image = images[0];
-  const int16_t *ramp = C == 1 ? RAMP.one_channel : RAMP.three_channels;
-  const double xs = line.x(first), xe = line.x(last - 1), ys = line.y(first), ye = line.y(last - 1);
-  const double slope = xe - xs > 0.5 ? (ye - ys) / (xe - xs) : 0, bottom = image.rows - 1;
+// Pixels first to last of a line in an image, and the image's pixels that they lie between.
+struct Stretch {
+  double xs, xe, ys, ye;  // positions of the first and the last pixel
+  int first, steps;       // steps from pixel to pixel
+  bool on_pixels;         // every pixel lies on a column of the image, one column after the other
+  int s0, elements;       // first pixel that is read, and the number of elements from there
+};
+
+template <int C, typename AnyLine>
+INLINE Stretch stretch_of(const Image &image, const AnyLine &line, int first, int last) {
+  const double xs = line.x(first), xe = line.x(last - 1);
   const int steps = last - 1 - first;
   const auto whole_px = [](double px) { return std::abs(px - std::nearbyint(px)) < 1e-6; };
-  const bool straight = xs >= 0 && xe < image.width && whole_px(xs) && std::abs(xe - xs - steps) < 1e-6 &&
-                        std::abs(line.x(first + 0.5 * steps) - xs - 0.5 * steps) < 1e-6;  // every pixel on one of the source
-  const int s0 = straight ? int(std::nearbyint(xs)) : std::clamp(int(std::floor(xs)) - 1, 0, image.width - 1) / LANES * LANES;
+  const bool on_pixels = xs >= 0 && xe < image.width && whole_px(xs) && std::abs(xe - xs - steps) < 1e-6 &&
+                         std::abs(line.x(first + 0.5 * steps) - xs - 0.5 * steps) < 1e-6;
+  const int s0 = on_pixels ? int(std::nearbyint(xs)) : std::clamp(int(std::floor(xs)) - 1, 0, image.width - 1) / LANES * LANES;
   const int s1 = std::clamp(int(std::floor(xe)) + 2, 0, image.width - 1);
-  const int elements = std::min((s1 - s0 + 1) * C, SOURCE - 4 * LANES);
-  for (int at = 0, length; at < elements; at += length) {
-    const double y = ys + (s0 + at / C - xs) * slope, within = std::clamp(y, 0.0, bottom);
+  return {xs, xe, line.y(first), line.y(last - 1), first, steps, on_pixels, s0, std::min((s1 - s0 + 1) * C, SOURCE - 4 * LANES)};
+}
+
+// Mix the two rows of the images between which a stretch runs, into to[f]: run by run, with weights that grow evenly.
+template <int F, int C>
+INLINE void mix_rows(const Image *images, const Stretch &along, int16_t *const (&to)[F]) {
+  const Image &image = images[0];
+  const int16_t *ramp = C == 1 ? RAMP.one_channel : RAMP.three_channels;
+  const double slope = along.xe - along.xs > 0.5 ? (along.ye - along.ys) / (along.xe - along.xs) : 0, bottom = image.rows - 1;
+  for (int at = 0, length; at < along.elements; at += length) {
+    const double y = along.ys + (along.s0 + at / C - along.xs) * slope, within = std::clamp(y, 0.0, bottom);
     const int row = std::min(int(within), std::max(image.rows - 2, 0));
     double grows = y == within ? slope : 0, until = 1e6;  // pixels
     if (std::abs(slope) > 1e-7) {
       const double end = y < 0 ? (slope > 0 ? 0 : -1e9) : y > bottom ? (slope < 0 ? bottom : 1e9) : row + (slope > 0);
       until = std::min((end - y) / slope, 1e6);
     }
-    length = std::min(elements - at, (int(until) + 1) * C);
+    length = std::min(along.elements - at, (int(until) + 1) * C);
     const double share = (within - row) * WEIGHT_UNIT;
     const int16_t step = rounded(float(grows * WEIGHT_UNIT));
-    const int64_t from = int64_t(s0) * C + at;
+    const int64_t from = int64_t(along.s0) * C + at;
     for (int e = 0; e < length; e += LANES) {
       const int px = e / C, phase = e - px * C;
       const int16_t begin = rounded(float(share + grows * WEIGHT_UNIT * px));
@@ -140,37 +148,56 @@ INLINE void sample(const Image *images, const AnyLine &line, int first, int last
       for (int f = 0; f < F; ++f) {
         const int16_t *upper = images[f].row(row) + from + e;
         const int16_t *lower = images[f].row(std::min(row + 1, image.rows - 1)) + from + e;
-        int16_t *to = (straight ? out[f] + begin_at : work.source[f] + LANES) + at + e;
-        VECTORISED for (int k = 0; k < LANES; ++k) to[k] = mixed(upper[k], lower[k], weights[k]);
+        int16_t *mix = to[f] + at + e;
+        VECTORISED for (int k = 0; k < LANES; ++k) mix[k] = mixed(upper[k], lower[k], weights[k]);
       }
     }
   }
-  if (straight) return;
-  for (int f = 0; f < F; ++f) {  // clamp to edge
-    int16_t *source = work.source[f] + LANES;
-    for (int beyond = 1; beyond <= EDGE_PX; ++beyond)
-      for (int c = 0; c < C; ++c) {
-        source[c - beyond * C] = source[c];
-        source[elements + (beyond - 1) * C + c] = source[elements - C + c];
-      }
-  }
-  const double half = 0.5 * steps, middle = steps > 1 ? line.x(first + half) : 0.5 * (xs + xe);
-  const double bend = steps > 1 ? (xs + xe - 2 * middle) / (half * half) * 0.5 : 0;  // along a tile: a parabola
-  const double scale = steps > 0 ? (xe - xs) / steps - bend * steps : 1;  // where it begins
+}
+
+// Repeat the first and the last pixel of mixed rows outside them (clamp to edge).
+template <int C>
+INLINE void clamp_ends(int16_t *source, int elements) {
+  for (int beyond = 1; beyond <= EDGE_PX; ++beyond)
+    for (int c = 0; c < C; ++c) {
+      source[c - beyond * C] = source[c];
+      source[elements + (beyond - 1) * C + c] = source[elements - C + c];
+    }
+}
+
+// Position along a stretch, in pixels after the first that is read: a parabola, in 2^-32 pixels. Pixel k's is k further.
+struct Parabola {
+  int64_t begin, drift, turn;
+  int at_once;  // elements of a vector
+};
+
+template <int C, typename AnyLine>
+INLINE Parabola parabola_of(const AnyLine &line, const Stretch &along) {
+  const int steps = along.steps;
+  const double half = 0.5 * steps, middle = steps > 1 ? line.x(along.first + half) : 0.5 * (along.xs + along.xe);
+  const double bend = steps > 1 ? (along.xs + along.xe - 2 * middle) / (half * half) * 0.5 : 0;
+  const double scale = steps > 0 ? (along.xe - along.xs) / steps - bend * steps : 1;  // at the first pixel
   // As many elements per vector as keep the source's gain below three pixels (two with one channel: over 32 pixels the
   // rounding of a weight's growth adds up) and a chord close to the parabola.
   constexpr double gains = C == 1 ? 1.9 : 2.9;
   const double most = std::max(std::abs(scale - 1), std::abs(scale - 1 + 2 * bend * steps));
   int at_once = LANES;
   for (int px; px = (at_once + C - 2) / C, at_once > 1 && (most * px > gains || std::abs(bend) * px * px > 0.008);) at_once /= 2;
-  constexpr double one = 4294967296.0;  // fixed point: how much further to the right the source is, in 2^-32 pixels
-  const int64_t begin = int64_t((xs - s0) * one), drift = int64_t((scale - 1) * one), turn = int64_t(bend * one);
-  for (int e = 0; e < (steps + 1) * C; e += at_once) {
-    const int k = e / C, phase = e - k * C, px = (at_once - 1 + phase) / C;
-    const int first_at = int((begin + k * (drift + turn * k)) >> 18);  // in WEIGHT_UNIT from here on, as weights are
-    const int each = int((drift + turn * (2 * k + px) + (1 << 17)) >> 18), last_at = first_at + each * px;
-    const int beside = std::min(first_at, last_at) >> 14, further = (std::max(first_at, last_at) >> 14) - beside;
-    const uint16_t share = uint16_t(first_at - beside * int(WEIGHT_UNIT));
+  constexpr double one = 4294967296.0;
+  return {int64_t((along.xs - along.s0) * one), int64_t((scale - 1) * one), int64_t(bend * one), at_once};
+}
+
+// Mix neighbours in mixed rows, a vector at a time: the source's pixels advance by a little more or less than the
+// line's, so that a vector needs two neighbours, or up to three more.
+template <int F, int C>
+INLINE void mix_neighbours(const Parabola &by, int elements, const int16_t *const (&sources)[F], int16_t *const (&to)[F]) {
+  const int16_t *ramp = C == 1 ? RAMP.one_channel : RAMP.three_channels;
+  for (int e = 0; e < elements; e += by.at_once) {
+    const int k = e / C, phase = e - k * C, px = (by.at_once - 1 + phase) / C;
+    const int first_at = int((by.begin + k * (by.drift + by.turn * k)) >> 18);  // in WEIGHT_UNIT from here on, as weights are
+    const int each = int((by.drift + by.turn * (2 * k + px) + (1 << 17)) >> 18), last_at = first_at + each * px;
+    const int offset = std::min(first_at, last_at) >> 14, further = (std::max(first_at, last_at) >> 14) - offset;  // pixels
+    const uint16_t share = uint16_t(first_at - offset * int(WEIGHT_UNIT));
     int16_t weights[4][LANES];  // from each neighbour to the next
     VECTORISED for (int i = 0; i < LANES; ++i) {
       constexpr uint16_t full = uint16_t(WEIGHT_UNIT);
@@ -181,16 +208,29 @@ INLINE void sample(const Image *images, const AnyLine &line, int first, int last
       weights[2][i] = int16_t(to_fourth), weights[3][i] = int16_t(beyond - to_fourth);
     }
     for (int f = 0; f < F; ++f) {
-      const int16_t *source = work.source[f] + LANES + (k + beside) * C + phase;
-      int16_t *to = out[f] + begin_at + e;
-      if (further == 0) VECTORISED for (int i = 0; i < LANES; ++i) to[i] = mixed(source[i], source[i + C], weights[0][i]);
+      const int16_t *source = sources[f] + (k + offset) * C + phase;
+      int16_t *mix = to[f] + e;
+      if (further == 0) VECTORISED for (int i = 0; i < LANES; ++i) mix[i] = mixed(source[i], source[i + C], weights[0][i]);
       else VECTORISED for (int i = 0; i < LANES; ++i)
-        to[i] = int16_t(mixed(source[i], source[i + C], weights[0][i]) + part_of(source[i + C], source[i + 2 * C], weights[1][i]));
+        mix[i] = int16_t(mixed(source[i], source[i + C], weights[0][i]) + part_of(source[i + C], source[i + 2 * C], weights[1][i]));
       for (int n = 2; n <= further; ++n)
         VECTORISED for (int i = 0; i < LANES; ++i)
-          to[i] = int16_t(to[i] + part_of(source[i + n * C], source[i + (n + 1) * C], weights[n][i]));
+          mix[i] = int16_t(mix[i] + part_of(source[i + n * C], source[i + (n + 1) * C], weights[n][i]));
     }
   }
+}
+
+// F images of one shape at pixels first to last of a line (TILE_PX at most, all of them `inside`), into out[f], from
+// element `begin_at` on; a vector and two pixels after the last may be overwritten, nothing before the first.
+template <int F, int C, typename AnyLine>
+INLINE void sample(const Image *images, const AnyLine &line, int first, int last, Work &work, int16_t (*out)[TILE], int begin_at = 0) {
+  const Stretch along = stretch_of<C>(images[0], line, first, last);
+  int16_t *sources[F], *to[F];
+  for (int f = 0; f < F; ++f) sources[f] = work.source[f] + LANES, to[f] = out[f] + begin_at;
+  if (along.on_pixels) return mix_rows<F, C>(images, along, to);
+  mix_rows<F, C>(images, along, sources);
+  for (int f = 0; f < F; ++f) clamp_ends<C>(sources[f], along.elements);
+  mix_neighbours<F, C>(parabola_of<C>(line, along), (along.steps + 1) * C, sources, to);
 }
 
 // Length of a tile of a line: short enough that a parabola is a hundredth of a pixel off, with room for its source.

@@ -21,7 +21,7 @@ struct Panel {
   Image ahead;   // read by the rays: with momentum
   Image moved;   // the same after the step
   Image before;  // without momentum
-  Image last;    // the same after the step: the same image, but for the first step, where `before` is `ahead`
+  Image last;    // the same after the step: the same image, except in the first step, where `before` is `ahead`
 };
 
 struct Problem {
@@ -50,64 +50,113 @@ struct Share {
   int panel_first[MAX_PANELS], panel_end[MAX_PANELS];
   int16_t *ring;
   int64_t stride, plane;  // of a row, of one field
-  int rows, fields;
+  int rows;               // of a ring
   Image cosine[MAX_PANELS], sine[MAX_PANELS];  // of pi times `ahead`
 
-  int16_t *field(int set, int f) const { return ring + (int64_t(set) * fields + f) * plane; }
+  int16_t *field(int set, int f) const { return ring + (int64_t(set) * FIELDS + f) * plane; }
   int16_t *row(int set, int f, int r) const { return field(set, f) + int64_t(r % rows) * stride; }
   Image image(const Problem &problem, int set, int f) const {
     return {field(set, f), stride, problem.height, problem.width, rows};
   }
 };
 
-Share share_of(const Problem &problem, int part, int parts, int fields, bool phasors) {
-  static thread_local std::vector<int16_t> memory;
-  const int height = problem.height;
-  Share share;
-  share.first = int(int64_t(height) * part / parts), share.end = int(int64_t(height) * (part + 1) / parts);
-  share.rows = 1, share.fields = fields;
-  int begin = share.first;
-  int64_t held[MAX_PANELS], total = 0;
-  for (int n = 0; n < problem.panels; ++n) {
-    const Image &image = problem.panel[n].ahead;
-    std::vector<int> &since = share.since[n], &until = share.until[n];
-    since.resize(image.rows), until.resize(image.rows);
-    int &first = share.panel_first[n] = image.rows, &end = share.panel_end[n] = 0, latest = 0;
-    for (int q = 0; q < image.rows; ++q) {
-      double low = 1e9, high = -1e9;
-      for (int set = 0; set < problem.sets; ++set) {
-        const Line line(problem.rays_from_panels + (set * problem.panels + n) * 9, q);
-        const double right = image.width - 0.5, top = line.y(-0.5), bottom = line.y(right);
-        const double run = std::abs(line.x(right) - line.x(-0.5));
-        const double beside = 2 * std::abs(bottom - top) / std::max(run, 1.0);  // two pixels further along the line
-        low = std::min({low, top - beside, bottom - beside}), high = std::max({high, top + beside, bottom + beside});
-      }
-      since[q] = int(std::clamp(std::floor(low), 0.0, height - 1.0));
-      until[q] = latest = std::max(latest, int(std::clamp(std::floor(high) + 1, 0.0, height - 1.0)));
-      share.rows = std::max(share.rows, latest - since[q] + 2);
-      const bool mine = (latest >= share.first || part == 0) && (latest < share.end || part == parts - 1);
-      if (mine) first = std::min(first, q), end = q + 1, begin = std::min(begin, since[q]);
-    }
-    for (int q = image.rows - 2; q >= 0; --q) since[q] = std::min(since[q], since[q + 1]);
-    // Rays between two rows see both: phasors are there from the row before's first ray to the next one's last.
-    held[n] = 2;
-    for (int q = 0, oldest = 0; q < image.rows; held[n] = std::max(held[n], int64_t(++q - oldest) + 2))
-      while (oldest < q && until[oldest + 1] < since[std::max(q - 1, 0)]) ++oldest;
-    total += phasors ? 2 * held[n] * whole_vectors(image.width * problem.channels + LANES) : 0;
+struct Range {
+  double low, high;
+};
+
+// Rows of rays, of any set, that see row q of a panel.
+Range rays_through(const Problem &problem, int n, int q) {
+  const double right = problem.panel[n].ahead.width - 0.5;
+  Range rays{1e9, -1e9};
+  for (int set = 0; set < problem.sets; ++set) {
+    const Line line(problem.rays_from_panels + (set * problem.panels + n) * 9, q);
+    const double top = line.y(-0.5), bottom = line.y(right), run = std::abs(line.x(right) - line.x(-0.5));
+    const double margin = 2 * std::abs(bottom - top) / std::max(run, 1.0);  // two pixels further along the line
+    rays.low = std::min({rays.low, top - margin, bottom - margin});
+    rays.high = std::max({rays.high, top + margin, bottom + margin});
   }
-  share.first = begin;
-  share.stride = whole_vectors(int64_t(problem.width) * problem.channels + LANES);
-  share.plane = share.stride * share.rows;
-  const int64_t rings = problem.sets * fields * share.plane + 2 * LANES;
-  memory.resize(size_t(rings + total + 3 * LANES));
+  return rays;
+}
+
+// Set `since` and `until` of each row of a panel. Neither decreases from row to row.
+void find_dependencies(const Problem &problem, int n, Share &share) {
+  const int rows = problem.panel[n].ahead.rows;
+  const double last = problem.height - 1.0;
+  std::vector<int> &since = share.since[n], &until = share.until[n];
+  since.resize(rows), until.resize(rows);
+  for (int q = 0, latest = 0; q < rows; ++q) {
+    const Range rays = rays_through(problem, n, q);
+    since[q] = int(std::clamp(std::floor(rays.low), 0.0, last));
+    until[q] = latest = std::max(latest, int(std::clamp(std::floor(rays.high) + 1, 0.0, last)));
+  }
+  for (int q = rows - 2; q >= 0; --q) since[q] = std::min(since[q], since[q + 1]);
+}
+
+// First row whose last ray is in row r or later.
+int first_until(const std::vector<int> &until, int r) {
+  return int(std::lower_bound(until.begin(), until.end(), r) - until.begin());
+}
+
+// Divide the rays' rows evenly: a partition updates the panel rows whose last ray is in its share. It also processes
+// the rays before its share that see those rows.
+void assign_rows(const Problem &problem, int part, int parts, Share &share) {
+  const int first = int(int64_t(problem.height) * part / parts);
+  share.first = first, share.end = int(int64_t(problem.height) * (part + 1) / parts);
+  for (int n = 0; n < problem.panels; ++n) {
+    const std::vector<int> &until = share.until[n];
+    const int begin = share.panel_first[n] = part == 0 ? 0 : first_until(until, first);
+    share.panel_end[n] = part == parts - 1 ? int(until.size()) : first_until(until, share.end);
+    if (begin < share.panel_end[n]) share.first = std::min(share.first, share.since[n][begin]);
+  }
+}
+
+// Rows of rays that a panel row may have to wait for, with two more.
+int ray_rows(const std::vector<int> &since, const std::vector<int> &until) {
+  int rows = 1;
+  for (size_t q = 0; q < since.size(); ++q) rows = std::max(rows, until[q] - since[q] + 2);
+  return rows;
+}
+
+// Rows of a panel whose phasors are in use together. Rays between two rows see both: a row's phasors are needed from the
+// row before's first ray to the next one's last.
+int phasor_rows(const std::vector<int> &since, const std::vector<int> &until) {
+  int rows = 2;
+  for (int q = 0, oldest = 0; q < int(since.size()); ++q) {
+    while (oldest < q && until[oldest + 1] < since[std::max(q - 1, 0)]) ++oldest;
+    rows = std::max(rows, q - oldest + 3);
+  }
+  return rows;
+}
+
+int64_t stride_of(const Problem &problem, int width) { return whole_vectors(int64_t(width) * problem.channels + LANES); }
+
+// Place the ring buffers in memory that the thread keeps from call to call.
+void lay_out(const Problem &problem, bool phasors, Share &share) {
+  static thread_local std::vector<int16_t> memory;
+  share.rows = 1;
+  int64_t of_phasors = 0;
+  for (int n = 0; n < problem.panels; ++n) {
+    const Image &panel = problem.panel[n].ahead;
+    share.rows = std::max(share.rows, ray_rows(share.since[n], share.until[n]));
+    if (!phasors) continue;
+    const int32_t rows = phasor_rows(share.since[n], share.until[n]);
+    share.cosine[n] = share.sine[n] = {nullptr, stride_of(problem, panel.width), panel.rows, panel.width, rows};
+    of_phasors += 2 * rows * share.cosine[n].stride;
+  }
+  share.stride = stride_of(problem, problem.width), share.plane = share.stride * share.rows;
+  const int64_t of_rays = problem.sets * FIELDS * share.plane + 2 * LANES;
+  memory.resize(size_t(of_rays + of_phasors + 3 * LANES));
   share.ring = memory.data() + (LANES - (reinterpret_cast<uintptr_t>(memory.data()) / sizeof(int16_t)) % LANES);
-  int16_t *at = share.ring + rings;
+  int16_t *at = share.ring + of_rays;
   for (int n = 0; phasors && n < problem.panels; ++n)
-    for (Image *image : {share.cosine + n, share.sine + n}) {
-      const Image &like = problem.panel[n].ahead;
-      *image = {at, whole_vectors(int64_t(like.width) * problem.channels + LANES), like.rows, like.width, int32_t(held[n])};
-      at += image->stride * held[n];
-    }
+    for (Image *image : {share.cosine + n, share.sine + n}) image->data = at, at += image->stride * image->ring;
+}
+
+Share share_of(const Problem &problem, int part, int parts, bool phasors) {
+  Share share;
+  for (int n = 0; n < problem.panels; ++n) find_dependencies(problem, n, share);
+  assign_rows(problem, part, parts, share);
+  lay_out(problem, phasors, share);
   return share;
 }
 
@@ -137,9 +186,9 @@ INLINE void to_phasors(const Problem &problem, const Share &share, int n, int q)
   }
 }
 
-INLINE void clear_beside(const Problem &problem, const Share &share, int set, int r, Span span) {
+INLINE void clear_outside(const Problem &problem, const Share &share, int set, int r, Span span) {
   const int C = problem.channels;
-  for (int f = 0; f < share.fields; ++f) {
+  for (int f = 0; f < FIELDS; ++f) {
     int16_t *row = share.row(set, f, r);
     std::memset(row, 0, size_t(span.first) * C * sizeof *row);
     std::memset(row + span.last * C, 0, size_t(share.stride - span.last * C) * sizeof *row);
@@ -188,7 +237,7 @@ INLINE void compare(const Problem &problem, const Share &share, int set, int r, 
         curvature[k] = product(int16_t(2 * im), int16_t(2 * im)), gradient[k] = product(error, int16_t(2 * im));
       }
   }
-  clear_beside(problem, share, set, r, span);
+  clear_outside(problem, share, set, r, span);
 }
 
 // Lines of all sets' rays through a panel's row.
@@ -290,7 +339,7 @@ INLINE void residual(const Problem &problem, const Share &share, int set, int r,
     for (int e = 0; e < count; e += LANES)
       VECTORISED for (int k = e; k < e + LANES; ++k) weighted[k] = product(int16_t(2 * sum[k]), int16_t(2 * weights[k]));
   }
-  clear_beside(problem, share, set, r, span);
+  clear_outside(problem, share, set, r, span);
 }
 
 // Row q of the middle panel: the mean of all rays' residuals there; it rests where there are none.
@@ -315,7 +364,7 @@ INLINE void step_rows(const Problem &problem, const Share &share) {
   int at[N], ready[N];  // the next row of a panel that moves, and that becomes phasors
   std::copy(share.panel_first, share.panel_first + N, at);
   for (int n = 0; n < N; ++n)
-    ready[n] = std::max(0, int(std::lower_bound(share.until[n].begin(), share.until[n].end(), share.first) - share.until[n].begin()) - 1);
+    ready[n] = std::max(0, first_until(share.until[n], share.first) - 1);
   for (int r = share.first; r < share.end; ++r) {
     for (int n = 0; n < N; ++n)
       for (const int rows = problem.panel[n].ahead.rows; ready[n] < rows && share.since[n][std::max(ready[n] - 1, 0)] <= r; ++ready[n])
@@ -341,7 +390,7 @@ INLINE void close_rows(const Problem &problem, const Share &share) {
 
 // Run partition `part` of `parts` of one step. Partitions are independent. Phasors are computed from `ahead`.
 FOR_EVERY_CPU void step(const Problem *problem, int part, int parts) {
-  const Share share = share_of(*problem, part, parts, 2, true);
+  const Share share = share_of(*problem, part, parts, true);
   switch (problem->channels * 10 + problem->panels) {
     case 12: return step_rows<1, 2>(*problem, share);
     case 13: return step_rows<1, 3>(*problem, share);
@@ -356,7 +405,7 @@ FOR_EVERY_CPU void step(const Problem *problem, int part, int parts) {
 
 // Run partition `part` of `parts` of solving the middle panel's `last`, with the other panels fixed.
 FOR_EVERY_CPU void close_middle(const Problem *problem, int part, int parts) {
-  const Share share = share_of(*problem, part, parts, 2, false);
+  const Share share = share_of(*problem, part, parts, false);
   if (problem->channels == 3) close_rows<3>(*problem, share);
   else close_rows<1>(*problem, share);
 }
@@ -377,4 +426,4 @@ FOR_EVERY_CPU void show(const Image *panel, int channels, uint32_t *pixels, int6
   }
 }
 
-extern "C" { extern const int32_t problem_bytes = sizeof(Problem); }
+extern "C" { extern const int32_t problem_bytes = sizeof(Problem), max_sets = MAX_SETS; }
