@@ -35,6 +35,7 @@ NOMINAL_DISTANCE_M = 0.6  # from here the surface looks like the picture
 TORN_RELATIVE = 0.12  # of the depth range: a larger step between neighbours is an edge, not a slope
 BLURRED_PX = 5  # so wide an edge of the depth map still is one
 MIXED_PX = 2  # to either side of an edge colours are of both sides
+REACH_PX = 10  # farthest that a colour is taken from
 BEHIND_SHARE = 0.1  # of the picture's width: how far behind an edge the background is filled in
 SET_BACK = 0.004  # of the depth range: offset of the made-up surface behind the true one
 SAMPLES = 4  # a pixel: the split edges are its outlines
@@ -97,11 +98,12 @@ def unmixed(colour: U8, depth: F32) -> U8:
         return colour
     there, wanted = np.argwhere(beside), np.argwhere(mixed)
     far_apart = 4 * side / TORN_RELATIVE  # pixels that a unit of depth counts for: the other side is farther off
-    nearest = cKDTree(np.column_stack([there, depth[beside] * far_apart])).query(
-        np.column_stack([wanted, depth[mixed] * far_apart])
-    )[1]
+    away, nearest = cKDTree(np.column_stack([there, depth[beside] * far_apart])).query(
+        np.column_stack([wanted, depth[mixed] * far_apart]), distance_upper_bound=REACH_PX
+    )
+    near = np.isfinite(away)  # what is too thin to have an inside keeps its own colours
     result = colour.copy()
-    result[mixed] = colour[beside][nearest]
+    result[tuple(wanted[near].T)] = colour[beside][nearest[near]]
     return result
 
 

@@ -231,6 +231,17 @@ def test_beside_an_edge_there_is_no_hole_and_no_stretched_foreground(
     assert green.sum() == pytest.approx(expected, rel=0.08)
 
 
+def test_a_thin_thing_of_an_rgbd_picture_keeps_its_colour(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    """It has no inside from which colours could be taken; a square of its depth is not it."""
+    colour, depth = solid(BLUE, 320, 180), np.zeros((180, 320, 3), np.uint8)
+    for columns, found in ((slice(80, 84), GREEN), (slice(200, 260), RED)):
+        colour[60:120, columns], depth[60:120, columns] = found, 255
+    write_png(tmp_path / "a_rgbd.png", np.concatenate([colour, depth], axis=1))
+    picture = opened(tmp_path / "a_rgbd.png", context, stack).render(panel_view(EYES[0], stack.panel(1)), time_ns=0)
+    red, green, blue, _ = picture.astype(int).transpose(2, 0, 1)
+    assert ((green > blue) & (red < 60)).sum() == pytest.approx(4 * 60 * 1.5**2, rel=0.2)
+
+
 def test_a_picture_much_larger_than_the_raster_is_averaged(stack: PanelStack) -> None:
     lines = np.zeros((1080, 1920, 3), np.uint8)
     lines[:, ::2] = 255
