@@ -75,9 +75,10 @@ class Part:
 
 def texture_of(image: Any) -> U8:
     """(h, w, 4) RGBA of Pillow's image, scaled down to the largest texture that is kept."""
-    image = image.convert("RGBA")
+    if image.mode not in ("L", "RGB", "RGBA") or "transparency" in image.info:  # such as a palette: it has no means
+        image = image.convert("RGBA")
     image.thumbnail((LARGEST_TEXTURE_PX, LARGEST_TEXTURE_PX))
-    return np.array(image)
+    return np.array(image.convert("RGBA"))
 
 
 def coded(light: ArrayLike) -> F32:

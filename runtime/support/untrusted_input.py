@@ -32,6 +32,7 @@ class Limits:
     triangles: int = 2_000_000  # of a mesh, all instances together
     splats: int = 3_000_000
     instances: int = 2000  # placed meshes in a glTF scene
+    json_values: int = 4_000_000  # of one JSON text: Python takes a gigabyte for them
     depth: int = 64  # how deep JSON or a glTF scene may nest
     load_s: float = 120.0  # time limit of loading one piece of content
     start_s: float = 600.0  # time limit of a start: content and model
@@ -129,6 +130,7 @@ def read_json(path: str | Path, *, most_bytes: int = JSON_BYTES_MAX) -> Any:
 def parsed_json(text: str | bytes, *, source: str | Path, most_depth: int = JSON_DEPTH_MAX) -> Any:
     """Parse strict JSON (no NaN or Infinity) of limited depth. Raises InputError."""
     data = text if isinstance(text, bytes) else text.encode(errors="surrogatepass")
+    within(sum(map(data.count, (b",", b"{", b"["))), LIMITS.json_values, source=source, field="JSON values")
     try:
         value = json.loads(decoded(data, source=source), parse_constant=_no_constant, parse_int=_whole)
         if _depth(value) <= most_depth:
