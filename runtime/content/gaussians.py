@@ -27,6 +27,7 @@ LARGEST_RELATIVE_SCALE = 100.0  # of a splat, in units of the scene's extent
 STRAY = 1.0  # percent of the splats at either end of an axis that do not decide the scale
 FAINT = 0.1  # opacity of a splat that decides nothing
 REACH = 2.0  # standard deviations of a splat that are to be seen
+AT_ONCE = 1 << 17  # splats that are worked on, and drawn, together: bounds the memory
 SAMPLED = 10_000  # points whose neighbours are looked for
 DOTS, MOST_DOTS = 500, 200_000  # of a line, and of all lines together
 FINEST_POINT, LARGEST_POINT = 5e-4, 0.01  # standard deviation of a point, in units of the scene's extent
@@ -173,19 +174,24 @@ def bounds(gaussians: Gaussians) -> tuple[F64, F64]:
 
 def covariances_of(scales: F32, quaternions: F32) -> F32:
     """(n, 6) R diag(s²) R^T of (n, 3) standard deviations and (n, 4) quaternions w, x, y, z."""
-    rotation = Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
-    spread = rotation * scales.astype(np.float64)[:, None]
-    full = spread @ spread.transpose(0, 2, 1)
-    return np.asarray(full.reshape(-1, 9)[:, PACKED], dtype=np.float32)
+    packed = np.empty((len(scales), 6), np.float32)
+    for first in range(0, len(scales), AT_ONCE):
+        rows = slice(first, first + AT_ONCE)
+        rotation = Rotation.from_quat(quaternions[rows], scalar_first=True).as_matrix()
+        spread = rotation * scales[rows].astype(np.float64)[:, None]
+        packed[rows] = (spread @ spread.transpose(0, 2, 1)).reshape(-1, 9)[:, PACKED]
+    return packed
 
 
 def moved(gaussians: Gaussians, target_from_source: F64) -> Gaussians:
     """The splats in another frame (4x4 similarity); harmonics stay in the file's directions."""
     linear = target_from_source[:3, :3]
     centres = gaussians.centres @ linear.T + target_from_source[:3, 3]
-    full = gaussians.covariances.astype(np.float64)[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
-    turned = linear @ full @ linear.T
-    packed = turned.reshape(-1, 9)[:, PACKED].astype(np.float32)
+    packed = np.empty_like(gaussians.covariances)
+    for first in range(0, len(packed), AT_ONCE):
+        some = gaussians.covariances[first : first + AT_ONCE].astype(np.float64)
+        turned = linear @ some[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3) @ linear.T
+        packed[first : first + AT_ONCE] = turned.reshape(-1, 9)[:, PACKED]
     return Gaussians(centres.astype(np.float32), packed, gaussians.opacities, gaussians.harmonics)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from runtime.content.base import ContentInfo, ContentSource
 from runtime.content.gaussians import LARGEST_COORDINATE, of_points
 from runtime.content.gltf import GltfScene
-from runtime.content.parts import UNCOLOURED, Part, merged
+from runtime.content.parts import OUTLINED_MAX, UNCOLOURED, Part, merged
 from runtime.content.placing import GLTF, SceneFile
 from runtime.content.ply import read_header
 from runtime.content.shapes import AT_ONCE, Shape, flat_normals
@@ -57,9 +57,10 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
         return partial(SplatSource, splats, stack_from_scene=matrix, info=info)
     parts = []
     alike = merged(data.parts)
+    is_small = sum(len(part.shape.triangles) for part in alike) <= OUTLINED_MAX
     for number, part in enumerate(alike):
         progress.tell(f"{file.path.name}: outlines", number, len(alike))
-        parts.append(DrawnPart(part))
+        parts.append(DrawnPart(part, outlined=is_small))
     return partial(TriangleSource, parts, [matrix] * len(parts), info=info)
 
 

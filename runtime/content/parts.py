@@ -17,7 +17,7 @@ BLACK: Colour = (0.0, 0.0, 0.0)
 UNCOLOURED: Colour = (0.70, 0.74, 0.80)  # of a file without colours
 OPAQUE_FROM = 0.99  # alpha from which a pixel counts as opaque
 LARGEST_TEXTURE_PX = 4096
-OUTLINED_MAX = 200_000  # triangles of a part; beyond, finding its outline costs more than drawing it
+OUTLINED_MAX = 200_000  # triangles of a part, and of a file; beyond, finding outlines costs more than drawing
 Wrap = Literal["repeat", "clamp", "mirror"]
 
 

@@ -12,6 +12,7 @@ from runtime.content.base import ContentInfo, View
 from runtime.content.canvas import OVER, SIDES, CanvasSource
 from runtime.content.compressed_splats import load_compressed_splats
 from runtime.content.gaussians import (
+    AT_ONCE,
     Gaussians,
     Splats,
     bounds,
@@ -26,6 +27,7 @@ from runtime.content.placing import SceneFile
 from runtime.content.ply import read_header
 from runtime.optics.rect import PixelRect
 from runtime.records import F32, F64
+from runtime.support.background import raise_if_abandoned
 from runtime.support.gl import DrawnPicture
 
 CUSTOM, CUSTOM_SPZ = ("-y", "-z"), ("+y", "+z")  # up, and to the viewer: trainers use OpenCV's camera axes
@@ -79,7 +81,7 @@ class SplatSource(CanvasSource):
         linear = stack_from_scene[:3, :3]
         self._scene_from_stack_rotation = (np.linalg.inv(linear) * np.cbrt(np.linalg.det(linear))).astype(np.float32)
         self._program = context.program(vertex_shader=VERTEX, fragment_shader=FRAGMENT)
-        count = len(gaussians.centres)
+        count = min(len(gaussians.centres), AT_ONCE)
         self._corners = np.empty((count, 4, FLOATS), np.float32)
         self._buffer = context.buffer(reserve=max(self._corners.nbytes, 1), dynamic=True)
         quads = np.arange(count, dtype=np.int32)[:, None] * 4 + np.array([0, 1, 2, 2, 1, 3], np.int32)
@@ -94,12 +96,16 @@ class SplatSource(CanvasSource):
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
         """Every splat that the eye can see, farthest first."""
         splats = self._seen[view.side] = seen_splats(self._gaussians, view)
-        count = self._prepare(view, splats)
+        count = len(splats.index)
 
         def paint() -> None:
             self.context.enable_only(self.context.BLEND)
             self.context.blend_func = OVER
-            self._vertices.render(vertices=6 * count)
+            for first in range(0, count, AT_ONCE):
+                raise_if_abandoned()
+                if first:
+                    self._buffer.orphan()  # its storage may still be drawn from
+                self._vertices.render(vertices=6 * self._prepare(view, splats, slice(first, first + AT_ONCE)))
 
         whole = PixelRect(0, 0, view.width_px, view.height_px if count else 0)
         return self.drawn(view, whole, paint)
@@ -108,21 +114,21 @@ class SplatSource(CanvasSource):
         splats = self._seen[view.side]
         return None if splats is None else nearest_blocks(splats, view, every=every, first=first)
 
-    def _prepare(self, view: View, splats: Splats) -> int:
-        """Fill the vertex buffer for a view; returns how many splats it holds."""
-        count = len(splats.index)
-        directions = self._gaussians.centres[splats.index] - view.eye_m.astype(np.float32)
+    def _prepare(self, view: View, splats: Splats, some: slice) -> int:
+        """Fill the vertex buffer with some splats of a view; returns how many."""
+        index, reach = splats.index[some], splats.reach[some]
+        count = len(index)
+        directions = self._gaussians.centres[index] - view.eye_m.astype(np.float32)
         directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), np.float32(1e-9))
         directions = directions @ self._scene_from_stack_rotation.T
         corners = self._corners[:count]
         scale = np.array([2 / view.width_px, 2 / view.height_px], np.float32)
         for corner, (right, down) in enumerate(((-1, -1), (1, -1), (-1, 1), (1, 1))):
-            offset = splats.major_px * np.float32(right) + splats.minor_px * np.float32(down)
-            corners[:, corner, 0:2] = (splats.centres_px + offset * splats.reach[:, None]) * scale - 1
-            corners[:, corner, 2] = splats.reach * right
-            corners[:, corner, 3] = splats.reach * down
-        corners[:, :, 4:7] = colours_towards(self._gaussians.harmonics[splats.index], directions)[:, None]
-        corners[:, :, 7] = splats.opacities[:, None]
-        if count:
-            self._buffer.write(corners)
+            offset = splats.major_px[some] * np.float32(right) + splats.minor_px[some] * np.float32(down)
+            corners[:, corner, 0:2] = (splats.centres_px[some] + offset * reach[:, None]) * scale - 1
+            corners[:, corner, 2] = reach * right
+            corners[:, corner, 3] = reach * down
+        corners[:, :, 4:7] = colours_towards(self._gaussians.harmonics[index], directions)[:, None]
+        corners[:, :, 7] = splats.opacities[some, None]
+        self._buffer.write(corners)
         return count

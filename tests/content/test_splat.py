@@ -13,6 +13,7 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from runtime.config import ContentSettings
+from runtime.content import splat
 from runtime.content.base import ContentInfo
 from runtime.content.compressed_splats import load_compressed_splats
 from runtime.content.gaussians import Gaussians, harmonic_basis, load_gaussians
@@ -318,6 +319,18 @@ def test_a_broken_file_is_one_line(tmp_path: Path, old: bytes, new: bytes, cut: 
         loaded(path)
     assert str(refused.value).startswith(f"{path}: {told}")
     assert "\n" not in str(refused.value)
+
+
+def test_splats_drawn_a_few_at_a_time_are_those_drawn_together(
+    tmp_path: Path, context: Any, stack: PanelStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, pictures = written(tmp_path, splat_table(50)), []
+    for at_once in (1000, 7):
+        monkeypatch.setattr(splat, "AT_ONCE", at_once)
+        source = prepare_content(ContentSettings(scene=str(path)), stack)(context=context)
+        pictures.append(source.render(panel_view([0.6, 0.03, 0.0], stack.panel(1)), time_ns=0).copy())
+        source.close()
+    assert np.array_equal(*pictures) and np.ptp(pictures[0][..., :3]) > 20
 
 
 def test_splats_behind_the_eye_or_beside_the_raster_draw_nothing(
