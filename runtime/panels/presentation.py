@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import moderngl
 import numpy as np
 
@@ -29,18 +32,17 @@ void main() {
 # runtime.optics.alignment.shown_layers is the reference for what `shown` answers. Aligned layers are sampled with
 # weights of full precision, which hardware's filters (1/256) have not, and are neutral outside. Layers that a
 # homography moves are sampled with cubic weights, once for registration and alignment: bilinear ones cost 0.15 dB more.
-FRAGMENT = """#version 330 core
+# Each case has its own program: a software rasteriser executes both branches of every `if`, and all cases in one
+# program take it several times as long as the longest of them.
+FRAGMENT = """
 uniform sampler2D solved;        // this panel's
 uniform sampler2D flat_picture;
 uniform sampler2D curve;
 uniform vec2 size_px;            // of the panel
 uniform vec2 solved_px;          // of the solution, which may be coarser
 uniform int extended;            // pixels by which its edge is extended: a coarse one's does not fade at the panel's
-uniform bool exact;              // the mounting takes pixels to pixels
-uniform bool aligned;            // or enlarged
 uniform vec4 solved_from_shown;  // scale u, v, shift u, v in pixels of the solution
 uniform sampler2D relief;        // of the content, over the middle panel
-uniform bool displaced;          // by it
 uniform vec4 middle_from_shown;  // scale u, v, shift u, v in pixels of the panels
 uniform vec3 drift;              // right, down, and growth
 uniform float weight_px;
@@ -48,9 +50,13 @@ uniform float flatness;
 uniform float even;
 in vec3 layer_px;
 out vec4 colour;
+#ifdef CURVED
 float grey(float phase, int channel) {
     return texture(curve, vec2((phase * 255.0 + 0.5) / 256.0, (float(channel) + 0.5) / 3.0)).r;
 }
+#else
+float grey(float phase, int channel) { return phase; }
+#endif
 vec3 solved_texel(ivec2 at) {
     ivec2 size = ivec2(solved_px);
     bool inside = all(greaterThanEqual(at, ivec2(-extended))) && all(lessThan(at, size + extended));
@@ -58,10 +64,12 @@ vec3 solved_texel(ivec2 at) {
 }
 vec2 solved_at(vec2 px) {  // pixels of the solution
     vec2 at = px * solved_from_shown.xy + solved_from_shown.zw;
-    if (!displaced) return at;
+#ifdef DISPLACED
     vec2 middle = px * middle_from_shown.xy + middle_from_shown.zw;
     float b = texture(relief, middle / size_px).r;
-    return at + weight_px * b * (drift.xy + drift.z * middle) * solved_px / size_px;
+    at += weight_px * b * (drift.xy + drift.z * middle) * solved_px / size_px;
+#endif
+    return at;
 }
 vec3 aligned_at(vec2 px) {
     vec2 place = clamp(solved_at(px) - 0.5, vec2(-3.0), solved_px + 2.0);
@@ -77,7 +85,11 @@ vec4 cubic(float t) {  // of four neighbours, as OpenCV's INTER_CUBIC has them (
     return vec4(far.x, near.y, near.z, far.w);
 }
 vec3 registered_at(vec2 px) {
-    vec2 place = (aligned ? solved_at(px) : px) - 0.5;
+#ifdef ALIGNED
+    vec2 place = solved_at(px) - 0.5;
+#else
+    vec2 place = px - 0.5;
+#endif
     place = clamp(place, vec2(-3.0), solved_px + 2.0);
     vec2 low = floor(place);
     vec4 across = cubic(place.x - low.x), down = cubic(place.y - low.y);
@@ -85,20 +97,39 @@ vec3 registered_at(vec2 px) {
     for (int j = 0; j < 4; j++) {
         for (int i = 0; i < 4; i++) {
             ivec2 at = ivec2(low) + ivec2(i - 1, j - 1);
-            vec3 texel = aligned ? solved_texel(at)
-                : texelFetch(solved, clamp(at, ivec2(0), ivec2(solved_px) - 1), 0).rgb;
+#ifdef ALIGNED
+            vec3 texel = solved_texel(at);
+#else
+            vec3 texel = texelFetch(solved, clamp(at, ivec2(0), ivec2(solved_px) - 1), 0).rgb;
+#endif
             total += across[i] * down[j] * texel;
         }
     }
     return clamp(total, 0.0, 1.0);
 }
 vec3 as_it_is(sampler2D picture, vec2 px) {
-    return exact ? texelFetch(picture, ivec2(floor(px)), 0).rgb : texture(picture, px / size_px).rgb;
+#ifdef EXACT
+    return texelFetch(picture, ivec2(floor(px)), 0).rgb;
+#else
+    return texture(picture, px / size_px).rgb;
+#endif
 }
 vec3 shown(vec2 px) {
-    if (flatness >= 1.0) return as_it_is(flat_picture, px);
-    vec3 phase = !exact ? registered_at(px) : aligned ? aligned_at(px) : as_it_is(solved, px);
-    return flatness > 0.0 ? mix(phase, as_it_is(flat_picture, px), flatness) : phase;
+#if !defined(SOLVED)
+    return as_it_is(flat_picture, px);
+#elif !defined(EXACT)
+    vec3 phase = registered_at(px);
+#elif defined(ALIGNED)
+    vec3 phase = aligned_at(px);
+#else
+    vec3 phase = as_it_is(solved, px);
+#endif
+#ifdef SOLVED
+#ifdef MIXED
+    phase = mix(phase, as_it_is(flat_picture, px), flatness);
+#endif
+    return phase;
+#endif
 }
 void main() {
     vec2 px = layer_px.xy / layer_px.z;
@@ -107,6 +138,13 @@ void main() {
     colour = vec4(grey(phase.r, 0), grey(phase.g, 1), grey(phase.b, 2), 1.0);
 }
 """
+
+
+Case = tuple[str, ...]  # names defined for the fragment shader
+CASES: tuple[Case, ...] = (
+    (),
+    *(("SOLVED", *how, *mixed) for how in ((), ("ALIGNED",), ("ALIGNED", "DISPLACED")) for mixed in ((), ("MIXED",))),
+)
 
 
 class FrameTextures:
@@ -220,19 +258,17 @@ class Painter:
         )
         # A homography's sign means nothing; the shader wants the panel's middle before the horizon.
         matrix = matrix / (matrix[2] @ np.array([screen_px[0] / 2, screen_px[1] / 2, 1.0]))
-        self._program = context.program(vertex_shader=VERTEX, fragment_shader=FRAGMENT)
-        self._array = context.vertex_array(self._program, [])
+        self._context = context
+        self._mounting = ["EXACT"] * permutes_pixels(matrix) + ["CURVED"] * bool(settings.lut or settings.gamma != 1)
         table = np.ascontiguousarray(lut.curve(lut=settings.lut, gamma=settings.gamma).T)
         self._curve = context.texture((lut.ENTRIES, 3), 1, table.tobytes(), dtype="f4")
         self._curve.filter = (moderngl.LINEAR, moderngl.LINEAR)
         self._curve.repeat_x = self._curve.repeat_y = False
-        self._program["solved"] = 0
-        self._program["flat_picture"] = 1
-        self._program["curve"] = 2
-        self._program["relief"] = 3
-        self._program["screen_px"] = tuple(map(float, screen_px))
-        self._program["layer_from_screen"] = tuple(matrix.T.ravel())
-        self._program["exact"] = permutes_pixels(matrix)
+        self._fixed = {
+            "solved": 0, "flat_picture": 1, "curve": 2, "relief": 3,
+            "screen_px": tuple(map(float, screen_px)), "layer_from_screen": tuple(matrix.T.ravel()),
+        }  # fmt: skip
+        self._cases = {case: self._compiled(case) for case in CASES}
 
     def draw(self, textures: FrameTextures, frame: PanelFrame, index: int) -> None:
         """Draw panel `index` of the uploaded frame over the whole of the bound framebuffer."""
@@ -241,25 +277,53 @@ class Painter:
         coarse = (width, height) != (solved_width, solved_height)
         by_u, by_v = solved_width / width, solved_height / height
         su, sv, tu, tv = scale_and_shift(matrix)
-        self._program["even"] = rest_code(textures.count) / 255
-        self._program["size_px"] = float(width), float(height)
-        self._program["solved_px"] = float(solved_width), float(solved_height)
-        self._program["extended"] = int(coarse)
+        values: dict[str, Any] = {
+            "even": rest_code(textures.count) / 255,
+            "size_px": (float(width), float(height)),
+            "solved_px": (float(solved_width), float(solved_height)),
+            "extended": int(coarse),
+            "solved_from_shown": (su * by_u, sv * by_v, tu * by_u, tv * by_v),
+            "flatness": float(frame.flatness),
+        }
         moved = displacement(frame.relief, frame.parallax, index)
-        self._program["aligned"] = coarse or moved is not None or not is_identity(matrix)
-        self._program["displaced"] = moved is not None
         if moved is not None:
-            scale_u, scale_v, shift_u, shift_v = scale_and_shift(moved.middle_from_shown)
-            self._program["middle_from_shown"] = scale_u, scale_v, shift_u, shift_v
-            self._program["drift"] = *moved.drift_px, moved.growth
-            self._program["weight_px"] = moved.weight
-        self._program["solved_from_shown"] = su * by_u, sv * by_v, tu * by_u, tv * by_v
-        self._program["flatness"] = 1.0 if frame.solved is None else float(frame.flatness)
+            values |= {
+                "middle_from_shown": scale_and_shift(moved.middle_from_shown),
+                "drift": (*moved.drift_px, moved.growth),
+                "weight_px": moved.weight,
+            }
+        case: Case = ()
+        if shows_solved(frame):
+            aligned = coarse or moved is not None or not is_identity(matrix)
+            case = (
+                "SOLVED",
+                *["ALIGNED"] * aligned,
+                *["DISPLACED"] * (moved is not None),
+                *["MIXED"] * shows_flat(frame),
+            )
+        program, array = self._cases[case]
+        _set(program, values)
         textures.use(index)
         self._curve.use(2)
-        self._array.render(moderngl.TRIANGLES, vertices=3)
+        array.render(moderngl.TRIANGLES, vertices=3)
+
+    def _compiled(self, case: Case) -> tuple[moderngl.Program, moderngl.VertexArray]:
+        head = "#version 330 core\n" + "".join(f"#define {name}\n" for name in (*self._mounting, *case))
+        program = self._context.program(vertex_shader=VERTEX, fragment_shader=head + FRAGMENT)
+        _set(program, self._fixed)
+        return program, self._context.vertex_array(program, [])
 
     def release(self) -> None:
         """Give the GL objects back."""
-        for thing in (self._array, self._program, self._curve):
-            thing.release()
+        for program, array in self._cases.values():
+            array.release()
+            program.release()
+        self._curve.release()
+
+
+def _set(program: moderngl.Program, values: Mapping[str, Any]) -> None:
+    """Set uniforms, except those that the compiler removed from this case."""
+    for name, value in values.items():
+        uniform: Any = program.get(name, None)
+        if uniform is not None:
+            uniform.value = value
