@@ -217,10 +217,11 @@ class GltfScene:
             problem = f"Draco needs `pip install 'phasestack[draco]'`; or {WAY_OUT}"
             raise InputError(self.path, DRACO, problem) from None
         try:
-            data = bytes(self.file.view(own["bufferView"])[0])
+            found = DracoPy.decode(bytes(self.file.view(own["bufferView"])[0]))
         except InputError as error:
             raise InputError(self.path, DRACO, error.problem) from None
-        found = DracoPy.decode(data)
+        except DracoPy.FileTypeException:
+            raise InputError(self.path, DRACO, "is damaged: its bytes cannot be decoded") from None
         arrays = {attribute["unique_id"]: attribute["data"] for attribute in found.attributes}
         values = {}
         for name, number in own["attributes"].items():

@@ -75,6 +75,8 @@ def load_mesh(path: Path) -> MeshData:
     with np.errstate(all="ignore"):  # coordinates beyond any scene overflow; they are refused below
         if path.suffix.lower() == ".ply":
             left_out = {name for name, count in read_header(path).counts.items() if count and name in UNREAD}
+        elif path.suffix.lower() == ".off" and data.lstrip().startswith(b"COFF"):
+            left_out = {"colours"}
         if _is_binary_stl(path, data):
             parts = [_binary_stl(data)]
         elif path.suffix.lower() in GLTF:

@@ -310,6 +310,11 @@ def test_lines_alone_are_drawn(tmp_path: Path, context: Any, stack: PanelStack, 
     assert covered[135, 240] == 0 and (covered[rows.min() : rows.max(), columns.min() + 1] > 128).mean() > 0.95
 
 
+def test_colours_of_an_off_file_are_said_to_be_left_out(tmp_path: Path) -> None:
+    (tmp_path / "a.off").write_text("COFF\n3 1 0\n0 0 0 255 0 0 255\n1 0 0 0 255 0 255\n0 1 0 0 0 255 255\n3 0 1 2\n")
+    assert load_mesh(tmp_path / "a.off").left_out == ("colours",)
+
+
 def test_strips_of_a_ply_are_said_to_be_left_out(tmp_path: Path) -> None:
     head = "ply\nformat ascii 1.0\nWritten by somebody\nelement vertex 3\nproperty float x\nproperty float y\n"
     head += "property float z\nelement tristrips 1\nproperty list int int vertex_indices\nend_header\n"
