@@ -1,6 +1,6 @@
-"""Import of phasestack's own `runtime`, `calib` and `model_export`, even next to others so named.
+"""Import phasestack's own `runtime`, `calib` and `model_export` even if other packages have these names.
 
-Raises ImportError if the program has already imported another module under one of these names.
+Raises ImportError if the program has already imported another module with one of these names.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Layers for a pair of pictures, eyes and a stack, and the quality of any layers."""
+"""Solving pairs of pictures, and measuring the quality of any layers."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ from runtime.support.artifacts import OutputFolder, write_json
 from runtime.support.progress import ShownProgress
 from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG, SEPARATION_MIN_M, refusal
 
-EVERY_LEAST = 20  # along the shorter side: number of pixels below which a picture is too small to resample
-SAME_PLACE_M = 0.001  # an eye and its camera
+EVERY_LEAST = 20  # least number of sampled pixels along a picture's shorter side
+SAME_PLACE_M = 0.001  # largest distance between an eye and its camera
 _one_at_a_time = Lock()  # a loaded model reuses its buffers
 
 Eyes = Sequence[Sequence[float]] | Sequence[F64] | F64
@@ -60,9 +60,11 @@ class _Pair:
 
 
 class Measuring(TypedDict, total=False):
-    """Options for a cheaper measurement of quality."""
+    """Options for a faster measurement of quality."""
 
-    sigmas_mm: Sequence[float]  # tracking errors, each at the cost of four measurements; default: 0, 1 and 2
+    sigmas_mm: Sequence[
+        float
+    ]  # tracking errors to measure, 0, 1 and 2 by default; each except 0 takes four more measurements
     every: int  # N: measure every Nth pixel of every Nth row of the pictures; 1: all of them
 
 
@@ -70,9 +72,9 @@ class Result:
     """Layers for a pair of pictures, with the views of both eyes and their quality."""
 
     layers: U8  # (panels, h, w, 3), rear to front
-    model: str  # the model used: `sart` if the networks do not support the stack
+    model: str  # name of the model used; `sart` if the networks do not support the stack
     eye_sigma_mm: float
-    total_ms: float  # of this one call
+    total_ms: float  # time that this call took
 
     def __init__(self, layers: U8, pair: _Pair, *, model: str, eye_sigma_mm: float, total_ms: float) -> None:
         self.layers, self.model, self.eye_sigma_mm, self.total_ms = layers, model, eye_sigma_mm, total_ms
@@ -84,7 +86,7 @@ class Result:
 
     @property
     def quality(self) -> PairQuality:
-        """Quality of the eyes' views. It is measured when first read, which may take longer than solving.
+        """Quality of the eyes' views, measured on first access, which may take longer than solving.
 
         Warns if `notes` explains why the quality is poor.
         """
@@ -159,14 +161,14 @@ def solve(
     """Compute layers that show each eye its picture.
 
     left, right: (h, w, 3 or 4), uint8 or float in 0..1, or Pillow images, as seen by a pinhole camera at each eye. The
-    cameras look at the stack's origin, without roll, with a horizontal field of view of `fov_deg`.
+    cameras look at the stack's origin, are not rolled, and have a horizontal field of view of `fov_deg`.
     eyes_m: left and right eye in metres, frame `stack` (+x out of the screen, +y the viewer's right, +z up).
     cameras: for pictures of other pinhole cameras (parallel, shifted), two 3x4 matrices from homogeneous metres of the
     stack's frame to pixels, +u right, +v down, pixel centres at half-integers: K·[R | t] with OpenCV's axes, plus half
     a pixel on K's principal point if its pixel centres are integers. They replace `eyes_m` and `fov_deg`; the pictures
     solved for and measured are then resampled to look at the stack's origin and to cover the panels.
     model: fast, balanced, best, sart or an ONNX file. eye_sigma_mm: tracking error, 1 for a good tracker, 0 for none.
-    Raises ValueError, naming the argument. Warns about implausible pictures or eyes.
+    Raises ValueError, naming the argument. Warns about implausible arguments.
     """
     pair = _checked((left, right), stack=stack, eyes_m=eyes_m, fov_deg=fov_deg, cameras=cameras)
     eye_sigma_mm = _number("eye_sigma_mm", eye_sigma_mm, 0.0, 1000.0, "mm")
@@ -236,8 +238,9 @@ def evaluate(
 ) -> PairQuality:
     """Measure the quality of any layers for two eyes, against their target pictures.
 
-    layers: (panels, h, w, 3 or 4), rear to front, in the stack's pixels, uint8 or float in 0..1: a panel's value v
-    turns light by v·90 degrees, and an eye sees sin² of the summed angle; floats are rounded to the panels' 8 bits.
+    layers: (panels, h, w, 3 or 4), rear to front, in the stack's pixels, uint8 or float in 0..1: a panel of value v
+        rotates the polarization by v·90 degrees, and an eye sees sin² of the summed angle; floats are rounded to the
+        panels' 8 bits.
     sigmas_mm, every: `evaluate(..., sigmas_mm=(1,), every=4)` is faster. It measures light PSNR for these tracking
     errors alone, at every 4th pixel of every 4th row, with its standard error; SSIM is then NaN. For the other
     arguments see `solve`. Raises ValueError, naming the argument.
@@ -363,7 +366,7 @@ def _loaded(model: str, stack: PanelStack) -> Predictor:
 
 
 def _eyes(eyes_m: Any, stack: PanelStack) -> F64:
-    """Return (2, 3) eyes that can be served. Raises ValueError."""
+    """Return the (2, 3) eyes if the display can serve them. Raises ValueError."""
     try:
         eyes = np.asarray(eyes_m, np.float64)
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""Conversion of pictures from programs (arrays of codes or intensities); finding eyes in them."""
+"""Conversion of callers' pictures (arrays, tensors, Pillow images), and finding eyes in them."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from runtime.records import U8
 from runtime.support.picture_file import rgb_of
 
 LEAST_PX = 16
-SLACK = 1e-3  # a quarter of a code, by which rounding may exceed the range
-OVERSHOOT = 0.3  # fraction of white by which sharp resampling may overshoot
+SLACK = 1e-3  # rounding may exceed the range by this: a quarter of a code
+OVERSHOOT = 0.3  # resampling may overshoot by this fraction of white
 
 
 def as_picture(name: str, given: Any) -> Picture:
@@ -34,7 +34,7 @@ def as_picture(name: str, given: Any) -> Picture:
             told = f"has dtype {picture.dtype}, neither uint8 (0..255) nor floating point (0..1)"
             raise ValueError(f"{name}: {told}{_advice_on_type(name, picture)}")
         low, high = (float(bound) for bound in (picture.min(), picture.max()))
-        if not (low >= -SLACK and high <= 1 + SLACK):  # nor NaN
+        if not (low >= -SLACK and high <= 1 + SLACK):  # also refuses NaN
             raise ValueError(f"{name}: values are {low:g} to {high:g}, not 0 to 1{_advice_on_range(name, low, high)}")
         picture = picture.astype(np.float32).clip(0, 1)
     if picture.shape[2] == 3:
@@ -49,14 +49,14 @@ def as_array(name: str, given: Any) -> Any:
     """Return an array, or a tensor on any device, as a numpy one. Raises ValueError, naming the argument."""
     if isinstance(given, str | os.PathLike):
         raise ValueError(f"{name}: is a file name; read the file first, e.g. with PIL.Image.open({os.fspath(given)!r})")
-    if hasattr(given, "detach"):  # torch's, with or without a gradient
+    if hasattr(given, "detach"):  # a torch tensor, with or without a gradient
         given = given.detach().cpu()
         given = given.float() if given.is_floating_point() else given
     try:
         array = np.asarray(given)
     except (TypeError, ValueError, RuntimeError):
         array = np.empty(0, object)
-    if array.dtype.name == "bfloat16":  # jax's
+    if array.dtype.name == "bfloat16":  # a jax array
         array = array.astype(np.float32)
     if array.dtype.kind not in "buif":
         raise ValueError(f"{name}: is {type(given).__name__}, not an array of numbers")
@@ -69,7 +69,7 @@ def _from_pillow(name: str, image: Any) -> U8:
         return rgb_of(image, name)
     except InputError as error:
         raise ValueError(str(error)) from None
-    except OSError as error:  # truncated files are noticed only when their pixels are read
+    except OSError as error:  # Pillow notices a truncated file only when its pixels are read
         raise ValueError(f"{name}: cannot be decoded ({error})") from None
 
 

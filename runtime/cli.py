@@ -1,10 +1,10 @@
-"""Entry point of the script `phasestack`: imported first, so that Ctrl-C exits silently with 130.
+"""Entry point of the script `phasestack`, imported first so that Ctrl-C exits silently with 130.
 
-No file is open while commands are imported, so that an interrupt needs no unwinding; as an exception it would end in a
-traceback, or be lost where Python drops it. Then `commands.guard` takes over.
+While commands are imported, no file is open, so an interrupt can simply exit. As an exception it would print a
+traceback, or be lost where Python ignores it. Then `commands.guard` takes over.
 """
 
-# Both are loaded already; importing `signal` would delay the handler by milliseconds.
+# These modules are already loaded; importing `signal` would delay the handler by milliseconds.
 import _signal  # type: ignore[import-not-found]
 import os
 

@@ -8,10 +8,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-PART_CHARACTERS_MAX = 300  # of a message: an untrusted name must not fill the screen, nor forge a line of the log
-PROBLEM_CHARACTERS_MAX = 1500  # of the problems of a file, all fields together
-_USER_OF_ADDRESS = re.compile(r"""(:/{1,2})[^/\s'"]*@""")  # a path's normal form has one slash
-# A lack of resources, or a passing failure of the hardware.
+PART_CHARACTERS_MAX = (
+    300  # limit for one part of a message: untrusted names must not fill the screen or forge log lines
+)
+PROBLEM_CHARACTERS_MAX = 1500  # limit for all problems of a file together
+_USER_OF_ADDRESS = re.compile(r"""(:/{1,2})[^/\s'"]*@""")  # normalised paths have one slash
+# Lack of resources, or a temporary hardware failure.
 PASSING = frozenset(
     (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.ENOBUFS, errno.EINTR)
 )
@@ -44,7 +46,7 @@ class PhasestackError(Exception):
 
 
 class FatalError(PhasestackError):
-    """A failure that retrying cannot cure: refuse to start. The CLI prints one line and exits with 2."""
+    """A failure that retrying cannot fix, so the start is refused. The CLI prints one line and exits with 2."""
 
 
 class InputError(FatalError):
@@ -92,15 +94,15 @@ class ModelFailure(TransientError):
 
 
 class EyesNotServed(ModelFailure):
-    """The model cannot serve these two eyes. Wait for a viewer to move; refuse an option."""
+    """The model does not support these eye positions. A viewer may move; eyes given as an option are refused."""
 
 
 class ContextLost(TransientError):
-    """The solver's GL context is lost: rebuild the solver from the settings."""
+    """The solver's GL context is lost. The solver must be rebuilt from the settings."""
 
 
 class PanelLost(TransientError):
-    """A panel's window, monitor or GL context is lost: rebuild it; the loop continues without it."""
+    """A panel's window, monitor or GL context is lost. The loop continues and tries to rebuild it."""
 
 
 class Stopped(PhasestackError):

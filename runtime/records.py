@@ -45,7 +45,7 @@ class Intrinsics:
 
     @classmethod
     def centred(cls, width_px: int, height_px: int, *, fov_rad: float) -> Intrinsics:
-        """Square pixels about the picture's middle; fov_rad: its horizontal field of view."""
+        """Intrinsics with square pixels and a centred principal point. fov_rad: horizontal field of view."""
         focal_px = width_px / 2 / math.tan(fov_rad / 2)
         return cls(width_px, height_px, focal_px, focal_px, width_px / 2, height_px / 2)
 
@@ -54,23 +54,23 @@ class Intrinsics:
 class EyePoints:
     """Two eyes at one instant, measured by a sensor or a finder."""
 
-    eyes_m: F64  # (2, 3) the viewer's left, right; metres; frame `sensor` or `stack`, given by the carrier
+    eyes_m: F64  # (2, 3) the viewer's left and right eye in metres; the context states the frame, `sensor` or `stack`
     confidence: F64  # (2,) in [0, 1], left, right
-    completed: Literal["", "left", "right"] = ""  # the eye that was hidden and filled in from the head's pose
-    covariance_m2: F64 | None = None  # (3, 3) of the middle between the eyes, same frame; None: unknown
+    completed: Literal["", "left", "right"] = ""  # the hidden eye, filled in from the head's pose
+    covariance_m2: F64 | None = None  # (3, 3) covariance of the midpoint of the eyes, same frame; None: unknown
 
 
 @dataclass(frozen=True, slots=True)
 class SensorFrame:
     """A driver's sample: one instant of the sensor's streams."""
 
-    sequence: int  # counts up by one for each frame of the device; gaps are losses
-    capture_ns: int  # monotonic clock, when the light was integrated
+    sequence: int  # the device's frame number; gaps mean lost frames
+    capture_ns: int  # time of exposure, on the monotonic clock
     eyes: EyePoints | None = None  # frame `sensor`; None: no face, or the sensor does not find eyes
     colour: U8 | None = None  # (h, w, 3) RGB
     depth_mm: U16 | None = None  # (h, w), registered to the colour image where both exist; 0: no measurement
-    intrinsics: Intrinsics | None = None  # of the image in which depth and colour are registered
-    true_eyes_m: F64 | None = None  # (2, 3) frame `stack`; only in recordings with ground truth
+    intrinsics: Intrinsics | None = None  # intrinsics of the image to which depth and colour are registered
+    true_eyes_m: F64 | None = None  # (2, 3) true eyes, frame `stack`; only in recordings with ground truth
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +81,7 @@ class EyesEstimate:
     capture_ns: int  # newest sample used; 0 with label none
     eyes_m: F64 | None  # (2, 3) left, right; frame `stack`; None with label none
     label: EyesLabel
-    sigma_m: float = 0.0  # standard deviation of an axis of the middle between the eyes, at that instant
+    sigma_m: float = 0.0  # standard deviation, per axis, of the midpoint of the eyes at that instant
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,24 +92,26 @@ class Parallax:
     """
 
     drift_px: tuple[float, float]  # right and down
-    growth: float  # of a head that comes nearer or goes away
-    middle_from_shown: tuple[F64, ...]  # per panel (3, 3), a scale and a shift, along the present middle's rays
-    weights: tuple[float, ...]  # per panel: its pixels for one of the middle panel's, along the old middle's rays
+    growth: float  # scaling as the head comes nearer or moves away
+    middle_from_shown: tuple[F64, ...]  # per panel (3, 3), a scale and a shift along rays from the present midpoint
+    weights: tuple[float, ...]  # per panel: its pixels per pixel of the middle panel, along rays from the old midpoint
 
 
 @dataclass(frozen=True, slots=True)
 class PanelFrame:
     """Layers of all panels at one refresh: an aligned solution, the flat picture, or a mix."""
 
-    number: int  # of the refresh, the same on all panels
-    solved: U8 | None  # (N, h, w, 4) RGBA, rear to front, of any raster; layers solved for two eyes; None: none yet
+    number: int  # number of the refresh, the same on all panels
+    solved: (
+        U8 | None
+    )  # (N, h, w, 4) RGBA, rear to front, on any raster: the layers solved for two eyes; None: not solved yet
     solved_version: int  # changes whenever `solved` changes
     solved_from_shown: tuple[F64, ...] = ()  # per panel (3, 3), both in the panels' pixels; (): layers as solved
-    flat: U8 | None = None  # (N, height_px, width_px, 4): the picture for eyes anywhere; never aligned
+    flat: U8 | None = None  # (N, height_px, width_px, 4): the flat picture, which is never aligned
     flat_version: int = 0
-    flatness: float = 0.0  # 0: `solved` alone, 1: `flat` alone, between: mixed linearly, code by code
-    size_px: tuple[int, int] | None = None  # columns and rows of the panels; None: those of `solved`
-    relief: F32 | None = None  # (h, w) of the solution's content over the middle panel; None: unknown
+    flatness: float = 0.0  # weight of `flat` in the linear mix of codes: 0: `solved` alone, 1: `flat` alone
+    size_px: tuple[int, int] | None = None  # columns and rows of the panels; None: as `solved`
+    relief: F32 | None = None  # (h, w) relief of the solution's content, on the middle panel; None: unknown
     parallax: Parallax | None = None  # None: content stays where it is on the middle panel
 
 
@@ -118,14 +120,14 @@ class PresentReport:
     """Outcome of presenting a PanelFrame."""
 
     number: int
-    present_ns: int  # estimated instant at which the last panel was lit
-    skew_ms: float  # between the first and the last panel
+    present_ns: int  # estimated time at which the last panel was lit
+    skew_ms: float  # time between the first and the last panel's swap
     vblank_ns: int | None = None  # estimated vertical blank of the refresh; None: not applicable
 
 
 @dataclass(frozen=True, slots=True)
 class PlanItem:
-    """A saving: the work omitted, the reason, the time saved and the quality lost."""
+    """A saving: the omitted work, the reason, the time saved and the quality lost."""
 
     what: str
     why: str
@@ -137,15 +139,15 @@ class PlanItem:
 class FrameTiming:
     """Predicted wake, present and display times of one refresh, on the run's clock."""
 
-    id: int  # number of the refresh
+    id: int  # refresh number
     wake_ns: int
-    present_ns: int  # the vertical blank or, without one, the end of presenting
+    present_ns: int  # time of the vertical blank or, without one, of the end of presenting
     photon_ns: int  # middle of the display time
 
 
 @dataclass(frozen=True, slots=True)
 class SolveRequest:
-    """Request of the presenter to the solver; it replaces an older one that has not begun."""
+    """Request from the presenter to the solver. It replaces an older request that has not started."""
 
     time_ns: int  # instant to solve for: middle of the solution's expected display time
     eyes_m: F64 | None  # (2, 3) left, right; frame `stack`; predicted for `time_ns`; None: no viewer
@@ -153,17 +155,21 @@ class SolveRequest:
     sigma_m: float  # standard deviation of these eyes per axis
     flat_wanted: bool  # the flat picture is shown or will be needed
     paused: bool = False  # no new solutions
-    effort: Effort | None = None  # of a solution for these eyes; None: full
-    refined_to: Effort | None = None  # continue the newest solution to this if eyes and pictures are unchanged
+    effort: Effort | None = None  # effort for a solution; None: full
+    refined_to: Effort | None = (
+        None  # effort to which the newest solution is continued if eyes and pictures are unchanged
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class Effort:
     """Work spent on a solution: its raster and its updates of all panels."""
 
-    reduction: int = 1  # divisor of the panels' rows and columns
+    reduction: int = 1  # divisor for the panels' rows and columns
     steps: int = 0
-    continued_from: int | None = None  # steps of the solution that was continued; None: from a proposal
+    continued_from: int | None = (
+        None  # steps already done by the solution that is continued; None: starts from a proposal
+    )
 
     @property
     def name(self) -> str:
@@ -175,47 +181,52 @@ class Effort:
 class Measures:
     """Measurements of a solution: squared errors of intensities in 0..1; None: not measured."""
 
-    residual: float | None = None  # of sampled rays against the solution's targets
-    detail: Mapping[int, float] = field(default_factory=dict)  # of the pictures on coarser rasters, by reduction
-    contrast: float | None = None  # between unrelated pictures: half the variance
-    change: tuple[float, float, float] | None = None  # from the previous pictures; metres moved; seconds
+    residual: float | None = None  # error of sampled rays against the solution's targets
+    detail: Mapping[int, float] = field(default_factory=dict)  # error of the pictures on coarser rasters, by reduction
+    contrast: float | None = None  # error between unrelated pictures: half the variance
+    change: tuple[float, float, float] | None = (
+        None  # error against the previous pictures; distance moved in metres; time in seconds
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class Solution:
     """Immutable layers for one pair of eyes, or the flat picture."""
 
-    number: int  # counts up from 1, flat pictures and solutions together
-    layers: U8  # (N, h, w, 4) RGBA, rear to front; the panels' pixels, or fewer (`effort.reduction`)
-    solved_for_m: F64 | None  # (2, 3) left, right; frame `stack`; None: flat, for eyes anywhere
-    solved_for_ns: int  # instant of its eyes and content
-    seeing: tuple[bool, bool] = (True, True)  # left, right: an eye outside the viewing range is replaced by the other
+    number: int  # from 1; flat pictures and solutions share one count
+    layers: U8  # (N, h, w, 4) RGBA, rear to front; in the panels' pixels, or fewer (`effort.reduction`)
+    solved_for_m: F64 | None  # (2, 3) left, right; frame `stack`; None: a flat picture
+    solved_for_ns: int  # instant for which its eyes and content were predicted
+    seeing: tuple[bool, bool] = (
+        True,
+        True,
+    )  # left, right: False for an eye outside the viewing range, which the other one replaces
     eye_sigma_m: float | None = None  # tracking error that it allows for
-    stage_ms: dict[str, float] = field(default_factory=dict)  # by `SOLVING_STAGES`; the run's clock
+    stage_ms: dict[str, float] = field(default_factory=dict)  # time of each of `SOLVING_STAGES`, on the run's clock
     effort: Effort | None = None  # None: flat
     measures: Measures | None = None
-    relief: F32 | None = None  # (h, w) of its content over the middle panel (`optics.relief`); None: unknown
+    relief: F32 | None = None  # (h, w) relief of its content, on the middle panel (`optics.relief`); None: unknown
 
 
 @dataclass(frozen=True, slots=True)
 class RefreshAccount:
-    """One refresh: a line of frames.jsonl (contract 5.2)."""
+    """Record of one refresh: a line of frames.jsonl (docs/contracts.md)."""
 
     frame: int
-    capture_ns: int  # newest sample used for the eyes; 0: none
+    capture_ns: int  # capture time of the newest sample used; 0: none
     predicted_for_ns: int  # display time
     present_ns: int
     eyes_m: F64 | None  # (2, 3) eyes that the panels are aligned to; frame `stack`
     eyes_label: EyesLabel
-    eye_sigma_mm: float | None  # their standard deviation per axis; None without eyes
+    eye_sigma_mm: float | None  # standard deviation of the eyes per axis; None without eyes
     state: State
     solution: int | None  # number of the solution that is shown; None: the flat picture alone
     solved_for_m: F64 | None  # (2, 3)
     solution_age_ms: float | None  # display time minus the solution's instant
-    inference: Inference  # ran: the first refresh that shows its solution; reused; skipped: no solution is shown
+    inference: Inference  # ran: first to show its solution; reused: a later one; skipped: no solution is shown
     presented: bool
     skew_ms: float
-    photon_ns: int = 0  # display time computed from the actual present time
+    photon_ns: int = 0  # display time, computed from the actual present time
     true_eyes_m: F64 | None = None  # (2, 3) at the display time, from recordings with ground truth
     stage_ms: dict[str, float] = field(default_factory=dict)  # on the run's clock
-    effort: str | None = None  # of the solution shown: 1/2+1 is half the raster and one step
+    effort: str | None = None  # effort of the shown solution: 1/2+1 is half the raster and one step

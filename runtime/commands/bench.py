@@ -16,7 +16,7 @@ def bench(
     out: Annotated[Path | None, typer.Option(help="regression file to write (JSON)")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
-    """Measure time, light and memory of the shipped models at two sizes, or compare two measurements.
+    """Measure the shipped models' run time, light and memory at two sizes, or compare two measurements.
 
     Example: phasestack bench --out bench.json
 
@@ -45,7 +45,7 @@ def compare(
     new: Annotated[Path, typer.Argument(help="the later one")],
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
-    """List every figure that became slower or worse by more than noise. Exits with 1 if there is any.
+    """List every figure that got worse by more than the noise. Exits with 1 if there is any.
 
     Times are not compared if the machine was too busy during either measurement.
 
@@ -64,9 +64,9 @@ def compare(
         print(to_json({"worse": len(worse), "changes": rows, "times_compared": not busy, "too_busy": busy}))
     else:
         for why in busy:
-            print(f"times are not compared because the machine was too busy: {why}")
+            print(f"times are not compared, because the machine was too busy: {why}")
         speed = after.yardstick_ms / before.yardstick_ms
-        print(f"machine: the yardstick takes {speed:.2f} times as long; times of solutions are corrected for this")
+        print(f"machine: the reference workload takes {speed:.2f} times as long; solution times are corrected for this")
         for change in sorted(changes, key=lambda change: not change.worse):
             print(f"{'worse ' if change.worse else 'better'} {change.what}: {change.text}")
         again = ", except for times, which cannot be compared: measure again" if busy else ""

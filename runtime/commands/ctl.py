@@ -39,13 +39,16 @@ def scene(
 def place(
     scale: Annotated[float | None, number(0.001, 1000, help="scale factor of the scene")] = None,
     offset: Annotated[
-        tuple[float, float, float] | None, number(-10, 10, "m", help="displacement: out, right, up; metres")
+        tuple[float, float, float] | None,
+        number(-10, 10, "m", help="displacement in metres: out of the screen, right, up"),
     ] = None,
     rotate: Annotated[
         tuple[float, float, float] | None,
-        number(-360, 360, "degrees", help="rotation about the axes out, right and up; degrees"),
+        number(-360, 360, "degrees", help="rotation in degrees about the axes out of the screen, right and up"),
     ] = None,
-    turntable: Annotated[float | None, number(-600, 600, help="turns per minute about the vertical; 0: none")] = None,
+    turntable: Annotated[
+        float | None, number(-600, 600, help="turns per minute about the vertical axis; 0: none")
+    ] = None,
     reset: Annotated[bool, typer.Option("--reset", help="return to the configured placement")] = False,
     config: Config = None,
 ) -> None:
@@ -68,7 +71,7 @@ def place(
 def model(
     name: Annotated[str, typer.Argument(help="fast, balanced, best, sart or an ONNX file")], config: Config = None
 ) -> None:
-    """Solve with another model. The current one stays until the new one has loaded, and if loading fails.
+    """Switch to another model. The current one stays until the new one has loaded. If loading fails, it remains.
 
     Example: phasestack ctl model best
     """
@@ -81,7 +84,7 @@ PLAIN = {
     "pause": "Freeze the picture until `resume`.",
     "resume": "Follow the viewer again, after `pause` or `flat`.",
     "flat": "Show the flat (2D) picture until `resume`.",
-    "reload": "Read the configuration again. An invalid one is refused, and the old one stays in force.\n\n"
+    "reload": "Read the configuration again. An invalid one is refused, and the old one stays in use.\n\n"
     "Scene, model and placement set by `ctl` stay unless the file has a new value for them.",
     "blackbox": "Write the last two minutes (eyes, states, times, log) to an MCAP file, and print its name.",
 }  # commands without a value
@@ -115,7 +118,7 @@ def tell(request: dict[str, Any], config: Path | None) -> None:
 
 
 def _advised(error: Exception) -> str:
-    """Return the error of an unanswered request, with advice for the user."""
+    """Return the error of a request without an answer, with advice for the user."""
     from runtime.daemon.client import unit_advice
 
     advice = unit_advice()
@@ -129,7 +132,7 @@ def status(
 ) -> None:
     """Show the running daemon: state and reason, rates, eyes and their uncertainty, times, faults.
 
-    Exits with 1 if no daemon answers, or if its loop has hung for five seconds.
+    Exits with 1 if no daemon answers or if its loop has hung for five seconds.
 
     Example: phasestack status --json
     """

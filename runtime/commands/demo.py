@@ -1,4 +1,4 @@
-"""`phasestack demo`: the main job, run on the built-in recording and scene."""
+"""`phasestack demo`: run the daemon's loop on the built-in recording and scene."""
 
 from __future__ import annotations
 
@@ -9,18 +9,20 @@ from typing import Annotated
 
 import typer
 
-FRAMES, MEASURED_EVERY = 42, 14  # refreshes: 0.7 s, in which the head sets off from the middle to the left
-LONGEST_S, LEAST = 45.0, 15  # a slower machine shows fewer refreshes, but enough for a good picture
+FRAMES, MEASURED_EVERY = 42, 14  # refreshes: 0.7 s, in which the head starts moving to the left
+LONGEST_S, LEAST = 45.0, 15  # seconds; refreshes shown even if that takes longer
 
 
 def demo(
     out: Annotated[Path, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = Path("out/demo"),
-    frames: Annotated[int, typer.Option(min=1, help="number of refreshes; all 600 take several minutes")] = FRAMES,
+    frames: Annotated[
+        int, typer.Option(min=1, help="number of refreshes; the whole recording (600) takes several minutes")
+    ] = FRAMES,
     as_json: Annotated[bool, typer.Option("--json", help="the summary as one JSON object on stdout")] = False,
 ) -> None:
-    """Replay a built-in recording of a moving head through the whole pipeline, without a screen.
+    """Run the whole pipeline on a built-in recording of a moving head, without a screen.
 
-    Ends after 45 s but not before the 15th refresh, unless --frames asks for more of them.
+    Ends after 45 s, but not before the 15th refresh, unless --frames is given.
 
     Example: phasestack demo --out out/demo
     """

@@ -46,7 +46,7 @@ def doctor(
     config: Annotated[Path | None, typer.Option(help="configuration to check; without one, the defaults")] = None,
     as_service: Annotated[
         bool,
-        typer.Option("--service", help="check as the service, with its user, groups and configuration (needs root)"),
+        typer.Option("--service", help="check with the service's user, groups and configuration (needs root)"),
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout")] = False,
 ) -> None:
@@ -76,7 +76,7 @@ def doctor(
 
 
 def _become_service() -> None:
-    """Turn this process into what systemd would start, except for the unit's sandbox. Raises InputError."""
+    """Take on the service's user, groups and environment, but not its sandbox. Raises InputError."""
     import grp
     import pwd
     import shlex
@@ -109,7 +109,7 @@ def examine(settings: Settings) -> list[Row]:
             rows += check(settings)
         except PhasestackError as error:
             rows.append(Row(name, "fail", str(error)))
-        except Exception as error:  # the remaining checks still run
+        except Exception as error:  # so that the remaining checks run
             if missing := missing_extra(error):
                 rows.append(Row(name, "fail", str(missing)))
                 continue
@@ -214,7 +214,7 @@ def monitors(settings: Settings) -> Iterator[Row]:
             "monitor",
             "ok",
             str(monitor),
-            "" if known else "no EDID serial number: bind it by connector",
+            "" if known else "it has no EDID serial number: identify it by its connector",
         )
     try:
         bound = bind(panels, there)
@@ -237,7 +237,7 @@ def content(settings: Settings) -> Iterator[Row]:
 
 
 def model(settings: Settings) -> Iterator[Row]:
-    """Check that the network loads, fits the stack and has its provider, and time a solution."""
+    """Check that the network loads, fits the stack and finds its execution provider, and time a solution."""
     import cv2
 
     from runtime.model.backends import choose
@@ -265,7 +265,7 @@ def model(settings: Settings) -> Iterator[Row]:
 
 
 def _rate(predictor: Predictor, backend: SolverBackend, settings: Settings) -> Row:
-    """Return the rate of full solutions on the configured raster, for the slowest kind of picture."""
+    """Measure the rate of full solutions on the configured raster, for the slowest kind of picture."""
     from dataclasses import replace
 
     from runtime.model.backends import solution_ms
@@ -281,8 +281,8 @@ def _rate(predictor: Predictor, backend: SolverBackend, settings: Settings) -> R
     detail = f"{raster}: {took_ms:.0f} ms per full solution, {1000 / took_ms:.1f} per second ({how})"
     if took_ms < SLOW_MS:
         return Row("rate", "ok", detail)
-    coarser = "moving viewers get coarser rasters and fewer steps; " if settings.model.effort == "auto" else ""
-    sharper = "for sharper pictures use a GPU, the model `fast` or fewer pixels (docs/planning.md)"
+    coarser = "while viewers move, pictures are coarser and less accurate;  " if settings.model.effort == "auto" else ""
+    sharper = "for better ones use a GPU, the model `fast` or fewer pixels (docs/planning.md)"
     return Row("rate", "warn", detail, coarser + sharper)
 
 

@@ -9,7 +9,7 @@ import typer
 
 from runtime.support.options import number
 
-JSON_S = 2.0  # of the sensor, for one JSON object
+JSON_S = 2.0  # time for which the sensor is observed with --json
 
 
 def eyes(
@@ -21,7 +21,9 @@ def eyes(
     sequence: Annotated[
         bool, typer.Option("--sequence", help="treat the pictures as successive frames, as the daemon does")
     ] = False,
-    rate_hz: Annotated[float, number(0.1, 1000, "Hz", help="rate of these frames, and of films without one")] = 30.0,
+    rate_hz: Annotated[
+        float, number(0.1, 1000, "Hz", help="frame rate of these pictures, and of films that do not state theirs")
+    ] = 30.0,
     out: Annotated[Path | None, typer.Option(help="folder for overlays, readable only by you")] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="one JSON object on stdout; a live sensor is observed for two seconds")

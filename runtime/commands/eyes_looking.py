@@ -26,8 +26,8 @@ from runtime.support.film import VIDEOS, open_film
 from runtime.support.picture_file import read_image
 
 RECORDING = ".mcap"
-OVERLAY_MIN_PX = 640  # longer side of an overlay, at least
-PRIVATE = 0o600  # for pictures of faces
+OVERLAY_MIN_PX = 640  # minimum length of an overlay's longer side
+PRIVATE = 0o600  # file mode for pictures of faces
 GREEN, RED, WHITE = (60, 220, 60), (230, 60, 60), (255, 255, 255)
 Row = dict[str, Any]
 
@@ -179,7 +179,7 @@ def look_at_sensor(
 ) -> None:
     """Report every frame of the configured sensor until the time is up, its recording ends, or Ctrl-C.
 
-    The newest overlay remains in `out`. Raises InputError, SensorLost.
+    `out` keeps only the newest overlay. Raises InputError, SensorLost.
     """
     watcher, driver = Watcher(settings), open_sensor(settings.sensor, MonotonicClock())
     end = time.monotonic() + seconds

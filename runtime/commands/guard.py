@@ -1,4 +1,4 @@
-"""Guard around every command: any failure becomes an exit code and at most one line on stderr.
+"""Guard around every command: converts any failure to an exit code and at most one line on stderr.
 
 0: done, 1: a check failed, 2: wrong usage or input, 70: a bug (the line names a file with the traceback), 75: a failure
 that may be temporary, 130: Ctrl-C, 141: stdout was closed.
@@ -20,7 +20,10 @@ INTERRUPTED, BAD_INPUT, OWN_ERROR, MAY_PASS, STDOUT_CLOSED = 130, 2, 70, 75, 141
 
 
 def run_guarded(*, interrupts_leave: bool) -> None:
-    """Run the command named by the arguments; never returns. interrupts_leave: until now, Ctrl-C exits."""
+    """Run the command named by the arguments; never returns.
+
+    interrupts_leave: until now, Ctrl-C has exited the process directly.
+    """
     _fill_standard_descriptors()
     try:
         from runtime.commands.app import app
@@ -43,7 +46,7 @@ def run_guarded(*, interrupts_leave: bool) -> None:
         logs.flush()
     else:
         atexit._run_exitfuncs()
-    # No teardown of modules: it takes time, and would abort if a library's thread is still running.
+    # Skip Python's teardown: it takes time, and aborts the process if a library's thread is still running.
     os._exit(code)
 
 
@@ -99,7 +102,7 @@ def _reported(error: BaseException) -> int:
 def _say(line: str) -> None:
     with contextlib.suppress(OSError, ValueError):  # without stderr there is only the exit code
         print(line, file=sys.stderr, flush=True)
-    if "NOTIFY_SOCKET" in os.environ:  # `phasestack status` shows it for a failed service
+    if "NOTIFY_SOCKET" in os.environ:  # so that `phasestack status` can show it if the service has failed
         with contextlib.suppress(ImportError):
             import sdnotify
 
@@ -122,5 +125,5 @@ def _fill_standard_descriptors() -> None:
         os.set_inheritable(number, True)
     for name in ("stdout", "stderr"):
         stream: Any = getattr(sys, name) or os.fdopen(number, "w", encoding="utf-8", closefd=False)
-        stream.reconfigure(errors="backslashreplace")  # a file's name need not be UTF-8
+        stream.reconfigure(errors="backslashreplace")  # file names need not be UTF-8
         setattr(sys, name, stream)

@@ -23,7 +23,7 @@ def identify(
 
     One panel at a time shows its card, and the others are clear. Press Enter or n for the next panel, p for the
     previous one, q to quit. Configured panels are rotated, mirrored and registered as in a run. If none is configured,
-    every monitor shows the line that names it in a configuration (`phasestack setup` writes it for you).
+    every monitor shows the line that identifies it in a configuration (`phasestack setup` writes it for you).
 
     Exits with 75 if the X server dies.
 
@@ -84,7 +84,7 @@ def _hold(panels: PanelSink, cards: list[U8], poll: Callable[[], Key | None]) ->
     from runtime.panels.card import alone
     from runtime.records import PanelFrame
 
-    lost, number = "", 0  # of key presses, so that each is another frame
+    lost, number = "", 0  # counts key presses, so that each makes a new frame
     shown, layers = 0, alone(cards, 0)
     typer.echo("one panel at a time (Enter, n: next; p: previous; q: quit)")
     try:

@@ -35,7 +35,7 @@ def page(
     set_niceness(BACKGROUND_NICENESS)  # lowered before its threads start, because the display has priority
     places = sockets(config)
     path = token_file or state_folder() / "page-token"
-    with retry_advised():  # such as a full disk
+    with retry_advised():  # for example, a full disk
         token = token_of(path)
     served = listening("page", port)
     typer.echo(f"page: http://{LOOPBACK}:{served.getsockname()[1]}/ - the token is in {path}", err=True)

@@ -1,4 +1,4 @@
-"""`phasestack plan`: list the work that can be saved for a scene."""
+"""`phasestack plan`: list the work that a scene makes unnecessary."""
 
 from __future__ import annotations
 

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from runtime.records import SensorFrame
     from runtime.sensor.worker import SensorWorker
 
-POLL_S = 0.004  # between two looks for samples: a quarter of a 60 Hz sensor's period
-FIRST_SAMPLE_S = 15.0  # to wait for the first sample
+POLL_S = 0.004  # interval between checks for samples: a quarter of a 60 Hz sensor's period
+FIRST_SAMPLE_S = 15.0  # longest wait for the first sample
 SUFFIX = ".mcap"
 OVER = ("ended", "failed")
 
@@ -96,7 +96,7 @@ def _refuse_target(out: Path, *, motion: bool) -> None:
     try:
         if motion and Recording(out).header.driver == "motion":
             return
-    except InputError:  # no recording
+    except InputError:  # not a recording
         pass
     raise InputError(out, "--out", "already exists: choose another name, or delete it")
 
@@ -165,7 +165,7 @@ def _samples(worker: SensorWorker, limit_s: float) -> Iterator[SensorFrame]:
 
     deadline_ns, begun = time.monotonic_ns() + round(FIRST_SAMPLE_S * 1e9), False
     while True:
-        is_over = worker.state in OVER  # first: the last samples arrive before this
+        is_over = worker.state in OVER  # read first: the last samples arrive before the state changes
         frames = worker.take()
         if frames and not begun:
             deadline_ns, begun = frames[0].capture_ns + round(limit_s * 1e9), True

@@ -13,13 +13,16 @@ def report(
     pairs: Annotated[Path | None, typer.Option(help="folder of case files, to measure on your own pairs")] = None,
     focal: Annotated[bool, typer.Option("--focal", help="also measure focal parallax through the layers")] = False,
     model: Annotated[list[str] | None, typer.Option(help="an ONNX file to compare as well; may be repeated")] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="quarter-size panels, fewer references: a first look")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="quick overview: quarter-size panels and fewer references")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
-    """Measure light PSNR and run time of every method on this machine, and write a page. Takes minutes.
+    """Measure light PSNR and run time of every method on this machine, and write a page.
 
-    The page exists from the first figure on, and grows: open it, or stop when it shows enough. To compare the published
-    network, make it from its checkpoint by `phasestack export`, and name it by `--model FILE.onnx`.
+    Takes minutes. The page appears with the first figure and is then completed: open it at once, or stop when it shows
+    enough. To compare the published network, export its checkpoint with `phasestack export`, and pass the file as
+    `--model FILE.onnx`.
 
     Example: phasestack report --pairs my-pairs --out report
     """

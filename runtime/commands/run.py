@@ -34,13 +34,13 @@ def run(
         typer.Option(help="device for everything except the network: auto (the faster one), cpu or gl"),
     ] = None,
     keep_light: Annotated[
-        int, typer.Option(min=0, help="with --out: write what the panels show every N refreshes; 0: never")
+        int, typer.Option(min=0, help="with --out: write the panels' layers every N refreshes; 0: never")
     ] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="the summary as one JSON object on stdout")] = False,
 ) -> None:
     """Run the display until SIGTERM. SIGHUP reads the configuration again.
 
-    Exits with 75 if the X server dies: when started again, it waits for the server.
+    Exits with 75 if the X server dies. When started again, it waits for the server.
 
     Example: phasestack run --config /etc/phasestack/phasestack.toml
 

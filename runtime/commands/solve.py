@@ -40,10 +40,12 @@ def solve(
         str | None,
         typer.Option(help="device for everything except the network: cpu, gl or auto (timed if --repeat >= 10)"),
     ] = None,
-    no_plan: Annotated[bool, typer.Option("--no-plan", help="skip no work, even if the pictures allow it")] = False,
+    no_plan: Annotated[
+        bool, typer.Option("--no-plan", help="do all work, even if the pictures make some of it unnecessary")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="solve.json's object on stdout")] = False,
 ) -> None:
-    """Compute the layers for two still pictures and two eyes, and measure the pictures that the eyes see.
+    """Compute the layers for two still pictures and two eyes, and measure the quality of the eyes' views.
 
     Example: phasestack solve --left l.png --right r.png --left-eye 0.6 -0.03 0 --right-eye 0.6 0.03 0 --fov 40
     --panels panels.json --out out/solve

@@ -33,7 +33,7 @@ from runtime.support.picture_file import read_image
 from runtime.support.progress import tell
 from runtime.support.ranges import SEPARATION_MIN_M
 
-MEASURED_FROM = 10  # number of runs from which measuring the backends pays off
+MEASURED_FROM = 10  # least number of runs for which timing both backends pays off
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class Files:
 
     left: Path
     right: Path | None
-    layout: str | None  # of the one
+    layout: str | None  # arrangement of the views, if there is one file
 
     @property
     def name(self) -> str:
@@ -102,14 +102,14 @@ def solve_pair(
 
         predictor = load_predictor(model, stack, settings)
         cleanup.callback(predictor.close)
-        # A few solutions take less time than measuring two backends.
+        # A few solutions take less time than timing both backends.
         device = "cpu" if settings.backend == "auto" and repeat < MEASURED_FROM else settings.backend
         predictor.set_backend(choose(device, predictor, context).backend)
         watch.lap("load model")
         inference_ms: list[float] = []
 
         def solve() -> Prediction:
-            tell("solving", len(inference_ms), repeat + 1)  # one is for warming up
+            tell("solving", len(inference_ms), repeat + 1)  # the first run warms up
             left, right = pictures
             prediction = solve_still(
                 left,
@@ -126,7 +126,7 @@ def solve_pair(
         try:
             done = timed(solve, runs=repeat)
         except EyesNotServed as error:  # a still pair's eyes do not move
-            why = f"{error}: {predictor.name} cannot serve these eyes (try --model sart)"
+            why = f"{error}: {predictor.name} does not support these eye positions (try --model sart)"
             raise InputError("solve", "--left-eye, --right-eye", why) from None
         watch.lap("solve, warm-up included")
         with OutputFolder(out) as folder:
@@ -153,7 +153,7 @@ def solve_pair(
                 "provider": predictor.provider,
                 "backend": predictor.backend,
                 "eye_sigma_mm": eye_sigma_mm,
-                "steps": done.answer.steps + 1,  # the proposal counts
+                "steps": done.answer.steps + 1,  # the network's proposal counts as a step
                 "plan": [asdict(item) for item in items],
                 "notes": notes,
                 "wall_s": {part: round(ms / 1e3, 3) for part, ms in watch.stage_ms.items()},
@@ -164,7 +164,10 @@ def solve_pair(
 
 
 def taken(pictures: list[Any], eyes: Eyes, stack: PanelStack) -> tuple[list[Any], F64, float]:
-    """Return pictures whose cameras look at the stack's origin, their eyes (2, 3) and field of view."""
+    """Resample the pictures as seen by eyes that look at the stack's origin.
+
+    Returns them, the eyes and the field of view.
+    """
     if eyes.cameras is None:
         if eyes.left is None or eyes.right is None:
             raise InputError("solve", "--left-eye, --right-eye", "are required, in metres, unless --camera is given")
@@ -182,7 +185,7 @@ def taken(pictures: list[Any], eyes: Eyes, stack: PanelStack) -> tuple[list[Any]
 
 
 def checked_eyes(left_eye: tuple[float, ...], right_eye: tuple[float, ...], stack: PanelStack) -> F64:
-    """Return eyes (2, 3) that can be served. Raises InputError, naming the option."""
+    """Return the (2, 3) eyes if the display can serve them. Raises InputError, naming the option."""
     for option, eye in (("--left-eye", left_eye), ("--right-eye", right_eye)):
         if eye[0] <= max(stack.x_m):
             raise InputError(

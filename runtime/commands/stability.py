@@ -1,4 +1,4 @@
-"""`phasestack stability`: test every numerical step on stiff and extreme cases."""
+"""`phasestack stability`: test every numerical method on stiff and extreme cases."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def stability(
         Path | None, typer.Option(help="write the errors to a limits file, after a model has changed")
     ] = None,
 ) -> None:
-    """Run every numerical step on stiff and extreme cases, and compare the results with references.
+    """Run every numerical method on stiff and extreme cases, and compare the results with references.
 
     A case without a reference may be at most 5% worse than the recorded limit. Exits with 1 if a case fails.
 
@@ -62,7 +62,7 @@ def stability(
 
 
 def _fits() -> dict[str, Fit]:
-    """Return the calibration's solvers by the name of their rule."""
+    """Return the calibration's solvers by method name."""
     from functools import partial
 
     from calib.solution import METHODS, Method, solve

@@ -17,7 +17,7 @@ def try_(
         str | None, typer.Option(help="arrangement of the views in pictures: a value of content.layout")
     ] = None,
     model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
-    webcam: Annotated[bool, typer.Option("--webcam", help="track you with this PC's camera")] = False,
+    webcam: Annotated[bool, typer.Option("--webcam", help="track your head with this PC's camera")] = False,
     port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0: any free one")] = 0,
     no_browser: Annotated[bool, typer.Option("--no-browser", help="print the address only")] = False,
     seconds: Annotated[float | None, number(1, 1e6, "s", help="stop after this long")] = None,

@@ -27,8 +27,8 @@ from runtime.page.server import application
 
 SIZE_PX = {"width_px": 960, "height_px": 540}  # default: small, for frequent solutions
 SCENE = "room"  # without a configuration
-WEBCAM_FOV_DEG = 65.0  # fits most webcams; set it in a configuration for others
-SLOW_PAGE_S = 2.0  # without a picture from a page's camera
+WEBCAM_FOV_DEG = 65.0  # about right for most webcams; a configuration can set another
+SLOW_PAGE_S = 2.0  # after this long without a picture from a page's camera, it is lost
 MEASURED_EVERY_S = 4.0  # interval between measurements of the light at the eyes
 
 

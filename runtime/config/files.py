@@ -1,4 +1,4 @@
-"""Settings from a file, replaced in part by options or an operator's choices; panels files."""
+"""Loading of settings and panels files; command-line options and operators' choices that replace settings."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def with_options(
 ) -> Settings:
     """Return the settings with command-line options applied. Raises InputError, naming the option.
 
-    loop: the recording restarts when it ends.
+    loop: restart the recording when it ends.
     """
     overrides: tuple[tuple[str, str, dict[str, Any] | None], ...] = (
         ("--replay", "sensor", None if replay is None else {"driver": "replay", "source": replay}),

@@ -1,6 +1,6 @@
-"""Types of settings that name a file: paths are relative to the folder of the file that holds them.
+"""Types of settings that name a file. Paths are relative to the folder of the configuration file.
 
-Where settings are validated without that folder (from code or the command line), they stay as they are.
+Paths from code or the command line stay as they are.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from runtime.support.plugins import located
 def path_in(folder: Path | None, value: str, *, or_name: bool = False) -> str:
     """Return the path resolved against the folder.
 
-    or_name: a bare word without a suffix is a name and stays.
+    or_name: leave a bare word without a suffix, which is a name, as it is.
     """
     if folder is None or Path(value).name in ("", ".."):
         return value

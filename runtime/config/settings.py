@@ -1,6 +1,6 @@
 """All settings, each with its type, range, default and meaning.
 
-Ranges cover displays that can be built, so that a wrong unit is refused, with a suggestion.
+Ranges cover all displays that can be built, so a value in the wrong unit is refused with a suggestion.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from runtime.support.plausible import nearest, within
 from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG
 from runtime.support.sections import Section
 
-MOST = 1e9  # of any number that has no narrower range
-PIXEL_ASPECT_TOLERANCE = 0.03  # relative: data sheets round the active area
-LEAST_GAP_M = 1e-5  # between panels: thinner than any panel
-PANELS_MOST = 8  # in a stack
+MOST = 1e9  # limit for any number without a narrower range
+PIXEL_ASPECT_TOLERANCE = 0.03  # relative; data sheets round the active area
+LEAST_GAP_M = 1e-5  # smallest gap between panels; any real panel is thicker
+PANELS_MOST = 8  # most panels in a stack
 
 NonNegative = Annotated[float, Field(ge=0, le=MOST)]
 Unit = Annotated[float, Field(ge=0, le=1)]
-Entry = Annotated[float, Field(ge=-MOST, le=MOST)]  # of a matrix
-Slope = Annotated[float, Field(ge=-0.2, le=0.2)]  # of a panel that should be upright
-Coordinate = Annotated[float, within(-EYE_MOST_M, EYE_MOST_M, "m")]  # of an eye
+Entry = Annotated[float, Field(ge=-MOST, le=MOST)]  # element of a matrix
+Slope = Annotated[float, Field(ge=-0.2, le=0.2)]  # slope of a panel that should be upright
+Coordinate = Annotated[float, within(-EYE_MOST_M, EYE_MOST_M, "m")]  # coordinate of an eye
 Point = tuple[Coordinate, Coordinate, Coordinate]
-Offset = Annotated[float, within(-10.0, 10.0, "m")]  # of a scene
+Offset = Annotated[float, within(-10.0, 10.0, "m")]  # displacement of a scene
 Turn = Annotated[float, within(-360.0, 360.0, "degrees")]
 
 
@@ -55,7 +55,7 @@ class StackGeometry(Section):
     )
     registered_from_m: Point = Field(
         (0.5, 0.0, 0.0),
-        description="eye, in frame `stack`, from which the homographies make tilted panels look parallel",
+        description="eye position, in frame `stack`, from which the registered panels look parallel",
     )
 
     @model_validator(mode="after")
@@ -150,9 +150,11 @@ class CalibrationSettings(Section):
         description="distance of the nearest and farthest viewer, for calibration charts and registration",
     )
     viewing_side_deg: Annotated[float, Field(ge=2, le=40)] = Field(
-        10.0, description="largest angle to either side at which viewers stand, seen from the display's centre"
+        10.0, description="largest angle to either side at which viewers stand, measured at the display's centre"
     )
-    viewing_up_deg: tuple[float, float] = Field((0.0, 20.0), description="lowest and highest elevation of their eyes")
+    viewing_up_deg: tuple[float, float] = Field(
+        (0.0, 20.0), description="lowest and highest elevation of the viewers' eyes"
+    )
 
     @model_validator(mode="after")
     def _viewing(self) -> CalibrationSettings:
@@ -184,13 +186,13 @@ class ContentSettings(Section):
     background: tuple[Unit, Unit, Unit] | None = Field(
         None, description="colour behind the scene, 0-1; unset: dark, or white for the built-in scenes"
     )
-    file: PathText = Field("", description="data of a preset: its .ply or .glb file, or its data-set folder")
+    file: PathText = Field("", description="data file or folder of a preset: its .ply or .glb file, or its data set")
     layout: Annotated[str, Field(pattern=LAYOUT)] = Field(
         "auto",
         description="arrangement of views in a picture or video: mono, side-by-side, top-bottom, cross-eyed (the "
         "right eye's on the left), each with half- before it, anaglyph, rgbd, a quilt's qs8x6a0.75; auto: by file name",
     )
-    cone_deg: Annotated[float, Field(gt=0, lt=180)] = Field(40.0, description="angle spanned by a quilt's views")
+    cone_deg: Annotated[float, Field(gt=0, lt=180)] = Field(40.0, description="angle between a quilt's outermost views")
     depth_m: tuple[Annotated[float, within(-10.0, 10.0, "m")], Annotated[float, within(-10.0, 10.0, "m")]] = Field(
         (-0.05, 0.05),
         description="depth range (rear, front) of an RGBD picture; a mesh scaled by `fit` may take up to twice this",
@@ -198,7 +200,7 @@ class ContentSettings(Section):
     picture_rate_hz: Annotated[float, within(0.01, 1000.0, "Hz")] = Field(
         30.0, description="frame rate of a folder of pictures"
     )
-    fit: bool = Field(True, description="fit a mesh or splat that has no preset to the display, and centre it")
+    fit: bool = Field(True, description="scale and centre a mesh or splat without a preset to fit the display")
     axes: Annotated[str, Field(pattern=r"^(auto|[+-][xyz] [+-][xyz])$")] = Field(
         "auto",
         description="axes of a mesh or splat that point up and to the viewer, such as `+z -y`; "
@@ -235,13 +237,13 @@ def _accept_legacy_backend(name: Any) -> Any:
 
 
 class ModelSettings(Section):
-    """Model of the panels, and where it runs."""
+    """The model, and the device on which it runs."""
 
     name: NameOrPath = Field("balanced", description="fast, balanced, best, sart, or an ONNX file with our contract")
     effort: Literal["auto", "full"] = Field(
         "auto",
-        description="raster and steps of each solution: auto (chosen by the loop, at most those of the model) or full "
-        "(always all of the model's)",
+        description="raster and steps of each solution: auto (adapted to the viewer's movement) or full "
+        "(always the configured raster and all of the model's steps)",
     )
     provider: Literal["cpu", "cuda", "tensorrt", "openvino"] = Field(
         "cpu", description="the network's execution provider"
@@ -254,12 +256,12 @@ class ModelSettings(Section):
     threads: Annotated[int, Field(ge=0, le=256)] = Field(2, description="inference threads; 0: all cores")
     eye_sigma_mm: Literal["auto"] | NonNegative = Field(
         "auto",
-        description="tracking error that solutions allow for: standard deviation of both eyes together, "
+        description="tracking error that solutions allow for: standard deviation of the eyes' common position, "
         "in mm per axis; 0: eyes known exactly; auto: from the tracker",
     )
     budget_ms: NonNegative = Field(
         0.0,
-        description="no step of a solution begins later than this after its start, drawing included; 0: no limit",
+        description="time limit of a solution, drawing included, after which no further step begins; 0: no limit",
     )
 
 
@@ -282,7 +284,7 @@ class OutputSettings(Section):
     """Output to the panels."""
 
     kind: Literal["offscreen", "windows"] = Field(
-        "offscreen", description="no windows, or one fullscreen window per panel"
+        "offscreen", description="offscreen: no windows; windows: one fullscreen window per panel"
     )
     panels: tuple[PanelSettings, ...] = Field(
         (), max_length=PANELS_MOST, description="one table per panel, rear to front"
@@ -331,17 +333,17 @@ class LoopSettings(Section):
 
 
 class PlanSettings(Section):
-    """Allowed savings."""
+    """Savings that are allowed."""
 
     enabled: bool = Field(
         True,
         description="skip work that the scene or a resting head makes unnecessary; false: do all work",
     )
-    align: bool = Field(True, description="shift and scale the panels at every refresh to follow the eyes")
+    align: bool = Field(True, description="shift and scale the panels' pictures at every refresh to follow the eyes")
 
 
 class ServiceSettings(Section):
-    """Socket and black box of the daemon."""
+    """The daemon's socket and black box."""
 
     socket: PathText = Field("/run/phasestack/status.sock", description="status and control socket")
     blackbox_minutes: Annotated[float, within(0.0, 60.0, "min")] = Field(

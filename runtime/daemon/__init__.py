@@ -1,1 +1,1 @@
-"""Daemon: builds, supervises and reconfigures a run; socket, signals, notifications."""
+"""The daemon: building, supervising and reconfiguring a run; its socket, signals and notifications."""

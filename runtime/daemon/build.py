@@ -44,7 +44,7 @@ from runtime.support.untrusted_input import LIMITS
 
 log = logging.getLogger("phasestack.build")
 
-SWITCH_INTERVAL_S = 0.0005  # between Python threads: the presenter must not wait long for the solver
+SWITCH_INTERVAL_S = 0.0005  # interval at which Python switches threads: the presenter must not wait long for the solver
 
 # Figures of summary.json that a simulated clock takes from the configuration.
 SIMULATED_FIGURES = (
@@ -55,17 +55,17 @@ SIMULATED_FIGURES = (
 
 @dataclass(frozen=True, slots=True)
 class RunOptions:
-    """Options of a run that the command line adds to the configuration."""
+    """Options of a run that only the command line sets."""
 
     max_speed: bool = False
     measure: bool = False
     scale: float = 1.0
     keep_light: int = 0
-    frames: int | None = None  # refreshes; None: to the end
+    frames: int | None = None  # number of refreshes; None: until the end
     out: Path | None = None  # folder for the run's files
     browser: BrowserLink | None = None  # a page shows the panels, and may be the sensor
     until: Callable[[], str] = str  # reason to stop, or empty
-    fixed: Effort | None = None  # of every solution, instead of all of the model's (with model.effort = "full")
+    fixed: Effort | None = None  # effort of every solution with model.effort = "full"; None: all of the model's steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +84,7 @@ class Run:
         return self.maker.parts
 
     def plan_items(self) -> list[dict[str, Any]]:
-        """Return the present savings; those without measured times or costs have None."""
+        """Return the savings in use; a time or cost that was not measured is None."""
         solver = self.parts.solver
         known = replace(solver.measured, reuse=Saving(saves_ms=self.presenter.stats.reuse_saves_ms()))
         return [asdict(item) for item in solver.plan_items(known)]
@@ -113,20 +113,20 @@ def scaled_stack(settings: Settings, scale: float) -> PanelStack:
 
 
 class Host(Supervisor):
-    """Owner of a run: called during the start, then its supervisor. The base does nothing."""
+    """Owner of a run, called while it starts. This base class does nothing."""
 
-    recorder: Any = None  # another observer, whose `watches` is called before the first refresh
+    recorder: Any = None  # an additional observer; its `watches` is called before the first refresh
 
     def starting(self, doing: str) -> bool:
-        """Report a long step of the start. False: stop."""
+        """Report that a long step of the start begins. Returns False to stop the start."""
         return True
 
     def wait_for_panel(self, why: str) -> bool:
-        """Wait for a missing panel. True: try again."""
+        """Wait for a missing panel. Returns True to try again."""
         return False
 
     def watches(self, run: Run) -> None:
-        """Take the complete run, before its first refresh."""
+        """Receive the complete run before its first refresh."""
 
 
 def build_run(
@@ -230,11 +230,11 @@ def build_run(
     if host.recorder is not None:
         host.recorder.watches(presenter, in_stack_frame=in_stack_frame)
     if not simulated:
-        # A collection through the libraries' objects would stop all Python threads for several refreshes.
+        # Garbage collection over all of the libraries' objects would stop every Python thread for several refreshes.
         gc.collect()
         gc.freeze()
         cleanup.callback(gc.unfreeze)
-        cleanup.enter_context(niceness(PRESENTER_NICENESS))  # of this thread, after all others were started
+        cleanup.enter_context(niceness(PRESENTER_NICENESS))  # this thread's, set once all others have started
     run = Run(presenter, observer, maker, simulated)
     host.watches(run)
     return run

@@ -1,4 +1,4 @@
-"""Operators' changes: the configuration, choices that override it, and the change being loaded."""
+"""Changes by operators: the configuration, the choices that override it, and the change being loaded."""
 
 from __future__ import annotations
 
@@ -20,12 +20,20 @@ from runtime.frame.presenter import Presenter
 
 log = logging.getLogger("phasestack.daemon")
 
-NEEDS_RESTART = ("stack", "sensor", "output", "service", "loop", "model.backend", "calibration.ipd_m")  # read once
+NEEDS_RESTART = (
+    "stack",
+    "sensor",
+    "output",
+    "service",
+    "loop",
+    "model.backend",
+    "calibration.ipd_m",
+)  # read only at the start
 
 
 @dataclass(frozen=True, slots=True)
 class Choices:
-    """The configuration as it was last read, and an operator's choices, which override it."""
+    """The configuration as last read, with the operator's choices, which override it."""
 
     configured: Settings
     chosen: dict[tuple[str, str], Any] = field(default_factory=dict)  # by section and key
@@ -38,11 +46,11 @@ class Choices:
         return settings
 
     def choosing(self, section: str, **values: Any) -> Choices:
-        """Return the choices, with some choices of one section added."""
+        """Return the choices with values of one section added."""
         return replace(self, chosen=self.chosen | {(section, key): value for key, value in values.items()})
 
     def another_scene(self, scene: str) -> Choices:
-        """Return the choices with another scene, placed as configured rather than as the last one was moved."""
+        """Return the choices with another scene in its configured placement."""
         kept = {setting: value for setting, value in self.chosen.items() if setting[1] not in PLACING}
         return replace(self, chosen=kept).choosing("content", scene=scene)
 
@@ -76,19 +84,19 @@ class _Change:
 
 
 class Changes:
-    """Changes to a run, loaded one at a time. Only the presenter's thread uses this object.
+    """Changes to a run, loaded one at a time.
 
-    Work on other threads receives all it needs, and its outcome comes back through a queue: a job reads and loads
-    settings (`Reconfiguration`), and the solver's thread moves the scene.
+    Only the presenter's thread uses this object. Other threads get copies of their inputs and return their outcome
+    through a queue: a job reads and loads settings (`Reconfiguration`), and the solver's thread moves the scene.
     """
 
     def __init__(self, presenter: Presenter) -> None:
         self._presenter = presenter
         self.choices = Choices(presenter.run_cell.state.settings)
-        self.refused = ""  # why the last change was refused; empty after one that was accepted
+        self.refused = ""  # why the last change was refused; empty if it was accepted
         self._loading: tuple[_Change, Reconfiguration] | None = None
-        self._next: _Change | None = None  # begins when that has ended
-        self._outcomes: SimpleQueue[Callable[[], None]] = SimpleQueue()  # of work on the solver's thread
+        self._next: _Change | None = None  # starts once the current change has ended
+        self._outcomes: SimpleQueue[Callable[[], None]] = SimpleQueue()  # outcomes of work on the solver's thread
 
     @property
     def loading(self) -> Reconfiguration | None:
@@ -96,9 +104,9 @@ class Changes:
         return None if self._loading is None else self._loading[1]
 
     def carry_on(self) -> None:
-        """Finish the work that other threads have done, and begin work that waits. Called once per refresh."""
+        """Process the results of other threads, and start the next change. Called once per refresh."""
         finished = self._loading is not None and self._loading[1].finished
-        while not self._outcomes.empty():  # those from before a scene was replaced, first
+        while not self._outcomes.empty():  # first, because they may belong to the scene that a change replaces
             self._outcomes.get()()
         if self._loading is not None and finished:
             (change, loading), self._loading = self._loading, None
@@ -109,7 +117,7 @@ class Changes:
             self.attempt(change.command, partial(self._load, change))
 
     def begin(self, command: Command, choose: Callable[[Choices], Choices], *, reload_content: bool = False) -> None:
-        """Begin a change, or let it wait until the one being loaded has been abandoned.
+        """Start a change. If another one is loading, that one is abandoned first.
 
         choose: computes the new choices, on the loading thread; reload_content: even if its settings are unchanged.
         """

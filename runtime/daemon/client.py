@@ -1,4 +1,4 @@
-"""Client of the running daemon: finds its socket, sends a JSON line and reads one back."""
+"""Client of the running daemon: finds its socket, sends one JSON line and reads the answer."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from runtime.errors import TransientError
 # `ServiceSettings().socket`, without loading all settings.
 DEFAULT_SOCKET = "/run/phasestack/status.sock"
 UNIT = "phasestack"
-REQUEST_MAX_BYTES = 65536  # of one request, of a client or a page: limits the memory that a client can use
-REQUEST_S = 5.0  # for a whole request to arrive, and for its answer to be read
+REQUEST_MAX_BYTES = 65536  # limit for one request, which bounds the memory that a client can use
+REQUEST_S = 5.0  # time limit for a whole request to arrive, and for its answer to be read
 LOOKED_UP_AGAIN_S = {"status": 0.2, "pictures": 0.3, "log": 0.5, "about": 2.0}
-LOOKED_UP_WITHIN_S = 3.0  # for an answer without the loop's work; after it, the page shows that the daemon hangs
-LOADED_WITHIN_S = 60.0  # longest wait of the daemon for a scene or model before it answers a command
-ANSWERED_WITHIN_S = LOADED_WITHIN_S + 10.0  # longest wait of a client
-HUNG_AFTER_S = 5.0  # without a completed turn, the loop counts as hanging
+LOOKED_UP_WITHIN_S = 3.0  # time limit for answers that need no work by the loop; after it, the page reports a hang
+LOADED_WITHIN_S = 60.0  # the daemon answers a command after this time even if its scene or model is still loading
+ANSWERED_WITHIN_S = LOADED_WITHIN_S + 10.0  # longest wait of a client for an answer
+HUNG_AFTER_S = 5.0  # the loop counts as hung after this long without a completed turn
 
 
 def user_socket() -> Path | None:
@@ -42,7 +42,7 @@ def candidates(configured: str) -> tuple[Path, ...]:
 def sockets(config: Path | None) -> tuple[Path, ...]:
     """Return the sockets to try for a configuration file. Raises InputError, naming file and field."""
     if config is None:
-        return candidates(DEFAULT_SOCKET)  # without loading the settings: clients start quickly
+        return candidates(DEFAULT_SOCKET)  # settings are not loaded, so that clients start quickly
     from runtime.config import load_settings
 
     return candidates(load_settings(config).service.socket)
@@ -51,7 +51,7 @@ def sockets(config: Path | None) -> tuple[Path, ...]:
 class NotRunning(TransientError):
     """No daemon answers at the socket; the message gives the reason and a remedy."""
 
-    hangs = False  # a daemon is there, but has not answered in time
+    hangs = False  # True if a daemon accepted the connection but did not answer in time
 
 
 def ask(paths: Iterable[Path], request: dict[str, Any], *, timeout_s: float = 10.0) -> dict[str, Any]:
@@ -73,7 +73,9 @@ def _exchanged(path: Path, request: dict[str, Any], timeout_s: float) -> dict[st
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as channel:
         channel.settimeout(timeout_s)
         channel.connect(str(path))
-        with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # refused: the answer gives the reason
+        with contextlib.suppress(
+            BrokenPipeError, ConnectionResetError
+        ):  # the request was refused; the answer gives the reason
             channel.sendall(json.dumps(request).encode() + b"\n")
         with channel.makefile("rb") as answers:
             line = answers.readline()

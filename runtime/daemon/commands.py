@@ -1,4 +1,4 @@
-"""Operators' commands to the running daemon, which are checked before they reach the loop."""
+"""Operators' commands to the running daemon. They are checked before they reach the loop."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ PLACING = ("scale", "offset_m", "rotation_deg", "turntable_per_min")  # of `plac
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """An operator's command, which the loop begins between two refreshes and answers exactly once.
+    """An operator's command, which the loop starts between two refreshes and answers exactly once.
 
-    It may be run only after `take` returned True, so that a command whose client has given up is never run.
+    It may be run only after `take` has returned True, so that a command whose client has given up is never run.
     `flat` shows the 2D picture until `resume`; `pause` freezes the picture until `resume`.
     """
 
@@ -26,7 +26,7 @@ class Command:
     answer: Future[dict[str, Any]] = field(default_factory=Future)
 
     def take(self) -> bool:
-        """Claim the command for execution. Return False if its client has given up: then it must not be run."""
+        """Claim the command for execution. Returns False if its client has given up; then it must not be run."""
         return self.answer.set_running_or_notify_cancel()
 
     def done(self, **state: Any) -> None:

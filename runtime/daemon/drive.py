@@ -1,4 +1,4 @@
-"""Common part of `demo` and `run`: runs the loop, shows progress, writes the files and the summary."""
+"""The part that `demo` and `run` share: run the loop, show progress, write the files and the summary."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from runtime.support import progress
 from runtime.support.background import wait_for_all
 from runtime.support.figures import lines_of
 
-JOBS_END_WITHIN_S = 0.5  # to wait for jobs at the end
-USUAL_M, IPD_M = 0.6, 0.063  # a usual viewer, if none was seen
+JOBS_END_WITHIN_S = 0.5  # longest wait for jobs at the end
+USUAL_M, IPD_M = 0.6, 0.063  # a typical viewer, used if none was seen
 
 
 def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> dict[str, Any]:
@@ -39,7 +39,7 @@ def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> 
         on_account = advance if options.max_speed else None
         run = build_run(settings, options, cleanup, host, output=output, on_account=on_account)
         reason = run.presenter.run(frames=options.frames)
-        run.presenter.panels.close()  # dark immediately; writing the run's files may take seconds
+        run.presenter.panels.close()  # turns the panels dark at once, because writing the run's files may take seconds
         for sample in run.presenter.samples.recorded_ahead():
             run.observer.sampled(sample)  # true eyes at the last display times
         if output is not None:
@@ -57,7 +57,7 @@ def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> 
 
 
 def _unseen(layers: U8, account: RefreshAccount, run: Run, settings: Settings) -> str:
-    """Return a viewer page of the last refresh, for a run in which nothing was measured."""
+    """Return a viewer page that shows the last refresh, for a run in which nothing was measured."""
     stack, is_flat = run.presenter.stack, account.solved_for_m is None
     away_m = max(USUAL_M, stack.x_m[-1] + USUAL_M / 2)
     eyes_m = np.array([[away_m, -IPD_M / 2, 0.0], [away_m, IPD_M / 2, 0.0]])

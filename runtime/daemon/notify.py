@@ -1,4 +1,4 @@
-"""Notifications to systemd (sd_notify, watchdog). Without a supervisor, every call does nothing."""
+"""Notifications to systemd (sd_notify, watchdog). Without systemd, every call does nothing."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from runtime.records import State
 
 NS_PER_US = 1000
 START_STEP_S = 60.0  # duration of the longest step of a start, on the slowest machine
-SETTLED_AFTER = 100  # presented refreshes: the first ones compile shaders, for seconds each on a slow machine
+SETTLED_AFTER = 100  # presented refreshes: the first ones compile shaders, which takes seconds on a slow machine
 
 
 class Notifier:
@@ -29,13 +29,13 @@ class Notifier:
             self._channel.socket.setblocking(False)
         self._watchdog_ns = watchdog_ns(environment)
         self._fed_ns = -self._watchdog_ns
-        self._settling = 0  # presented refreshes until the watchdog's own period holds
+        self._settling = 0  # presented refreshes until the watchdog's normal period applies
         self._status = ""
         self._ready = False
 
     @property
     def supervised(self) -> bool:
-        """Return True under a supervisor, where a start waits for missing parts instead of failing."""
+        """True under systemd, where a start waits for missing parts instead of failing."""
         return self._channel is not None and self._channel.socket is not None
 
     def ready(self) -> None:

@@ -1,4 +1,4 @@
-"""Change of settings during a run: loaded in the background, adopted between two solutions."""
+"""Changes of settings during a run: loaded in the background and adopted between two solutions."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from runtime.support.progress import listening
 from runtime.support.untrusted_input import LIMITS
 
 MODEL_S = 30.0  # to load a model and solve with it twice, at 1920x1080 on a slow PC
-Ready = tuple[Opener | None, Predictor | None]  # None: stays as it is
+Ready = tuple[Opener | None, Predictor | None]  # None: unchanged
 
 
 class Reconfiguration:
@@ -49,8 +49,8 @@ class Reconfiguration:
         self.abandoned = False
         self._begun_s = time.monotonic()
         self.progress = ""  # the current stage of loading, for the status
-        self.problem = ""  # one line if it was refused
-        self._adopter: RunningSolver | None = None  # the solver that adopts it
+        self.problem = ""  # one line with the reason if the change was refused
+        self._adopter: RunningSolver | None = None  # the solver that will adopt the change
         self._finished = False
         self._job = BackgroundJob("reconfiguration", self._make_ready)
 
@@ -79,7 +79,7 @@ class Reconfiguration:
 
     @property
     def finished(self) -> bool:
-        """Return True once it is adopted or refused, or if the solver, or the abandoned change, hangs."""
+        """Return True once the change is adopted or refused, or if its solver or its abandoned job hangs."""
         if not self._finished and self._adopter is not None and not self._adopter.is_newest:
             self.problem, self._finished = LEFT_BEHIND, True
         is_stuck = self.abandoned and time.monotonic() - self._begun_s > LIMITS.load_s
@@ -136,7 +136,7 @@ class Reconfiguration:
             except PhasestackError as error:
                 self.problem = str(error)
                 return
-            except (Exception, SystemExit) as error:  # from a GL driver or a library: the current scene continues
+            except (Exception, SystemExit) as error:  # from a GL driver or a library: keep the current scene
                 self.problem = f"{self.settings.content.scene}: {written(error)}"
                 return
             undo.pop_all()
@@ -147,7 +147,7 @@ class Reconfiguration:
 
 
 def _tried(settings: Settings) -> None:
-    """Load an untrusted model and solve with it in a child process, which it may crash."""
+    """Load an untrusted model and solve with it in a child process, so that it cannot crash the daemon."""
     ready_predictor(settings, settings.stack.stack()).close()
 
 
@@ -157,5 +157,5 @@ def moved_since(before: ContentSettings, now: ContentSettings) -> dict[str, Any]
 
 
 def _model_part(settings: Settings) -> Any:
-    """Return the model settings whose change requires a new predictor."""
+    """Return the model settings that require a new predictor if they change."""
     return settings.model.model_copy(update={"budget_ms": 0.0, "eye_sigma_mm": "auto"})

@@ -1,7 +1,7 @@
 """Status and control socket: JSON lines over a local socket, served on its own thread.
 
-Slow, hanging or numerous clients cannot block it: requests and answers have time limits, no client costs a thread, and
-when all connections are in use, a new client replaces the one that has waited longest to complete its request.
+Slow, hanging or numerous clients cannot block it. Requests and answers have time limits, and no client needs a thread
+of its own. When all connections are in use, a new client replaces the one whose request has been incomplete longest.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from runtime.support.background import BACKGROUND_NICENESS, begin, patience_s, s
 log = logging.getLogger("phasestack.service")
 
 CLIENTS_MAX = 64  # simultaneous connections
-LOOP_ANSWERS_WITHIN_S = 5.0  # a command not begun by then is refused
-LOOKED_AGAIN_S = 0.1  # between checks whether the client is still connected
+LOOP_ANSWERS_WITHIN_S = 5.0  # a command that the loop has not started by then is refused
+LOOKED_AGAIN_S = 0.1  # interval between checks that the client is still connected
 
 
 class Refusal(Exception):
-    """Reason for disconnecting a client."""
+    """A client is disconnected; the message is the reason."""
 
 
 class StatusServer:
@@ -51,12 +51,14 @@ class StatusServer:
         """Start serving. Raises SocketInUse, InputError, TransientError."""
         self.path = path
         self.commands: queue.SimpleQueue[Command] = queue.SimpleQueue()
-        self.lookups: dict[str, Callable[[], dict[str, Any]]] = {}  # called on the server's thread
+        self.lookups: dict[
+            str, Callable[[], dict[str, Any]]
+        ] = {}  # functions that answer a request on the server's thread
         self._clock = clock
         self._started_ns = clock.now_ns()
         self._snapshot: tuple[int, Callable[[], dict[str, Any]]] = (self._started_ns, dict)
         self._clients: set[asyncio.Task[None]] = set()
-        self._reading: dict[asyncio.Task[None], None] = {}  # waiting for a whole request, longest first
+        self._reading: dict[asyncio.Task[None], None] = {}  # clients with an incomplete request, longest first
         listening = listening_socket(path)
         self._own = path.lstat().st_ino
         self._loop = asyncio.new_event_loop()
@@ -66,9 +68,10 @@ class StatusServer:
         self._thread: threading.Thread | None = begin("status", self._run)
 
     def publish(self, snapshot: Callable[[], dict[str, Any]]) -> None:
-        """Replace the snapshot, once a turn; called on the server's thread when a client asks.
+        """Replace the function that creates the status, once per turn of the loop.
 
-        A callable, so that a turn without clients costs nothing: it must only read values that no longer change.
+        It is called on the server's thread when a client asks, so a turn without clients costs nothing. It may read
+        only values that no longer change.
         """
         self._snapshot = (self._clock.now_ns(), snapshot)
 
@@ -120,7 +123,7 @@ class StatusServer:
 
     async def _end(self) -> None:
         self._server.close()
-        for _ in range(16):  # lets new clients begin, to be answered, too
+        for _ in range(16):  # let clients that have just connected send their requests, so that they are answered, too
             await asyncio.sleep(0)
         clients = asyncio.all_tasks() - {asyncio.current_task()}
         for client in clients:
@@ -157,11 +160,11 @@ class StatusServer:
             if longest is None:
                 raise Refusal("too many clients")
             self._reading.pop(longest)
-            self._clients.discard(longest)  # now: many may connect before it runs again
+            self._clients.discard(longest)  # at once, because more clients may connect before the task ends
             longest.cancel("too many clients")
 
     async def _request(self, reader: StreamReader, task: asyncio.Task[None]) -> bytes:
-        """Return the next request including its end, or a partial one at the end of input. Raises Refusal."""
+        """Return the next request with its newline, or a partial one at the end of input. Raises Refusal."""
         self._reading[task] = None
         try:
             async with asyncio.timeout(REQUEST_S):
@@ -200,7 +203,7 @@ def _line(answer: dict[str, Any]) -> bytes:
 
 
 def _is_gone(writer: StreamWriter) -> bool:
-    """Return True if a client has disconnected rather than merely stopped sending."""
+    """Return True if a client has disconnected, not merely stopped sending."""
     if writer.is_closing():
         return True
     hung_up = select.poll()

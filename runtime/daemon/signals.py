@@ -1,4 +1,4 @@
-"""Signals as flags that the loop reads at its own pace."""
+"""Signals as flags that the loop polls."""
 
 from __future__ import annotations
 

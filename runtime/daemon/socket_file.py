@@ -1,4 +1,4 @@
-"""The status socket's file, of mode 0660: one daemon owns it, and a crashed daemon's is replaced."""
+"""The status socket's file (mode 0660), owned by one daemon; a file left by a crashed daemon is replaced."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ log = logging.getLogger("phasestack.service")
 
 GROUP = "phasestack"  # members may use the socket
 BACKLOG = 64  # connections waiting to be accepted
-LOCKED_WITHIN_S = 2.0  # to wait for the folder's lock, which is only held briefly
+LOCKED_WITHIN_S = 2.0  # longest wait for the folder's lock, which is held only briefly
 
 
 class SocketInUse(TransientError):
@@ -34,7 +34,7 @@ def listening_socket(path: Path) -> socket.socket:
         path.parent.mkdir(parents=True, exist_ok=True)
         with _locked(path.parent):
             _remove_dead(path)
-            # By the mask, not by chmod: the mode must be right from the first moment.
+            # umask instead of chmod, so that the mode is right from the first moment.
             mask = os.umask(0o117)
             try:
                 made.bind(str(path))
@@ -58,11 +58,11 @@ def listening_socket(path: Path) -> socket.socket:
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Lock a folder, so that one daemon at a time replaces a dead socket."""
+    """Lock a folder, so that only one daemon at a time replaces a dead socket."""
     opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         until_s = time.monotonic() + LOCKED_WITHIN_S
-        while time.monotonic() < until_s:  # another program may never release it
+        while time.monotonic() < until_s:  # give up in the end: another program may never release it
             with contextlib.suppress(BlockingIOError):
                 fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break

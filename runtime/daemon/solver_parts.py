@@ -1,4 +1,4 @@
-"""Solver with its GL context, content and model. One thread creates, uses and releases it."""
+"""The solver with its GL context, content and model. One thread creates, uses and releases them."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ class RunningSolver:
 
     run: RunCell
     solver: Solver
-    backend: Choice  # of every model
+    backend: Choice  # the device, which every model uses
     context: Any  # current on this thread
-    owns_context: bool  # and released with the rest
+    owns_context: bool  # True if the context is released with the rest
     contexts_lost: Callable[[], int]
     generation: int
-    _owned: RunState = field(init=False)  # its content and model are closed by this solver
+    _owned: RunState = field(init=False)  # this solver closes its content and model
 
     def __post_init__(self) -> None:
         self._owned, self._lost_before = self.run.state, self.contexts_lost()
@@ -62,7 +62,7 @@ class RunningSolver:
     def step(self, request: SolveRequest) -> SolverUpdate:
         if self.contexts_lost() != self._lost_before:
             raise ContextLost("the panels have lost their OpenGL context")
-        state = self.run.state  # before checking whether it belongs to another solver
+        state = self.run.state  # read before checking whether it belongs to another solver
         if not self.is_newest:
             raise Stopped("this solver was abandoned")
         self._owned = state
@@ -80,12 +80,12 @@ class RunningSolver:
         for release in (state.content.close, state.predictor.close, self.backend.backend.close, *own):
             try:
                 release()
-            except Exception as error:  # a lost context has nothing to release
+            except Exception as error:  # in a lost context there is nothing to release
                 log.warning("closing the solver: %s", error)
 
 
 class SolverMaker:
-    """Creates a solver on the calling thread and, after a hang, another one with the current settings."""
+    """Creates a solver on the calling thread. After a hang it creates another one with the current settings."""
 
     def __init__(
         self,
@@ -97,11 +97,11 @@ class SolverMaker:
     ) -> None:
         """contexts_lost: returns how many GL contexts the panels have lost; called on any thread."""
         self._settings, self._stack, self._calibration = settings, stack, calibration
-        self.run: RunCell | None = None  # from the first solver on
+        self.run: RunCell | None = None  # set by the first solver
         self.parts: RunningSolver | None = None  # the newest
         self._device: Wanted = settings.model.backend
         self._contexts_lost = contexts_lost
-        self._prepared: tuple[ContentSettings, Opener] | None = None  # content that was read but not yet opened
+        self._prepared: tuple[ContentSettings, Opener] | None = None  # content that has been read but not opened
 
     def __call__(self, *, context: Any = None, simulated: bool = False) -> RunningSolver:
         """context: shared with the panels, or None for a new one. Raises FatalError, leaving nothing open."""
@@ -140,7 +140,7 @@ class SolverMaker:
         return parts
 
     def _opener(self, content: ContentSettings) -> Opener:
-        """Return content that has been read: the previous solver's, if that solver never opened it."""
+        """Read the content, or reuse the previous solver's if that solver never opened it."""
         prepared = self._prepared
         if prepared is None or prepared[0] != content:
             prepared = self._prepared = content, prepare_content(content, self._stack)

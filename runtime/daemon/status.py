@@ -38,7 +38,7 @@ def placing_in(settings: Settings) -> dict[str, Any]:
 
 
 def holds(presenter: Presenter) -> dict[str, Any]:
-    """Return the operator's current choices, which are the answer to every command."""
+    """Return the operator's current choices, which answer every command."""
     state = presenter.run_cell.state
     return {
         "scene": state.settings.content.scene,
@@ -92,7 +92,7 @@ def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
         "eyes_label": account.eyes_label,
         "eye_sigma_now_mm": account.eye_sigma_mm,
         "solution": account.solution,
-        # If the solution is for a later instant than this display time, it has no age yet.
+        # A solution for an instant after this display time has no age yet.
         "solution_age_now_ms": None if account.solution_age_ms is None else max(0.0, account.solution_age_ms),
         "effort": account.effort,
         "light_db": None if run.observer.moment is None else run.observer.moment.light_db,
@@ -130,7 +130,7 @@ def about(run: Run) -> dict[str, Any]:
 def library_scenes(settings: ContentSettings) -> tuple[str, ...]:
     """Return the paths of the library folder's scenes, up to the page's limit.
 
-    Names that are not printable UTF-8 are skipped, because no setting can contain them.
+    Names that are not printable UTF-8 are skipped, because settings cannot contain them.
     """
     if not settings.library:
         return ()
@@ -153,8 +153,8 @@ def pictures(run: Run) -> dict[str, Any]:
     return {"frame": refresh.account.frame, "jpegs": {name: b64encode(jpeg).decode() for name, jpeg in jpegs.items()}}
 
 
-WIDTH_PX = 256  # of the page's small pictures
-JPEG_QUALITY = 80  # of the page's small pictures
+WIDTH_PX = 256  # width of the page's small pictures
+JPEG_QUALITY = 80
 
 
 def pictures_of(refresh: Refresh, stack: PanelStack, *, fov_deg: float) -> dict[str, bytes]:
@@ -171,7 +171,9 @@ def pictures_of(refresh: Refresh, stack: PanelStack, *, fov_deg: float) -> dict[
     width = min(WIDTH_PX, stack.width_px)
     small = replace(stack, width_px=width, height_px=max(1, round(width * stack.height_px / stack.width_px)))
     size = small.width_px, small.height_px
-    part = slice(None, None, max(1, shown.shape[2] // (2 * width)))  # twice as fine: averaging all pixels takes 15 ms
+    part = slice(
+        None, None, max(1, shown.shape[2] // (2 * width))
+    )  # sampled at twice the size: averaging all pixels takes 15 ms
     parts = (np.ascontiguousarray(layer[part, part]) for layer in shown)
     resized = [cv2.resize(layer, size, interpolation=cv2.INTER_AREA) for layer in parts]
     layers: U8 = np.stack(resized).astype(np.uint8, copy=False)

@@ -1,4 +1,4 @@
-"""Supervised run: signals, systemd, the status socket and operators' commands."""
+"""Supervision of a run: signals, systemd, the status socket and operators' commands."""
 
 from __future__ import annotations
 
@@ -57,9 +57,9 @@ class Daemon(Host):
         self._read_settings = read_settings
         self._signals, self._notifier, self._server = signals, notifier, server
         self.recorder = recorder
-        self.run: Run | None = None  # set once it is complete, as are the changes
+        self.run: Run | None = None  # set once the run is complete, together with the changes
         self.changes: Changes | None = None
-        self._waits_for = ""  # before the first refresh: why it waits for a panel
+        self._waits_for = ""  # before the first refresh: the reason for waiting for a panel
 
     def stop_reason(self) -> str:
         return f"{self._signals.stop} received" if self._signals.stop else self._until()
@@ -74,7 +74,7 @@ class Daemon(Host):
             changes.attempt(command, partial(self._carry_out, presenter, changes, command))
         while self._server is not None and not self._server.commands.empty():
             command = self._server.commands.get()
-            if command.take():  # otherwise its client has given up
+            if command.take():  # False: its client has given up
                 changes.attempt(command, partial(self._carry_out, presenter, changes, command))
         changes.carry_on()
 
@@ -98,7 +98,7 @@ class Daemon(Host):
             self._server.lookups |= {"log": self.recorder.look_at_log} if self.recorder is not None else {}
 
     def wait_for_panel(self, why: str) -> bool:
-        """Report that a panel is missing and wait a second, if run as a service; by hand, refuse."""
+        """As a service, report that a panel is missing and wait a second. Otherwise refuse to start."""
         if not self._notifier.supervised or self._signals.stop:
             return False
         if why != self._waits_for:
@@ -112,7 +112,7 @@ class Daemon(Host):
         return not self._signals.stop
 
     def starting(self, doing: str) -> bool:
-        """Ask systemd for more time, and report the step of the start."""
+        """Report the current step of the start, and ask systemd for more time."""
         self._notifier.starting()
         self._notifier.status(f"starting ({doing})")
         if self._server is not None:
@@ -173,7 +173,7 @@ def run_daemon(read_settings: Callable[[], Settings], options: RunOptions) -> di
 
     Raises FatalError for a wrong configuration or file, TransientError if another start may help.
     """
-    keep_freed_memory()  # before anything starts threads
+    keep_freed_memory()  # before any thread starts
     settings = read_settings()
     service, clock = settings.service, MonotonicClock()
     logs.configure()
@@ -195,7 +195,7 @@ def run_daemon(read_settings: Callable[[], Settings], options: RunOptions) -> di
         except Stopped as reason:
             summary = {"stopped": str(reason)}
         except SystemExit as error:
-            raise FatalError(f"a configured class ended the run: sys.exit({error.code!r})") from error
+            raise FatalError(f"a class named in the configuration called sys.exit({error.code!r})") from error
         except PanelLost:
             if not signals.stop:
                 raise
