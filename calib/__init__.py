@@ -1,1 +1,1 @@
-"""Calibration: the sensor's pose, the panels' registration, and their grey curves."""
+"""Calibration: pose of the sensor, registration of the panels, and their grey curves."""

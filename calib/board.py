@@ -1,9 +1,9 @@
 """Coded calibration boards: marks that identify a panel and a position on it.
 
 A mark is a white square with an ArUco marker inside and a smaller white square at each of its corners. Where two
-squares touch there is a saddle point, which is symmetric under half a turn; it is located to a few hundredths of a
-pixel despite blur and the camera's tone curve. The rest of the board is black (phase 0), which lets the other panels'
-marks show through. One photograph therefore shows the marks of all panels, and no tripod is needed. Marks are
+squares touch, there is a saddle point. Because it is symmetric under a half turn, it can be located to a few hundredths
+of a pixel despite blur and the camera's tone curve. The rest of the board is black (phase 0), which lets the other
+panels' marks show through. One photograph therefore shows the marks of all panels, and no tripod is needed. Marks are
 scattered, so that two which overlap from one viewpoint do not overlap from another.
 """
 
@@ -22,7 +22,7 @@ from runtime.records import F64, U8
 
 MARKER_BITS = 4
 DICTIONARY_SIZE = 100
-ACROSS, DOWN = 5, 4  # marks on a panel
+ACROSS, DOWN = 5, 4  # marks across and down a panel
 PER_PANEL = ACROSS * DOWN
 BITS_ON_SHORT_SIDE = 216  # a bit is 5 pixels at 1080 rows
 # In bits: marker (its black border counts), quiet zone on each side, corner squares.
@@ -42,9 +42,9 @@ class Mark:
 
     number: int  # the marker's id
     panel: int
-    left_px: int  # of the white square
+    left_px: int  # left edge of the white square
     top_px: int
-    unit_px: int  # one bit of the marker
+    unit_px: int  # size of one bit of the marker
 
     @property
     def side_px(self) -> int:
@@ -69,7 +69,7 @@ class Mark:
 def marks(stack: PanelStack) -> tuple[Mark, ...]:
     """Lay out the marks of all panels. Raises InputError if panels are too many or too small."""
     if stack.count * PER_PANEL > DICTIONARY_SIZE:
-        raise InputError("stack", "x_m", f"there are boards for at most {DICTIONARY_SIZE // PER_PANEL} panels")
+        raise InputError("stack", "x_m", f"boards support at most {DICTIONARY_SIZE // PER_PANEL} panels")
     unit = max(2, round(min(stack.width_px * 9 / 16, stack.height_px) / BITS_ON_SHORT_SIDE))
     tile = TILE * unit
     cell = np.array([stack.width_px / ACROSS, stack.height_px / DOWN])
@@ -77,7 +77,7 @@ def marks(stack: PanelStack) -> tuple[Mark, ...]:
     if room.min() < 0:
         raise InputError("stack", "width_px", f"boards need panels of at least {ACROSS * tile}x{DOWN * tile} pixels")
     every = []
-    random = np.random.default_rng(16)  # fixed: photographs are compared with the board
+    random = np.random.default_rng(16)  # a fixed seed, because photographs are compared with the board
     for panel in range(stack.count):
         for place in range(PER_PANEL):
             corner = np.array([place % ACROSS, place // ACROSS]) * cell + 1 + random.uniform(size=2) * room

@@ -24,11 +24,11 @@ from runtime.records import F64
 
 LENS = 9  # fx fy cx cy k1 k2 p1 p2 k3
 POSE = 6  # turn, shift
-FOCAL_GUESSES = (0.6, 0.8, 1.1, 1.6, 2.4)  # of the longer side
+FOCAL_GUESSES = (0.6, 0.8, 1.1, 1.6, 2.4)  # initial focal lengths, relative to the longer side
 ROBUST_PX = 0.3  # scale of the soft L1 norm
 OUTLIER_SIGMAS = 4.0  # distance beyond which a point is an outlier
-MIN_SIGMA_PX = 0.01  # least noise of the points: exact data have no outliers
-NO_FIT_PX = 5.0  # median distance of points beyond which the photographs do not show the configuration
+MIN_SIGMA_PX = 0.01  # least noise assumed for the points, so that exact data have no outliers
+NO_FIT_PX = 5.0  # median distance of points beyond which the photographs do not show the configured stack
 MAX_STEPS, MAX_DAMPING = 60, 1e8
 # Prior standard deviations for any camera: square pixels, a centred lens, distortion of a few per cent. They are
 # negligible compared with twelve photographs.
@@ -47,9 +47,9 @@ class Bundle:
     reference: int
     places_m: F64  # (P, 3) positions of the camera, frame `stack`
     covariance: F64  # (6(N-1), 6(N-1)) of rotation about its middle (rad) and shift (m) of each moving panel
-    sigma_px: float  # of one coordinate of a saddle in a photograph
-    used: NDArray[np.bool_]  # (K,) points that are not outliers
-    photograph: Any  # (K,) index
+    sigma_px: float  # standard deviation of one coordinate of a saddle in a photograph
+    used: NDArray[np.bool_]  # (K,) True for points that are not outliers
+    photograph: Any  # (K,) index of each point's photograph
 
     def sigma_of(self, derived: Any) -> F64:
         """Return the standard deviation of a function of the panels, to first order, in the result's shape."""
@@ -213,8 +213,8 @@ def _solved(problem: _Problem, state: _State, used: NDArray[np.bool_], *, robust
 def _refuse_reverse(problem: _Problem, state: _State) -> None:
     """Raise Undetermined if the panels are in the reverse of the configured order.
 
-    A stack mirrored front to rear, seen by cameras behind it, gives the same pictures. Or no configured stack fits,
-    and the reverse does.
+    Cameras behind a stack that is mirrored front to rear would take the same pictures. Otherwise the configured order
+    does not fit, but the reverse does.
     """
     depth_m = problem.camera_m(state)[:, 2]
     behind = any(np.median(depth_m[problem.photograph == number]) <= 0 for number in range(problem.photographs))
@@ -239,7 +239,7 @@ def adjust(seen: Sequence[SeenMarks], stack: PanelStack, *, reference: int) -> B
     _refuse_reverse(problem, state)
     for _ in range(6):
         distance = np.linalg.norm(problem.residual_px(state), axis=1)
-        # The median length of a vector of two normal coordinates is 1.1774 of their standard deviation.
+        # The median length of a vector with two normal coordinates is 1.1774 times their standard deviation.
         sigma = max(float(np.median(distance[used])) / 1.1774, MIN_SIGMA_PX)
         good = distance < OUTLIER_SIGMAS * sigma
         state = _solved(problem, state, good, robust=False)

@@ -26,7 +26,7 @@ from runtime.sensor.samples import RecordedSamples
 
 WINDOW_NS = NS_PER_S // 2  # a pair is the median over this window
 MAX_SPREAD_M = 0.010  # largest motion or scatter of the eyes in the window
-MIN_SAMPLES = 5  # in the window, for a meaningful spread
+MIN_SAMPLES = 5  # samples in the window, for a meaningful spread
 
 
 def midpoint(eyes: EyePoints | None) -> F64 | None:
@@ -127,12 +127,12 @@ class Walk:
     def _accept(self) -> None:
         viewpoint, seen = self.current, self._window.measure()
         if seen is None:
-            self._say(f"{viewpoint.name}: not accepted: the sensor does not see both eyes")
+            self._say(f"{viewpoint.name}: rejected: the sensor does not see both eyes")
             return
         middle_m, spread_m = seen
         spread = f"{spread_m * 1e3:.1f}"
         if spread_m > MAX_SPREAD_M:
-            self._say(f"{viewpoint.name}: not accepted: the eyes moved or scattered by {spread} mm: hold still")
+            self._say(f"{viewpoint.name}: rejected: the eyes moved or scattered by {spread} mm; hold still")
             return
         self._file.accept(
             PairRow.of(middle_m, viewpoint.midpoint_m, viewpoint.name, serial=self._serial, spread_mm=spread)

@@ -24,7 +24,7 @@ from runtime.support.progress import tracked
 
 MODEL = "best"
 LINE_PX = 10.0  # width of a line of the chart
-WIDEST_FOV_DEG = 40.0  # horizontal, of the eyes' images, as in the published code
+WIDEST_FOV_DEG = 40.0  # horizontal field of view of the eyes' images, as in the published code
 
 
 def chart_fov_deg(viewpoint: Viewpoint, stack: PanelStack) -> float:
@@ -62,7 +62,7 @@ class Charts:
         picture = line_picture(width_px=self.stack.width_px, height_px=self.stack.height_px)
         eyes_m, fov_deg = viewpoint.eyes_m(self.ipd_m), chart_fov_deg(viewpoint, self.stack)
         prediction = solve_still(picture, picture, eyes_m=eyes_m, fov_deg=fov_deg, predictor=self._predictor)
-        return np.array(prediction.layers)  # a copy: the predictor reuses its array
+        return np.array(prediction.layers)  # a copy, because the predictor reuses its array
 
     def close(self) -> None:
         """Release the model."""

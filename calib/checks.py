@@ -12,13 +12,13 @@ from runtime.errors import InputError
 from runtime.eyes.calibration import check_similarity
 from runtime.records import F64
 
-RESIDUAL_LIMIT_M = 0.05  # the EyeReal supplement's (its figure S5)
-SENSOR_NOISE_FLOOR_M = 0.001  # no depth camera is better on a face
+RESIDUAL_LIMIT_M = 0.05  # as in the EyeReal supplement (figure S5)
+SENSOR_NOISE_FLOOR_M = 0.001  # no depth camera measures a face better than this
 REFUSE_EYE_ERROR_M = 0.05  # expected error at the eye that makes a calibration useless
 WARN_EYE_ERROR_M = 0.01  # expected error at the eye that causes visible ghosts
-COPLANAR = 0.01  # third extent over the first
+COPLANAR = 0.01  # ratio of the third extent to the first
 MIRROR_GAIN = 0.5  # maximum ratio of errors, with the sensor mirrored and not, that means mirrored data
-NAMED = 8  # pairs named in a message
+NAMED = 8  # most pairs named in a message
 
 
 def check_pairs(pairs: Pairs) -> list[str]:

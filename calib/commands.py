@@ -20,8 +20,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="one JSON object on std
 
 app = typer.Typer(
     no_args_is_help=True,
-    help="The steps of `phasestack setup` one by one: the panels' true poses, their grey curves, and the pose of the "
-    "depth camera.\n\n"
+    help="Run the steps of `phasestack setup` one by one: the panels' poses, their grey curves, the camera's pose.\n\n"
     "Run them in this order: `panels`, `grey`, `charts`, `capture`, `solve`, `report`.\n\n"
     "Example: phasestack calibrate charts --out charts",
 )
@@ -162,7 +161,7 @@ def solve(
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compute stack_from_sensor from pairs, and its error at the eye. Inadequate pairs are refused.
+    """Compute stack_from_sensor from pairs, and the expected error at the eye. Inadequate pairs are refused.
 
     Example: phasestack calibrate solve --pairs pairs.csv --out calibration.toml
     """
@@ -178,7 +177,7 @@ def report(
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a page with a calibration's figures and a map of its errors.
+    """Write a page with a calibration's figures and error plots.
 
     Example: phasestack calibrate report calibration.toml --out report
     """

@@ -1,4 +1,4 @@
-"""Editing of configuration files: keeps comments and past versions, and writes only valid files."""
+"""Editing of configuration files. Comments and previous versions are kept, and only valid files are written."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 KEPT_VERSIONS = 20  # backups of a configuration or calibration
-KEPT_BYTES_MAX = 64 << 20  # largest file that is backed up
+KEPT_BYTES_MAX = 64 << 20  # size of the largest file that is backed up
 
 
 def save(path: Path, text: str) -> Path | None:

@@ -13,12 +13,12 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 
 DETECTION_PX = 2400  # size at which photographs are searched; corners are located at full resolution
-MIN_MARKS = 3  # per panel: twelve points
-MIN_EXTENT = 0.3  # share of a panel that its marks must span: one corner hardly determines the rest
-MIN_UNIT_PX = 1.7  # photograph's pixels per bit of a marker, for reliable reading
+MIN_MARKS = 3  # per panel, that is, twelve points
+MIN_EXTENT = 0.3  # share of a panel that its marks must span, because one corner hardly determines the rest
+MIN_UNIT_PX = 1.7  # least size of a marker's bit in the photograph for reliable reading
 BLURRED_BITS = 1.1  # maximum width of an edge, in bits of a marker
-MIN_CONTRAST = 0.35  # of a saddle, relative to its mark's
-MIN_DYNAMIC = 24  # code values between black and white
+MIN_CONTRAST = 0.35  # least contrast of a saddle, relative to its mark's
+MIN_DYNAMIC = 24  # least difference between black and white, in codes
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ def _detector() -> Any:
     parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = 11, 43
     parameters.adaptiveThreshWinSizeStep = 16
     parameters.minMarkerPerimeterRate = 0.008
-    parameters.errorCorrectionRate = 0.3  # low, so that overlapping marks are not read as other ones
+    parameters.errorCorrectionRate = 0.3  # low, so that overlapping marks are not mistaken for others
     parameters.minDistanceToBorder = 2
     return cv2.aruco.ArucoDetector(dictionary(), parameters)
 
@@ -97,7 +97,7 @@ def find_marks(picture: U8, stack: PanelStack, *, name: str) -> SeenMarks:
 
 
 def _mirrored(picture: U8, known: dict[int, Mark], counts: list[int]) -> str:
-    """Return the fault of a picture whose marks appear only in its mirror image, or an empty string."""
+    """Return a fault if a picture's marks appear only in its mirror image; otherwise an empty string."""
     if min(counts) >= MIN_MARKS:
         return ""
     turned = [mark.panel for mark, _ in _markers(np.ascontiguousarray(picture[:, ::-1]), known)]
@@ -112,12 +112,12 @@ def _mirrored(picture: U8, known: dict[int, Mark], counts: list[int]) -> str:
 def _unreadable(counts: list[int], edges: list[float], unit_px: float) -> str:
     """Return a fault in sharpness, or an empty string. edges: width of each mark's edge in marker bits."""
     if sum(counts) == 0:
-        return "shows no mark of a board: it is blurred, too dark, or of something else"
+        return "shows no board mark: it is blurred or too dark, or does not show the display"
     edge_bits = float(np.median(edges))
     if edge_bits > BLURRED_BITS:
         return f"is blurred: its edges are {edge_bits * unit_px:.1f} px wide"
     if unit_px < MIN_UNIT_PX:
-        return f"is too small: {unit_px:.1f} px for one bit of a mark; go nearer or use more pixels"
+        return f"shows marks too small ({unit_px:.1f} px per bit): go nearer or use a higher resolution"
     return ""
 
 
@@ -126,7 +126,7 @@ def _covered(counts: list[int], places: F64, owners: Any) -> str:
     fewest = min(counts)
     if fewest < MIN_MARKS:
         panel = counts.index(fewest)
-        return f"shows {fewest} marks of panel {panel}, fewer than {MIN_MARKS}: covered, cut off or too oblique"
+        return f"shows {fewest} marks of panel {panel}, fewer than {MIN_MARKS}: it is covered, cut off or too oblique"
     for panel in range(len(counts)):
         share = float(np.ptp(places[owners == panel], axis=0).min())
         if share < MIN_EXTENT:
@@ -165,7 +165,7 @@ def _refined(picture: U8, guess: F64, quad: F64, *, window: int) -> tuple[Any, F
 
 
 def _quarter(out: F64, guess: F64) -> F64:
-    """Return the other diagonal at each corner, from its two neighbours, to account for perspective."""
+    """Return the other diagonal at each corner, estimated from its two neighbours to account for perspective."""
     following, before = np.roll(guess, -1, axis=0) - guess, np.roll(guess, 1, axis=0) - guess
     return np.asarray((following - before) / 10 * 0.9, dtype=np.float64)
 

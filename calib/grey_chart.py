@@ -1,8 +1,8 @@
 """Chart for measuring a panel's grey curve with a camera whose tone curve is unknown.
 
-The patches of each grey are scattered over the chart, to separate uneven light from the greys. Patches of black and
-white pixels in known proportions have a known intensity regardless of the panel's grey curve: they calibrate the
-camera. The board's marks between the patches locate them in a photograph.
+The patches of each grey are scattered over the chart, so that uneven light can be separated from the greys. Patches of
+black and white pixels in known proportions have a known intensity regardless of the panel's grey curve: they calibrate
+the camera. The board's marks between the patches locate them in a photograph.
 
 Between crossed polarizers, with the other panels at zero, a panel of phase p shows dark + range·sin²(pi/2·p) (EyeReal,
 (4)). Full white is assumed to be phase 1; intensities cannot reveal a panel that does not reach it.

@@ -1,4 +1,4 @@
-"""Hardware that the setup uses: keys, monitors, panels, a camera, a depth sensor."""
+"""Hardware for the setup: keys, monitors, panels, photographs and a depth sensor."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class SetupHardware:
         """keys: the terminal's keys, which are used in addition to those of the panels' windows."""
         self._keys, self._photos = keys, photos
         self._clock = MonotonicClock()
-        self._display: PanelDisplay | None = None  # owns the open windows, if any
+        self._display: PanelDisplay | None = None  # the open windows, if any
         self._charts: Charts | None = None
         self._cards: tuple[list[U8], tuple[Monitor, ...]] = ([], ())
         self._worker: SensorWorker | None = None
@@ -89,10 +89,10 @@ class SetupHardware:
         self._display = open_display(settings, grey_curve=panel is None)
         try:
             self._display.show(grey_layers(pictures))
-            say(f"put {count} into {folder}, then Enter (q: stop)")
+            say(f"put {count} into {folder}, then press Enter (q: stop)")
             while (key := self.key()) is not Key.ACCEPT:
                 if key is Key.QUIT:
-                    raise InputError("photographs", "", "stopped before there were any")
+                    raise InputError("photographs", "", "stopped before any were taken")
         finally:
             self.let_go()
         return photographs(folder)
@@ -100,7 +100,7 @@ class SetupHardware:
     def open_sensor(self, settings: Settings) -> str:
         """Start the sensor and wait until it works. Returns its name. Raises InputError."""
         self._stop_sensor()
-        open_sensor(settings.sensor, self._clock)  # refuses unknown names before anything starts
+        open_sensor(settings.sensor, self._clock)  # unknown names are refused before anything starts
         worker = SensorWorker(
             lambda: open_sensor(settings.sensor, self._clock),
             settings.sensor,
@@ -124,9 +124,10 @@ class SetupHardware:
         return f"{settings.sensor.driver} {worker.serial}".strip()
 
     def sample(self, standing_at: Viewpoint) -> Sample | None:
-        """Return the next sample in order, if there is one. No sample is lost if the panels are slow.
+        """Return the next sample in order, if there is one.
 
-        standing_at: where the person was asked to stand. A simulated person stands exactly there.
+        No sample is lost if the panels are slow. standing_at: the position at which the person was asked to stand, for
+        simulations.
         """
         if self._worker is None:
             return None

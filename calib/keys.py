@@ -59,7 +59,7 @@ class TerminalKeys:
         self._quit_at_end = quit_at_end
         self._descriptor = _standard_input() if descriptor is None else descriptor
         self._rest = b""
-        self._mode: Any = None  # of the terminal before
+        self._mode: Any = None  # the terminal's previous mode
 
     def poll(self) -> Key | None:
         """Return the next key, or None. Never waits."""

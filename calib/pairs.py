@@ -18,9 +18,9 @@ from runtime.records import F64
 from runtime.support import untrusted_input
 from runtime.support.artifacts import write_text
 
-MAX_PAIRS = 1_000_000  # in a file
-MAX_LISTED = 3  # mistakes listed in an error
-MAX_MAGNITUDE = 1e9  # of a coordinate, in any unit
+MAX_PAIRS = 1_000_000  # most pairs in a file
+MAX_LISTED = 3  # most mistakes listed in an error
+MAX_MAGNITUDE = 1e9  # largest coordinate, in any unit
 
 
 def _no_truth_value(value: Any) -> Any:
@@ -74,7 +74,7 @@ class Pairs:
     stack_m: F64  # (K, 3)
     names: tuple[str, ...]
     source: str
-    sensor_serial: str = ""  # of the device that measured all of them; empty: unknown
+    sensor_serial: str = ""  # serial number of the device that measured all pairs; empty: unknown
 
     def __len__(self) -> int:
         return len(self.names)

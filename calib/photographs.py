@@ -13,7 +13,7 @@ from runtime.records import U8
 from runtime.support import untrusted_input
 from runtime.support.picture_header import is_cut_off, read_coded
 
-MAX_PHOTOGRAPHS = 100  # in a folder
+MAX_PHOTOGRAPHS = 100  # most photographs in a folder
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
 
 

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from runtime.optics.stack import PanelStack
 from runtime.records import F64
 
-HOMOGENEOUS = np.array([0.0, 0.0, 1.0])  # picks the homogeneous one of a pixel (u, v, 1)
+HOMOGENEOUS = np.array([0.0, 0.0, 1.0])  # selects the third component of a pixel (u, v, 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,4 +71,4 @@ def true_from_ideal_seen(panel: PlacedPanel, eye_m: ArrayLike, stack: PanelStack
     if abs(np.linalg.det(seen)) < 1e-18:
         raise ValueError("an eye in a panel's plane cannot see through the panel")
     matrix = np.linalg.solve(seen, stack.panel(index).stack_from_raster() - eye)
-    return np.asarray(matrix / matrix[2, 2] + 0.0, dtype=np.float64)  # + 0.0: no -0.0 in a file
+    return np.asarray(matrix / matrix[2, 2] + 0.0, dtype=np.float64)  # + 0.0 avoids -0.0 in files

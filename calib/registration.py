@@ -2,8 +2,8 @@
 
 The stack's frame is that of the reference (middle) panel, whose picture is not resampled. Every other panel gets its
 true distance, and a homography that moves each pixel to its position on a panel parallel to the reference. If the panel
-is parallel, this is exact for every eye; if it is tilted, only for an eye at the viewing place. The models know the
-tilts and correct for them at other eye positions.
+is parallel, this is exact for every eye position. If it is tilted, this is exact only for the viewing position, and the
+models correct for the tilt at other positions.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from runtime.records import F64, U8
 from runtime.support.artifacts import write_json
 from runtime.support.progress import status_line
 
-MIN_PHOTOGRAPHS = 5  # usable ones
+MIN_PHOTOGRAPHS = 5  # least number of usable photographs
 MIN_SPAN_DEG = 15.0  # between the two directions farthest apart
-DISAGREES = 0.4  # share of outliers among a photograph's points that excludes it
+DISAGREES = 0.4  # a photograph with a larger share of outliers is excluded
 MISFIT_PX = 1.5  # residual above which the stack is not rigid, or something moved
-IMPLAUSIBLE_M = 0.010  # displacement of a panel that manual assembly does not explain
+IMPLAUSIBLE_M = 0.010  # displacement of a panel that is too large for manual assembly
 DOUBTFUL_PX = 0.3  # uncertainty of a corner above which a registration is refused
 
 
@@ -42,13 +42,13 @@ class Registration:
     """Registered panels, with their uncertainties."""
 
     bundle: Bundle
-    stack: PanelStack  # the geometry to configure: true distances, and tilts
+    stack: PanelStack  # the geometry to configure, with true distances and tilts
     gap_sigma_m: F64  # (N-1,)
-    homographies: F64  # (N, 3, 3) true pixels from ideal ones of `stack`
+    homographies: F64  # (N, 3, 3) from the ideal pixels of `stack` to true ones
     corners_px: F64  # (N, 4, 2) displacement of the corners (0, 0), (W, 0), (W, H), (0, H)
     corner_sigma_px: F64  # (N, 4, 2)
-    eye_m: F64  # (3,) the viewing place
-    used: int  # photographs
+    eye_m: F64  # (3,) the viewing position
+    used: int  # number of photographs used
     notes: list[str]  # excluded photographs, with reasons
 
     @property
@@ -94,7 +94,7 @@ def register_photographs(seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m:
         if max(unfit) <= DISAGREES:
             break
         odd = good.pop(int(np.argmax(unfit)))
-        excluded[odd.name] = "does not agree with the others: it shows another stack, or something moved"
+        excluded[odd.name] = "does not agree with the other photographs: it shows another stack, or something moved"
     _refuse_one_place(bundle)
     if bundle.sigma_px > MISFIT_PX:
         raise Undetermined(
@@ -220,8 +220,8 @@ def registration_summary(registered: Registration) -> dict[str, Any]:
     panels = [
         {
             "x_m": stack.x_m[index],
-            "tilt_deg": tilt_deg[index],  # of its right edge, and its top edge, towards the viewer
-            "turn_deg": np.degrees(np.arctan2(rows[index, 2], rows[index, 1])),  # counter-clockwise, in its plane
+            "tilt_deg": tilt_deg[index],  # tilt of its right edge and of its top edge towards the viewer
+            "turn_deg": np.degrees(np.arctan2(rows[index, 2], rows[index, 1])),  # counter-clockwise in its plane
             "homography": registered.homographies[index],
             "corner_off_px": np.linalg.norm(registered.corners_px[index], axis=1).max(),
             "sigma_px": registered.sigma_panel_px[index],

@@ -21,10 +21,10 @@ COLOURS = {"X": "#c0392b", "Y": "#27803b", "Z": "#2260a8"}
 
 
 class StoredPairs(Lenient):
-    """`[data]` of a calibration file: the pairs that it was computed from, if it contains them."""
+    """Table `[data]` of a calibration file: the pairs from which it was computed, if it contains them."""
 
     sensor_m: tuple[Vector3, ...]
-    stack_m: tuple[Vector3, ...]  # known
+    stack_m: tuple[Vector3, ...]  # known positions
     used: tuple[bool, ...]
     names: tuple[str, ...]
 
@@ -37,7 +37,7 @@ class StoredPairs(Lenient):
 
 
 class Points(NamedTuple):
-    """The pairs that a calibration was computed from."""
+    """The pairs from which a calibration was computed."""
 
     names: tuple[str, ...]
     residual_m: F64  # (K, 3) calibrated minus true positions, frame `stack`

@@ -16,12 +16,12 @@ from calib.similarity import Degenerate, ScaleRule, Similarity, fit, fit_batch
 from runtime.records import F64
 
 STARTS = 120  # random subsets to start from
-START_PAIRS = 4  # in each subset
-STEPS = 4  # concentration steps from each
-MAX_SCORED = 2000  # with more pairs the starts use a random sample; rejection sees all pairs
-REJECTION_PROBABILITY = 1e-4  # of a good pair with Gaussian noise
+START_PAIRS = 4  # pairs in each subset
+STEPS = 4  # concentration steps from each subset
+MAX_SCORED = 2000  # with more pairs, the starts use a random sample; rejection uses all pairs
+REJECTION_PROBABILITY = 1e-4  # probability that a good pair with Gaussian noise is rejected
 RULE: ScaleRule = "inverse"
-MIN_NOISE = 1e-12  # relative to the points' extent: keeps exact data from rejection by rounding errors
+MIN_NOISE = 1e-12  # relative to the points' extent; prevents rejection of exact data because of rounding
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class RobustFit:
     """A similarity fitted to the pairs that agree."""
 
     similarity: Similarity
-    inlier: NDArray[np.bool_]  # (K,)
+    inlier: NDArray[np.bool_]  # (K,) True for pairs that agree
 
 
 def _residuals(candidate: Similarity, sensor_m: F64, stack_m: F64) -> F64:

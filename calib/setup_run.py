@@ -1,4 +1,4 @@
-"""`phasestack setup`: lead a person through the steps, which can be resumed, and write the figures."""
+"""`phasestack setup`: guide a person through the steps, which can be resumed, and write the figures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from runtime.errors import InputError, PhasestackError
 from runtime.support import untrusted_input
 from runtime.support.artifacts import write_json
 
-MAX_PROGRESS_BYTES = 4 << 20  # of setup.json
+MAX_PROGRESS_BYTES = 4 << 20  # largest setup.json
 
 
 def progress_path(config: Path) -> Path:
@@ -69,7 +69,7 @@ def walk_through(setup: Setup) -> bool:
         state = "already done" if step.name in setup.done else "not done yet"
         setup.say(f"\nStep {number + 1} of {len(STEPS)}: {step.title}\n{step.what}\n({state})")
         try:
-            answer = setup.ask("Enter: do it; n: skip (keeps earlier results); p: previous step", "do it")
+            answer = setup.ask("Enter: start; n: skip (keeps earlier results); p: previous step", "do it")
         except SetupStopped:
             return False
         if answer == "p":

@@ -29,9 +29,9 @@ from runtime.support import untrusted_input
 from runtime.support.artifacts import OutputFolder, write_bytes, write_text
 
 Figures = dict[str, Any]
-MIN_PAIRS = 9  # of the 27 viewpoints, before the setup solves
+MIN_PAIRS = 9  # least number of the 27 viewpoints needed for a calibration
 SERVICE_FOLDER = "/etc/phasestack"
-MAX_BYTES = 64 << 20  # of a file for the service
+MAX_BYTES = 64 << 20  # largest file copied for the service
 ARROWS: dict[Key, Arrow] = {Key.UP: "up", Key.DOWN: "down", Key.LEFT: "left", Key.RIGHT: "right"}
 YES_NO = {Key.ACCEPT: True, Key.NEXT: False}
 
@@ -49,7 +49,7 @@ class Setup:
     hardware: SetupHardware
     say: Say
     line: Callable[[], str]  # returns the next line typed
-    done: dict[str, Figures] = field(default_factory=dict)  # of earlier steps, by name
+    done: dict[str, Figures] = field(default_factory=dict)  # figures of earlier steps, by name
 
     @property
     def settings(self) -> Settings:
@@ -81,12 +81,12 @@ def identify(setup: Setup) -> Figures:
     monitors = hardware.monitors()
     if len(monitors) < count:
         raise InputError(setup.config, "stack.x_m", f"{len(monitors)} monitors for {count} panels")
-    free = list(range(len(monitors)))  # the first one shows its card
+    free = list(range(len(monitors)))  # monitors not assigned yet; the first one shows its card
     tables: list[dict[str, Any]] = []
 
     def ask(question: str, keys: str, answers: Mapping[Key, Any]) -> Any:
         hardware.show_card(free[0], [question, f"{keys}; q: stop"])
-        setup.say(f"{monitors[free[0]]} shows its card, the others are clear. {question} ({keys}; q: stop)")
+        setup.say(f"{monitors[free[0]]} shows its card; the others are clear. {question} ({keys}; q: stop)")
         while (key := hardware.key()) not in answers:
             if key is Key.QUIT:
                 raise SetupStopped
@@ -167,7 +167,7 @@ def grey(setup: Setup) -> Figures:
     residuals = [0.0]
     for number in range(stack.count):
         state = "has a curve" if known[number] else "has no curve yet"
-        while setup.ask(f"panel {number} {state}: measure it? y or n", "y") == "y":
+        while setup.ask(f"panel {number} {state}: measure it? (y or n)", "y") == "y":
             try:
                 residuals.append(_measure_grey(setup, number))
             except InputError as error:
@@ -176,7 +176,7 @@ def grey(setup: Setup) -> Figures:
             known[number] = True
             break
     if not any(known):
-        setup.say("no panel has a curve, so the configured gammas stay")
+        setup.say("no panel has a curve; the configured gammas are used")
         raise SetupStopped
     numbers = ", ".join(str(n) for n, has in enumerate(known) if has)
     return {"text": f"of panels {numbers}, measured to {100 * max(residuals):.2f}%"}
@@ -242,7 +242,7 @@ def service(setup: Setup) -> Figures:
     if setup.hardware.simulated or sudo:
         setup.say("the service uses its own copy of these files; install it with\n  " + "\n  ".join(commands))
         return {"text": f"{len(files)} files; install them with: {listed}"}
-    setup.hardware.let_go()  # the service needs the panels
+    setup.hardware.let_go()  # release the panels, because the service needs them
     for command in commands:
         result = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)
         if result.returncode != 0:
@@ -262,7 +262,7 @@ def gather(config: Path, out: Path) -> list[str]:
     copies: dict[str, bytes] = {}
     for section, values in settings:
         for key, value in values:
-            if key in document.get(section, {}) and isinstance(value, str):  # a path is absolute here
+            if key in document.get(section, {}) and isinstance(value, str):  # paths are absolute here
                 document[section][key] = value
     if settings.calibration.file:
         copies["calibration.toml"] = untrusted_input.read_bytes(settings.calibration.file, most_bytes=MAX_BYTES)
@@ -281,7 +281,7 @@ def gather(config: Path, out: Path) -> list[str]:
 
 
 STEPS = (
-    SetupStep("identify", "Which monitor is which panel", "one panel after another shows a card to identify", identify),
+    SetupStep("identify", "Which monitor is which panel", "each panel in turn shows a card; identify it", identify),
     SetupStep(
         "geometry", "Sizes and distances", "size of the panels, approximate gap, distance of the viewers", geometry
     ),
@@ -293,8 +293,8 @@ STEPS = (
     SetupStep(
         "calibration",
         "The sensor's position",
-        "stand where the lines fuse and press Enter, at 27 viewpoints or at least 9 (q: enough)",
+        "stand where the lines fuse and press Enter, at 9 to 27 viewpoints (q: enough)",
         calibration,
     ),
-    SetupStep("service", "The service", "gathers the service's files in a folder and, as root, installs them", service),
+    SetupStep("service", "The service", "collects the service's files and, as root, installs them", service),
 )

@@ -3,11 +3,10 @@
 A similarity maps a sensor point c to the stack as  w = s·R·c + t.  All rules give the same rotation, which maximises
 the correlation of the centred points (Kabsch, Umeyama 1991). They differ in the scale:
 
-* `seed`: ratio of the RMS radii (EyeReal, (22)), the geometric mean of the next two;
-* `least-squares`: minimises the error in the stack (EyeReal, (20), Umeyama); biased low by noise in the sensor;
-* `inverse`: minimises the error in the sensor, that is, fitted from stack to sensor and inverted; consistent if the
-  stack's points are known and the sensor's are noisy, as here;
-* a number: the scale is known.
+* `seed`: ratio of the RMS radii (EyeReal, (22)), the geometric mean of the next two; * `least-squares`: minimises the
+error in the stack (EyeReal, (20), Umeyama); noise in the sensor makes it too small; * `inverse`: minimises the error in
+the sensor, that is, fitted from stack to sensor and inverted; consistent if the stack's points are exact and the
+sensor's are noisy, as here; * a number: the scale is known.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from runtime.records import F64
 
 ScaleRule = Literal["seed", "least-squares", "inverse"] | float
 EPSILON = float(np.finfo(np.float64).eps)
-ROTATION_BOUND_RAD = 1e-6  # refuse points for which rounding alone could rotate the result by more
+ROTATION_BOUND_RAD = 1e-6  # points for which rounding alone could rotate the result by more are refused
 POLISH_ABOVE = 1e2  # ratio of the points' two largest extents above which the cross-covariance loses digits
 
 
@@ -113,7 +112,7 @@ def fit(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
         raise Degenerate("not every coordinate is finite")
     _refuse_degenerate("sensor", sensor_m)
     first, second = _refuse_degenerate("stack", stack_m)
-    # Scale by powers of two, which is exact: squares of 1e-200 m or 1e200 m would leave float64.
+    # Scale by powers of two, which is exact. Squares of 1e-200 m or 1e200 m would exceed the range of float64.
     sensor_unit, stack_unit = (float(np.exp2(np.frexp(np.abs(p).max())[1])) for p in (sensor_m, stack_m))
     unit_rule = rule if isinstance(rule, str) else rule * sensor_unit / stack_unit
     unit_sensor, unit_stack = sensor_m / sensor_unit, stack_m / stack_unit
@@ -132,7 +131,7 @@ def _refuse_degenerate(name: str, points_m: F64) -> tuple[float, float]:
         raise Degenerate(f"the {name} points coincide")
     if second <= 4 * EPSILON * magnitude or second <= 1e-13 * first:
         raise Degenerate(f"the {name} points are on one line, so the rotation about it is unknown")
-    bound = 4 * EPSILON * magnitude / second  # measured against 50-digit arithmetic: `phasestack stability`
+    bound = 4 * EPSILON * magnitude / second  # verified with 50-digit arithmetic: `phasestack stability`
     if bound > ROTATION_BOUND_RAD:
         raise Degenerate(
             f"the {name} points are too thin or too far from the origin for double precision: "

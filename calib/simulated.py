@@ -18,9 +18,9 @@ from runtime.optics.stack import PanelStack
 from runtime.panels.monitors import Monitor
 from runtime.records import U8, EyePoints
 
-SENSOR_NOISE_M = 0.003  # standard deviation of a coordinate, of a simulated depth camera
+SENSOR_NOISE_M = 0.003  # standard deviation of the simulated depth camera's coordinates
 STANDING_M = 0.002  # standard deviation, per axis, of a person's position when the lines seem fused
-SAMPLES_HERE = 16  # sensor samples, at 30 a second, per viewpoint
+SAMPLES_HERE = 16  # sensor samples per viewpoint, at 30 a second
 
 
 class SimulatedHardware(SetupHardware):
@@ -36,7 +36,7 @@ class SimulatedHardware(SetupHardware):
     ) -> None:
         super().__init__(keys, photos=photos)
         self._random = random = np.random.default_rng(seed)
-        # Monitor k is panel order[k]; some are upside down, some seen from behind.
+        # Monitor k is panel order[k]. Some are upside down, and some are seen from behind.
         self.order = random.permutation(stack.count).tolist()
         self.mounted = [(int(random.choice([0, 180])), str(random.choice(["none", "horizontal"]))) for _ in self.order]
         self._stack, self._say = stack, say

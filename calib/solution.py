@@ -1,4 +1,4 @@
-"""Calibration methods, their residuals and covariances, and the choice among them."""
+"""Calibration methods, their residuals and covariances, and the choice between them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ METHODS: tuple[Method, ...] = get_args(Method)
 # can show, off by some percent, or in other units. The shares balance the excess error with a right metre against that
 # with one that is off by up to a tenth (tests/calib/test_methods.py).
 SCALE_PRIOR = np.array([(0.8, 0.0), (0.17, 0.06), (0.03, 1.0)])
-MIN_SIGMA = 1e-12  # of the scale's logarithm, for exact pairs
+MIN_SIGMA = 1e-12  # least sigma of the scale's logarithm, for exact pairs
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class CalibrationSolution:
     pivot_m: F64  # (3,) frame `stack`: the centre of the used pairs
     unit_covariance: F64  # (7, 7) for noise of 1 m; the scale's row is zero if it is fixed
     condition: float  # condition number of the design, lengths in units of the pairs' RMS radius
-    reason: str = ""  # for choosing this method
+    reason: str = ""  # reason for choosing this method
 
     @property
     def covariance(self) -> F64:

@@ -23,7 +23,7 @@ from runtime.records import F64
 if TYPE_CHECKING:
     from tomlkit.items import Array
 
-STORED_PAIRS = 500  # more are left in their own file
+STORED_PAIRS = 500  # most pairs stored in the calibration file
 
 
 def solve_file(

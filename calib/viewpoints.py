@@ -12,7 +12,7 @@ from runtime.optics.views import stack_from_eye
 from runtime.records import F64
 
 USUAL = CalibrationSettings()  # R 40 to 60 cm, phi 70 to 90 degrees from the vertical, theta 80 to 100 about it
-IPD_M = 0.060  # the paper's, used if the configuration gives none
+IPD_M = 0.060  # the paper's value, used if the configuration has none
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ def spherical_m(radius_m: float, *, phi_deg: float, theta_deg: float) -> F64:
 
 
 def viewing_place_m(viewing: CalibrationSettings) -> F64:
-    """(3,) middle of the viewing range, frame `stack`; registration is exact there."""
+    """(3,) middle of the viewing range, frame `stack`, where registration is exact."""
     up_deg = sum(viewing.viewing_up_deg) / 2
     return spherical_m(sum(viewing.viewing_m) / 2, phi_deg=90 - up_deg, theta_deg=90)
 

@@ -1,1 +1,1 @@
-"""Networks, their training and their export to ONNX. No other package needs torch."""
+"""Networks, their training and their export to ONNX. Only this package needs torch."""

@@ -1,4 +1,4 @@
-"""Checkpoints, which are read as weights only (no code from the file runs) and written atomically."""
+"""Checkpoints. They are read as weights only, so no code from the file runs, and written atomically."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from runtime.errors import InputError, one_line
 from runtime.support import untrusted_input
 from runtime.support.artifacts import write_bytes
 
-FILE_BYTES_MAX = 4 << 30  # of a checkpoint
+FILE_BYTES_MAX = 4 << 30  # largest checkpoint
 WIDTH_KEY = "subnets.in_conv.0.weight"
 
 
@@ -33,7 +33,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         raise InputError(path, "", f"is not a checkpoint of plain weights ({one_line(str(error), most=120)})") from None
     state = table.get("model") if isinstance(table, dict) else None
     if not isinstance(state, Mapping) or not state or not all(isinstance(v, Tensor) for v in state.values()):
-        raise InputError(path, "model", 'missing; a checkpoint must contain {"model": state_dict}')
+        raise InputError(path, "model", 'is missing; a checkpoint must contain {"model": state_dict}')
     return table
 
 
@@ -41,7 +41,7 @@ def eyereal_width(state: Mapping[str, Tensor], *, source: Path) -> int:
     """Return the width of the published network in a checkpoint. Raises InputError."""
     first = state.get(WIDTH_KEY)
     if first is None or first.ndim != 4:
-        raise InputError(source, WIDTH_KEY, "missing, so this is not a checkpoint of the published network")
+        raise InputError(source, WIDTH_KEY, "is missing, so this is not a checkpoint of the published network")
     return int(first.shape[0])
 
 

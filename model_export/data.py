@@ -1,4 +1,4 @@
-"""Endless procedural training pairs: random poses, scenes made of planes, views around the eyes."""
+"""Endless procedural training pairs: scenes made of textured planes, seen from random positions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class TrainingPair:
     stack: PanelStack
     eyes_m: F64  # (2, 3) left, right; frame `stack`
     images: tuple[U8, U8]  # (h, w, 3) left, right
-    fov_deg: float  # horizontal, of both
+    fov_deg: float  # horizontal field of view of both pictures
 
 
 def random_stack(random: Random, *, width_px: int, height_px: int) -> PanelStack:

@@ -150,7 +150,7 @@ def picture_file(
         layout="NCHW",
         eye_order=eye_order,
         value_range=(least, 1 + least),
-        trained_for=None,  # checkpoints don't record their training stack
+        trained_for=None,  # checkpoints do not record the stack they were trained for
         recipe_sha256=origin,
         **form.model_dump(exclude={"steps"}),
         steps=steps,

@@ -1,4 +1,4 @@
-"""The published network (EyeReal's U-Net), with its parameter names, so that its checkpoints load."""
+"""The published network (EyeReal's U-Net). Parameters keep their published names, so that its checkpoints load."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from runtime.config import Section
 PICTURE_FOV_DEG = 40.0  # horizontal; the published code feeds black outside it
 OFFSET = 0.2  # the published code shows sigmoid(y) - 0.2, clipped at the panel
 INPUT, OUTPUT = "eyes", "panels"
-LEAST_PX = 32  # for five halvings
-NORM_MOMENTUM = 0.02  # of running means; batches have one pair, of which torch's 0.1 would average only ten
+LEAST_PX = 32  # smallest side, which is halved five times
+NORM_MOMENTUM = 0.02  # of running means; with one pair per batch, torch's default (0.1) would average only ten pairs
 
 
 def _block(channels: int, middle: int, out: int) -> nn.Sequential:

@@ -45,9 +45,9 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
 
 NEAR_PX = 0.5  # rays count if they are at least this far inside every panel
-SIZE = 0.8  # of steps after a learned network; larger ones overshoot from poor starts
+SIZE = 0.8  # size of steps after a learned network; larger ones overshoot from poor starts
 MOMENTUM, FLOOR = 0.7, 0.1
-LEAST_ERROR = 1e-6  # squared; caps the PSNR at 60 dB
+LEAST_ERROR = 1e-6  # least squared error, which limits the PSNR to 60 dB
 
 
 @dataclass(frozen=True, slots=True)

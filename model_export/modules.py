@@ -24,7 +24,7 @@ from runtime.support.plugins import is_plugin, plugin_class, strict
 
 KNOWN = {"eyereal": "model_export.eyereal:EyeRealNet", "unrolled": "model_export.unrolled:Unrolled"}
 PANELS, COLOURS = 3, 3
-STEPS_MOST = 64  # in a contract
+STEPS_MOST = 64  # most steps in a contract
 
 
 class Form(Section):
@@ -35,13 +35,13 @@ class Form(Section):
     )
     input_value: Literal["intensity", "phase"] = "intensity"
     output: Literal["panels"] = "panels"
-    branch: Literal[1, 2] = Field(1, description="of phases: their sums are in [0, 1] or in [1, 2]")
+    branch: Literal[1, 2] = Field(1, description="branch of phase sums: [0, 1] or [1, 2]")
     picture_fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
         0.0, description="horizontal field of view of its pictures, which are black beyond it; 0: the content's own"
     )
 
     steps: Annotated[int, Field(ge=0, le=STEPS_MOST)] = Field(
-        0, description="solver steps after it, in training and at runtime"
+        0, description="solver steps after the network, in training and at run time"
     )
 
     @property
@@ -60,7 +60,7 @@ class Network:
     options: dict[str, Any]
 
     def steps(self) -> tuple[Sequence[Any], Sequence[Any]]:
-        """Sizes and momenta of the solver's steps after it: learned by the module, or constant."""
+        """Sizes and momenta of the solver steps after the network, learned by the module or constant."""
         learned = [getattr(self.net, name, None) for name in ("step_sizes", "step_momenta")]
         if isinstance(learned[0], Tensor) and isinstance(learned[1], Tensor):
             return list(learned[0].clamp(1e-3, 3)), list(learned[1].clamp(0, 0.99))
@@ -69,7 +69,7 @@ class Network:
 
 @contextmanager
 def blamed(arch: str, field: str) -> Iterator[None]:
-    """Turn any exception of a user's module into a one-line InputError."""
+    """Convert any exception from a user's module to a one-line InputError."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

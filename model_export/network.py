@@ -12,9 +12,9 @@ from runtime.kernels import FULL
 
 INPUTS = ("left", "right", "waves", "shifted_waves", "spectrum", "modes_in", "eye_sigma_px")
 OUTPUTS = ("rear", "front", "check")
-BLOCK_ROWS = 8  # rows transformed together; the raster has whole blocks
-BOX = 0.5  # outer panels start in the middle of their range and may change by this much
-IN_SCALE = 64  # codes per unit of the transformed inputs, which would overflow half precision in codes
+BLOCK_ROWS = 8  # rows transformed together; the raster consists of whole blocks
+BOX = 0.5  # outer panels start in the middle of their range and can change by this much
+IN_SCALE = 64  # codes per unit of the transformed inputs, which in codes would overflow half precision
 
 
 class SpectralSolver(nn.Module):
@@ -40,7 +40,7 @@ class SpectralSolver(nn.Module):
         self.w: Tensor
         self.v: Tensor
         self.register_buffer("columns", columns, persistent=False)
-        # Combine the block's row transform with difference and sum: of the eyes on input, of g and h on output.
+        # Combine the block's row transform with a difference and sum: of the eyes on input, of g and h on output.
         into = torch.cat([torch.cat([-rows, rows], dim=1), torch.cat([rows, rows], dim=1)]) / IN_SCALE
         back = rows.transpose(0, 1) * FULL
         out = torch.stack([torch.cat([-back, back], dim=1), torch.cat([back, back], dim=1)])
@@ -85,15 +85,15 @@ class SpectralSolver(nn.Module):
         (cells + 1, cells) U^T (`runtime.model.chain.chain_modes`); eye_sigma_px (3,): c columns, r rows, e columns.
         """
         rear, front, check = self._solved(feeds, added=0.5)
-        # The cast truncates; the added half makes it round, since values are clamped to be non-negative.
+        # The cast truncates. Adding a half makes it round, because values are clamped to be non-negative.
         codes = (_by_rows(torch.clamp(x, 0, FULL + 0.5), like=feeds[0]).to(torch.int16) for x in (rear, front))
         return (*codes, check)  # type: ignore[return-value]
 
     def _solved(self, feeds: tuple[Tensor, ...], *, added: float) -> tuple[Tensor, Tensor, Tensor]:
         """Rear and front panel (1, block's rows, all else) in codes plus `added`, and the check.
 
-        A cell's row stays contiguous throughout, with the rows of all blocks next to each other: so copies are cheap,
-        and the products with the rows' and the chain's matrices are few and large.
+        A cell's row stays contiguous throughout, with the rows of all blocks next to each other. This makes copies
+        cheap, and the products with the rows' and the chain's matrices few and large.
         """
         left, right, waves, shifted_waves, spectrum, modes_in, eye_sigma_px = feeds
         channels = left.shape[2] // (2 * self.cell_px)
@@ -142,8 +142,8 @@ def _by_rows(x: Tensor, *, like: Tensor) -> Tensor:
 
 
 def _size(x: Tensor) -> Tensor:
-    """(1,) norm of x: finite if x is, with a margin for later products with moderate matrices."""
-    size: Tensor = torch.linalg.vector_norm(x)  # its squares overflow long before later results would
+    """(1,) norm of x. It is finite only if x is, with a margin for later products with moderate matrices."""
+    size: Tensor = torch.linalg.vector_norm(x)  # squares overflow long before later results would
     return size.reshape(1)
 
 

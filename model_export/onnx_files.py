@@ -1,4 +1,4 @@
-"""Convert torch modules to ONNX bytes with the contract in them."""
+"""Conversion of torch modules to ONNX files that contain the contract."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def with_contract(data: bytes, contract: Contract) -> bytes:
     del model.metadata_props[:]
     known = digest(model.SerializeToString(deterministic=True))
     contract = contract.model_copy(update={"graph_sha256": known})
-    # Only a picture network may have a fixed field of view; other contracts omit it.
+    # Only picture networks may have a fixed field of view, so other contracts omit it.
     text = contract.model_dump_json(exclude=None if contract.picture_fov_deg else {"picture_fov_deg"})
     onnx.helper.set_model_props(model, {METADATA_KEY: text})
     return bytes(model.SerializeToString(deterministic=True))

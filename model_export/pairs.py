@@ -30,7 +30,7 @@ from runtime.records import F32, F64, U8
 from runtime.support.gl import offscreen_context
 from runtime.support.picture_file import read_image
 
-PICTURE_FOV_DEG = 40.0  # of pictures in the published data set
+PICTURE_FOV_DEG = 40.0  # field of view of pictures in the published data set
 
 
 @dataclass(frozen=True)
@@ -42,10 +42,10 @@ class TrainingPairs(Dataset[dict[str, Tensor]]):
     width_px: int
     height_px: int
     eye_sigma_mm: float
-    count: int = 0  # number of different pairs, repeated; 0: unlimited
+    count: int = 0  # number of different pairs, which are repeated; 0: unlimited
     stack: PanelStack | None = None  # None: random panels
     folder: tuple[Pair, ...] = ()  # pictures to use; empty: procedural pairs
-    scene: str = ""  # drawn by the runtime instead, rotated about the vertical
+    scene: str = ""  # scene for the runtime to draw instead, rotated about the vertical axis
 
     def __getitem__(self, number: int) -> dict[str, Tensor]:
         """Network input, targets, and rays of the estimated and of the true eyes."""
@@ -114,7 +114,7 @@ def folder_pairs(folder: Path) -> tuple[Pair, ...]:
 
 
 def prototype(*, width_px: int, height_px: int) -> PanelStack:
-    """Panels that the published pictures were rendered for."""
+    """Return the panels for which the published pictures were rendered."""
     return PanelStack(PITCH_WIDTH_M, PITCH_WIDTH_M * 9 / 16, (-0.06, 0.0, 0.06), width_px, height_px)
 
 

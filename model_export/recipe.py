@@ -20,7 +20,7 @@ DESIGN_RANGE = TrainedFor(
 
 
 class Recipe(Section):
-    """A model of the spectral family: a closed-form network and the steps after it."""
+    """A shipped model: a closed-form network and the steps after it."""
 
     name: str
     arch: Literal["spectral"] = "spectral"
@@ -29,7 +29,7 @@ class Recipe(Section):
     steps: Steps = ()
 
     def sha256(self) -> str:
-        """Digest for the contract, of canonical JSON."""
+        """Digest of the recipe's canonical JSON, for the contract."""
         text = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()
 

@@ -12,7 +12,7 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8
 
 FINER = 2  # supersampling factor, for antialiasing
-TEXELS = (24, 768)  # range of a texture's side
+TEXELS = (24, 768)  # smallest and largest side of a texture
 Random = np.random.Generator
 
 
@@ -57,7 +57,7 @@ def _part(raster_from_plane: F64, width: int, height: int) -> tuple[slice, slice
     area = np.linalg.det(raster_from_plane)
     if not np.isfinite(area) or abs(area) < 1e-12 or (corners[2] <= 0).all():
         return None
-    if (corners[2] <= 0).any():  # it reaches behind the eye, so may cover any pixel
+    if (corners[2] <= 0).any():  # the plane extends behind the eye, so it may cover any pixel
         return slice(0, height), slice(0, width)
     u, v = corners[:2] / corners[2]
     left, right = max(0, math.floor(u.min()) - 1), min(width, math.ceil(u.max()) + 1)
@@ -96,12 +96,12 @@ def random_scene(random: Random, stack: PanelStack, middle_m: F64) -> Scene:
     deep_m = (stack.x_m[-1] - centre_m) * math.exp(random.uniform(math.log(0.3), math.log(6.0)))
     rear_m, front_m = -deep_m, min(deep_m, 0.35 * distance_m)
     panel_m, pixel_m = np.array([stack.width_m, stack.height_m]), stack.width_m / stack.width_px / FINER
-    # Most real pictures are not saturated.
+    # Most real pictures are not saturated, so most of these are not either.
     contrast, level = (1.0, 0.0) if random.random() < 0.4 else (random.uniform(0.15, 0.8), random.uniform(-0.25, 0.25))
     tones = np.clip(np.rint((np.arange(256) - 127.5) * contrast + 127.5 + 255 * level), 0, 255).astype(np.uint8)
 
     def card(x_m: float, size_m: F64, aside: F64, *, slant: float, see_through: bool) -> Plane:
-        """aside: position of its middle as seen on the centre panel, in panel sizes."""
+        """aside: position of the card's middle as seen on the centre panel, in panel sizes."""
         share = (x_m - centre_m) / distance_m
         middle = aside * panel_m * (1 - share) + middle_m[1:] * share
         turns = random.uniform(-slant, slant, 2)

@@ -14,7 +14,7 @@ from runtime.records import F32
 Feeds = dict[str, np.ndarray]
 ORDINARY = "ordinary pair"
 EXTRA = ("one eye black", "noise")
-LARGE_PX = 1_000_000  # pixels; larger pictures skip the slow cases
+LARGE_PX = 1_000_000  # number of pixels; larger pictures skip the slow cases
 
 
 def stress_pictures(height: int, width: int) -> dict[str, tuple[F32, F32]]:

@@ -34,10 +34,10 @@ from runtime.report.page import drawing, png
 from runtime.support.artifacts import write_bytes, write_text
 from runtime.support.progress import progress_bar
 
-HELD_OUT_SEED = 9_000_001  # of the validation pairs; training seeds are smaller
-HELD_OUT, HELD_OUT_SHARE = 6, 8  # number of procedural validation pairs; one in this many of a folder's pairs
+HELD_OUT_SEED = 9_000_001  # seed of the validation pairs; training seeds are smaller
+HELD_OUT, HELD_OUT_SHARE = 6, 8  # procedural validation pairs; of a folder's pairs, one in this many
 FIRST_SAVED = 10  # iteration of the first checkpoint, so that a short training can be resumed
-SMALL_PX = 30_000  # pixels in a batch up to which one thread is faster (17 s instead of 24 at 160x90)
+SMALL_PX = 30_000  # up to this many pixels in a batch, one thread is faster (17 s instead of 24 at 160x90)
 COLUMNS = ("iteration", "light_db", "held_out_light_db")
 Device = Literal["auto", "cpu", "cuda"]
 Batch = dict[str, Tensor]
@@ -159,7 +159,7 @@ def displayed(panels: Tensor) -> Tensor:
 
 
 def _loss(network: Network, batch: Batch) -> Tensor:
-    """Minus the mean light in dB, which weighs easy and hard pairs equally."""
+    """Negative mean of the light in dB, which gives easy and hard pairs equal weight."""
     with torch.autocast(batch["input"].device.type, torch.bfloat16, enabled=batch["input"].is_cuda):
         answer = network.net.train()(batch["input"])
     losses = []

@@ -1,7 +1,7 @@
 """Checks of a model file: the runtime's requirements, then values on ordinary and on stress inputs.
 
-Values are compared with the torch module that an export came from, or, of a file alone, with the same graph run
-without onnxruntime's optimisations: any file that the runtime takes can be checked.
+Values are compared with the torch module being exported. For an existing file, they are compared with the same graph
+run without onnxruntime's optimisations, so every file that the runtime accepts can be checked.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from runtime.optics.stack import PanelStack
 from runtime.support import untrusted_input
 from runtime.support.progress import tracked
 
-FILE_BYTES_MAX = 4 << 30  # of a model
+FILE_BYTES_MAX = 4 << 30  # largest model file
 LIMIT = 0.25 / 255  # largest difference in panel values: a quarter of a code
-SMALL = (96, 160)  # pictures for a model that takes any size
+SMALL = (96, 160)  # size of the pictures for a model without a fixed size
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One line of the table."""
+    """Result of one check."""
 
     name: str
     found: str
@@ -57,7 +57,7 @@ class Report:
         return json.dumps({"file": self.file, "passed": self.passed, "checks": [asdict(c) for c in self.checks]})
 
     def table(self) -> str:
-        """Return a table for people: check, found, wanted."""
+        """Return a readable table: check, found, wanted."""
         rows = [f"{'ok' if c.passed else 'FAILED':8}{c.name}: {c.found}; wanted: {c.wanted}" for c in self.checks]
         failed = sum(not check.passed for check in self.checks)
         end = f"{failed} of {len(self.checks)} checks failed" if failed else f"all {len(self.checks)} checks passed"
@@ -68,7 +68,7 @@ Reference = Callable[[Feeds], Sequence[np.ndarray]]
 
 
 def validate_file(path: Path) -> Report:
-    """Checks of a file. Raises InputError for a file that every command refuses."""
+    """Check a file. Raises InputError for a file that every command refuses."""
     session = ModelSession(path)
     contract = session.contract
     if contract.input_frame != "chain":
@@ -127,7 +127,7 @@ def _run(session: onnxruntime.InferenceSession) -> Reference:
 
 
 def _ports(session: onnxruntime.InferenceSession, contract: Contract) -> list[Check]:
-    """Names and ranks of the graph's inputs and outputs are those that its contract declares."""
+    """Check that names and ranks of the graph's inputs and outputs match its contract."""
     checks = []
     for what, items, ports in (
         ("inputs", session.get_inputs(), contract.inputs),
@@ -150,7 +150,7 @@ def _panels(answer: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _compared(name: str, run: Reference, reference: Reference, feeds: Feeds) -> Check:
-    """One input through both: shape, finite, and how far apart."""
+    """Run one input through both, and check shape, finite values and largest difference."""
     name = f"{'values' if name.startswith(ORDINARY) else 'drift'}, {name}"
     try:
         found = _panels(run(feeds))

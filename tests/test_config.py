@@ -45,7 +45,7 @@ PANEL = '[[output.panels]]\nconnector = "DP-{}"\n'
         (PANEL.format(1) + PANEL.format(2), "output.panels", "has 2 tables, needs 3"),
         ("[modle]\nname = 'fast'", "modle", "did you mean model?"),
         ("[[output.panels]]\nedid_seril = 'A'", "output.panels.0.edid_seril", "did you mean edid_serial?"),
-        ("[loop]\nzebra = 1", "loop.zebra", "is no setting"),
+        ("[loop]\nzebra = 1", "loop.zebra", "is not a setting"),
     ],
 )
 def test_nonsense_is_refused_with_its_field_and_a_suggestion(tmp_path: Path, text: str, field: str, said: str) -> None:
@@ -138,5 +138,5 @@ def test_every_wrong_field_of_a_file_is_told_in_one_line(tmp_path: Path) -> None
         loaded(tmp_path, '[stack]\nwidth_m = 518.4\n[content]\nup = "z"\n[loop]\nrate_hz = 0\nzebra = 1\n')
     parts = str(told.value).split("; ")
     assert parts[0].startswith(f"{tmp_path}/phasestack.toml: stack.width_m: ")
-    assert any(part.startswith("content.up: is no setting") for part in parts)
-    assert any(part.startswith("loop.rate_hz: ") for part in parts) and "loop.zebra: is no setting" in parts
+    assert any(part.startswith("content.up: is not a setting") for part in parts)
+    assert any(part.startswith("loop.rate_hz: ") for part in parts) and "loop.zebra: is not a setting" in parts

@@ -42,26 +42,26 @@ from runtime.support.version import version
 
 log = logging.getLogger("phasestack.blackbox")
 
-Saved = Callable[[str, Path | None], None]  # the problem (empty: none) and the file
+Saved = Callable[[str, Path | None], None]  # arguments: the problem (empty: none) and the file
 
-BYTES_MAX = 32 << 20  # kept in memory
-OVERHEAD_BYTES = 150  # of a message in addition to its data
-AFTER_FAULT_NS = 5 * NS_PER_S  # recorded after a fault, before its file is written
-FAULTS_APART_NS = 60 * NS_PER_S  # between files of one kind: a repeated fault does not fill the disk
+BYTES_MAX = 32 << 20  # limit for messages in memory
+OVERHEAD_BYTES = 150  # memory that a message takes in addition to its data
+AFTER_FAULT_NS = 5 * NS_PER_S  # time recorded after a fault before its file is written
+FAULTS_APART_NS = 60 * NS_PER_S  # least time between files of one kind, so that a repeated fault does not fill the disk
 STATE_EVERY_NS = NS_PER_S
 WRITTEN_WITHIN_S = 5.0  # the end of a run waits this long for a file to be written
-JOURNAL_EVERY_NS = 3 * NS_PER_S  # lost in a power cut at most, with one chunk
-CHUNK_BYTES = 16384  # of the journal
+JOURNAL_EVERY_NS = 3 * NS_PER_S  # at most this long, plus one chunk, is lost in a power cut
+CHUNK_BYTES = 16384  # chunk size of the journal
 CUT = "cut"
-LINES_KEPT, STATES_KEPT = 200, 50  # for the operator's page
-FILES_MAX = 20  # in the folder
+LINES_KEPT, STATES_KEPT = 200, 50  # kept for the operator's page
+FILES_MAX = 20  # files in the folder
 PREFIX = "blackbox-"
 ASKED = "asked"
 JOURNAL = "journal"
 PART = ".part"
 
 LOG, REFRESH, STATE = "/log", "/refresh", "/state"
-# Viewers plot any number they find; only topics that they show in a special way need their fields named.
+# Viewers plot any number. Only topics that they display specially need a schema with field names.
 SCHEMAS: dict[str, dict[str, Any]] = {
     **fmt.SCHEMAS,
     LOG: {
@@ -115,10 +115,10 @@ def text_of(record: logging.LogRecord) -> str:
 
 
 class BlackBoxMessage(NamedTuple):
-    """An event, serialised for a file."""
+    """An event, serialised for the file."""
 
-    at_ns: int  # on the run's clock: the wall clock may be set back
-    wall_ns: int  # since 1970
+    at_ns: int  # time on the run's clock, because the wall clock may be set back
+    wall_ns: int  # wall-clock time since 1970
     topic: str
     data: bytes  # JSON
     sequence: int
@@ -140,15 +140,15 @@ class Recorder(logging.Handler):
         self._presenter: Presenter | None = None
         self._sensor_from_stack: F64 | None = None
         self._state, self._state_ns = ("", ""), 0
-        self._fault: tuple[int, str] | None = None  # its start and kind, until its file is written
-        self._faults_ns: dict[str, int] = {}  # last fault of each kind
+        self._fault: tuple[int, str] | None = None  # start and kind of a fault whose file has not been written yet
+        self._faults_ns: dict[str, int] = {}  # time of the last fault of each kind
         self._last_file: Path | None = None
         self._lines: deque[dict[str, Any]] = deque(maxlen=LINES_KEPT)
         self._passed: deque[dict[str, Any]] = deque(maxlen=STATES_KEPT)
         self._waiting_lock, self._is_writing = threading.Lock(), False
-        self._waiting: dict[str, list[Saved]] = {}  # files that the writer has not begun, by kind
+        self._waiting: dict[str, list[Saved]] = {}  # requests for files that the writer has not started, by kind
         self._writer: BackgroundJob[None] | None = None
-        self._fresh = 0  # newest of the kept messages that are not in the journal yet
+        self._fresh = 0  # number of newest messages that are not in the journal yet
         self._journal, self._journaled_ns = _Journal(folder), 0
         self._journaling: BackgroundJob[None] | None = None
         if self._most_ns:
@@ -190,14 +190,14 @@ class Recorder(logging.Handler):
                 fresh = list(islice(reversed(self._kept), self._fresh))[::-1]
                 self._fresh = 0
             work = partial(self._journal.add, fresh, *_head(self._presenter), most_ns=self._most_ns)
-            self._journaling = BackgroundJob("black box's journal", work)  # no refresh waits for a disk
+            self._journaling = BackgroundJob("black box's journal", work)  # so that no refresh waits for a disk
         if self._fault is not None and at_ns - self._fault[0] >= AFTER_FAULT_NS:
             kind, self._fault = self._fault[1], None
             self.save(kind)
 
     def _state_changed(self, name: str, reason: str, at_ns: int) -> None:
         self._passed.append({"time_s": round(time.time(), 3), "state": name, "reason": reason})
-        was_well = self._state[0].partition(":")[0] not in ("", "starting", "degraded")  # not during a slow start
+        was_well = self._state[0].partition(":")[0] not in ("", "starting", "degraded")  # a slow start is not a fault
         if not name.startswith("degraded") or not was_well or self._fault is not None or not self._most_ns:
             return
         kind = "fault-" + name.partition(": ")[2].replace(", ", "+")
@@ -219,12 +219,12 @@ class Recorder(logging.Handler):
             self._bytes += len(data) + OVERHEAD_BYTES
             while self._kept and (self._bytes > BYTES_MAX or at_ns - self._kept[0].at_ns > self._most_ns):
                 self._bytes -= len(self._kept.popleft().data) + OVERHEAD_BYTES
-            self._fresh = min(self._fresh, len(self._kept))  # a journal that hangs costs no more memory
+            self._fresh = min(self._fresh, len(self._kept))  # bounds the memory if the journal hangs
 
     def save(self, kind: str, saved: Saved = lambda problem, path: None) -> None:
-        """Write the kept messages to a file in the background, then call `saved`. kind: `asked` or a fault.
+        """Write the kept messages to a file in the background, then call `saved`.
 
-        One file is enough for all requests of a kind that come before it is begun.
+        kind: `asked` or a fault. All requests of a kind that arrive before its file is started share that file.
         """
         if not self._most_ns or self._presenter is None:
             saved("the black box is switched off (service.blackbox_minutes is 0)", None)
@@ -241,7 +241,7 @@ class Recorder(logging.Handler):
         saved(self._writer.problem, None)
 
     def _write(self, presenter: Presenter) -> None:
-        """Write the files that wait, in the order of their first request; on the writer's thread."""
+        """Write the requested files in the order of their first request, on the writer's thread."""
         while True:
             with self._waiting_lock:
                 self._is_writing = bool(self._waiting)
@@ -299,7 +299,7 @@ class Recorder(logging.Handler):
         for job in (self._writer, self._journaling):
             if job is not None:
                 job.wait(WRITTEN_WITHIN_S)
-        if self._writer is None or self._writer.done:  # otherwise the next run finds the journal
+        if self._writer is None or self._writer.done:  # otherwise leave the journal for the next run
             self._journal.close(in_use=self._journaling is not None and not self._journaling.done)
         self._presenter = None
         super().close()
@@ -313,7 +313,7 @@ def _head(presenter: Presenter) -> tuple[RecordingHeader, str]:
 
 
 def write_file(folder: Path, kind: str, kept: list[BlackBoxMessage], header: RecordingHeader, settings: str) -> Path:
-    """Write a new file atomically, readable only by its owner, as it shows who was here. Raises OSError.
+    """Write a new file atomically, readable only by its owner because it shows viewers' movements. Raises OSError.
 
     Its number is higher than all others in the folder, because the wall clock may be set back.
     """
@@ -341,7 +341,7 @@ def _next_name(folder: Path, kind: str, at: datetime) -> Path:
 
 def _opened(part: Path) -> IO[bytes]:
     file = os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600), "wb")
-    fcntl.flock(file, fcntl.LOCK_EX)  # an unlocked part is swept
+    fcntl.flock(file, fcntl.LOCK_EX)  # unlocked partial files are deleted by `_sweep`
     return file
 
 
@@ -377,7 +377,7 @@ class _Journal:
         self._written: _Written | None = None
 
     def add(self, fresh: list[BlackBoxMessage], header: RecordingHeader, settings: str, *, most_ns: int) -> None:
-        """Write messages through to the disk. If that fails, the journal ends and the run continues."""
+        """Write messages to the disk at once. If that fails, the journal ends and the run continues."""
         now_ns = time.monotonic_ns()
         try:
             if self._file is None or now_ns - self._begun_ns > most_ns // 2 or self._file.tell() > BYTES_MAX // 2:
@@ -422,7 +422,7 @@ def _find_cut(folder: Path) -> None:
 
 
 def make_room(folder: Path) -> None:
-    """Delete surplus files, of the most frequent kind first, but never a kind's first file or the newest."""
+    """Delete surplus files of the most frequent kind, but never the first or newest file of a kind."""
     kinds: dict[str, list[Path]] = {}
     *earlier, _ = sorted(folder.glob(f"{PREFIX}*.mcap"), key=lambda path: (_number(path), path.name)) or [folder]
     for file in earlier:

@@ -30,20 +30,20 @@ class SeenEyes:
 
 @dataclass(eq=False)
 class BrowserLink:
-    """Thread-safe link to the pages. One page is the viewer; the others look on."""
+    """Thread-safe link to the pages. One page is the viewer; the others only watch."""
 
-    stack: PanelStack  # the stack that is shown at present
+    stack: PanelStack  # the stack that is shown now
     fov_deg: float
     is_sensor: bool = True  # True: the viewer's eyes come from the page; False: from a camera
     noise_mm: float = 0.2  # standard deviation per axis of the simulated sensor
     latency_ms: float = 0.0
     is_camera: bool = False  # the viewer's page sends its camera's pictures
     camera_fov_deg: float = 65.0  # horizontal; 65 fits most webcams
-    wishes: dict[str, float] = field(default_factory=dict)  # settings of a page that need a restart: gap_mm, camera
+    wishes: dict[str, float] = field(default_factory=dict)  # choices that need a restart: gap_mm, camera
     moment: Any = None  # newest measured moment: layers and targets
     found: dict[str, Any] | None = None  # newest camera picture and the pupils in it
     frame: PanelFrame | None = None  # newest frame handed to the panels
-    shown: tuple[PanelFrame | None, dict[str, Any]] = (None, {})  # frame of the newest refresh and its account
+    shown: tuple[PanelFrame | None, dict[str, Any]] = (None, {})  # frame of the newest refresh, and its record
     news: dict[object, Callable[[], None]] = field(default_factory=dict)  # callback for each refresh, by page
     _arrived: threading.Condition = field(default_factory=threading.Condition)
     _picture: tuple[bytes, float] | None = None  # coded camera picture and its time on the page's clock
@@ -108,7 +108,7 @@ class BrowserLink:
         return find
 
     def captured(self, capture_ns: int, page_ms: float) -> None:
-        """Remember the page time of a capture."""
+        """Remember the page's time for a capture."""
         self._captures.append((capture_ns, page_ms))
 
     def page_ms_of(self, capture_ns: int) -> float | None:

@@ -1,4 +1,4 @@
-"""Self-contained HTML file of a solution: its layers, and the script that traces what eyes see."""
+"""Self-contained HTML file of a solution: its layers, and the script that renders the eyes' views."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from runtime.support.threads import parallel_map
 
 WEBP_MAX_PX = 16383
 EXTRA_BYTES = 60 << 10  # a page's size beyond its layers as PNG files
-PAGE_BYTES = 8_000_000  # a page's size at most
-LAYERS_BYTES = 6_400_000  # of these for layers; larger ones (4K) are not stored exactly
-QUALITY_BYTES = 512  # of these for the lines on how well pictures are compressed
-QUALITIES = (92, 84, 76, 66, 54)  # AVIF qualities: the first that fits is used
+PAGE_BYTES = 8_000_000  # maximum size of a page
+LAYERS_BYTES = 6_400_000  # share for layers; larger ones (4K) are not stored exactly
+QUALITY_BYTES = 512  # share for the lines that report the compression's quality
+QUALITIES = (92, 84, 76, 66, 54)  # AVIF qualities; the first one that fits is used
 CODINGS: dict[str, dict[str, Any]] = {
     "png": {},
     "webp": {"lossless": True, "method": 2},
@@ -81,7 +81,7 @@ def viewer_html(
 
 
 def half_floats(relief: F32) -> bytes:
-    """A relief as the script reads it: 16-bit floats, little-endian, row after row."""
+    """Encode a relief for the script: 16-bit floats, little-endian, row after row."""
     return np.clip(relief, -1e3, 1e3).astype("<f2").tobytes()
 
 
@@ -103,12 +103,12 @@ def _script() -> str:
 
 
 def _exact(layer: U8) -> str:
-    """Lossless data URL of a layer; WebP is a third smaller than PNG, which makes up for base64."""
+    """Lossless data URL of a layer. WebP is a third smaller than PNG, which compensates for base64."""
     return _url(layer, "webp" if max(layer.shape) <= WEBP_MAX_PX else "png")
 
 
 def _stored(pictures: Sequence[U8], room: int, *, qualities: Sequence[int] = QUALITIES) -> tuple[list[str], float]:
-    """Pictures as data URLs, within `room` bytes if possible; mean squared error of the coding (full scale 1)."""
+    """Encode pictures as data URLs, within `room` bytes if possible. Also returns the coding's mean squared error."""
     urls: list[str] = []
     for quality in qualities:
         urls = parallel_map(partial(_url, kind="avif", quality=quality), list(pictures))

@@ -1,7 +1,7 @@
 """Status and control socket: JSON lines over a local socket, served on its own thread.
 
-Slow, hanging or numerous clients cannot block it. Requests and answers have time limits, and no client needs a thread
-of its own. When all connections are in use, a new client replaces the one whose request has been incomplete longest.
+Slow, hanging or numerous clients cannot block it. Requests and answers have time limits, and clients share one
+thread. When all connections are in use, a new client replaces the one whose request has been incomplete longest.
 """
 
 from __future__ import annotations

@@ -98,7 +98,7 @@ class Daemon(Host):
             self._server.lookups |= {"log": self.recorder.look_at_log} if self.recorder is not None else {}
 
     def wait_for_panel(self, why: str) -> bool:
-        """As a service, report that a panel is missing and wait a second. Otherwise refuse to start."""
+        """Report a missing panel and wait a second, if run as a service. By hand, refuse to start."""
         if not self._notifier.supervised or self._signals.stop:
             return False
         if why != self._waits_for:

@@ -18,9 +18,9 @@ from runtime.records import F32, F64, U8
 
 TILE_WIDTH = 640  # pixels
 MARGIN = 12  # pixels
-LINE_LETTERS = 58  # letters per tile of a line below the headline
+LINE_LETTERS = 58  # letters per tile in a line below the headline
 HEADLINE, TITLE = 52, 34
-ERROR_GAIN = 8  # factor on the difference
+ERROR_GAIN = 8  # amplification of the difference
 INK = (40, 40, 40)
 PAPER = 246
 
@@ -31,7 +31,7 @@ class Moment:
 
     layers: U8  # (N, h, w, 3 or 4), as the panels showed them: aligned
     eye_views: EyeViews
-    light_db: float  # with tracking errors of 1 mm
+    light_db: float  # for a tracking error of 1 mm
     lines: tuple[str, ...]  # position of the eyes and its uncertainty
     solution: U8  # (N, h, w, 3 or 4), before alignment
     solved_for_m: F64  # (2, 3) eyes, frame `stack`
@@ -42,7 +42,7 @@ class Moment:
 def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, lines: Sequence[str] = ()) -> U8:
     """Draw an (h, w, 3) RGB sheet: a row of layers, then for each eye target, retina image and error.
 
-    headline: sentence with the figure to quote; lines: text below it.
+    headline: a sentence with the figure to quote; lines: text below it.
     """
     height, width = layers.shape[1:3]
     tile = (TILE_WIDTH, round(TILE_WIDTH * height / width))

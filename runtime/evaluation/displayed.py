@@ -30,7 +30,7 @@ class EyeViews:
 
     seen: tuple[Retina, ...]
     wanted: tuple[Picture, ...]
-    quality: Quality  # exact, at the eyes that the layers were solved for or aligned to
+    quality: Quality  # measured at exactly the eyes that the layers were solved for or aligned to
     stack: PanelStack
     eyes_m: F64  # (2, 3)
     fov_deg: float
@@ -70,14 +70,14 @@ def displayed(
 class Expected(NamedTuple):
     """Expected PSNR (docs/contracts.md, Error) by tracking error in millimetres: "0", "1", "2"."""
 
-    db: dict[str, float]  # NaN if such an error would move an eye to where it sees no part of the panels
-    standard_error_db: dict[str, float]  # of groups of rows; empty without groups
+    db: dict[str, float]  # NaN if such an error moves an eye so far that it sees no part of the panels
+    standard_error_db: dict[str, float]  # from groups of rows; empty without groups
 
 
 def expected_quality(
     eye_views: EyeViews, layers: U8, *, sampling: Sampling | None = None, sigmas_mm: Sequence[float] = SIGMAS_MM
 ) -> Expected:
-    """Measure at tracking errors; sampling: None: light, as `expected_errors` samples it."""
+    """Measure expected quality for several tracking errors. sampling: None: light, sampled as in `expected_errors`."""
     groups = sampling.groups if sampling else 0
     errors = dict.fromkeys(sigmas_mm, np.full(1 + groups, np.nan))
     with contextlib.suppress(ValueError):

@@ -1,7 +1,7 @@
 """`phasestack record --motion`: write a benchmark motion as a recording, with its true eyes.
 
-The file contains the true eyes, so that a run's summary has the displayed quality at them. The sensor's pose is that of
-the demo's calibration, the default.
+The file contains the true eyes, so that a run's summary can give the quality at them. The sensor's pose is that of the
+demo's calibration, which is the default.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
 
 SECONDS, RATE_HZ, NOISE_MM = 12.0, 30.0, 3.0
-SECONDS_MAX = 3600.0  # longest: a synthetic recording is built in memory
+SECONDS_MAX = 3600.0  # longest recording, because it is built in memory
 
 
 def write_motion(

@@ -1,4 +1,4 @@
-"""Quality of one sampled refresh, at the eyes that it was aligned to and, *live*, at the true eyes."""
+"""Quality of one sampled refresh at the eyes that it was aligned to and (*live*) at the true eyes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from runtime.records import F64, U8, RefreshAccount
 
 log = logging.getLogger("phasestack.quality")
 
-# Sampling of light. A displaced view errs at edges: sampling a quarter of a small picture's pixels is 0.6 dB off.
+# Sampling of light. Errors of a displaced view are at edges: sampling a quarter of a small picture is off by 0.6 dB.
 ALIGNED, LIVE = Sampling(step=2), Sampling(rays=4)
 ALIGNED_LARGE, LIVE_LARGE = Sampling(step=4), Sampling(step=2)  # for pictures with `PLENTY` values
 FIGURES = ("light_db", "psnr_db", "ssim", "carried_db", "psnr_db_true_eyes", "carried_db_true_eyes")
@@ -67,9 +67,9 @@ def measure_refresh(
 ) -> RefreshQuality:
     """Measure a refresh as far as its targets were drawn, skipping eyes that see no part of the panels.
 
-    account: with its true eyes, where they are known; layers: (N, h, w, 4), as the panels showed them;
-    carried: the layers aligned as if all content were on the middle panel, and before alignment; None where
-    the panels show no solution alone.
+    account: includes the true eyes if known; layers: (N, h, w, 4), as the panels showed them; carried: the layers
+    aligned as if all content were on the middle panel, and before alignment; None unless the panels show only a
+    solution.
     """
     error = None
     if targets.true is not None and account.true_eyes_m is not None:
@@ -130,7 +130,7 @@ def _lines(account: RefreshAccount, error: float | None) -> tuple[str, ...]:
     sigma = "" if account.eye_sigma_mm is None else f", standard deviation {account.eye_sigma_mm:.1f} mm"
     moved_mm = view_error_mm(account.eyes_m, account.solved_for_m)
     first = f"Refresh {account.frame}; eyes {account.eyes_label}{sigma}, {moved_mm:.0f} mm from where the layers"
-    lines = [f"{first} were solved for: the outer panels were shifted along"]
+    lines = [f"{first} were solved for; the outer panels were shifted accordingly"]
     if error is not None and account.true_eyes_m is not None:
         stale_mm = view_error_mm(account.true_eyes_m, account.solved_for_m)
         lines.append(

@@ -20,8 +20,8 @@ from runtime.support.background import MEASURING_NICENESS, set_niceness
 log = logging.getLogger("phasestack.output")
 
 Work = Callable[[], object]
-WAITING = 4096  # most jobs queued for the disk: a minute of lines
-WAITING_PICTURES = 4  # most of those with a refresh's pictures, 25 MB at 1080p
+WAITING = 4096  # jobs queued for the disk: a minute of lines
+WAITING_PICTURES = 4  # queued jobs with a refresh's pictures: 25 MB each at 1080p
 
 
 class RunOutput:
@@ -32,11 +32,12 @@ class RunOutput:
     """
 
     def __init__(self, target: Path, *, every_one: bool = True) -> None:
-        """every_one: wait for a slow disk, instead of dropping lines and pictures that it can't keep up with."""
+        """every_one: wait for a slow disk instead of dropping lines and pictures."""
         self._folder = OutputFolder(target)
         self._target, self._every_one = target, every_one
         self._lines: TextIO | None = None
-        self._work: queue.Queue[tuple[Work, Work] | None] = queue.Queue(WAITING)  # a job, and its cleanup, always run
+        # A job, and a cleanup that always runs.
+        self._work: queue.Queue[tuple[Work, Work] | None] = queue.Queue(WAITING)
         self._pictures = threading.BoundedSemaphore(WAITING_PICTURES)
         self._writer = threading.Thread(target=self._write, name="output", daemon=True)
         self.problem = ""  # why the files were abandoned
@@ -61,7 +62,7 @@ class RunOutput:
         if self.left_out:
             log.warning("output: the disk was too slow for %d lines or pictures of %s", self.left_out, self._target)
         if self.problem:
-            kind = kind or InputError  # discards incomplete files
+            kind = kind or InputError  # makes the folder discard its incomplete files
         self._attempt(lambda: self._folder.__exit__(kind, error, trace))
 
     def refresh(self, line: Mapping[str, Any]) -> None:
@@ -165,7 +166,7 @@ class RunOutput:
             work()
         except (OSError, InputError) as error:
             self._abandon(str(error), trace=False)
-        except Exception as error:  # a bug in these files must not end the run either
+        except Exception as error:  # not even a bug here may end the run
             self._abandon(f"{type(error).__name__}: {error}", trace=True)
 
     def _abandon(self, why: str, *, trace: bool) -> None:
@@ -173,7 +174,7 @@ class RunOutput:
             return
         self.problem = why
         log.warning("output abandoned; nothing new was written to %s: %s", self._target, why, exc_info=trace)
-        self._folder.discard()  # now: these files may be what fills the disk
+        self._folder.discard()  # at once, because these files may be filling the disk
 
     def _line(self, line: Mapping[str, Any]) -> None:
         assert self._lines is not None

@@ -17,7 +17,7 @@ from runtime.records import F64, U8
 from runtime.support.artifacts import write_png, write_text
 
 BySigma = Mapping[str, float]
-GROUPS = 10  # of rows, for a sampled light's standard error
+GROUPS = 10  # groups of rows, for the standard error of sampled light
 WHOLE_PX = 1920 * 1200  # largest picture whose light is measured at every pixel
 
 
@@ -25,10 +25,10 @@ WHOLE_PX = 1920 * 1200  # largest picture whose light is measured at every pixel
 class PairQuality:
     """Quality at the eyes (docs/contracts.md, Error), by tracking error: "0", "1", "2" mm.
 
-    NaN if not requested, or if such an error moves an eye to where it sees nothing.
+    NaN if not requested, or if such an error moves an eye so far that it sees no part of the panels.
     """
 
-    light_db: BySigma  # with real pixels and pupils; "1", a good tracker's, is the figure to quote
+    light_db: BySigma  # with square pixels and a finite pupil; quote "1", the error of a good tracker
     expected_db: BySigma  # one ray a pixel
     psnr_db: float  # one ray a pixel, at exactly known eyes
     ssim: float

@@ -1,1 +1,1 @@
-"""Finding both eyes in pictures or samples, and tracking and predicting them in the `stack` frame."""
+"""Finding both eyes in pictures, and tracking and predicting them in the `stack` frame."""

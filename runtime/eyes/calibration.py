@@ -21,10 +21,10 @@ from runtime.errors import InputError
 from runtime.records import F64, EyePoints
 
 DEMO_FILE = Path(__file__).parent / "data" / "demo-calibration.toml"
-SIMILARITY_TOLERANCE = 1e-3  # relative; printed matrices of four digits pass, sheared ones do not
+SIMILARITY_TOLERANCE = 1e-3  # relative; accepts matrices printed with four digits, but not sheared ones
 PLAUSIBLE_SCALE = (0.8, 1.25)  # both frames are in metres
 SCALE = (5e-4, 2e3)  # wide enough for millimetres on one side; anything outside is an error
-NEAR_M, MAX_DISTANCE_M = 5.0, 20.0  # sensor to display: warn beyond the first, refuse beyond the second
+NEAR_M, MAX_DISTANCE_M = 5.0, 20.0  # distance from sensor to display: warn beyond the first, refuse beyond the second
 
 Number = Annotated[float, Field(strict=True, ge=-MOST, le=MOST)]  # "1.0" and true are not numbers
 Row4 = tuple[Number, Number, Number, Number]
@@ -33,7 +33,7 @@ Row7 = tuple[Number, Number, Number, Number, Number, Number, Number]
 
 
 class Lenient(Section):
-    """A table that ignores unknown keys, which other programs or later versions may have written."""
+    """A table in which unknown keys are ignored, because later versions may have written them."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
@@ -154,7 +154,7 @@ def check_similarity(matrix: F64, *, source: str | Path) -> None:
     volume = float(np.linalg.det(matrix[:3, :3] / largest))
     if volume <= 0.0:
         raise InputError(source, name, "mirrors space (determinant not positive): check the axes' directions")
-    scale = largest * float(np.cbrt(volume))  # the matrix's own determinant may overflow
+    scale = largest * float(np.cbrt(volume))  # the determinant of the unscaled matrix may overflow
     if not SCALE[0] <= scale <= SCALE[1]:
         raise InputError(source, name, f"has scale {scale:.3g}: with both frames in metres it must be about 1")
     distance_m = float(np.linalg.norm(matrix[:3, 3]))

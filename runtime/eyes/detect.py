@@ -13,11 +13,12 @@ from runtime.eyes.face_depth import EyeDepths, FaceDepth
 from runtime.eyes.pupils import SIDES, PupilFinder, Pupils
 from runtime.records import F64, EyePoints, Intrinsics, SensorFrame
 
-# Sigma of the midpoint over that of one pupil: sideways errors of the two are nearly independent, vertical ones shared.
+# Sigma of the midpoint over that of one pupil. Sideways errors of the two pupils are nearly independent, vertical
+# errors are shared.
 MIDDLE_SIDEWAYS, MIDDLE_UP = 0.55, 1.1
-RANGE_MAX_M = 4.0  # a face farther away is not a viewer's
+RANGE_MAX_M = 4.0  # faces farther away are not viewers
 LOCK_NS = NS_PER_S  # a viewer unseen for this long is replaced; shorter gaps happen when another person walks past
-FILLED_IN_CONFIDENCE = 0.4  # of an eye that was hidden
+FILLED_IN_CONFIDENCE = 0.4  # confidence of a hidden eye
 
 log = logging.getLogger(__name__)
 

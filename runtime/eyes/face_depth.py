@@ -2,7 +2,7 @@
 
 The filter estimates one number: the viewer's eye separation in metres, from depth measurements. Distance is that
 number times the focal length over the separation in pixels (measured along the line between the eyes in space, from the
-mesh). Holes and bad frames therefore do no harm, and averaging reduces depth noise without lag. Without depth, the
+mesh). So holes and bad frames do no harm, and averaging reduces depth noise without lag. Without depth, the
 separation comes from the settings, or is learnt from the size of the irises.
 """
 
@@ -17,16 +17,16 @@ from runtime.eyes.pupils import CORNERS, Pupils
 from runtime.records import F64, U16, Intrinsics
 
 M_PER_MM = 1e-3
-EYE_DISTANCE_M = (0.063, 0.0036)  # of adults: mean, standard deviation
+EYE_DISTANCE_M = (0.063, 0.0036)  # adults: mean and standard deviation
 KNOWN_SIGMA_M = 0.001  # standard deviation of an eye distance measured by an optician
 IRIS_M, IRIS_SIGMA = 0.0117, 0.07  # diameter of an iris; relative spread, people's and the network's together
-PERSON_M = (0.045, 0.085)  # people's eye distances, children's included; depth that implies another is rejected
-FLYING_M = 0.03  # off the other points: a flying pixel between face and wall, or the wall
-POINTS_MIN = 8  # measured rigid points of the mesh needed
+PERSON_M = (0.045, 0.085)  # people's eye separations, including children; other depths are rejected
+FLYING_M = 0.03  # deviation from the other points that marks a flying pixel or the wall
+POINTS_MIN = 8  # least number of rigid mesh points with depth
 RELIEF_MAX, RELIEF_PICTURES = 1.3, 30  # times the mesh's relief; pictures averaged
-POINT_SIGMA_M = 0.0005  # floor for the mean of many points, whose errors are not independent
-SHAPE_SIGMA_M = 0.006  # of this viewer's eyes relative to the mesh's, along the line of sight
-EYE_SIGMA_M, EYE_GATE_M = 0.002, 0.02  # of one measurement at an eye; limit beyond which it is rejected (glasses)
+POINT_SIGMA_M = 0.0005  # least sigma of the mean of many points, whose errors are not independent
+SHAPE_SIGMA_M = 0.006  # deviation of this viewer's eyes from the mesh's, along the line of sight
+EYE_SIGMA_M, EYE_GATE_M = 0.002, 0.02  # sigma of one measurement at an eye; larger deviations (glasses) are rejected
 EYE_WINDOW = 0.12  # radius of the depth window at an eye, in eye distances
 PICTURE_SHARE, TURN_SHARE = 0.0007, 0.3  # relative uncertainty added per picture, and per change of foreshortening
 
@@ -36,7 +36,7 @@ class EyeDepths:
     """Distances from the camera along its optical axis, in metres."""
 
     eyes_m: F64  # (2,) left, right
-    sigma_m: float  # standard deviation of their middle
+    sigma_m: float  # standard deviation of their mean
 
 
 class FaceDepth:
@@ -61,8 +61,8 @@ class FaceDepth:
         relief = pupils.mesh_px[:, 2]
         eyes = np.array([relief[list(corners)].mean() for corners in CORNERS])
         focal = float(np.sqrt(intrinsics.fx_px * intrinsics.fy_px))
-        # Off the picture's centre a plane across the line of sight is tilted relative to the image plane: the mesh's z
-        # is along that line, and pixels are stretched.
+        # Off the picture's centre, a plane perpendicular to the line of sight is tilted relative to the image plane.
+        # The mesh's z is along that line, and pixels are stretched.
         middle_px = pupils.eyes_px.mean(axis=0)
         sight = (middle_px - [intrinsics.cx_px, intrinsics.cy_px]) / focal
         tilt = -sight / (1 + sight @ sight)  # pixels of depth per pixel of the picture
@@ -70,7 +70,7 @@ class FaceDepth:
         across = np.sqrt(apart @ apart + (apart @ tilt) * (apart @ sight))
         length = float(np.hypot(across, eyes[0] - eyes[1]))
         tilts = (pupils.mesh_px[RIGID, :2] - middle_px) @ tilt, (pupils.eyes_px - middle_px) @ tilt
-        away = focal / length  # distance of the eyes' middle, in eye distances
+        away = focal / length  # distance of the eyes' midpoint, in eye separations
         self._predict(float(across) / length)
         relief, eyes = relief - eyes.mean(), eyes - eyes.mean()
         if depth_mm is not None:
@@ -81,7 +81,7 @@ class FaceDepth:
             self._learn(length / pupils.iris_px)
         middle = self._distance * away
         shape = self._shape - self._shape.mean()
-        # An eye distance from depth includes the pixels' error already; to a known or learnt one it is added.
+        # An eye separation from depth already includes the pixels' error. For a known or learnt one it is added.
         added = self._shape_variance.mean() if self.has_measured else 2 * (pupils.sigma_px / length * middle) ** 2
         sigma = np.sqrt(self._variance * away**2 + added)
         relief_m = (eyes * self._relief + tilts[1]) * self._distance / length
@@ -95,7 +95,7 @@ class FaceDepth:
             self._variance += (PICTURE_SHARE**2 + turn**2) * self._distance**2
 
     def _learn(self, ratio: float) -> None:
-        """Estimate the eye separation without depth, from the irises, whose size varies less than a face's."""
+        """Estimate the eye separation without depth, from the irises, which vary less between people than faces do."""
         self._irises = [*self._irises[-99:], ratio]
         iris = IRIS_M * float(np.median(self._irises))
         weights = np.array([EYE_DISTANCE_M[1], IRIS_SIGMA * iris]) ** -2.0

@@ -14,7 +14,7 @@ import numpy as np
 from runtime.eyes.networks import resampled, transformed
 from runtime.records import F64, U8
 
-# Mesh points that move with the skull: forehead, nose, cheeks and the corners of the eyes.
+# Mesh points that move rigidly with the head: forehead, nose, cheeks and the corners of the eyes.
 RIGID = np.array([
     6, 8, 9, 10, 168, 197, 195, 5, 4, 1, 151, 108, 337, 67, 297, 54, 284, 21, 251, 103, 332, 107, 336, 55, 285, 122,
     351, 196, 419, 114, 343, 188, 412, 116, 345, 117, 346, 50, 280, 101, 330, 36, 266, 205, 425, 33, 133, 263,

@@ -1,9 +1,9 @@
 """Interacting multiple models (Blom and Bar-Shalom 1988): Kalman filters that differ in agility.
 
 Each model uses Singer's acceleration (1970), which decays with a time constant and is driven by noise whose strength
-differs between models. A still head needs heavy filtering, a fast one light filtering, and heads change between these
-within a tenth of a second. Measurement noise is a covariance matrix: a camera measures right and up twenty times as
-precisely as depth.
+differs between models. A still head needs heavy filtering and a fast one light filtering, and a head can change within
+a tenth of a second. Measurement noise is a covariance matrix: a camera measures right and up twenty times as precisely
+as depth.
 
 A state has nine numbers: position, velocity and acceleration, each along x, y and z, in metres and seconds.
 """
@@ -35,7 +35,7 @@ class Belief(NamedTuple):
 
 
 def _response(times_s: F64) -> F64:
-    """(3, n) position, velocity and acceleration that result from a unit acceleration at time 0."""
+    """(3, n) position, velocity and acceleration that result from an initial acceleration of 1."""
     x = times_s / FADE_S
     gone = -np.expm1(-x)
     return np.array([FADE_S**2 * (x - gone), FADE_S * gone, 1 - gone])
@@ -82,7 +82,7 @@ def started(place: F64, *, noise: F64, speed: float, acceleration: Sequence[floa
 def predicted(belief: Belief, dt_s: float, *, acceleration: Sequence[float], stay_s: float) -> Belief:
     """Predict the belief dt_s >= 0 ahead: mix the models, then move them. stay_s: mean time in one model."""
     count = len(belief.weight)
-    leave = -math.expm1(-dt_s / stay_s) / count  # to each model with equal probability, this one included
+    leave = -math.expm1(-dt_s / stay_s) / count  # probability of a switch to each model, including this one
     change = np.full((count, count), leave) + (1 - count * leave) * np.eye(count)
     shares = belief.weight[:, None] * change
     weight = shares.sum(0)
@@ -98,7 +98,7 @@ def predicted(belief: Belief, dt_s: float, *, acceleration: Sequence[float], sta
 
 
 def surprise(belief: Belief, measured: F64, *, noise: F64) -> float:
-    """Smallest squared Mahalanobis distance of a measurement from any model (chi² of three axes)."""
+    """Smallest squared Mahalanobis distance of a measurement from any model (chi² with three degrees of freedom)."""
     return float(_chi2(measured - belief.state[:, :3], _total(belief, noise)).min())
 
 

@@ -1,4 +1,4 @@
-"""Simulated head motions, and a depth camera's simulated samples of them, for benchmarks and tests."""
+"""Simulated head motions, and simulated samples of a depth camera, for benchmarks and tests."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from runtime.clock import NS_PER_S
 from runtime.records import F64, EyePoints
 
 IPD_M = 0.063
-DISTANCE_M = 0.6  # of the eyes from the panels, at rest
+DISTANCE_M = 0.6  # distance of the resting eyes from the panels
 DROPOUT_S = 0.2  # length of every dropout
-NECK_TO_EYES_M = np.array([-0.09, 0.0, 0.14])  # forward (towards the display), aside, up
+NECK_TO_EYES_M = np.array([-0.09, 0.0, 0.14])  # forward (towards the display), sideways, up
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +113,7 @@ def true_eyes(motion: str, times_s: F64, *, path: Path = BENCHMARK_PATH) -> F64:
     c, s = np.cos(pitch), np.sin(pitch)
     middle = neck + np.stack([forward * c + up * s, np.zeros_like(c), up * c - forward * s], 1)
     middle += np.array([DISTANCE_M - forward, 0.0, -up])
-    # The head turns towards the display and tilts into a lean.
+    # The head keeps facing the display and tilts as it leans.
     yaw, roll = np.arctan2(middle[:, 1], middle[:, 0]), -0.6 * neck[:, 1]
     across = [-np.sin(yaw) * np.cos(roll), np.cos(yaw) * np.cos(roll), np.sin(roll)]
     half = IPD_M / 2 * np.stack(across, 1)

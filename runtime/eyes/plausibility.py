@@ -22,11 +22,11 @@ EXCHANGED = "left and right swapped"
 
 IPD_MIN_M, IPD_MAX_M = 0.050, 0.078  # a person's eye separation
 WINDOW = 30  # samples: a second of a common depth camera
-SAMPLES_MIN = 10  # before any reason is reported
-WARNING_SHARE = 0.5  # of the window, refused for one reason, that raises a warning
-UNIT_SLACK = 1.25  # a separation between 40 and 98 can only be in millimetres
-DISTANT_M = 20.0  # from the display: no sensor sees a face from there
-UPSIDE_DOWN_COSINE = -0.5  # a roll of more than 120 degrees means exchanged eyes
+SAMPLES_MIN = 10  # least number of samples before a reason is reported
+WARNING_SHARE = 0.5  # share of the window refused for one reason that raises a warning
+UNIT_SLACK = 1.25  # factor on the limits when checking for millimetres: 40 to 98
+DISTANT_M = 20.0  # distance from the display beyond which no sensor sees a face
+UPSIDE_DOWN_COSINE = -0.5  # a roll of more than 120 degrees means that the eyes are swapped
 
 MISTAKES = (NOT_NEWER, NOT_A_NUMBER, MILLIMETRES, TOO_CLOSE, TOO_FAR_APART, BEHIND, TOO_DISTANT, EXCHANGED)
 _HINTS = {
@@ -62,7 +62,7 @@ def reason_against(eyes_m: F64, *, in_front_m: float = 0.0) -> str:
 
 
 class RefusalWatch:
-    """Counts refused samples by reason, and warns once if most samples are refused for the same reason."""
+    """Counts refused samples by reason, and warns once if most are refused for the same reason."""
 
     def __init__(self) -> None:
         self._last: deque[str] = deque(maxlen=WINDOW)

@@ -18,34 +18,34 @@ Side = Literal["", "left", "right"]
 SIDES: tuple[Side, Side] = ("left", "right")
 
 LEVELS_PX = (320, 640)  # longer side of the picture searched; the finer one if the first shows no face
-SCORE_MIN = 0.8  # of a face found: people in the dark 1.5 m away score 0.85, most dogs less than this
+SCORE_MIN = 0.8  # least score of a face: people in the dark at 1.5 m score 0.85, most dogs less than 0.8
 PRESENCE_FOUND, PRESENCE_FOLLOWED = 0.9, 0.5  # minimum probability of a face in the mesh's crop
 CANDIDATES_MAX = 4  # faces examined when looking for the viewer
-FARTHEST_OUT = 0.7  # relative penalty of a face in the picture's corner when a viewer is chosen
-CORNERS = ((362, 263), (33, 133))  # of the left and the right eye, in the mesh
-EYE_SQUARE = 2.7  # side of the iris network's input, in widths of the eye: the most accurate of 1.8 to 3.1
+FARTHEST_OUT = 0.7  # relative penalty for a face in the picture's corner when a viewer is chosen
+CORNERS = ((362, 263), (33, 133))  # mesh points at the corners of the left and right eye
+EYE_SQUARE = 2.7  # side of the iris network's input, in eye widths; the most accurate value from 1.8 to 3.1
 FACE_SQUARE = 1.5  # side of the mesh network's input, in sizes of the face
-MOVED_FAR = 0.35  # eye distances between pictures beyond which the mesh network runs again at the new position
+MOVED_FAR = 0.35  # movement between pictures, in eye separations, beyond which the mesh network runs again
 
-# An iris measures 11.7 mm and eyes are 50 to 75 mm apart, which excludes dogs and monkeys.
+# A human iris measures 11.7 mm, and the eyes are 50 to 75 mm apart. This excludes dogs and monkeys.
 IRIS_RANGE = (0.12, 0.33)  # diameter in eye distances; turning the head shortens the distance
-IRIS_RATIO_MAX = 1.4  # of the larger to the smaller one
+IRIS_RATIO_MAX = 1.4  # largest ratio of the two irises
 # The upper lid hides part of the iris and the network returns the centre of the visible rest: too low by this share of
 # the eye distance (0.6 mm), independent of camera and distance. Fitted to all 51 faces measured; fitted to random
 # halves of them, the error on the other half is 0.61 to 0.67 mm up to 1 m.
 TOO_LOW = 0.0093
-OPEN_MIN = 0.12  # height of an open eye over its width; in a blink it is less, and the iris is hidden
+OPEN_MIN = 0.12  # least height of an open eye over its width; in a blink the iris is hidden
 
-PULL = 0.1  # share of the distance to the networks' estimate that each picture corrects
+PULL = 0.1  # share of the deviation from the networks' estimate that each picture corrects
 # Gaze changes: the gain rises by GAZE_PULL as the distance goes from GAZE_FROM to GAZE_FULL eye distances.
 GAZE_FROM, GAZE_FULL, GAZE_PULL = 0.02, 0.06, 0.6
-# Eyes turn together. If one seems to turn alone by more than this (eye distances) it is hidden by a hand or hair, and
-# the network invents it; it then moves with the face for at most CARRIED_MAX pictures.
+# Eyes turn together. If one seems to turn alone by more than this (in eye separations), a hand or hair hides it and the
+# network only guesses its position. It is then moved with the face for at most CARRIED_MAX pictures.
 APART_MAX, CARRIED_MAX = 0.06, 30
 
-SAME_LOOKS = 0.75  # minimum correlation of two looks at one person; 19 of 20 other people score less
-SAME_LOOKS_FOLLOWED = 0.6  # the minimum for a face where the viewer's was a moment ago
-LOOKS_PULL = 0.05  # rate at which the stored looks adapt to light and turns
+SAME_LOOKS = 0.75  # minimum correlation between two views of one person; 19 in 20 other people score less
+SAME_LOOKS_FOLLOWED = 0.6  # the same for a face at the viewer's last position
+LOOKS_PULL = 0.05  # rate at which the stored appearance adapts to light and pose
 
 # Standard deviation of a pupil along an axis: people's spread about the networks' mean (eye distances),
 # pixel noise (px), and the share of a surprise in one picture that remains.
@@ -61,7 +61,7 @@ class Pupils:
     mesh_px: F64  # (468, 3) the face; z in the same pixels, away from the camera
     iris_px: float  # mean diameter of the irises
     seen: Seen
-    hidden: Side  # the eye filled in from the rest of the face
+    hidden: Side  # the hidden eye, filled in from the rest of the face
     certainty: float  # probability that this is a face
 
     @property
@@ -107,7 +107,7 @@ class PupilFinder:
     def forget(self) -> None:
         """Reset: treat the next picture as the first."""
         self._looks: F64 | None = None  # the viewer's face, kept while unseen
-        self._last: _Look | None = None  # where the viewer was in the previous picture
+        self._last: _Look | None = None  # the viewer in the previous picture
         self._eyes = np.zeros((2, 2))  # px, returned for the previous picture
         self._steps = self._carried = 0  # pictures averaged in `_eyes`; consecutive ones with a hidden eye
         self._seen_ns = 0
@@ -179,7 +179,7 @@ class PupilFinder:
             iris[side] = (np.linalg.norm(points[1] - points[3]) + np.linalg.norm(points[2] - points[4])) / 2
             openness[side] = np.linalg.norm(lids[4] - lids[12]) / np.linalg.norm(lids[0] - lids[8])
         line = eyes[0] - eyes[1]
-        eyes -= TOO_LOW * np.array([-line[1], line[0]])  # towards the chin at any roll of the head
+        eyes -= TOO_LOW * np.array([-line[1], line[0]])  # towards the chin for any roll of the head
         return _Look(mesh, presence, eyes, iris, openness, _looks(picture, mesh, float(np.linalg.norm(line))))
 
     def _steadied(self, picture: U8, look: _Look, seen: Seen) -> Pupils:

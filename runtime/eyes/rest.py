@@ -1,8 +1,8 @@
 """Detection of a head at rest, from the accepted samples.
 
-The tracker's predictions jitter by several times the sensor's noise, because the prediction horizon amplifies the
-noise in the estimated velocity. A head at rest has zero velocity, so the median of its samples is the best estimate
-of its position, and the picture can stand still.
+The tracker's predictions jitter by several times the sensor's noise, because the prediction horizon amplifies the noise
+in the estimated velocity. For a head at rest, the median of its samples is the best estimate of its position, and the
+picture can stand still.
 """
 
 from __future__ import annotations
@@ -12,21 +12,21 @@ import numpy as np
 from runtime.clock import NS_PER_S
 from runtime.records import F64
 
-REST_NS = NS_PER_S  # a head that has not moved for this long is at rest
+REST_NS = NS_PER_S  # a head counts as at rest if it has not moved for this long
 LOST_NS = NS_PER_S  # a longer gap between samples resets the detector
-DRIFT_NS = 3 * NS_PER_S  # length of the median that measures drift
+DRIFT_NS = 3 * NS_PER_S  # time span of the median that measures drift
 EVERY = 8  # samples between measurements of noise and drift, which change slowly
-FEWEST = 8  # samples needed for any conclusion
-KEPT = 256  # samples of a resting head
+FEWEST = 8  # least number of samples for any conclusion
+KEPT = 256  # samples kept of a resting head
 GRACE_M = 0.0005  # added to every threshold, for sensors without noise
-NOISE_MAX_M = 0.005  # with more noise than this no head counts as resting: a departure would go unnoticed
+NOISE_MAX_M = 0.005  # with more noise than this no head counts as resting, because a departure would go unnoticed
 # In standard deviations of one sample; white noise at 60 samples a second exceeds each once in hours.
 SINGLE = 4.5  # two consecutive samples, off in the same direction
 MEDIAN_OF_FIVE = 2.6  # of the newest five samples
-HALVES = 4.5  # of the difference of two halves' means, over the root of their length
+HALVES = 4.5  # difference between the means of two halves, over the root of their length
 MAD_TO_SIGMA = 1.4826  # standard deviation of normal noise over its median absolute deviation
 MEDIAN_EFFICIENCY = 1.25  # standard deviation of a median over that of a mean
-LEVER_M = 0.15  # RMS distance of a point from the middle, for a display of half a metre
+LEVER_M = 0.15  # RMS distance of a point from the centre of a display half a metre wide
 NEAREST_M = 0.1  # nearest distance from the display; smaller ones are raised to it
 
 
@@ -59,7 +59,7 @@ class RestWatch:
             if self._stands():
                 self._settle(capture_ns - REST_NS)
         elif self._left(self.place):
-            # Samples from before the motion don't help to detect its end.
+            # Samples from before a motion do not help to detect its end.
             self._keep_last(2)
             self.place = None
         elif slow_checks and self._drifted(self.place):
@@ -93,7 +93,7 @@ class RestWatch:
         median_sigma_m = MEDIAN_EFFICIENCY * noise_m / len(recent) ** 0.5
         # Drift up to this goes uncorrected (`_drifted`).
         drift_m = self._max_drift_m + 2 * MEDIAN_EFFICIENCY * noise_m * (4 / max(len(recent), FEWEST)) ** 0.5
-        self.sigma_m = float(np.hypot(median_sigma_m, drift_m / 2**0.5))  # drift mostly goes in one direction
+        self.sigma_m = float(np.hypot(median_sigma_m, drift_m / 2**0.5))  # drift is mostly in one direction
 
     def _measure_noise(self) -> None:
         """Measure noise as each sample's distance from the line between its neighbours: steady motion adds none."""
@@ -106,7 +106,7 @@ class RestWatch:
         self.noise_m = np.tile([max(right, up), max(right, up), deep], 2)
 
     def _stands(self) -> bool:
-        """Return True if both halves of the last second agree with each other and with the newest samples."""
+        """Return True if the two halves of the last second agree with each other and with the newest samples."""
         now_ns = int(self._times[self._count - 1])
         if now_ns - self._times[0] < REST_NS:
             return False
@@ -126,7 +126,7 @@ class RestWatch:
             return True
         last, newest = shifts[-2:]
         reach = SINGLE * self.noise_m + GRACE_M
-        # Outliers are off in any direction: two consecutive samples must agree on theirs.
+        # Outliers deviate in random directions, so two consecutive samples must deviate in the same one.
         together = np.minimum(last, newest) > reach
         opposite = np.maximum(last, newest) < -reach
         return bool((together | opposite).any())
@@ -137,7 +137,7 @@ class RestWatch:
             return False
         recent = self._since(now_ns - DRIFT_NS)
         shift = _shifts(np.median(recent, axis=0)[None], place)[0]
-        # `place` itself is the median of a third as many samples.
+        # `place` is the median of a third as many samples.
         shift_sigma_m = MEDIAN_EFFICIENCY * self.noise_m * (4 / len(recent)) ** 0.5
         return bool((np.abs(shift) > self._max_drift_m + 2 * shift_sigma_m).any())
 

@@ -17,24 +17,25 @@ from runtime.eyes.plausibility import NOT_NEWER, reason_against
 from runtime.records import F64, EyePoints, EyesEstimate, EyesLabel
 
 HISTORY = 256  # filtered samples kept: four seconds at 60 Hz
-CONFIDENCE_MIN = 0.3  # less certain samples (a blink) are refused
-CHI2_GATE = 21.1  # chi² with three degrees of freedom; refuses one good sample in 10 000
+CONFIDENCE_MIN = 0.3  # samples with less confidence (a blink) are refused
+CHI2_GATE = 21.1  # chi² with three degrees of freedom; refuses one good sample in 10,000
 CHI2_DOUBT = 11.3  # 1 % gate: a sample beyond it is rolled back if the next two fit better without it
 ACCELERATION = (0.05, 0.4, 2.0)  # m/s², standard deviations for a calm, a moving and a fast head
 STAY_S = 1.0  # mean time that a head stays calm, moving or fast
-TURN_ACCELERATION = (0.03, 0.4)  # m/s², of half the line between the eyes: hardly turning, and shaking the head
+# m/s², standard deviations for half the vector between the eyes: a head that hardly turns, and one that shakes
+TURN_ACCELERATION = (0.03, 0.4)
 FIRST_SPEED = 0.3  # m/s, standard deviation for a head just found
 REACH_SPEED, REACH_ACCELERATION = 2.0, 30.0  # m/s, m/s²: limits of a head's motion
 KEEP_S = 0.4  # a longer gap discards a head's motion
-ANOTHER_AFTER_S = 0.5  # a viewer unseen for this long, or for hold_s if that is shorter, is replaced by another
-LOSS_S = 0.2  # after this long without a sample they stop being predicted and are held
+ANOTHER_AFTER_S = 0.5  # another person replaces a viewer unseen for this long, or for hold_s if that is shorter
+LOSS_S = 0.2  # after this long without a sample, eyes are held instead of predicted
 HORIZON_S = 0.2  # longest prediction
 DECAY_S = 0.06  # time constant of a lost head's slowing to rest
-REVIVE_S = 0.06  # duration of the blend to eyes that were lost and found
-CLOCK_RESET_NS = NS_PER_S  # a capture this far in the past means a clock set back, not a late sample
+REVIVE_S = 0.06  # duration of the blend when lost eyes are found again
+CLOCK_RESET_NS = NS_PER_S  # a capture this far in the past means that the clock was set back
 COMPLETED_NOISE = 2.0  # factor on the standard deviation of a pair with a filled-in eye
-NOISE_FLOOR_M = 2e-5  # smaller covariances from a driver are raised to this: no sensor measures a pupil better
-ESTABLISHED = 3  # samples of a head; fewer may have been a mistake
+NOISE_FLOOR_M = 2e-5  # floor for drivers' covariances, since no sensor measures a pupil better
+ESTABLISHED = 3  # samples after which a head is established; one with fewer may be a mistake
 SIGMA_AHEAD_S = 1.0  # uncertainty is not extrapolated beyond this horizon
 NEAREST_M = 0.1  # nearest distance from the display when weighing depth errors
 PANEL_M = (0.5184, 0.2916)  # default width and height
@@ -48,10 +49,10 @@ class _Head(NamedTuple):
     """Estimated motion of one head after its newest sample."""
 
     capture_ns: int
-    middle: imm.Belief  # between the eyes, frame `stack`
-    half: imm.Belief  # from the middle to the right eye
-    samples: int  # count processed
-    surprise: float  # of the newest (chi²)
+    middle: imm.Belief  # midpoint of the eyes, frame `stack`
+    half: imm.Belief  # vector from the midpoint to the right eye
+    samples: int  # number processed
+    surprise: float  # chi² of the newest sample
 
     def age_s(self, time_ns: int) -> float:
         return (time_ns - self.capture_ns) / NS_PER_S
@@ -68,7 +69,7 @@ class _Sample(NamedTuple):
     capture_ns: int
     middle_m: F64  # (3,)
     half_m: F64  # (3,)
-    noise_m2: F64  # (3, 3) covariance of the middle, and of `half_m`
+    noise_m2: F64  # (3, 3) covariance of the midpoint, and of `half_m`
 
     def begun(self) -> _Head:
         """Start a head from this sample alone."""
@@ -108,10 +109,10 @@ class _Sample(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Shown:
-    """The viewer's head after a sample, and the jump that is still being smoothed out."""
+    """The viewer's head after a sample, and the jump that still has to be smoothed out."""
 
     head: _Head
-    jump_m: F64  # (2, 3) from the measured eyes back to those last shown, at `jump_ns`; decays afterwards
+    jump_m: F64  # (2, 3) from the measured eyes to those last shown, at `jump_ns`; decays afterwards
     jump_ns: int
 
     def eyes_m(self, ahead_s: float, time_ns: int) -> F64:
@@ -127,14 +128,14 @@ class _Other(NamedTuple):
     """A head seen somewhere other than the viewer's position."""
 
     head: _Head
-    may_be_viewer: bool  # whether the viewer could have moved there
+    may_be_viewer: bool  # True if the viewer could have moved there
 
 
 class Tracker:
     """Tracks one viewer's eyes. `update` takes samples as they arrive; `at` returns the eyes at any time.
 
-    The first person seen remains the viewer for as long as they are visible. When eyes return after a loss, the output
-    moves smoothly from the last position shown to the measured one; a change to another person is abrupt.
+    The first person seen remains the viewer while visible. When eyes return after a loss, the output moves smoothly
+    from the last position shown to the measured one. A change to another person is abrupt.
     """
 
     def __init__(
@@ -151,7 +152,7 @@ class Tracker:
         self._other: _Other | None = None
         self._lost_ns: int | None = None
         self._newest_ns = -1
-        self._asked_ns = 0  # latest time that `at` was called for: that of the last picture shown
+        self._asked_ns = 0  # display time of the last picture: the latest argument of `at`
 
     def update(self, points: EyePoints | None, *, capture_ns: int) -> str:
         """Add a sample in the `stack` frame, or None if the sensor saw no face.
@@ -296,9 +297,9 @@ class Tracker:
 def sideways_sigma_m(error_m2: F64, eye_m: F64, *, panel_m: tuple[float, float]) -> float:
     """Sideways standard deviation that affects the picture as much as an eye's (3, 3) covariance does.
 
-    An eye that is d nearer than its estimated distance x affects a display point like a sideways displacement of
-    d·u/x, where u is the distance from that point to the foot of the eye's perpendicular. The mean square over the
-    display is used.
+    If an eye is nearer than its estimated distance x by d, the effect at a display point is that of a sideways
+    displacement of d·u/x, where u is the distance from that point to the foot of the eye's perpendicular. The result is
+    the root mean square over the display.
     """
     x, y, z = max(float(eye_m[0]), NEAREST_M), float(eye_m[1]), float(eye_m[2])
     lever2 = (y * y + z * z + (panel_m[0] ** 2 + panel_m[1] ** 2) / 12) / (x * x)

@@ -1,1 +1,1 @@
-"""Everything that happens in one frame: solver, presenter, pacing, policy, states and statistics."""
+"""The display loop: presenter, solver, pacing, policy, states and statistics."""

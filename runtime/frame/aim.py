@@ -1,4 +1,4 @@
-"""Solver requests: at each refresh, the eyes midway through the next solution's life, and its effort."""
+"""Solver requests: the eyes predicted for the middle of the next solution's display time, and its effort."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from runtime.frame.solver_host import SolverHost
 from runtime.frame.viewer import Viewer
 from runtime.records import F64, Effort, EyesEstimate, EyesLabel, FrameTiming, Solution, SolveRequest
 
-HORIZON_NS = NS_PER_S // 8  # longest prediction beyond this refresh's display time
+HORIZON_NS = NS_PER_S // 8  # longest prediction after this refresh's display time
 SPEED_NS = NS_PER_S // 2  # time constant of the running mean of a head's squared speed
 REQUESTS_KEPT = 256
-CALM_M_S = 0.02  # a seated head sways more slowly; one that moves on purpose is faster
-WORTH = 0.995  # refine only if the expected error drops below this share of the present one
+CALM_M_S = 0.02  # a seated head sways more slowly than this; a deliberate movement is faster
+WORTH = 0.995  # refine only if the expected error falls below this share of the current one
 
 
 class Aim:
     """Builds the solver requests of one run. Single-threaded; never reads a clock."""
 
     def __init__(self, viewer: Viewer, solver: SolverHost, *, period_ns: int, fixed: Effort | None = None) -> None:
-        """fixed: effort of every solution where the settings say `full`, instead of all of the model's."""
+        """fixed: effort of every solution if the setting is `full`; None: all of the model's steps."""
         self._viewer, self._solver, self._period_ns, self._fixed = viewer, solver, period_ns, fixed
         self._chooser = EffortChooser()
-        self._calm_ns: int | None = None  # since when the head has been slower than CALM_M_S
-        self._expected: dict[int, float] = {}  # by target instant: expected squared distance from those eyes, m²
+        self._calm_ns: int | None = None  # time since which the head has been slower than CALM_M_S
+        self._expected: dict[int, float] = {}  # expected squared distance of the true eyes, m², by requested instant
         self._speed2 = 0.0  # (m/s)², running mean
         self._learned: int | None = None  # number of the newest solution whose measures have been used
 
@@ -66,7 +66,7 @@ class Aim:
         self._expected[then_ns] = expected_m2
         while len(self._expected) > REQUESTS_KEPT:
             self._expected.pop(next(iter(self._expected)))
-        # A solution is aligned to newer eyes when shown, so the uncertainty of the present eyes is what counts.
+        # When shown, a solution is aligned to newer eyes, so only the uncertainty of the current eyes matters.
         return SolveRequest(then_ns, then_m, label, eyes.sigma_m, flat_wanted, paused, effort, refined)
 
     def _learn(self, shown: Solution | None, eyes: EyesEstimate) -> None:
@@ -82,14 +82,14 @@ class Aim:
             self._chooser.pictures.learn(shown.measures, shown.effort)
 
     def _middle_ns(self, timing: FrameTiming, cost_ns: int) -> int:
-        """Return the middle of the interval in which a solution begun now is shown.
+        """Return the middle of the time for which a solution started now will be shown.
 
-        It completes after its cost, appears half a period later on average, and lasts until the next one appears.
+        It is complete after its cost, appears half a period later on average, and is shown until the next one appears.
         """
         return timing.photon_ns + cost_ns + (self._period_ns + max(cost_ns, self._period_ns)) // 2
 
     def _eyes_then(self, timing: FrameTiming, eyes: EyesEstimate, *, cost_ns: int) -> tuple[int, F64 | None, EyesLabel]:
-        """Return the instant to solve for and the eyes then, predicted only as far as the tracker is reliable."""
+        """Return the instant to solve for and its predicted eyes, no farther ahead than the tracker is reliable."""
         middle_ns = self._middle_ns(timing, cost_ns)
         reach_ns = min(middle_ns, timing.photon_ns + HORIZON_NS)
         then = self._viewer.ahead(reach_ns) if eyes.eyes_m is not None else eyes
@@ -117,7 +117,7 @@ class Aim:
         return outlook
 
     def _horizon_s(self, timing: FrameTiming, *, speed_m_s: float) -> float:
-        """Return the time the present motion is assumed to continue; for a calm head, as long as it has been calm."""
+        """Return how long the current motion is assumed to continue: for a calm head, as long as it has been calm."""
         if speed_m_s > CALM_M_S:
             self._calm_ns = None
             return HORIZON_S

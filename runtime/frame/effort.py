@@ -1,7 +1,7 @@
 """Choice of each solution's effort: the raster and step count with the least expected error.
 
-A solution that takes c seconds stays on the panels for T = max(c, refresh period) and is computed for the eyes midway
-through that interval. Averaged over its life, its squared error in light at the true eyes is that for a viewer
+A solution that takes c seconds stays on the panels for T = max(c, refresh period) and is computed for the eyes at the
+middle of that interval. Averaged over that time, its squared error of light at the true eyes is the error for a viewer
 who keeps still plus that of a stale view (docs/mathematics.md, "Effort"):
 
     J = Q(raster, steps) + D(sqrt(2·sigma² + v²·T²/12 + l²), T/sqrt(12)),
@@ -24,11 +24,11 @@ from dataclasses import dataclass, field
 from runtime.records import Effort, Measures
 
 SOLVING_STAGES = ("render", "prepare", "inference", "finish", "step")
-HORIZON_S = 1.0  # time over which head and content are assumed to continue as they are
-EQUAL = 1.03  # of efforts whose expected errors differ by less, the fastest is chosen
-PREFERRED = 0.93  # switch effort only if its expected error is below this share of the present one's
+HORIZON_S = 1.0  # time for which head and content are assumed to continue as they are
+EQUAL = 1.03  # among efforts whose expected errors differ by less, choose the fastest
+PREFERRED = 0.93  # switch effort only if its expected error is below this share of the current one's
 GAIN = 0.2  # weight of the newest measurement in a running mean
-KEPT_SOLUTIONS = 100  # a raster's times are forgotten after this many solutions on others: the load has changed
+KEPT_SOLUTIONS = 100  # forget a raster's times after this many solutions on others, since the load may have changed
 # Squared error in light after k steps, relative to no steps: solver `best`, mean of the scenes demo and texture at
 # 960x540, with a tracking error of 2 mm.
 STEP_SHARES = (1.0, 0.77, 0.61, 0.58, 0.53, 0.53, 0.51, 0.51, 0.51)
@@ -40,11 +40,11 @@ FIRST_DETAIL = {
     4: 6e-3,
 }  # squared error due to a coarse raster's lost detail; initial values
 FIRST_RATE = 0.5  # per m, from the demo scene
-BLUR_M = 4e-3  # d0: beyond it, outlines are off by more than they are blurred, and the error grows linearly
+BLUR_M = 4e-3  # d0: beyond it, outlines are displaced by more than their blur, and the error grows linearly
 FIRST_CONTRAST = 0.03
 FORESIGHT_GAIN = 1 / 60  # weight of the newest refresh
 LEAST_SCALE, MOST_SCALE = 0.02, 4.0
-TAIL = 0.02  # slope in y that remains at saturation, so that nearer stays better
+TAIL = 0.02  # slope in y that remains at saturation, so that a smaller distance is always better
 SCALE_M, SCALE_S = 5e-3, 0.1  # units of displacement and time in the fit of the rates
 
 
@@ -68,7 +68,7 @@ def simulated_costs(stage_ms: Mapping[str, float], reductions: Iterable[int]) ->
 
 
 class CostBook:
-    """Running means of stage times by raster; those of rasters long unused are forgotten."""
+    """Running means of stage times by raster. Those of rasters that have long been unused are forgotten."""
 
     def __init__(self, first: Mapping[int, Mapping[str, float]]) -> None:
         """first: times by reduction and stage, measured with full pictures before the first refresh."""
@@ -93,8 +93,9 @@ class CostBook:
     def costs(self) -> Costs:
         """Return the current costs.
 
-        Rasters without measurements are scaled like the measured ones, and taken to be cheaper than the next finer
-        one by at least the ratio of their widths: a first time that other work delayed must not exclude them.
+        Costs of rasters without measurements are scaled like those of the measured ones. They are at most those of the
+        next finer raster divided by the ratio of the widths, so that a first time which other work delayed does not
+        exclude them.
         """
         measured_ms = sum(sum(stages.values()) for stages in self._measured.values())
         first_ms = sum(self._first.get(by, {}).get(s, 0.0) for by, stages in self._measured.items() for s in stages)
@@ -113,14 +114,14 @@ class CostBook:
 
 @dataclass(frozen=True, slots=True)
 class Outlook:
-    """Tracker's forecast for one effort: the eyes midway through its life."""
+    """The tracker's forecast for one effort: the eyes in the middle of the solution's display time."""
 
     sigma_m: float = 0.0  # standard deviation per axis of the point midway between the eyes
     speed_m_s: float = 0.0
-    lag_m: float = 0.0  # distance the head moves beyond the tracker's horizon
+    lag_m: float = 0.0  # distance that the head moves beyond the tracker's horizon
 
     def moved_m2(self, life_s: float) -> float:
-        """Return the mean squared distance between a solution's eyes and the true ones over its life."""
+        """Return the mean squared distance between a solution's eyes and the true ones while it is shown."""
         return 2 * self.sigma_m**2 + (self.speed_m_s * life_s) ** 2 / 12 + self.lag_m**2
 
 
@@ -235,13 +236,14 @@ class EffortChooser:
     def mean_error(self, error: float, cost_ms: float, *, shown_error: float, horizon_s: float) -> float:
         """Average the displayed picture's error until completion and the solution's error afterwards.
 
-        A head that starts to move meanwhile sees a stale view until then: with probability c/H, for c/2 on average.
+        If the head starts to move meanwhile, the view is stale until completion: with probability c/H, for c/2 on
+        average.
         """
         waited = min(cost_ms / 1e3 / horizon_s, 0.9)
         return waited * shown_error + (1 - waited) * error + waited**2 / 2 * self.pictures.contrast
 
     def expected_error(self, effort: Effort, outlook: Outlook, *, life_s: float) -> float:
-        """Return J, the mean squared error in light over a solution's life."""
+        """Return J, the mean squared error of light while the solution is shown."""
         spread_s = life_s / 12**0.5
         moved_m = (self.foresight.scale * outlook.moved_m2(life_s)) ** 0.5
         return self.pictures.own(effort) + self.pictures.stale(moved_m, spread_s)

@@ -1,4 +1,4 @@
-"""Kept light: the panels' layers at every N-th refresh, and the target pictures for comparison."""
+"""Kept light (`--keep-light`): the panels' layers at every N-th refresh, with target pictures for comparison."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class KeptLight:
         kept = _Kept(account, solved_for_ns, self._drawer.shown_content())
         if self._truth.is_recorded:
             self._kept.append(kept)
-        else:  # a live run ends with a signal, leaving no time to draw afterwards
+        else:  # a live run ends with a signal, so there is no time to draw afterwards
             self._draw(kept, lambda: None)
 
     def finish(self, stopped: Callable[[], bool]) -> None:

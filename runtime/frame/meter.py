@@ -1,4 +1,4 @@
-"""Sampled measures of solutions on the solver's thread: error, lost detail and rate of change."""
+"""Sampled measurements of solutions on the solver's thread: error, lost detail and rate of change."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from runtime.support.gl import DrawnPicture
 RAYS = 1024  # per eye
 SAMPLED = 54, 96  # rows and columns of the grid for comparing successive pictures
 BAND_ROWS = 64  # height of each of the two bands in which detail is measured
-EVERY = 4  # residual and detail are measured in one of this many solutions of an effort
+EVERY = 4  # residual and detail are measured for one in this many solutions of an effort
 
 
 class SolutionMeter:
     """Measures solutions, and compares each with samples of the previous pictures."""
 
     def __init__(self) -> None:
-        self._before: tuple[tuple[int, ...], list[U8], Job, int] | None = None  # raster and window, pictures, time
+        self._before: tuple[tuple[int, ...], list[U8], Job, int] | None = None  # raster and window, pictures, job, time
         self._counts: dict[Effort, int] = {}
         self._places = np.random.default_rng(1).random((2, RAYS, 2))
 
@@ -108,7 +108,7 @@ def _lost(band: U8, reduction: int) -> float:
 
 
 def _halved(picture: U8) -> U8:
-    """Average 2 x 2 pixels, so that the comparison's own interpolation hardly counts."""
+    """Average 2 x 2 pixels, which reduces the effect of the comparison's own interpolation."""
     height, width = picture.shape[:2]
     if min(height, width) < 2:
         return picture.copy()

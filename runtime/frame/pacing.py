@@ -1,6 +1,6 @@
 """Pacing: wake, present and display times of refreshes, predicted from vertical blanks.
 
-It is pure: callers pass in times and events, and it never reads a clock. The scheme follows Monado's compositor pacing:
+It reads no clock: callers pass in times and events. The scheme follows Monado's compositor pacing:
 predict, report events, learn the phase of the blanks and the time a refresh needs before one.
 """
 
@@ -11,9 +11,9 @@ from runtime.records import FrameTiming
 
 PHASE_GAIN = 0.1  # gain of the newest blank's error in the predicted phase
 WORK_GAIN = 0.05  # decay of the work-time estimate (increases use gain 0.5)
-LATE_SHARE = 0.5  # of a period; a refresh later than this moves to the next slot
+LATE_SHARE = 0.5  # share of a period; a refresh that is later than this moves to the next slot
 MARGIN_GROWTH = 1.5  # factor on the margin after a missed blank
-MARGIN_DECAY = 0.9995  # factor per met blank; if drawing needs more than the minimum, one blank in 800 is missed
+MARGIN_DECAY = 0.9995  # factor per met blank; if drawing exceeds the minimum margin, one blank in 800 is missed
 MARGIN_MIN_NS = NS_PER_MS
 
 
@@ -24,14 +24,14 @@ class Pacer:
     """
 
     def __init__(self, *, period_ns: int, photon_ns: int, work_ns: int = 0) -> None:
-        """photon_ns: from presenting to the middle of the light; work_ns: initial estimate, waking to presenting."""
+        """photon_ns: from presenting to mid-light; work_ns: initial estimate of the time from waking to presenting."""
         if period_ns <= 0:
             raise ValueError("a period must be positive")
         self.period_ns, self._photon_ns = period_ns, photon_ns
         self._work_ns = float(work_ns)
         self._margin_ns = float(MARGIN_MIN_NS)
         self._has_blanks = False
-        self._target_ns: int | None = None  # of the last refresh
+        self._target_ns: int | None = None  # target of the last refresh
         self._number = -1
         self.missed = 0
 

@@ -1,7 +1,7 @@
 """Decisions on what to solve and show (flat, solved, reuse): pure functions without clock or I/O.
 
-Stillness is decided in one place, by the rest watch on the sensor's samples (`eyes.rest`): eyes labelled `rested` are
-solved for once; any other change of position gets a new solution.
+Only the rest watch on the sensor's samples (`eyes.rest`) decides whether a head is still. Eyes labelled `rested` are
+solved for once. Any other change of position gets a new solution.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ class SolutionKey:
     """Inputs of the newest solution or flat picture."""
 
     state_version: int
-    revision: int  # of the content
-    eyes_m: F64 | None  # (2, 3) solved for; None: flat picture
-    effort: Effort | None = None  # of the solution
+    revision: int  # the content's revision
+    eyes_m: F64 | None  # (2, 3) eyes solved for; None: flat picture
+    effort: Effort | None = None  # the solution's effort
     episode: int = 0  # number of the current flat episode; the flat picture keeps one viewpoint throughout it
 
 
@@ -34,7 +34,7 @@ class Decision:
     """The solver's next action."""
 
     kind: Kind
-    eyes_m: F64 | None = None  # (2, 3) to solve for
+    eyes_m: F64 | None = None  # (2, 3) eyes to solve for
 
 
 class FramePolicy:

@@ -1,7 +1,7 @@
 """Presenter's loop: receive, map, predict, align, present, account. It waits only for its slot.
 
-The solver works alongside it (`solver_host`) and hands over complete solutions; every refresh shows the newest one,
-aligned to the eyes' predicted position at its display time.
+The solver (`solver_host`) runs in parallel and hands over complete solutions. Every refresh shows the newest one,
+aligned to the eyes predicted for its display time.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ log = logging.getLogger("phasestack.presenter")
 
 
 class Supervisor:
-    """Hooks that connect the presenter to the outside, called once per refresh; they must not wait."""
+    """Hooks through which the daemon controls the presenter. They are called once per refresh and must not wait."""
 
     def stop_reason(self) -> str:
         """Return the reason to stop, or an empty string to continue."""
@@ -110,7 +110,7 @@ class RefreshTimes:
 
 
 class Presenter:
-    """Presents one run. The caller owns the parts that it passes in; the presenter only its counters."""
+    """Presents one run. The caller owns the parts that it passes in. The presenter owns only its counters."""
 
     def __init__(
         self,
@@ -146,7 +146,7 @@ class Presenter:
         self._presented = False
         self._shown_solution: int | None = None  # number of the solution shown at the previous refresh
         self._drew_solution = False  # True once any solution has been on the panels
-        self._aligned: tuple[int, bytes, Alignment] | None = None  # solution, eyes
+        self._aligned: tuple[int, bytes, Alignment] | None = None  # solution number, eyes, and their alignment
 
     def run(self, *, frames: int | None = None) -> str:
         """Refresh until the recording ends, `frames` are done or a stop is requested. Returns the reason."""
@@ -179,7 +179,7 @@ class Presenter:
         times.lap("track")
         report, lost = self._present(frame)
         times.lap("present")
-        if report is not None and times.simulated:  # the clock has only now advanced by the cost of presenting
+        if report is not None and times.simulated:  # only now has the clock advanced by the cost of presenting
             report = replace(report, present_ns=self.clock.now_ns())
         photon_ns = self._presented_at(timing, report, woke_ns=woke_ns)
         request = self._aim.request(
@@ -211,7 +211,7 @@ class Presenter:
                 observer.sampled(sample)
 
     def _compose(self, timing: FrameTiming, eyes: EyesEstimate, news: SolverUpdate) -> tuple[PanelFrame, str]:
-        """Return the frame for the panels and the reason the alignment is at its limit (empty: it is not)."""
+        """Return the frame for the panels, and the reason if the alignment is at its limit."""
         solution, flat = news.solution, news.flat
         target = 1.0 if eyes.eyes_m is None or self.flat_asked else 0.0
         if solution is None:
@@ -311,7 +311,7 @@ class Presenter:
         state: State,
         times: RefreshTimes,
     ) -> RefreshAccount:
-        solution = news.solution if report is not None and frame.flatness < 1.0 else None  # only if visible
+        solution = news.solution if report is not None and frame.flatness < 1.0 else None  # only if it is visible
         ran = solution is not None and solution.number != self._shown_solution
         stage_ms = dict(times.stage_ms)
         if solution is not None and ran:

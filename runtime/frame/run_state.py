@@ -35,7 +35,7 @@ class RunCell:
     ) -> None:
         self._lock = threading.Lock()
         self._numbers = count(1)
-        self.generation = 0  # of the newest solver
+        self.generation = 0  # number of the newest solver
         self.state = RunState(0, settings, calibration, content, predictor)
 
     def next_number(self) -> int:

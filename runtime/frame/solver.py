@@ -1,4 +1,4 @@
-"""Solver, which draws content and computes layers for the predicted eyes, on its GL context's thread."""
+"""The solver: draws content and computes layers for the predicted eyes, on the thread of its GL context."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ FLAT_EYE_M = (0.7, 0.0, 0.0)  # viewpoint of the flat picture before any viewer 
 
 @dataclass(frozen=True, slots=True)
 class SolverUpdate:
-    """Result of one request; in the news, the newest results so far."""
+    """Results of one request or, in the news, the newest results so far."""
 
     solution: Solution | None = None  # new solution for two eyes
     flat: Solution | None = None  # a new flat picture
@@ -52,8 +52,8 @@ class Solver:
         self._policy = FramePolicy()
         self._solved: SolutionKey | None = None
         self._flat: SolutionKey | None = None
-        self._windows: dict[int, SolveWindow | None] = {}  # windows of the newest solutions, by reduction
-        self._kept: Job | None = None  # with private copies of its pictures; None: must be drawn
+        self._windows: dict[int, SolveWindow | None] = {}  # windows that the newest solutions covered, by reduction
+        self._kept: Job | None = None  # the last job, with copies of its pictures; None: pictures must be drawn
         self._meter = SolutionMeter()
         self._middle_m: F64 = np.array(FLAT_EYE_M)
         self._missing: dict[str, str] = {}
@@ -85,7 +85,7 @@ class Solver:
             effort = wanted or Effort(1, state.predictor.steps)
             return self._solve(state, request, job.eyes_m, effort, revision=revision)
         if request.eyes_m is not None and not request.paused:
-            self._missing = {}  # the newest solution already answers the request
+            self._missing = {}  # the newest solution already satisfies the request
         return SolverUpdate(missing=dict(self._missing))
 
     def _solve(

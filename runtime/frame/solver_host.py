@@ -1,4 +1,4 @@
-"""Solver hosts: the presenter's interface to a solver, and the host for a simulated clock."""
+"""The presenter's interface to a solver, and its implementation for a simulated clock."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from runtime.records import SolveRequest
 
 FIRST_REQUEST = SolveRequest(0, None, "none", 0.0, flat_wanted=True)  # before the first refresh: flat picture
 
-SHOWN_STAGES = ("render", "prepare", "inference", "finish")  # in frames.jsonl; steps count as `finish`
+SHOWN_STAGES = ("render", "prepare", "inference", "finish")  # stages in frames.jsonl; steps count as `finish`
 
 
 class SolverParts(Protocol):
@@ -62,7 +62,7 @@ class SolverHost(ABC):
 
 
 def taken_in(news: SolverUpdate, step: SolverUpdate) -> SolverUpdate:
-    """Return the news updated with a step's results, if any, and its failures."""
+    """Return the news, updated with a step's results and failures."""
     return SolverUpdate(step.solution or news.solution, step.flat or news.flat, step.missing)
 
 

@@ -23,14 +23,14 @@ from runtime.support.untrusted_input import LIMITS
 
 log = logging.getLogger("phasestack.solver")
 
-LATE_S = 0.5  # a longer step is late; a single one of twice this is a fault
+LATE_S = 0.5  # a longer step is late; a single step of twice this is a fault
 ABANDON_S = 10.0  # a step that takes longer is abandoned and a new solver started
 # Starting a solver may take `LIMITS.start_s`; a task, which loads content, `LIMITS.load_s`.
 IDLE_S = 0.02  # interval between checks for tasks while requests are absent
-USUAL_S = 0.2  # time allowed at the end for a running step to finish
+USUAL_S = 0.2  # time that a running step gets to finish at the end
 LATE_STEPS = 3  # this many consecutive late steps raise a fault, this many on time clear it
 ANSWER_STEP_MS = 500  # resolution of the reported time without an answer
-ABANDONED_MAX = 4  # most hung threads at a time; beyond it no new solver is started
+ABANDONED_MAX = 4  # hung threads; with more, no new solver is started
 
 
 class _Attempt:
@@ -86,7 +86,7 @@ class SolverThread(SolverHost):
 
     @property
     def costs(self) -> Costs:
-        return self._costs or Costs(defaultdict(dict))  # a run that is stopped while it starts asks once, too
+        return self._costs or Costs(defaultdict(dict))  # needed once if a run is stopped while it starts
 
     def post(self, request: SolveRequest) -> None:
         with self._lock:
@@ -157,7 +157,7 @@ class SolverThread(SolverHost):
 
     def _live(self, attempt: _Attempt) -> None:
         self._run(attempt)
-        if not self._closing.is_set():  # hundreds of MiB that the next solver's thread could not reuse
+        if not self._closing.is_set():  # return hundreds of MiB that the next solver's thread could not reuse
             give_back()
 
     def _run(self, attempt: _Attempt) -> None:
@@ -190,11 +190,11 @@ class SolverThread(SolverHost):
                 if request is not None:
                     self._step(attempt, parts, request)
         except (ContextLost, Stopped) as error:
-            log.error("solver: %s", _line(error))  # logged as text: the error's frames keep large objects alive
+            log.error("solver: %s", _line(error))  # log only text, because the error's frames keep large objects alive
             attempt.error, attempt.busy_since_ns = error.with_traceback(None), self._clock.now_ns()
         except ThreadAbandoned:
             raise
-        except BaseException as error:  # not an expected failure of a step: a bug here or in a library
+        except BaseException as error:  # not an expected failure, but a bug here or in a library
             log.exception("solver")
             attempt.error, attempt.busy_since_ns = error.with_traceback(None), self._clock.now_ns()
         finally:

@@ -19,12 +19,12 @@ class Conditions:
     """Conditions that are observed in one turn of the loop."""
 
     eyes: EyesLabel
-    missing: dict[Part, str]  # failed parts, with a short reason; empty: all is well
+    missing: dict[Part, str]  # failed parts, with a short reason
     presented: bool  # True once any frame has been on the panels
     flat_wanted: bool = False  # the operator asked for the 2D picture
     stopping: str = ""  # reason for stopping; empty: not stopping
     limited: str = ""  # reason the alignment to the eyes is at its limit; empty: it is not
-    late: str = ""  # shortfall of refreshes against the display's rate; empty: none
+    late: str = ""  # number of refreshes if too few for the display's rate, otherwise empty
     paused: bool = False  # the operator froze the picture; it is still aligned to the eyes
 
 
@@ -74,7 +74,7 @@ class StateMachine:
             return False
         before = self.name
         self.state, reason = judge(conditions)
-        self.reason = without_secrets(reason)  # it may contain a camera's address and is widely published
+        self.reason = without_secrets(reason)  # it may contain a camera's address, and many programs can read it
         self.missing = tuple(part for part in PARTS if part in conditions.missing)
         return self.name != before
 
@@ -88,7 +88,7 @@ class StateMachine:
 WINDOW_NS = NS_PER_S
 LATE_SHARE = 0.9  # share of a second's refreshes below which the display is late
 WELL_SHARE = 0.95  # share from which it is on time again
-REFRESHES_MAX = 1024  # most refreshes in the window
+REFRESHES_MAX = 1024  # most refreshes counted in the window
 
 
 class Lateness:

@@ -60,7 +60,7 @@ class RunStats:
         self._overhead_run, self._skew, self._age, self._sigma = Quantiles(), Quantiles(), Quantiles(), Quantiles()
         self._view_error = Quantiles()
         self._efforts_ns: dict[str, int] = {}
-        self._effort: str | None = None  # shown since the last refresh, by name
+        self._effort: str | None = None  # effort shown since the last refresh
         self._recent: deque[tuple[int, bool, bool]] = deque(maxlen=NOW_KEPT)  # time, presented, shows a new solution
 
     def add(self, account: RefreshAccount, *, overhead_ms: float, missed_blanks: int = 0) -> None:

@@ -1,4 +1,4 @@
-"""Target retina pictures, drawn on the solver's thread in its GL context."""
+"""Target pictures for the eyes, drawn on the solver's thread in its GL context."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import retina_pictures
 from runtime.records import F64
 
-Wanted = Mapping[str, tuple[F64, int]]  # by field of `RefreshTargets`: eyes (2, 3), frame `stack`, and an instant
+Wanted = Mapping[str, tuple[F64, int]]  # for each field of `RefreshTargets`: eyes (2, 3), frame `stack`, and an instant
 
 
 class TargetDrawer:

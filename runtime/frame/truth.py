@@ -8,7 +8,7 @@ from runtime.clock import NS_PER_S
 from runtime.records import F64
 
 GAP_NS = NS_PER_S // 5  # longer gaps are not interpolated
-KEPT = 512  # samples: eight seconds at 60 Hz
+KEPT = 512  # samples kept: eight seconds at 60 Hz
 
 
 class TrueEyes:
@@ -20,7 +20,7 @@ class TrueEyes:
 
     @property
     def is_recorded(self) -> bool:
-        """Return True once any sample has had true eyes, which a live sensor never provides."""
+        """True once a sample has contained true eyes, which a live sensor never does."""
         return bool(self._known)
 
     def add(self, capture_ns: int, eyes_m: F64) -> None:

@@ -1,4 +1,4 @@
-"""Viewer's eyes at any instant, from sensor samples: calibration, tracking, detection of rest."""
+"""The viewer's eyes at any instant, from sensor samples: calibration, tracking and detection of rest."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ IN_FRONT_M = 0.01  # eyes nearer to the front panel than this, or behind it, are
 
 
 class Viewer:
-    """One viewer's eyes in the `stack` frame. Single-threaded; never reads a clock."""
+    """The viewer's eyes in the `stack` frame. Single-threaded; never reads a clock."""
 
     def __init__(
         self, settings: Settings, calibration: Calibration, *, front_m: float, in_stack_frame: bool = False
@@ -56,7 +56,7 @@ class Viewer:
 
     @property
     def refused(self) -> Mapping[str, int]:
-        """Return the number of rejected samples by reason. Each counts once."""
+        """Return the number of rejected samples by reason."""
         return self._refusals.counts
 
     @property

@@ -1,1 +1,1 @@
-"""Optics of the display: pure functions of arrays, with frames, units and equation numbers."""
+"""Optics of the display as pure functions of arrays. Names and docstrings state frames, units and equations."""

@@ -26,11 +26,11 @@ from runtime.optics.relief import Displacement, displacement, parallax
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8, PanelFrame, Parallax
 
-FARTHEST_M = 1e6  # limit of any coordinate; beyond it counts as not finite
+FARTHEST_M = 1e6  # coordinates beyond this count as not finite
 NEAREST_M = 0.01  # least distance of an eye from the front panel
-MOST_SHIFT = 0.5  # largest shift of a panel's middle, of its width or height
+MOST_SHIFT = 0.5  # largest shift of a panel's middle, in panel widths or heights
 MOST_SCALE = 2.0  # largest enlargement or reduction of a panel
-ROWS = 32  # rows resampled together, so that their float32 pixels fit a core's cache
+ROWS = 32  # rows resampled together, so that their float32 pixels fit in a core's cache
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,8 +38,8 @@ class Alignment:
     """Maps with which each panel is drawn for the current eyes."""
 
     solved_from_shown: tuple[F64, ...]  # per panel (3, 3), a scale and a shift: pixels of the solved layer from shown
-    limited: str = ""  # why it is at its limit, with the eyes too far from those solved for; empty: it is not
-    parallax: Parallax | None = None  # of content off the middle panel; None: the eyes are those solved for
+    limited: str = ""  # reason if it is at its limit, because the eyes have moved too far; otherwise empty
+    parallax: Parallax | None = None  # motion of content off the middle panel; None: the eyes are those solved for
 
 
 def reference_x_m(stack: PanelStack) -> float:
@@ -61,7 +61,7 @@ def align(stack: PanelStack, *, solved_for_m: F64, eyes_m: F64) -> Alignment:
     old, new = _middle(solved_for_m), _middle(eyes_m)
     share, limited = 1.0, ""
     for most, least, why in _limits(stack, solved_for_m, eyes_m, old=old, new=new):
-        # Every limit has the form share · most <= least.
+        # Every limit has the form share · most <= least, where share is the part of the movement that is allowed.
         reach = 0.0 if least < 0.0 else 1.0 if most <= least else least / most
         if reach < share:
             share, limited = reach, why
@@ -144,7 +144,7 @@ def _solved_from_shown(stack: PanelStack, index: int, *, old: F64, step: F64) ->
     # The pixels' origin is the top left corner, not the middle.
     matrix[0, 2] = (raster.left_m * magnified + shift_m[0]) / raster.pitch_u_m
     matrix[1, 2] = -(raster.top_m * magnified + shift_m[1]) / raster.pitch_v_m
-    matrix += 0.0  # no negative zeros
+    matrix += 0.0  # avoids negative zeros
     return matrix
 
 
@@ -196,7 +196,7 @@ def _resampled(layer: U8, matrix: F64, rest: int, *, size: tuple[int, int]) -> I
     for begin in range(0, size[0], ROWS):
         strip = slice(begin, min(begin + ROWS, size[0]))
         first, weight = rows[strip], down[strip, None, None]
-        low, high = int(first.min()), int(first.max()) + 2  # in padded rows
+        low, high = int(first.min()), int(first.max()) + 2  # rows of the padded layer
         source = np.full((high - low, width + 2, 4), rest, np.float32)
         source[..., 3] = 255.0
         inside = slice(max(low, 1), min(high, height + 1))
@@ -204,7 +204,7 @@ def _resampled(layer: U8, matrix: F64, rest: int, *, size: tuple[int, int]) -> I
             inside.start - 1 : inside.stop - 1
         ]
         lines = _between(source.take(first - low, axis=0), source.take(first + 1 - low, axis=0), weight)
-        # A pixel of four floats is gathered as one number.
+        # Gather each pixel of four floats as one number.
         pixels = lines.view(np.complex128)[..., 0]
         left, right = (
             pixels.take(columns + k, axis=1).view(np.float32).reshape(*pixels.shape[:1], size[1], 4) for k in (0, 1)
@@ -219,7 +219,7 @@ def _displaced(
     su, sv, tu, tv = scale_and_shift(matrix)
     height, width = layer.shape[:2]
     by_u, by_v, extended = width / size[1], height / size[0], int((height, width) != size)
-    # Outside is the resting code, and around a coarse layer first a pixel of its edge.
+    # Outside is the rest code. A coarse layer is first extended by one pixel of its edge.
     padded = np.pad(layer, ((extended, extended), (extended, extended), (0, 0)), mode="edge")
     padded = np.pad(padded, ((1, 1), (1, 1), (0, 0)), constant_values=rest).astype(np.float32)
     padded[..., 3] = 255.0

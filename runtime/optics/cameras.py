@@ -1,4 +1,4 @@
-"""Resampling of pictures from cameras at the eyes as if these looked at the stack's origin."""
+"""Resampling of pictures from arbitrary cameras, as seen by eyes that look at the stack's origin."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import stack_from_eye
 from runtime.records import F32, F64, U8
 
-OUTSIDE_MOST = 1 / 3  # share of a picture outside the panels; more raises a doubt
+OUTSIDE_MOST = 1 / 3  # largest share of a picture outside the panels before a warning
 LEAST_PX = 16  # side of a resampled picture
-EXACT = 1e-6  # of the focal length: cameras that differ by less are equal
-DIGITS = 9  # of metres and degrees: recovers the values that a camera matrix was built from
+EXACT = 1e-6  # cameras that differ by less, relative to the focal length, count as equal
+DIGITS = 9  # decimals of metres and degrees, which recover the values that a camera matrix was built from
 NAMES = ("left", "right")
 Picture = U8 | F32  # (h, w, 3)
 
@@ -82,7 +82,7 @@ def looking_at_origin(
     size = [max(LEAST_PX, round(2 * focal_px * side)) for side in half]
     focal_px = size[0] / 2 / half[0]
     direction = np.array([[1, 0, 0.5 - size[0] / 2], [0, 1, 0.5 - size[1] / 2], [0, 0, focal_px]]) / focal_px
-    centres = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])  # OpenCV's pixel centres are whole numbers
+    centres = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])  # OpenCV's pixel centres are integers
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
     turned: list[Picture] = []
     for picture, matrix in zip(pictures, pixels_from_gaze, strict=True):

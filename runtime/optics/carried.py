@@ -1,7 +1,7 @@
 """Carried, expected and light quality, at eyes other than those solved for (docs/contracts.md).
 
-The picture that the layers were solved for is carried along on the centre panel: the ray of each of its pixels is
-replaced by the ray from the true eye through the same point of that panel. Ghosts and colour fringes count as errors.
+The picture that the layers were solved for is treated as painted on the centre panel: each pixel's ray is replaced by
+the ray from the true eye through the same point of that panel. Ghosts and colour fringes count as errors.
 The parallax between nominal and true eye, which no shift of the layers can add, does not count. A stale view is
 not counted here; live quality counts it (`evaluation.refresh_quality`).
 """
@@ -21,7 +21,7 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import stack_from_eye
 from runtime.records import F32, F64, U8
 
-PLENTY = 3_000_000  # values in a picture that allow sparser sampling
+PLENTY = 3_000_000  # pictures with more values than this are sampled more sparsely
 
 
 def carried_db(
@@ -50,8 +50,8 @@ def carried_db(
 class AtEyes(TypedDict):
     """Eyes at which an expected quality is measured."""
 
-    eyes_m: ArrayLike  # (2, 3) that the layers were solved for
-    fov_deg: float  # of the pictures
+    eyes_m: ArrayLike  # (2, 3) eyes that the layers were solved for
+    fov_deg: float  # field of view of the pictures
     sigmas_mm: Sequence[float]  # tracking errors
     seen_from_m: NotRequired[ArrayLike | None]  # (2, 3) true positions of the eyes; by default the same
 
@@ -64,14 +64,14 @@ def expected_errors(
     sampling: Sampling | None = None,
     **at: Unpack[AtEyes],
 ) -> dict[float, F64]:
-    """Carried squared error, expected over normal tracking errors: of all rows, then of groups.
+    """Expected carried squared error over normal tracking errors, for all rows and then for groups of rows.
 
-    For each standard deviation to the right and up, by five points: no error with weight 1/2, two standard deviations
-    to either side with 1/8 each, which is exact for second moments. drawn: an (h, w, 3) picture for each of the eyes
-    (2, 3) that the layers were solved for. sampling: None: light, the figure to quote, with four times as many rays a
-    pixel in a picture of fewer values than `PLENTY`. Moved eyes get a quarter of the rays, which is exact to 0.02 dB:
-    in a picture of `PLENTY` every second pixel of every second row, otherwise, for light, two rays instead of four.
-    Other arguments and errors as for `carried_db`.
+    For each standard deviation, to the right and up, it is evaluated at five points: no error with weight 1/2, and two
+    standard deviations to either side with weight 1/8 each. This is exact for second moments. drawn: an (h, w, 3)
+    picture for each of the eyes (2, 3) that the layers were solved for. sampling: None: light, the figure to quote,
+    with four times as many rays a pixel in a picture of fewer values than `PLENTY`. Moved eyes get a quarter of the
+    rays, which is exact to 0.02 dB: in a picture of `PLENTY` every second pixel of every second row, otherwise, for
+    light, two rays instead of four. Other arguments and errors as for `carried_db`.
     """
     chosen = sampling or (LIGHT if drawn[0].size > PLENTY else LIGHT._replace(rays=2 * LIGHT.rays))
     seen_from_m = at.get("seen_from_m")

@@ -14,12 +14,13 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
 from runtime.records import F32, F64, U8
 
-WIDTH_PX = 256  # of the middle panel's raster that pictures are matched on
+WIDTH_PX = 256  # width of the raster on the middle panel that pictures are matched on
 REACH_PX = WIDTH_PX // 4  # largest disparity searched, in either direction
-# Times the outer panels' disparity. Blocks of strong contrast keep 35 dB of 38 at 2, 30 at 3, 26 at 4 (light, 1 mm).
+# In units of the outer panels' disparity. High-contrast blocks have 35 dB of light (1 mm) at 2, 30 at 3 and 26 at 4,
+# instead of 38.
 SHOWN_MOST = 2.5
-TOO_MUCH = 0.1  # share of a picture beyond `SHOWN_MOST` that is reported
-ROLLED, TURNED = 0.05, 0.2  # slopes of the line between the eyes up to which picture rows correspond
+TOO_MUCH = 0.1  # least share of a picture beyond `SHOWN_MOST` that is reported
+ROLLED, TURNED = 0.05, 0.2  # largest slopes of the line between the eyes for which picture rows correspond
 LEAST_MATCHED = 0.1  # share of the panel that must be matched
 
 
@@ -57,9 +58,9 @@ def disparities_m(pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, 
 def disparity_doubts(
     pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, *, fov_deg: float, parallel: bool = True
 ) -> list[str]:
-    """Why eyes (2, 3) will see ghosts of these pictures, one line; empty: no reason is found.
+    """Explain in one line why eyes (2, 3) will see ghosts of these pictures; empty if no reason is found.
 
-    parallel: the pictures may be a rectified pair's, of parallel cameras, given by mistake for the eyes' own.
+    parallel: the pictures may be a rectified pair from parallel cameras, passed by mistake as the eyes' own views.
     """
     found_m = disparities_m(pictures, eyes_m, stack, fov_deg=fov_deg)
     if len(found_m) < LEAST_MATCHED * WIDTH_PX**2 * stack.height_m / stack.width_m:

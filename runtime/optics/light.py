@@ -27,16 +27,16 @@ from runtime.optics.tilt import layer_from_seen, layer_pixels_from_seen
 from runtime.optics.views import stack_from_eye
 from runtime.records import F32, F64, U8
 
-RINGS = 9  # of points of the pupil, one for each ray: 271 are as good as a disc
+RINGS = 9  # rings of points on the pupil, one point for each ray: 271 points are as good as a disc
 
 
 class Sampling(NamedTuple):
     """The rays along which the squared error is measured."""
 
-    rays: int = 2  # across and down a pixel, in each of the two sets; 0: one ray, bilinear
+    rays: int = 2  # rays across and down a pixel, in each of the two sets; 0: one ray, bilinear
     pupil_mm: float = PUPIL_MM  # diameter; 0: a point
     step: int = 1  # every `step`-th pixel of every `step`-th row
-    groups: int = 0  # of rows, for the standard error
+    groups: int = 0  # groups of rows, for the standard error
 
 
 LIGHT = Sampling()
@@ -47,10 +47,10 @@ class LightView(NamedTuple):
     """One eye's picture and the geometry of its rays."""
 
     target: F32  # (h, w, 3) intensities
-    centre_from_image: F64  # (3, 3) pixels of the centre panel
-    panels_from_centre: F64  # (points of the pupil, N, 3, 3) pixels of the panels
+    centre_from_image: F64  # (3, 3) from the image's pixels to the centre panel's
+    panels_from_centre: F64  # (points of the pupil, N, 3, 3) from the centre panel's pixels to the panels'
     toward: F64  # (3,) dot (u, v, 1) is negative for a ray towards the panels
-    first_ray: int  # its number
+    first_ray: int  # number of its first ray
 
 
 def squared_errors(
@@ -87,10 +87,10 @@ def squared_errors(
         return _squared_error(codes, view, table, sampling, first, last)
 
     with ThreadPoolExecutor(cores) as pool:
-        sums = np.array(list(pool.map(error, calls)), np.float64)  # of squared errors, and of their terms
+        sums = np.array(list(pool.map(error, calls)), np.float64)  # of the squared errors, and numbers of terms
     if not sums[:, 1].any():
         raise ValueError("no ray from these eyes crosses every panel")
-    if sampling.groups:  # a part is a row
+    if sampling.groups:  # one part per row
         sums = sums.reshape(len(targets), -1, 2).sum(axis=0)
     groups = [sums[group :: sampling.groups].sum(axis=0) for group in range(sampling.groups)]
     total, counted = np.array([sums.sum(axis=0), *groups]).T

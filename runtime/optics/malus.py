@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 HALF_PI = np.pi / 2
 Branch = Literal[1, 2]
 T = TypeVar("T", bound=np.floating[Any])
-# Panel values at rest, before any solving: their sum is in the middle of one of sin²'s slopes.
+# Panel values at rest, before any solving. Their sum is in the middle of one of the slopes of sin².
 REST = {2: 0.75, 3: 0.5, 4: 0.375, 5: 0.5}
 
 

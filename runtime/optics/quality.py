@@ -18,7 +18,7 @@ HALF_WINDOW = 5  # half width of SSIM's window, pixels
 class Quality:
     """PSNR and SSIM of both eyes together, and PSNR of each."""
 
-    psnr_db: float  # of one mean squared error over all counted pixels, channels and eyes
+    psnr_db: float  # from the mean squared error over all counted pixels, channels and eyes
     ssim: float  # mean over eyes
     eye_psnr_db: tuple[float, ...]
 
@@ -39,7 +39,7 @@ def ssim(a: F32, b: F32, mask: Mask) -> float:
     for rows in strips(len(mask)):
         if not mask[rows].any():
             continue
-        # Half a window more at both ends completes every row's window; outside the image it is mirrored.
+        # Half a window more at both ends completes every row's window. Outside, the image is mirrored.
         first = max(rows.start - HALF_WINDOW, 0)
         around, inside = slice(first, rows.stop + HALF_WINDOW), slice(rows.start - first, rows.stop - first)
         x, y = a[around], b[around]

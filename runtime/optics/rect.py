@@ -35,7 +35,7 @@ class PixelRect:
         return slice(self.v0, self.v1), slice(self.u0, self.u1)
 
     def beside(self, *, width_px: int, height_px: int) -> list[PixelRect]:
-        """All other pixels of a raster, as up to four boxes."""
+        """Return all other pixels of a raster, as up to four boxes."""
         if not self.width_px or not self.height_px:
             return [PixelRect(0, 0, width_px, height_px)]
         boxes = (

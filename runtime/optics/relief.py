@@ -1,4 +1,4 @@
-"""Depth of the content across the display, and the resulting movement of its picture with the eyes.
+"""Depth of the content, and how its picture on the panels moves with the eyes.
 
 A point of the content on the plane x is seen from the middle between the eyes, o, through a point c of the middle
 panel's plane (x = r). With c relative to the plane's origin, relief b = (x - r) / (o_x - x) and the middle n that the
@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, Parallax
 
-WIDEST_PX = 480  # columns of a relief: more of them show no finer outlines
-RIM_PX = 2  # of a relief's, by which nearer content extends over its surroundings: its outline must move with it
+WIDEST_PX = 480  # columns of a relief; more of them do not give finer outlines
+RIM_PX = 2  # relief pixels by which nearer content is extended over its surroundings, so that its outline moves with it
 
 Pixels = NDArray[np.floating[Any]]
 

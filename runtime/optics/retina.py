@@ -19,7 +19,7 @@ from runtime.records import F32, F64, U8
 
 Mask = NDArray[np.bool_]
 
-STRIP_ROWS = 32  # of a picture processed together: they fit the cache
+STRIP_ROWS = 32  # rows processed together, which fit in the cache
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class _Samples:
     def of(self, plane: F32) -> F32:
         """(h, w) samples of (H, W)."""
         right, below = self._right, self._below
-        no_second_map: Any = None  # valid, but missing from OpenCV's stubs
+        no_second_map: Any = None  # None is valid, but missing from OpenCV's stubs
         top, top_right, bottom, bottom_right = (
             np.asarray(cv2.remap(part, self._corner, no_second_map, cv2.INTER_NEAREST), np.float32)
             for part in (plane, plane[:, right], plane[below], plane[below, right])

@@ -47,7 +47,7 @@ class PlaneRaster:
 
 @dataclass(frozen=True, slots=True)
 class Tilt:
-    """Slopes of panels that are not quite parallel, and the eye position they are registered from."""
+    """Slopes of panels that are not quite parallel, and the eye position for which they are registered."""
 
     depth: tuple[tuple[float, float, float], ...]  # per panel (d, r, u): d + r·y + u·z metres before its x_m
     seen_from_m: tuple[float, float, float]  # frame `stack`

@@ -67,7 +67,7 @@ def _projected(
     ideal = np.array([[0.0, 0.0, x_m], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # (x, y, z) from (y, z, 1)
     weight = normal @ ideal - [0.0, 0.0, normal @ place]
     ray = ideal - np.outer(place, [0.0, 0.0, 1.0])
-    point = np.outer(place, weight) + ray * (far - normal @ place)  # times weight
+    point = np.outer(place, weight) + ray * (far - normal @ place)  # multiplied by the weight
     ahead = point[0] - origin[0] * weight
     sideways = np.outer(origin[1:], ahead) + (point[1:] - np.outer(origin[1:], weight)) * (x_m - origin[0])
     matrix = np.vstack([sideways, ahead])

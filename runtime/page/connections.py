@@ -13,7 +13,7 @@ from runtime.daemon.client import REQUEST_MAX_BYTES, REQUEST_S
 from runtime.errors import InputError
 
 LOOPBACK = "127.0.0.1"
-CONNECTIONS_MAX = 64  # simultaneous ones
+CONNECTIONS_MAX = 64  # simultaneous connections
 
 
 class LimitedConnection(H11Protocol):
@@ -25,7 +25,7 @@ class LimitedConnection(H11Protocol):
         self._timer: asyncio.TimerHandle = self.loop.call_later(REQUEST_S, self._let_go)
         if len(self.connections) > CONNECTIONS_MAX:
             waiting = [one for one in self.connections if isinstance(one, LimitedConnection) and one.waits]
-            min(waiting, key=lambda one: one.made_s).transport.abort()  # this one, if all others are being answered
+            min(waiting, key=lambda one: one.made_s).transport.abort()  # possibly this one
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._timer.cancel()
@@ -33,12 +33,12 @@ class LimitedConnection(H11Protocol):
 
     @property
     def waits(self) -> bool:
-        """True while it waits for a request."""
+        """True while the connection waits for a request."""
         cycle: Any = self.cycle  # None before the first request
         return cycle is None or bool(cycle.response_complete)
 
     def _let_go(self) -> None:
-        if self.waits and self in self.connections:  # not after an upgrade to another protocol
+        if self.waits and self in self.connections:  # False after an upgrade to another protocol
             self.transport.abort()
 
 

@@ -18,13 +18,13 @@ from runtime.optics.retina import as_codes
 from runtime.records import F32, U8
 from runtime.support.artifacts import to_json
 
-PAGES_MAX = 8  # most live pages: each one is sent its own pictures
+PAGES_MAX = 8  # live pages; each of them is sent pictures
 RANGES = {"noise_mm": (0.0, 50.0), "latency_ms": (0.0, 1000.0), "camera_fov_deg": (20.0, 150.0)}
-RANGES |= {"gap_mm": (1.0, 500.0), "camera": (0.0, 1.0)}  # these need a restart of the loop
+RANGES |= {"gap_mm": (1.0, 500.0), "camera": (0.0, 1.0)}  # changing these restarts the loop
 
 
 async def live(socket: WebSocket, link: BrowserLink, *, protocol: str | None) -> None:
-    """Serve one authorised page, from its first message to its last."""
+    """Serve one authorised page until it disconnects."""
     if len(link.news) >= PAGES_MAX:
         await socket.close(1013, "too many pages")
         return
@@ -53,14 +53,14 @@ def _tell(loop: asyncio.AbstractEventLoop, news: asyncio.Event) -> None:
 
 
 class _Page:
-    """State of one page. It is sent the newest picture whenever it has drawn the one before."""
+    """State of one page. The next picture is sent once the page has drawn the previous one."""
 
     def __init__(self, socket: WebSocket, link: BrowserLink) -> None:
         self._socket, self._link = socket, link
         self.news, self._sent = asyncio.Event(), {"solved": 0, "flat": 0}
-        self._under_way = False  # the page has not drawn the layers last sent yet
+        self._under_way = False  # True until the page has drawn the layers last sent
         self._stack: Any = None
-        self._checks, self._moment = False, None  # checks: it shows the newest measured refresh instead
+        self._checks, self._moment = False, None  # checks: the page shows the newest measured refresh instead
 
     async def send(self, me: object) -> None:
         sent: dict[str, Any] = {}
@@ -91,7 +91,7 @@ class _Page:
             self.news.clear()
 
     async def _send_layers(self, kind: str, layers: U8, relief: F32 | None, solved_for_m: Any) -> None:
-        """Send layers, RGBA, followed by the relief of their content as 16-bit floats, where it is known."""
+        """Send RGBA layers, followed by the relief of their content as 16-bit floats if it is known."""
         data = await asyncio.to_thread(lambda: layers.tobytes() + (b"" if relief is None else half_floats(relief)))
         message = {"layers": kind, "solved_for_m": solved_for_m, "size": layers.shape[2:0:-1]}
         await self._say(message if relief is None else message | {"relief": relief.shape[::-1]})

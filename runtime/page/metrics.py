@@ -1,4 +1,4 @@
-"""The status's figures in Prometheus's text format, under their JSON names."""
+"""Figures of the status in Prometheus's text format, with their JSON names."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ from runtime.support.artifacts import to_json
 from runtime.support.untrusted_input import parsed_json
 
 SCRIPT, STYLE = "text/javascript", "text/css"
-PROTOCOL = "phasestack"  # of the WebSocket
+PROTOCOL = "phasestack"  # WebSocket subprotocol
 METRICS = "text/plain; version=0.0.4; charset=utf-8"  # Prometheus
 ASSETS = {"page.css": STYLE, "look.css": STYLE}
 ASSETS |= dict.fromkeys(("session.js", "page.js", "display.js", "look.js", "try.js"), SCRIPT)
@@ -51,7 +51,7 @@ Handler = Callable[[Request], Awaitable[Response]]
 
 
 class JsonAnswer(JSONResponse):
-    """JSON in ASCII: a file name need not be UTF-8."""
+    """JSON response in ASCII, because file names need not be UTF-8."""
 
     def render(self, content: Any) -> bytes:
         return to_json(content).encode()
@@ -64,7 +64,7 @@ class TooLong(ValueError):
 def application(daemon: DaemonClient, token: str, *, link: BrowserLink | None = None) -> Starlette:
     """Return the application, for loopback.
 
-    link: the page is the display itself, and opens by an address with the token.
+    link: for a page that is the display itself; its address contains the token.
     """
 
     def permitted(request: HTTPConnection) -> bool:
@@ -86,7 +86,7 @@ def application(daemon: DaemonClient, token: str, *, link: BrowserLink | None = 
         return HTMLResponse(_asset("page.html"))
 
     async def connected(socket: WebSocket) -> None:
-        # A browser's script cannot set headers of a WebSocket, except the protocols offered.
+        # The only header of a WebSocket that a browser's script can set is the list of protocols.
         offered = [one.strip() for one in socket.headers.get("sec-websocket-protocol", "").split(",")]
         if link is None or not (permitted(socket) or any(same(one, token) for one in offered)):
             await socket.close(1008)

@@ -12,8 +12,8 @@ from pathlib import Path
 from runtime.errors import InputError
 
 TOKEN_BYTES = 32  # random bytes of a new token
-LEAST_CHARACTERS = 16  # of a hand-written token: a shorter one could be guessed
-MOST_BYTES = 4096  # read from its file
+LEAST_CHARACTERS = 16  # least length of a hand-written token; a shorter one could be guessed
+MOST_BYTES = 4096  # largest part of the file that is read
 
 
 def token_of(path: Path) -> str:
@@ -28,7 +28,7 @@ def token_of(path: Path) -> str:
             os.link(name, path)  # atomically
             return token
     except FileExistsError:
-        pass  # another process was faster
+        pass  # another process created it first
     except OSError as error:
         raise InputError(path, "", f"cannot be created ({error.strerror})") from None
     finally:
@@ -47,7 +47,7 @@ def _read(path: Path) -> str:
         if not stat.S_ISREG(status.st_mode):
             raise InputError(path, "", "is not a file")
         if status.st_uid != os.geteuid():
-            raise InputError(path, "", f"belongs to another user (number {status.st_uid}), who knows the token")
+            raise InputError(path, "", f"belongs to another user (uid {status.st_uid}), who knows the token")
         if status.st_mode & 0o077:
             raise InputError(
                 path, "", f"others may read it (mode {status.st_mode & 0o777:o}): chmod it to 600, or delete it"

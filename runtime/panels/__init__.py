@@ -1,1 +1,1 @@
-"""Outputs for panel values (offscreen, windows, browser), the presentation shader, and monitors."""
+"""Outputs for the panels' pictures (offscreen, windows, browser), the presentation shader, and monitors."""

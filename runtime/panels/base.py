@@ -9,7 +9,7 @@ from runtime.records import PanelFrame, PresentReport
 
 
 class PanelSink(ABC):
-    """An output for all panels of the stack. A frame is shown on all of them or on none."""
+    """An output to all panels of the stack. A frame is shown on all of them or on none."""
 
     name: str
     contexts_lost = 0  # GL contexts lost since the start. After a GPU reset, every other context is lost as well

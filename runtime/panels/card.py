@@ -1,4 +1,4 @@
-"""Card that `identify` shows on a panel, for its index, orientation, colours and edges."""
+"""Test card of `identify`, which shows a panel's index, orientation, colours and edges."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ FONT = cv2.FONT_HERSHEY_SIMPLEX
 def identity_card(width_px: int, height_px: int, *, title: str, lines: Sequence[str]) -> U8:
     """Draw an upright (height_px, width_px, 4) card: title, lines, upward arrow, colour bars, grey steps.
 
-    A one-pixel line runs along every edge; if one is missing, the panel is cropped or misaligned. Text stays away
-    from the edges, where nearby viewers see a front panel's rim with no lit panel behind it.
+    A one-pixel line runs along every edge; if one is missing, the panel is cropped or misaligned. Text stays away from
+    the edges, because nearby viewers see the front panel's rim without a lit panel behind it.
     """
     card = np.empty((height_px, width_px, 4), np.uint8)
     card[:] = PAPER

@@ -61,21 +61,21 @@ class Window:
 
     handle: Any
     context: moderngl.Context
-    faults: list[str] = field(default_factory=list)  # from its callback: closed
+    faults: list[str] = field(default_factory=list)  # faults reported by its callback
 
     def make_current(self) -> None:
         """Make its context current on this thread."""
         glfw.make_context_current(self.handle)
 
 
-watch: xlib.ServerWatch | None = None  # of the process's connection
+watch: xlib.ServerWatch | None = None  # watches the process's connection
 
 
 def _connect() -> None:
     """Connect GLFW to the X server for the lifetime of the process. Raises PanelLost, MissingPart.
 
-    A drawing thread may still have a context of that EGL display current when the panels lose theirs. If GLFW closed
-    the display then, Mesa would use freed memory.
+    When the panels lose their contexts, a drawing thread may still have a context of the same EGL display current. If
+    GLFW then closed the display, Mesa would use freed memory.
     """
     global watch
     if watch is not None:

@@ -15,7 +15,7 @@ class Edid:
     """Manufacturer, model and serial number of a monitor. The serial number may be empty."""
 
     maker: str  # three letters
-    serial: str  # text descriptor, else the header's number; unique only together with the model
+    serial: str  # from the text descriptor, otherwise the header; unique only together with the model
     name: str
 
 
@@ -29,7 +29,7 @@ def parse(data: bytes) -> Edid | None:
     number = int.from_bytes(block[12:16], "little")
     return Edid(
         maker=maker,
-        # Makers write 0 or 0x01010101 instead of a number.
+        # Makers write 0 or 0x01010101 if there is no number.
         serial=_text(block, SERIAL_TAG) or (str(number) if number not in (0, 0x01010101) else ""),
         name=_text(block, NAME_TAG),
     )

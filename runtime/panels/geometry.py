@@ -1,4 +1,4 @@
-"""Mapping from a monitor's pixels to a layer's: registration, mirroring and mounting."""
+"""Mapping from a monitor's pixels to a layer's pixels: registration, mirroring and mounting."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Grey curves: the grey level that produces each phase on a panel."""
+"""Grey curves, which give the grey level for each phase on a panel."""
 
 from __future__ import annotations
 

@@ -33,9 +33,9 @@ class Monitor:
     """One active monitor of the X screen."""
 
     connector: str
-    serial: str  # EDID's; empty if it has none
+    serial: str  # from the EDID; empty if it has none
     model: str
-    x_px: int  # of its top left corner on the X screen
+    x_px: int  # position of its top left corner on the X screen
     y_px: int
     width_px: int
     height_px: int
@@ -65,8 +65,8 @@ def in_order(monitors: Sequence[Monitor]) -> tuple[Monitor, ...]:
 def bind(panels: Sequence[PanelSettings], monitors: Sequence[Monitor]) -> tuple[Monitor, ...]:
     """Find the monitor of each panel, rear to front.
 
-    A monitor must match both serial and connector if a panel gives both. Two monitors with equal serials are told
-    apart by their connectors.
+    A monitor must match both serial and connector if a panel gives both. Monitors with equal serials are distinguished
+    by their connectors.
 
     Raises InputError if a panel has neither, since waiting can't help; PanelLost if a panel's monitor is missing,
     ambiguous or already bound to another panel. The message names the panel, the criteria and the monitors found.

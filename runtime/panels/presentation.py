@@ -1,4 +1,4 @@
-"""Presentation shader, which aligns and mixes a layer and draws it to a panel's framebuffer."""
+"""Presentation shader, which aligns a layer, mixes in the flat picture and draws to a panel's framebuffer."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ void main() {
 }
 """
 
-# runtime.optics.alignment.shown_layers is the reference for what `shown` answers. Aligned layers are sampled with
-# weights of full precision, which hardware's filters (1/256) have not, and are neutral outside. Layers that a
-# homography moves are sampled with cubic weights, once for registration and alignment: bilinear ones cost 0.15 dB more.
-# Each case has its own program: a software rasteriser executes both branches of every `if`, and all cases in one
-# program take it several times as long as the longest of them.
+# The reference for `shown` is runtime.optics.alignment.shown_layers. Aligned layers are sampled with full-precision
+# weights (hardware filters have steps of 1/256) and have the rest value outside. Layers moved by a homography are
+# sampled once, for registration and alignment together, with cubic weights: bilinear ones cost 0.15 dB more.
+# Each case has its own program: a software rasteriser executes both branches of every `if`, and a single program for
+# all cases would take several times as long as the slowest of them.
 FRAGMENT = """
-uniform sampler2D solved;        // this panel's
+uniform sampler2D solved;        // this panel's layer of the solution
 uniform sampler2D flat_picture;
 uniform sampler2D curve;
-uniform vec2 size_px;            // of the panel
-uniform vec2 solved_px;          // of the solution, which may be coarser
-uniform int extended;            // pixels by which its edge is extended: a coarse one's does not fade at the panel's
+uniform vec2 size_px;            // size of the panel
+uniform vec2 solved_px;          // size of the solution, which may be coarser
+uniform int extended;            // pixels by which a coarse solution is extended, so that its edge does not fade
 uniform vec4 solved_from_shown;  // scale u, v, shift u, v in pixels of the solution
-uniform sampler2D relief;        // of the content, over the middle panel
+uniform sampler2D relief;        // the content's relief on the middle panel
 uniform vec4 middle_from_shown;  // scale u, v, shift u, v in pixels of the panels
-uniform vec3 drift;              // right, down, and growth
+uniform vec3 drift;              // drift right and down, and growth
 uniform float weight_px;
 uniform float flatness;
 uniform float even;
@@ -78,7 +78,7 @@ vec3 aligned_at(vec2 px) {
     return mix(mix(solved_texel(at), solved_texel(at + ivec2(1, 0)), weight.x),
                mix(solved_texel(at + ivec2(0, 1)), solved_texel(at + ivec2(1, 1)), weight.x), weight.y);
 }
-vec4 cubic(float t) {  // of four neighbours, as OpenCV's INTER_CUBIC has them (a = -3/4)
+vec4 cubic(float t) {  // weights of four neighbours, as in OpenCV's INTER_CUBIC (a = -3/4)
     vec4 d = vec4(1.0 + t, t, 1.0 - t, 2.0 - t);
     vec4 near = (1.25 * d - 2.25) * d * d + 1.0;
     vec4 far = ((-0.75 * d + 3.75) * d - 6.0) * d + 3.0;
@@ -148,7 +148,7 @@ CASES: tuple[Case, ...] = (
 
 
 class FrameTextures:
-    """Textures with the newest frame's layers, uploaded whenever their version changes."""
+    """Textures with the newest frame's layers, which are uploaded whenever their version changes."""
 
     def __init__(self, context: moderngl.Context, size_px: tuple[int, int], *, count: int) -> None:
         """size_px: columns and rows of a panel."""
@@ -158,7 +158,7 @@ class FrameTextures:
         self._solved: tuple[moderngl.Texture, ...] = ()
         self._flat: tuple[moderngl.Texture, ...] = ()
         self._reliefs: dict[tuple[int, int], moderngl.Texture] = {}  # by raster
-        self._relief: moderngl.Texture | None = None  # the solution's
+        self._relief: moderngl.Texture | None = None  # the current solution's relief
         self._solved_version: int | None = None
         self._flat_version: int | None = None
 
@@ -168,17 +168,17 @@ class FrameTextures:
         return self._solved[0].size if self._solved else self.size_px
 
     def lacks(self, frame: PanelFrame) -> tuple[bool, bool]:
-        """Return whether the frame's solution, and its flat picture, is visible but not yet uploaded."""
+        """Return two flags: the frame's solution, and its flat picture, is visible but not uploaded yet."""
         return (
             shows_solved(frame) and frame.solved_version != self._solved_version,
             shows_flat(frame) and frame.flat_version != self._flat_version,
         )
 
     def upload(self, frame: PanelFrame) -> None:
-        """Upload those of the frame's visible pictures that have not been uploaded yet."""
+        """Upload the frame's visible pictures unless they have been uploaded already."""
         lacks_solved, lacks_flat = self.lacks(frame)
         if lacks_solved and frame.solved is not None:
-            self._solved_version = None  # until it is here as a whole
+            self._solved_version = None  # until it is uploaded completely
             self._solved = self._written("solved", frame.solved)
             self._relief = None if frame.relief is None else self._relief_of(frame.relief)
             self._solved_version = frame.solved_version
@@ -256,7 +256,7 @@ class Painter:
             mirror=settings.mirror,
             homography=settings.homography,
         )
-        # A homography's sign means nothing; the shader wants the panel's middle before the horizon.
+        # A homography's sign is arbitrary; the shader needs a positive third coordinate in the panel's middle.
         matrix = matrix / (matrix[2] @ np.array([screen_px[0] / 2, screen_px[1] / 2, 1.0]))
         self._context = context
         self._mounting = ["EXACT"] * permutes_pixels(matrix) + ["CURVED"] * bool(settings.lut or settings.gamma != 1)

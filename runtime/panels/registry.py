@@ -1,4 +1,4 @@
-"""Opening of the configured panels, and panels without a screen for replay and tests."""
+"""Opening of the configured panels, and offscreen panels for replay and tests."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class OffscreenPanels(PanelSink):
-    """Panels without a screen: they accept frames without drawing them."""
+    """Panels without a screen, which accept frames without drawing them."""
 
     name = "offscreen"
 
@@ -54,7 +54,7 @@ def panel_settings(settings: OutputSettings, count: int) -> tuple[PanelSettings,
 def open_panels(settings: OutputSettings, stack: PanelStack, clock: Clock, context: moderngl.Context) -> PanelSink:
     """Open the output configured in `[output]`. `context` is current again after each of its methods.
 
-    Raises InputError for unsuitable settings, PanelLost if a monitor is not there yet (wait and retry).
+    Raises InputError for unsuitable settings, PanelLost if a monitor is missing (wait and retry).
     """
     if settings.kind != "offscreen":
         from runtime.panels.window import WindowPanels

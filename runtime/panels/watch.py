@@ -1,8 +1,8 @@
-"""Checks that windows and monitors are still as they were bound, with one query to X at a time.
+"""Checks that windows and monitors are unchanged since they were bound, with one query to X at a time.
 
-GLFW reports monitors that come and go, and windows that are closed or resized. It does not report a window that was
-destroyed, unmapped or moved from outside, or a monitor whose position or mode changed. In these cases a picture is on
-the wrong panel or on none, although every swap succeeds.
+GLFW reports monitors that come and go, and windows that are closed or resized. It does not report a window that another
+program destroyed, unmapped or moved, or a monitor whose position or mode changed. In these cases a picture is on the
+wrong panel or on none, although every swap succeeds.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from runtime.panels import xlib
 from runtime.panels.display import Display, Window
 from runtime.panels.monitors import Monitor
 
-EVERY_NS = NS_PER_S  # for one round of all queries
+EVERY_NS = NS_PER_S  # period in which every window and monitor is queried once
 REFRESH_TOLERANCE = 1e-3  # relative
 
 
 class PlacementWatch:
     """Checks one window or monitor per call, each once in EVERY_NS.
 
-    If the X server has refused a request since the last call, something has gone: then it checks all of them.
+    If the X server has refused a request since the last call, something has disappeared, and it checks all of them.
     """
 
     def __init__(self, display: Display, monitors: Sequence[Monitor], windows: Sequence[Window], clock: Clock) -> None:
@@ -43,7 +43,7 @@ class PlacementWatch:
         """Return faults, naming the panel; empty without a fault or a due query."""
         if xlib.refusals() != self._refusals:
             faults = [fault for fault in (question() for question in self._questions) if fault]
-            self._refusals = xlib.refusals()  # read after the queries, which may be refused too
+            self._refusals = xlib.refusals()  # read after the queries, because these may be refused, too
             return "; ".join(faults)
         now_ns = self._clock.now_ns()
         if now_ns < self._due_ns:

@@ -1,4 +1,4 @@
-"""Panels on monitors: a fullscreen window for each panel, or an identity card on every monitor."""
+"""Panels on monitors: a fullscreen window for each panel, or a test card on every monitor."""
 
 from __future__ import annotations
 
@@ -62,8 +62,8 @@ class WindowPanels(PanelSink):
         self._textures: FrameTextures | None = None
         self._watch: PlacementWatch | None = None
         self._retry_ns, self._lost = 0, ""
-        self._shown = False  # the windows show the previous frame
-        self._away = False  # a context other than `content` may be current
+        self._shown = False  # True while the windows show the previous frame
+        self._away = False  # True if a context other than `content` may be current
         self._context_lost = False
         self.monitors: tuple[Monitor, ...] = ()
         try:

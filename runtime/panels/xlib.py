@@ -1,6 +1,6 @@
-"""Functions of Xlib and RandR that GLFW lacks: state of outputs, and X errors.
+"""Xlib and RandR functions that GLFW lacks: the state of outputs, and handlers for X errors.
 
-Bound by ctypes to libraries that GLFW requires anyway. By default Xlib ends the process on any error.
+ctypes binds them from libraries that GLFW needs anyway. By default Xlib ends the process on any error.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ _refused = 0  # requests refused in this process
 
 
 def refusals() -> int:
-    """Number of requests refused by the X server; an increase means that a window or monitor has gone."""
+    """Number of requests that the X server has refused. An increase means that a window or monitor has disappeared."""
     return _refused
 
 
@@ -137,8 +137,8 @@ _IO_ERROR_HANDLER = IOErrorHandler(_end)
 def take_over_errors() -> None:
     """Install error handlers, so that a refused X request (an unplugged monitor) is only logged.
 
-    The server's death ends the process immediately, with a line in the log. It may happen in the middle of a call, and
-    afterwards Xlib, EGL and GLFW hang or crash even when releasing their objects.
+    The server's death ends the process immediately, with a line in the log. That can happen in the middle of a call,
+    after which Xlib, EGL and GLFW hang or crash even when releasing objects.
     """
     x11 = _libraries()[0]
     x11.XSetErrorHandler(_ERROR_HANDLER)
@@ -148,7 +148,7 @@ def take_over_errors() -> None:
 class ServerWatch:
     """Detects the server's death while the main thread is in a call that never returns.
 
-    Mesa's software renderer loops forever in a swap after the connection broke, and Xlib does not notice.
+    After the connection breaks, Mesa's software renderer loops forever in a swap, and Xlib does not notice.
     """
 
     def __init__(self, display: int) -> None:
@@ -177,7 +177,7 @@ class ServerWatch:
 
 
 def output_state(display: int, output: int) -> OutputState | None:
-    """Current state of an output; None if it is off or gone. Four round trips."""
+    """Current state of an output, in four round trips; None if it is off or disconnected."""
     x11, randr = _libraries()
     resources = randr.XRRGetScreenResourcesCurrent(display, x11.XDefaultRootWindow(display))
     if not resources:

@@ -1,1 +1,1 @@
-"""Measurements of error against run time, of stability and in motion; their pages and plots."""
+"""Measurements of quality against run time, in motion and of stability, with their pages and plots."""

@@ -1,4 +1,4 @@
-"""The whole report: measurements in their order, and the page and record that grow with them."""
+"""The whole report: runs the measurements in order, and rewrites page and record after each."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Progress = Callable[[str], None]
 
 
 class GrowingPage:
-    """index.html, report.json and plots, rewritten as results come, so that a stopped report is complete."""
+    """index.html, report.json and plots, rewritten with every result, so that a stopped report is usable."""
 
     def __init__(self, out: Path, command: str, progress: Progress) -> None:
         self.out, self._command, self._progress = out, command, progress
@@ -39,7 +39,7 @@ class GrowingPage:
         self.record["measuring"] = what
 
     def put(self, name: str, section: PageSection) -> None:
-        """Add a section, or replace the one of that name."""
+        """Add a section, or replace the section of that name."""
         self._sections[name] = section
         self.write()
 
@@ -50,11 +50,11 @@ class GrowingPage:
         self.write()
 
     def write(self) -> None:
-        """Write everything measured until now. Raises InputError."""
+        """Write everything measured so far. Raises InputError."""
         doing = self.record.get("measuring")
-        notes = [f"Not finished: the page grows with every measurement. Last known step: {doing}."] if doing else []
+        notes = [f"Not finished: this page grows as figures come in. Last known step: {doing}."] if doing else []
         if busy := too_busy(self.record["yardsticks_ms"]):
-            notes.append(f"The machine had other work ({busy}): don't compare these times, not even their ratios.")
+            notes.append(f"The machine was busy ({busy}): do not compare these times, not even their ratios.")
         sections, machine = list(self._sections.values()), self.record["machine"]
         lead = "Light, at a tracking error of 1 mm, is the figure to quote; higher is better."
         page = Page("Light against run time", lead, sections, machine, self._command, notes)
@@ -80,7 +80,7 @@ def whole_report(
     if quick:
         stack = replace(stack, width_px=960, height_px=540)
     for name in models:
-        for each in dict.fromkeys([*(pair.stack for pair in cases), stack]):  # refuse it now, not minutes later
+        for each in dict.fromkeys([*(pair.stack for pair in cases), stack]):  # refuse it now instead of minutes later
             load_predictor(name, each, ModelSettings(threads=1)).close()
     page = GrowingPage(out, command, progress)
     methods = shipped_and_references(models, quick=quick)
@@ -119,7 +119,7 @@ def _frontier(
 
 
 def _moving(page: GrowingPage, *, quick: bool) -> None:
-    """Measure all motions; runs on a simulated clock may go side by side."""
+    """Measure all motions. Runs on a simulated clock may run in parallel."""
     fixed = (moving.FULL, Effort(2, 0)) if quick else moving.FIXED
     runs = [(motion, effort) for motion in moving.SCENES for effort in (None, *fixed)]
     small = partial(moving.moving_run, scale=0.15, seconds=2.5)

@@ -1,4 +1,4 @@
-"""Regression file: time, light and memory of the shipped models, with a yardstick for the machine."""
+"""Regression file: time, light and memory of the shipped models, and a reference time for the machine."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from runtime.report.page import describe
 from runtime.report.pairs import FOV_DEG, PairPainter, eyes_at
 
 SIZES = ((960, 540), (1920, 1080))
-WORSE_DB = 0.1  # more than rounding and thread order can change
-SLOWER = 0.15  # at least; more if the runs scatter more
+WORSE_DB = 0.1  # change that rounding and thread order cannot explain
+SLOWER = 0.15  # least relative change that is reported; larger if the runs scatter more
 MORE_MEMORY = 0.15  # relative change that is reported
-UNSTEADY = 1.3  # ratio of the slowest to the fastest yardstick beyond which times are not compared
-SCATTERS = 3.0  # times the medians' scatter: a smaller difference does not count
+UNSTEADY = 1.3  # times are not compared if the slowest and fastest yardstick differ by a larger factor
+SCATTERS = 3.0  # a difference must exceed this many times the medians' scatter
 
 
 class BenchEntry(BaseModel):
@@ -48,15 +48,15 @@ class RegressionFile(BaseModel):
 
     version: Literal[2]
     yardstick_ms: PositiveFloat
-    yardsticks_ms: Annotated[list[PositiveFloat], Field(min_length=1)]  # over the whole measurement
+    yardsticks_ms: Annotated[list[PositiveFloat], Field(min_length=1)]  # yardsticks over the whole measurement
     methods: list[BenchEntry]
 
 
 def too_busy(yardsticks_ms: Sequence[float]) -> str:
-    """Reason why times measured meanwhile can't be compared (other load on the machine); empty: they can."""
+    """Reason why times can't be compared (other load on the machine); empty if they can."""
     least, most = min(yardsticks_ms), max(yardsticks_ms)
     if most > UNSTEADY * least:
-        return f"the same work took {least:.1f} to {most:.1f} ms while it was measured"
+        return f"the same work took {least:.1f} to {most:.1f} ms during the measurement"
     return ""
 
 

@@ -1,8 +1,8 @@
 """Focal parallax (supplement, 1.4): an eye with a finite pupil focuses through the layers.
 
-A pupil sees the mean of the pictures of its points. Focusing at a distance shifts those pictures so that they agree
-there: the picture of a pupil's point (right, up) is a pinhole's, shifted by focal_px·right/f to the right and
-focal_px·up/f up, where f is the distance in focus along the gaze.
+The eye sees the mean of the pictures through all points of its pupil. Focusing at a distance f along the gaze shifts
+these pictures so that they agree there: the pinhole picture through the pupil's point (right, up) is shifted by
+focal_px·right/f to the right and focal_px·up/f up.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ class Slice:
     """One setting of the eye's lens."""
 
     plane_m: float  # x of the plane in focus
-    shown: F32  # (h, w, 3) through the layers
-    true: F32  # (h, w, 3) of the scene itself
+    shown: F32  # (h, w, 3) view through the layers
+    true: F32  # (h, w, 3) view of the scene itself
 
 
 @dataclass(frozen=True, slots=True)
 class Accommodation:
     """Distances at which the eyes converge on a card and at which its picture is sharpest."""
 
-    card_m: float  # distance from the eye to where the lines of sight meet
+    card_m: float  # distance from the eye to the point where the lines of sight meet
     sharpest_shown_m: float
     sharpest_true_m: float
 
@@ -67,7 +67,7 @@ def projection(eye_m: F64, point: F64, *, focus_m: float) -> F64:
     Its third coordinate is the distance from the eye along the gaze.
     """
     centre = image_from_stack(eye_m, width_px=WIDTH_PX, height_px=HEIGHT_PX, fov_deg=FOV_DEG)
-    # In front of the plane in focus a point's picture moves against the pupil's point, behind it with it.
+    # Points in front of the plane in focus move opposite to the pupil's point, points behind it move with it.
     focal_px = WIDTH_PX / 2 / math.tan(math.radians(FOV_DEG / 2))
     out_of_focus = centre[2] / focus_m - [0.0, 0.0, 0.0, 1.0]
     return centre + np.outer([focal_px * point[0], -focal_px * point[1], 0.0], out_of_focus)

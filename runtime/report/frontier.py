@@ -33,13 +33,13 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 T = TypeVar("T")
 Kind = Literal["network", "iterative"]
-SHIPPED = ("balanced", "fast", "best")  # the default first: it is a report's first figure
+SHIPPED = ("balanced", "fast", "best")  # the default model comes first in a report
 SART = (1, 3, 10, 30)
-ENOUGH_S = 2.0  # of timed runs for each pair; slow methods run once
+ENOUGH_S = 2.0  # seconds of timed runs per pair; slow methods run once
 MOST_RUNS = 25  # timed runs of one method on one pair
 FEWEST_RUNS = 3  # timed runs, unless the first is slow
-SLOW_S = 4.0  # a first run longer than this counts and is the only one
-OFF_STEP = 3  # off the eyes, every third ray of every third row is enough
+SLOW_S = 4.0  # if the first run takes longer than this, it counts and is the only one
+OFF_STEP = 3  # for displaced eyes, every third ray of every third row is enough
 QUOTED = "1"  # key of `light_db`: tracking error 1 mm
 
 
@@ -50,7 +50,7 @@ class Method:
     name: str
     kind: Kind
     source: str  # argument of `load_predictor`
-    iterations: int = 0  # of SART
+    iterations: int = 0  # iterations of SART
 
     def opened(self, stack: PanelStack, *, threads: int) -> Predictor:
         """Load a predictor for a stack. Raises InputError, MissingPart."""
@@ -75,8 +75,8 @@ class MethodRun:
     """One method on one pair, measured in its process."""
 
     layers: U8
-    run_ms: tuple[float, ...]  # whole solutions: two decoded images to N 8-bit layers
-    memory_mib: float  # peak of the process
+    run_ms: tuple[float, ...]  # times of whole solutions, from two decoded images to N 8-bit layers
+    memory_mib: float  # peak memory of the process
     parameters: int
     precision: str
 
@@ -107,10 +107,10 @@ class MethodResult:
     memory_mib: float
     parameters: int
     light_db: dict[str, float]  # by tracking error, millimetres: "0", "1", "2"
-    expected_db: dict[str, float]  # the same, one ray a pixel
+    expected_db: dict[str, float]  # the same with one ray per pixel
     psnr_db: float
     ssim: float
-    worst_eye_psnr_db: float  # least of all eyes and pairs
+    worst_eye_psnr_db: float  # worst of all eyes and pairs
     psnr_db_off_eye: dict[str, float]
     pairs: list[PairResult] = field(default_factory=list)
 
@@ -123,7 +123,7 @@ class MethodResult:
 
     @property
     def quoted_db(self) -> float:
-        """The figure to quote; NaN where such eyes see no part of the panels."""
+        """The figure to quote; NaN if displaced eyes see no part of the panels."""
         return self.light_db.get(QUOTED, math.nan)
 
 
@@ -146,7 +146,7 @@ def measure(
 
 def apart(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
     """Call an importable function in a fresh process with its own memory. Raises FatalError."""
-    # Its stdout goes to stderr: ours may be JSON.
+    # Its stdout goes to stderr, because ours may be JSON.
     with ProcessPoolExecutor(1, get_context("spawn"), initializer=os.dup2, initargs=(2, 1)) as pool:
         try:
             return pool.submit(_called, function, args, kwargs).result()
@@ -157,7 +157,7 @@ def apart(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
 def _called(function: Callable[..., T], args: Any, kwargs: Any) -> T:
     try:
         return function(*args, **kwargs)
-    except PhasestackError as error:  # our other classes can't be pickled
+    except PhasestackError as error:  # not every error class can be pickled
         raise FatalError(str(error)) from None
 
 
@@ -169,7 +169,7 @@ def run_method(method: Method, pair: StillPair, threads: int) -> MethodRun:
 
     cv2.setNumThreads(threads)
     predictor = method.opened(pair.stack, threads=threads)
-    with contextlib.suppress(OSError):  # older kernels: the peak then includes the interpreter's start, which is less
+    with contextlib.suppress(OSError):  # on older kernels the peak includes the interpreter's start, which needs less
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
     done = timed(
         lambda: solve_still(*pair.images, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, predictor=predictor).layers,
@@ -188,7 +188,7 @@ def _peak_mib() -> float:
 
 
 def pair_result(pair: StillPair, run: MethodRun, *, viewer: Path | None = None) -> PairResult:
-    """Displayed quality (docs/contracts.md, Error): at the eyes, expected, and off the eyes.
+    """Measure quality (docs/contracts.md, Error) at the eyes, expected, and at displaced eyes.
 
     viewer: folder for a viewer of the layers.
     """
@@ -198,7 +198,7 @@ def pair_result(pair: StillPair, run: MethodRun, *, viewer: Path | None = None) 
     for view in pair.off:
         place = view.eye_m[None]
         where: Any = {"solved_for_m": place, "eyes_m": place, "fov_deg": pair.fov_deg, "sampling": sampling}
-        with contextlib.suppress(ValueError):  # that eye sees no part of the panels
+        with contextlib.suppress(ValueError):  # raised if that eye sees no part of the panels
             errors = squared_errors(run.layers, [intensities(view.image)], pair.stack, **where)
             off.setdefault(f"{view.mm:g}mm", []).append(psnr_db(errors[0]))
     beside = {name: float(np.mean(values)) for name, values in off.items()}
@@ -233,7 +233,7 @@ def _together(method: Method, pair: StillPair, run: MethodRun, pairs: list[PairR
 
 
 def _means(tables: Sequence[Any]) -> dict[str, float]:
-    """Means by key over the tables that have a finite number there."""
+    """Mean for each key, over the tables that have a finite value for it."""
     keys = dict.fromkeys(key for table in tables for key in table)
     values_of = {key: [table[key] for table in tables if math.isfinite(table.get(key, math.nan))] for key in keys}
     return {key: float(np.mean(values)) for key, values in values_of.items() if values}

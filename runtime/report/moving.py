@@ -17,11 +17,12 @@ from runtime.frame.kept_light import Output
 from runtime.records import Effort
 
 SCENES = {"still": "demo", "lean": "demo", "walk": "demo", "stop-and-go": "demo", "film": "moving"}  # by motion
-FULL = Effort(1, 4)  # `balanced` whole: the effort of every solution before the loop chose
+FULL = Effort(1, 4)  # the whole model `balanced`
 FIXED = (FULL, Effort(1, 1), Effort(1, 0), Effort(2, 0), Effort(3, 0), Effort(4, 0))
-COSTS_MS = {"render": 44, "prepare": 40, "inference": 31, "finish": 38, "step": 85}  # full raster, a slow processor
+# Costs of the full raster on a slow processor.
+COSTS_MS = {"render": 44, "prepare": 40, "inference": 31, "finish": 38, "step": 85}
 SECONDS, NOISE_MM, SEED = 6.0, 0.3, 5
-EVERY = 23  # refreshes between samples: not a multiple of a solution's refreshes
+EVERY = 23  # refreshes between samples; not a multiple of the refreshes per solution
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +62,7 @@ def settings_for(recording: Path, *, scene: str, effort: str) -> Settings:
     table["content"]["scene"] = scene
     table["loop"]["evaluate_every"] = EVERY
     table["loop"]["simulated_stage_ms"] |= COSTS_MS
-    table["model"] |= {"effort": effort, "threads": 1}  # runs go side by side
+    table["model"] |= {"effort": effort, "threads": 1}  # runs are parallel
     return validated(Settings, table, source="settings")
 
 

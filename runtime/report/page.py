@@ -1,4 +1,4 @@
-"""Self-contained HTML pages for reports, the style of plots, and a description of the machine."""
+"""Self-contained HTML pages for reports, the style of their plots, and a description of the machine."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class PageSection:
     text: Sequence[str] = ()  # paragraphs, plain text
     figures: Sequence[Figure] = ()
     tables: Sequence[Table] = ()
-    links: Sequence[tuple[str, str]] = ()  # text, and a file next to the page
+    links: Sequence[tuple[str, str]] = ()  # pairs of a text and a file next to the page
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +121,7 @@ def describe() -> dict[str, str]:
         "cores": str(len(os.sched_getaffinity(0))),
         "memory": f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.1f} GiB",
         "system": f"{platform.system()} {platform.release()}",
-        "seed": "0",  # of all random numbers
+        "seed": "0",  # seed of all random numbers
         "Python": platform.python_version(),
     }
     for name in PACKAGES:

@@ -52,7 +52,7 @@ def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
             if len(of_pairs) > len(dots):
                 seen = [(ms, light_db.get(QUOTED, np.nan)) for ms, light_db in of_pairs]
                 axes.scatter(*zip(*seen, strict=True), s=9, color=colour, alpha=0.5, linewidths=0)
-            for result in dots:  # above and to the left of a rising curve
+            for result in dots:  # the region above and to the left of a rising curve
                 axes.annotate(result.name, (result.ms_p50, result.quoted_db), xytext=(-5, 6), ha="right", **beside)
         axes.set(xscale="log", xlabel="median time of a whole solution, ms", ylabel="light, dB (tracking error 1 mm)")
         axes.use_sticky_edges = False  # which bars have
@@ -61,7 +61,7 @@ def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter("")
         axes.legend()
-    told = "Times hold for this machine and hour: compare ratios. Bars: eight runs in ten. Dots: single pairs."
+    told = "Times depend on this machine and its load: compare ratios. Bars: eight runs in ten. Dots: single pairs."
     return Figure(name, png(figure), told)
 
 

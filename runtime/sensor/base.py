@@ -1,4 +1,4 @@
-"""Interface of sensor drivers (open, capabilities, read_newest, close); conversion of device clocks."""
+"""Interface of sensor drivers (open, capabilities, read_newest, close), and conversion of device clocks."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from runtime.errors import EndOfRecording, SensorLost, SensorTimeout
 from runtime.records import SensorFrame
 
 ARRIVED_MAX = 1024  # samples returned per call; the rest follow in later calls
-WINDOW_NS = 5_000_000_000  # for estimating a device clock's offset
+WINDOW_NS = 5_000_000_000  # window for estimating a device clock's offset
 
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:
-    """Capabilities of a sensor: the kinds of data that it delivers."""
+    """The kinds of data that a sensor delivers."""
 
     colour: bool = False
     depth: bool = False
-    eye_points: bool = False  # it finds the eyes itself, without our detector
-    in_stack_frame: bool = False  # its eye points are in frame `stack` already: no calibration is applied
+    eye_points: bool = False  # the sensor finds the eyes itself, so our detector is not used
+    in_stack_frame: bool = False  # its eye points are already in frame `stack`, so no calibration is applied
     may_pause: bool = False  # gaps and constant samples are not faults (a recording)
 
 
@@ -40,11 +40,11 @@ class Sensor(ABC):
     must be based.
     """
 
-    Options: ClassVar[type[BaseModel]] = Section  # of a user's class: the schema of [sensor.options]
+    Options: ClassVar[type[BaseModel]] = Section  # schema of [sensor.options] for a user's class
 
     name: str
     capabilities: Capabilities
-    serial: str = ""  # known after `open`; empty if the device has none. If set before, `open` takes only that device
+    serial: str = ""  # set by `open`; empty if the device has none. If set before, `open` accepts only that device
     skipped: int = 0  # samples that `read_newest` skipped in favour of newer ones
 
     @abstractmethod
@@ -87,7 +87,7 @@ class SteppedSensor(Sensor):
     def __init__(self, source: str, clock: Clock, *, latency_ms: float = 0.0) -> None:
         """source: for messages; latency_ms: from a sample's capture to its arrival."""
         self._source, self._clock, self._latency_ns = source, clock, round(latency_ms * NS_PER_MS)
-        self._frames: Iterator[SensorFrame] | None = None  # those after the next; None: not open
+        self._frames: Iterator[SensorFrame] | None = None  # samples after the next one; None: not open
         self._next: SensorFrame | None = None
 
     def _begin(self, frames: Iterator[SensorFrame]) -> None:
@@ -152,13 +152,13 @@ class DeviceClock:
 
     def __init__(self) -> None:
         self._start_ns = 0
-        self._offsets: list[int] = []  # minimum of the previous window, and of this one
+        self._offsets: list[int] = []  # minima of the previous window and of this one
         self._last_ns: int | None = None
 
     def host_ns(self, device_ns: int, *, arrival_ns: int) -> int:
         """Convert a device's time to the host's clock; never later than the arrival."""
         offset = arrival_ns - device_ns
-        if self._last_ns is None or device_ns < self._last_ns:  # first, or the device was restarted
+        if self._last_ns is None or device_ns < self._last_ns:  # the first sample, or the device was restarted
             self._offsets, self._start_ns = [offset], arrival_ns
         elif arrival_ns - self._start_ns > WINDOW_NS:
             self._offsets, self._start_ns = [self._offsets[-1], offset], arrival_ns

@@ -1,4 +1,4 @@
-"""Driver `browser`: a web page's pointer acts as the head, with noise and latency; or its camera."""
+"""Driver `browser`: a web page's pointer acts as the head, with noise and latency, or its camera tracks the viewer."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from runtime.errors import SensorLost, SensorTimeout
 from runtime.records import EyePoints, Intrinsics, SensorFrame
 from runtime.sensor.base import Capabilities, DeviceClock, Sensor
 
-AGAIN_NS = NS_PER_S // 30  # a page reports eyes when they move; between reports the last position is repeated
+AGAIN_NS = NS_PER_S // 30  # the last position is repeated, because a page reports eyes only when they move
 SILENT_NS = 5 * NS_PER_S  # after this long without a message from a page there is no viewer
 LEAST_SIGMA_M = 5e-5  # floor that keeps the covariance of noise-free samples from being singular
 PICTURE_MAX_PX = 2048  # longer side of a page's camera picture
@@ -30,7 +30,7 @@ class BrowserEyes(Sensor):
     def __init__(self, link: BrowserLink, clock: Clock) -> None:
         self._link, self._clock = link, clock
         self._random = np.random.default_rng(0)
-        self._waiting: deque[tuple[int, SensorFrame]] | None = None  # with arrival times
+        self._waiting: deque[tuple[int, SensorFrame]] | None = None  # samples with their arrival times
         self._times, self._heard_ns, self._sampled_ns, self._count = DeviceClock(), 0, 0, 0
         self._last, self._captured_ns = SeenEyes(None, 0.0), 0
 

@@ -24,19 +24,19 @@ from runtime.sensor.openni2_library import load
 
 SERIAL_PROPERTY = 3  # ONI_DEVICE_PROPERTY_SERIAL_NUMBER
 DEPTH_1_MM, DEPTH_100_UM, RGB888, GRAY8 = 100, 101, 200, 202
-PAIR_APART_US = 40_000  # largest time between depth and colour of a pair: a period of an unsynchronised camera
+PAIR_APART_US = 40_000  # most time between the depth and colour of a pair: a period of an unsynchronised camera
 PAIR_WAIT_S = 0.02  # how long a depth picture waits for its colour
-THREADS_STOP_S = 0.5  # fifteen periods of a file's threads; three caused crashes on a busy machine
+THREADS_STOP_S = 0.5  # fifteen periods of a recording's threads; with three there were crashes on a busy machine
 DRAIN_MAX = 32  # frames skipped in one call, so that a fast source can't block it
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
-_idle: list[_PersistentThread] = []  # for reuse; a thread that hangs never comes back
+_idle: list[_PersistentThread] = []  # threads for reuse; one that hangs is never returned
 _lock = threading.Lock()
 
 
 class _Picture(NamedTuple):
-    number: int  # the device's own count
+    number: int  # the device's frame number
     time_us: int
     pixels: Any  # U8 (h, w, 3) or U16 (h, w)
 
@@ -117,7 +117,7 @@ class OpenNI2Driver(Sensor):
         if both and device.is_image_registration_mode_supported(mode):
             device.set_image_registration_mode(mode)
         elif both and not device.is_file():
-            log.warning("OpenNI2: this camera does not register depth to colour; parallax will displace the eyes")
+            log.warning("OpenNI2: this camera does not register depth to colour, so parallax will displace the eyes")
         for stream in self._streams.values():
             if stream.is_property_supported(7):  # mirroring
                 stream.set_mirroring_enabled(False)
@@ -131,7 +131,7 @@ class OpenNI2Driver(Sensor):
 
     def _read_intrinsics(self, stream: Any) -> Intrinsics | None:
         """Return a centred pinhole with the camera's field of view, else the settings'; None if unknown."""
-        try:  # files have the property but deny it
+        try:  # recordings claim to have the property but fail to return it
             fov_x, fov_y = stream.get_horizontal_fov(), stream.get_vertical_fov()
         except Exception:
             fov_x = fov_y = 0.0
@@ -193,7 +193,7 @@ class OpenNI2Driver(Sensor):
     def _take(self, timeout_s: float) -> bool:
         """Copy one frame from whichever stream has one. Returns False if none arrived in time."""
         try:
-            # The library reports an error for a wait of 0 on some devices.
+            # With a wait of 0, the library reports an error for some devices.
             stream = self._openni.wait_for_any_stream(list(self._streams.values()), max(timeout_s, 0.001))
             if stream is None:
                 return False
@@ -225,7 +225,7 @@ class OpenNI2Driver(Sensor):
         for stream in streams.values():
             _quietly(stream.stop)
         if streams and self._settings.source.endswith(".oni"):
-            # The library does not wait for a file's threads to stop: without a pause they write to freed memory.
+            # The library does not wait for a recording's threads to stop: without a pause they write to freed memory.
             time.sleep(THREADS_STOP_S)
         for handle in (*streams.values(), device):
             if handle is not None:
@@ -299,4 +299,4 @@ class _PersistentThread:
                 outcome.set_result(call())
             except BaseException as error:  # raised by the caller
                 outcome.set_exception(error)
-            del outcome, call  # so that nothing stays alive until the next call
+            del outcome, call  # so that no object stays alive until the next call

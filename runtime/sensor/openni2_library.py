@@ -1,8 +1,8 @@
 """Finding and loading libOpenNI2 and its drivers.
 
 The `openni` package expects a folder with `libOpenNI2.so` and `OpenNI2/Drivers/`. Distributions install them under
-other names, so a folder of links is created. Drivers are pinned in memory, because some leave threads running after
-closing a device, and the process would crash when the library unloads their code.
+other names, so a folder of links is created. Drivers are kept in memory: some leave threads running after closing a
+device, and unloading their code would crash the process.
 """
 
 from __future__ import annotations

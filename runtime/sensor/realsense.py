@@ -19,10 +19,11 @@ from runtime.records import U8, U16, Intrinsics, SensorFrame
 from runtime.sensor.base import Capabilities, DeviceClock, Sensor
 
 RATE_HZ = 30
-FILES = (".bag", ".db3")  # the SDK's recordings, older and newer
+FILES = (".bag", ".db3")  # older and newer recordings of the SDK
 STAMP_AGE_NS = NS_PER_S  # older timestamps on the host's clock, and future ones, are ignored
 DRAIN_MAX = 32  # frames skipped in one call
-COLOURS = {"rgb8": [0, 1, 2], "bgr8": [2, 1, 0], "rgba8": [0, 1, 2], "bgra8": [2, 1, 0]}  # indices of R, G and B
+# Indices of the R, G and B channels.
+COLOURS = {"rgb8": [0, 1, 2], "bgr8": [2, 1, 0], "rgba8": [0, 1, 2], "bgra8": [2, 1, 0]}
 
 log = logging.getLogger(__name__)
 
@@ -154,7 +155,7 @@ class RealSenseDriver(Sensor):
         if pipeline is not None:
             try:
                 pipeline.stop()
-            except RuntimeError as error:  # an unplugged camera
+            except RuntimeError as error:  # the camera was unplugged
                 log.debug("RealSense: closing: %s", error)
 
 

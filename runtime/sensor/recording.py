@@ -1,4 +1,4 @@
-"""Recordings as MCAP files with small chunks: after a crash every complete sample is readable."""
+"""Recordings as MCAP files. Chunks are small, so that every complete sample is readable after a crash."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from runtime.support.artifacts import put_in_place
 from runtime.support.background import BackgroundJob
 from runtime.support.untrusted_input import LIMITS, MIB
 
-CHUNK_BYTES = 4096  # some 20 eye samples
+CHUNK_BYTES = 4096  # about 20 eye samples
 INDEX_SHARE = 1.1  # size with chunk indices over size without
 SUMMARY_BYTES = 10_000  # with the schemas
-MAX_S, MAX_BYTES = 600.0, 2 << 30  # a recording ends before it is longer or larger
+MAX_S, MAX_BYTES = 600.0, 2 << 30  # limits at which a recording ends
 MAGIC = b"\x89MCAP0\r\n"
-RECORD, CHUNK = struct.Struct("<BQ"), b"\x06"  # a record's kind and length; the kind of a chunk
+RECORD, CHUNK = struct.Struct("<BQ"), b"\x06"  # header of a record: kind and length; a chunk's kind
 CHUNK_HEAD = struct.Struct("<BQQQQII")  # with times, size, checksum, and the length of the compression's name
-EXPANDED_MOST = 8  # of a cut-off chunk: unpacked bytes for each byte
-WINDOW_BYTES = 1 << 27  # of zstandard
-NEEDED = "a recording for replay has it and `/eyes` (docs/sensors.md); to read others, write a driver"
-KINDS = {  # other files, by their first bytes
+EXPANDED_MOST = 8  # for a truncated chunk: unpacked bytes per byte
+WINDOW_BYTES = 1 << 27  # largest window of zstandard
+NEEDED = "replay requires it and the topic `/eyes` (docs/sensors.md); to read other recordings, write a driver"
+KINDS = {  # kinds of other files, by their first bytes
     b"#ROSBAG ": " (a ROS 1 bag; convert it with `mcap convert`)",
     b"SQLite f": " (a ROS 2 bag in SQLite; convert it with `ros2 bag convert`)",
     b"version ": " (a Git LFS pointer; fetch the file with `git lfs pull`)",
@@ -84,7 +84,7 @@ class RecordingWriter:
         return self._channels[topic]
 
     def write(self, frame: SensorFrame) -> bool:
-        """Append a sample, its images first. Returns False, without writing, if this would exceed a limit."""
+        """Append a sample, images first. Returns False without writing if this would exceed a limit."""
         at = frame.capture_ns
         messages: list[tuple[str, bytes]] = []
         if self._images and frame.intrinsics is not None and frame.intrinsics != self._intrinsics:
@@ -107,7 +107,7 @@ class RecordingWriter:
             self._on_first()
         if time.monotonic_ns() - self._synced_ns >= SYNC_EVERY_NS and (self._sync is None or self._sync.done):
             self._synced_ns = time.monotonic_ns()
-            # In the background: a slow disk loses no sample.
+            # In the background, so that a slow disk loses no sample.
             self._sync = BackgroundJob("recording", lambda: os.fsync(self._file.fileno()))
         return True
 
@@ -134,9 +134,9 @@ def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -
             with path.open("rb") as present:
                 fcntl.flock(present, fcntl.LOCK_SH | fcntl.LOCK_NB)
         file = os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600), "wb")
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until it is closed, under either name
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # held until the file is closed, also after it is renamed
         file.truncate()
-        os.fchmod(file.fileno(), 0o600 if header.colour or header.depth else 0o644)  # a face is private
+        os.fchmod(file.fileno(), 0o600 if header.colour or header.depth else 0o644)  # faces are private
     except OSError as error:
         if file is not None:
             file.close()
@@ -161,11 +161,11 @@ def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -
 
 
 class Recording:
-    """An open recording. Samples are read lazily, so that images do not fill up the memory."""
+    """An open recording. Samples are read one at a time, so that images do not fill the memory."""
 
     def __init__(self, path: Path) -> None:
         """Read the header and the first sample. Raises InputError, naming the file."""
-        self.path, self.is_whole = path, True  # whole as far as it was read
+        self.path, self.is_whole = path, True  # is_whole: no damage found so far
         self._written_by = ("", "")  # profile and library
         self.header = self._read_header()
         first = next(self.samples(), None)
@@ -220,7 +220,7 @@ class Recording:
             raise
         except OSError as error:
             raise InputError(self.path, "", f"cannot be read ({error.strerror})") from None
-        except Exception as error:  # mcap, lz4 and zstandard have their own errors for a damaged file
+        except Exception as error:  # mcap, lz4 and zstandard raise their own errors for a damaged file
             if self.is_whole:
                 problem = str(error) or type(error).__name__
                 log.warning("%s: the file is truncated or damaged; reading the intact part (%s)", self.path, problem)
@@ -255,7 +255,7 @@ def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader, breakup_chunk
 
-    end = len(MAGIC)  # of the last whole record
+    end = len(MAGIC)  # end of the last complete record
     indexed = _indexed_chunks(file, max_bytes=max_bytes)
     file.seek(0)
     try:
@@ -266,14 +266,14 @@ def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[
                 yield from breakup_chunk(replace(record, compression="", data=data), validate_crc=True)
             else:
                 yield record
-            # mcap skips a record of an unknown kind
+            # mcap skips records of unknown kinds
             if end in indexed and os.pread(file.fileno(), len(CHUNK), end) != CHUNK:
                 raise ValueError(f"the chunk at byte {end} is not marked as one")
     except InputError:
         raise
-    except Exception:  # mcap, lz4 and zstandard have their own
+    except Exception:  # mcap, lz4 and zstandard raise their own errors
         file.seek(-len(MAGIC), os.SEEK_END)
-        is_whole = file.read() == MAGIC  # damaged, so its lengths cannot be trusted
+        is_whole = file.read() == MAGIC  # a damaged file, whose lengths cannot be trusted
         file.seek(end)
         if not is_whole and (data := _cut_off_chunk(file.read(max_bytes))):
             yield from breakup_chunk(Chunk("", data, 0, 0, 0, len(data)))
@@ -294,7 +294,7 @@ def _indexed_chunks(file: IO[bytes], *, max_bytes: int) -> set[int]:
         begin = file.seek(next(records(file.read())).summary_start)
         summary = records(file.read() if end - begin < max_bytes else b"")
         return {record.chunk_start_offset for record in summary if isinstance(record, ChunkIndex)}
-    except Exception:  # cut off, damaged, or of another kind
+    except Exception:  # a truncated or damaged file, or one of another kind
         return set()
 
 

@@ -20,8 +20,8 @@ METADATA_NAME = "phasestack.recording"
 EYES_TOPIC, COLOUR_TOPIC, DEPTH_TOPIC, CALIBRATION_TOPIC = "/eyes", "/colour", "/depth", "/camera"
 POSITION_DIGITS = 7  # 0.1 µm, far below any sensor's noise
 JPEG_QUALITY = 92  # of recorded colour pictures
-NUMBER_MAX = 1 << 62  # as a time, 146 years: sums and differences of two still fit 64 bits
-COORDINATE_MAX_M = 1e6  # beyond any sensor's range in any unit; the tracker judges plausibility
+NUMBER_MAX = 1 << 62  # sums and differences of two still fit 64 bits; 146 years in nanoseconds
+COORDINATE_MAX_M = 1e6  # beyond any sensor's range in any unit; the tracker checks for plausible values
 IMAGE_SIDE_MAX_PX = 1 << 15  # larger than any camera's pictures
 
 Count = Annotated[int, Field(ge=0, le=NUMBER_MAX)]
@@ -59,7 +59,7 @@ class EyeSample(Message):
 
 
 class Stamp(Message):
-    """Capture time of a picture, as a message holds it."""
+    """Capture time of a picture in a message."""
 
     sec: Annotated[int, Field(ge=0, le=NUMBER_MAX // NS_PER_S)]
     nsec: Annotated[int, Field(ge=0, lt=NS_PER_S)]
@@ -128,7 +128,7 @@ class RecordingHeader:
     def metadata(self) -> dict[str, str]:
         """Return the header as MCAP metadata, which maps text to text."""
         flags = {name: str(int(value)) for name, value in asdict(self).items() if isinstance(value, bool)}
-        # `eye_points`: every sample says where the eyes are, or the absence of a face.
+        # `eye_points`: every sample contains the eyes, or null without a face.
         texts = {"schema_version": str(SCHEMA_VERSION), "driver": self.driver, "serial": self.serial, "eye_points": "1"}
         return texts | flags
 

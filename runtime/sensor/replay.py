@@ -65,7 +65,7 @@ class ReplayDriver(SteppedSensor):
             yield frame
 
     def _shifted(self, recording: Recording) -> Iterator[SensorFrame]:
-        """Yield samples on the run's clock. A loop starts over after the recording's last interval."""
+        """Yield samples on the run's clock. A loop restarts after the recording's last interval."""
         last_ns = interval_ns = sequence_shift = last_sequence = shift_ns = 0
         is_first_round = True
         while True:

@@ -12,7 +12,7 @@ from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.base import Sensor, SteppedSensor
 
 FindEyes = Callable[[SensorFrame], EyePoints | None]
-AHEAD_NS = NS_PER_S // 10  # exceeds the time from a sample to the display of a refresh that used it
+AHEAD_NS = NS_PER_S // 10  # longer than the time from a sample to the display of a refresh that uses it
 
 
 class Samples(ABC):

@@ -17,10 +17,10 @@ from runtime.records import Intrinsics, SensorFrame
 from runtime.sensor.base import Capabilities, Sensor
 from runtime.support.film import open_film
 
-WAITED_NS = 3 * NS_PER_MS  # a picture that arrives sooner was already queued in the driver, where newer ones may be too
+WAITED_NS = 3 * NS_PER_MS  # a picture that arrives sooner was already queued in the driver, which may hold newer ones
 QUEUE_MAX = 8  # maximum number of pictures taken from the driver's queue in one read
 STAMP_AGE_NS = NS_PER_S  # older timestamps, and future ones, are ignored
-STREAMS = ("rtsp", "rtsps", "http", "https")  # FFmpeg's other protocols may listen or open other files
+STREAMS = ("rtsp", "rtsps", "http", "https")  # other protocols of FFmpeg may listen or open files
 
 
 class UsbCameraDriver(Sensor):

@@ -12,7 +12,7 @@ from runtime.support.extras import missing_extra
 UDEV_RULE = "70-phasestack-sensors.rules"
 SPEEDS = {1: "low speed (1.5 Mbit/s)", 2: "full speed (12 Mbit/s)", 3: "high speed, USB 2 (480 Mbit/s)"}
 SPEEDS |= {4: "SuperSpeed, USB 3 (5 Gbit/s)", 5: "SuperSpeed+, USB 3 (10 Gbit/s)"}
-SUPER_SPEED = 4  # libusb's number of USB 3's speed
+SUPER_SPEED = 4  # libusb's constant for USB 3
 
 
 class KnownDevice(NamedTuple):
@@ -49,8 +49,8 @@ class UsbDevice:
     known: KnownDevice
     bus: int
     address: int
-    serial: str  # empty: none, or not readable
-    speed: int  # libusb's number, 0: unknown
+    serial: str  # empty if missing or not readable
+    speed: int  # libusb's constant; 0: unknown
     is_accessible: bool
 
     def __str__(self) -> str:
@@ -77,7 +77,7 @@ def _described(device: Any, known: KnownDevice) -> UsbDevice:
     except (usb.core.USBError, NotImplementedError, ValueError):
         accessible = False  # pyusb raises ValueError ("no langid") without permission to read strings
     finally:
-        usb.util.dispose_resources(device)  # which reading the serial opened
+        usb.util.dispose_resources(device)  # reading the serial number opened the device
     return UsbDevice(known, device.bus or 0, device.address or 0, serial, device.speed or 0, accessible)
 
 

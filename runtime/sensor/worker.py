@@ -1,4 +1,4 @@
-"""Sensor thread, which queues samples, reopens lost sensors and abandons SDK calls that hang."""
+"""The sensor thread: queues samples, reopens lost sensors and abandons SDK calls that hang."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from runtime.support.extras import missing_extra
 
 TIMEOUTS_TO_REOPEN = 2  # consecutive timeouts without an error after which the sensor is reopened
 REOPEN_AFTER_S, REOPEN_AFTER_MAX_S = 0.25, 0.5  # the wait before reopening a lost sensor doubles up to the second
-OPEN_TIMEOUT_S = 10.0  # an attempt to open that takes longer is abandoned and repeated
+OPEN_TIMEOUT_S = 10.0  # an attempt to open the sensor that takes longer is abandoned and repeated
 HANG_MARGIN_S = 0.5  # time beyond its timeout after which a read counts as hung
-ABANDONED_MAX = 8  # abandoned threads; beyond that, the sensor is not reopened
+ABANDONED_MAX = 8  # with more abandoned threads, the sensor is not reopened
 QUEUE_MAX = 1024  # queued samples: four seconds of the fastest sensor
 PICTURES_MAX = 8  # queued samples with pictures
-AHEAD_NS = NS_PER_S // 1000  # a capture later than its arrival by more is on another clock
-BEHIND_NS = 60 * NS_PER_S  # as is one earlier by more
+AHEAD_NS = NS_PER_S // 1000  # a capture time later than its arrival by more than this is on another clock
+BEHIND_NS = 60 * NS_PER_S  # so is one earlier by more than this
 FROZEN_NS = 2 * NS_PER_S  # identical pictures or eye points for this long are a fault: real ones have noise
-COMPARED = slice(None, None, 4)  # rows and columns of a picture compared
+COMPARED = slice(None, None, 4)  # rows and columns of a picture that are compared
 
 log = logging.getLogger(__name__)
 
@@ -78,12 +78,12 @@ class SensorWorker(Samples):
         self._attempt: _Attempt | None = None
         self._hung: list[_Attempt] = []
         self._state, self.reason = SensorState.STOPPED, ""
-        self._was_well = False  # there was a valid sample
+        self._was_well = False  # True once there was a valid sample
         self._delivered: dict[str, tuple[int, int]] = {}  # checksum of the newest data, and when it last changed
-        self._untimely = ""  # fault of the latest wrong timestamp
-        self._skipped = 0  # samples superseded by a newer one, without those counted by the current driver
+        self._untimely = ""  # problem with the latest timestamp
+        self._skipped = 0  # samples superseded by a newer one, apart from those that the current driver counts
         self._driver: Sensor | None = None
-        self.serial = ""  # of the device once opened; used to reopen the same one
+        self.serial = ""  # the device's serial number once opened, used to reopen the same device
         self.error: FatalError | None = None
 
     def start(self) -> None:
@@ -146,7 +146,7 @@ class SensorWorker(Samples):
     def _watch(self) -> None:
         """Abandon a thread whose call takes too long, and start a new one."""
         if not self._watching.acquire(blocking=False):
-            return  # another thread is doing it
+            return  # another thread is already doing it
         try:
             self._abandon_if_hung(self._attempt)
         finally:
@@ -212,7 +212,7 @@ class SensorWorker(Samples):
                     self.error = missing
                     self._set(attempt, SensorState.FAILED, str(missing))
                     return
-                # An SDK's exception or `sys.exit()` must not end the daemon: it may recover.
+                # An SDK's exception or `sys.exit()` must not end the daemon, because the sensor may recover.
                 log.exception("sensor")
                 self._set(attempt, SensorState.LOST, f"{type(error).__name__}: {error}")
             finally:
@@ -262,7 +262,8 @@ class SensorWorker(Samples):
             well_ns, self._was_well = now_ns, True
             if not driver.capabilities.may_pause:
                 self._check_changing(frames[-1], now_ns)
-            overtaken = 0 if find is None else len(frames) - 1  # finding eyes takes a camera's period: only the newest
+            # Finding eyes takes as long as a camera's period, so only the newest frame is searched.
+            overtaken = 0 if find is None else len(frames) - 1
             frames = [searched(frame, find, keep_images=self._keep_images) for frame in frames[overtaken:]]
             attempt.received += 1
             with self._lock:

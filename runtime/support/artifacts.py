@@ -1,4 +1,4 @@
-"""Atomic writing of files and pictures: under a temporary name, then synced and renamed."""
+"""Atomic writing of files and pictures: written under a temporary name, synced, then renamed."""
 
 from __future__ import annotations
 
@@ -58,16 +58,16 @@ def write_bytes(path: Path, data: bytes, *, like: Path | None = None) -> None:
         with os.fdopen(handle, "wb") as file:
             file.write(data)
         if before is not None:
-            with suppress(PermissionError):  # another user's file becomes ours
+            with suppress(PermissionError):  # replacing another user's file makes it ours
                 os.chown(name, before.st_uid, before.st_gid)
         Path(name).chmod(0o644 if before is None else stat.S_IMODE(before.st_mode))
-        if any(part.startswith(STAGING) for part in path.parts):  # OutputFolder syncs at its end
+        if any(part.startswith(STAGING) for part in path.parts):  # OutputFolder syncs all files at its end
             Path(name).replace(path)
         else:
             put_in_place(Path(name), path)
     except BaseException as error:
         Path(name).unlink(missing_ok=True)
-        if isinstance(error, OSError):  # a full or failing disk, for example
+        if isinstance(error, OSError):  # for example, a full or failing disk
             raise InputError(path, "", f"cannot be written ({error.strerror})") from None
         raise
 
@@ -124,10 +124,10 @@ def write_png(path: Path, image: U8) -> None:
 
 
 class OutputFolder:
-    """A folder whose new files appear together at the end, or not at all.
+    """A folder whose new files appear all together at the end, or not at all.
 
-    It is a context manager: write to `staging`. On success all files are renamed into `target`, replacing files of the
-    same names; after an error no new file remains. Staged files of a killed process are removed by the next writer.
+    Use it as a context manager and write to `staging`. On success all files are renamed into `target`, replacing files
+    of the same names. After an error no new file remains. The next writer removes staged files of a killed process.
     """
 
     def __init__(self, target: Path) -> None:
@@ -140,7 +140,7 @@ class OutputFolder:
             _sweep(self.target)
             self.staging = Path(tempfile.mkdtemp(prefix=STAGING, dir=self.target))
             self._held = os.open(self.staging, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-            fcntl.flock(self._held, fcntl.LOCK_EX)  # held until this process ends
+            fcntl.flock(self._held, fcntl.LOCK_EX)  # until this process ends
         except OSError as error:
             raise InputError(self.target, "", f"cannot be written ({error.strerror})") from None
         return self
@@ -190,7 +190,7 @@ class OutputFolder:
 
 
 def _sweep(target: Path) -> None:
-    """Remove staging folders of killed processes, recognised by their missing lock, even across namespaces."""
+    """Remove staging folders of killed processes. Their lock is missing, which also shows across namespaces."""
     for stale in target.glob(f"{STAGING}*"):
         with suppress(OSError):
             opened = os.open(stale, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
@@ -202,19 +202,19 @@ def _sweep(target: Path) -> None:
 
 
 def _check_free(place: Path, *, within: Path) -> None:
-    """Raise InputError if a folder is in a file's place, or a file in a folder's place."""
+    """Raise InputError if a folder exists where a file must go, or a file where a folder must go."""
     for folder in place.parents:
         if folder == within:
             break
         if folder.exists() and not folder.is_dir():
-            raise InputError(folder, "", "is not a folder, and blocks an output")
+            raise InputError(folder, "", "exists but is not a folder, so the output cannot be written")
     if place.is_dir():
-        raise InputError(place, "", "is a folder, and blocks an output of that name")
+        raise InputError(place, "", "is a folder, so the output of that name cannot be written")
 
 
 @contextmanager
 def held_back() -> Iterator[None]:
-    """Hide what libraries write to stderr's file descriptor within the block.
+    """Suppress libraries' output to stderr's file descriptor within the block.
 
     Does nothing if other threads run, because the descriptor belongs to the whole process.
     """

@@ -1,4 +1,4 @@
-"""Background threads: priorities (presenter, solver, then the rest), abandonment, one-off jobs."""
+"""Background threads: priorities (presenter, then solver, then the rest), abandonment and one-off jobs."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ log = logging.getLogger("phasestack.background")
 PRESENTER_NICENESS = -10
 SOLVER_NICENESS = 5
 BACKGROUND_NICENESS = 10
-MEASURING_NICENESS = 15  # of measurements and files, which are not urgent
-STOPS_WITHIN_S = 1.2  # limit after a stop request; the rest of the two seconds is for calls without a timeout
+MEASURING_NICENESS = 15  # for measurements and writing files, which are not urgent
+STOPS_WITHIN_S = 1.2  # time limit after a stop request; the rest of the two seconds is for calls without a timeout
 T = TypeVar("T")
 
 _ends_by_s = math.inf
@@ -28,13 +28,13 @@ _abandoned: set[threading.Thread] = set()
 
 
 def ends_by(at_s: float) -> None:
-    """Set the deadline, in `time.monotonic` seconds, of every wait that `patience_s` limits."""
+    """Set the deadline, in `time.monotonic` seconds, for every wait that `patience_s` limits."""
     global _ends_by_s
     _ends_by_s = at_s
 
 
 def patience_s(most_s: float) -> float:
-    """Return the timeout for a thread that may be abandoned: `most_s` or the time to the deadline."""
+    """Return how long to wait for a thread that may be abandoned: `most_s`, or less if the deadline is nearer."""
     return max(0.0, min(most_s, _ends_by_s - time.monotonic()))
 
 
@@ -61,7 +61,7 @@ class ThreadAbandoned(BaseException):
 
 
 def abandon(thread: threading.Thread) -> None:
-    """Make a thread end its work at its next `raise_if_abandoned`."""
+    """Abandon a thread: its next call to `raise_if_abandoned` raises."""
     _abandoned.add(thread)
 
 
@@ -81,7 +81,7 @@ class BackgroundJob(Generic[T]):
         self._name, self._work, self._niceness = name, work, niceness
         self._result: T | None = None
         self.done = False
-        self.problem = ""  # one line if it failed
+        self.problem = ""  # one line with the reason if the job failed
         self._thread: threading.Thread | None = None
         try:
             self._thread = begin(f"job {name}", self._run)
@@ -105,7 +105,7 @@ class BackgroundJob(Generic[T]):
             self._result = self._work()
         except PhasestackError as error:
             self.problem = str(error)
-        except BaseException as error:  # from a library, or a vendor's `sys.exit()`
+        except BaseException as error:  # includes a vendor's `sys.exit()`
             self.problem = one_line(f"{self._name}: {type(error).__name__}: {error}")
             log.exception("%s", self._name)
         finally:

@@ -1,7 +1,7 @@
 """Processing of untrusted files in a child process with limits on memory and time.
 
-Parsers hold Python's lock, and a small file may make them use all memory. The result's arrays return in shared memory;
-progress, log lines and errors are forwarded as if the work ran in this process.
+Parsers hold Python's lock, and even a small file can make them use all memory. Arrays of the result are returned in
+shared memory. Progress, log lines and errors are forwarded as if the work ran in this process.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from runtime.support import progress
 from runtime.support.extras import missing_extra
 from runtime.support.untrusted_input import LIMITS, MIB
 
-MEMORY_MAX = 4 << 30  # bytes of data; enough for a scene at every limit
+MEMORY_MAX = 4 << 30  # bytes; enough for a scene that reaches every limit
 LOOK_S = 0.05  # interval between checks for cancellation
-ALIGNED = 64  # bytes; alignment of an array
+ALIGNED = 64  # bytes; alignment of arrays
 PR_SET_PDEATHSIG = 1  # prctl.h of Linux
 SMALL = 1 << 16  # bytes; smaller arrays are copied
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1")
@@ -52,7 +52,8 @@ def in_child(
     ours, theirs = Pipe()
     memory = os.memfd_create("result")
     command = [sys.executable, "-P", "-m", __name__, str(theirs.fileno()), str(memory)]
-    python_path = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, sys.path)])  # this package first
+    # This copy of phasestack comes first.
+    python_path = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, sys.path)])
     environment = os.environ | ONE_THREAD | {"PYTHONPATH": python_path}
     try:
         child = subprocess.Popen(
@@ -74,7 +75,7 @@ def in_child(
                 ours.send((work, args, str(source), asdict(LIMITS), (memory_bytes, seconds)))
             result = _outcome(ours, str(source), seconds)
             if result is None:
-                limit = f"needs more than {memory_bytes // MIB} MiB"
+                limit = f"needs more than {memory_bytes // MIB} MiB to read"
                 raise InputError(source, "", f"{limit}, or crashes the process that reads it ({child.wait()})")
             return pickle.loads(result[0], buffers=_mapped(memory, result[1]))  # type: ignore[no-any-return]
         finally:
@@ -134,13 +135,13 @@ def main(channel: Connection, memory: int) -> None:
     work, args, source, limits, (memory_bytes, seconds) = channel.recv()
     for name, limit in limits.items():
         setattr(LIMITS, name, limit)
-    processor_s = (os.cpu_count() or 1) * int(seconds) + 10  # in case the parent can't kill it
+    processor_s = (os.cpu_count() or 1) * int(seconds) + 10  # a limit in case the parent can't kill the child
     for kind, most in (
         (resource.RLIMIT_DATA, memory_bytes),
         (resource.RLIMIT_CPU, processor_s),
         (resource.RLIMIT_CORE, 0),
     ):
-        hard = resource.getrlimit(kind)[1]  # inherited, possibly from another child
+        hard = resource.getrlimit(kind)[1]  # inherited limit, possibly from another child
         most = most if hard == resource.RLIM_INFINITY else min(most, hard)
         resource.setrlimit(kind, (most, most))
     with suppress(OSError):
@@ -177,7 +178,7 @@ def main(channel: Connection, memory: int) -> None:
 def _passing(error: BaseException | None) -> OSError | None:
     """Return the transient system error that caused a refusal, for `is_retryable`.
 
-    Ends the process on a MemoryError, which means that it hit its limit.
+    Ends the process on a MemoryError, which means that it reached its limit.
     """
     while error is not None:
         if isinstance(error, MemoryError):

@@ -1,4 +1,4 @@
-"""ICC profiles of the colours that an AVIF or HEIC states by numbers (`nclx`, ITU-T H.273)."""
+"""ICC profiles for AVIF and HEIC pictures that declare their colours by code (`nclx`, ITU-T H.273)."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ import numpy as np
 from runtime.records import F64
 
 NCLX = re.compile(rb"colrnclx(..)(..)", re.DOTALL)
-SEARCHED = 1 << 18  # bytes at a file's beginning
-PQ, HLG = 16, 18  # transfer characteristics; every other one is taken as sRGB's
-PAPER_NITS, PQ_NITS = 203.0, 10_000.0  # what counts as white (ITU-R BT.2408); PQ's largest
-PRIMARIES = {  # XYZ of red, green and blue, adapted to D50; BT.709's are sRGB's own
+SEARCHED = 1 << 18  # bytes searched at the beginning of a file
+PQ, HLG = 16, 18  # transfer characteristics; all others are treated as sRGB
+PAPER_NITS, PQ_NITS = 203.0, 10_000.0  # luminance of white (ITU-R BT.2408); PQ's maximum
+PRIMARIES = {  # XYZ of red, green and blue, adapted to D50; BT.709 has the primaries of sRGB
     1: ((0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.71410)),
     9: ((0.67348, 0.27905, -0.00193), (0.16566, 0.67534, 0.02998), (0.12505, 0.04561, 0.79686)),
     12: ((0.51512, 0.24120, -0.00105), (0.29198, 0.69225, 0.04189), (0.15710, 0.06657, 0.78407)),
 }
 D50 = (0.9642, 1.0, 0.8249)
 SRGB_CURVE = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
-SAMPLES = 4096  # of another curve
+SAMPLES = 4096  # number of samples of a transfer curve
 
 
 def stated_profile(coded: bytes) -> bytes:
-    """The profile of a picture's colours; empty: they are sRGB, or unknown."""
+    """ICC profile of a picture's declared colours; empty for sRGB or unknown colours."""
     found = NCLX.search(coded[:SEARCHED]) if coded[4:8] == b"ftyp" else None
     if found is None:
         return b""
@@ -49,7 +49,7 @@ def _fixed(*values: float) -> bytes:
 
 
 def _table(transfer: int) -> bytes:
-    """A curve from codes to light in units of paper white; what is brighter is white."""
+    """Table from codes to light in units of paper white; brighter light is clipped to white."""
     code = np.linspace(0.0, 1.0, SAMPLES)
     light = _pq(code) if transfer == PQ else _hlg(code) / _hlg(np.array(0.75))  # where HLG has paper white
     values = np.rint(np.clip(light, 0.0, 1.0) * 65535).astype(">u2")
@@ -57,13 +57,13 @@ def _table(transfer: int) -> bytes:
 
 
 def _pq(code: F64) -> F64:
-    """SMPTE ST 2084."""
+    """Perceptual quantizer (PQ), SMPTE ST 2084."""
     root = code ** (1 / 78.84375)
     shown = np.maximum(root - 0.8359375, 0.0) / (18.8515625 - 18.6875 * root)
     return np.asarray(shown ** (1 / 0.1593017578125) * (PQ_NITS / PAPER_NITS))
 
 
 def _hlg(code: F64) -> F64:
-    """ARIB STD-B67, with the system gamma of a screen of 1000 nits, channel by channel."""
+    """Hybrid log-gamma (HLG), ARIB STD-B67, with the system gamma of a 1000-nit screen, per channel."""
     a, b, c = 0.17883277, 0.28466892, 0.55991073
     return np.asarray(np.where(code <= 0.5, code**2 / 3, (np.exp((code - c) / a) + b) / 12) ** 1.2)

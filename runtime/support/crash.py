@@ -1,4 +1,4 @@
-"""Report of an unexpected exception: the traceback in a file, one line for people."""
+"""Reports of unexpected exceptions: the traceback goes to a file, and one line to the user."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from runtime.errors import one_line, without_secrets
 from runtime.support.folders import state_folder
 
 STEM = "phasestack-error-"
-KEPT = 20  # newest files kept per folder, so that a service that fails repeatedly does not fill the disk
+KEPT = 20  # files kept per folder, so that a service that fails repeatedly does not fill the disk
 
 
 def written(error: BaseException) -> str:
@@ -34,7 +34,7 @@ def written(error: BaseException) -> str:
     for folder in (state_folder(), Path(tempfile.gettempdir())):
         with contextlib.suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
-            # mkstemp makes it readable by its owner alone: paths and names in it may be private.
+            # mkstemp makes the file readable only by its owner, since its paths and names may be private.
             file, path = tempfile.mkstemp(".log", f"{STEM}{now:%Y%m%dT%H%M%S}-{os.getpid()}-", folder)
             try:
                 with os.fdopen(file, "w", encoding="utf-8", errors="backslashreplace") as opened:
@@ -42,7 +42,7 @@ def written(error: BaseException) -> str:
             except OSError:
                 Path(path).unlink()
                 raise
-            with contextlib.suppress(OSError):  # another user's files
+            with contextlib.suppress(OSError):  # some files may be another user's
                 for old in sorted(folder.glob(f"{STEM}*.log"))[:-KEPT]:
                     old.unlink()
             return f"unexpected error ({summary}); details are in {path}"
@@ -50,7 +50,7 @@ def written(error: BaseException) -> str:
 
 
 def watch_threads() -> None:
-    """Report, in one line, exceptions that end a thread and exceptions that Python can't raise."""
+    """Report exceptions that end a thread or that Python can't raise, one line each."""
     threading.excepthook = lambda hook: _say(hook.exc_value, hook.exc_type)
     sys.unraisablehook = lambda hook: _say(hook.exc_value, hook.exc_type)
 
@@ -59,7 +59,7 @@ def _say(error: BaseException | None, kind: type[BaseException]) -> None:
     if issubclass(kind, SystemExit):
         return
     if issubclass(kind, KeyboardInterrupt):
-        # It hit a finaliser or a callback, where Python drops it, and would do so here: send the signal again.
+        # Python drops an interrupt that arrives in a finaliser or callback, or here: send the signal again.
         again = threading.Timer(0.01, signal.raise_signal, (signal.SIGINT,))
         again.daemon = True
         again.start()

@@ -7,7 +7,7 @@ from importlib.metadata import PackageNotFoundError, requires
 
 from runtime.errors import MissingPart
 
-IMPORTED_AS = {"usb": "pyusb"}  # packages whose module has another name
+IMPORTED_AS = {"usb": "pyusb"}  # packages whose module has a different name
 NOT_TO_RUN = frozenset({"all", "docs", "test"})
 
 

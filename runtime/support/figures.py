@@ -1,4 +1,4 @@
-"""Formatting of a record as lines for people, with the same names as in JSON."""
+"""Formatting of a record as readable lines, with the same names as in JSON."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ LINE_MAX = 2000  # characters
 
 
 def shown(record: Mapping[str, Any], *, as_json: bool) -> str:
-    """Format a command's result: JSON, or lines for people."""
+    """Format a command's result as JSON or as readable lines."""
     return json.dumps(record) if as_json else "\n".join(lines_of(record))
 
 

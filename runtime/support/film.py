@@ -17,9 +17,9 @@ _alone = threading.Lock()
 
 
 def open_film(path: Path) -> cv2.VideoCapture:
-    """Open a film. FFmpeg's and OpenCV's messages are suppressed, because ours name the file.
+    """Open a film. FFmpeg's and OpenCV's messages are suppressed, because our errors name the file.
 
-    FFmpeg is restricted because a playlist or script with a film's suffix, or a name that looks like a URL, would make
+    FFmpeg is restricted, because a playlist or script with a film's suffix, or a name that looks like a URL, could make
     it open other files and connections. Raises InputError for anything but a file.
     """
     untrusted_input.open_regular(path).close()

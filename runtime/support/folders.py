@@ -1,4 +1,4 @@
-"""Folders for data that outlive a run."""
+"""Folders for data that must survive a run."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def state_folder() -> Path:
-    """Return the state folder of the systemd service or, outside of it, of the user."""
+    """Return the systemd service's state folder or, outside the service, the user's."""
     if service := os.environ.get("STATE_DIRECTORY", ""):
         return Path(service.split(":")[0])
     xdg, home = os.environ.get("XDG_STATE_HOME", ""), os.environ.get("HOME", "")

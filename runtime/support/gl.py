@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import moderngl
 
 DEBIAN_PACKAGES = "libegl1 libgl1-mesa-dri libgles2 libgl1"
-MINIMUM_VERSION = 330  # of OpenGL, times 100: the shaders' version
+MINIMUM_VERSION = 330  # OpenGL version times 100, as the shaders require
 # Sonames avoid moderngl's search for libraries, which starts a compiler and takes 60 ms.
 EGL: dict[str, Any] = {"backend": "egl", "libegl": "libEGL.so.1", "libgl": "libGL.so.1"}
 
@@ -31,7 +31,7 @@ def offscreen_context() -> moderngl.Context:
     except ImportError as error:
         raise missing_extra(error) or error from None
 
-    if "MESA_SHADER_CACHE_DIR" not in os.environ:  # no cache in the home folder: our shaders compile in milliseconds
+    if "MESA_SHADER_CACHE_DIR" not in os.environ:  # no cache in the home folder; compiling takes milliseconds
         os.environ["MESA_SHADER_CACHE_DISABLE"] = "true"
     try:
         return moderngl.create_context(require=MINIMUM_VERSION, standalone=True, **EGL)
@@ -70,7 +70,7 @@ class DrawnPicture:
     texture: moderngl.Texture
     target: moderngl.Framebuffer  # contains `texture`
     held: U8  # (h, w, 4) the renderer's buffer for reading pixels back
-    grey: bool = False  # known to have no colour
+    grey: bool = False  # True if it is known to have no colour
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -1,7 +1,8 @@
-"""Search for the second view of a Leia picture (LIF): a JPEG followed by fields, from a Lume Pad.
+"""Search for the second view of a Leia picture (LIF) from a Lume Pad: a JPEG followed by fields.
 
-The file ends with the length of these fields and a mark. Fields: their number, then of each its number, its size and
-its bytes. One field holds the views as JSON, each with its place and the field of its JPEG; -1 is the file itself.
+The file ends with the total length of the fields and a marker. The fields begin with their count; each has an
+identifier, a size and its bytes. One field describes the views in JSON: the position of each and the field that
+contains its JPEG, where -1 is the file itself.
 """
 
 from __future__ import annotations
@@ -13,12 +14,12 @@ from runtime.errors import InputError
 from runtime.support.untrusted_input import parsed_json
 
 MARK = b"\x1e\x1a"
-VIEWS, OWN = 7, -1  # numbers of fields: of the views' JSON; of the JPEG that the file begins with
+VIEWS, OWN = 7, -1  # field identifiers: the views' JSON; the JPEG at the start of the file
 JSON_BYTES_MAX = 65536
 
 
 def other_view(file: IO[bytes]) -> tuple[slice, bool] | None:
-    """Return a pair's other JPEG and whether it is the left eye's; None for another or damaged file."""
+    """Return a pair's other JPEG and whether it is the left eye's; None for other or damaged files."""
     size = file.seek(0, 2)
     if size < 6:
         return None
@@ -39,7 +40,7 @@ def other_view(file: IO[bytes]) -> tuple[slice, bool] | None:
     try:
         views = parsed_json(file.read(told.stop - told.start), source="LIF")["views"]
         across = sorted((float(view["xLocation"]), int(view["albedoId"])) for view in views)
-        # Of more than two, which are closer to each other than eyes are, the outermost.
+        # With more than two views, use the outermost, because neighbouring ones are closer together than eyes.
         left, right = across[0][1], across[-1][1]
         return (fields[right], False) if left == OWN else (fields[left], True) if right == OWN else None
     except (InputError, LookupError, TypeError, ValueError):

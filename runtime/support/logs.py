@@ -1,6 +1,6 @@
 """Log lines for people and for journald.
 
-Repeated messages are rate-limited, messages can't forge lines, and logging never blocks on a slow reader.
+Repeated messages are rate-limited, a message cannot forge another line, and a slow reader never blocks logging.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ PRIORITY = {
     logging.ERROR: "<3>",
     logging.CRITICAL: "<2>",
 }
-ROOTS = ("phasestack", "runtime")  # loggers named by subject, and by module
-BURST = 5  # number of equal messages passed within `QUIET_NS`
+ROOTS = ("phasestack", "runtime")  # loggers named by subject, and loggers named by module
+BURST = 5  # equal messages passed within `QUIET_NS`
 REMEMBERED = 1000  # different messages counted
-QUIET_NS = 30 * NS_PER_S  # after which a suppressed message passes again
+QUIET_NS = 30 * NS_PER_S  # time after which a suppressed message passes again
 QUEUED_MAX = 4096  # lines waiting for a reader
 CLOSE_S = 1.0  # longest wait for the last lines
 LINE_MAX = 4000  # characters
@@ -46,9 +46,9 @@ class TextFormat(logging.Formatter):
         self._journald = journald
 
     def format(self, record: logging.LogRecord) -> str:
-        text = one_line(record.getMessage(), most=LINE_MAX)  # names and messages can't forge a line
+        text = one_line(record.getMessage(), most=LINE_MAX)  # one line, so that names and messages can't forge another
         if record.exc_info and record.exc_info[1]:
-            text += f": {written(record.exc_info[1])}"  # names the file with the traceback
+            text += f": {written(record.exc_info[1])}"  # the text names the file with the traceback
         if self._journald:
             return PRIORITY.get(record.levelno, "<6>") + text
         when = datetime.fromtimestamp(record.created).strftime("%H:%M:%S")
@@ -64,14 +64,14 @@ class RateLimit(logging.Filter):
     def __init__(self, clock: Clock) -> None:
         super().__init__()
         self._clock = clock
-        self._seen: dict[tuple[str, str], tuple[int, int, int]] = {}  # start of the window, passed, suppressed
+        self._seen: dict[tuple[str, str], tuple[int, int, int]] = {}  # window start, passed, suppressed
 
     def filter(self, record: logging.LogRecord) -> bool:
         if getattr(record, "always", False):
             return True
         key = (record.name, str(record.msg))
         now_ns = self._clock.now_ns()
-        if len(self._seen) > REMEMBERED:  # bounds the memory for messages that never repeat
+        if len(self._seen) > REMEMBERED:  # bound the memory for messages that never repeat
             self._seen.clear()
         start_ns, passed, suppressed = self._seen.get(key, (now_ns, 0, 0))
         if now_ns - start_ns >= QUIET_NS:
@@ -86,7 +86,7 @@ class RateLimit(logging.Filter):
 
 
 class _Lines(logging.Handler):
-    """Writes lines to a descriptor, and blocks if its reader is slow; used on the listener's thread."""
+    """Writes lines to a descriptor. It blocks if the reader is slow, so only the listener's thread uses it."""
 
     def __init__(self, descriptor: int) -> None:
         super().__init__()
@@ -113,7 +113,7 @@ class QueuedLines(QueueHandler):
         self._listener.start()
 
     def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
-        """Format the message now, but leave the exception, which takes longer, to the listener."""
+        """Format the message now, but leave the exception to the listener, because that takes longer."""
         prepared = copy.copy(record)
         prepared.msg, prepared.args = record.getMessage(), None
         return prepared
@@ -130,7 +130,7 @@ class QueuedLines(QueueHandler):
 
     def close(self) -> None:
         self.flush()
-        if not self.queue.unfinished_tasks:  # else its thread is blocked and ends with the process
+        if not self.queue.unfinished_tasks:  # otherwise its thread is blocked and ends with the process
             self._listener.stop()
         super().close()
 
@@ -138,7 +138,7 @@ class QueuedLines(QueueHandler):
 def configure(
     *, stream: TextIO | None = None, clock: Clock | None = None, environment: Mapping[str, str] = os.environ
 ) -> None:
-    """Send phasestack's log lines to a stream (default stderr), replacing an earlier call's."""
+    """Send phasestack's log lines to a stream (default stderr), which replaces any earlier one."""
     for old in logging.getLogger(ROOTS[0]).handlers[:]:
         if isinstance(old, QueuedLines):
             old.close()

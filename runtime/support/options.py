@@ -1,4 +1,4 @@
-"""Numeric command-line options with ranges. Errors name the option."""
+"""Numeric command-line options with ranges; errors name the option."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ OPTION_OF = {("content", "scene"): "scene", ("model", "name"): "model"}
 
 
 def number(low: float, high: float, unit: str = "", *, help: str) -> Any:
-    """Return an option whose number, or each of whose numbers, must be in [low, high], both finite.
+    """Return an option whose numbers must be in [low, high], both finite.
 
     Any other value, NaN included, raises InputError during parsing, naming command and option.
     """

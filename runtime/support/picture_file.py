@@ -1,4 +1,4 @@
-"""Reading of picture files as upright 8-bit sRGB over a colour: stills, stereo pairs, animations."""
+"""Reading of stills, stereo pairs and animations as upright 8-bit sRGB over a background colour."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ log = logging.getLogger("phasestack.pictures")
 
 Colour = tuple[float, float, float]  # 0-1
 WHITE: Colour = (1.0, 1.0, 1.0)
-ROWS_AT_ONCE = 64  # rows converted together, which bounds the memory
-LATTICE = 9  # values per channel at which a profile is compared with sRGB
-SRGB_CODES = 2  # largest difference of a profile that is sRGB apart from rounding
-STILL_MS = 100.0  # duration of an animation's frame that gives 0, as in browsers
-DEEP = {"I;16": "<u2", "I;16L": "<u2", "I;16B": ">u2", "I;16N": "=u2"}  # Pillow's modes of 16 bits
+ROWS_AT_ONCE = 64  # rows converted together, to bound the memory
+LATTICE = 9  # values per channel at which a colour profile is compared with sRGB
+SRGB_CODES = 2  # largest difference for a profile to count as sRGB
+STILL_MS = 100.0  # duration of an animation's frame that declares 0, as in browsers
+DEEP = {"I;16": "<u2", "I;16L": "<u2", "I;16B": ">u2", "I;16N": "=u2"}  # Pillow's 16-bit modes
 
 
 def read_image(path: Path, *, background: Colour = WHITE) -> U8:
@@ -66,8 +66,8 @@ def read_animation(path: Path, *, background: Colour = WHITE) -> tuple[list[U8],
         numbers = range(1 if image.info.get("default_image") else 0, image.n_frames)
     if len(numbers) * header.width_px * header.height_px > LIMITS.pixels:
         size = f"{header.width_px} x {header.height_px}"
-        total = f"{len(numbers)} frames of {size} pixels; at most {LIMITS.pixels:,} in all"
-        log.warning("%s has %s; only its first frame is shown, as a still", path, total)
+        total = f"{len(numbers)} frames of {size} pixels; the maximum is {LIMITS.pixels:,} pixels in all"
+        log.warning("%s has %s; showing only its first frame", path, total)
         numbers = numbers[:1]
     frames = list(_decoded(path, data, tuple(numbers), background))
     return [picture for picture, _ in frames], [shown_ms for _, shown_ms in frames]
@@ -90,14 +90,14 @@ def _decoded(path: Path, data: bytes, frames: tuple[int, ...], background: Colou
                 yield rgb_of(image, path, background=background), shown_ms
     except InputError:
         raise
-    except Exception as error:  # each of Pillow's decoders raises its own
+    except Exception as error:  # each of Pillow's decoders raises its own exceptions
         raise InputError(path, "", undecodable(data, error)) from None
 
 
 def rgb_of(image: Any, source: object, *, background: Colour = WHITE) -> U8:
     """Convert Pillow's decoded image to (h, w, 3) 8-bit sRGB over a colour.
 
-    Applies its EXIF orientation and its profile. Raises InputError if its values have no defined range.
+    Applies the EXIF orientation and colour profile. Raises InputError if its values have no defined range.
     """
     profile = image.info.get("icc_profile")
     image = _upright(image)
@@ -110,7 +110,7 @@ def rgb_of(image: Any, source: object, *, background: Colour = WHITE) -> U8:
     is_clear = image.has_transparency_data
     behind = np.array([round(value * 255) for value in background], np.uint16)
     result = np.empty((image.height, image.width, 3), np.uint8)
-    for first in range(0, image.height, ROWS_AT_ONCE):  # intermediate values take several times the picture's memory
+    for first in range(0, image.height, ROWS_AT_ONCE):  # intermediate values need several times the picture's memory
         rows = slice(first, min(first + ROWS_AT_ONCE, image.height))
         part = _eight_bits(image.crop((0, rows.start, image.width, rows.stop)))
         alpha = np.asarray(part.convert("RGBA"))[..., 3:] if is_clear else None
@@ -122,13 +122,13 @@ def rgb_of(image: Any, source: object, *, background: Colour = WHITE) -> U8:
 
 
 def composed(colour: U8, alpha: U8, behind: Any) -> U8:
-    """colour·a + behind·(1 - a), rounded."""
+    """Return colour·a + behind·(1 - a), rounded."""
     mixed = colour.astype(np.uint16) * alpha + behind.astype(np.uint16) * (255 - alpha.astype(np.uint16))  # < 65,026
     return np.asarray((mixed + 127) // 255, np.uint8)
 
 
 def _upright(image: Any) -> Any:
-    with suppress(Exception):  # ignore a malformed entry
+    with suppress(Exception):  # ignore malformed entries
         if image.getexif().get(ORIENTATION, 1) != 1:
             return ImageOps.exif_transpose(image)
     return image
@@ -154,7 +154,7 @@ def _to_srgb(profile: bytes, colours: str, source: object) -> Any:
             renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
             flags=ImageCms.Flags.BLACKPOINTCOMPENSATION,
         )
-    except Exception as error:  # broken, or for another colour space: ignored, as in browsers
+    except Exception as error:  # a broken profile, or one for another colour space, is ignored, as in browsers
         log.info("%s: its colour profile is ignored (%s)", source, error)
         return None
     if colours == "CMYK":

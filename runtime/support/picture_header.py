@@ -19,31 +19,31 @@ from runtime.support.leia import other_view
 from runtime.support.untrusted_input import LIMITS
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
-PNG_DEPTH = slice(24, 25)  # where a PNG has its bits a channel
+PNG_DEPTH = slice(24, 25)  # position of a PNG's bit depth
 CHUNK_BYTES = 12  # overhead of a PNG chunk: length, kind, checksum
-SIDE_MAX_PX = 1 << 16  # that a header may claim
-# Pillow's: of EPS it would start Ghostscript. An MPO is a JPEG to it.
+SIDE_MAX_PX = 1 << 16  # largest side that a header may declare
+# Pillow's names. EPS is excluded, because Pillow would start Ghostscript. Pillow identifies an MPO as JPEG.
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "PPM", "TGA", "AVIF")
 ANIMATED = ("GIF", "PNG", "WEBP", "AVIF")
-ORIENTATION = 0x0112  # EXIF's tag
-TURNED = (5, 6, 7, 8)  # by a quarter: width and height are exchanged
-MP_ENTRIES, MP_NUMBER = 0xB002, 0xB101  # tags of an MPO: its pictures; which viewpoint one is, from the left
+ORIENTATION = 0x0112  # EXIF tag
+TURNED = (5, 6, 7, 8)  # quarter turns, which exchange width and height
+MP_ENTRIES, MP_NUMBER = 0xB002, 0xB101  # tags of an MPO: its pictures; a picture's viewpoint, counted from the left
 DISPARITY, UNDEFINED = "Multi-Frame Image: (Disparity)", "Undefined"
-JPS, JPS_BYTES = b"_JPSJPS_", 14  # mark of a stereo header, and its bytes up to the kind of picture
+JPS, JPS_BYTES = b"_JPSJPS_", 14  # marker of a stereo header, and offset of its layout field
 JPS_LAYOUTS = {2: "side-by-side", 3: "top-bottom", 4: "anaglyph"}
 JPS_HALF_HEIGHT, JPS_HALF_WIDTH, JPS_LEFT_FIRST = 1, 2, 4
-GAIN_MAP = (b"hdrgm", b"21496-1")  # marks of a gain map, a second picture with the brightness of the first
+GAIN_MAP = (b"hdrgm", b"21496-1")  # markers of a gain map, a second picture that only holds brightness
 HEAD_BYTES = 512  # read to identify a file
 UNDECODED = "is not an image that can be decoded"
 ANOTHER = "save it as PNG, JPEG or AVIF"
 CAMERA_SET = "such a scene is trained first; its splats (.ply) are drawn, and its folder of pictures as a slideshow"
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")  # most are TIFFs too
 RAW_KIND = "a camera's raw picture", "develop it and save it as JPEG"
-OTHER_KINDS = (  # unsupported formats: offset and value of the mark, name, way out
+OTHER_KINDS = (  # unsupported formats: offset and value of the marker, name, remedy
     (0, b"\xff\x0a", "JPEG XL", f"{ANOTHER} (djxl in.jxl out.png)"),
     (4, b"JXL \r\n", "JPEG XL", f"{ANOTHER} (djxl in.jxl out.png)"),
-    (0, b"v/1\x01", "OpenEXR", "its values have no range: expose it and save it as PNG"),
-    (0, b"#?RADIANCE", "Radiance HDR", "its values have no range: expose it and save it as PNG"),
+    (0, b"v/1\x01", "OpenEXR", "its values have no fixed range: tone-map it and save it as PNG"),
+    (0, b"#?RADIANCE", "Radiance HDR", "its values have no fixed range: tone-map it and save it as PNG"),
     (4, b"jP  \r\n", "JPEG 2000", ANOTHER),
     (0, b"8BPS", "a Photoshop document", ANOTHER),
     (0, b"%PDF", "PDF", "make pictures of its pages (pdftoppm -png)"),
@@ -56,7 +56,7 @@ OTHER_KINDS = (  # unsupported formats: offset and value of the mark, name, way 
     (0, b"7z\xbc\xaf", "a 7z archive", "unpack it first"),
     (0, b"Rar!", "a RAR archive", "unpack it first"),
     (0, b"\x89MCAP", "a recording", "it is replayed with --replay"),
-    (0, b"version https://git-lfs", "a pointer of Git LFS", "fetch the file itself (git lfs pull)"),
+    (0, b"version https://git-lfs", "a Git LFS pointer", "fetch the file itself (git lfs pull)"),
     (0, b"<svg", "SVG", ANOTHER),
     (0, b"<!DOCTYPE html", "a web page", "download the picture itself"),
     (0, b"<!doctype html", "a web page", "download the picture itself"),
@@ -67,22 +67,22 @@ OTHER_KINDS = (  # unsupported formats: offset and value of the mark, name, way 
 class Header:
     """Properties of a picture file, without decoding its pixels."""
 
-    kind: str  # Pillow's name of the format
+    kind: str  # Pillow's name for the format
     width_px: int
     height_px: int
-    views: tuple[int, ...]  # frames: the one that is shown, or the left and the right eye's
+    views: tuple[int, ...]  # indices of the frames: the one to show, or the left and the right eye's
     is_animated: bool
-    is_around: bool = False  # its XMP declares a sphere of 360 by 180 degrees
-    warning: str = ""  # missing second view
-    layout: str = ""  # of the views in one picture, by its own stereo header
-    other: slice | None = None  # bytes of view 1 of a Leia picture
+    is_around: bool = False  # True if its XMP declares a sphere of 360 by 180 degrees
+    warning: str = ""  # for example, that the second view is missing
+    layout: str = ""  # arrangement of the views in one picture, from its stereo header
+    other: slice | None = None  # bytes of a Leia picture's other view
 
 
 @contextmanager
 def opened(coded: bytes | IO[bytes]) -> Iterator[Any]:
-    """Pillow's image, not decoded, without Pillow's own limits: the caller has some.
+    """Open a picture with Pillow without decoding it.
 
-    Raises what Pillow's formats raise.
+    Pillow's own limits are off, because the caller applies stricter ones. Raises any exception of Pillow's formats.
     """
     from PIL import Image
 
@@ -99,7 +99,7 @@ def opened(coded: bytes | IO[bytes]) -> Iterator[Any]:
 
 @cache
 def _formats() -> tuple[str, ...]:
-    """Pillow's formats, with HEIC where the extra `heic` is installed."""
+    """Names of the supported Pillow formats, with HEIC if the extra `heic` is installed."""
     if importlib.util.find_spec("pillow_heif") is None:
         return FORMATS
     import pillow_heif
@@ -111,7 +111,7 @@ def _formats() -> tuple[str, ...]:
 def _header_of(path: Path, coded: bytes | IO[bytes]) -> Header:
     """Return the header of a picture file, from its bytes or the open file. Raises InputError.
 
-    A second picture that an MPO does not call a view is one only where the file is named .mpo.
+    If an MPO does not declare its second picture as a view, it counts as one only in a file named .mpo.
     """
     if path.suffix.lower() in RAW:  # of a TIFF, Pillow would show the thumbnail
         raise InputError(path, "", "is {}, which is not read: {}".format(*RAW_KIND))
@@ -141,9 +141,9 @@ def _beginning(coded: bytes | IO[bytes], most_bytes: int) -> bytes:
 
 
 def _views(image: Any, *, is_named_so: bool) -> tuple[tuple[int, ...], str]:
-    """Return frames of the left and the right eye, or the one to show, and a warning.
+    """Return the indices of the left and right eyes' frames, or of the one to show, and a warning.
 
-    A second picture is an eye's only if the file calls it one, and if it is as large as the first.
+    A second picture is an eye's view only if the file declares it as one and if it is as large as the first.
     """
     shown = (image.tell(),)
     if image.format == "HEIF":
@@ -160,7 +160,7 @@ def _views(image: Any, *, is_named_so: bool) -> tuple[tuple[int, ...], str]:
     try:
         image.seek(1)
     except Exception:  # as every decoder's
-        return (0,), "its second picture is missing: the first one is shown to both eyes"
+        return (0,), "its second picture is missing: both eyes see the first one"
     extra = b"".join(content for _, content in image.applist)
     if image.size != size or image.layers != 3 or any(mark in extra for mark in GAIN_MAP):
         return (0,), ""
@@ -168,7 +168,7 @@ def _views(image: Any, *, is_named_so: bool) -> tuple[tuple[int, ...], str]:
 
 
 def _leia_view(coded: bytes | IO[bytes], size: tuple[int, int]) -> tuple[slice, bool] | None:
-    """Return what `other_view` does, but None if the other view is not a picture of the same size."""
+    """Return the result of `other_view`, or None if the other view is not a picture of the same size."""
     file = io.BytesIO(coded) if isinstance(coded, bytes) else coded
     if found := other_view(file):
         file.seek(found[0].start)
@@ -179,7 +179,7 @@ def _leia_view(coded: bytes | IO[bytes], size: tuple[int, int]) -> tuple[slice, 
 
 
 def _jps_layout(image: Any) -> str:
-    """The layout that a JPEG's stereo header (JPS) states, in the syntax of `content.layout`; empty without one."""
+    """Layout declared by a JPEG's stereo header (JPS), in the syntax of `content.layout`; empty without a header."""
     for name, data in getattr(image, "applist", ()):
         if name == "APP3" and data[:8] == JPS and len(data) >= JPS_BYTES:
             flags, kind, is_stereo = data[11], JPS_LAYOUTS.get(data[12], ""), data[13] == 1
@@ -204,7 +204,7 @@ def _size_of(image: Any, frame: int) -> tuple[int, int]:
 
 
 def _viewpoint(image: Any) -> int | None:
-    """The number of a frame's viewpoint in an MPO, 1 the leftmost; None: unknown."""
+    """Number of a frame's viewpoint in an MPO, where 1 is the leftmost; None if unknown."""
     from PIL import TiffImagePlugin
 
     with suppress(Exception):  # a malformed table has no number
@@ -217,7 +217,7 @@ def _viewpoint(image: Any) -> int | None:
 
 
 def picture_size(coded: bytes) -> tuple[int, int]:
-    """Width and height of a coded picture as it is stored. Raises ValueError with the problem."""
+    """Width and height of a coded picture as stored. Raises ValueError with the problem."""
     try:
         with opened(coded) as image:
             width, height = image.size
@@ -227,7 +227,7 @@ def picture_size(coded: bytes) -> tuple[int, int]:
 
 
 def undecodable(data: bytes, error: Exception | None = None) -> str:
-    """Why a picture can't be decoded: its kind, with the way out, or that it is cut off."""
+    """Reason why a picture can't be decoded: an unsupported format, with a remedy, or a damaged file."""
     from PIL import UnidentifiedImageError
 
     if not data:
@@ -237,9 +237,9 @@ def undecodable(data: bytes, error: Exception | None = None) -> str:
         return f"is HEIC, which the extra `heic` reads (pip install pillow-heif); or {ANOTHER}"
     for place, mark, name, way_out in OTHER_KINDS:
         if data[place : place + len(mark)] == mark and (mark != b"CR" or data[:2] in (b"II", b"MM")):
-            return f"is {name}, which is not read: {way_out}"
+            return f"is {name}, which cannot be shown: {way_out}"
     if data[:5] == b"<?xml" and b"<svg" in data[:HEAD_BYTES]:
-        return f"is SVG, which is not read: {ANOTHER}"
+        return f"is SVG, which cannot be shown: {ANOTHER}"
     if data.lstrip()[:1] == b"{" and b'"frames"' in data:
         return f"is a camera set, as of a NeRF: {CAMERA_SET}"
     told = str(error).lower()
@@ -255,16 +255,16 @@ def _promises_more(data: bytes) -> bool:
     place = 0
     while data[4:8] == b"ftyp" and place + 8 <= len(data):
         size = int.from_bytes(data[place : place + 4], "big")
-        if size < 8:  # to the file's end, or with a longer number: none of those that cameras write
+        if size < 8:  # the box extends to the end of the file or has a 64-bit size; cameras write neither
             return False
         place += size
     return place > len(data)
 
 
 def is_cut_off(coded: bytes) -> bool:
-    """Return True if a PNG's chunks exceed the file, or it has no end; False for other formats.
+    """Return True if a PNG's chunks exceed the file or its end is missing; False for other formats.
 
-    OpenCV allocates the promised size before it reads: up to 2 GiB for a file of any size.
+    OpenCV allocates the declared size before reading, up to 2 GiB for a file of any size.
     """
     if not coded.startswith(PNG):
         return False
@@ -278,9 +278,9 @@ def is_cut_off(coded: bytes) -> bool:
 
 
 def _orientation(image: Any) -> int:
-    """Return the EXIF orientation stored before the pixels; Pillow already turns a TIFF.
+    """Return the EXIF orientation stored before the pixels. Pillow rotates TIFF itself.
 
-    Pillow's `getexif` would unpack a PNG.
+    Pillow's `getexif` is not used, because it would unpack a PNG.
     """
     from PIL import Image
 
@@ -288,7 +288,7 @@ def _orientation(image: Any) -> int:
     if image.format == "TIFF" or not isinstance(coded, bytes):
         return 1
     exif = Image.Exif()
-    with suppress(Exception):  # a malformed one turns nothing
+    with suppress(Exception):  # a malformed orientation is ignored
         exif.load(coded)
     found = exif.get(ORIENTATION)
     return found if isinstance(found, int) else 1
@@ -297,9 +297,9 @@ def _orientation(image: Any) -> int:
 def check_size(
     width_px: int, height_px: int, *, source: str | Path, field: str = "", name: str = "", head: bytes = b""
 ) -> None:
-    """Raise InputError for more pixels than the limit, or half of it for a PNG with 16 bits a channel.
+    """Raise InputError for more pixels than the limit, which is halved for a PNG with 16 bits per channel.
 
-    name: of a picture within `source`. head: the coded picture's beginning, where it is known.
+    name: the picture's name within `source`. head: beginning of the coded picture, if known.
     """
     is_deep = head.startswith(PNG) and head[PNG_DEPTH] == b"\x10"
     most = LIMITS.pixels // (2 if is_deep else 1)
@@ -309,7 +309,7 @@ def check_size(
 
 
 def decoded_picture(coded: bytes, *, source: str | Path, field: str, name: str) -> Any:
-    """Pillow's image of a picture that is whole and within the limit. Raises InputError."""
+    """Open a picture that is complete and within the limit. Raises InputError."""
     try:
         width, height = picture_size(coded)
         check_size(width, height, source=source, field=field, name=name, head=coded)
@@ -329,7 +329,7 @@ def camera_set_in(folder: Path) -> str:
 
 
 def read_coded(path: Path) -> tuple[bytes, Header]:
-    """A picture file's undecoded bytes, checked by its header. Raises InputError."""
+    """Read a picture file without decoding it, and check its header. Raises InputError."""
     if untrusted_input.is_there(path, folder=True) and (problem := camera_set_in(path)):
         raise InputError(path, "", problem)
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)

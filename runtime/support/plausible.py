@@ -1,4 +1,4 @@
-"""Checks of settings: ranges with hints at wrong units, valid paths, misspelt names."""
+"""Checks of settings: ranges that suggest the right unit, valid paths, misspelt names."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PART_MAX_BYTES = 255  # of one part of a path
 
 
 def within(low: float, high: float, unit: str, *, zero: bool = False) -> AfterValidator:
-    """Validator for a number in [low, high] with hints at other units; zero: allow 0 as "not set".
+    """Validator for a number in [low, high] that suggests the right unit; zero: also allow 0, for "not set".
 
     >>> within(0.005, 20.0, "m").func(518.4)
     Traceback (most recent call last):
@@ -33,7 +33,7 @@ def within(low: float, high: float, unit: str, *, zero: bool = False) -> AfterVa
 def check_text(value: str) -> str:
     """Return the text if it can be a name or a path. Raises ValueError."""
     if "\0" in value:
-        raise ValueError("holds a NUL character")
+        raise ValueError("contains a NUL character")
     try:
         size = len(value.encode())
         longest = max(len(part.encode()) for part in value.split("/"))
@@ -45,7 +45,7 @@ def check_text(value: str) -> str:
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """`: did you mean model?` if a known word is similar, else an empty text.
+    """Return `: did you mean model?` if a known word is similar, else an empty string.
 
     >>> nearest("modle", ["model", "loop"])
     ': did you mean model?'

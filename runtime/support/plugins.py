@@ -1,4 +1,4 @@
-"""User-defined classes, named `module:Class`, as in `mypackage.tunnel:Tunnel`."""
+"""Users' own classes, named `module:Class`, such as `mypackage.tunnel:Tunnel`."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def plugin_class(name: str, base: type, *, field: str) -> Any:
     module, _, attribute = name.partition(":")
     try:
         plugin = getattr(importlib.import_module(module), attribute, None)
-    except (Exception, SystemExit) as error:  # the module's own
+    except (Exception, SystemExit) as error:  # any exception of the module
         if missing := missing_extra(error):
             raise missing from None
         problem = one_line(f"{type(error).__name__}: {error}")

@@ -1,6 +1,6 @@
 """Progress of long work, reported to an optional listener, which may stop the work.
 
-Work calls `tell` as it proceeds. `listening` installs a listener. An exception raised by the listener ends the work,
+Functions call `tell` as they proceed, and `listening` installs a listener. An exception in the listener ends the work,
 so a signal takes effect within one step.
 """
 
@@ -13,7 +13,7 @@ from contextvars import ContextVar
 from typing import Any, TextIO, TypeVar
 
 T = TypeVar("T")
-NOW_AND_THEN_S = 10.0  # between two lines without a terminal
+NOW_AND_THEN_S = 10.0  # interval between lines if stderr is not a terminal
 
 Listener = Callable[[str, int, int | None], None]  # task, steps done, steps in all (None: unknown)
 

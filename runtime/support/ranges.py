@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 
 EYE_MOST_M = 50.0  # largest absolute coordinate of an eye
-SEPARATION_MIN_M = 0.005  # of two eyes; the tracker judges what is plausible for a person
-FOV_RANGE_DEG = (0.1, 179.0)  # of a picture's horizontal field of view
+SEPARATION_MIN_M = 0.005  # between two eyes; the tracker checks for a person's
+FOV_RANGE_DEG = (0.1, 179.0)  # horizontal field of view of a picture
 RECORD_MOST_S = 604_800.0  # a week
-SCALE = (1e-6, 1e6)  # of one frame's unit in another's: micrometres in metres, and vice versa
-# Units that a value may have been given in by mistake, by its proper unit: factor and name.
+SCALE = (1e-6, 1e6)  # scale between the units of two frames: from micrometres in metres to the reverse
+# Units that are often used by mistake, by the proper unit: factor and name.
 OTHER_UNITS = {
     "m": ((1e-3, "millimetres"), (1e-2, "centimetres")),
     "s": ((1e-3, "milliseconds"),),

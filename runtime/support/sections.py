@@ -1,4 +1,4 @@
-"""Tables of TOML and JSON files: read, and validated with errors that name the field."""
+"""Reading and validation of TOML and JSON tables; errors name the field."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from runtime.support import untrusted_input
 from runtime.support.plausible import check_text, nearest
 
 TABLE_BYTES_MAX = 4 << 20
-KEY_PARTS_MAX = 16  # in a dotted key: tomllib's time and memory are quadratic in their number
+KEY_PARTS_MAX = 16  # parts of a dotted key: tomllib's time and memory grow with their square
 STRINGS_AND_COMMENTS = re.compile(
     r'''"""(?:[^\\]|\\.)*?"""|\'{3}.*?\'{3}|"(?:[^"\\\n]|\\.)*"|'[^'\n]*'|#[^\n]*''', re.DOTALL
 )
@@ -23,7 +23,7 @@ M = TypeVar("M", bound=BaseModel)
 
 
 class Section(BaseModel):
-    """A frozen table: unknown keys refused, numbers finite, texts valid as names and paths."""
+    """A frozen table. Unknown keys are refused, numbers must be finite, and texts must be valid names or paths."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -38,7 +38,7 @@ def read_table(path: Path) -> dict[str, Any]:
     text = untrusted_input.read_text(path, most_bytes=TABLE_BYTES_MAX)
     table = untrusted_input.parsed_json(text, source=path) if path.suffix.lower() == ".json" else _toml(text, path)
     if not isinstance(table, dict):
-        raise InputError(path, "", "must hold one table")
+        raise InputError(path, "", "must contain one table")
     return table
 
 
@@ -57,7 +57,7 @@ def _toml(text: str, path: Path) -> Any:
 def validated(model: type[M], table: dict[str, Any], *, source: str | Path, folder: Path | None = None) -> M:
     """Return the table as a validated record. Raises InputError that names every wrong field.
 
-    folder: base of relative paths (`runtime.config.paths`); without it they stay as they are.
+    folder: base for relative paths (`runtime.config.paths`); without one they stay as they are.
     """
     try:
         return model.model_validate(table, context=folder)
@@ -72,7 +72,7 @@ def _wrong_field(model: type[BaseModel], error: Any) -> tuple[str, str]:
     name = ".".join(str(part) for part in error["loc"])
     message = error["msg"].removeprefix("Value error, ")
     if error["type"] == "extra_forbidden":
-        return name, "is no setting" + nearest(str(error["loc"][-1]), _keys(model, error["loc"][:-1]))
+        return name, "is not a setting" + nearest(str(error["loc"][-1]), _keys(model, error["loc"][:-1]))
     field, colon, rest = message.partition(": ")
     if colon and error["type"] == "value_error" and field.partition(".")[0] in _keys(model, error["loc"]):
         return ".".join(filter(None, (name, field))), rest  # a rule about several fields

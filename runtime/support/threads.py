@@ -22,7 +22,7 @@ def parallel_map(work: Callable[[Item], Result], items: Sequence[Item]) -> list[
         return [work(item) for item in items]
     others = [_pool(threads).submit(work, item) for item in items[1:]]
     try:
-        first = work(items[0])  # here: waking one thread less
+        first = work(items[0])  # on this thread, to wake one thread less
     finally:
         wait(others)
     return [first, *(other.result() for other in others)]
@@ -36,5 +36,5 @@ def on_rows(work: Callable[[int, int], None], rows: int, *, threads: int | None 
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """Keep the threads: starting one takes two milliseconds."""
+    """Return the thread pool, which is kept because starting a thread takes two milliseconds."""
     return ThreadPoolExecutor(threads, "parallel-map")

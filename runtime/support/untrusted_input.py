@@ -1,7 +1,7 @@
-"""Reading of untrusted input (paths, files, JSON, numbers), in one place and within limits.
+"""Reading of untrusted input (paths, files, JSON, numbers) within limits.
 
-Every reader of untrusted bytes uses this module. A fault is an InputError, one line that names the file and the
-field; a value over a limit is reported with the limit.
+Every reader of untrusted bytes uses this module. Faults raise InputError with one line that names the file and the
+field. If a value exceeds a limit, the line also gives the limit.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from typing import IO, Any
 
 from runtime.errors import InputError
 
-JSON_DEPTH_MAX = 64  # of nested objects, well within Python's recursion limit
-JSON_BYTES_MAX = 64 << 20  # of a JSON file
-DIGITS_MAX = 19  # of a 63-bit number
+JSON_DEPTH_MAX = 64  # depth of nested objects, well within Python's recursion limit
+JSON_BYTES_MAX = 64 << 20  # size of a JSON file
+DIGITS_MAX = 19  # digits of a 63-bit number
 MIB = 1 << 20
 
 
@@ -27,16 +27,16 @@ class Limits:
     """Limits for files from outside, checked before memory is allocated."""
 
     file_bytes: int = 1 << 30  # one file of content or of a recording
-    pixels: int = 134_217_728  # of one picture; 16384 x 8192
-    texture_pixels: int = 134_217_728  # of all pictures of a scene together
-    triangles: int = 2_000_000  # of a mesh, all instances together
+    pixels: int = 134_217_728  # pixels of one picture: 16384 x 8192
+    texture_pixels: int = 134_217_728  # pixels of all pictures of a scene together
+    triangles: int = 2_000_000  # triangles of a scene, all instances together
     splats: int = 3_000_000
     instances: int = 2000  # placed meshes in a glTF scene
-    json_values: int = 4_000_000  # of one JSON text: Python takes a gigabyte for them
-    depth: int = 64  # how deep JSON or a glTF scene may nest
+    json_values: int = 4_000_000  # values in one JSON text, which take a gigabyte in Python
+    depth: int = 64  # nesting depth of JSON or a glTF scene
     load_s: float = 120.0  # time limit of loading one piece of content
     start_s: float = 600.0  # time limit of a start: content and model
-    recording_s: float = 21_600.0  # length of a recording that is replayed
+    recording_s: float = 21_600.0  # longest recording that is replayed
     chunk_bytes: int = 32 << 20  # one chunk or message of a recording, unpacked
 
 
@@ -59,7 +59,7 @@ def checked_path(path: str | Path, *, source: str | Path = "", field: str = "") 
 
 
 def is_there(path: str | Path, *, folder: bool = False) -> bool:
-    """Return True if something (or a folder) exists at a path. Raises InputError if that is unknown."""
+    """Return True if a file or folder exists at a path. Raises InputError if that cannot be determined."""
     checked = checked_path(path)
     try:
         return checked.is_dir() if folder else checked.exists()
@@ -72,7 +72,7 @@ def open_regular(
 ) -> IO[bytes]:
     """Open a regular file for reading. Raises InputError for any other kind, or if it is too large.
 
-    Opening never waits (a FIFO without a writer would), and the opened file itself is checked.
+    Opening never waits, as it would for a FIFO without a writer. The check applies to the opened file itself.
     """
     name = source or str(path)
     checked = checked_path(path, source=source, field=field)
@@ -98,8 +98,8 @@ def read_bytes(path: str | Path, *, most_bytes: int, source: str | Path = "", fi
     with open_regular(path, most_bytes=most_bytes, source=source, field=field) as file:
         try:
             size = min(os.fstat(file.fileno()).st_size, most_bytes)
-            data = file.read(size + 1)  # allocates the present size, not the limit
-            if len(data) > size:  # it grows while it is read
+            data = file.read(size + 1)  # allocates the current size, not the limit
+            if len(data) > size:  # the file grew while it was read
                 data += file.read(most_bytes + 1 - len(data))
         except OSError as error:
             raise InputError(name, field, f"cannot be read ({error.strerror})") from None
@@ -173,7 +173,7 @@ def whole_from_text(text: str, *, source: str | Path, field: str) -> int:
 def within(count: int | float, most: int | float, *, source: str | Path, field: str) -> None:
     """Raise InputError, with both figures, if a count exceeds its limit."""
     if count > most:
-        raise InputError(source, field, f"{count:,} is over the limit of {most:,}")
+        raise InputError(source, field, f"{count:,} exceeds the limit of {most:,}")
 
 
 def shown(value: Any, *, most: int = 40) -> str:

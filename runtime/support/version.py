@@ -7,7 +7,7 @@ from functools import cache
 
 @cache
 def version() -> str:
-    """Version of the installed package; `unknown` when run from a folder without installation."""
+    """Version of the installed package; `unknown` if it is run without installation."""
     from importlib.metadata import PackageNotFoundError
     from importlib.metadata import version as installed
 

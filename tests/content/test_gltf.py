@@ -197,7 +197,7 @@ def test_a_node_stands_as_often_as_its_instances_say(tmp_path: Path, monkeypatch
     data = load_mesh(path)
     assert len(data.parts) == 3 and data.high[:2].tolist() == [12, 6]
     monkeypatch.setattr(LIMITS, "instances", 2)
-    with pytest.raises(InputError, match="nodes: 3 is over the limit of 2"):
+    with pytest.raises(InputError, match="nodes: 3 exceeds the limit of 2"):
         load_mesh(path)
 
 

@@ -337,7 +337,7 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
         ("a.obj", TRIANGLE + "f 1 2 9\n", "cannot be read as a mesh"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "faces: none has an area"),
         ("a.stl", "\0" * 80 + "\7\0\0\0" + "\0" * 60, "faces: there are none"),
-        ("a.stl", "solid x\n" + "facet normal 0 0 1\n" * 50, "faces: 50 is over the limit of 20"),
+        ("a.stl", "solid x\n" + "facet normal 0 0 1\n" * 50, "faces: 50 exceeds the limit of 20"),
         ("a.stl", "", "faces: there are none"),
         ("a.ply", CLOUD, "faces: there are none"),
         ("a.stl", "\0" * 84, "faces: there are none"),

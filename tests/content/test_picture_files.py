@@ -374,7 +374,7 @@ def test_an_animation_over_the_limit_is_a_still_and_says_so(tmp_path: Path, monk
     monkeypatch.setattr(LIMITS, "pixels", 2 * 160 * 90)
     assert open_frames(tmp_path / "a.gif", AUTO).count == 1
     assert "3 frames of 160 x 90 pixels; at most" in caplog.text
-    assert "only its first frame is shown, as a still" in caplog.text
+    assert "showing only its first frame" in caplog.text
 
 
 # Refusals

@@ -93,7 +93,7 @@ def test_an_entry_has_its_own_settings_and_place(folder: Path, context: Any, sta
         (("seconds = 1",), "show[0].scene: "),
         (("scene = 'list.toml'\nseconds = 1",), "show[0].scene: another list is no scene"),
         (("scene = 'other.toml'\nseconds = 1",), "show[0].scene: another list is no scene"),
-        (("scene = 'red.png'\nseconds = 1\nscael = 2",), "show[0].scael: is no setting: did you mean scale?"),
+        (("scene = 'red.png'\nseconds = 1\nscael = 2",), "show[0].scael: is not a setting: did you mean scale?"),
         (("scene = 'red.png'\nseconds = 1\nscale = 'x'",), "show[0].scale: "),
         ((), "show: "),
         (("scene = 'red.png'\nseconds = 1",) * 65, "show: "),

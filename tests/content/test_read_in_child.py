@@ -151,7 +151,7 @@ def deep(folder: Path, width: int, height: int) -> Path:
         (lambda folder: deep(folder, 8192, 4096), "", 900),  # 21 bytes a pixel; 82 before
         (lambda folder: deep(folder, 16_384, 8192), "of 16 bits a channel; at most 67,108,864", 200),  # 11 GB
         (lambda folder: painted(folder, png(16_384, 8192, "RGB")), "", 1300),  # 2.0 GB
-        (lambda folder: painted(folder, *[png(4096, 4096)] * 40), "is over the limit of 134,217,728", 400),  # 2.8 GB
+        (lambda folder: painted(folder, *[png(4096, 4096)] * 40), "exceeds the limit of 134,217,728", 400),  # 2.8 GB
     ],
     ids=["deep", "too deep", "a large texture", "many textures"],
 )

@@ -170,7 +170,7 @@ def test_all_textures_together_have_a_limit(tmp_path: Path, monkeypatch: pytest.
     """Forty textures of one 20 KB picture took 2.8 GB and eight minutes."""
     monkeypatch.setattr(LIMITS, "texture_pixels", 100_000)
     told = refused(painted(tmp_path, png(300, 300), png(301, 300)))
-    assert told.endswith("textures' pixels: 180,300 is over the limit of 100,000")
+    assert told.endswith("textures' pixels: 180,300 exceeds the limit of 100,000")
 
 
 def test_a_texture_starts_no_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -226,8 +226,8 @@ def ply(folder: Path, vertices: Any, faces: Any, form: str = "binary_little_endi
 @pytest.mark.parametrize(
     ("vertices", "faces", "told"),
     [
-        (9, 10_000_000, "element face: 10,000,000 is over the limit of 2,000,000"),
-        (10**18, 1, "is over the limit of 6,000,000"),
+        (9, 10_000_000, "element face: 10,000,000 exceeds the limit of 2,000,000"),
+        (10**18, 1, "exceeds the limit of 6,000,000"),
         (9, 1_999_999, "the file is cut off: 1,999,999 are declared in"),
         ("²", 1, "element vertex: is not a whole number: ²"),
         (9, "²", "element face: is not a whole number: ²"),
@@ -247,7 +247,7 @@ def test_a_ply_that_promises_too_much_is_refused(
 def test_an_obj_of_too_many_triangles_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(LIMITS, "triangles", 100)
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "f 1 2 3 1 2\n" * 40)
-    assert "faces: 120 is over the limit of 100" in refused(tmp_path / "a.obj")
+    assert "faces: 120 exceeds the limit of 100" in refused(tmp_path / "a.obj")
 
 
 def gltf(**changes: Any) -> dict[str, Any]:
@@ -269,7 +269,7 @@ PNG_URI = PNG_TYPE + base64.b64encode(png(4, 4)).decode()
 GLTFS: dict[str, tuple[dict[str, Any], str]] = {
     "20,000 instances": (
         gltf(nodes=[{"mesh": 0}] * 20_000, scenes=[{"nodes": list(range(20_000))}]),
-        "nodes: 20,000 is over the limit of 2,000",
+        "nodes: 20,000 exceeds the limit of 2,000",
     ),
     "a chain of nodes": (
         gltf(nodes=[*({"children": [k + 1]} for k in range(99)), {"mesh": 0}]),
@@ -278,7 +278,7 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
     "a circle of nodes": (gltf(nodes=[{"children": [0], "mesh": 0}]), ""),
     "a count": (
         gltf(accessors=[{"componentType": 5126, "count": 10**9, "type": "VEC3"}] * 2),
-        "accessors[0].count: 1,000,000,000 is over the limit of 20,000,000",
+        "accessors[0].count: 1,000,000,000 exceeds the limit of 20,000,000",
     ),
     "a buffer that is not there": (
         gltf(buffers=[{"uri": "gone.bin", "byteLength": 9}]),

@@ -61,7 +61,9 @@ def test_a_folder_that_cannot_be_written_is_named_as_given(tmp_path: Path) -> No
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(("in_the_way", "told"), [("b/c/x", "b/c: is a folder"), ("b", "b: is not a folder")])
+@pytest.mark.parametrize(
+    ("in_the_way", "told"), [("b/c/x", "b/c: is a folder"), ("b", "b: exists but is not a folder")]
+)
 def test_an_obstacle_to_one_file_keeps_all_others_from_being_replaced(
     tmp_path: Path, in_the_way: str, told: str
 ) -> None:

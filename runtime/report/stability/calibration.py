@@ -33,8 +33,8 @@ def fitted(
 ) -> Answer:
     """Compare the similarity fitted to rotated, scaled and shifted points with the true one.
 
-    The condition is the points' distance from the origin over the second largest of their extents: the amplification
-    of a relative error of the coordinates, rounding included, to a turn of the fit.
+    The condition is the points' distance from the origin over their second largest extent. It is the factor by which
+    relative errors of the coordinates, including rounding, rotate the fit.
     """
     stack_m = scale * sensor_m @ turn.T + offset_m
     matrix = fit(sensor_m, stack_m)

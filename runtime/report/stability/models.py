@@ -32,17 +32,17 @@ SOLVE, NETWORK = "solve", "network"
 MODELS = ("fast", "balanced", "best")
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 192, 108)
 FOV_DEG = 40.0
-AMPLITUDE = 0.1  # of the target difference between the eyes at its lowest frequency, in phase units of pi/2
+AMPLITUDE = 0.1  # amplitude of the target difference between the eyes at its lowest frequency, in units of pi/2
 FINER = ((5, 0.05), (11, 0.03))  # further waves of the difference: cycles across the panels, amplitude
 COMMON = ((3, 0.15), (7, 0.1))  # waves of both eyes' common part
 WIDTH_M, HEIGHT_M, WIDTH_PX, HEIGHT_PX = 0.5184, 0.0648, 64, 8
 SOLVE_FLOOR = 0.002  # a grey level of 8 bits, on one of three panels, relative to the target
-NETWORK_FLOOR = 0.0005  # an eighth of a code, for another processor's rounding
+NETWORK_FLOOR = 0.0005  # an eighth of a code, for different rounding on other processors
 
 
 @lru_cache(maxsize=4)
 def ready(model: str, stack: PanelStack) -> Predictor:
-    """Return a model's predictor; most cases are about the same panels."""
+    """Return a model's predictor, which is cached because most cases share the same panels."""
     return load_predictor(model, stack, ModelSettings(threads=1))
 
 
@@ -71,7 +71,7 @@ class StiffProblem:
 
     gap_m: float = 0.06
     ipd_m: float = 0.06
-    distance_m: float = 0.54  # from the front panel
+    distance_m: float = 0.54  # distance from the front panel
 
     @property
     def eye_x_m(self) -> float:
@@ -139,9 +139,9 @@ def solved(model: str, problem: StiffProblem) -> Answer:
     layers = layers_of(model, images, eyes_m, stack, fov_deg=fov_deg)
     residual, least = problem.residual(layers.mean(axis=-1) / 255), optimum(problem)
     note = f"no panels leave less than {least:.3g}"
-    if residual < 0.8 * least - SOLVE_FLOOR:  # slightly different rows can do with less
+    if residual < 0.8 * least - SOLVE_FLOOR:  # rows that differ slightly can reach a smaller residual
         return Answer(math.nan, 1.0, problem.condition(), note=f"{residual:.3g} is impossible: {note}")
-    # Alternating between the eyes leaves all of the difference to one of them; flat grey is the worst.
+    # A model that alternates between the eyes gives one of them the whole error. Flat grey is the worst case.
     return Answer(residual, 1.0, problem.condition(), residual - least, note=note)
 
 
@@ -225,7 +225,7 @@ def trials(*, full: bool = False) -> Iterator[Trial]:
             yield case(model, f"panels {gap_m:g} m apart", smooth(stack), eyes_at(distance_m=0.6 + gap_m), stack)
         for width, height in ((16, 16), (17, 31), (333, 77), *(((3840, 2160),) if full else ())):
             stack = replace(STACK, width_px=width, height_px=height)
-            # 333x77: a row of the panels covers three of the picture and shows their mean, so one ray says little.
+            # 333x77: a panel row covers three picture rows and shows their mean, so a single ray is not representative.
             flat = (width, height) == (333, 77)
             yield case(model, f"panels of {width}x{height}", smooth(stack), eyes_at(distance_m=0.6), stack, light=flat)
     far_aside = partial(stressed, "balanced", smooth(STACK), eyes_at(distance_m=3.0, angle_deg=85.0))

@@ -23,7 +23,7 @@ POSE, RPU, PHASE, JONES = "eye pose", "RPU", "phase", "Jones optics"
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 1920, 1080)
 FOV_DEG = 40.0
 PROBES = [(a, b) for a in (0.1, 0.5, 0.9) for b in (0.2, 0.8)]  # positions on a panel, as fractions of its size
-STEP = 1e-10  # relative, of the differences that estimate a condition number
+STEP = 1e-10  # relative step of the differences that estimate a condition number
 INTENSITIES = {
     "0": 0.0, "the least subnormal": 5e-324, "1e-300": 1e-300, "1e-16": 1e-16, "1e-8": 1e-8, "1/255": 1 / 255,
     "1/2": 0.5, "254/255": 254 / 255, "1 - 1e-8": 1 - 1e-8, "1 - 1e-12": 1 - 1e-12,
@@ -129,7 +129,7 @@ def of_intensity(intensity: float, branch: Literal[1, 2]) -> Answer:
     root = np.arcsin(np.sqrt(extended(intensity))) * 2 / PI
     truth = root if branch == 1 else 2 - root
     phase = phase_from_intensity(np.array(intensity), branch)
-    # Relative condition of asin(sqrt(I)); a double spaced eps from 1 bounds it there.
+    # Relative condition of asin(sqrt(I)), bounded at 1 by the spacing of doubles.
     away = max(1 - intensity, EPS64)
     condition = max(1.0, math.sqrt(intensity / away) / math.pi / max(float(truth), 1e-30))
     back = abs(float(intensity_from_phase(phase)) - intensity)

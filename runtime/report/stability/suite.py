@@ -1,7 +1,8 @@
 """The complete suite: all trials of all stages.
 
-Cases without a closed form, of models and the tracker, are compared with recorded errors in `limits.json`. After a
-change of either, `phasestack stability --full --record FILE` writes them again; the commit says what became worse.
+Cases of the models and the tracker without a closed form are compared with the errors recorded in `limits.json`. After
+a change to either, record them again with `phasestack stability --full --record FILE`, and explain in the commit what
+became worse.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ from runtime.report.stability.trial import Answer, Trial
 STAGE = "tracker"
 EYES_M = np.array([[0.6, -0.031, 0.05], [0.6, 0.032, 0.05]])
 FRAME_NS = NS_PER_S // 30
-TRAVEL_M = np.array([0.02, 0.09, -0.04])  # of the head during a case, at most at FASTEST
+TRAVEL_M = np.array([0.02, 0.09, -0.04])  # movement of the head during a case, at no more than FASTEST
 FASTEST = 0.3  # m/s
 FLOOR_M = 1e-6
 

@@ -1,4 +1,4 @@
-"""Trials: a trial is one extreme case. Running it gives a Case, even if the tested code crashes."""
+"""Trials: extreme cases that have not been run yet. Running one returns a Case, even if the tested code raises."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ WORSE = 1.05  # largest accepted ratio of an error to the recorded one
 class Answer:
     """A result, measured against the reference."""
 
-    forward_error: float  # of the result, in the trial's measure
+    forward_error: float  # error of the result, in the trial's measure
     tolerance: float  # largest forward error that passes, fixed before the trial is run
-    condition: float = 1.0  # amplification by the problem itself of a relative error of its input
-    backward_error: float | None = None  # relative change of the input that explains the result; None: the forward one
+    condition: float = 1.0  # factor by which the problem itself amplifies a relative error of its input
+    backward_error: float | None = None  # change of the input that explains the result; None: as the forward error
     note: str = ""
 
 
@@ -67,7 +67,7 @@ def settle(trial: Trial, *, limit: float | None = None) -> Case:
     """
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # numpy's, about inf and NaN: the result is measured
+            warnings.simplefilter("ignore", RuntimeWarning)  # about inf and NaN: the result is checked anyway
             answer = trial.run()
     except Exception as error:
         is_refusal = isinstance(error, PhasestackError | ValueError)
