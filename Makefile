@@ -1,4 +1,4 @@
-# Two commands do all the set-up: `make demo` (the runtime's needs, without torch) and `make test` (everything).
+# Two commands install everything: `make demo` (for the runtime, without torch) and `make test` (all packages).
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -23,11 +23,11 @@ test-slow: $(VENV)/.test
 	@sh systemd/packages.sh slow
 	$(BIN)/python -m pytest -m slow --timeout 3600 $(PYTEST_ARGS)
 
-# Replace the golden runs' references, on purpose; GOLDEN_ARGS="walk fault": some of them.
+# Replace the golden runs' references after an intended change; GOLDEN_ARGS="walk fault": only these.
 golden: $(VENV)/.test
 	$(BIN)/python -m tests.golden --renew $(GOLDEN_ARGS)
 
-# Style, layers, spelling, prose, shell; `pre-commit install` has them run, with types and secrets, before every commit.
+# Style, layers, spelling, prose, shell. `pre-commit install` runs them, with types and secrets, before every commit.
 lint: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -42,7 +42,7 @@ types: $(VENV)/.test
 secrets: $(VENV)/.test
 	git ls-files -z | xargs -0 $(BIN)/detect-secrets-hook --exclude-files '\.lock$$|\.npz$$'
 
-# Branch coverage, with its floor in pyproject.toml; takes twice the tests' time.
+# Branch coverage, with its minimum in pyproject.toml; takes twice as long as the tests.
 coverage: $(VENV)/.test
 	$(BIN)/python -m pytest -m "not slow" -n $(TEST_WORKERS) --dist loadfile --cov --cov-report=term:skip-covered --cov-report=html:out/coverage
 

@@ -113,7 +113,7 @@ def _name_of(monitor: Monitor, monitors: Sequence[Monitor]) -> dict[str, Any]:
 
 
 def geometry(setup: Setup) -> Figures:
-    """Step 2: approximate sizes, gap and viewing distances; registration refines the gap."""
+    """Step 2: ask for approximate sizes, gap and viewing distances. Registration refines the gap."""
     stack, calibration = setup.settings.stack, setup.settings.calibration
 
     def length_m(question: str, value_m: float, unit_m: float = 1e-3) -> float:
@@ -150,7 +150,7 @@ def geometry(setup: Setup) -> Figures:
 
 
 def registration(setup: Setup) -> Figures:
-    """Step 3: the panels' true poses, from photographs of the boards."""
+    """Step 3: measure the panels' true poses from photographs of the boards."""
     rewrite(setup.config, lambda document: None)  # creates an empty configuration if there is none
     settings = setup.settings
     pictures = setup.hardware.photographs(settings, boards(settings.stack.stack()), panel=None, say=setup.say)
@@ -161,7 +161,7 @@ def registration(setup: Setup) -> Figures:
 
 
 def grey(setup: Setup) -> Figures:
-    """Step 4: the grey curve of each panel from photographs of its chart, saved one by one."""
+    """Step 4: measure each panel's grey curve from photographs of its chart, and save it at once."""
     stack = setup.settings.stack.stack()
     known = [bool(panel.lut) for panel in setup.settings.output.panels] or [False] * stack.count
     residuals = [0.0]
@@ -216,7 +216,7 @@ def sensor(setup: Setup) -> Figures:
 
 
 def calibration(setup: Setup) -> Figures:
-    """Step 6: the sensor's pose, measured with a person who moves from viewpoint to viewpoint."""
+    """Step 6: measure the sensor's pose with a person who moves from viewpoint to viewpoint."""
     pairs_path, target = setup.out / "pairs.csv", setup.out / "calibration.toml"
     count = capture_live(pairs_path, setup.settings, setup.hardware, show=True, say=setup.say)["pairs"]
     if count < MIN_PAIRS:

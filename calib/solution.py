@@ -136,10 +136,10 @@ def posterior_scale(fitted: float, *, sigma: float, freedom: int) -> tuple[float
 
 
 def solve_default(sensor_m: F64, stack_m: F64) -> CalibrationSolution:
-    """Solve by the method with the least error at the eye for such pairs (tests/calib/test_methods.py).
+    """Solve by the method with the least expected error at the eye (tests/calib/test_methods.py).
 
-    That is `robust` if there are gross errors, else `fixed-scale` at the posterior mean of the scale, which is 1 unless
-    the pairs contradict it. Raises `similarity.Degenerate`.
+    If there are gross errors, this is `robust`. Otherwise it is `fixed-scale` with the posterior mean of the scale,
+    which is 1 unless the pairs contradict it. Raises `similarity.Degenerate`.
     """
     robust = solve(sensor_m, stack_m, method="robust")
     rejected = int((~robust.used).sum())

@@ -1,4 +1,4 @@
-"""Calibration viewpoints (EyeReal, 2.3, extended to any distance) and the viewing volume."""
+"""Calibration viewpoints (EyeReal, section 2.3, extended to any distance) and the viewing volume."""
 
 from __future__ import annotations
 

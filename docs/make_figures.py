@@ -98,7 +98,7 @@ def optics() -> Figure:
 
 
 def architecture() -> Figure:
-    """Who hands what to whom, on which thread."""
+    """Diagram of the threads and the data that they exchange."""
     figure = Figure(figsize=(11, 5.6), layout="constrained")
     axes = blank(figure, 111, (0, 22), (0, 11))
     threads = (

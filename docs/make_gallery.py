@@ -248,7 +248,7 @@ def leaning(folder: Path) -> None:
 
 
 def light_of(eye_m: F64, layers: U8, stack: PanelStack, *, fov_deg: float) -> U8:
-    """An eye's picture: the mean over its pupil; what misses a panel is black."""
+    """Compute an eye's picture, averaged over its pupil. Rays that miss a panel are black."""
     points = pupil_points(PUPIL_MM / 1000) @ stack_from_eye(eye_m)[:3, :2].T
     seen = average(
         [
@@ -275,7 +275,7 @@ def _label(sheet: Image.Image, place: tuple[int, int], text: str) -> None:
 
 
 def smaller(source: Path, name: str) -> bytes:
-    """A picture as the pages show it. Raises SystemExit if it stays too large."""
+    """Reduce a picture for the pages. Raises SystemExit if it stays too large."""
     image = Image.open(source).convert("RGB")
     image.thumbnail((WIDTH_PX, 10 * WIDTH_PX), Image.Resampling.LANCZOS)
     for quality in range(90, 50, -5):
@@ -290,7 +290,7 @@ def smaller(source: Path, name: str) -> bytes:
 
 
 def main() -> None:
-    """Run, and only then write: a command that fails leaves the page as it was."""
+    """Run all commands, then write, so that a failure leaves the page as it was."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, default=DOCS.parent / "out" / "gallery")
     parser.add_argument("--keep", action="store_true")

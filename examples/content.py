@@ -2,7 +2,7 @@
 
     python examples/content.py gltf --out out/content        # any of the kinds; without one: all
 
-The scene's file is kept next to the run's pictures, so that a display can show it, too:
+The scene's file is kept next to the run's pictures, so that you can show it on a display:
 
     phasestack run --scene out/content/gltf/ring.glb
 """
@@ -23,7 +23,7 @@ Made = tuple[str, str]  # value of --scene; further lines of [content]
 
 
 def ball_and_ground(width: int, height: int, eye_x: float = 0.0) -> tuple[Image.Image, Image.Image]:
-    """A picture and its depth (white nearest): a ball and bars before a ground; eye_x: sideways, for a second view."""
+    """Draw a ball and bars in front of a background, with depth (white is nearest); eye_x: shift for a second view."""
     colour, depth = Image.new("RGB", (width, height), (235, 225, 205)), Image.new("L", (width, height), 50)
     pen, deep = ImageDraw.Draw(colour), ImageDraw.Draw(depth)
     for row in range(0, height, height // 9):
@@ -44,7 +44,7 @@ def ball_and_ground(width: int, height: int, eye_x: float = 0.0) -> tuple[Image.
 
 
 def picture(folder: Path) -> Made:
-    """A picture, flat."""
+    """A flat picture."""
     ball_and_ground(960, 540)[0].save(folder / "picture.png")
     return str(folder / "picture.png"), ""
 

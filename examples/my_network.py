@@ -38,7 +38,7 @@ class MyNetwork(nn.Module):
         self.down = nn.ModuleList(block(a, b, stride=2) for a, b in pairwise(widths))
         self.up = nn.ModuleList(block(a + b, a) for a, b in pairwise(widths))
         self.last = nn.Conv2d(width, 9 * 4, 1)
-        nn.init.zeros_(self.last.weight)  # at first all panels show the same
+        nn.init.zeros_(self.last.weight)  # initially all panels show the same picture
         nn.init.zeros_(self.last.bias)
 
     def forward(self, eyes: Tensor) -> Tensor:
@@ -52,7 +52,7 @@ class MyNetwork(nn.Module):
             x = functional.interpolate(x, size=skip.shape[2:], mode="nearest")
             x = up(torch.cat([skip, x], dim=1))
         mean = (eyes[:, :3] + eyes[:, 3:]) / 2
-        phase = torch.asin(mean.clamp(1e-4, 1 - 1e-4).sqrt()) * (2 / torch.pi)  # the sum of the panels that gives it
+        phase = torch.asin(mean.clamp(1e-4, 1 - 1e-4).sqrt()) * (2 / torch.pi)  # sum of panel values for this intensity
         even = (2 - phase) / 3  # a third of 2 minus that: near the middle of a panel's range
         return even.repeat(1, 3, 1, 1) + functional.pixel_shuffle(self.last(x), 2)
 

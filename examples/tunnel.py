@@ -19,7 +19,7 @@ from pydantic import BaseModel, Field
 import phasestack
 
 RING_M = 0.04  # length of a ring of tiles
-TILES = 16  # in a ring
+TILES = 16  # tiles in a ring
 DARK_AFTER_M = 0.5
 
 
@@ -43,7 +43,7 @@ class Tunnel(phasestack.ContentSource):
         """Draw the tube where the ray through each pixel meets it."""
         u, v = np.meshgrid(np.arange(view.width_px) + 0.5, np.arange(view.height_px) + 0.5)
         rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(view.pixels_from_stack[:, :3]).T
-        # The wall is where |eye + t ray| = radius across the axis; of the two solutions take the one ahead.
+        # Solve for the t at which eye + t ray reaches the wall; of the two solutions take the one ahead.
         across, eye = rays[..., 1:], view.eye_m[1:]
         a, b = (across**2).sum(-1), across @ eye
         c = eye @ eye - self._options.radius_m**2

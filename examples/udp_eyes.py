@@ -26,7 +26,7 @@ class UdpOptions(BaseModel):
     """Fields of [sensor.options]."""
 
     port: int = Field(ge=1, le=65535)
-    noise_mm: tuple[float, float, float] = (0.5, 0.5, 2.0)  # right, down, away: standard deviations
+    noise_mm: tuple[float, float, float] = (0.5, 0.5, 2.0)  # standard deviations to the right, down and away
 
 
 class UdpEyes(Sensor):

@@ -86,9 +86,9 @@ class Views:
 
 
 def light(panels: Tensor, views: Views) -> tuple[Tensor, Tensor]:
-    """Intensities (E, C, h, w) of panels (N, C, H, W) by (L1), (L2); mask (E, 1, h, w) of valid rays.
+    """Intensities (E, C, h, w) of panels (N, C, H, W) by (L1) and (L2), and a mask (E, 1, h, w) of valid rays.
 
-    Differentiable with respect to the panels; on their device, in their dtype.
+    Differentiable with respect to the panels. The results have their device and dtype.
     """
     bundles, counts = _bundles(panels, views)
     return torch.stack([(1 - reduce(torch.mul, z).real) / 2 for z in bundles]), counts

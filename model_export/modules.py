@@ -82,7 +82,7 @@ def blamed(arch: str, field: str) -> Iterator[None]:
 
 
 def check_known(arch: str, *others: str) -> None:
-    """Raise InputError unless `arch` is the name of a network or `module:Class`."""
+    """Raise InputError unless `arch` names a network or has the form `module:Class`."""
     if not is_plugin(arch) and arch not in (*others, *KNOWN):
         raise InputError("--arch", "", f"{arch!r} is neither {', '.join([*others, *KNOWN])} nor module:Class")
 

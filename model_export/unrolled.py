@@ -13,7 +13,10 @@ from runtime.config import Section
 
 
 class Unrolled(nn.Module):
-    """Starts from panels that share the pictures' mean evenly; training optimises the steps."""
+    """Network of solver steps.
+
+    They start from panels that share the pictures' mean equally, and training optimises them.
+    """
 
     class Options(Section):
         """Number of steps and their initial size."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from runtime.sensor.usb_devices import KNOWN_DEVICES
 
 HEADER = """\
-# Depth cameras that phasestack knows: the group plugdev and the user at the seat may open them;
-# they are never suspended. Made by systemd/make_udev_rules.py from runtime/sensor/usb_devices.py.
+# Known depth cameras: the group plugdev and the user at the seat may open them, and they are never suspended.
+# Made by systemd/make_udev_rules.py from runtime/sensor/usb_devices.py.
 ACTION=="remove", GOTO="phasestack_end"
 SUBSYSTEM!="usb", GOTO="phasestack_end"
 """

@@ -1,4 +1,4 @@
-"""Link between the loop and the live pages: the viewer's eyes in, the panels' layers out."""
+"""Link between the loop and the live pages, which send the viewer's eyes and receive the panels' layers."""
 
 from __future__ import annotations
 

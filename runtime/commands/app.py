@@ -1,4 +1,4 @@
-"""All commands by name. A command's dependencies are imported only when it runs."""
+"""The command line's app with all commands. A command's dependencies are imported only when it runs."""
 
 from __future__ import annotations
 

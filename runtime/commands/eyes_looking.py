@@ -1,4 +1,4 @@
-"""Body of `phasestack eyes`: pictures to rows and overlays."""
+"""Implementation of `phasestack eyes`: finds pupils in pictures, and draws overlays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Body of `phasestack solve`."""
+"""Implementation of `phasestack solve`."""
 
 from __future__ import annotations
 

@@ -204,4 +204,6 @@ def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
     return data[20 : 20 + size], data[20 + size + 8 :]
 
 
-VERSION_1 = "is 1.0, which is not read; convert it to glTF 2.0, with `gltf-pipeline -i old.gltf -o new.glb` or Blender"
+VERSION_1 = (
+    "is 1.0, which is not supported; convert it to glTF 2.0, with `gltf-pipeline -i old.gltf -o new.glb` or Blender"
+)

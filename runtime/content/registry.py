@@ -109,11 +109,11 @@ def _from_path(file: SceneFile) -> Opener:
     suffix = path.suffix.lower()
     if suffix in OTHER_FILES and path.is_file():
         kind, way_out = OTHER_FILES[suffix]
-        raise InputError(path, "", f"is {kind} ({suffix}), which is not read: {way_out.format(suffix)}")
+        raise InputError(path, "", f"is {kind} ({suffix}), which is not supported: {way_out.format(suffix)}")
     if suffix in (*MESHES, *SPLATS) and path.is_file():
         with untrusted_input.open_regular(path) as opened:
             if opened.read(len(LFS)) == LFS:
-                raise InputError(path, "", "is a pointer of Git LFS: fetch the file itself (git lfs pull)")
+                raise InputError(path, "", "is a Git LFS pointer: fetch the file itself (git lfs pull)")
     progress.tell(f"loading {path.name}", 0)
     if suffix in PLAYLISTS and not path.is_dir():
         return _playlist(file)

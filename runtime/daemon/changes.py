@@ -159,7 +159,7 @@ class Changes:
         self._between_steps(command, skip)
 
     def attempt(self, command: Command, work: Callable[[], None]) -> None:
-        """Do the work. If it fails, the command is refused and the run continues."""
+        """Run `work`. If it raises, the command is refused and the run continues."""
         if problem := _problem_of(command, work):
             self.answer(command, problem)
 
@@ -191,7 +191,7 @@ class Changes:
     def _between_steps(
         self, command: Command, work: Callable[[Any], str], succeeded: Callable[[], None] = lambda: None
     ) -> None:
-        """Do the work on the solver's thread between two solutions, then answer on this one.
+        """Run `work` on the solver's thread between two solutions, then answer on this thread.
 
         work: returns the reason for a refusal, or nothing; succeeded: runs on the presenter's thread.
         """
@@ -211,7 +211,7 @@ class Changes:
 
 
 def _problem_of(command: Command, work: Callable[[], None]) -> str:
-    """Do the work, and return what went wrong or an empty string. Unexpected errors are logged."""
+    """Run `work`, and return the problem or an empty string. Unexpected errors are logged."""
     try:
         work()
     except PhasestackError as error:

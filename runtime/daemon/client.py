@@ -128,7 +128,7 @@ def unit_advice() -> str:
 
 
 class DaemonClient:
-    """The page's access to the daemon; answers are cached for all browsers. Thread-safe."""
+    """The page's connection to the daemon. Answers are cached for all browsers. Thread-safe."""
 
     def __init__(self, sockets: tuple[Path, ...]) -> None:
         """sockets: paths to try."""

@@ -68,7 +68,7 @@ def _unseen(layers: U8, account: RefreshAccount, run: Run, settings: Settings) -
 
 
 def print_summary(summary: dict[str, Any], out: Path | None) -> None:
-    """Print the summary for people: measured figures first, and the one to quote."""
+    """Print a readable summary: measured figures first, then the figure to quote."""
     configured = summary["configured"]
     for line in lines_of({name: value for name, value in summary.items() if name not in (*configured, "configured")}):
         print(line)

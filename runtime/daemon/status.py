@@ -33,7 +33,7 @@ IN_LIBRARY = {*PICTURES, *VIDEOS, *MESHES, *PLAYLISTS, *SPLATS}
 
 
 def placing_in(settings: Settings) -> dict[str, Any]:
-    """Return the settings that `place` may change."""
+    """Return the settings that `ctl place` can change."""
     return settings.content.model_dump(include=set(PLACING))
 
 
@@ -51,7 +51,7 @@ def holds(presenter: Presenter) -> dict[str, Any]:
 
 
 def shown(presenter: Presenter, account: RefreshAccount, link: BrowserLink) -> dict[str, Any]:
-    """Return a refresh's figures, for a page that shows the panels."""
+    """Return the figures of a refresh, for a page that shows the panels."""
     assert presenter.last is not None
     frame, solution = presenter.last.frame, presenter.last.solution
     return {
@@ -114,7 +114,7 @@ def _view_error_now_mm(account: RefreshAccount) -> float | None:
 
 
 def about(run: Run) -> dict[str, Any]:
-    """Return facts that do not change during a run, and the available scenes, for the page."""
+    """Return the facts that do not change during a run, and the available scenes, for the page."""
     settings, stack = run.presenter.run_cell.state.settings, run.presenter.stack
     return {
         "version": version(),

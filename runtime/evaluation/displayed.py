@@ -52,8 +52,9 @@ def displayed(
 ) -> EyeViews:
     """Compute retina images of eyes (2, 3), frame `stack`, through layers, with a target for each eye.
 
-    layers: (N, H, W, 3 or 4), rear to front. Targets are `fov_deg` wide; those of the panels' aspect are compared at
-    the panels' resolution, others at their own, or reduced to as many pixels as a panel has.
+    layers: (N, H, W, 3 or 4), rear to front. Targets are `fov_deg` wide. If their aspect ratio is that of the panels,
+    they are compared at the panels' resolution, otherwise at their own resolution, but with at most as many pixels as a
+    panel has.
     similarity: compute SSIM; otherwise it is NaN.
     Raises ValueError for eyes behind a panel, or that see no part of the panels.
     """

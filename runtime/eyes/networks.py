@@ -102,7 +102,7 @@ class FoundFace:
         return float(np.sqrt(self.box[2] * self.box[3]))
 
     def square(self) -> Square:
-        """Region to use as input for the mesh network."""
+        """Square region around the face, as input for the mesh network."""
         eyes, mouth = self.points[:2].mean(axis=0), self.points[3:].mean(axis=0)
         line = self.points[1] - self.points[0]
         size = max(np.linalg.norm(line), 0.95 * np.linalg.norm(mouth - eyes))

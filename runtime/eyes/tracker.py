@@ -158,8 +158,8 @@ class Tracker:
         """Add a sample in the `stack` frame, or None if the sensor saw no face.
 
         Returns the reason for a refusal, or an empty string. Samples are refused if they are old, uncertain (a blink),
-        implausible for a person, or away from the viewer. The second consecutive sample at a position that the viewer
-        could have reached is accepted; another person's samples are accepted only once the viewer has gone.
+        implausible for a person, or away from the viewer. If two consecutive samples are at a position that the viewer
+        could have reached, the second is accepted. Another person's samples are accepted only once the viewer has left.
         """
         if capture_ns <= self._newest_ns:
             if self._newest_ns - capture_ns < CLOCK_RESET_NS:

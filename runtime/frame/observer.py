@@ -94,7 +94,7 @@ class RunObserver:
                 self._sampler.finish(last)
 
     def live(self) -> dict[str, Any]:
-        """Return the live figures (contract 5.5) so far, for the status."""
+        """Return the live figures (docs/contracts.md, Error) measured so far, for the status."""
         return {"live_db": self._sampler.live_db, "view_error_mm": self._lines.view_error_mm.of("p50", "p95")}
 
     def summary(self) -> dict[str, Any]:

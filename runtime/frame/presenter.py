@@ -349,7 +349,7 @@ class Presenter:
             observer.refreshed(self.last)
 
     def summary(self, *, simulated: bool = False) -> dict[str, Any]:
-        """Return the counted part of summary.json (contract 5.2). simulated: times are on the run's clock."""
+        """Return the counted part of summary.json (docs/contracts.md). simulated: times are on the run's clock."""
         predictor = self.run_cell.state.predictor
         return {
             **self.stats.summary(stale_inputs=self.samples.stale_inputs, simulated=simulated),

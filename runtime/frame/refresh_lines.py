@@ -46,7 +46,7 @@ class RefreshLines:
 
 
 def line_of(account: RefreshAccount) -> dict[str, Any]:
-    """Return one line of frames.jsonl (contract 5.2)."""
+    """Return one line of frames.jsonl (docs/contracts.md)."""
     return {name: _plain(getattr(account, name)) for name in LINE}
 
 

@@ -185,7 +185,7 @@ class QualitySampler:
 
     @property
     def live_db(self) -> float | None:
-        """Live quality (contract 5.5) over the refreshes already measured."""
+        """Live quality (docs/contracts.md, Error) over the refreshes measured so far."""
         return round(psnr_db(float(np.mean(list(self.live.values())))), 3) if self.live else None
 
     def summary(self) -> dict[str, Any]:

@@ -53,7 +53,7 @@ class _Attempt:
 
 
 class SolverThread(SolverHost):
-    """Runs a solver alongside the presenter. `post`, `news` and `watch` never wait."""
+    """Runs a solver in parallel with the presenter. `post`, `news` and `watch` never wait."""
 
     def __init__(self, make: Callable[[], SolverParts], clock: Clock) -> None:
         """make: creates a solver with its own GL context on the calling thread; called again after a hang."""

@@ -102,7 +102,7 @@ class RunStats:
         return (self._last_ns - self._first_ns) / NS_PER_S if self.frames else 0.0
 
     def reuse_saves_ms(self) -> float | None:
-        """Return the solver time that a refresh saves by reusing a solution; None before any was reused."""
+        """Return the solver time that a refresh saves by reusing a solution; None before the first reuse."""
         medians = [self._stages[stage].of("p50") for stage in SHOWN_STAGES]
         known = [median["p50"] for median in medians if median is not None]
         return sum(known) if known and self.presented > self.solutions > 0 else None
@@ -124,7 +124,7 @@ class RunStats:
         self.faults[part] = self.faults.get(part, 0) + 1
 
     def summary(self, *, stale_inputs: int, simulated: bool = False) -> dict[str, Any]:
-        """Return the counted part of summary.json (contract 5.2); unmeasured figures are null."""
+        """Return the counted part of summary.json (docs/contracts.md); unmeasured figures are null."""
         seconds = self.seconds()
         return {
             "frames": self.frames,

@@ -1,4 +1,4 @@
-"""True eyes at any instant, interpolated between a recording's samples."""
+"""True eye positions at any instant, interpolated between a recording's samples."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ KEPT = 512  # samples kept: eight seconds at 60 Hz
 
 
 class TrueEyes:
-    """True eyes recorded with samples, interpolated between their capture times."""
+    """True eye positions from a recording, interpolated between capture times."""
 
     def __init__(self) -> None:
         self._known: deque[tuple[int, F64]] = deque(maxlen=KEPT)

@@ -51,7 +51,7 @@ class Viewer:
 
     @property
     def warning(self) -> str:
-        """Return why most recent samples are implausible (eyes swapped, millimetres, ...), or ""."""
+        """Return the reason if most recent samples are implausible (eyes swapped, millimetres, ...), else ""."""
         return self._refusals.warning
 
     @property

@@ -15,7 +15,7 @@ REST = {2: 0.75, 3: 0.5, 4: 0.375, 5: 0.5}
 
 
 def rest_value(panels: int) -> float:
-    """Value in [0, 1] that each of `panels` panels shows when at rest."""
+    """Value in [0, 1] that each panel of a stack of `panels` panels shows at rest."""
     return REST.get(panels, 1.5 / panels)
 
 

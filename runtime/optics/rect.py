@@ -47,7 +47,7 @@ class PixelRect:
         return [box for box in boxes if box.width_px and box.height_px]
 
     def in_rows(self, rows: int) -> list[PixelRect]:
-        """Split into boxes of at most `rows` rows."""
+        """Split the rectangle into boxes of at most `rows` rows."""
         return [PixelRect(self.u0, v, self.u1, min(v + rows, self.v1)) for v in range(self.v0, self.v1, rows)]
 
     def cut(self, raster: PlaneRaster) -> PlaneRaster:

@@ -80,7 +80,7 @@ def _mix(a: F32, b: F32, weight: F32) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Rays:
-    """Rays of the image of an eye that looks at the stack's origin."""
+    """Rays through an eye's image. The eye looks at the stack's origin."""
 
     from_stack: F64  # (3, 4) `image_from_stack`
     u: F64  # (w,) columns

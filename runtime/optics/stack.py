@@ -70,12 +70,12 @@ class PanelStack:
 
     @property
     def is_evenly_spaced(self) -> bool:
-        """Return True if the gaps are even enough for the shipped networks."""
+        """True if the gaps are equal enough for the shipped networks."""
         gaps = np.diff(self.x_m)
         return bool(gaps.size == 0 or np.ptp(gaps) <= UNEVEN_MOST * gaps.mean())
 
     def reduced(self, reduction: int) -> PanelStack:
-        """Return the stack with `reduction` times fewer rows and columns (at least one)."""
+        """Return the stack with rows and columns divided by `reduction`, but at least one of each."""
         if reduction == 1:
             return self
         width_px, height_px = (max(1, round(px / reduction)) for px in (self.width_px, self.height_px))

@@ -51,7 +51,7 @@ def listening(command: str, port: int) -> sockets.socket:
 
 
 def server_of(application: Any) -> uvicorn.Server:
-    """Return a uvicorn server for an application, with the limits of all pages."""
+    """Return a uvicorn server for an application, with the same limits for all pages."""
     return uvicorn.Server(
         uvicorn.Config(
             application,

@@ -1,4 +1,4 @@
-"""Connection of a live page: the viewer's eyes in, layers and refreshes out."""
+"""WebSocket of a live page, which sends the viewer's eyes and receives layers and refreshes."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ SERIAL_TAG, NAME_TAG = 0xFF, 0xFC
 
 @dataclass(frozen=True, slots=True)
 class Edid:
-    """Manufacturer, model and serial number of a monitor. The serial number may be empty."""
+    """Manufacturer, model and serial number of a monitor."""
 
     maker: str  # three letters
     serial: str  # from the text descriptor, otherwise the header; unique only together with the model

@@ -196,7 +196,7 @@ class FrameTextures:
             self._relief.use(3)
 
     def release(self) -> None:
-        """Give the GL objects back."""
+        """Release the GL objects."""
         for textures in (*self._textures.values(), self._reliefs.values()):
             for texture in textures:
                 texture.release()
@@ -314,7 +314,7 @@ class Painter:
         return program, self._context.vertex_array(program, [])
 
     def release(self) -> None:
-        """Give the GL objects back."""
+        """Release the GL objects."""
         for program, array in self._cases.values():
             array.release()
             program.release()

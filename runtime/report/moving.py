@@ -1,4 +1,4 @@
-"""Live quality for moving viewers: simulated runs with fixed efforts and with the loop's choice."""
+"""Live quality for moving viewers, from simulated runs with fixed efforts and with the loop's choice."""
 
 from __future__ import annotations
 

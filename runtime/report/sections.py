@@ -128,7 +128,7 @@ def most_used(one: Moving) -> str:
 
 
 def moving_plot(found: Sequence[Moving]) -> Figure:
-    """Plot live quality and view error of the fixed efforts, with a star for `auto`, for every motion."""
+    """Plot live quality and view error for every motion: lines for the fixed efforts, stars for `auto`."""
     motions = list(dict.fromkeys(one.motion for one in found))
     efforts = [*(effort.name for effort in FIXED), "auto"]
     with drawing(9.6, 6.4) as figure:

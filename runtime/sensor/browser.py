@@ -84,7 +84,7 @@ class BrowserEyes(Sensor):
 
 
 class BrowserCamera(Sensor):
-    """Delivers pictures from a page's camera. Without depth, distance follows from the eye separation."""
+    """Delivers pictures from a page's camera. There is no depth, so the distance follows from the eye separation."""
 
     name = "browser"
     capabilities = Capabilities(colour=True)

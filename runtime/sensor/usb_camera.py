@@ -1,4 +1,4 @@
-"""Driver `usb-camera`: a webcam, through V4L2. The eyes' distance follows from their separation."""
+"""Driver `usb-camera`: a webcam through V4L2. The eyes' distance follows from their separation."""
 
 from __future__ import annotations
 

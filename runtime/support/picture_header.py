@@ -114,7 +114,7 @@ def _header_of(path: Path, coded: bytes | IO[bytes]) -> Header:
     If an MPO does not declare its second picture as a view, it counts as one only in a file named .mpo.
     """
     if path.suffix.lower() in RAW:  # of a TIFF, Pillow would show the thumbnail
-        raise InputError(path, "", "is {}, which is not read: {}".format(*RAW_KIND))
+        raise InputError(path, "", "is {}, which is not supported: {}".format(*RAW_KIND))
     try:
         with opened(coded) as image:
             width, height = image.size
@@ -237,9 +237,9 @@ def undecodable(data: bytes, error: Exception | None = None) -> str:
         return f"is HEIC, which the extra `heic` reads (pip install pillow-heif); or {ANOTHER}"
     for place, mark, name, way_out in OTHER_KINDS:
         if data[place : place + len(mark)] == mark and (mark != b"CR" or data[:2] in (b"II", b"MM")):
-            return f"is {name}, which cannot be shown: {way_out}"
+            return f"is {name}, which is not supported: {way_out}"
     if data[:5] == b"<?xml" and b"<svg" in data[:HEAD_BYTES]:
-        return f"is SVG, which cannot be shown: {ANOTHER}"
+        return f"is SVG, which is not supported: {ANOTHER}"
     if data.lstrip()[:1] == b"{" and b'"frames"' in data:
         return f"is a camera set, as of a NeRF: {CAMERA_SET}"
     told = str(error).lower()

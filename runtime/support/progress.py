@@ -78,7 +78,7 @@ def status_line(title: str) -> Iterator[Callable[[str], None]]:
 
 
 def tracked(title: str, items: Sequence[T]) -> Iterator[T]:
-    """Yield the items with a progress bar."""
+    """Yield the items while showing a progress bar."""
     with progress_bar(title) as update:
         for number, item in enumerate(items, start=1):
             yield item

@@ -18,7 +18,7 @@ OTHER_UNITS = {
 
 
 def refusal(value: float, low: float, high: float, unit: str = "") -> str:
-    """Error message for a number outside [low, high], both finite; empty if it is inside.
+    """Error message for a number outside [low, high], both finite; empty if the number is inside.
 
     >>> refusal(518.4, 0.005, 20.0, "m")
     '518.4 m is beyond 20 m: did you mean millimetres (0.5184)?'

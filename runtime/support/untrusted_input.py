@@ -171,7 +171,7 @@ def whole_from_text(text: str, *, source: str | Path, field: str) -> int:
 
 
 def within(count: int | float, most: int | float, *, source: str | Path, field: str) -> None:
-    """Raise InputError, with both figures, if a count exceeds its limit."""
+    """Raise InputError, which gives both numbers, if a count exceeds its limit."""
     if count > most:
         raise InputError(source, field, f"{count:,} exceeds the limit of {most:,}")
 

@@ -345,7 +345,7 @@ def test_what_a_folder_holds_besides_is_left_out_and_named(tmp_path: Path, caplo
     (tmp_path / "a.jxl").write_bytes(b"\xff\x0a" + bytes(40))
     (tmp_path / "b.png").write_bytes(b"\x89PNG\r\n\x1a\n")
     (tmp_path / "notes.txt").write_text("nothing")
-    with pytest.raises(InputError, match=r"a\.jxl: is JPEG XL, which is not read"):
+    with pytest.raises(InputError, match=r"a\.jxl: is JPEG XL, which is not supported"):
         open_frames(tmp_path, AUTO)
     write_png(tmp_path / "c.png", solid(RED))
     Image.fromarray(solid(RED)).save(tmp_path / "d.tga")
@@ -373,7 +373,7 @@ def test_an_animation_over_the_limit_is_a_still_and_says_so(tmp_path: Path, monk
     pictures[0].save(tmp_path / "a.gif", save_all=True, append_images=pictures[1:])
     monkeypatch.setattr(LIMITS, "pixels", 2 * 160 * 90)
     assert open_frames(tmp_path / "a.gif", AUTO).count == 1
-    assert "3 frames of 160 x 90 pixels; at most" in caplog.text
+    assert "3 frames of 160 x 90 pixels; the maximum is" in caplog.text
     assert "showing only its first frame" in caplog.text
 
 
@@ -397,15 +397,15 @@ def test_a_picture_that_ends_too_early_is_called_cut_off(tmp_path: Path, suffix:
 @pytest.mark.parametrize(
     ("data", "told"),
     [
-        (b"\x00\x00\x00\x0cJXL \r\n\x87\n", "is JPEG XL, which is not read: save it as PNG, JPEG or AVIF"),
-        (b"v/1\x01\x02\x00\x00\x00", "is OpenEXR, which is not read: its values have no range"),
+        (b"\x00\x00\x00\x0cJXL \r\n\x87\n", "is JPEG XL, which is not supported: save it as PNG, JPEG or AVIF"),
+        (b"v/1\x01\x02\x00\x00\x00", "is OpenEXR, which is not supported: its values have no fixed range"),
         (b"8BPS\x00\x01", "is a Photoshop document"),
         (b"II*\x00\x10\x00\x00\x00CR\x02\x00", "is a camera's raw picture"),
-        (b"version https://git-lfs.github.com/spec/v1\n", "is a pointer of Git LFS"),
+        (b"version https://git-lfs.github.com/spec/v1\n", "is a Git LFS pointer"),
         (b'<?xml version="1.0"?><svg/>', "is SVG"),
         (b"<!DOCTYPE html><html>", "is a web page"),
-        (b"PK\x03\x04", "is a ZIP archive, which is not read: unpack it first"),
-        (b"\x89MCAP0\r\n", "is a recording, which is not read: it is replayed with --replay"),
+        (b"PK\x03\x04", "is a ZIP archive, which is not supported: unpack it first"),
+        (b"\x89MCAP0\r\n", "is a recording, which is not supported: it is replayed with --replay"),
     ],
 )
 def test_another_kind_is_called_by_its_name_with_the_way_out(tmp_path: Path, data: bytes, told: str) -> None:
@@ -418,7 +418,7 @@ def test_another_kind_is_called_by_its_name_with_the_way_out(tmp_path: Path, dat
 def test_of_a_raw_picture_the_thumbnail_is_not_shown(tmp_path: Path, suffix: str) -> None:
     """A raw file is a TIFF whose first picture is small."""
     Image.fromarray(solid(RED)).save(tmp_path / f"a.{suffix}", "TIFF")
-    with pytest.raises(InputError, match="is a camera's raw picture, which is not read: develop it"):
+    with pytest.raises(InputError, match="is a camera's raw picture, which is not supported: develop it"):
         open_frames(tmp_path / f"a.{suffix}", AUTO)
 
 

@@ -181,7 +181,7 @@ def test_a_texture_starts_no_program(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
     monkeypatch.setattr(EpsImagePlugin, "gs_binary", None)
     eps = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 64 64\n%%EndComments\nshowpage\n%%EOF\n"
-    assert "is PostScript, which is not read" in refused(painted(tmp_path, eps))
+    assert "is PostScript, which is not supported" in refused(painted(tmp_path, eps))
     assert not (tmp_path / "started").exists()
 
 
@@ -311,7 +311,7 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
         "extensionsRequired: EXT_meshopt_compression: meshopt is not read; save it without that compression",
     ),
     "an extension": (gltf(extensionsRequired=["ADOBE_x"]), "extensionsRequired: ADOBE_x is not understood"),
-    "an older version": (gltf(asset={"version": "1.0"}), "asset.version: is 1.0, which is not read; convert it"),
+    "an older version": (gltf(asset={"version": "1.0"}), "asset.version: is 1.0, which is not supported; convert it"),
     "an accessor beyond its view": (
         gltf(accessors=[{"bufferView": 0, "componentType": 5126, "count": 99, "type": "VEC3"}] * 2),
         "is damaged, or not glTF (an accessor reaches beyond its buffer view)",
@@ -321,7 +321,10 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
         "is damaged, or not glTF (a reference to a missing object)",
     ),
     "a number as a list": (gltf(nodes=7), "is damaged, or not glTF (a value of a wrong kind)"),
-    "an older table": (gltf(asset={"version": "1.0"}, accessors={"a": {}}), "asset.version: is 1.0, which is not read"),
+    "an older table": (
+        gltf(asset={"version": "1.0"}, accessors={"a": {}}),
+        "asset.version: is 1.0, which is not supported",
+    ),
     "a buffer without data": (gltf(buffers=[{"byteLength": 48}]), "buffers[0].uri: is missing"),
 }
 
@@ -343,17 +346,17 @@ def test_a_gltf_is_refused_by_what_it_says_of_itself(tmp_path: Path, name: str) 
 @pytest.mark.parametrize(
     ("name", "told"),
     [
-        ("a.fbx", "is a 3D scene (.fbx), which is not read: export it as glTF (.glb), as Blender does"),
-        ("a.usdz", "is a USD scene (.usdz), which is not read: export it as glTF"),
-        ("a.3mf", "is a model of CAD or 3D print (.3mf), which is not read: export it as STL or glTF"),
-        ("a.xyz", "is a point cloud (.xyz), which is not read: save it as PLY"),
+        ("a.fbx", "is a 3D scene (.fbx), which is not supported: export it as glTF (.glb), as Blender does"),
+        ("a.usdz", "is a USD scene (.usdz), which is not supported: export it as glTF"),
+        ("a.3mf", "is a model of CAD or 3D print (.3mf), which is not supported: export it as STL or glTF"),
+        ("a.xyz", "is a point cloud (.xyz), which is not supported: save it as PLY"),
         (
             "a.LCC",
-            "is compressed splats (.lcc), which is not read: convert it: `npx @playcanvas/splat-transform in.lcc",
+            "is compressed splats (.lcc), which is not supported: convert it: `npx @playcanvas/splat-transform in.lcc",
         ),
-        ("a.wmv", "is a film (.wmv), which is not read: convert it: `ffmpeg -i in.wmv out.mp4`"),
-        ("a.glb", "is a pointer of Git LFS: fetch the file itself (git lfs pull)"),
-        ("a.ply", "is a pointer of Git LFS"),
+        ("a.wmv", "is a film (.wmv), which is not supported: convert it: `ffmpeg -i in.wmv out.mp4`"),
+        ("a.glb", "is a Git LFS pointer: fetch the file itself (git lfs pull)"),
+        ("a.ply", "is a Git LFS pointer"),
     ],
 )
 def test_a_file_of_another_kind_is_called_by_its_name(tmp_path: Path, name: str, told: str) -> None:

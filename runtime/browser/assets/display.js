@@ -1,4 +1,4 @@
-// Optics of a stack of panels, its picture in WebGL 2, and the plan of eyes and panels.
+// Optics of a stack of panels, rendering in WebGL 2, and a plan view of eyes and panels.
 // Frame `stack`: metres, x out of the screen, y to the viewer's right, z up. Matrices are 3x3, row after row.
 
 const NEAREST_M = 0.01, MOST_SHIFT = 0.5, MOST_SCALE = 2; // limits of an alignment, equal to the runtime's
@@ -32,7 +32,7 @@ export function planeFromPicture(eye, picture, x_m) {
     ...ray[0].map((v) => -v)];
 }
 
-// Half width and half height, at focal length 1, of the picture that holds all the eyes see through every panel.
+// Half width and half height, at focal length 1, of the picture that contains everything the eyes see through all panels.
 export function reach(stack, eyes) {
   const { width_m, height_m, x_m } = stack;
   const found = eyes.map((eye) => {
@@ -83,7 +83,7 @@ export function panelFromPicture(stack, n, eye, picture, nominal = eye) {
 
 // Alignment of solved layers to other eyes (derivations: runtime/optics/alignment.py and relief.py): for each panel
 // [scale u, scale v, shift u, shift v] to solved pixels from shown ones; `parallax`: motion of content off the middle panel;
-// `limited`: why they follow only part of the way.
+// `limited`: the reason if the panels can follow only part of the way.
 export function alignment(stack, solved, eyes) {
   const old = middle(solved), now = middle(eyes), step = now.map((v, k) => v - old[k]), r = reference(stack);
   let share = 1, limited = "";
@@ -117,7 +117,7 @@ export function alignment(stack, solved, eyes) {
 const mapped = (stack, larger, [right, up]) => [1 + larger, 1 + larger,
   ((-stack.width_m / 2) * larger + right) * (stack.width_px / stack.width_m), -((stack.height_m / 2) * larger + up) * (stack.height_px / stack.height_m)];
 
-// Null with an even number of panels, none of which is the middle one, or without a movement.
+// Null without a movement, or if an even number of panels has no middle one.
 function parallax(stack, old, now) {
   if (stack.x_m.length % 2 === 0 || old.every((v, k) => v === now[k])) return null;
   const r = reference(stack), k = (old[0] - r) / (now[0] - r), growth = 1 - k;
@@ -134,7 +134,7 @@ export const unaligned = (stack) => ({ maps: stack.x_m.map(() => [1, 1, 0, 0]), 
 const VERTEX = `#version 300 es
 void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }`;
 
-// A shown pixel's place in the solution, in its pixels. The solution may be coarser than the panels; the relief is 0 without one.
+// Position in the solution, in its pixels, of a shown pixel. The solution may be coarser than the panels. Without a relief it is 0.
 const SOLVED_AT = `precision highp float; precision highp sampler2D; precision highp sampler2DArray;
 const int PANELS = @PANELS@;
 uniform sampler2D relief; uniform vec4 maps[PANELS], middles[PANELS]; uniform float weights[PANELS], rest; uniform vec3 drift;
@@ -150,7 +150,7 @@ const SHOW = `#version 300 es
 ${SOLVED_AT}
 uniform sampler2DArray layers, flat_picture; uniform int panel, extended; uniform float flatness;
 out vec4 colour;
-vec3 texel(ivec2 at) { // the edge of a coarse solution is extended by a pixel: it does not fade at the panel's
+vec3 texel(ivec2 at) { // a coarse solution is extended by a pixel, so that its edge does not fade
   ivec2 end = ivec2(solved_px);
   bool inside = all(greaterThanEqual(at, ivec2(-extended))) && all(lessThan(at, end + extended));
   return inside ? texelFetch(layers, ivec3(clamp(at, ivec2(0), end - 1), panel), 0).rgb : vec3(rest);
@@ -164,8 +164,8 @@ void main() {
   colour = vec4(code, 1.0);
 }`;
 
-// A draft: one ray a pixel through the solution itself, between its pixels, with the relief where the ray crosses the middle
-// panel. It takes a tenth of the time of drawing and tracing the panels.
+// Draft picture: one ray per pixel through the solution itself, interpolated, with the relief at the point where the ray
+// crosses the middle panel. It takes a tenth of the time of drawing and tracing the panels.
 const QUICK = `#version 300 es
 ${SOLVED_AT}
 uniform sampler2DArray layers; uniform mat3 into[PANELS]; uniform vec2 origin; uniform vec3 room;
@@ -233,7 +233,7 @@ vec4 light(vec2 p) {
   return sum * share * share;
 }`;
 
-// Exact: the pixel is cut at every edge of a panel pixel in it.
+// Exact picture: each pixel is divided at every edge of a panel pixel in it.
 const BOXES = `
 float next(float at, float slope) { // distance along the pixel to the next edge
   float edge = slope > 0.0 ? floor(at + 1e-4) + 1.0 : ceil(at - 1e-4) - 1.0;
@@ -288,7 +288,7 @@ void main() {
   colour = vec4(sum * 0.25, 1.0) * opacity;
 }`;
 
-// The display in a canvas. Layers are texture arrays with one slice per panel.
+// The display on a canvas. Layers are texture arrays with one slice per panel.
 export class Display {
   constructor(canvas, stack) {
     this.canvas = canvas;
@@ -360,7 +360,7 @@ export class Display {
     this.drawn = null;
   }
 
-  // Set the solution's relief over the middle panel, 16-bit floats; null: its content stays where it is there.
+  // Set the solution's relief on the middle panel, as 16-bit floats; null: content stays in place on that panel.
   unfold(relief, [w, h] = [1, 1]) {
     const g = this.g;
     g.deleteTexture(this.relief);
@@ -375,7 +375,7 @@ export class Display {
     this.drawn = null;
   }
 
-  // Give a program an alignment: the solution's place on each panel.
+  // Set a program's alignment: the position of the solution on each panel.
   #align(places, { maps, parallax }) {
     const g = this.g, { width_px: w, height_px: h } = this.stack, still = { drift: [0, 0, 0], middles: maps, weights: maps.map(() => 0) };
     const { drift, middles, weights } = parallax ?? still;
@@ -428,7 +428,7 @@ export class Display {
   }
 
   // Draw one eye's picture into a part [x, y, width, height] (y from below) of the bound framebuffer. rays 0: exact boxes.
-  // nominal: eye whose picture is carried along on the centre panel. gain 1: the target; above 1: difference times gain.
+  // nominal: eye whose picture is treated as painted on the centre panel. gain 1: the target; above 1: difference times gain.
   // quick: an alignment, to sample the solution directly, without drawing the panels first.
   see({ eye, nominal = eye, picture, part, quick = null, rays = 0, pupil_mm = 0, side = 0, gain = 0, stride = [1, 1], room = [0.07, 0.08, 0.1] }) {
     const g = this.g, { stack } = this, places = quick ? this.#use("quick", "solved") : this.#use(rays ? "grid" : "boxes", "shown");

@@ -1,4 +1,4 @@
-// The page around a display: head control by pointer and keys, viewing modes, and the figures next to the picture.
+// The page around a display: head control by pointer and keys, viewing modes, and figures.
 import { Display, alignment, unaligned, drawPlan, middle, moved, reach } from "/display.js";
 
 const MODES = [ // key, name, group, hint
@@ -14,7 +14,7 @@ const MODES = [ // key, name, group, hint
   ["difference", "Difference × 8", "Check", "What each eye sees minus what it should see; black is perfect. For the head position the layers were solved for."],
 ];
 const KEYS = { ArrowLeft: [0, -1, 0], ArrowRight: [0, 1, 0], ArrowUp: [0, 0, 1], ArrowDown: [0, 0, -1], "+": [-2, 0, 0], "-": [2, 0, 0] };
-// Without a GPU, drawing takes the solver's time: a moving head's pictures are fewer and smaller.
+// Without a GPU, drawing takes processor time from the solver, so pictures are fewer and smaller while the head moves.
 const SOFTWARE = { rays: 1, coarse: 0.5, frame_ms: 60 };
 const STEP_M = 0.005, REACH_M = [0.5, 0.3]; // head movement per key press; across the picture's whole width and height
 const REST_MS = 200, REST_RAYS = 5, STRIPS = 12, WIGGLE_MS = 280, REPORT_MS = 120, SAMPLED = 12; // light is measured on every SAMPLED-th pixel in each direction
@@ -45,7 +45,7 @@ export class Look {
     if (this.display.software) Object.assign(this, SOFTWARE);
     this.flatness = 0;
     this.used = null; // eyes that the panels are aligned to, if not the true ones
-    this.state = ""; // why the picture is not the one two eyes should see
+    this.state = ""; // reason why the picture is not what the two eyes should see
     this.onhead = () => {}; // called after the head was moved
     this.onframe = () => {};
     this.onmode = () => {}; // called when a mode is chosen; true: it needs the targets
@@ -170,7 +170,7 @@ export class Look {
     if (mode === "apart") return this.#apart(width, height);
     if (checks) {
       g.clear(g.COLOR_BUFFER_BIT);
-      if (!display.targets[0]) return; // the targets have not arrived yet
+      if (!display.targets[0]) return; // until the targets have arrived
       const { width: pw, height: ph } = this.scene.picture, fit = 0.97 * Math.min(w / pw, h / ph), pic = { width: Math.floor(pw * fit), height: Math.floor(ph * fit) };
       sides.forEach((side, k) => {
         const left = (k % across) * w + ((w - pic.width) >> 1), below = height - (Math.floor(k / across) + 1) * h + ((h - pic.height) >> 1);
@@ -306,7 +306,7 @@ export class Look {
       }
     }
     if (!counted) return void (this.$(".light").textContent = "No ray from here crosses all panels.");
-    this.light_db = -10 * Math.log10(Math.max(error / counted - (scene.target_error ?? 0), 1e-9)); // minus the error of the targets' compression
+    this.light_db = -10 * Math.log10(Math.max(error / counted - (scene.target_error ?? 0), 1e-9)); // without the error of the targets' compression
     const words = this.light_db > 33 ? "hard to distinguish from the target" : this.light_db > 27 ? "a good picture with faint traces of the other layers" :
       this.light_db > 21 ? "obvious ghosts and coloured edges" : "the layers fall apart";
     this.$(".light").textContent = `Light reaching both eyes here: ${this.light_db.toFixed(1)} dB against the target: ${words}.`;

@@ -1,4 +1,4 @@
-// A solution as one file with its layers and targets embedded.
+// A solution in one file, with embedded layers and targets.
 import { Look } from "/look.js";
 
 const read = (id) => JSON.parse(document.getElementById(id).textContent);

@@ -38,8 +38,8 @@ function eyesOf(head) {
 const eyesNow = (head) => (viewer && sensor ? eyesOf(head) : newest?.eyes_m ?? follows ?? eyesOf([0, 0, 0]));
 const say = (message) => { if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message)); };
 
-// The head follows the pointer along the smoothest path from its current motion (minimum jerk), replanned when the pointer moves:
-// the tracker takes a pointer's jumps for another person's head.
+// The head follows the pointer along a minimum-jerk path, which is replanned when the pointer moves. Without it, the
+// tracker would mistake a jump of the pointer for another person.
 let way = { begin_ms: 0, seconds: 0, curves: [0, 1, 2].map(() => [0, 0, 0, 0, 0, 0]) }, step = null;
 
 // Position, velocity and acceleration, for each axis.
@@ -117,7 +117,7 @@ function build({ stack, fov_deg }) {
   about();
 }
 
-// Targets exist only for measured moments: a checking mode shows the newest of those instead of the live picture.
+// Targets exist only for measured moments, so checking modes show the newest of these instead of the live picture.
 function check(on) {
   if (on === checks) return;
   checks = on;
@@ -197,7 +197,7 @@ function take({ refresh, viewer: mine }) {
   if (layersSeen.solved && flatness < 1) first?.();
 }
 
-// Why the picture is not the one two eyes should see.
+// Reason why the picture is not what the two eyes should see.
 function explained({ state, reason }) {
   const late = /solutions take (\d+) ms|has not answered for (\d+) ms/.exec(reason);
   if (!late) return `${state.split(":")[0]}: ${reason}`;
@@ -299,7 +299,7 @@ async function report() {
     if (starting && now.reason) starting.textContent = `Starting: ${now.reason}. The first start on a machine takes about ten seconds longer.`;
     if (look && now.ok) figures(now, asked_ms);
   } catch {
-    // the closed connection shows it
+    // the closed connection reports it
   }
   setTimeout(report, document.hidden ? 4 * STATUS_MS : STATUS_MS);
 }

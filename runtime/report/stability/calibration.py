@@ -52,7 +52,7 @@ def fitted(
 
 
 def trials(fits: Mapping[str, Fit]) -> Iterator[Trial]:
-    """Yield every case of the calibration. fits: solvers by rule."""
+    """Yield every case of the calibration. fits: solvers by method name."""
     for rule, solver in fits.items():
         yield Trial(STAGE, f"{rule}: a usual cloud", partial(fitted, solver, cloud()), measure="rad")
     fit = partial(fitted, fits["least-squares"])

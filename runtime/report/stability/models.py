@@ -89,7 +89,10 @@ class StiffProblem:
         return float((3 + abs(c)) / (3 - abs(c)))
 
     def rays(self, side: int) -> tuple[list[tuple[F64, F64]], F64]:
-        """Trace an eye's rays that cross every panel: weights of rows and columns by panel, and targets."""
+        """Trace an eye's rays that cross every panel.
+
+        Returns weights of rows and columns for each panel, and targets.
+        """
         v, u = np.mgrid[0:HEIGHT_PX, 0:WIDTH_PX] + 0.5
         focal_px = WIDTH_PX * self.eye_x_m / WIDTH_M
         eye = np.array([self.eye_x_m, (side - 0.5) * self.ipd_m])
@@ -174,7 +177,7 @@ KINDS = {
 
 
 def smooth(stack: PanelStack) -> list[U8]:
-    """Return an ordinary picture (h, w, 3) and the same one shifted by a pixel."""
+    """Return an ordinary picture (h, w, 3) and the same picture shifted by a pixel."""
     y, x = np.mgrid[0 : stack.height_px, 0 : stack.width_px]
     wave = 128 + 90 * np.sin(x / stack.width_px * 19) * np.cos(y / stack.height_px * 11)
     left = np.repeat(wave[..., None], 3, axis=2).astype(np.uint8)

@@ -21,7 +21,7 @@ LIMITS = Path(__file__).with_name("limits.json")  # forward errors by `stage: ca
 
 
 def every_trial(fits: Mapping[str, Fit], *, full: bool) -> Iterator[Trial]:
-    """Yield all trials. fits: the calibration's solvers by rule."""
+    """Yield all trials. fits: the calibration's solvers by method name."""
     yield from optics.trials()
     yield from models.trials(full=full)
     yield from tracking.trials(full=full)

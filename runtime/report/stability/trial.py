@@ -40,7 +40,7 @@ class Trial:
 
     @property
     def key(self) -> str:
-        """Name of the case in the file of recorded errors."""
+        """Key of the case in the file of recorded errors."""
         return f"{self.stage}: {self.name}"
 
 
