@@ -112,7 +112,7 @@ def _mirrored(picture: U8, known: dict[int, Mark], counts: list[int]) -> str:
 def _unreadable(counts: list[int], edges: list[float], unit_px: float) -> str:
     """Return a fault in sharpness, or an empty string. edges: width of each mark's edge in marker bits."""
     if sum(counts) == 0:
-        return "shows no board mark: it is blurred or too dark, or does not show the display"
+        return "shows no mark of a board: it is blurred or too dark, or shows something else"
     edge_bits = float(np.median(edges))
     if edge_bits > BLURRED_BITS:
         return f"is blurred: its edges are {edge_bits * unit_px:.1f} px wide"
