@@ -379,7 +379,7 @@ def test_json_of_too_many_values_is_refused_before_it_is_parsed(
     """A file of 98 MB with 7.5 million nodes took 4 GB and 44 s."""
     monkeypatch.setattr(LIMITS, "json_values", 100)
     (tmp_path / "a.gltf").write_text(json.dumps(gltf() | {"nodes": [{}] * 60}))
-    assert "JSON values: 1" in (told := refused(tmp_path / "a.gltf")) and told.endswith("is over the limit of 100")
+    assert "JSON values: 1" in (told := refused(tmp_path / "a.gltf")) and told.endswith("exceeds the limit of 100")
 
 
 def test_files_beside_an_obj_are_read_only_if_they_are_files(tmp_path: Path) -> None:
