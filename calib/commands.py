@@ -161,8 +161,9 @@ def solve(
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compute stack_from_sensor from pairs, and the expected error at the eye. Inadequate pairs are refused.
+    """Compute stack_from_sensor from pairs, and the expected error at the eye.
 
+    Inadequate pairs are refused.
     Example: phasestack calibrate solve --pairs pairs.csv --out calibration.toml
     """
     from calib.solve_run import solve_file

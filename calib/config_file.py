@@ -1,4 +1,7 @@
-"""Editing of configuration files. Comments and previous versions are kept, and only valid files are written."""
+"""Editing of configuration files.
+
+Comments and previous versions are kept, and only valid files are written.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The published network (EyeReal's U-Net). Parameters keep their published names, so that its checkpoints load."""
+"""The published network (EyeReal's U-Net).
+
+Parameters keep their published names, so that its checkpoints load.
+"""
 
 from __future__ import annotations
 

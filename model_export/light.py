@@ -86,7 +86,7 @@ class Views:
 
 
 def light(panels: Tensor, views: Views) -> tuple[Tensor, Tensor]:
-    """Intensities (E, C, h, w) of panels (N, C, H, W) by (L1) and (L2), and a mask (E, 1, h, w) of valid rays.
+    """Intensities (E, C, h, w) of panels (N, C, H, W) by (L1), (L2), and a mask (E, 1, h, w) of rays.
 
     Differentiable with respect to the panels. The results have their device and dtype.
     """

@@ -1,4 +1,4 @@
-"""Import phasestack's own `runtime`, `calib` and `model_export` even if other packages have these names.
+"""Import phasestack's own `runtime`, `calib` and `model_export`, even next to others of these names.
 
 Raises ImportError if the program has already imported another module with one of these names.
 """

@@ -46,7 +46,10 @@ class PhasestackError(Exception):
 
 
 class FatalError(PhasestackError):
-    """A failure that retrying cannot fix, so the start is refused. The CLI prints one line and exits with 2."""
+    """A failure that retrying cannot fix, so the start is refused.
+
+    The CLI prints one line and exits with 2.
+    """
 
 
 class InputError(FatalError):
@@ -94,7 +97,10 @@ class ModelFailure(TransientError):
 
 
 class EyesNotServed(ModelFailure):
-    """The model does not support these eye positions. A viewer may move; eyes given as an option are refused."""
+    """The model does not support these eye positions.
+
+    A viewer may move; eyes given as an option are refused.
+    """
 
 
 class ContextLost(TransientError):

@@ -313,8 +313,9 @@ def _head(presenter: Presenter) -> tuple[RecordingHeader, str]:
 
 
 def write_file(folder: Path, kind: str, kept: list[BlackBoxMessage], header: RecordingHeader, settings: str) -> Path:
-    """Write a new file atomically, readable only by its owner because it shows viewers' movements. Raises OSError.
+    """Write a new file atomically, readable only by its owner because it shows viewers' movements.
 
+    Raises OSError.
     Its number is higher than all others in the folder, because the wall clock may be set back.
     """
     folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Link between the loop and the live pages, which send the viewer's eyes and receive the panels' layers."""
+"""Link between the loop and the live pages, which send eye positions and receive layers."""
 
 from __future__ import annotations
 

@@ -71,8 +71,9 @@ def place(
 def model(
     name: Annotated[str, typer.Argument(help="fast, balanced, best, sart or an ONNX file")], config: Config = None
 ) -> None:
-    """Switch to another model. The current one stays until the new one has loaded. If loading fails, it remains.
+    """Switch to another model.
 
+    The current one stays until the new one has loaded. If loading fails, it remains.
     Example: phasestack ctl model best
     """
     from runtime.support.plugins import located

@@ -1,4 +1,4 @@
-"""Implementation of `phasestack try`: the daemon, with a web server that acts as its sensor and panels."""
+"""Implementation of `phasestack try`: the daemon with a web server as its sensor and panels."""
 
 from __future__ import annotations
 

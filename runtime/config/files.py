@@ -1,4 +1,4 @@
-"""Loading of settings and panels files; command-line options and operators' choices that replace settings."""
+"""Loading of settings and panels files, and replacing settings by options or operators' choices."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The status socket's file (mode 0660), owned by one daemon; a file left by a crashed daemon is replaced."""
+"""The status socket's file, of mode 0660. One daemon owns it; a crashed daemon's file is replaced."""
 
 from __future__ import annotations
 

@@ -85,7 +85,10 @@ class RunningSolver:
 
 
 class SolverMaker:
-    """Creates a solver on the calling thread. After a hang it creates another one with the current settings."""
+    """Creates a solver on the calling thread.
+
+    After a hang it creates another one with the current settings.
+    """
 
     def __init__(
         self,

@@ -78,7 +78,10 @@ class Expected(NamedTuple):
 def expected_quality(
     eye_views: EyeViews, layers: U8, *, sampling: Sampling | None = None, sigmas_mm: Sequence[float] = SIGMAS_MM
 ) -> Expected:
-    """Measure expected quality for several tracking errors. sampling: None: light, sampled as in `expected_errors`."""
+    """Measure expected quality for several tracking errors.
+
+    sampling: None: light, sampled as in `expected_errors`.
+    """
     groups = sampling.groups if sampling else 0
     errors = dict.fromkeys(sigmas_mm, np.full(1 + groups, np.nan))
     with contextlib.suppress(ValueError):

@@ -98,7 +98,10 @@ def predicted(belief: Belief, dt_s: float, *, acceleration: Sequence[float], sta
 
 
 def surprise(belief: Belief, measured: F64, *, noise: F64) -> float:
-    """Smallest squared Mahalanobis distance of a measurement from any model (chi² with three degrees of freedom)."""
+    """Smallest squared Mahalanobis distance of a measurement from any model.
+
+    For a good measurement it follows chi² with three degrees of freedom.
+    """
     return float(_chi2(measured - belief.state[:, :3], _total(belief, noise)).min())
 
 

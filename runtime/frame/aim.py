@@ -1,4 +1,4 @@
-"""Solver requests: the eyes predicted for the middle of the next solution's display time, and its effort."""
+"""Solver requests: the effort, and the eyes predicted for the middle of a solution's display time."""
 
 from __future__ import annotations
 

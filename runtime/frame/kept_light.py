@@ -1,4 +1,4 @@
-"""Kept light (`--keep-light`): the panels' layers at every N-th refresh, with target pictures for comparison."""
+"""Kept light (`--keep-light`): layers of every N-th refresh, with target pictures for comparison."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Observer of refreshes, which passes each to the line writer, the quality sampler and the light keeper."""
+"""Observer of refreshes: passes each to the line writer, quality sampler and light keeper."""
 
 from __future__ import annotations
 

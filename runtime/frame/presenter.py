@@ -46,7 +46,10 @@ log = logging.getLogger("phasestack.presenter")
 
 
 class Supervisor:
-    """Hooks through which the daemon controls the presenter. They are called once per refresh and must not wait."""
+    """Hooks through which the daemon controls the presenter.
+
+    They are called once per refresh and must not wait.
+    """
 
     def stop_reason(self) -> str:
         """Return the reason to stop, or an empty string to continue."""
@@ -110,7 +113,10 @@ class RefreshTimes:
 
 
 class Presenter:
-    """Presents one run. The caller owns the parts that it passes in. The presenter owns only its counters."""
+    """Presents one run. The caller owns the parts that it passes in.
+
+    The presenter owns only its counters.
+    """
 
     def __init__(
         self,
@@ -349,7 +355,10 @@ class Presenter:
             observer.refreshed(self.last)
 
     def summary(self, *, simulated: bool = False) -> dict[str, Any]:
-        """Return the counted part of summary.json (docs/contracts.md). simulated: times are on the run's clock."""
+        """Return the counted part of summary.json (docs/contracts.md).
+
+        simulated: times are on the run's clock.
+        """
         predictor = self.run_cell.state.predictor
         return {
             **self.stats.summary(stale_inputs=self.samples.stale_inputs, simulated=simulated),

@@ -1,4 +1,4 @@
-"""The solver: draws content and computes layers for the predicted eyes, on the thread of its GL context."""
+"""The solver: draws content and computes layers for the predicted eyes, on its GL context's thread."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ def expected_errors(
     sampling: Sampling | None = None,
     **at: Unpack[AtEyes],
 ) -> dict[float, F64]:
-    """Expected carried squared error over normal tracking errors, for all rows and then for groups of rows.
+    """Expected carried squared error over normal tracking errors, for all rows, then for groups.
 
     For each standard deviation, to the right and up, it is evaluated at five points: no error with weight 1/2, and two
     standard deviations to either side with weight 1/8 each. This is exact for second moments. drawn: an (h, w, 3)

@@ -1,1 +1,1 @@
-"""Outputs for the panels' pictures (offscreen, windows, browser), the presentation shader, and monitors."""
+"""Outputs for panel pictures (offscreen, windows, browser), the presentation shader, and monitors."""

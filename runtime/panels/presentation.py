@@ -1,4 +1,4 @@
-"""Presentation shader, which aligns a layer, mixes in the flat picture and draws to a panel's framebuffer."""
+"""Presentation shader: aligns a layer, mixes in the flat picture and draws to a panel's framebuffer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checks that windows and monitors are unchanged since they were bound, with one query to X at a time.
+"""Checks that windows and monitors have not changed since they were bound, one X query at a time.
 
 GLFW reports monitors that come and go, and windows that are closed or resized. It does not report a window that another
 program destroyed, unmapped or moved, or a monitor whose position or mode changed. In these cases a picture is on the

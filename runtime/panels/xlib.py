@@ -111,7 +111,10 @@ _refused = 0  # requests refused in this process
 
 
 def refusals() -> int:
-    """Number of requests that the X server has refused. An increase means that a window or monitor has disappeared."""
+    """Number of requests that the X server has refused.
+
+    An increase means that a window or monitor has disappeared.
+    """
     return _refused
 
 

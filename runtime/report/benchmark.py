@@ -1,4 +1,4 @@
-"""Regression file: time, light and memory of the shipped models, and a reference time for the machine."""
+"""Regression file: time, light and memory of the shipped models, and the machine's reference time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stereo pairs with their geometry and pictures for displaced eyes, from case files and built-in scenes."""
+"""Stereo pairs with geometry and pictures for displaced eyes, from case files and built-in scenes."""
 
 from __future__ import annotations
 

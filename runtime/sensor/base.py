@@ -1,4 +1,4 @@
-"""Interface of sensor drivers (open, capabilities, read_newest, close), and conversion of device clocks."""
+"""Interface of sensor drivers, and conversion of device clocks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Driver `browser`: a web page's pointer acts as the head, with noise and latency, or its camera tracks the viewer."""
+"""Driver `browser`: a web page's pointer acts as the head, or its camera tracks the viewer."""
 
 from __future__ import annotations
 
@@ -84,7 +84,10 @@ class BrowserEyes(Sensor):
 
 
 class BrowserCamera(Sensor):
-    """Delivers pictures from a page's camera. There is no depth, so the distance follows from the eye separation."""
+    """Delivers pictures from a page's camera.
+
+    There is no depth, so the distance follows from the eye separation.
+    """
 
     name = "browser"
     capabilities = Capabilities(colour=True)

@@ -1,4 +1,7 @@
-"""Recordings as MCAP files. Chunks are small, so that every complete sample is readable after a crash."""
+"""Recordings as MCAP files.
+
+Chunks are small, so that every complete sample is readable after a crash.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Background threads: priorities (presenter, then solver, then the rest), abandonment and one-off jobs."""
+"""Background threads: priorities (presenter, solver, then the rest), abandonment and one-off jobs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def ends_by(at_s: float) -> None:
 
 
 def patience_s(most_s: float) -> float:
-    """Return how long to wait for a thread that may be abandoned: `most_s`, or less if the deadline is nearer."""
+    """Return how long to wait for a thread that may be abandoned: `most_s` or until the deadline."""
     return max(0.0, min(most_s, _ends_by_s - time.monotonic()))
 
 

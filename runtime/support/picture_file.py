@@ -46,7 +46,7 @@ def read_image(path: Path, *, background: Colour = WHITE) -> U8:
 
 
 def read_views(path: Path, *, background: Colour = WHITE) -> list[U8]:
-    """Read one picture, or the left and right eyes' pictures if the file contains both, as `read_image` does."""
+    """Read one picture, or both eyes' pictures if the file contains two, as `read_image` does."""
     data, header = read_coded(path)
     if header.warning:
         log.warning("%s: %s", path, header.warning)

@@ -297,7 +297,7 @@ def _orientation(image: Any) -> int:
 def check_size(
     width_px: int, height_px: int, *, source: str | Path, field: str = "", name: str = "", head: bytes = b""
 ) -> None:
-    """Raise InputError for more pixels than the limit, which is halved for a PNG with 16 bits per channel.
+    """Raise InputError for more pixels than the limit, half of it for a PNG with 16 bits per channel.
 
     name: the picture's name within `source`. head: beginning of the coded picture, if known.
     """

@@ -14,7 +14,7 @@ PART_MAX_BYTES = 255  # of one part of a path
 
 
 def within(low: float, high: float, unit: str, *, zero: bool = False) -> AfterValidator:
-    """Validator for a number in [low, high] that suggests the right unit; zero: also allow 0, for "not set".
+    """Validator for a number in [low, high] that suggests the right unit; zero: also allow 0 ("not set").
 
     >>> within(0.005, 20.0, "m").func(518.4)
     Traceback (most recent call last):

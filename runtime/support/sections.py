@@ -23,7 +23,7 @@ M = TypeVar("M", bound=BaseModel)
 
 
 class Section(BaseModel):
-    """A frozen table. Unknown keys are refused, numbers must be finite, and texts must be valid names or paths."""
+    """A frozen table: no unknown keys, only finite numbers, and only texts that are valid names or paths."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 

@@ -1,4 +1,7 @@
-"""Trials: extreme cases that have not been run yet. Running one returns a Case, even if the tested code raises."""
+"""Trials: extreme cases that have not been run yet.
+
+Running one returns a Case, even if the tested code raises.
+"""
 
 from __future__ import annotations
 
