@@ -89,7 +89,7 @@ class Walk:
     def begin(self) -> None:
         """Announce the first viewpoint."""
         if self.finished:
-            self._say("every viewpoint already has its pair")
+            self._say("every viewpoint already has a pair")
         else:
             self._announce()
 

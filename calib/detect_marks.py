@@ -117,7 +117,7 @@ def _unreadable(counts: list[int], edges: list[float], unit_px: float) -> str:
     if edge_bits > BLURRED_BITS:
         return f"is blurred: its edges are {edge_bits * unit_px:.1f} px wide"
     if unit_px < MIN_UNIT_PX:
-        return f"shows marks too small ({unit_px:.1f} px per bit): go nearer or use a higher resolution"
+        return f"shows marks that are too small ({unit_px:.1f} px per bit): go nearer or use a higher resolution"
     return ""
 
 

@@ -166,7 +166,7 @@ def _refuse_implausible(bundle: Bundle, stack: PanelStack) -> None:
             )
         if np.abs(off[1:]).max() > IMPLAUSIBLE_M:
             raise Undetermined(
-                f"panel {index} is shifted {np.linalg.norm(off[1:]) * 1e3:.0f} mm against panel {bundle.reference}: "
+                f"panel {index} is shifted {np.linalg.norm(off[1:]) * 1e3:.0f} mm from panel {bundle.reference}: "
                 "the photographs are of another stack, or the panel must be moved by hand first"
             )
 
@@ -180,7 +180,7 @@ def register_photos(
     """
     stack = settings.stack.stack()
     if config is not None and len(settings.output.panels) not in (0, stack.count):
-        problem = f"has {len(settings.output.panels)} tables for {stack.count} panels"
+        problem = f"has {len(settings.output.panels)} tables, but the stack has {stack.count} panels"
         raise InputError(config, "output.panels", problem)
     seen = []
     with status_line("photographs") as say:
@@ -231,7 +231,7 @@ def registration_summary(registered: Registration) -> dict[str, Any]:
     notes = list(registered.notes)
     if not stack.is_evenly_spaced:
         notes.append(
-            f"the gaps differ by more than {100 * UNEVEN_MOST:.0f}%: use the model sart, the networks don't apply"
+            f"the gaps differ by more than {100 * UNEVEN_MOST:.0f}%, so the networks cannot be used: use the model sart"
         )
     return {
         "reference": bundle.reference,

@@ -58,7 +58,7 @@ def _best_half(sensor_m: F64, stack_m: F64, *, random: np.random.Generator) -> N
 def fit_robust(sensor_m: F64, stack_m: F64) -> RobustFit:
     """Fit a similarity to the pairs that agree, (K, 3) each, K >= 3. The result is deterministic.
 
-    Five pairs or fewer cannot form a majority, so all are kept. Raises Degenerate as `fit` does.
+    With five pairs or fewer there is no clear majority, so all are kept. Raises Degenerate as `fit` does.
     """
     count = len(sensor_m)
     everything = fit(sensor_m, stack_m, rule=RULE)

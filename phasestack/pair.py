@@ -55,7 +55,7 @@ class _Pair:
     is_resampled: bool  # from the caller's cameras
 
     def judged(self, layers: U8) -> SolvedPair:
-        """Return the layers together with the views that the eyes have of them."""
+        """Return the layers together with both eyes' views of them."""
         return SolvedPair(layers, self.pictures, self.stack, self.eyes_m, self.fov_deg)
 
 

@@ -100,7 +100,7 @@ def expected_quality(
 
 
 def on_panels_raster(picture: Picture, stack: PanelStack) -> Picture:
-    """Resample a picture to the panels' resolution if the aspects agree, else to at most as many pixels.
+    """Resample a picture to the panels' resolution, or only reduce it if its aspect ratio differs.
 
     Detail finer than the panels' pixels cannot be shown, and would take time and memory to measure.
     """

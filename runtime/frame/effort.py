@@ -172,7 +172,7 @@ class PictureStatistics:
         return y / (1 + y / self.contrast) + TAIL * y
 
     def own(self, effort: Effort) -> float:
-        """Return Q, the squared error at the eyes that were solved for."""
+        """Return Q, the squared error at the eyes solved for."""
         return self.detail.get(effort.reduction, 0.0) + self.residual * step_share(effort.steps)
 
     def _learn_change(self, changed: float, distance_m: float, elapsed_s: float) -> None:

@@ -27,7 +27,7 @@ LATE_S = 0.5  # a longer step is late; a single step of twice this is a fault
 ABANDON_S = 10.0  # a step that takes longer is abandoned and a new solver started
 # Starting a solver may take `LIMITS.start_s`; a task, which loads content, `LIMITS.load_s`.
 IDLE_S = 0.02  # interval between checks for tasks while requests are absent
-USUAL_S = 0.2  # time that a running step gets to finish at the end
+USUAL_S = 0.2  # when stopping, a running step gets this long to finish
 LATE_STEPS = 3  # this many consecutive late steps raise a fault, this many on time clear it
 ANSWER_STEP_MS = 500  # resolution of the reported time without an answer
 ABANDONED_MAX = 4  # hung threads; with more, no new solver is started
@@ -145,7 +145,7 @@ class SolverThread(SolverHost):
                     attempt.abandoned.set()
                 self._hung.append(attempt)
                 self.restarts += 1
-                log.error("solver: no answer for %.1f s; it is abandoned, and a new one started", busy_ns / NS_PER_S)
+                log.error("solver: no answer for %.1f s; abandoned, starting a new one", busy_ns / NS_PER_S)
         busy_ms = busy_ns // NS_PER_MS // ANSWER_STEP_MS * ANSWER_STEP_MS
         return f"the solver {'has not answered' if attempt.ready.is_set() else 'has been restarting'} for {busy_ms} ms"
 

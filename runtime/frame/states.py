@@ -24,7 +24,7 @@ class Conditions:
     flat_wanted: bool = False  # the operator asked for the 2D picture
     stopping: str = ""  # reason for stopping; empty: not stopping
     limited: str = ""  # reason the alignment to the eyes is at its limit; empty: it is not
-    late: str = ""  # number of refreshes if too few for the display's rate, otherwise empty
+    late: str = ""  # message if there are too few refreshes for the display's rate, otherwise empty
     paused: bool = False  # the operator froze the picture; it is still aligned to the eyes
 
 

@@ -8,7 +8,7 @@ EYE_MOST_M = 50.0  # largest absolute coordinate of an eye
 SEPARATION_MIN_M = 0.005  # between two eyes; the tracker checks for a person's
 FOV_RANGE_DEG = (0.1, 179.0)  # horizontal field of view of a picture
 RECORD_MOST_S = 604_800.0  # a week
-SCALE = (1e-6, 1e6)  # scale between the units of two frames: from micrometres in metres to the reverse
+SCALE = (1e-6, 1e6)  # range of scales between two frames' units, from micrometres to metres and back
 # Units that are often used by mistake, by the proper unit: factor and name.
 OTHER_UNITS = {
     "m": ((1e-3, "millimetres"), (1e-2, "centimetres")),

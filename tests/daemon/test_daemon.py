@@ -185,7 +185,7 @@ def test_why_it_cannot_start_is_its_last_word_to_the_supervisor(started: Callabl
 
 def test_monitors_do_not_take_a_scaled_stack() -> None:
     settings = Settings.model_validate({"output": {"kind": "windows"}})
-    with pytest.raises(InputError, match="run: --scale: needs --headless"), ExitStack() as cleanup:
+    with pytest.raises(InputError, match="run: --scale: requires --headless"), ExitStack() as cleanup:
         build_run(settings, RunOptions(scale=0.5), cleanup)
 
 
