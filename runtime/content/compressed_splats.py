@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logit
 
-from runtime.content.gaussians import COEFFICIENTS, Gaussians, drawable
+from runtime.content.gaussians import COEFFICIENTS, Gaussians, drawable, with_higher
 from runtime.content.packed_splats import fields_of, with_largest
 from runtime.errors import InputError
 from runtime.records import F32, U8
@@ -68,20 +68,14 @@ def _spz(path: Path) -> Gaussians:
     if [len(block) for block in blocks] != sizes:
         raise InputError(path, "", f"is cut off: {count:,} splats are promised")
     places, alphas, colours, scales, turns, higher = (np.frombuffer(block, np.uint8) for block in blocks)
-    harmonics = np.concatenate(
-        [
-            (colours.reshape(count, 1, 3) / np.float32(255) - np.float32(0.5)) / np.float32(SPZ_COLOUR),
-            (higher.reshape(count, rest, 3)[:, :MOST].astype(np.float32) - 128) / 128,
-        ],
-        axis=1,
-    )
+    flat = np.asarray((colours.reshape(count, 1, 3) / np.float32(255) - np.float32(0.5)) / SPZ_COLOUR, np.float32)
     return drawable(
         path,
         centres=places.view("<f2").reshape(count, 3).astype(np.float32) if version == 1 else _fixed(places, bits),
         log_scales=np.asarray(scales.reshape(count, 3) / 16 - 10, np.float32),
         quaternions=_three_bytes(turns.reshape(count, 3)) if version < 3 else _four_bytes(turns.view("<u4")),
         logits=logit(alphas / np.float32(255)),
-        harmonics=harmonics.astype(np.float32),
+        harmonics=with_higher(flat, higher.reshape(count, rest, 3)[:, :MOST], zero=128, unit=1 / 128),
     )
 
 
@@ -140,7 +134,7 @@ def _sog(path: Path) -> Gaussians:
             entries = palette[..., :3].reshape(-1, palette.shape[1] // WIDE, 3)
             label = files.pixels(more["files"][1], count)[:, :2].astype(np.int64) @ [1, 256]
             higher = np.array(more["codebook"], np.float32)[entries[label]]
-            harmonics = np.concatenate([harmonics, higher[:, :MOST]], axis=1)
+            harmonics = with_higher(harmonics, higher[:, :MOST])
     if 3 * (harmonics.shape[1] - 1) not in COEFFICIENTS:
         raise InputError(path, "shN", "holds no harmonics of degree 1 to 3")
     three = (turns[:, :3] / np.float32(255) - np.float32(0.5)) * np.float32(np.sqrt(2))

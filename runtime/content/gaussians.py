@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -84,10 +85,11 @@ def load_gaussians(header: PlyHeader) -> Gaussians:
         with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite
             return np.column_stack([table[name] for name in wanted]).astype(np.float32)
 
-    harmonics = columns(*(f"f_dc_{channel}" for channel in range(3)))[:, None]
-    if rest:
-        higher = columns(*(f"f_rest_{number}" for number in range(rest))).reshape(len(table), 3, -1)
-        harmonics = np.ascontiguousarray(np.concatenate([harmonics, higher.transpose(0, 2, 1)], axis=1))
+    harmonics = np.empty((len(table), 1 + rest // 3, 3), np.float32)
+    harmonics[:, 0] = columns(*(f"f_dc_{channel}" for channel in range(3)))
+    for number in range(rest):
+        channel, place = divmod(number, rest // 3)
+        harmonics[:, 1 + place, channel] = columns(f"f_rest_{number}")[:, 0]
     return drawable(
         path,
         centres=columns("x", "y", "z"),
@@ -129,6 +131,15 @@ def _extent(places: F32) -> float:
 def flat_harmonics(colours: F32) -> F32:
     """(n, 1, 3) harmonics of degree 0 that show (n, 3) colours from everywhere."""
     return np.asarray((colours - np.float32(0.5)) / np.float32(FLAT_HARMONIC), np.float32)[:, None]
+
+
+def with_higher(flat: F32, higher: NDArray[Any], *, zero: float = 0.0, unit: float = 1.0) -> F32:
+    """(n, k, 3) harmonics: flat (n, 1, 3) and (higher - zero) * unit (n, k - 1, 3), in little memory."""
+    found = np.empty((len(flat), 1 + higher.shape[1], 3), np.float32)
+    found[:, :1], found[:, 1:] = flat, higher
+    found[:, 1:] -= np.float32(zero)
+    found[:, 1:] *= np.float32(unit)
+    return found
 
 
 def dotted(ends: F32, colours: F32) -> tuple[F32, F32]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logit
 
-from runtime.content.gaussians import COEFFICIENTS, Gaussians, drawable, flat_harmonics
+from runtime.content.gaussians import COEFFICIENTS, Gaussians, drawable, flat_harmonics, with_higher
 from runtime.content.ply import PlyHeader, read_elements
 from runtime.errors import InputError
 from runtime.records import F32
@@ -51,8 +51,8 @@ def load_compressed(header: PlyHeader) -> Gaussians:
         rest = np.column_stack([elements["sh"][name] for name in fields])
         if rest.shape[1] not in COEFFICIENTS or len(rest) != len(splats):
             raise InputError(header.path, "sh", "holds no harmonics of degree 1 to 3 for every splat")
-        higher = (rest.astype(np.float32) * np.float32(8 / 255) - 4).reshape(len(rest), 3, -1)
-        harmonics = np.concatenate([harmonics, higher.transpose(0, 2, 1)], axis=1)
+        higher = rest.reshape(len(rest), 3, -1).transpose(0, 2, 1)
+        harmonics = with_higher(harmonics, higher, zero=127.5, unit=8 / 255)
     return drawable(
         header.path,
         centres=_between(fields_of(place, (11, 10, 11)), *bounds_of("", "xyz")),
