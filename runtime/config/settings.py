@@ -328,7 +328,7 @@ class LoopSettings(Section):
     )
     evaluate_every: Annotated[int, Field(ge=0)] = Field(
         20,
-        description="with --out: measure what the eyes see every N refreshes; 0: only at the last refresh",
+        description="with --out: measure quality every N refreshes (less often in real time); 0: at the last one",
     )
 
 
