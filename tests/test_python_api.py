@@ -18,6 +18,7 @@ import phasestack
 from runtime.commands.app import app
 from runtime.errors import InputError
 from runtime.evaluation import solved
+from runtime.optics.disparity import disparity_doubts
 from runtime.optics.stack import PanelStack
 from runtime.report.pairs import PairPainter, read_pairs
 from tests.test_cli import pair_in, solve_arguments
@@ -361,3 +362,20 @@ def test_a_pair_with_too_much_disparity_is_explained_wherever_its_figure_is(tmp_
     assert "rectified" in (tmp_path / "viewer.html").read_text()
     moved = [np.roll(picture, shift_px, axis=1) for picture, shift_px in zip(rectified(60), (-30, 30), strict=True)]
     assert phasestack.solve(*moved, eyes_m=eyes, stack=STACK, model="fast").notes == ()
+
+
+@pytest.mark.parametrize("period_px", [8, 12, 24])
+@pytest.mark.parametrize("sharp", [False, True])
+def test_a_texture_that_repeats_has_no_known_disparity(period_px: int, sharp: bool) -> None:
+    eyes = np.array([(0.6, -0.0315, 0.0), (0.6, 0.0315, 0.0)])
+
+    def texture(shift_px: float) -> np.ndarray:
+        down, across = np.mgrid[:180, :320] * (2 * np.pi / period_px)
+        wave = np.sin(across + 2 * np.pi * shift_px / period_px) + np.sin(down)
+        grey = 128 + 45 * (2 * np.sign(wave) if sharp else wave)
+        return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2)
+
+    for shift_px in (0, 2, 6):
+        pair = texture(-shift_px / 2), texture(shift_px / 2)
+        assert disparity_doubts(pair, eyes, STACK, fov_deg=40) == []
+    assert disparity_doubts(rectified(60), eyes, STACK, fov_deg=40) != []  # the same blocks only once

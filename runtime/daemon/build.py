@@ -93,12 +93,12 @@ class Run:
         """Return summary.json (docs/contracts.md)."""
         return {
             "clock": "simulated" if self.simulated else "real",
+            "configured": list(SIMULATED_FIGURES) if self.simulated else [],  # not measured
             **self.presenter.summary(simulated=self.simulated),
             **self.observer.summary(),
             "backend": self.presenter.run_cell.state.predictor.backend,
             "scene": self.presenter.run_cell.state.content.info.name,
             "plan": self.plan_items(),
-            "configured": list(SIMULATED_FIGURES) if self.simulated else [],
         }
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack
@@ -22,13 +23,17 @@ SHOWN_MOST = 2.5
 TOO_MUCH = 0.1  # least share of a picture beyond `SHOWN_MOST` that is reported
 ROLLED, TURNED = 0.05, 0.2  # largest slopes of the line between the eyes for which picture rows correspond
 LEAST_MATCHED = 0.1  # share of the panel that must be matched
+LEAST_ONCE = 1 / 3  # share of the matches that must be the only ones at their place; else the picture repeats
+WINDOW_PX, APART_PX = 21, 4  # of two matches at one place
+NO_WORSE = 1.3, 1.0  # factor and codes: errors up to which the second match is as good
 
 
 def disparities_m(pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, *, fov_deg: float) -> F64:
-    """(n,) disparities, metres on the middle panel, of points matched in both (h, w, 3) pictures.
+    """(n,) disparities, metres on the middle panel, of points matched in both (h, w, 3) pictures, and only once.
 
     Positive for points in front of that panel, which are farther right for the left eye. Pictures are `fov_deg` wide
-    and look at the stack's origin. Empty if the line between the eyes is not level or not parallel to the panels.
+    and look at the stack's origin. Empty if the line between the eyes is not level or not parallel to the panels, or
+    if most of the pictures repeats.
     """
     line = eyes_m[1] - eyes_m[0]
     if line[1] <= 0 or abs(line[2]) > ROLLED * line[1] or abs(line[0]) > TURNED * line[1]:
@@ -52,7 +57,29 @@ def disparities_m(pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, 
     )  # fmt: skip
     matched = matcher.compute(left, right) / 16.0
     seen = (matched >= -REACH_PX) & (left_inside == 255)
-    return np.asarray(matched[seen] * panel.pitch_u_m, np.float64)
+    once = seen & ~_is_ambiguous(left, right, matched)
+    if once.sum() < LEAST_ONCE * seen.sum():
+        return np.empty(0)
+    return np.asarray(matched[once] * panel.pitch_u_m, np.float64)
+
+
+def _is_ambiguous(left: U8, right: U8, matched: F64) -> NDArray[np.bool_]:
+    """Where another disparity matches as well as the one found, as in a texture that repeats.
+
+    The matcher's own test compares ratios, and so misses matches without any error.
+    """
+    there = right.astype(np.float32)
+    halves = (there + np.roll(there, 1, 1)) / 2, (there + np.roll(there, -1, 1)) / 2
+    least, most = np.minimum(there, np.minimum(*halves)), np.maximum(there, np.maximum(*halves))
+    found, other = np.full((2, *left.shape), np.inf, np.float32)
+    for shift_px in range(-REACH_PX, REACH_PX + 1):
+        low, high = np.roll(least, shift_px, 1), np.roll(most, shift_px, 1)
+        error = np.maximum(0.0, np.maximum(left - high, low - left))  # Birchfield and Tomasi: half a pixel is free
+        cost = cv2.blur(error, (WINDOW_PX, WINDOW_PX))
+        away_px = np.abs(matched - shift_px)
+        np.minimum(found, cost, out=found, where=away_px <= 1)
+        np.minimum(other, cost, out=other, where=away_px > APART_PX)
+    return other <= NO_WORSE[0] * found + NO_WORSE[1]
 
 
 def disparity_doubts(
@@ -62,13 +89,13 @@ def disparity_doubts(
 
     parallel: the pictures may be a rectified pair from parallel cameras, passed by mistake as the eyes' own views.
     """
-    found_m = disparities_m(pictures, eyes_m, stack, fov_deg=fov_deg)
-    if len(found_m) < LEAST_MATCHED * WIDTH_PX**2 * stack.height_m / stack.width_m:
-        return []
     apart_m, away_m = float(eyes_m[1, 1] - eyes_m[0, 1]), float(eyes_m[:, 0].mean())
     centre_m = stack.x_m[stack.count // 2]
     rear_m, front_m = (apart_m * (x_m - centre_m) / (away_m - x_m) for x_m in (stack.x_m[0], stack.x_m[-1]))
     shown_m = SHOWN_MOST * (front_m - rear_m) / 2
+    found_m = disparities_m(pictures, eyes_m, stack, fov_deg=fov_deg)
+    if len(found_m) < LEAST_MATCHED * WIDTH_PX**2 * stack.height_m / stack.width_m:
+        return []
     beyond = float(np.mean(np.abs(found_m) > shown_m))
     if beyond < TOO_MUCH:
         return []
