@@ -79,7 +79,7 @@ def _is_ambiguous(left: U8, right: U8, matched: F64) -> NDArray[np.bool_]:
         away_px = np.abs(matched - shift_px)
         np.minimum(found, cost, out=found, where=away_px <= 1)
         np.minimum(other, cost, out=other, where=away_px > APART_PX)
-    return other <= NO_WORSE[0] * found + NO_WORSE[1]
+    return np.asarray(other <= NO_WORSE[0] * found + NO_WORSE[1])
 
 
 def disparity_doubts(
