@@ -64,7 +64,7 @@ def disparities_m(pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, 
 
 
 def _is_ambiguous(left: U8, right: U8, matched: F64) -> NDArray[np.bool_]:
-    """Where another disparity matches as well as the one found, as in a texture that repeats.
+    """Mask of places where another disparity matches as well as the one found, as in a texture that repeats.
 
     The matcher's own test compares ratios, and so misses matches without any error.
     """
