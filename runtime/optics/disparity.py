@@ -29,7 +29,7 @@ NO_WORSE = 1.3, 1.0  # factor and codes: errors up to which the second match is 
 
 
 def disparities_m(pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, *, fov_deg: float) -> F64:
-    """(n,) disparities, metres on the middle panel, of points matched in both (h, w, 3) pictures, and only once.
+    """(n,) disparities, metres on the middle panel, of points that match only once.
 
     Positive for points in front of that panel, which are farther right for the left eye. Pictures are `fov_deg` wide
     and look at the stack's origin. Empty if the line between the eyes is not level or not parallel to the panels, or
@@ -64,7 +64,7 @@ def disparities_m(pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, 
 
 
 def _is_ambiguous(left: U8, right: U8, matched: F64) -> NDArray[np.bool_]:
-    """Mask of places where another disparity matches as well as the one found, as in a texture that repeats.
+    """Mask of places where another disparity matches as well, as in a texture that repeats.
 
     The matcher's own test compares ratios, and so misses matches without any error.
     """
