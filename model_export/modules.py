@@ -31,7 +31,7 @@ class Form(Section):
     """Input and output format of a picture network, from class attributes or defaults."""
 
     input_frame: Literal["centre", "panel"] = Field(
-        "centre", description="both eyes' pictures on the centre panel's pixels, or on those of every panel"
+        "centre", description="both eyes' pictures, resampled to the pixels of the centre panel or of every panel"
     )
     input_value: Literal["intensity", "phase"] = "intensity"
     output: Literal["panels"] = "panels"

@@ -11,7 +11,7 @@ DEFAULT_PORT = 8717
 
 
 def page(
-    config: Annotated[Path | None, typer.Option(help="the daemon's configuration, for its socket")] = None,
+    config: Annotated[Path | None, typer.Option(help="the daemon's configuration file, which names its socket")] = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0: any free one")] = DEFAULT_PORT,
     token_file: Annotated[
         Path | None, typer.Option(help="file with the token, created if missing; default: a file in the state folder")

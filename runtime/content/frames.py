@@ -177,7 +177,7 @@ class Video(Frames):
 
 
 def layout_in(header: Header, path: Path, settings: ContentSettings, folder: Path | None = None) -> Layout:
-    """The layout of a picture as it is read: of a file with two views, else as it or its folder is named."""
+    """Return a picture's layout: from the file if it holds two views, else from its or its folder's name."""
     layout = layout_of(path, settings, stated=header.layout)
     if header.is_around:
         layout = replace(layout, span_deg=360)

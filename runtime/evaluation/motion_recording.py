@@ -37,7 +37,7 @@ def write_motion(
     Raises InputError for an unknown motion, a length out of range, or a file that can't be written.
     """
     if motion not in MOTIONS:
-        raise InputError("record", "--motion", f"unknown: {motion!r}; known: {', '.join(MOTIONS)}")
+        raise InputError("record", "--motion", f"unknown motion {motion!r}; choose from {', '.join(MOTIONS)}")
     if not 2 / rate_hz <= seconds <= SECONDS_MAX:
         raise InputError("record", "--seconds", f"is {seconds:g}; must be {2 / rate_hz:g} to {SECONDS_MAX:g}")
     way = path_of(seed)

@@ -24,7 +24,7 @@ class Aim:
     """Builds the solver requests of one run. Single-threaded; never reads a clock."""
 
     def __init__(self, viewer: Viewer, solver: SolverHost, *, period_ns: int, fixed: Effort | None = None) -> None:
-        """fixed: effort of every solution if the setting is `full`; None: all of the model's steps."""
+        """fixed: effort of every solution if `model.effort` is `full`; None: full raster, all steps."""
         self._viewer, self._solver, self._period_ns, self._fixed = viewer, solver, period_ns, fixed
         self._chooser = EffortChooser()
         self._calm_ns: int | None = None  # time since which the head has been slower than CALM_M_S

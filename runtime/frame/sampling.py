@@ -198,7 +198,7 @@ class QualitySampler:
 
 
 def has_picture(refresh: Refresh) -> bool:
-    """Return True if the panels show only a solution for two eyes, with no flat picture mixed in."""
+    """Return True if the panels show only the solution for two eyes, without the flat picture."""
     solution = refresh.solution
     return (
         refresh.account.presented

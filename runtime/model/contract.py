@@ -24,7 +24,7 @@ class Step(Section):
 
     size: Annotated[float, Field(gt=0, le=3)] = 1.0
     momentum: Annotated[float, Field(ge=0, lt=1)] = Field(
-        0.7, description="this fraction of the step's change is added again for the next step"
+        0.7, description="momentum: fraction of a step's update carried into the next step"
     )
     floor: Annotated[float, Field(gt=0, le=1)] = Field(
         0.1, description="the squared slope of what an eye sees counts for so much at least"

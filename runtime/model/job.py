@@ -60,7 +60,7 @@ class Targets:
         return geometry_of(self.stack, self.eyes_m, self.views, boxes=boxes, kept=window.kept, taper_px=window.taper_px)
 
     def reduced(self, reduction: int) -> tuple[TargetView, TargetView]:
-        """The views with about one pixel for `reduction` x `reduction` of the panels'. Computed once for each value."""
+        """Return the views averaged down by `reduction` (`reduced_view`). Computed once for each value."""
         if reduction not in self._reduced:
             middle = self.stack.panel(self.stack.count // 2)
             # A texture is read back on the thread of its context only, which is this one.

@@ -37,7 +37,7 @@ def resized_px(pixels: int, scale: float) -> int:
 
 
 def reduced_view(view: TargetView, middle: PlaneRaster, reduction: int) -> TargetView:
-    """A view with about one pixel for `reduction` x `reduction` of the middle panel's, averaged."""
+    """Average a view down to one pixel for about `reduction` x `reduction` pixels of the middle panel."""
     picture = view.pixels
     picture_from_middle = np.linalg.inv(view.plane_from_picture) @ middle.plane_from_raster()
     scales = source_px(picture_from_middle, (middle.width_px, middle.height_px))

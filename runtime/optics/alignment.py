@@ -81,7 +81,7 @@ def scale_and_shift(matrix: F64) -> tuple[float, float, float, float]:
 
 
 def is_identity(matrix: F64) -> bool:
-    """Return True if the shown pixels are the solved ones, so that nothing is resampled."""
+    """Return True if the solved pixels are shown unchanged, without resampling."""
     return scale_and_shift(matrix) == (1.0, 1.0, 0.0, 0.0)
 
 

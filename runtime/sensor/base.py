@@ -85,7 +85,7 @@ class SteppedSensor(Sensor):
     """
 
     def __init__(self, source: str, clock: Clock, *, latency_ms: float = 0.0) -> None:
-        """source: for messages; latency_ms: from a sample's capture to its arrival."""
+        """source: its name in messages; latency_ms: time from a sample's capture to its arrival."""
         self._source, self._clock, self._latency_ns = source, clock, round(latency_ms * NS_PER_MS)
         self._frames: Iterator[SensorFrame] | None = None  # samples after the next one; None: not open
         self._next: SensorFrame | None = None

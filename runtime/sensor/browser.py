@@ -84,9 +84,9 @@ class BrowserEyes(Sensor):
 
 
 class BrowserCamera(Sensor):
-    """Delivers pictures from a page's camera.
+    """Delivers camera frames sent by a web page.
 
-    There is no depth, so the distance follows from the eye separation.
+    The camera gives no depth, so the distance is estimated from the eye separation.
     """
 
     name = "browser"
