@@ -225,12 +225,12 @@ INLINE void mix_neighbours(const Parabola &by, int elements, const int16_t *cons
 template <int F, int C, typename AnyLine>
 INLINE void sample(const Image *images, const AnyLine &line, int first, int last, Work &work, int16_t (*out)[TILE], int begin_at = 0) {
   const Stretch along = stretch_of<C>(images[0], line, first, last);
-  int16_t *sources[F], *to[F];
-  for (int f = 0; f < F; ++f) sources[f] = work.source[f] + LANES, to[f] = out[f] + begin_at;
-  if (along.on_pixels) return mix_rows<F, C>(images, along, to);
-  mix_rows<F, C>(images, along, sources);
-  for (int f = 0; f < F; ++f) clamp_ends<C>(sources[f], along.elements);
-  mix_neighbours<F, C>(parabola_of<C>(line, along), (along.steps + 1) * C, sources, to);
+  int16_t *mixes[F], *to[F];  // straight to the output where pixels lie on pixels
+  for (int f = 0; f < F; ++f) to[f] = out[f] + begin_at, mixes[f] = along.on_pixels ? to[f] : work.source[f] + LANES;
+  mix_rows<F, C>(images, along, mixes);
+  if (along.on_pixels) return;
+  for (int f = 0; f < F; ++f) clamp_ends<C>(mixes[f], along.elements);
+  mix_neighbours<F, C>(parabola_of<C>(line, along), (along.steps + 1) * C, mixes, to);
 }
 
 // Length of a tile of a line: short enough that a parabola is a hundredth of a pixel off, with room for its source.
