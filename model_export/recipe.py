@@ -1,4 +1,4 @@
-"""Recipes of the shipped models, one small JSON file each."""
+"""Recipes for the shipped models, one small JSON file each."""
 
 from __future__ import annotations
 

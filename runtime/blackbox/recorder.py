@@ -394,7 +394,7 @@ class _Journal:
             self._file.flush()
             os.fsync(self._file.fileno())
         except OSError as error:
-            log.warning("the black box's journal: %s", error.strerror)
+            log.warning("cannot write the black box's journal: %s", error.strerror)
             self.close()
 
     @property

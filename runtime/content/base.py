@@ -88,7 +88,7 @@ class ContentSource(ABC):
         return None
 
     def expect(self, views: Sequence[View], *, time_ns: int) -> None:  # noqa: B027 - most have nothing to prepare
-        """These views of both eyes are rendered next. Raises ContentFailure."""
+        """Announce the two eyes' views that will be rendered next. Raises ContentFailure."""
 
     @property
     def program(self) -> dict[str, Any] | None:

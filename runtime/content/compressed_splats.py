@@ -66,7 +66,7 @@ def _spz(path: Path) -> Gaussians:
     else:
         blocks = _zstd_blocks(data, table, sizes)
     if [len(block) for block in blocks] != sizes:
-        raise InputError(path, "", f"is cut off: {count:,} splats are promised")
+        raise InputError(path, "", f"is cut off: its header declares {count:,} splats")
     places, alphas, colours, scales, turns, higher = (np.frombuffer(block, np.uint8) for block in blocks)
     flat = np.asarray((colours.reshape(count, 1, 3) / np.float32(255) - np.float32(0.5)) / SPZ_COLOUR, np.float32)
     return drawable(
@@ -118,7 +118,7 @@ def _sog(path: Path) -> Gaussians:
         meta = untrusted_input.parsed_json(files.read("meta.json"), source=path)
         if meta.get("version") != 2:
             version = untrusted_input.shown(meta.get("version", 1))
-            raise InputError(path, "meta.json", f"is of SOG's version {version}; 2 is read")
+            raise InputError(path, "meta.json", f"is SOG version {version}; only version 2 is supported")
         count = int(meta["count"])
         untrusted_input.within(count, LIMITS.splats, source=path, field="splats")
         low, high, scales, turns, flat = (

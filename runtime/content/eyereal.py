@@ -42,7 +42,7 @@ class Pair:
 
 
 def is_data_set(folder: Path) -> bool:
-    """True if a folder holds pictures named as the data set's."""
+    """True if the folder contains pictures that follow the data set's naming scheme."""
     return folder.is_dir() and any(NAME.match(path.name) for path in folder.iterdir())
 
 

@@ -82,7 +82,7 @@ def read_playlist(path: Path, settings: ContentSettings) -> Playlist:
 
 
 class PlaylistSource(ForwardingSource):
-    """The scenes of a list, one after another; its time starts at the first request."""
+    """Plays a list of scenes one after another. The clock starts at the first request."""
 
     def __init__(self, playlist: Playlist, openers: list[Callable[..., ContentSource]], *, context: Any) -> None:
         """Prepare every entry. Raises InputError if one can't be shown."""

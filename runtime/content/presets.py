@@ -60,7 +60,7 @@ def rotation_matrix(angles_deg: Triple, order: str) -> F64:
 
 
 def axes_matrix(*, out: str, up: str) -> F64:
-    """3x3 scene_from_stack rotation: columns are the scene's axes out of the screen, to the right and up."""
+    """3x3 scene_from_stack rotation: its columns point out of the screen, right and up, in scene axes."""
     columns = []
     for axis in (out, up):
         column = np.zeros(3)

@@ -106,7 +106,7 @@ def surprise(belief: Belief, measured: F64, *, noise: F64) -> float:
 
 
 def _total(belief: Belief, noise: F64) -> F64:
-    """(n, 3, 3) covariance of the innovation, regularized: after jumps of metres, rounding can make it singular."""
+    """(n, 3, 3) covariance of the innovation, regularized: rounding can make it singular after a long jump (metres)."""
     total = belief.covariance[:, :3, :3] + noise
     spread: F64 = np.trace(total, axis1=1, axis2=2)[:, None, None] * ROUNDING
     return np.asarray(total + spread * np.eye(3), np.float64)
@@ -134,7 +134,7 @@ def corrected(belief: Belief, measured: F64, *, noise: F64) -> Belief:
 
 
 def _positive(covariance: F64) -> F64:
-    """(n, 9, 9) covariance, its eigenvalues made positive if rounding (after jumps of metres) left any negative."""
+    """(n, 9, 9) covariance, its eigenvalues made positive if rounding (after a long jump) left any negative."""
     try:
         np.linalg.cholesky(covariance)
     except np.linalg.LinAlgError:

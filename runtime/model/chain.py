@@ -135,7 +135,7 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int)
     step = ROWS_STEP if rise_rows > 0.01 else BLOCK_ROWS
     rows = step * ceil((stack.height_px / reduction + rise_rows) / step)
     if rows > ROWS_MAX:
-        raise ValueError(f"the eyes stand so unlike a person's that their raster has {rows} rows")
+        raise ValueError(f"implausible eye positions: their raster would need {rows} rows")
     middle_y_m = window.middle_m[0] - window.half_width_m * line.nearness / (1 + sqrt(1 - line.nearness**2))
     middle_z_m = (min(reached_m) + max(reached_m)) / 2
     plane_from_raster = np.array([

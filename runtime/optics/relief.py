@@ -1,13 +1,13 @@
 """Depth of the content, and how its picture on the panels moves with the eyes.
 
-A point of the content on the plane x is seen from the middle between the eyes, o, through a point c of the middle
-panel's plane (x = r). With c relative to the plane's origin, relief b = (x - r) / (o_x - x) and the middle n that the
-eyes have moved to, k = (o_x - r) / (n_x - r), the same content is seen through c now where it was seen before through
+Let o be the point midway between the eyes. From o, a content point at depth x is seen through a point c on the middle
+panel's plane (x = r). Measure c from the plane's origin. Let b = (x - r) / (o_x - x) be the relief, n the new midpoint
+between the eyes, and k = (o_x - r) / (n_x - r). The content now seen through c was previously seen through
 
-    c + b·((k·n - o) + (1 - k)·c)        (y and z alone).
+    c + b·((k·n - o) + (1 - k)·c)        (in y and z only).
 
-The relief of a plane at the middle panel is 0: content there stays where it is, which is what `alignment` does with
-all of it. From there, the old middle's ray leads to every other panel's pixel.
+A point on the middle panel has relief 0: content there does not move; `alignment` treats all content this way. The ray
+from the old midpoint through that point gives the pixel on each of the other panels.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Savings that a scene, display and viewer allow: pure decisions from measurements."""
+"""Decide which work can be skipped for a scene, display and viewer. Pure functions of measurements."""
 
 from __future__ import annotations
 

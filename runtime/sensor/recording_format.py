@@ -49,8 +49,10 @@ class EyeSample(Message):
 
     sequence: Count = Field(description="the device's frame number; gaps mean lost frames")
     capture_ns: Count = Field(description="time of exposure, on the monotonic clock")
-    eyes_m: tuple[Point, Point] | None = Field(description="frame `sensor` (+x right, +y down, +z away); null: no face")
-    confidence: tuple[Unit, Unit] = Field((1.0, 1.0), description="0 to 1, left and right")
+    eyes_m: tuple[Point, Point] | None = Field(
+        description="in the `sensor` frame (+x right, +y down, +z away from the sensor); null: no face"
+    )
+    confidence: tuple[Unit, Unit] = Field((1.0, 1.0), description="confidence in the left and right eye, 0 to 1")
     covariance_m2: tuple[Row, Row, Row] | None = Field(
         None, description="3x3 covariance of the midpoint of the eyes, if known"
     )

@@ -258,8 +258,8 @@ def test_a_compressed_file_stands_by_its_format_s_custom(tmp_path: Path, stack: 
 @pytest.mark.parametrize(
     ("name", "change", "told"),
     [
-        ("a.spz", lambda data: data[: len(data) // 2], "is cut off: 600 splats are promised"),
-        ("a.spz", lambda data: gzip.decompress(data)[:-1], "is cut off: 600 splats are promised"),
+        ("a.spz", lambda data: data[: len(data) // 2], "is cut off: its header declares 600 splats"),
+        ("a.spz", lambda data: gzip.decompress(data)[:-1], "is cut off: its header declares 600 splats"),
         ("a.spz", lambda data: b"NGSP\4\0\0\0\1\0\0\0\0\x0c\0\5\0\0\0\1" + bytes(12), "is damaged, or not an SPZ file"),
         ("a.spz", lambda data: gzip.compress(b"NGSP" + bytes(40)), "is not an SPZ file of version 1 to 4"),
         ("a.sog", lambda data: data[:400], "is damaged, or not a SOG file"),

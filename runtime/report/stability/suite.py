@@ -31,7 +31,7 @@ def every_trial(fits: Mapping[str, Fit], *, full: bool) -> Iterator[Trial]:
 def run(
     trials: list[Trial], *, record: Path | None = None, progress: Callable[[int, int], None] = lambda done, of: None
 ) -> list[Case]:
-    """Run every trial. record: rewrite the limits file with their errors."""
+    """Run every trial. record: overwrite the limits file with the errors measured."""
     limits: dict[str, float] = json.loads(LIMITS.read_text(encoding="utf-8"))
     cases = []
     for number, trial in enumerate(trials, 1):
