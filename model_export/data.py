@@ -58,7 +58,7 @@ def random_eyes(random: Random, stack: PanelStack) -> F64:
 
 
 def is_served(eyes_m: F64, stack: PanelStack) -> bool:
-    """Return True if each eye sees at least `LEAST_COMMON` of the display's width and height through all panels."""
+    """Return True if each eye sees the share `LEAST_COMMON` of the width and height through all panels."""
     for eye in eyes_m:
         edges = []
         for x_m in stack.x_m:

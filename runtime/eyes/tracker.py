@@ -132,11 +132,11 @@ class _Other(NamedTuple):
 
 
 class Tracker:
-    """Tracks one viewer's eyes. `update` takes samples as they arrive; `at` returns the eye positions for a given time.
+    """Tracks one viewer's eyes.
 
-    The first person seen remains the viewer while visible. When eyes return after a loss, the output moves smoothly
-    from the last position shown to the measured one. When another person becomes the viewer, the output jumps to
-    their eyes.
+    `update` takes samples as they arrive; `at` returns the eye positions for a given time. The first person seen
+    remains the viewer while visible. When eyes return after a loss, the output moves smoothly from the last position
+    shown to the measured one. When another person becomes the viewer, the output jumps to their eyes.
     """
 
     def __init__(
