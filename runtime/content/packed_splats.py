@@ -68,7 +68,7 @@ def load_splat(path: Path) -> Gaussians:
     """Read a .splat: position, scale, RGBA, rotation. Raises InputError: wrong length, over a limit."""
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
     if not data or len(data) % SPLAT.itemsize:
-        problem = f"is cut off, or no .splat: it has {len(data)} bytes, no multiple of {SPLAT.itemsize}"
+        problem = f"is cut off, or not a .splat: it has {len(data)} bytes, not a multiple of {SPLAT.itemsize}"
         raise InputError(path, "", problem)
     table = np.frombuffer(data, SPLAT)
     untrusted_input.within(len(table), LIMITS.splats, source=path, field="splats")

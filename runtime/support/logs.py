@@ -30,7 +30,7 @@ PRIORITY = {
     logging.CRITICAL: "<2>",
 }
 ROOTS = ("phasestack", "runtime")  # loggers named by subject, and loggers named by module
-BURST = 5  # equal messages passed within `QUIET_NS`
+BURST = 5  # identical messages passed within `QUIET_NS`
 REMEMBERED = 1000  # different messages counted
 QUIET_NS = 30 * NS_PER_S  # time after which a suppressed message passes again
 QUEUED_MAX = 4096  # lines waiting for a reader
@@ -56,7 +56,7 @@ class TextFormat(logging.Formatter):
 
 
 class RateLimit(logging.Filter):
-    """Passes five equal messages in half a minute. The next one that passes gives the number suppressed.
+    """Passes five identical messages per 30 seconds. The next one gives the number suppressed.
 
     Records with `extra={"always": True}` (state transitions) always pass.
     """
