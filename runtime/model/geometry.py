@@ -22,7 +22,7 @@ from runtime.records import F32, F64, U8
 from runtime.support.gl import DrawnPicture
 
 PAD_PX = 2  # around the visible pixels
-ALIGN_PX = 8  # boxes begin and end at multiples of this, so that a half or a quarter of them is whole
+ALIGN_PX = 8  # boxes begin and end at multiples of this, so that the network's raster (a half, a quarter) is whole
 LEAST_PX = 32
 MIN_WEIGHT = 0.05  # least homogeneous weight of a window's corner relative to its middle: below, it has no image
 SNAPPED = 1e-6  # pixels by which a homography may miss whole pixels and still count as a translation by them
