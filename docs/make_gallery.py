@@ -49,7 +49,7 @@ IMAGES = DOCS / "images"
 WIDTH_PX, LIMIT_BYTES = 1200, 200_000
 FILM_BYTES, FILM_PX, FILM_EVERY = 1_500_000, (400, 225), 4  # each of three pictures; refreshes of one
 FILM_S = 2.0, 8.0  # of the run: first and last
-PICTURES = {  # in docs/images: what the commands leave, and what is made here
+PICTURES = {  # in docs/images: results of the commands, and of this script
     "boards.jpg": "boards.png",
     "kinds.jpg": "kinds.png",
     "contact-sheet.jpg": "demo/contact-sheet.png",
