@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import moderngl
@@ -258,17 +258,16 @@ class Painter:
         )
         # A homography's sign is arbitrary; the shader needs a positive third coordinate in the panel's middle.
         matrix = matrix / (matrix[2] @ np.array([screen_px[0] / 2, screen_px[1] / 2, 1.0]))
-        self._context = context
-        self._mounting = ["EXACT"] * permutes_pixels(matrix) + ["CURVED"] * bool(settings.lut or settings.gamma != 1)
+        mounting = ["EXACT"] * permutes_pixels(matrix) + ["CURVED"] * bool(settings.lut or settings.gamma != 1)
         table = np.ascontiguousarray(lut.curve(lut=settings.lut, gamma=settings.gamma).T)
         self._curve = context.texture((lut.ENTRIES, 3), 1, table.tobytes(), dtype="f4")
         self._curve.filter = (moderngl.LINEAR, moderngl.LINEAR)
         self._curve.repeat_x = self._curve.repeat_y = False
-        self._fixed = {
+        fixed = {
             "solved": 0, "flat_picture": 1, "curve": 2, "relief": 3,
             "screen_px": tuple(map(float, screen_px)), "layer_from_screen": tuple(matrix.T.ravel()),
         }  # fmt: skip
-        self._cases = {case: self._compiled(case) for case in CASES}
+        self._cases = {case: _compiled(context, (*mounting, *case), fixed) for case in CASES}
 
     def draw(self, textures: FrameTextures, frame: PanelFrame, index: int) -> None:
         """Draw panel `index` of the uploaded frame over the whole of the bound framebuffer."""
@@ -307,18 +306,22 @@ class Painter:
         self._curve.use(2)
         array.render(moderngl.TRIANGLES, vertices=3)
 
-    def _compiled(self, case: Case) -> tuple[moderngl.Program, moderngl.VertexArray]:
-        head = "#version 330 core\n" + "".join(f"#define {name}\n" for name in (*self._mounting, *case))
-        program = self._context.program(vertex_shader=VERTEX, fragment_shader=head + FRAGMENT)
-        _set(program, self._fixed)
-        return program, self._context.vertex_array(program, [])
-
     def release(self) -> None:
         """Release the GL objects."""
         for program, array in self._cases.values():
             array.release()
             program.release()
         self._curve.release()
+
+
+def _compiled(
+    context: moderngl.Context, names: Sequence[str], fixed: Mapping[str, Any]
+) -> tuple[moderngl.Program, moderngl.VertexArray]:
+    """Compile the shader with these names defined and these uniforms set."""
+    head = "#version 330 core\n" + "".join(f"#define {name}\n" for name in names)
+    program = context.program(vertex_shader=VERTEX, fragment_shader=head + FRAGMENT)
+    _set(program, fixed)
+    return program, context.vertex_array(program, [])
 
 
 def _set(program: moderngl.Program, values: Mapping[str, Any]) -> None:
