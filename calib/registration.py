@@ -1,4 +1,4 @@
-"""Registration of the panels from photographs of their test patterns: poses, homographies, standard errors.
+"""Registration of the panels from photographs of their test patterns: poses and standard errors.
 
 The stack's frame is that of the reference (middle) panel, whose picture is not resampled. Every other panel gets its
 true distance, and a homography that moves each pixel to its position on a panel parallel to the reference. If the panel
