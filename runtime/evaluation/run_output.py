@@ -16,6 +16,7 @@ from runtime.evaluation.refresh_quality import Pictures
 from runtime.records import U8
 from runtime.support.artifacts import OutputFolder, to_json, write_json, write_png, write_text
 from runtime.support.background import MEASURING_NICENESS, set_niceness
+from runtime.support.threads import parallel_map
 
 log = logging.getLogger("phasestack.output")
 
@@ -101,8 +102,9 @@ class RunOutput:
         return self._folder.staging / "light" / str(frame)
 
     def run_is_over(self) -> None:
-        """Block on disk writes from now on: they can no longer delay a refresh."""
+        """Block on disk writes and speed them up from now on: they can no longer delay a refresh."""
         self._every_one = True
+        set_niceness(0, self._writer)
 
     def finish(
         self, summary: dict[str, Any], layers: U8 | None, moment: Moment | None = None, *, unseen: str = ""
@@ -117,8 +119,7 @@ class RunOutput:
             write_json(folder / "summary.json", summary)
             if layers is None:
                 return
-            for n, layer in enumerate(layers):
-                write_png(folder / f"layer-{n}.png", layer)
+            parallel_map(lambda n: write_png(folder / f"layer-{n}.png", layers[n]), range(len(layers)))
             shown, title, lines, page = layers, headline(None), [in_one_line(summary)], unseen
             if moment is not None:
                 shown, title, lines = moment.layers, headline(moment.light_db), [*moment.lines, *lines]

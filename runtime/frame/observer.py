@@ -72,9 +72,6 @@ class RunObserver:
         self._sampler.refreshed(refresh)
         if self._kept is not None:
             self._kept.refreshed(refresh)
-        self._advance()
-
-    def _advance(self) -> None:
         self._lines.advance()
         self._sampler.advance()
 
@@ -84,7 +81,7 @@ class RunObserver:
         In real time the last refresh is measured only if no other was. stopped: returns True after a stop request.
         """
         self.truth.end()
-        self._advance()
+        self._lines.advance()
         if self._kept is not None:
             self._kept.finish(stopped)
         self._sampler.drain(stopped)

@@ -86,23 +86,21 @@ class QualitySampler:
         return bool(self._waiting) or self._drawing or self._job is not None
 
     def drain(self, stopped: Callable[[], bool]) -> None:
-        """Measure the queued samples after a real-time run. stopped: returns True after a stop request."""
+        """Measure the queued samples after the run, until `stopped` returns True; then begin no more."""
         ends_s = time.monotonic() + MEASURED_WITHIN_S
-        self.advance(at_once=True)
+        self._collect()
         while self._is_busy and not stopped() and time.monotonic() < ends_s:
-            time.sleep(LOOK_S)
             self.advance(at_once=True)
+            if self._is_busy:
+                time.sleep(LOOK_S)
 
     def advance(self, *, at_once: bool = False) -> None:
         """Collect a finished measurement and start those whose true eyes are now known.
 
         at_once: begin the next one now; otherwise, in real time, keep to MEASURING_SHARE.
         """
+        self._collect()
         now_s = time.monotonic()
-        if self._job is not None and self._job.done:
-            job, self._job = self._job, None
-            self._take(self._job_frame, job.take())
-            self._resumes_s = now_s + (now_s - self._began_s) * (1 / MEASURING_SHARE - 1)
         if not (self._simulated or at_once) and now_s < self._resumes_s:
             return
         while self._waiting and self._job is None and not self._drawing:
@@ -113,6 +111,13 @@ class QualitySampler:
             del self._waiting[first]
             self._began_s = now_s
             self._begin(sample)
+
+    def _collect(self) -> None:
+        if self._job is not None and self._job.done:
+            job, self._job = self._job, None
+            self._take(self._job_frame, job.take())
+            now_s = time.monotonic()
+            self._resumes_s = now_s + (now_s - self._began_s) * (1 / MEASURING_SHARE - 1)
 
     def finish(self, last: Refresh) -> None:
         """Measure the run's last refresh, which enters the means only if no other was measured."""

@@ -124,7 +124,7 @@ def niceness(value: int) -> Iterator[None]:
         set_niceness(before)
 
 
-def set_niceness(niceness: int) -> None:
-    """Set the niceness of the calling thread and of threads it starts later, if the system allows it."""
+def set_niceness(niceness: int, thread: threading.Thread | None = None) -> None:
+    """Set the niceness of a thread (default: this one) and of those it starts later, if allowed."""
     with suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
+        os.setpriority(os.PRIO_PROCESS, (thread or threading.current_thread()).native_id or 0, niceness)

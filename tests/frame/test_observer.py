@@ -247,6 +247,18 @@ def test_who_stops_a_run_waits_for_no_measurement(content: ContentSource, solved
     assert observer.moment is None and solver.tasks == []
 
 
+def test_who_stops_a_run_begins_no_measurement_and_keeps_the_last(content: ContentSource, solved: Solution) -> None:
+    solver = Drawing(content, at_once=False)
+    observer, _ = looking(content, solver=solver, simulated=False, evaluate_every=1)
+    observer.refreshed(refresh(1, solved))
+    observer.refreshed(refresh(2, solved))  # queued
+    assert solver.tasks.pop()(solver) is True
+    assert wait_for_all(120.0) == 0
+    observer.finish(lambda: True)
+    assert solver.tasks == []
+    assert observer.summary()["quality_frames"] == 1
+
+
 def test_in_real_time_one_measurement_runs_at_a_time_and_delays_nothing(
     content: ContentSource, solved: Solution
 ) -> None:
