@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ import phasestack
 from runtime.commands.app import app
 from runtime.errors import InputError
 from runtime.evaluation import solved
-from runtime.optics.disparity import disparity_doubts
+from runtime.optics.disparity import _compared, disparity_doubts
 from runtime.optics.stack import PanelStack
 from runtime.report.pairs import PairPainter, read_pairs
 from tests.test_cli import pair_in, solve_arguments
@@ -340,10 +341,10 @@ def test_many_pairs_are_solved_in_turn() -> None:
         list(phasestack.solve_each([(picture(), picture(3), EYES), (picture(), picture(3), ())], stack=STACK))
 
 
-def rectified(shift_px: int) -> tuple[np.ndarray, ...]:
-    """Blocks of strong contrast in front of the middle panel, seen by parallel cameras."""
-    levels = np.random.default_rng(4).choice([30, 90, 160, 230], (9, 24, 3)).astype(np.uint8)
-    wide = cv2.resize(levels, (480, 180), interpolation=cv2.INTER_NEAREST)
+def rectified(shift_px: int, levels: Sequence[int] = (30, 90, 160, 230)) -> tuple[np.ndarray, ...]:
+    """Blocks in front of the middle panel, seen by parallel cameras."""
+    blocks = np.random.default_rng(4).choice(levels, (9, 24, 3)).astype(np.uint8)
+    wide = cv2.resize(blocks, (480, 180), interpolation=cv2.INTER_NEAREST)
     return tuple(
         np.ascontiguousarray(wide[:, start : start + 320]) for start in (80 - shift_px // 2, 80 + shift_px // 2)
     )
@@ -362,6 +363,44 @@ def test_a_pair_with_too_much_disparity_is_explained_wherever_its_figure_is(tmp_
     assert "rectified" in (tmp_path / "viewer.html").read_text()
     moved = [np.roll(picture, shift_px, axis=1) for picture, shift_px in zip(rectified(60), (-30, 30), strict=True)]
     assert phasestack.solve(*moved, eyes_m=eyes, stack=STACK, model="fast").notes == ()
+
+
+def example_at(gap_m: float, toed_px: int = 0) -> tuple[Any, ...]:
+    """The example pair, moved apart as a rectified one is, with its eyes and a stack of these gaps."""
+    pair = phasestack.example_pair()
+    moved = np.roll(pair.left, toed_px, axis=1), np.roll(pair.right, -toed_px, axis=1)
+    return moved, pair.eyes_m, phasestack.Stack(0.5184, 0.2916, (-gap_m, 0.0, gap_m), 640, 360)
+
+
+@pytest.mark.filterwarnings("ignore:pictures")
+def test_contrast_and_gaps_decide_how_much_disparity_is_too_much() -> None:
+    """The example pair has 37.1 dB of light with 3 and 6 cm (`balanced`), 33.3 with 1 cm, and 24 to 27 if rectified."""
+    for gap_m, toed_px, ghosts in (
+        (0.06, 0, False),
+        (0.03, 0, False),
+        (0.01, 0, True),
+        (0.03, 40, True),
+        (0.06, 40, True),
+    ):
+        pictures, eyes, stack = example_at(gap_m, toed_px)
+        assert bool(disparity_doubts(pictures, eyes, stack, fov_deg=40)) == ghosts, (gap_m, toed_px)
+    eyes = np.array([(0.6, -0.0315, 0.0), (0.6, 0.0315, 0.0)])
+    gaps = phasestack.Stack(0.5184, 0.2916, (-0.03, 0.0, 0.03), 320, 180)
+    for levels, ghosts, least_db, most_db in (((90, 115, 145, 170), False, 32, 40), ((30, 90, 160, 230), True, 10, 25)):
+        pictures = rectified(24, levels)
+        assert bool(disparity_doubts(pictures, eyes, gaps, fov_deg=40)) == ghosts
+        light_db = phasestack.solve(*pictures, eyes_m=eyes, stack=gaps).measure(sigmas_mm=(1,), every=2).light_db["1"]
+        assert least_db < light_db < most_db, levels
+
+
+def test_the_size_of_ghosts_is_foretold() -> None:
+    for gap_m, toed_px in ((0.03, 40), (0.06, 40), (0.005, 0)):
+        pictures, eyes, stack = example_at(gap_m, toed_px)
+        unit_m = 0.063 * 0.6 * gap_m / (0.6**2 - gap_m**2)  # of disparity, on the middle panel
+        foretold_db = -20 * np.log10(_compared(pictures, eyes, stack, fov_deg=40).ghosts(unit_m))
+        solved = phasestack.solve(*pictures, eyes_m=eyes, stack=stack)
+        with pytest.warns(UserWarning, match="more disparity than these gaps"):
+            assert solved.measure(sigmas_mm=(1,), every=4).light_db["1"] == pytest.approx(foretold_db, abs=2.5)
 
 
 @pytest.mark.parametrize("period_px", [8, 12, 24])

@@ -1,9 +1,9 @@
-"""Disparity of a pair of pictures, compared with the range that a stack's gaps can show."""
+"""Disparity of a pair of pictures, compared with what a stack's gaps can show."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -11,16 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.optics.rpu import panel_from_image
-from runtime.optics.stack import PanelStack
+from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import image_from_stack
 from runtime.records import F32, F64, U8
 
-WIDTH_PX = 256  # width of the raster on the middle panel that pictures are matched on
+WIDTH_PX = 256  # width of the raster on the middle panel that pictures are compared on
 REACH_PX = WIDTH_PX // 4  # largest disparity searched, in either direction
-# In units of the outer panels' disparity. High-contrast blocks have 35 dB of light (1 mm) at 2, 30 at 3 and 26 at 4,
-# instead of 38.
-SHOWN_MOST = 2.5
-TOO_MUCH = 0.1  # least share of a picture beyond `SHOWN_MOST` that is reported
+# Largest ghosts that are not reported: root mean square, in shares of full scale. The example pair has as much error of
+# other kinds (37 dB of light), so that larger ghosts cost more than 3 dB.
+GHOSTS_MOST = 0.015
+BEYOND_LEAST = (
+    0.1  # share of the matches that must be outside the stack; between the panels, disparity causes no ghosts
+)
+LARGER, MOST_LARGER = 1.1, 20.0  # factor between gaps that are tried, and between the largest of them and the stack's
 ROLLED, TURNED = 0.05, 0.2  # largest slopes of the line between the eyes for which picture rows correspond
 LEAST_MATCHED = 0.1  # share of the panel that must be matched
 LEAST_ONCE = 1 / 3  # share of the matches that must be the only ones at their place; else the picture repeats
@@ -28,39 +31,78 @@ WINDOW_PX, APART_PX = 21, 4  # of two matches at one place
 NO_WORSE = 1.3, 1.0  # factor and codes: errors up to which the second match is as good
 
 
-def disparities_m(pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, *, fov_deg: float) -> F64:
-    """(n,) disparities, metres on the middle panel, of points that match only once.
+@dataclass(frozen=True, slots=True)
+class _Compared:
+    """Both pictures, left first, on a coarse raster of the middle panel."""
 
-    Positive for points in front of that panel, which are farther right for the left eye. Pictures are `fov_deg` wide
-    and look at the stack's origin. Empty if the line between the eyes is not level or not parallel to the panels, or
-    if most of the pictures repeats.
-    """
-    line = eyes_m[1] - eyes_m[0]
-    if line[1] <= 0 or abs(line[2]) > ROLLED * line[1] or abs(line[0]) > TURNED * line[1]:
-        return np.empty(0)
+    grey: tuple[U8, U8]
+    inside: tuple[U8, U8]  # 255 where the picture covers the panel
+    panel: PlaneRaster
+
+    def ghosts(self, unit_m: float) -> float:
+        """Root mean square of the light, 0 to 1, that reaches the wrong eye, as the outer panels' range ends.
+
+        Two eyes see a point of the front panel `unit_m` apart on the middle panel, and of the rear panel as far apart
+        in the other direction. The difference between their pictures, in panel values, is therefore the slope of
+        (front - rear) times `unit_m`, and front - rear stays between -1 and 1. Each row is followed from left to right.
+        Where that range ends, the difference is lost, and both eyes see the mean.
+        """
+        light = np.stack(self.grey) / 255.0
+        value = np.arcsin(np.sqrt(light)) / (np.pi / 2)
+        both = (self.inside[0] == 255) & (self.inside[1] == 255)
+        step = np.where(both, value[0] - value[1], 0.0) * (self.panel.pitch_u_m / unit_m)
+        low, high = np.percentile(np.cumsum(step, axis=1), (5, 95), axis=1)
+        at, lost = -(low + high) / 2, np.zeros_like(step)
+        for column, wanted in enumerate(step.T):
+            lost[:, column] = at + wanted
+            at = np.clip(lost[:, column], -1.0, 1.0)
+            lost[:, column] -= at
+        share = np.divide(lost, step, out=np.zeros_like(step), where=step != 0).clip(0.0, 1.0)
+        return float(np.sqrt(np.mean((share * (light[0] - light[1]) / 2)[both] ** 2))) if both.any() else 0.0
+
+    def disparities_m(self) -> F64:
+        """(n,) disparities, metres on the middle panel, of points that match only once.
+
+        Positive for points in front of that panel, which are farther right for the left eye. Empty if most of the
+        pictures repeats, or if too little of them matches.
+        """
+        sides = 0, 0, REACH_PX, REACH_PX
+        framed: list[Any] = [
+            cv2.copyMakeBorder(one, *sides, cv2.BORDER_CONSTANT) for one in (*self.grey, self.inside[0])
+        ]
+        left, right, inside = framed
+        matcher = cv2.StereoSGBM.create(
+            minDisparity=-REACH_PX, numDisparities=2 * REACH_PX, blockSize=5, P1=200, P2=800, disp12MaxDiff=1,
+            uniquenessRatio=10, speckleWindowSize=40, speckleRange=2,
+        )  # fmt: skip
+        matched: Any = matcher.compute(left, right) / 16.0
+        seen = (matched >= -REACH_PX) & (inside == 255)
+        once = seen & ~_is_ambiguous(left, right, matched)
+        if once.sum() < max(LEAST_ONCE * seen.sum(), LEAST_MATCHED * self.grey[0].size):
+            return np.empty(0)
+        return np.asarray(matched[once] * self.panel.pitch_u_m, np.float64)
+
+
+def _compared(pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, *, fov_deg: float) -> _Compared:
+    """Pictures are `fov_deg` wide and look at the stack's origin."""
     small = replace(stack, width_px=WIDTH_PX, height_px=max(16, round(WIDTH_PX * stack.height_m / stack.width_m)))
     panel, size = small.panel(stack.count // 2), (WIDTH_PX, small.height_px)
     found: list[Any] = []
     for picture, eye_m in zip(pictures, eyes_m, strict=True):
-        height, width = picture.shape[:2]
         codes: Any = picture[..., :3] if picture.dtype == np.uint8 else np.rint(255 * picture[..., :3])
-        image = image_from_stack(eye_m, width_px=width, height_px=height, fov_deg=fov_deg)
-        matrix = panel_from_image(image, panel)
-        coarser = np.ascontiguousarray(codes, np.uint8)
-        grey = cv2.warpPerspective(cv2.cvtColor(coarser, cv2.COLOR_RGB2GRAY), matrix, size, flags=cv2.INTER_AREA)
-        inside = cv2.warpPerspective(np.full((height, width), 255, np.uint8), matrix, size)
-        found += [cv2.copyMakeBorder(one, 0, 0, REACH_PX, REACH_PX, cv2.BORDER_CONSTANT) for one in (grey, inside)]
-    left, left_inside, right, _ = found
-    matcher = cv2.StereoSGBM.create(
-        minDisparity=-REACH_PX, numDisparities=2 * REACH_PX, blockSize=5, P1=200, P2=800, disp12MaxDiff=1,
-        uniquenessRatio=10, speckleWindowSize=40, speckleRange=2,
-    )  # fmt: skip
-    matched = matcher.compute(left, right) / 16.0
-    seen = (matched >= -REACH_PX) & (left_inside == 255)
-    once = seen & ~_is_ambiguous(left, right, matched)
-    if once.sum() < LEAST_ONCE * seen.sum():
-        return np.empty(0)
-    return np.asarray(matched[once] * panel.pitch_u_m, np.float64)
+        grey = cv2.cvtColor(np.ascontiguousarray(codes, np.uint8), cv2.COLOR_RGB2GRAY)
+        # Sampled as they are, fine textures would differ between the eyes at random.
+        shrunk = min(1.0, WIDTH_PX / stack.width_m * _width_m(eye_m, fov_deg) / grey.shape[1])
+        grey = cv2.resize(grey, None, fx=shrunk, fy=shrunk, interpolation=cv2.INTER_AREA)
+        height, width = grey.shape
+        matrix = panel_from_image(image_from_stack(eye_m, width_px=width, height_px=height, fov_deg=fov_deg), panel)
+        found += [cv2.warpPerspective(one, matrix, size) for one in (grey, np.full_like(grey, 255))]
+    return _Compared((found[0], found[2]), (found[1], found[3]), panel)
+
+
+def _width_m(eye_m: F64, fov_deg: float) -> float:
+    """Width of an eye's picture at the stack's origin."""
+    return float(2 * np.linalg.norm(eye_m) * np.tan(np.radians(fov_deg / 2)))
 
 
 def _is_ambiguous(left: U8, right: U8, matched: F64) -> NDArray[np.bool_]:
@@ -89,15 +131,19 @@ def disparity_doubts(
 
     parallel: the pictures may be a rectified pair from parallel cameras, passed by mistake as the eyes' own views.
     """
-    apart_m, away_m = float(eyes_m[1, 1] - eyes_m[0, 1]), float(eyes_m[:, 0].mean())
+    line = eyes_m[1] - eyes_m[0]
+    if line[1] <= 0 or abs(line[2]) > ROLLED * line[1] or abs(line[0]) > TURNED * line[1]:
+        return []  # a point is not in the same row of both pictures
+    compared = _compared(pictures, eyes_m, stack, fov_deg=fov_deg)
+    apart_m, away_m = float(line[1]), float(eyes_m[:, 0].mean())
     centre_m = stack.x_m[stack.count // 2]
     rear_m, front_m = (apart_m * (x_m - centre_m) / (away_m - x_m) for x_m in (stack.x_m[0], stack.x_m[-1]))
-    shown_m = SHOWN_MOST * (front_m - rear_m) / 2
-    found_m = disparities_m(pictures, eyes_m, stack, fov_deg=fov_deg)
-    if len(found_m) < LEAST_MATCHED * WIDTH_PX**2 * stack.height_m / stack.width_m:
+    unit_m = (front_m - rear_m) / 2
+    ghosts = compared.ghosts(unit_m)
+    if ghosts <= GHOSTS_MOST:
         return []
-    beyond = float(np.mean(np.abs(found_m) > shown_m))
-    if beyond < TOO_MUCH:
+    found_m = compared.disparities_m()
+    if not len(found_m) or np.mean(np.abs(found_m) > unit_m) < BEYOND_LEAST:
         return []
 
     def place(disparity_m: float) -> str:
@@ -107,11 +153,13 @@ def disparity_doubts(
         return f"{abs(depth_mm):.0f} mm {'before' if depth_mm > 0 else 'behind'}"
 
     low_m, middle_m, high_m = (float(value) for value in np.percentile(found_m, (10, 50, 90)))
-    told = f"pictures: {beyond:.0%} of them has more disparity than these gaps can show without ghosts. Things stand "
-    told += f"{place(low_m)} to {place(high_m)} the middle panel; {place(-shown_m)} to {place(shown_m)} can be shown"
+    told = "pictures: have more disparity than these gaps can show without ghosts, which are estimated at "
+    told += f"{ghosts:.0%} of full scale. Things stand {place(low_m)} to {place(high_m)} the middle panel"
+    factors = LARGER ** np.arange(1, 1 + np.log(MOST_LARGER) / np.log(LARGER))
+    if larger := next((float(one) for one in factors if compared.ghosts(one * unit_m) <= GHOSTS_MOST), None):
+        told += f"; {larger:.1f} times the gaps, or as many times less disparity, would show them"
     if parallel and low_m > 0:
-        width_m = 2 * np.hypot(away_m, eyes_m[:, 1:].mean(axis=0)).max() * np.tan(np.radians(fov_deg / 2))
-        shift_px = middle_m / width_m * pictures[0].shape[1] / 2
+        shift_px = middle_m / _width_m(eyes_m.mean(axis=0), fov_deg) * pictures[0].shape[1] / 2
         told += ". All of it is before that panel, as in a rectified pair (parallel cameras): give the cameras, or "
         told += f"move the left picture {shift_px:.0f} pixels to the left and the right one as far to the right"
     return [told]
