@@ -58,17 +58,16 @@ PICTURES = {  # in docs/images: results of the commands, and of this script
     "focal-slices.jpg": "report/focal-slices.png",
 }
 MOVING = f"""\
-The daemon's own loop runs on the simulated clock with the costs of a slow processor (ms on the full raster: render 44,
-prepare 40, inference 31, finish 38, a step 85), panels of 960x540 and {NOISE_MM} mm of sensor noise, for {SECONDS:g} s.
-*Film* is moving content for a resting head. *Live* ([contracts](contracts.md#error)) is the light at the true eyes,
-compared with what they should see from there at that refresh. *View* is the distance of the true eyes from those that
-the picture was drawn for (median and 95th percentile); between solutions the picture is
-[reprojected](mathematics.md#reprojection) by its depth. *Full* uses the whole model for every solution. *Auto*, the
-default, [chooses](mathematics.md#effort) the raster and the number of steps for each solution.
+The daemon's own loop runs for {SECONDS:g} s on the simulated clock, with panels of 960x540 and {NOISE_MM} mm of
+sensor noise. The costs are those of a slow processor (ms on the full raster: render 44, prepare 40, inference 31,
+finish 38, a step 85). *Film* is moving content for a resting head. *Full* uses the whole model for every solution.
+*Auto*, the default, [chooses](mathematics.md#effort) an effort, such as half the raster without steps (`1/2+0`). The
+table gives [live quality](contracts.md#error) in dB, the view error in mm (median and 95th percentile) and the share
+of time of each effort. Between solutions, the picture is [reprojected](mathematics.md#reprojection) by its depth.
 """
 LEANING = """\
-The left eye's view while a head leans at 0.6 m, at every fourth refresh: with `model.effort = "full"` ("before"), with
-`"auto"` ("now"), and the true view. The first two are reprojected by depth.
+This is the left eye's view while a head leans at 0.6 m, at every fourth refresh: with `model.effort = "full"`
+("before"), with `"auto"` ("now"), and the true view.
 """
 HEAD = """\
 <!-- Written by `make gallery`: change docs/make_gallery.py, not this page. -->
@@ -80,13 +79,13 @@ HEAD = """\
     phasestack bench --out new.json           # figures for regression tests
     phasestack bench compare old.json new.json
 
-**Quote light at a tracking error of 1 mm** (`light_db`, `"1"`). [Contracts](contracts.md#error) defines it, *one ray*
-(`psnr_db`) and *carried*. *Time* is that of a whole solution, from two decoded pictures to 8-bit layers. Every method
-runs in a separate process; its memory is that process's peak. Run times depend on the machine and its load, so
-compare ratios. To include the published network (`eyereal`), export its checkpoint and pass `--model FILE.onnx`.
+**Quote [light](contracts.md#error) at a tracking error of 1 mm** (`light_db`, `"1"`). *One ray* is `psnr_db`. The time
+of a solution runs from two decoded pictures to 8-bit layers. Every method runs in its own process, whose peak memory
+is reported. Run times depend on the machine and its load, so compare ratios. To include the published network
+(`eyereal`), export its checkpoint and pass `--model FILE.onnx`.
 
 `bench compare` divides times by a reference measured in the same run and skips them if the machine was busy. It exits
-with 1 if a model got slower by more than the noise, lost 0.1 dB or took 15% more memory.
+with 1 if a model became slower by more than the noise, lost 0.1 dB or took 15% more memory.
 
 `report --pairs` reads every [case file](contracts.md#cases-pairs-calibration) in DIR. The optional `off` lists pictures
 that should be seen `mm` away from an eye:
@@ -117,7 +116,8 @@ def page(report: dict[str, Any]) -> str:
     return "\n".join(
         [
             HEAD,
-            f"## Error against run time\n\nBuilt-in scenes, panels of {size}; `{report['command']}`; {facts}.\n",
+            "## Error against run time\n",
+            f"Measured on built-in scenes and panels of {size} by `{report['command']}`; {facts}.\n",
             _table(["method", "× fastest", "ms", "MiB", "light 0 mm, dB", "**1 mm**", "2 mm", "one ray"], rows),
             "![light against run time](images/frontier.png)\n",
             "## What a moving viewer sees\n",
@@ -126,8 +126,9 @@ def page(report: dict[str, Any]) -> str:
             "![a leaning head, before, now, and what it should see](images/leaning.webp)\n",
             LEANING,
             "## Focal parallax\n",
-            "Three cards seen through a pupil of 4 mm: the distance at which the eyes converge on each card, at which "
-            "its\npicture through the layers is sharpest, and at which the card itself is sharpest.\n",
+            "Three cards are seen through a pupil of 4 mm. The table gives the distance at which the eyes converge on "
+            "each card,\nat which its picture through the layers is sharpest, and at which the card itself is "
+            "sharpest.\n",
             _table(["card at, mm", "sharpest through the layers", "sharpest in truth"], cards),
             "![focused behind, on and in front of the panels](images/focal-slices.jpg)",
             "",
