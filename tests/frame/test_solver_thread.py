@@ -15,7 +15,7 @@ from runtime.clock import NS_PER_S, MonotonicClock, SimulatedClock
 from runtime.errors import ContextLost, FatalError, InputError
 from runtime.frame.solver import SolverUpdate
 from runtime.frame.solver_thread import ABANDON_S, ABANDONED_MAX, LATE_S, SolverThread
-from runtime.records import SolveRequest
+from runtime.records import Effort, SolveRequest
 from runtime.report.pairs import PairPainter
 from runtime.support.memory import keep_freed_memory
 from runtime.support.untrusted_input import LIMITS
@@ -410,3 +410,114 @@ def test_a_stop_ends_a_step_between_two_drawings(shop: Workshop) -> None:
     shop.host.close(PATIENCE_S)
     assert [parts.closed for parts in shop.all] == [1]
     assert drawn < 3000
+
+
+class Drawn:
+    """A drawn request, as `SolverThread` sees it."""
+
+    effort, render_ms, is_apart = Effort(1, 0), 5.0, True
+
+    def __init__(self, request: SolveRequest) -> None:
+        self.request = request
+
+
+class ApartParts(FakeParts):
+    """Parts that are drawn by the test's function and solved by another, on the worker."""
+
+    overlaps = True
+    behave_apart: Behaviour = staticmethod(solves)
+
+    def __init__(self) -> None:
+        super().__init__(lambda request: SolverUpdate(flat=solution(1, None)))
+        self.drawn: queue.Queue[int] = queue.Queue()
+        self.solving: queue.Queue[str] = queue.Queue()
+        self.settled: list[tuple[int, bool]] = []
+
+    def draw(self, request: SolveRequest) -> Any:
+        if request.eyes_m is None:
+            return self.step(request)
+        self.drawn.put(request.time_ns)
+        return Drawn(request)
+
+    def solve(self, drawn: Any) -> SolverUpdate:
+        self.solving.put(threading.current_thread().name)
+        return self.behave_apart(drawn.request)
+
+    def settle(self, drawn: Any, update: SolverUpdate) -> None:
+        self.settled.append((drawn.request.time_ns, update.solution is not None))
+
+
+@pytest.fixture
+def apart() -> Iterator[tuple[SolverThread, list[ApartParts], SimulatedClock]]:
+    all_parts: list[ApartParts] = []
+
+    def make() -> ApartParts:
+        all_parts.append(ApartParts())
+        return all_parts[-1]
+
+    clock = SimulatedClock(NS_PER_S)
+    host = SolverThread(make, clock)
+    host.wait_ready()
+    yield host, all_parts, clock
+    host.close(PATIENCE_S)
+
+
+def test_the_next_request_is_drawn_while_the_last_is_solved(apart: Any) -> None:
+    host, (parts,), _ = apart
+    gate = threading.Event()
+    parts.behave_apart = lambda request: solves(request) if gate.wait(PATIENCE_S) else SolverUpdate()
+    host.post(wish(1))
+    threads = [parts.solving.get(timeout=PATIENCE_S)]
+    host.post(wish(2))
+    assert [parts.drawn.get(timeout=PATIENCE_S) for _ in range(2)] == [1, 2]
+    assert parts.solving.empty(), "the second one waits for the first"
+    gate.set()
+    assert eventually(lambda: parts.settled == [(1, True), (2, True)])
+    assert [*threads, parts.solving.get()] == ["solver-1-worker"] * 2
+    assert host.news().solution.solved_for_ns == 2
+
+
+def test_a_task_waits_until_nothing_is_being_solved(apart: Any) -> None:
+    host, (parts,), _ = apart
+    gate, at_task = threading.Event(), threading.Event()
+    parts.behave_apart = lambda request: solves(request) if gate.wait(PATIENCE_S) else SolverUpdate()
+    host.post(wish(1))
+    parts.solving.get(timeout=PATIENCE_S)
+    host.do(lambda _: bool(at_task.set()) or True)
+    assert not at_task.wait(0.3)
+    gate.set()
+    assert at_task.wait(PATIENCE_S)
+    assert parts.settled == [(1, True)]
+
+
+def test_an_exception_while_solving_apart_restarts_the_solver(apart: Any) -> None:
+    host, all_parts, clock = apart
+
+    def fail(request: SolveRequest) -> SolverUpdate:
+        raise RuntimeError("a bug in the kernels")
+
+    all_parts[0].behave_apart = fail
+    host.post(wish(1))
+    assert eventually(lambda: host.post(wish(2)) or "a bug in the kernels" in host.news().missing.get("model", ""))
+    assert eventually(lambda: all_parts[0].closed == 1)
+    clock.advance_ns(round((ABANDON_S + 0.1) * NS_PER_S))
+    assert eventually(lambda: host.news().missing == {})
+    host.post(wish(3))
+    assert eventually(lambda: host.news().solution is not None and host.news().solution.solved_for_ns == 3)
+
+
+def test_a_solution_that_never_comes_is_abandoned_for_a_new_solver(apart: Any) -> None:
+    host, all_parts, clock = apart
+    gate = threading.Event()
+    all_parts[0].behave_apart = lambda request: solves(request) if gate.wait(PATIENCE_S) else SolverUpdate()
+    host.post(wish(1))
+    all_parts[0].solving.get(timeout=PATIENCE_S)
+    clock.advance_ns(round(2 * NS_PER_S))
+    assert host.news().missing["model"] == "the solver has not answered for 2000 ms"
+    clock.advance_ns(round(ABANDON_S * NS_PER_S))
+    host.news()
+    assert eventually(lambda: len(all_parts) == 2 and host.news().missing == {})
+    assert all_parts[0].closed == 0, "its model is still in use"
+    gate.set()
+    assert eventually(lambda: all_parts[0].closed == 1)
+    assert host.news().solution is None, "the abandoned solver's result is ignored"
