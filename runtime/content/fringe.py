@@ -6,7 +6,9 @@ half a pixel on average.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,18 +64,39 @@ def edges_of(shape: Shape) -> Edges:
     )
 
 
-def silhouette(edges: Edges, eye: F64) -> tuple[I32, I32]:
-    """(k, 2) vertices and (k,) apexes, of the visible face, of the edges that an eye sees as outlines.
+class Outlines:
+    """Edges of several parts, searched together for the outlines that an eye sees."""
 
-    eye: (3,) in the shape's own frame. Normals must point outwards.
-    """
-    if not len(edges.normals):
-        return edges.ends[:, 0], edges.apex[:, 0]
-    facing = edges.normals @ eye > edges.heights
-    first, second = facing[edges.faces.T]
-    chosen = np.flatnonzero(edges.border | (first != second))
-    which = np.where(edges.border[chosen] | first[chosen], 0, 1)
-    return edges.ends[chosen, which], edges.apex[chosen, which]
+    def __init__(self, each: Sequence[Edges], *, vertices: Sequence[int]) -> None:
+        """each: the parts' edges; vertices: how many each part has. Results count vertices over all parts."""
+        faces_before = np.cumsum([0, *(len(edges.normals) for edges in each)])
+        self.vertices_before = np.cumsum([0, *vertices])
+        self._faces = list(pairwise(faces_before.tolist()))
+        self._edges = Edges(
+            faces=np.concatenate([edges.faces + n for edges, n in zip(each, faces_before, strict=False)]),
+            ends=np.concatenate([edges.ends + n for edges, n in zip(each, self.vertices_before, strict=False)]),
+            apex=np.concatenate([edges.apex + n for edges, n in zip(each, self.vertices_before, strict=False)]),
+            normals=np.concatenate([edges.normals for edges in each]),
+            heights=np.concatenate([edges.heights for edges in each]),
+            border=np.concatenate([edges.border for edges in each]),
+        )
+        self._part = np.repeat(np.arange(len(each)), [len(edges.faces) for edges in each])
+
+    def seen(self, eyes: Sequence[F64 | None]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """(k, 3) vertices, both ends and the apex of the visible face, of the outlines' edges, and (k,) their parts.
+
+        eyes: (3,) in each part's own frame; None: the part is left out. Normals must point outwards.
+        """
+        edges = self._edges
+        facing = np.zeros(len(edges.normals), bool)
+        for (begin, end), eye in zip(self._faces, eyes, strict=True):
+            if eye is not None:
+                facing[begin:end] = edges.normals[begin:end] @ eye > edges.heights[begin:end]
+        first, second = facing[edges.faces.T]
+        is_seen = np.array([eye is not None for eye in eyes])[self._part]
+        chosen = np.flatnonzero((edges.border | (first != second)) & is_seen)
+        which = np.where(edges.border[chosen] | first[chosen], 0, 1)
+        return np.column_stack([edges.ends[chosen, which], edges.apex[chosen, which]]), self._part[chosen]
 
 
 def ramps(points: F64, *, width_px: int, height_px: int, ramp_px: float = 1.0) -> tuple[F32, NDArray[np.intp]]:

@@ -6,14 +6,17 @@ A part without lamp, picture, vertex colours or holes has a shader without them.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from runtime.content import camera
 from runtime.content.base import ContentInfo, View
 from runtime.content.canvas import OVER, CanvasSource
-from runtime.content.fringe import CORNER_ENDS, edges_of, ramps, silhouette
+from runtime.content.fringe import CORNER_ENDS, Outlines, edges_of, ramps
 from runtime.content.parts import OPAQUE_FROM, OUTLINED_MAX, Part, Sampler
 from runtime.optics.rect import PixelRect
 from runtime.records import F32, F64, U8
@@ -176,18 +179,26 @@ class DrawnPart:
             held.release()
 
 
-class _Look:
-    """The matrices of a place in a view: computed once for all parts at that place."""
+class _Place:
+    """A part's place in a scene, with the matrices that do not depend on the view."""
 
-    def __init__(self, clip_from_part: F64, stack_from_part: F64, view: View) -> None:
+    def __init__(self, stack_from_part: F64) -> None:
         linear = stack_from_part[:3, :3]
-        self.has_inside = bool(np.linalg.det(linear))  # not squashed flat
-        if self.has_inside:
-            self.eye = np.linalg.solve(stack_from_part, np.append(view.eye_m, 1.0))[:3]
-        if view.display_from_view is not None:
-            linear = view.display_from_view @ linear
-        self.clip_from_part, self._clip = clip_from_part, _gl(clip_from_part)
-        self._normals = _gl(np.linalg.pinv(linear).T * np.cbrt(abs(np.linalg.det(linear))))
+        volume = float(np.linalg.det(linear))
+        self.stack_from_part = stack_from_part
+        self.part_from_stack = np.linalg.inv(stack_from_part) if volume else None  # None: squashed flat
+        self.normals = np.linalg.pinv(linear).T * np.cbrt(abs(volume))
+
+
+class _Look:
+    """The matrices of a place in a view."""
+
+    def __init__(self, place: _Place, clip_from_stack: F64, view: View) -> None:
+        inverse = place.part_from_stack
+        self.eye = None if inverse is None else inverse[:3, :3] @ view.eye_m + inverse[:3, 3]  # None: has no inside
+        turned = place.normals if view.display_from_view is None else view.display_from_view @ place.normals
+        self.clip_from_part = clip_from_stack @ place.stack_from_part
+        self._clip, self._normals = _gl(self.clip_from_part), _gl(turned)
 
     def set(self, program: Any, part: DrawnPart) -> None:
         """Set a program's uniforms and textures for a part."""
@@ -197,6 +208,16 @@ class _Look:
         _set_uniforms(program, colour=part.colour, glow=part.glow, glow_picture=len(part.textures) - 1)
         for unit, texture in enumerate(part.textures):
             texture.use(unit)
+
+
+@dataclass(frozen=True, slots=True)
+class _Arrangement:
+    """Where all parts are at one time."""
+
+    places: list[_Place]  # of each part; parts of one place share it
+    points_m: F64  # (n, 3) around all parts, frame `stack`
+    corners_m: F64  # (p, 8, 3) of each part's box, frame `stack`
+    nearest_first: NDArray[np.intp]  # (p,)
 
 
 class TriangleSource(CanvasSource):
@@ -218,10 +239,17 @@ class TriangleSource(CanvasSource):
         super().__init__(context, info=info, samples=samples)
         self.parts, self.stack_from_parts = list(parts), list(stack_from_parts)
         self._with_ramps = samples == 0
-        self._still: tuple[F64, F64] | None = None
+        self._still: _Arrangement | None = None  # of a scene that does not move
         self._programs: dict[tuple[str, ...], Any] = {}
         self._textures: dict[tuple[int, Sampler], Any] = {}
-        edges = sum(len(part.edges.faces) for part in self.parts if part.edges is not None)
+        self._outlined = [(n, part, part.edges) for n, part in enumerate(self.parts) if part.edges is not None]
+        edges = sum(len(edges.faces) for _, _, edges in self._outlined)
+        if self._outlined:
+            counts = [len(part.vertices) for _, part, _ in self._outlined]
+            self._edges = Outlines([edges for _, _, edges in self._outlined], vertices=counts)
+            self._corners = np.concatenate([part.vertices for _, part, _ in self._outlined])
+            for (begin, end), (_, part, _) in zip(pairwise(self._edges.vertices_before), self._outlined, strict=True):
+                part.vertices = self._corners[begin:end]  # not kept twice
         self._outline_buffer = context.buffer(reserve=max(edges, 1) * 6 * OUTLINE_FLOATS * 4, dynamic=True)
         self._outlines: dict[tuple[str, ...], Any] = {}
         for part in self.parts:
@@ -236,60 +264,63 @@ class TriangleSource(CanvasSource):
         return self.stack_from_parts
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect:
-        return camera.covered_box(view, self._around(self.places(time_ns))[0], align_px=1)
+        return camera.covered_box(view, self._arranged(time_ns).points_m, align_px=1)
 
-    def _around(self, places: Sequence[F64]) -> tuple[F64, F64]:
-        """(n, 3) points around all parts, and (p, 8, 3) corners of each one's box, in the frame `stack`."""
-        if places is self.stack_from_parts and self._still is not None:
+    def _arranged(self, time_ns: int) -> _Arrangement:
+        matrices = self.places(time_ns)
+        is_still = matrices is self.stack_from_parts
+        if is_still and self._still is not None:
             return self._still
+        shared = {id(matrix): _Place(matrix) for matrix in matrices}
         points, corners = [], []
-        for part, matrix in zip(self.parts, places, strict=True):
+        for part, matrix in zip(self.parts, matrices, strict=True):
             corners.append(part.corners_m @ matrix[:3, :3].T + matrix[:3, 3])
             is_few = part.is_projected
             points.append(part.positions @ matrix[:3, :3].T + matrix[:3, 3] if is_few else corners[-1])
-        found = np.concatenate(points), np.stack(corners)
-        if places is self.stack_from_parts:
+        # Nearest first: hidden pixels need not be shaded.
+        order = np.argsort([-box[:, 0].mean() for box in corners], kind="stable")
+        found = _Arrangement([shared[id(m)] for m in matrices], np.concatenate(points), np.stack(corners), order)
+        if is_still:
             self._still = found
         return found
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
         """Draw the view; the same view and time give the same bytes."""
-        places = self.places(time_ns)
-        corners = self._around(places)[1]
-        placed = list(zip(self.parts, places, strict=True))
-        area = camera.covered_box(view, corners.reshape(-1, 3))
-        # Nearest first: hidden pixels need not be shaded.
-        placed = [placed[index] for index in np.argsort(-corners[..., 0].mean(1), kind="stable")]
+        arranged = self._arranged(time_ns)
+        corners_m = arranged.corners_m.reshape(-1, 3)
+        area = camera.covered_box(view, corners_m)
 
         def paint() -> None:
-            clip = camera.clip_from_stack(view, corners.reshape(-1, 3))
-            looks = {key: _Look(clip @ matrix, matrix, view) for key, matrix in {id(m): m for m in places}.items()}
+            clip = camera.clip_from_stack(view, corners_m)
+            shared = {id(place): _Look(place, clip, view) for place in arranged.places}
+            looks = [shared[id(place)] for place in arranged.places]
+            placed = [(self.parts[n], looks[n]) for n in arranged.nearest_first]
             self.context.enable_only(self.context.DEPTH_TEST)
-            for part, stack_from_part in placed:
-                looks[id(stack_from_part)].set(part.surface_program, part)
+            for part, look in placed:
+                look.set(part.surface_program, part)
                 least = OPAQUE_FROM if part.is_blended else part.cutoff
                 _set_uniforms(part.surface_program, kept=(least, ANY_ALPHA))
                 part.draw_surface()
-            if self._with_ramps:
-                self._draw_outlines(placed, looks, view)
+            if self._with_ramps and self._outlined:
+                self._draw_outlines(looks, arranged.nearest_first, view)
             if any(part.is_blended for part in self.parts):
-                self._draw_translucent(placed, looks)
+                self._draw_translucent(placed)
 
         picture = self.drawn(view, area, paint)
         if area.width_px and area.height_px:
-            self._bounds[view.side] = camera.depth_bounds(view, corners.reshape(-1, 3))
+            self._bounds[view.side] = camera.depth_bounds(view, corners_m)
         return picture
 
-    def _draw_translucent(self, placed: list[tuple[DrawnPart, F64]], looks: dict[int, _Look]) -> None:
+    def _draw_translucent(self, placed: list[tuple[DrawnPart, _Look]]) -> None:
         """Blend translucent parts over the opaque ones: farthest part first, back faces before front faces."""
         context, framebuffer = self.context, self.context.fbo
         context.enable_only(context.DEPTH_TEST | context.BLEND | context.CULL_FACE)
         context.blend_func = OVER
         context.front_face = "cw"  # the raster's rows run along GL's y
         framebuffer.depth_mask = False
-        for part, stack_from_part in reversed(placed):
+        for part, look in reversed(placed):
             if part.is_blended:
-                looks[id(stack_from_part)].set(part.surface_program, part)
+                look.set(part.surface_program, part)
                 _set_uniforms(part.surface_program, kept=(1 / 255, OPAQUE_FROM))
                 for hidden in ("front", "back") if part.two_sided else ("back",):
                     context.cull_face = hidden
@@ -326,39 +357,31 @@ class TriangleSource(CanvasSource):
             self._textures[key] = texture
         return self._textures[key]
 
-    def _draw_outlines(self, placed: list[tuple[DrawnPart, F64]], looks: dict[int, _Look], view: View) -> None:
-        outlined, vertices, points = [], [], []
-        for part, stack_from_part in reversed(placed):
-            look = looks[id(stack_from_part)]
-            if part.edges is None or not look.has_inside:
-                continue
-            ends, apex = silhouette(part.edges, look.eye)
-            corners = part.positions[np.column_stack([ends, apex])]
-            outlined.append((part, look))
-            vertices.append(ends)
-            points.append(corners @ look.clip_from_part[:, :3].T + look.clip_from_part[:, 3])
-        if not outlined:
-            return
-        # For all parts at once: most have few edges.
+    def _draw_outlines(self, looks: list[_Look], nearest_first: NDArray[np.intp], view: View) -> None:
+        """Draw ramps along the outlines of all parts, farthest part first."""
+        eyes = [looks[n].eye for n, _, _ in self._outlined]
+        seen, of_part = self._edges.seen(eyes)
+        rank = np.argsort(nearest_first)[[n for n, _, _ in self._outlined]]
+        order = np.argsort(-rank[of_part], kind="stable")
+        seen, of_part = seen[order], of_part[order]
+        clips = np.stack([looks[n].clip_from_part for n, _, _ in self._outlined])[of_part]
+        points = self._corners[seen, :3] @ clips[:, :, :3].transpose(0, 2, 1) + clips[:, None, :, 3]
         size = {"width_px": view.width_px, "height_px": view.height_px}
-        corners, kept = ramps(np.concatenate(points), **size, ramp_px=1 / view.reduction)
-        ends_before = np.cumsum([0, *map(len, vertices)])
-        first = np.searchsorted(kept, ends_before)
+        corners, kept = ramps(points, **size, ramp_px=1 / view.reduction)
         packed = np.empty((len(kept), 6, OUTLINE_FLOATS), np.float32)
         packed[..., :5] = corners
-        for n, (part, _) in enumerate(outlined):
-            own = slice(first[n], first[n + 1])
-            packed[own, :, 5:] = part.vertices[vertices[n][kept[own] - ends_before[n]][:, CORNER_ENDS], 3:]
+        packed[..., 5:] = self._corners[seen[kept][:, CORNER_ENDS], 3:]
         self._outline_buffer.write(packed)
         context, framebuffer = self.context, self.context.fbo
         context.enable_only(context.DEPTH_TEST | context.BLEND)
         context.blend_func = OVER
         framebuffer.depth_mask = False
-        for n, (part, look) in enumerate(outlined):
-            if first[n + 1] > first[n]:
-                look.set(part.outline.program, part)
-                _set_uniforms(part.outline.program, kept=(part.cutoff, ANY_ALPHA))
-                part.outline.render(first=6 * int(first[n]), vertices=6 * int(first[n + 1] - first[n]))
+        begins = np.flatnonzero(np.diff(of_part[kept], prepend=-1)).tolist()
+        for begin, end in pairwise([*begins, len(kept)]):
+            n, part, _ = self._outlined[of_part[kept[begin]]]
+            looks[n].set(part.outline.program, part)
+            _set_uniforms(part.outline.program, kept=(part.cutoff, ANY_ALPHA))
+            part.outline.render(first=6 * begin, vertices=6 * (end - begin))
         framebuffer.depth_mask = True
 
 
