@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from runtime.clock import NS_PER_MS, NS_PER_S
-from runtime.frame.effort import HORIZON_S, EffortChooser, Outlook, candidates
+from runtime.frame.effort import HORIZON_S, Costs, EffortChooser, Outlook, candidates
 from runtime.frame.run_state import RunState
 from runtime.frame.solver_host import SolverHost
 from runtime.frame.viewer import Viewer
@@ -44,23 +44,24 @@ class Aim:
     ) -> SolveRequest:
         """Return the next request. eyes: at the display time of this refresh; shown: the newest solution."""
         self._learn(shown, eyes)
-        predictor, refined = state.predictor, None
+        predictor, refined, costs = state.predictor, None, self._solver.costs
         whole = self._fixed or Effort(1, predictor.steps)
         effort, expected_m2 = whole, 0.0
         if eyes.eyes_m is not None and state.settings.model.effort == "auto":
-            outlook = self._outlook(timing, eyes)
+            outlook = self._outlook(timing, eyes, costs)
             horizon_s = self._horizon_s(timing, speed_m_s=outlook(whole).speed_m_s)
             error = self._shown_error(eyes, shown, time_ns=timing.photon_ns)
             period_ms = self._period_ns / NS_PER_MS
-            costs = self._solver.costs
+            timed = tuple(by for by in predictor.reductions if by in costs.stages)  # a new model may not be timed yet
             effort = self._chooser.choose(
-                candidates(predictor.reductions, predictor.steps),
+                candidates(timed, predictor.steps),
                 costs, outlook, shown_error=error, period_ms=period_ms, horizon_s=horizon_s,
             )  # fmt: skip
             if shown is not None and eyes.label == "rested":
-                refined = self._refined(shown, predictor.refined_steps, shown_error=error, horizon_s=horizon_s)
+                most = predictor.refined_steps
+                refined = self._refined(shown, most, costs, shown_error=error, horizon_s=horizon_s)
             expected_m2 = outlook(effort).moved_m2(max(costs.interval_ms(effort), period_ms) / 1e3)
-        then_ns, then_m, label = self._eyes_then(timing, eyes, effort)
+        then_ns, then_m, label = self._eyes_then(timing, eyes, middle_ns=self._middle_ns(timing, effort, costs))
         self._expected[then_ns] = expected_m2
         while len(self._expected) > REQUESTS_KEPT:
             self._expected.pop(next(iter(self._expected)))
@@ -79,18 +80,18 @@ class Aim:
             self._learned = shown.number
             self._chooser.pictures.learn(shown.measures, shown.effort)
 
-    def _middle_ns(self, timing: FrameTiming, effort: Effort) -> int:
+    def _middle_ns(self, timing: FrameTiming, effort: Effort, costs: Costs) -> int:
         """Return the middle of the time for which a solution started now will be shown.
 
         It is complete after its cost, appears half a period later on average, and is shown until the next one appears.
         """
-        costs = self._solver.costs
         cost_ns, interval_ns = (round(ms * NS_PER_MS) for ms in (costs.ms(effort), costs.interval_ms(effort)))
         return timing.photon_ns + cost_ns + (self._period_ns + max(interval_ns, self._period_ns)) // 2
 
-    def _eyes_then(self, timing: FrameTiming, eyes: EyesEstimate, effort: Effort) -> tuple[int, F64 | None, EyesLabel]:
+    def _eyes_then(
+        self, timing: FrameTiming, eyes: EyesEstimate, *, middle_ns: int
+    ) -> tuple[int, F64 | None, EyesLabel]:
         """Return the instant to solve for and its predicted eyes, no farther ahead than the tracker is reliable."""
-        middle_ns = self._middle_ns(timing, effort)
         reach_ns = min(middle_ns, timing.photon_ns + HORIZON_NS)
         then = self._viewer.ahead(reach_ns) if eyes.eyes_m is not None else eyes
         if then.eyes_m is None or eyes.eyes_m is None:
@@ -99,7 +100,7 @@ class Aim:
         share = moved_m2 / (moved_m2 + 2 * then.sigma_m**2) if moved_m2 > 0.0 and then.label != "rested" else 1.0
         return middle_ns, eyes.eyes_m + share * (then.eyes_m - eyes.eyes_m), then.label
 
-    def _outlook(self, timing: FrameTiming, eyes: EyesEstimate) -> Callable[[Effort], Outlook]:
+    def _outlook(self, timing: FrameTiming, eyes: EyesEstimate, costs: Costs) -> Callable[[Effort], Outlook]:
         near = self._viewer.ahead(timing.photon_ns + self._period_ns)
         far = self._viewer.ahead(timing.photon_ns + HORIZON_NS)
         if near.eyes_m is None or far.eyes_m is None or eyes.eyes_m is None or far.label == "rested":
@@ -109,7 +110,7 @@ class Aim:
         growth_m = max(far.sigma_m - near.sigma_m, 0.0) / (HORIZON_NS - self._period_ns)
 
         def outlook(effort: Effort) -> Outlook:
-            ahead_ns = self._middle_ns(timing, effort) - timing.photon_ns
+            ahead_ns = self._middle_ns(timing, effort, costs) - timing.photon_ns
             sigma_m = near.sigma_m + growth_m * (ahead_ns - self._period_ns)
             beyond_s = max(ahead_ns - HORIZON_NS, 0) / NS_PER_S
             return Outlook(sigma_m, speed_m_s, beyond_s * speed_m_s)
@@ -141,9 +142,11 @@ class Aim:
         moved_m = float(np.linalg.norm((shown.solved_for_m - eyes.eyes_m).mean(axis=0)))
         return pictures.own(shown.effort) + pictures.stale(moved_m, (time_ns - shown.solved_for_ns) / NS_PER_S)
 
-    def _refined(self, shown: Solution, most: int, *, shown_error: float, horizon_s: float) -> Effort | None:
+    def _refined(
+        self, shown: Solution, most: int, costs: Costs, *, shown_error: float, horizon_s: float
+    ) -> Effort | None:
         """Choose how to refine a solution for a resting head: finer raster or more steps. None: good enough."""
-        done, costs, pictures = shown.effort, self._solver.costs, self._chooser.pictures
+        done, pictures = shown.effort, self._chooser.pictures
         if done is None:
             return None
         efforts = [Effort(by, 0) for by in costs.stages if by < done.reduction]

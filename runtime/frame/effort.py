@@ -82,7 +82,7 @@ class CostBook:
 
     def __init__(self, first: Mapping[int, Mapping[str, float]], *, overlaps: bool = False) -> None:
         """first: times by reduction and stage, measured with full pictures before the first refresh."""
-        self._first, self._overlaps = first, overlaps
+        self.first, self._overlaps = first, overlaps
         self._measured: dict[int, dict[str, float]] = {}
         self._unused: dict[int, int] = {}  # by reduction: solutions on other rasters since its last one
 
@@ -108,11 +108,11 @@ class CostBook:
         exclude them.
         """
         measured_ms = sum(sum(stages.values()) for stages in self._measured.values())
-        first_ms = sum(self._first.get(by, {}).get(s, 0.0) for by, stages in self._measured.items() for s in stages)
+        first_ms = sum(self.first.get(by, {}).get(s, 0.0) for by, stages in self._measured.items() for s in stages)
         scale = measured_ms / first_ms if first_ms > 0 and measured_ms > 0 else 1.0
         costs: dict[int, dict[str, float]] = {}
         finer: tuple[int, dict[str, float]] | None = None
-        for by, first in sorted(self._first.items()):
+        for by, first in sorted(self.first.items()):
             costs[by] = {stage: scale * ms for stage, ms in first.items()}
             if finer is not None:
                 most = {stage: ms * finer[0] / by for stage, ms in finer[1].items()}

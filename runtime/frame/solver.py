@@ -114,8 +114,9 @@ class Solver:
             return self._draw_flat(state, revision=revision, time_ns=time_ns)
         if job.eyes_m is not None:
             wanted = request.refined_to if job.kind == "refine" else request.effort
-            effort = wanted or Effort(1, state.predictor.steps)
-            return self._draw_targets(state, request, job.eyes_m, effort, revision=revision, apart=apart)
+            if wanted is None or wanted.reduction not in state.predictor.reductions:  # for the model before
+                wanted = Effort(1, state.predictor.steps)
+            return self._draw_targets(state, request, job.eyes_m, wanted, revision=revision, apart=apart)
         if request.eyes_m is not None and not request.paused:
             self._missing = {}  # the newest solution already satisfies the request
         return SolverUpdate(missing=dict(self._missing))

@@ -201,6 +201,7 @@ class SolverThread(SolverHost):
         try:
             while not self._is_over(attempt):
                 self._do_tasks(attempt, parts)
+                self._adopt_model(attempt, parts)
                 attempt.worker.wait(self._spare_s(attempt))
                 self._settle(attempt, parts)
                 request = self._next_request()
@@ -219,6 +220,13 @@ class SolverThread(SolverHost):
             parts.close()
             if attempt.abandoned.is_set():  # no longer needed, and its frames keep large objects alive
                 attempt.error = None
+
+    def _adopt_model(self, attempt: _Attempt, parts: SolverParts) -> None:
+        """Begin new measurements if a task has changed the model: its rasters and costs are others."""
+        assert attempt.costs is not None
+        if (first := parts.first_costs()) != attempt.costs.first:
+            attempt.costs = CostBook(first, overlaps=parts.overlaps)
+            self._costs = attempt.costs.costs()
 
     def _next_request(self) -> SolveRequest | None:
         with self._lock:

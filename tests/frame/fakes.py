@@ -236,7 +236,8 @@ class Named:
     """Content or a model of which only the name is asked."""
 
     provider = "none"
-    reductions, steps, refined_steps = (1,), 0, 0
+    reductions: tuple[int, ...] = (1,)
+    steps, refined_steps = 0, 0
 
     def __init__(self, name: str) -> None:
         self.name = name

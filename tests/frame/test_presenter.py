@@ -12,7 +12,7 @@ from runtime.clock import NS_PER_MS, NS_PER_S
 from runtime.frame.aim import HORIZON_NS
 from runtime.optics.alignment import align
 from runtime.records import State
-from tests.frame.fakes import EYES, HZ, PERIOD_NS, STACK, Stage, aside, picture, solution
+from tests.frame.fakes import EYES, HZ, PERIOD_NS, STACK, Named, Stage, aside, picture, solution
 
 
 def moves(time_s: float) -> np.ndarray:
@@ -370,3 +370,16 @@ def test_panels_that_take_longer_than_a_period_are_told_by_the_presenter() -> No
     now = stage.presenter.stats.rates_now()["fps_now"]
     told_now = int(stage.presenter.machine.reason.split("late: ")[1].split()[0])
     assert abs(told_now - now) <= 2
+
+
+def test_a_model_whose_rasters_are_not_timed_yet_stops_no_refresh(stage: Stage) -> None:
+    """A model is replaced on the solver's thread; the presenter may see it before its costs are known."""
+    model = Named("model of four rasters")
+    model.reductions = (1, 2, 3, 4)
+    stage.cell.replace(predictor=model)
+    stage.eyes = moves
+    stage.refresh(30)
+    assert {request.effort.reduction for request in stage.solver.requests[-30:]} == {1}
+    stage.solver.reductions, stage.solver.solve_cost_ns = (1, 2, 3, 4), 300 * NS_PER_MS
+    stage.refresh(30)
+    assert stage.solver.requests[-1].effort.reduction > 1

@@ -412,6 +412,17 @@ def test_a_stop_ends_a_step_between_two_drawings(shop: Workshop) -> None:
     assert drawn < 3000
 
 
+def test_after_a_change_of_the_model_its_own_rasters_are_timed(shop: Workshop) -> None:
+    shop.solve(1)
+    assert set(shop.host.costs.stages) == {1}
+    parts: Any = shop.all[0]
+    parts.first_costs = lambda: {1: {"finish": 40.0}, 2: {"finish": 10.0}}
+    shop.host.do(lambda _: True)
+    shop.solve(2)
+    assert set(shop.host.costs.stages) == {1, 2}
+    assert shop.host.costs.ms(Effort(2, 0)) <= 10.0
+
+
 class Drawn:
     """A drawn request, as `SolverThread` sees it."""
 
