@@ -212,7 +212,7 @@ class _Look:
 
 @dataclass(frozen=True, slots=True)
 class _Arrangement:
-    """Where all parts are at one time."""
+    """Places of all parts at one time."""
 
     places: list[_Place]  # of each part; parts of one place share it
     points_m: F64  # (n, 3) around all parts, frame `stack`
