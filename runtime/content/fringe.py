@@ -83,9 +83,9 @@ class Outlines:
         self._part = np.repeat(np.arange(len(each)), [len(edges.faces) for edges in each])
 
     def seen(self, eyes: Sequence[F64 | None]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """(k, 3) vertices, both ends and the apex of the visible face, of the outlines' edges, and (k,) their parts.
+        """Return (k, 3) vertices of the edges on the outlines, and (k,) their parts.
 
-        eyes: (3,) in each part's own frame; None: the part is left out. Normals must point outwards.
+        The vertices are both ends and the apex of the visible face. eyes: (3,) in each part's own frame; None: the part is left out. Normals must point outwards.
         """
         edges = self._edges
         facing = np.zeros(len(edges.normals), bool)

@@ -1,4 +1,4 @@
-"""Second thread of a solver, which solves one drawn request while the solver's own thread draws the next."""
+"""Second thread of a solver: solves one drawn request while the next is drawn."""
 
 from __future__ import annotations
 
