@@ -85,8 +85,8 @@ class Outlines:
     def seen(self, eyes: Sequence[F64 | None]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return (k, 3) vertices of the edges on the outlines, and (k,) their parts.
 
-        The vertices are both ends and the apex of the visible face. eyes: (3,) in each part's own frame; None leaves the
-        part out. Normals must point outwards.
+        The vertices are both ends and the apex of the visible face. eyes: (3,) in each part's own frame; None leaves
+        the part out. Normals must point outwards.
         """
         edges = self._edges
         facing = np.zeros(len(edges.normals), bool)
