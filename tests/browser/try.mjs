@@ -4,7 +4,9 @@ import { opened, say } from "./chromium.mjs";
 const [, , url, folder] = process.argv;
 const origin = new URL(url).origin, token = new URL(url).searchParams.get("token");
 const { browser, context, page: newPage, elsewhere, errors } = await opened({ origin, width: 640, height: 480 });
-const now = async (name) => (await fetch(`${origin}/now/${name}`, { headers: { Authorization: `Bearer ${token}` } })).json();
+const ask = (name) => fetch(`${origin}/now/${name}`, { headers: { Authorization: `Bearer ${token}` } });
+// Once more, as browsers do: on a busy machine, the server may have closed the idle connection that is used again.
+const now = async (name) => (await ask(name).catch(() => ask(name))).json();
 const status = () => now("status"), about = () => now("about");
 const until = async (holds, within_ms = 60000) => {
   const end = Date.now() + within_ms;
