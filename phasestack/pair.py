@@ -242,8 +242,9 @@ def evaluate(
         rotates the polarization by v·90 degrees, and an eye sees sin² of the summed angle; floats are rounded to the
         panels' 8 bits.
     sigmas_mm, every: `evaluate(..., sigmas_mm=(1,), every=4)` is faster. It measures light PSNR for these tracking
-    errors alone, at every 4th pixel of every 4th row, with its standard error; SSIM is then NaN. For the other
-    arguments see `solve`. Raises ValueError, naming the argument.
+        errors alone, at every 4th pixel of every 4th row, with its standard error; SSIM is then NaN.
+
+    For the other arguments see `solve`. Raises ValueError, naming the argument.
     """
     pair = _checked((left, right), stack=stack, eyes_m=eyes_m, fov_deg=fov_deg, cameras=cameras)
     given = as_array("layers", layers)

@@ -61,6 +61,6 @@ def test_the_site_builds_without_warnings_with_every_page_and_the_api(tmp_path: 
         assert (tmp_path / page.relative_to(ROOT)).with_suffix(".html").exists(), page
     api = (tmp_path / "docs" / "api.html").read_text(encoding="utf-8")
     assert "phasestack.solve" in api and "phasestack.Stack" in api
-    html = (tmp_path / "docs" / "for-researchers.html").read_text(encoding="utf-8")
+    html = (tmp_path / "docs" / "performance.html").read_text(encoding="utf-8")
     sources = [name for name in re.findall(r'<img[^>]* src="([^"]+)"', html) if re.search(PICTURES, name)]
     assert sources and all((tmp_path / "docs" / name).exists() for name in sources)
