@@ -72,7 +72,7 @@ def solve_arguments(folder: Path, **changes: object) -> list[str]:
         ({"left_eye": (0.05, -0.03, 0.0)}, "--left-eye"),
         ({"left_eye": ("nan", 0, 0)}, "--left-eye"),
         ({"right_eye": (0.6, -0.03, 0.0)}, "--right-eye"),
-        ({"right_eye": (0.6, -0.0251, 0.0)}, "--right-eye: is 4.9 mm from the left one"),
+        ({"right_eye": (0.6, -0.0251, 0.0)}, "--right-eye: is 4.9 mm from the left eye"),
         ({"left_eye": (0.061, 40.0, 0.0), "right_eye": (0.061, 40.06, 0.0)}, "--left-eye"),
         ({"left_eye": (0.6, 1e30, 0)}, "--left-eye: 1e+30 m is beyond 50 m"),
         (

@@ -1,1 +1,1 @@
-"""One module for each command: arguments at the top, heavy imports inside the functions."""
+"""The command line: one module per command, with heavy imports inside the functions so that `--help` is fast."""

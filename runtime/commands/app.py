@@ -1,4 +1,4 @@
-"""The command line's app with all commands. A command's dependencies are imported only when it runs."""
+"""The typer app with all commands. Each command imports its dependencies only when it runs."""
 
 from __future__ import annotations
 
@@ -80,4 +80,4 @@ def options(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and exit")
     ] = False,
 ) -> None:
-    """Handle the options that precede a command; typer shows the app's help instead of this text."""
+    """Accept options that come before a command. (Typer shows the app's own help instead of this docstring.)"""

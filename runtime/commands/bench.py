@@ -1,4 +1,4 @@
-"""`phasestack bench`: write the frontier's regression file, or compare two of them."""
+"""`phasestack bench`: measure the models' quality and run time, or compare two such measurements."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ app = typer.Typer()
 @app.callback(invoke_without_command=True)
 def bench(
     context: typer.Context,
-    out: Annotated[Path | None, typer.Option(help="regression file to write (JSON)")] = None,
+    out: Annotated[Path | None, typer.Option(help="write the measurement to this JSON file")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
-    """Measure the shipped models' run time, light and memory at two sizes, or compare two measurements.
+    """Measure run time, memory and light PSNR of the shipped models at two sizes, or compare two measurements.
 
     Example: phasestack bench --out bench.json
 
@@ -41,13 +41,13 @@ def bench(
 
 @app.command()
 def compare(
-    old: Annotated[Path, typer.Argument(help="the earlier regression file")],
-    new: Annotated[Path, typer.Argument(help="the later one")],
+    old: Annotated[Path, typer.Argument(help="JSON file of the earlier measurement")],
+    new: Annotated[Path, typer.Argument(help="JSON file of the later measurement")],
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
-    """List every figure that got worse by more than the noise. Exits with 1 if there is any.
+    """List every figure that changed by more than the noise. Exits with 1 if any got worse.
 
-    Times are not compared if the machine was too busy during either measurement.
+    Times are left out if the machine was too busy during either measurement.
 
     Example: phasestack bench compare old.json new.json
     """
@@ -64,13 +64,13 @@ def compare(
         print(to_json({"worse": len(worse), "changes": rows, "times_compared": not busy, "too_busy": busy}))
     else:
         for why in busy:
-            print(f"times are not compared, because the machine was too busy: {why}")
+            print(f"run times are not compared because the machine was too busy: {why}")
         speed = after.yardstick_ms / before.yardstick_ms
-        print(f"machine: the reference workload takes {speed:.2f} times as long; solution times are corrected for this")
+        print(f"the reference workload takes {speed:.2f} times as long as before; solution times are corrected for it")
         for change in sorted(changes, key=lambda change: not change.worse):
             print(f"{'worse ' if change.worse else 'better'} {change.what}: {change.text}")
-        again = ", except for times, which cannot be compared: measure again" if busy else ""
+        again = "; run times could not be compared, so measure again" if busy else ""
         ends = f"{len(worse)} worse, {len(changes) - len(worse)} better"
-        print(ends if changes else f"no change beyond noise{again}")
+        print(ends if changes else f"nothing changed by more than the noise{again}")
     if worse:
         raise typer.Exit(1)

@@ -1,12 +1,12 @@
-"""`phasestack config`: all settings with their defaults and meanings."""
+"""`phasestack config`: print all settings with their defaults and descriptions."""
 
 from __future__ import annotations
 
 
 def config() -> None:
-    """Print a complete configuration in TOML: every setting with its default and meaning.
+    """Print a complete configuration in TOML: every setting with its default and description.
 
-    Paths in a configuration are relative to its folder. To check one, run `phasestack doctor --config FILE`.
+    Relative paths start at the configuration file's folder. `phasestack doctor --config FILE` checks a configuration.
 
     Example: phasestack config > phasestack.toml
     """

@@ -1,4 +1,4 @@
-"""`phasestack ctl` and `status`: control of the running daemon, and its state."""
+"""`phasestack ctl` and `phasestack status`: control the running daemon and show its state."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ app = typer.Typer(
     help="Control the running daemon. Exits with 1 if no daemon answers.\n\nExample: phasestack ctl scene demo",
 )
 
-Config = Annotated[Path | None, typer.Option(help="the daemon's configuration file, which names its socket")]
+Config = Annotated[Path | None, typer.Option(help="the daemon's configuration file, to find its socket")]
 
 
 @app.command()
 def scene(
-    name: Annotated[str, typer.Argument(help="a value of `content.scene`, or `next`: the playlist's next entry")],
+    name: Annotated[str, typer.Argument(help="scene to show, or `next` for the playlist's next entry")],
     config: Config = None,
 ) -> None:
-    """Show another scene: a built-in one such as `demo`, or a file or folder (`./NAME`) on this PC.
+    """Show another scene: a built-in one such as `demo`, or a file or folder on this PC (`./NAME`).
 
-    The current scene stays until the new one has loaded. If loading fails, it remains, and the exit code is 2.
+    The current scene stays until the new one has loaded. If loading fails, it remains and the exit code is 2.
 
     Example: phasestack ctl scene demo
     """
@@ -40,21 +40,21 @@ def place(
     scale: Annotated[float | None, number(0.001, 1000, help="scale factor of the scene")] = None,
     offset: Annotated[
         tuple[float, float, float] | None,
-        number(-10, 10, "m", help="displacement in metres: out of the screen, right, up"),
+        number(-10, 10, "m", help="displacement in metres: out of the screen, to the right, up"),
     ] = None,
     rotate: Annotated[
         tuple[float, float, float] | None,
-        number(-360, 360, "degrees", help="rotation in degrees about the axes out of the screen, right and up"),
+        number(-360, 360, "degrees", help="rotation in degrees about the axes out, right and up"),
     ] = None,
     turntable: Annotated[
-        float | None, number(-600, 600, help="turns per minute about the vertical axis; 0: none")
+        float | None, number(-600, 600, help="rotation speed about the vertical axis, in turns per minute; 0 stops it")
     ] = None,
-    reset: Annotated[bool, typer.Option("--reset", help="return to the configured placement")] = False,
+    reset: Annotated[bool, typer.Option("--reset", help="restore the configured placement")] = False,
     config: Config = None,
 ) -> None:
-    """Move, turn or scale the current scene. Options that are not given keep their values.
+    """Move, turn or scale the current scene.
 
-    The next scene is placed as configured.
+    Omitted options keep their values. The next scene starts in its configured placement.
 
     Example: phasestack ctl place --scale 1.2 --offset 0.01 0 -0.02 --turntable 3
     """
@@ -69,11 +69,12 @@ def place(
 
 @app.command()
 def model(
-    name: Annotated[str, typer.Argument(help="fast, balanced, best, sart or an ONNX file")], config: Config = None
+    name: Annotated[str, typer.Argument(help="model to use: fast, balanced, best, sart or an ONNX file")],
+    config: Config = None,
 ) -> None:
     """Switch to another model.
 
-    The current one stays until the new one has loaded. If loading fails, it remains.
+    The current model runs until the new one has loaded, and keeps running if loading fails.
     Example: phasestack ctl model best
     """
     from runtime.support.plugins import located
@@ -85,10 +86,10 @@ PLAIN = {
     "pause": "Freeze the picture until `resume`.",
     "resume": "Follow the viewer again, after `pause` or `flat`.",
     "flat": "Show the flat (2D) picture until `resume`.",
-    "reload": "Read the configuration again. An invalid one is refused, and the old one stays in use.\n\n"
-    "Scene, model and placement set by `ctl` stay unless the file has a new value for them.",
-    "blackbox": "Write the last two minutes (eyes, states, times, log) to an MCAP file, and print its name.",
-}  # commands without a value
+    "reload": "Reload the configuration file. If it is invalid, the old configuration stays in use.\n\n"
+    "A scene, model or placement set by `ctl` stays unless the file has changed that setting.",
+    "blackbox": "Save the last two minutes (eyes, states, times, log) as an MCAP file and print its name.",
+}  # commands without an argument
 
 
 def _add_plain(name: str, meaning: str) -> None:
@@ -102,7 +103,7 @@ for _name, _meaning in PLAIN.items():
 
 
 def tell(request: dict[str, Any], config: Path | None) -> None:
-    """Send one request and print the new state. Exits with 1 if no daemon answers, with 2 if it refuses."""
+    """Send one request and print the new state. Exits with 1 if no daemon answers, or 2 if it refuses."""
     from runtime.daemon.client import ANSWERED_WITHIN_S, NotRunning, ask, sockets
     from runtime.errors import InputError
     from runtime.support.figures import lines_of
@@ -119,19 +120,20 @@ def tell(request: dict[str, Any], config: Path | None) -> None:
 
 
 def _advised(error: Exception) -> str:
-    """Return the error of a request without an answer, with advice for the user."""
+    """Return the text for a request that got no answer, with advice for the user."""
     from runtime.daemon.client import unit_advice
 
     advice = unit_advice()
     if not advice and any(each in str(error) for each in ("no daemon", "has died")):
-        advice = "start one with `phasestack run`; without hardware: `phasestack try`"
+        advice = "start one with `phasestack run` or, without hardware, `phasestack try`"
     return "; ".join(filter(None, (str(error), advice)))
 
 
 def status(
-    config: Config = None, as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout")] = False
+    config: Config = None,
+    as_json: Annotated[bool, typer.Option("--json", help="print the status as one JSON object")] = False,
 ) -> None:
-    """Show the running daemon: state and reason, rates, eyes and their uncertainty, times, faults.
+    """Show the daemon's state and its reason, rates, eye positions with their uncertainty, times and faults.
 
     Exits with 1 if no daemon answers or if its loop has hung for five seconds.
 

@@ -1,4 +1,4 @@
-"""`phasestack demo`: run the daemon's loop on the built-in recording and scene."""
+"""`phasestack demo`: run the display loop on the built-in recording and scene."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from typing import Annotated
 
 import typer
 
-FRAMES, MEASURED_EVERY = 42, 14  # refreshes: 0.7 s, in which the head starts moving to the left
-LONGEST_S, LEAST = 45.0, 15  # seconds; refreshes shown even if that takes longer
+FRAMES, MEASURED_EVERY = 42, 14  # refreshes: 0.7 s, long enough for the head to start moving
+LONGEST_S, LEAST = 45.0, 15  # seconds, after which the demo ends; least number of refreshes
 
 
 def demo(
     out: Annotated[Path, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = Path("out/demo"),
     frames: Annotated[
-        int, typer.Option(min=1, help="number of refreshes; the whole recording (600) takes several minutes")
+        int, typer.Option(min=1, help="refreshes to show; all 600 of the recording take several minutes")
     ] = FRAMES,
-    as_json: Annotated[bool, typer.Option("--json", help="the summary as one JSON object on stdout")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the summary as one JSON object")] = False,
 ) -> None:
-    """Run the whole pipeline on a built-in recording of a moving head, without a screen.
+    """Play a built-in recording of a moving head through the whole pipeline, without a screen.
 
-    Ends after 45 s, but not before the 15th refresh, unless --frames is given.
+    By default the demo ends after 42 refreshes, or after 45 s on a slow machine (but at least 15 refreshes).
 
     Example: phasestack demo --out out/demo
     """
@@ -31,18 +31,18 @@ def demo(
     from runtime.daemon.drive import drive, print_summary
 
     class InTime(Host):
-        """Ends the demo after a time limit on slow machines."""
+        """Host that ends the demo after a time limit, for slow machines."""
 
         def __init__(self) -> None:
             self._ends_s = time.monotonic() + LONGEST_S if frames <= FRAMES else float("inf")
-            self._asked = 0  # once per refresh
+            self._asked = 0  # number of calls, one per refresh
 
         def stop_reason(self) -> str:
             self._asked += 1
             is_over = self._asked >= LEAST and time.monotonic() > self._ends_s
             return f"the time limit of {LONGEST_S:g} s is up" if is_over else ""
 
-    every = MEASURED_EVERY if frames <= 4 * FRAMES else 60  # comparing takes as long as ten refreshes
+    every = MEASURED_EVERY if frames <= 4 * FRAMES else 60  # refreshes; one measurement takes as long as ten refreshes
     settings = changed(Settings(), "loop", {"evaluate_every": every}, source="demo")
     settings = changed(settings, "content", {"scene": "room"}, source="demo")
     summary = drive(settings, RunOptions(max_speed=True, measure=True, frames=frames, out=out), InTime())

@@ -1,6 +1,6 @@
-"""`phasestack doctor`: check everything that the configuration needs, with a remedy for each fault.
+"""`phasestack doctor`: check everything the configuration needs and suggest a remedy for each fault.
 
-Each check is a small function that takes the settings and returns rows of a table.
+Each check is a small function that takes the settings and yields rows of the table.
 """
 
 from __future__ import annotations
@@ -25,34 +25,34 @@ if TYPE_CHECKING:
     from runtime.model.device import SolverBackend
 
 Verdict = Literal["ok", "warn", "fail", "skip"]
-CHECK_SENSOR_FOR_S = 3.0  # longest wait for a sensor's first sample
+CHECK_SENSOR_FOR_S = 3.0  # time limit for a sensor's first sample
 SERVICE_CONFIG = Path("/etc/phasestack/phasestack.toml")
-SLOW_MS = 150.0  # time of a solution above which moving viewers lose quality (docs/performance.md)
-MEASURED_MS = 2000.0  # a solution that takes longer is estimated, not timed
+SLOW_MS = 150.0  # solution time above which moving viewers see a worse picture (docs/performance.md)
+MEASURED_MS = 2000.0  # a solution expected to take longer is not timed at full size
 NO_DEVICE = ("replay", "fixed")  # drivers that need no device
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One row of the table."""
+    """Result of one check."""
 
     name: str
     state: Verdict
-    detail: str  # the finding
-    remedy: str = ""  # action to take; empty if none is needed
+    detail: str  # what was found
+    remedy: str = ""  # what to do about it; empty if nothing
 
 
 def doctor(
-    config: Annotated[Path | None, typer.Option(help="configuration to check; without one, the defaults")] = None,
+    config: Annotated[Path | None, typer.Option(help="configuration file to check; default: built-in settings")] = None,
     as_service: Annotated[
         bool,
-        typer.Option("--service", help="check with the service's user, groups and configuration (needs root)"),
+        typer.Option("--service", help="check as the service's user, with its groups and configuration (needs root)"),
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the result as one JSON object")] = False,
 ) -> None:
     """Check the settings, sensor, permissions, OpenGL, monitors, scene, model, calibration and service.
 
-    Anything unusual is a warning. Exits with 1 if a check fails.
+    Anything unusual but usable is a warning. Exits with 1 if a check fails.
 
     Example: phasestack doctor --config /etc/phasestack/phasestack.toml
 
@@ -76,7 +76,7 @@ def doctor(
 
 
 def _become_service() -> None:
-    """Take on the service's user, groups and environment, but not its sandbox. Raises InputError."""
+    """Switch this process to the service's user, groups and environment, but not its sandbox. Raises InputError."""
     import grp
     import pwd
     import shlex
@@ -93,7 +93,7 @@ def _become_service() -> None:
         os.setuid(pwd.getpwnam(unit["User"]).pw_uid)
         os.chdir(unit["WorkingDirectory"])
     except (OSError, KeyError) as error:
-        raise InputError("doctor", "--service", f"can't become the service's user ({error}): run with sudo") from None
+        raise InputError("doctor", "--service", f"cannot become the service's user ({error}); use sudo") from None
     os.environ |= dict(entry.partition("=")[::2] for entry in shlex.split(unit["Environment"]))
     os.environ["STATE_DIRECTORY"] = f"/var/lib/{unit['StateDirectory']}"
 
@@ -102,18 +102,18 @@ Check = Callable[["Settings"], Iterator[Row]]
 
 
 def examine(settings: Settings) -> list[Row]:
-    """Run all checks. An unexpected exception is reported as a failed row."""
+    """Run all checks. An unexpected exception becomes a failed row, so that the other checks still run."""
     rows: list[Row] = []
     for name, check in CHECKS.items():
         try:
             rows += check(settings)
         except PhasestackError as error:
             rows.append(Row(name, "fail", str(error)))
-        except Exception as error:  # so that the remaining checks run
+        except Exception as error:
             if missing := missing_extra(error):
                 rows.append(Row(name, "fail", str(missing)))
                 continue
-            rows.append(Row(name, "fail", f"{type(error).__name__}: {error}", "a bug in phasestack: please report it"))
+            rows.append(Row(name, "fail", f"{type(error).__name__}: {error}", "this is a bug; please report it"))
     return rows
 
 
@@ -126,7 +126,7 @@ def sensor(settings: Settings) -> Iterator[Row]:
 
     if settings.sensor.driver not in NO_DEVICE and (answer := _daemon(settings)):
         eyes = answer.get("eyes_label", "unknown")
-        yield Row("sensor", "skip", f"in use by the running daemon (eyes: {eyes})")
+        yield Row("sensor", "skip", f"the running daemon is using it (eyes: {eyes})")
         return
     driver = open_sensor(settings.sensor, MonotonicClock())
     own = is_plugin(settings.sensor.driver)
@@ -135,8 +135,8 @@ def sensor(settings: Settings) -> Iterator[Row]:
         driver.open()
         frame = driver.read_newest(CHECK_SENSOR_FOR_S)
     except (SensorLost, SensorTimeout, EndOfRecording) as error:
-        remedy = "docs/sensors.md, A driver of your own" if own else "connect it; see the usb rows and docs/planning.md"
-        yield Row("sensor", "fail", f"{what}: {error or 'no sample'}", remedy)
+        remedy = "see docs/sensors.md" if own else "connect it; see the usb rows and docs/planning.md"
+        yield Row("sensor", "fail", f"{what}: {error or 'no sample arrived'}", remedy)
         return
     finally:
         driver.close()
@@ -146,7 +146,7 @@ def sensor(settings: Settings) -> Iterator[Row]:
     yield Row("sensor", "ok", f"{what} delivers {', '.join(kinds) or 'frames without a face'}{serial}")
     calibrated = load_calibration(Path(settings.calibration.file) if settings.calibration.file else None)
     if warning := calibrated.serial_warning(driver.serial):
-        yield Row("calibration", "fail", warning, "run `phasestack calibrate capture`, then `solve`, with this sensor")
+        yield Row("calibration", "fail", warning, "run `phasestack setup`")
 
 
 def usb(settings: Settings) -> Iterator[Row]:
@@ -163,7 +163,7 @@ def usb(settings: Settings) -> Iterator[Row]:
         yield Row("usb", absent, str(error), "install it" if needed else "")
         return
     if not devices:
-        remedy = "connect one; docs/planning.md lists them" if needed else ""
+        remedy = "connect a depth camera; docs/planning.md lists the supported ones" if needed else ""
         yield Row("usb", absent, "no known depth camera is connected", remedy)
     for device in devices:
         problems = device.problems()
@@ -172,7 +172,7 @@ def usb(settings: Settings) -> Iterator[Row]:
 
 
 def opengl(settings: Settings) -> Iterator[Row]:
-    """Check OpenGL without a screen, for content and offscreen panels."""
+    """Check OpenGL without a screen, which content and offscreen panels use."""
     from runtime.support.gl import describe, offscreen_context
 
     context = offscreen_context()
@@ -182,25 +182,25 @@ def opengl(settings: Settings) -> Iterator[Row]:
         context.release()
     for node in sorted(Path("/dev/dri").glob("renderD*")):
         if not os.access(node, os.R_OK | os.W_OK):
-            yield Row("opengl", "warn", f"this user can't open {node}", "join the groups video and render")
+            yield Row("opengl", "warn", f"this user cannot open {node}", "add the user to the groups video and render")
     software = any(name in found["renderer"].lower() for name in ("llvmpipe", "softpipe", "swrast"))
     bad = software and (settings.output.kind != "offscreen" or settings.model.backend == "gl")
-    slow = "rendering in software is slow; if there is a GPU, install its driver" if software else ""
+    slow = "software rendering is slow; if there is a GPU, install its driver" if software else ""
     yield Row("opengl", "warn" if bad else "ok", f"{found['renderer']}, {found['version']} ({found['vendor']})", slow)
 
 
 def monitors(settings: Settings) -> Iterator[Row]:
-    """Check that each panel has its monitor."""
+    """Check that every configured panel has its monitor connected."""
     from runtime.errors import InputError, PanelLost
     from runtime.panels.monitors import bind, check_modes, refresh_difference
     from runtime.panels.registry import panel_settings
 
     if settings.output.kind == "offscreen":
-        yield Row("monitors", "skip", "output.kind is offscreen: no monitor is used")
+        yield Row("monitors", "skip", "no monitor is used because output.kind is offscreen")
         return
     from runtime.panels.display import connected_monitors
 
-    remedy = "run `phasestack identify`, which shows each monitor's name"
+    remedy = "run `phasestack identify`, which shows the name of each monitor"
     try:
         there = connected_monitors()
     except PanelLost as error:
@@ -214,7 +214,7 @@ def monitors(settings: Settings) -> Iterator[Row]:
             "monitor",
             "ok",
             str(monitor),
-            "" if known else "it has no EDID serial number: identify it by its connector",
+            "" if known else "it has no EDID serial number; identify it by its connector",
         )
     try:
         bound = bind(panels, there)
@@ -225,7 +225,7 @@ def monitors(settings: Settings) -> Iterator[Row]:
     for number, monitor in enumerate(bound):
         yield Row("panels", "ok", f"panel {number} is {monitor}")
     if difference := refresh_difference(bound):
-        yield Row("panels", "warn", difference, "set all panels to the same mode")
+        yield Row("panels", "warn", difference, "set all panels to the same video mode")
 
 
 def content(settings: Settings) -> Iterator[Row]:
@@ -237,7 +237,7 @@ def content(settings: Settings) -> Iterator[Row]:
 
 
 def model(settings: Settings) -> Iterator[Row]:
-    """Check that the network loads, fits the stack and finds its execution provider, and time a solution."""
+    """Check that the network loads, fits the stack and finds its execution provider. Times a solution."""
     import cv2
 
     from runtime.model.backends import choose
@@ -260,12 +260,12 @@ def model(settings: Settings) -> Iterator[Row]:
     other = settings.model.name not in name and "/" not in settings.model.name
     remedy = f"the network of {settings.model.name} does not fit this stack" if other else ""
     yield Row("model", "warn" if other else "ok", f"{name} on {settings.model.provider}", remedy)
-    yield Row("backend", "ok", f"{choice.backend.name} for the solver steps: {choice.why}")
+    yield Row("backend", "ok", f"the solver runs on {choice.backend.name}: {choice.why}")
     yield rate
 
 
 def _rate(predictor: Predictor, backend: SolverBackend, settings: Settings) -> Row:
-    """Measure the rate of full solutions on the configured raster, for the slowest kind of picture."""
+    """Measure how many full solutions per second this machine computes, for the slowest kind of picture."""
     from dataclasses import replace
 
     from runtime.model.backends import solution_ms
@@ -273,7 +273,7 @@ def _rate(predictor: Predictor, backend: SolverBackend, settings: Settings) -> R
     stack = predictor.stack
     raster = f"{stack.width_px}x{stack.height_px}"
     if predictor.on_panels(stack) is None:
-        return Row("rate", "skip", f"{predictor.name} is not timed")
+        return Row("rate", "skip", f"{predictor.name} cannot be timed")
     coarse = replace(stack, width_px=max(64, stack.width_px // 4), height_px=max(64, stack.height_px // 4))
     took_ms, how = 16 * solution_ms(predictor, coarse, backend, runs=3), f"estimated from {coarse.width_px} columns"
     if took_ms < MEASURED_MS:
@@ -281,24 +281,29 @@ def _rate(predictor: Predictor, backend: SolverBackend, settings: Settings) -> R
     detail = f"{raster}: {took_ms:.0f} ms per full solution, {1000 / took_ms:.1f} per second ({how})"
     if took_ms < SLOW_MS:
         return Row("rate", "ok", detail)
-    coarser = "while viewers move, pictures are coarser and less accurate;  " if settings.model.effort == "auto" else ""
-    sharper = "for better ones use a GPU, the model `fast` or fewer pixels (docs/planning.md)"
+    coarser = "moving viewers will see coarser pictures; " if settings.model.effort == "auto" else ""
+    sharper = "a GPU, the model `fast` or fewer pixels would help (docs/planning.md)"
     return Row("rate", "warn", detail, coarser + sharper)
 
 
 def calibration(settings: Settings) -> Iterator[Row]:
-    """Check that the calibration is a similarity and, for a real sensor, not the demo's."""
+    """Check that the calibration is a similarity and that a real sensor does not use the demo's."""
     from runtime.eyes.calibration import load_calibration
     from runtime.sensor.base import Sensor
 
     if not settings.calibration.file:
         driver = settings.sensor.driver
         if is_plugin(driver) and plugin_class(driver, Sensor, field="sensor.driver").capabilities.in_stack_frame:
-            yield Row("calibration", "ok", "not needed, since this sensor delivers eyes in the stack's frame")
+            yield Row("calibration", "ok", "not needed: this sensor delivers eyes in the stack's frame")
             return
         real = driver not in NO_DEVICE
-        remedy = "run `phasestack calibrate capture`, then `solve`, and set calibration.file" if real else ""
-        yield Row("calibration", "fail" if real else "ok", "the demo recording's built-in calibration", remedy)
+        remedy = "run `phasestack calibrate capture` and `calibrate solve`, then set calibration.file" if real else ""
+        yield Row(
+            "calibration",
+            "fail" if real else "ok",
+            "calibration.file is not set; the demo's calibration is used",
+            remedy,
+        )
         return
     found = load_calibration(Path(settings.calibration.file))
     fit = f", residual {found.file.residuals.rms_m * 1000:.1f} mm" if found.file.residuals else ""
@@ -318,9 +323,11 @@ def service(settings: Settings) -> Iterator[Row]:
     state = str(answer.get("state", "unknown"))
     age_s = float(answer.get("turn_age_s", 0.0))
     if age_s > HUNG_AFTER_S:
-        yield Row("service", "fail", f"its display loop has hung for {age_s:.0f} s", "journalctl -u phasestack")
+        yield Row(
+            "service", "fail", f"the display loop has hung for {age_s:.0f} s", "see the log: journalctl -u phasestack"
+        )
     elif state.startswith("degraded"):
-        yield Row("service", "fail", f"{state} ({answer.get('reason', '')})", "journalctl -u phasestack")
+        yield Row("service", "fail", f"{state} ({answer.get('reason', '')})", "see the log: journalctl -u phasestack")
     else:
         yield Row("service", "ok", f"{state} ({answer.get('reason', '')}), pid {answer.get('pid')}")
 

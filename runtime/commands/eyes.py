@@ -1,4 +1,4 @@
-"""`phasestack eyes`: find the viewer's pupils in pictures, films or recordings, or with the sensor."""
+"""`phasestack eyes`: find the viewer's pupils in pictures, films, recordings or the sensor's live frames."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ import typer
 
 from runtime.support.options import number
 
-JSON_S = 2.0  # time for which the sensor is observed with --json
+JSON_S = 2.0  # how long a live sensor is watched with --json
 
 
 def eyes(
     files: Annotated[
         list[Path] | None,
-        typer.Argument(help="pictures, films or recordings; none: the configured sensor, live"),
+        typer.Argument(help="pictures, films or recordings; default: the configured sensor, live"),
     ] = None,
-    config: Annotated[Path | None, typer.Option(help="configuration whose sensor is used")] = None,
+    config: Annotated[Path | None, typer.Option(help="configuration file with the sensor to use")] = None,
     sequence: Annotated[
-        bool, typer.Option("--sequence", help="treat the pictures as successive frames, as the daemon does")
+        bool, typer.Option("--sequence", help="follow the viewer from picture to picture, as the daemon does")
     ] = False,
     rate_hz: Annotated[
-        float, number(0.1, 1000, "Hz", help="frame rate of these pictures, and of films that do not state theirs")
+        float, number(0.1, 1000, "Hz", help="frame rate of the pictures, and of films that do not give one")
     ] = 30.0,
-    out: Annotated[Path | None, typer.Option(help="folder for overlays, readable only by you")] = None,
+    out: Annotated[Path | None, typer.Option(help="folder for annotated copies, readable only by you")] = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="one JSON object on stdout; a live sensor is observed for two seconds")
+        bool, typer.Option("--json", help="print one JSON object; a live sensor is watched for two seconds")
     ] = False,
 ) -> None:
-    """Find the viewer's pupils, with their uncertainty, and draw them.
+    """Find the viewer's pupils and their uncertainty. With --out, also draw them.
 
     Example: phasestack eyes me.jpg room.mp4 --out out/eyes
     """

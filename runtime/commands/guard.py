@@ -1,7 +1,7 @@
-"""Guard around every command: converts any failure to an exit code and at most one line on stderr.
+"""Guard around every command: turns any failure into an exit code and at most one line on stderr.
 
-0: done, 1: a check failed, 2: wrong usage or input, 70: a bug (the line names a file with the traceback), 75: a failure
-that may be temporary, 130: Ctrl-C, 141: stdout was closed.
+0: success, 1: a check failed, 2: wrong usage or input, 70: a bug (the line names a file with the traceback), 75: a
+failure that may be temporary, 130: Ctrl-C, 141: stdout was closed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ INTERRUPTED, BAD_INPUT, OWN_ERROR, MAY_PASS, STDOUT_CLOSED = 130, 2, 70, 75, 141
 def run_guarded(*, interrupts_leave: bool) -> None:
     """Run the command named by the arguments; never returns.
 
-    interrupts_leave: until now, Ctrl-C has exited the process directly.
+    interrupts_leave: Ctrl-C still exits the process at once; make it raise KeyboardInterrupt from here on.
     """
     _fill_standard_descriptors()
     try:
@@ -51,7 +51,7 @@ def run_guarded(*, interrupts_leave: bool) -> None:
 
 
 def _interrupted(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt, or exit if an import is in progress, where Python would drop it."""
+    """Raise KeyboardInterrupt, or exit at once during an import, where Python would swallow the exception."""
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
             os._exit(INTERRUPTED)
@@ -60,7 +60,7 @@ def _interrupted(number: int, frame: FrameType | None) -> None:
 
 
 def _has_hung_thread() -> bool:
-    """Return True if a solver thread (`frame.solver_thread`) or a job (`support.background`) still runs."""
+    """Return True if a solver thread (`frame.solver_thread`) or a background job is still running."""
     return any(thread.name.startswith(("solver-", "job ")) for thread in threading.enumerate())
 
 
@@ -75,7 +75,7 @@ def _code_of(app: Any) -> int:
 
 
 def _reported(error: BaseException) -> int:
-    """Print the error that ended a command, on one line, and return the exit code."""
+    """Print the error that ended a command as one line, and return the exit code."""
     from runtime.errors import PhasestackError, TransientError, one_line
     from runtime.support.extras import missing_extra
 
@@ -91,7 +91,7 @@ def _reported(error: BaseException) -> int:
         _say(f"phasestack: {one_line(str(error), most=2000)}")
         return MAY_PASS if isinstance(error, TransientError) else BAD_INPUT
     if isinstance(error, MemoryError):
-        _say("phasestack: out of memory (temporary: try again)")
+        _say("phasestack: out of memory; try again")
         return MAY_PASS
     from runtime.support.crash import written
 
@@ -100,9 +100,9 @@ def _reported(error: BaseException) -> int:
 
 
 def _say(line: str) -> None:
-    with contextlib.suppress(OSError, ValueError):  # without stderr there is only the exit code
+    with contextlib.suppress(OSError, ValueError):  # if stderr is closed, only the exit code remains
         print(line, file=sys.stderr, flush=True)
-    if "NOTIFY_SOCKET" in os.environ:  # so that `phasestack status` can show it if the service has failed
+    if "NOTIFY_SOCKET" in os.environ:  # lets `phasestack status` show it after the service has failed
         with contextlib.suppress(ImportError):
             import sdnotify
 

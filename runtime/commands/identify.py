@@ -1,4 +1,4 @@
-"""`phasestack identify`: show on each panel its name and which way is up."""
+"""`phasestack identify`: show each panel's name and orientation on the panel itself."""
 
 from __future__ import annotations
 
@@ -17,13 +17,15 @@ if TYPE_CHECKING:
 
 
 def identify(
-    config: Annotated[Path | None, typer.Option(help="configuration; without one, every monitor shows a card")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="configuration file; without it, every monitor shows a card")
+    ] = None,
 ) -> None:
-    """Show a test card on each panel: index, monitor, an arrow that should point up, colour bars, edges.
+    """Show a test card on each panel, with its index, its monitor, an arrow that should point up and colour bars.
 
-    One panel at a time shows its card, and the others are clear. Press Enter or n for the next panel, p for the
-    previous one, q to quit. Configured panels are rotated, mirrored and registered as in a run. If none is configured,
-    every monitor shows the line that identifies it in a configuration (`phasestack setup` writes it for you).
+    One panel at a time shows its card while the others are clear. Press Enter or n for the next panel, p for the
+    previous one and q to quit. Configured panels are rotated, mirrored and registered as in a run. If no panel is
+    configured, every monitor shows the line that identifies it in a configuration. (`phasestack setup` writes it.)
 
     Exits with 75 if the X server dies.
 
@@ -54,7 +56,7 @@ def identify(
 
 
 def _bound(settings: Settings) -> tuple[PanelSink, list[U8]]:
-    """Open the configured panels. Returns them and their cards. Raises InputError, PanelLost."""
+    """Open the configured panels and return them with their cards. Raises InputError, PanelLost."""
     from runtime.clock import MonotonicClock
     from runtime.panels.card import identity_card
     from runtime.panels.window import WindowPanels
@@ -69,14 +71,14 @@ def _bound(settings: Settings) -> tuple[PanelSink, list[U8]]:
         lines = [
             f"at x = {stack.x_m[index] * 100:+.1f} cm",
             *str(monitor).replace(" (", "\n(").splitlines(),
-            f"mounted at {panel.rotation_deg} degrees, mirroring {panel.mirror}",
+            f"rotation {panel.rotation_deg} degrees, mirroring {panel.mirror}",
         ]
         cards.append(identity_card(stack.width_px, stack.height_px, title=f"PANEL {index}", lines=lines))
     return panels, cards
 
 
 def _hold(panels: PanelSink, cards: list[U8], poll: Callable[[], Key | None]) -> None:
-    """Show one card at a time until q is pressed. Closed windows and lost monitors are opened again."""
+    """Show one card at a time until q is pressed. Reopens closed windows and lost monitors."""
     import time
 
     from calib.keys import Key
@@ -84,9 +86,9 @@ def _hold(panels: PanelSink, cards: list[U8], poll: Callable[[], Key | None]) ->
     from runtime.panels.card import alone
     from runtime.records import PanelFrame
 
-    lost, number = "", 0  # counts key presses, so that each makes a new frame
+    lost, number = "", 0  # frame number, incremented by each key press
     shown, layers = 0, alone(cards, 0)
-    typer.echo("one panel at a time (Enter, n: next; p: previous; q: quit)")
+    typer.echo("press Enter or n for the next panel, p for the previous one, q to quit")
     try:
         while True:
             try:

@@ -1,4 +1,4 @@
-"""`phasestack page`: serve the operator's page, in a separate process."""
+"""`phasestack page`: serve the operator's page from a separate process."""
 
 from __future__ import annotations
 
@@ -11,16 +11,15 @@ DEFAULT_PORT = 8717
 
 
 def page(
-    config: Annotated[Path | None, typer.Option(help="the daemon's configuration file, which names its socket")] = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0: any free one")] = DEFAULT_PORT,
+    config: Annotated[Path | None, typer.Option(help="the daemon's configuration file, to find its socket")] = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0 picks a free one")] = DEFAULT_PORT,
     token_file: Annotated[
-        Path | None, typer.Option(help="file with the token, created if missing; default: a file in the state folder")
+        Path | None, typer.Option(help="file with the login token, created if missing; default: in the state folder")
     ] = None,
 ) -> None:
-    """Serve the operator's page, which shows the running daemon's live state and controls it.
+    """Serve the operator's page, which shows and controls the running daemon.
 
-    The page connects to the daemon's socket, and waits if no daemon is running. Browsers log in with the token in
-    the token file.
+    If no daemon is running, the page waits for one. Browsers log in with the token from the token file.
 
     Example: phasestack page --port 8717
     """
@@ -32,10 +31,10 @@ def page(
     from runtime.support.background import BACKGROUND_NICENESS, set_niceness
     from runtime.support.folders import state_folder
 
-    set_niceness(BACKGROUND_NICENESS)  # lowered before its threads start, because the display has priority
+    set_niceness(BACKGROUND_NICENESS)  # before any thread starts, because the display has priority
     places = sockets(config)
     path = token_file or state_folder() / "page-token"
-    with retry_advised():  # for example, a full disk
+    with retry_advised():  # for example when the disk is full
         token = token_of(path)
     served = listening("page", port)
     typer.echo(f"page: http://{LOOPBACK}:{served.getsockname()[1]}/ - the token is in {path}", err=True)

@@ -1,4 +1,4 @@
-"""`phasestack plan`: list the work that a scene makes unnecessary."""
+"""`phasestack plan`: list the work that the solver can skip for a scene."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from runtime.support.options import blame_option, number
 
 
 def plan(
-    config: Annotated[Path | None, typer.Option(help="TOML file; see `phasestack config`")] = None,
-    scene: Annotated[str | None, typer.Option(help="a built-in scene, a file or folder")] = None,
-    model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
-    scale: Annotated[float, number(0.05, 2.0, help="scale factor of the panels' pixel counts")] = 1.0,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout")] = False,
+    config: Annotated[Path | None, typer.Option(help="configuration file; `phasestack config` prints one")] = None,
+    scene: Annotated[str | None, typer.Option(help="scene to show: a built-in name, a file or a folder")] = None,
+    model: Annotated[str | None, typer.Option(help="model to use: fast, balanced, best, sart or an ONNX file")] = None,
+    scale: Annotated[float, number(0.05, 2.0, help="factor applied to the panels' size in pixels")] = 1.0,
+    as_json: Annotated[bool, typer.Option("--json", help="print the result as one JSON object")] = False,
 ) -> None:
-    """List the work that this scene makes unnecessary, with reasons and measured savings and costs.
+    """List the work that the solver can skip for this scene, with reasons, time saved and quality lost.
 
-    The scene is drawn and solved about twenty times on the full raster: seconds at 960x540, minutes at 4K without a GPU
-    (--scale 0.25 is sixteen times as fast).
+    The scene is drawn and solved about twenty times at full size. This takes seconds at 960x540, and minutes at 4K
+    without a GPU; --scale 0.25 makes it sixteen times as fast.
 
     Example: phasestack plan --scene sparse
     """

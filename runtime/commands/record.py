@@ -1,4 +1,4 @@
-"""`phasestack record`: write the sensor's samples to a file for `--replay`."""
+"""`phasestack record`: record the sensor's samples in a file that `--replay` can play."""
 
 from __future__ import annotations
 
@@ -20,32 +20,32 @@ if TYPE_CHECKING:
     from runtime.records import SensorFrame
     from runtime.sensor.worker import SensorWorker
 
-POLL_S = 0.004  # interval between checks for samples: a quarter of a 60 Hz sensor's period
-FIRST_SAMPLE_S = 15.0  # longest wait for the first sample
+POLL_S = 0.004  # polling interval: a quarter of a 60 Hz sensor's period
+FIRST_SAMPLE_S = 15.0  # time limit for the first sample
 SUFFIX = ".mcap"
 OVER = ("ended", "failed")
 
 
 def record(
-    out: Annotated[Path, typer.Option(help="recording to write, .mcap")],
-    config: Annotated[Path | None, typer.Option(help="TOML file; see `phasestack config`")] = None,
+    out: Annotated[Path, typer.Option(help="recording to write (.mcap)")],
+    config: Annotated[Path | None, typer.Option(help="configuration file; `phasestack config` prints one")] = None,
     images: Annotated[
-        bool, typer.Option("--images", help="also record colour and depth pictures, which show faces")
+        bool, typer.Option("--images", help="also record colour and depth pictures (these show faces)")
     ] = False,
     seconds: Annotated[
-        float | None, number(0.1, RECORD_MOST_S, "s", help="stop after this long; default: 600 s, with --motion 12 s")
+        float | None, number(0.1, RECORD_MOST_S, "s", help="length in s; default: 600, or 12 with --motion")
     ] = None,
     motion: Annotated[str | None, typer.Option(help="simulate a head: still, lean, nod, walk or stop-and-go")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="with --motion: seed of its path")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="with --motion: seed of the head's path")] = None,
     rate_hz: Annotated[float | None, number(15, 240, "Hz", help="with --motion: samples per second")] = None,
     noise_mm: Annotated[
         float | None, number(0, 100, "mm", help="with --motion: standard deviation of the sensor's noise per axis")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the result as one JSON object")] = False,
 ) -> None:
-    """Record eye positions with their times, and pictures with --images. Ctrl-C ends the recording.
+    """Record eye positions and their times and, with --images, pictures. Ctrl-C ends the recording.
 
-    --motion records a simulated head of the tracker's benchmark, with noise, outliers, dropouts and the true eyes.
+    --motion records a simulated head from the tracker's benchmark: noise, outliers, dropouts and the true eyes.
 
     Example: phasestack record --out lean.mcap --seconds 20
 
@@ -76,16 +76,16 @@ def record(
 
 
 def _refuse_target(out: Path, *, motion: bool) -> None:
-    """Raise InputError if the name lacks the suffix or the file exists.
+    """Raise InputError if the file name has the wrong suffix or the file exists.
 
-    A simulated motion may be replaced, because its seed can reproduce it.
+    A simulated motion may be overwritten, because its seed reproduces it.
     """
     from runtime.sensor.recording import Recording
     from runtime.support.untrusted_input import checked_path
 
     checked_path(out, source="record", field="--out")
     if out.suffix.lower() != SUFFIX:
-        raise InputError(out, "--out", f"must end in {SUFFIX}, since recordings are MCAP files")
+        raise InputError(out, "--out", f"must end in {SUFFIX}, because recordings are MCAP files")
     if os.path.isdir(out):  # noqa: PTH112 - a Path raises where a folder above it is forbidden
         raise InputError(out, "--out", "is a folder")
     if not os.path.lexists(out):
@@ -98,11 +98,11 @@ def _refuse_target(out: Path, *, motion: bool) -> None:
             return
     except InputError:  # not a recording
         pass
-    raise InputError(out, "--out", "already exists: choose another name, or delete it")
+    raise InputError(out, "--out", "already exists; choose another name or delete the file")
 
 
 def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | None) -> dict[str, Any]:
-    """Record until a time or size limit, the source's end or Ctrl-C. Raises FatalError, InputError."""
+    """Record until Ctrl-C, a time or size limit, or the end of the source. Raises FatalError, InputError."""
     from runtime.clock import NS_PER_S, MonotonicClock
     from runtime.eyes.detect import EyeFinder
     from runtime.sensor.recording import MAX_S, recording_to
@@ -160,12 +160,12 @@ def _streams(frame: SensorFrame) -> list[str]:
 
 
 def _samples(worker: SensorWorker, limit_s: float) -> Iterator[SensorFrame]:
-    """Yield samples until the source ends, or for the given time after the first sample."""
+    """Yield samples for the given time after the first one, or until the source ends."""
     import time
 
     deadline_ns, begun = time.monotonic_ns() + round(FIRST_SAMPLE_S * 1e9), False
     while True:
-        is_over = worker.state in OVER  # read first: the last samples arrive before the state changes
+        is_over = worker.state in OVER  # read before `take`: the last samples precede the change of state
         frames = worker.take()
         if frames and not begun:
             deadline_ns, begun = frames[0].capture_ns + round(limit_s * 1e9), True

@@ -1,4 +1,4 @@
-"""`phasestack report`: compare light PSNR with run time."""
+"""`phasestack report`: compare the methods by light PSNR and run time."""
 
 from __future__ import annotations
 
@@ -10,19 +10,18 @@ import typer
 
 def report(
     out: Annotated[Path, typer.Option(help="folder for index.html, report.json and the plots")] = Path("report"),
-    pairs: Annotated[Path | None, typer.Option(help="folder of case files, to measure on your own pairs")] = None,
+    pairs: Annotated[Path | None, typer.Option(help="folder of case files with your own stereo pairs")] = None,
     focal: Annotated[bool, typer.Option("--focal", help="also measure focal parallax through the layers")] = False,
-    model: Annotated[list[str] | None, typer.Option(help="an ONNX file to compare as well; may be repeated")] = None,
+    model: Annotated[list[str] | None, typer.Option(help="ONNX file to compare as well; may be repeated")] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="quick overview: quarter-size panels and fewer references")
+        bool, typer.Option("--quick", help="quick overview with quarter-size panels and fewer reference methods")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
-    """Measure light PSNR and run time of every method on this machine, and write a page.
+    """Measure light PSNR and run time of every method on this machine and write them to a page.
 
-    Takes minutes. The page appears with the first figure and is then completed: open it at once, or stop when it shows
-    enough. To compare the published network, export its checkpoint with `phasestack export`, and pass the file as
-    `--model FILE.onnx`.
+    This takes minutes. The page appears with the first figure and grows from then on; Ctrl-C keeps what it shows.
+    To include the published network, convert its checkpoint with `phasestack export` and pass the result with --model.
 
     Example: phasestack report --pairs my-pairs --out report
     """
@@ -45,7 +44,7 @@ def report(
                 progress=tell,
             )
     except KeyboardInterrupt:
-        typer.echo(f"report: stopped; {out / 'index.html'} shows the measurements so far", err=True)
+        typer.echo(f"report: stopped; {out / 'index.html'} contains the measurements so far", err=True)
         raise
     if as_json:
         print(to_json(record))
@@ -57,4 +56,4 @@ def report(
             f"{result['name']:18}{size:>11}{result['ms_p50']:10.1f} ms   "
             f"light {light:6.2f} dB, one ray {result['psnr_db']:6.2f} dB {result['memory_mib']:7.0f} MiB"
         )
-    print(f"see {out / 'index.html'}; light, at a tracking error of 1 mm, is the figure to quote")
+    print(f"see {out / 'index.html'}; quote the light PSNR, which assumes a tracking error of 1 mm")

@@ -1,4 +1,4 @@
-"""`phasestack run`: run the daemon, or play a recording through the same code."""
+"""`phasestack run`: run the daemon, or play a recording through the same pipeline."""
 
 from __future__ import annotations
 
@@ -13,34 +13,34 @@ from runtime.support.options import blame_option, number
 
 
 def run(
-    config: Annotated[Path | None, typer.Option(help="TOML file; see `phasestack config`")] = None,
+    config: Annotated[Path | None, typer.Option(help="configuration file; `phasestack config` prints one")] = None,
     replay: Annotated[
-        str | None, typer.Option(help="recording to play instead of the sensor; `demo` repeats until stopped")
+        str | None, typer.Option(help="recording to play instead of the sensor; `demo` is built in and repeats")
     ] = None,
-    headless: Annotated[bool, typer.Option("--headless", help="use offscreen panels instead of windows")] = False,
+    headless: Annotated[bool, typer.Option("--headless", help="render offscreen instead of opening windows")] = False,
     frames: Annotated[int | None, typer.Option(min=1, help="stop after this many refreshes")] = None,
     max_speed: Annotated[
-        bool, typer.Option("--max-speed", help="play a recording on a simulated clock: reproducible, without waiting")
+        bool, typer.Option("--max-speed", help="play a recording on a simulated clock: reproducible and without waits")
     ] = False,
     out: Annotated[Path | None, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = None,
-    scene: Annotated[str | None, typer.Option(help="a built-in scene, a file or folder")] = None,
+    scene: Annotated[str | None, typer.Option(help="scene to show: a built-in name, a file or a folder")] = None,
     layout: Annotated[
-        str | None, typer.Option(help="arrangement of the views in pictures: a value of content.layout")
+        str | None, typer.Option(help="arrangement of the views in pictures, as in content.layout")
     ] = None,
-    model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
-    scale: Annotated[float, number(0.05, 2.0, help="scale factor of the pixel counts of offscreen panels")] = 1.0,
+    model: Annotated[str | None, typer.Option(help="model to use: fast, balanced, best, sart or an ONNX file")] = None,
+    scale: Annotated[float, number(0.05, 2.0, help="factor applied to the size of offscreen panels in pixels")] = 1.0,
     backend: Annotated[
         str | None,
-        typer.Option(help="device for everything except the network: auto (the faster one), cpu or gl"),
+        typer.Option(help="device for everything except the network: cpu, gl or auto (the faster)"),
     ] = None,
     keep_light: Annotated[
-        int, typer.Option(min=0, help="with --out: write the panels' layers every N refreshes; 0: never")
+        int, typer.Option(min=0, help="with --out: write the panels' layers every N refreshes; 0 never does")
     ] = 0,
-    as_json: Annotated[bool, typer.Option("--json", help="the summary as one JSON object on stdout")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the summary as one JSON object")] = False,
 ) -> None:
-    """Run the display until SIGTERM. SIGHUP reads the configuration again.
+    """Run the display until SIGTERM. SIGHUP reloads the configuration.
 
-    Exits with 75 if the X server dies. When started again, it waits for the server.
+    Exits with 75 if the X server dies. A restarted service waits for the server to return.
 
     Example: phasestack run --config /etc/phasestack/phasestack.toml
 

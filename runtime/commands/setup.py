@@ -10,18 +10,18 @@ import typer
 
 def setup(
     config: Annotated[
-        Path, typer.Option(help="configuration to write or change; a copy of the old one is kept")
+        Path, typer.Option(help="configuration file to create or change; the old one is backed up")
     ] = Path("phasestack.toml"),
     out: Annotated[Path, typer.Option(help="folder for pairs, calibration, reports and setup.json")] = Path("setup"),
-    photos: Annotated[Path, typer.Option(help="folder for the photographs")] = Path("photos"),
-    simulate: Annotated[bool, typer.Option("--simulate", help="try the setup on a simulated display")] = False,
+    photos: Annotated[Path, typer.Option(help="folder with the photographs of the panels")] = Path("photos"),
+    simulate: Annotated[bool, typer.Option("--simulate", help="try the setup with a simulated display")] = False,
     seed: Annotated[int, typer.Option(min=0, help="seed of the simulated display")] = 0,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout at the end")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the result as one JSON object at the end")] = False,
 ) -> None:
-    """Set up a display: monitors, sizes, registration from photographs, grey curves, sensor, calibration.
+    """Set up a display: assign monitors, enter sizes, register panels, measure grey curves, calibrate the sensor.
 
-    Answer in the terminal, or with keys on the panels' windows. Every step can be skipped or repeated; q stops, and the
-    same command resumes there. The result is a valid configuration, and the figures of each step.
+    Answer in the terminal or press keys on the panels' windows. Every step can be skipped or repeated. After q, the
+    same command resumes where it stopped. The result is a valid configuration and a record of each step's figures.
 
     Example: phasestack setup --simulate --config try.toml --out try
     """

@@ -13,39 +13,39 @@ from runtime.support.ranges import FOV_RANGE_DEG
 
 def solve(
     left: Annotated[
-        Path, typer.Option(help="picture of a pinhole camera at the left eye, looking at the stack's origin")
+        Path, typer.Option(help="picture taken by a pinhole camera at the left eye that looks at the stack's origin")
     ],
-    panels: Annotated[Path, typer.Option(help="TOML or JSON: width_m, height_m, x_m")],
-    out: Annotated[Path, typer.Option(help="folder for the layers")],
-    right: Annotated[Path | None, typer.Option(help="picture for the right eye; none: --left contains both")] = None,
-    layout: Annotated[str | None, typer.Option(help="arrangement of both views in --left (see content.layout)")] = None,
-    left_eye: Annotated[tuple[float, float, float] | None, place(help="left eye, metres, stack frame")] = None,
-    right_eye: Annotated[tuple[float, float, float] | None, place(help="right eye, metres")] = None,
+    panels: Annotated[Path, typer.Option(help="stack geometry: a TOML or JSON file with width_m, height_m and x_m")],
+    out: Annotated[Path, typer.Option(help="folder to write the layers to")],
+    right: Annotated[Path | None, typer.Option(help="picture for the right eye; omit it if --left has both")] = None,
+    layout: Annotated[str | None, typer.Option(help="arrangement of the views in --left, as in content.layout")] = None,
+    left_eye: Annotated[tuple[float, float, float] | None, place(help="left eye in the stack frame, in metres")] = None,
+    right_eye: Annotated[tuple[float, float, float] | None, place(help="right eye")] = None,
     camera: Annotated[
         Path | None,
         typer.Option(
-            help="instead of eyes and --fov, for other cameras: TOML or JSON with `left` and `right`, 3x4 matrices "
-            "from metres of the stack's frame to pixels"
+            help="cameras that look elsewhere, in place of eyes and --fov: TOML or JSON with the 3x4 matrices `left` "
+            "and `right`, which map metres in the stack frame to pixels"
         ),
     ] = None,
     fov: Annotated[
-        float, number(*FOV_RANGE_DEG, "degrees", help="horizontal field of view of the pictures, degrees")
+        float, number(*FOV_RANGE_DEG, "degrees", help="horizontal field of view of the pictures in degrees")
     ] = 40.0,
-    model: Annotated[str, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = "balanced",
-    repeat: Annotated[int, typer.Option(min=1, max=10000, help="timed runs, after the warm-up")] = 1,
+    model: Annotated[str, typer.Option(help="model to use: fast, balanced, best, sart or an ONNX file")] = "balanced",
+    repeat: Annotated[int, typer.Option(min=1, max=10000, help="number of timed runs after the warm-up")] = 1,
     eye_sigma_mm: Annotated[
-        float, number(0, 1000, "mm", help="tracking error, mm per axis; 1 for a good tracker, 0 for known eyes")
+        float, number(0, 1000, "mm", help="tracking error to expect, in mm per axis; 1 for a good tracker")
     ] = 1.0,
     backend: Annotated[
         str | None,
         typer.Option(help="device for everything except the network: cpu, gl or auto (timed if --repeat >= 10)"),
     ] = None,
     no_plan: Annotated[
-        bool, typer.Option("--no-plan", help="do all work, even if the pictures make some of it unnecessary")
+        bool, typer.Option("--no-plan", help="solve every pixel, even where the pictures make this unnecessary")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="solve.json's object on stdout")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the content of solve.json")] = False,
 ) -> None:
-    """Compute the layers for two still pictures and two eyes, and measure the quality of the eyes' views.
+    """Compute the layers for two still pictures and two eyes, and measure how well each eye sees its picture.
 
     Example: phasestack solve --left l.png --right r.png --left-eye 0.6 -0.03 0 --right-eye 0.6 0.03 0 --fov 40
     --panels panels.json --out out/solve
@@ -67,5 +67,5 @@ def solve(
         )
     typer.echo(shown(result, as_json=as_json))
     if not as_json:
-        typer.echo("light_db at a tracking error of 1 mm is the figure to quote")
-        typer.echo(f"see {out / 'contact-sheet.png'}; interactive: {out / 'viewer.html'}")
+        typer.echo("quote light_db, which assumes a tracking error of 1 mm")
+        typer.echo(f"see {out / 'contact-sheet.png'} or, to look around, {out / 'viewer.html'}")

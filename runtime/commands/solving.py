@@ -33,12 +33,12 @@ from runtime.support.picture_file import read_image
 from runtime.support.progress import tell
 from runtime.support.ranges import SEPARATION_MIN_M
 
-MEASURED_FROM = 10  # least number of runs for which timing both backends pays off
+MEASURED_FROM = 10  # with fewer runs, timing both backends takes longer than it saves
 
 
 @dataclass(frozen=True, slots=True)
 class Eyes:
-    """Cameras of the pictures, as the options give them."""
+    """Cameras of the pictures, as given by the options."""
 
     left: tuple[float, ...] | None
     right: tuple[float, ...] | None
@@ -52,22 +52,22 @@ class Files:
 
     left: Path
     right: Path | None
-    layout: str | None  # arrangement of the views, if there is one file
+    layout: str | None  # arrangement of the views in a single file
 
     @property
     def name(self) -> str:
         return self.left.name if self.right is None else f"{self.left.name} and {self.right.name}"
 
     def read(self) -> list[Any]:
-        """Read the left and the right eye's pictures. Raises InputError."""
+        """Read the pictures for the left and the right eye. Raises InputError."""
         if self.right is None:
             return list(read_pair(self.left, with_options(Settings(), layout=self.layout).content))
         if self.layout is not None:
-            raise InputError("solve", "--layout", "requires one file with both views: omit --right")
+            raise InputError("solve", "--layout", "requires one file with both views; omit --right")
         pictures = [read_image(path) for path in (self.left, self.right)]
         if pictures[0].shape != pictures[1].shape:
             sizes = " and ".join(f"{p.shape[1]}x{p.shape[0]}" for p in pictures)
-            raise InputError(self.right, "size", f"the two pictures differ: {sizes}")
+            raise InputError(self.right, "size", f"the two pictures differ in size: {sizes}")
         return pictures
 
 
@@ -83,7 +83,7 @@ def solve_pair(
     backend: str | None,
     plan: bool,
 ) -> dict[str, Any]:
-    """Solve, write the layers and pictures, and return the content of solve.json. Raises InputError."""
+    """Solve a pair, write the layers and pictures, and return the content of solve.json. Raises InputError."""
     watch = Stopwatch()
     settings = with_options(Settings(), model=model, backend=backend).model
     cv2.setNumThreads(settings.threads)
@@ -125,8 +125,8 @@ def solve_pair(
 
         try:
             done = timed(solve, runs=repeat)
-        except EyesNotServed as error:  # a still pair's eyes do not move
-            why = f"{error}: {predictor.name} does not support these eye positions (try --model sart)"
+        except EyesNotServed as error:  # cannot pass, because a still pair's eyes do not move
+            why = f"{error}: {predictor.name} does not support these eye positions; try --model sart"
             raise InputError("solve", "--left-eye, --right-eye", why) from None
         watch.lap("solve, warm-up included")
         with OutputFolder(out) as folder:
@@ -135,13 +135,13 @@ def solve_pair(
             try:
                 quality = seen.quality
             except ValueError as error:
-                why = f"{error}: the display is not visible from there"
+                why = f"the display is not visible from there: {error}"
                 raise InputError("solve", "--left-eye", why) from None
             notes = disparity_doubts(pictures, eyes_m, stack, fov_deg=fov_deg, parallel=eyes.cameras is None)
             for note in notes:
                 typer.echo(f"phasestack: {note}", err=True)
             line = f"{files.name}, model {predictor.name}, solved for a tracking error of "
-            line += f"{eye_sigma_mm:g} mm; one ray a pixel, as published: {quality.psnr_db:.1f} dB"
+            line += f"{eye_sigma_mm:g} mm; PSNR with one ray per pixel, as published: {quality.psnr_db:.1f} dB"
             tell("writing", 0)
             seen.write(folder.staging, lines=[line, *notes])
             watch.lap("measure and write")
@@ -153,7 +153,7 @@ def solve_pair(
                 "provider": predictor.provider,
                 "backend": predictor.backend,
                 "eye_sigma_mm": eye_sigma_mm,
-                "steps": done.answer.steps + 1,  # the network's proposal counts as a step
+                "steps": done.answer.steps + 1,  # the network's initial layers count as a step
                 "plan": [asdict(item) for item in items],
                 "notes": notes,
                 "wall_s": {part: round(ms / 1e3, 3) for part, ms in watch.stage_ms.items()},
@@ -164,16 +164,16 @@ def solve_pair(
 
 
 def taken(pictures: list[Any], eyes: Eyes, stack: PanelStack) -> tuple[list[Any], F64, float]:
-    """Resample the pictures as seen by eyes that look at the stack's origin.
+    """Return the pictures as seen by eyes that look at the stack's origin, the eyes and the field of view.
 
-    Returns them, the eyes and the field of view.
+    Pictures from other cameras (--camera) are resampled.
     """
     if eyes.cameras is None:
         if eyes.left is None or eyes.right is None:
             raise InputError("solve", "--left-eye, --right-eye", "are required, in metres, unless --camera is given")
         return pictures, checked_eyes(eyes.left, eyes.right, stack), eyes.fov_deg
     if eyes.left is not None or eyes.right is not None:
-        raise InputError("solve", "--camera", "already gives the eyes: omit --left-eye and --right-eye")
+        raise InputError("solve", "--camera", "already gives the eyes; omit --left-eye and --right-eye")
     table = read_table(eyes.cameras)
     try:
         cameras, places_m = as_cameras([table.get("left"), table.get("right")])
@@ -185,7 +185,7 @@ def taken(pictures: list[Any], eyes: Eyes, stack: PanelStack) -> tuple[list[Any]
 
 
 def checked_eyes(left_eye: tuple[float, ...], right_eye: tuple[float, ...], stack: PanelStack) -> F64:
-    """Return the (2, 3) eyes if the display can serve them. Raises InputError, naming the option."""
+    """Return the eyes as a (2, 3) array in metres. Raises InputError if the display cannot serve them."""
     for option, eye in (("--left-eye", left_eye), ("--right-eye", right_eye)):
         if eye[0] <= max(stack.x_m):
             raise InputError(
@@ -193,5 +193,5 @@ def checked_eyes(left_eye: tuple[float, ...], right_eye: tuple[float, ...], stac
             )
     separation_m = math.dist(left_eye, right_eye)
     if separation_m < SEPARATION_MIN_M:
-        raise InputError("solve", "--right-eye", f"is {separation_m * 1e3:g} mm from the left one; the minimum is 5 mm")
+        raise InputError("solve", "--right-eye", f"is {separation_m * 1e3:g} mm from the left eye; the minimum is 5 mm")
     return np.array([left_eye, right_eye])

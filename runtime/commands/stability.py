@@ -13,16 +13,16 @@ if TYPE_CHECKING:
 
 
 def stability(
-    out: Annotated[Path | None, typer.Option(help="folder for stability.json")] = None,
-    full: Annotated[bool, typer.Option("--full", help="also run the long cases: minutes instead of seconds")] = False,
+    out: Annotated[Path | None, typer.Option(help="folder to write stability.json to")] = None,
+    full: Annotated[bool, typer.Option("--full", help="also run the long cases; takes minutes")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
     record: Annotated[
-        Path | None, typer.Option(help="write the errors to a limits file, after a model has changed")
+        Path | None, typer.Option(help="record the errors as new limits in this file, after a model has changed")
     ] = None,
 ) -> None:
     """Run every numerical method on stiff and extreme cases, and compare the results with references.
 
-    A case without a reference may be at most 5% worse than the recorded limit. Exits with 1 if a case fails.
+    The error of a case without a reference may exceed its recorded limit by 5%. Exits with 1 if a case fails.
 
     Example: phasestack stability --out stability
     """
@@ -62,7 +62,7 @@ def stability(
 
 
 def _fits() -> dict[str, Fit]:
-    """Return the calibration's solvers by method name."""
+    """Return the solver of each calibration method, by name."""
     from functools import partial
 
     from calib.solution import METHODS, Method, solve

@@ -11,19 +11,19 @@ from runtime.support.options import blame_option, number
 
 
 def try_(
-    config: Annotated[Path | None, typer.Option(help="TOML file; default: panels of 960x540")] = None,
-    scene: Annotated[str | None, typer.Option(help="a built-in scene, a file or folder")] = None,
+    config: Annotated[Path | None, typer.Option(help="configuration file; default: panels of 960x540 pixels")] = None,
+    scene: Annotated[str | None, typer.Option(help="scene to show: a built-in name, a file or a folder")] = None,
     layout: Annotated[
-        str | None, typer.Option(help="arrangement of the views in pictures: a value of content.layout")
+        str | None, typer.Option(help="arrangement of the views in pictures, as in content.layout")
     ] = None,
-    model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
-    webcam: Annotated[bool, typer.Option("--webcam", help="track your head with this PC's camera")] = False,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0: any free one")] = 0,
-    no_browser: Annotated[bool, typer.Option("--no-browser", help="print the address only")] = False,
-    seconds: Annotated[float | None, number(1, 1e6, "s", help="stop after this long")] = None,
+    model: Annotated[str | None, typer.Option(help="model to use: fast, balanced, best, sart or an ONNX file")] = None,
+    webcam: Annotated[bool, typer.Option("--webcam", help="track your head with a webcam of this PC")] = False,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0 picks a free one")] = 0,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="only print the address")] = False,
+    seconds: Annotated[float | None, number(1, 1e6, "s", help="stop after this many seconds")] = None,
     as_json: Annotated[bool, typer.Option("--json", help='print {"url": ...} as soon as the page is served')] = False,
 ) -> None:
-    """Try the display without hardware: the daemon's own loop, with a browser as both viewer and panels.
+    """Try the display without hardware: the display loop runs here, and a browser shows what a viewer would see.
 
     Example: phasestack try
     """

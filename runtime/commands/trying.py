@@ -1,4 +1,4 @@
-"""Implementation of `phasestack try`: the daemon with a web server as its sensor and panels."""
+"""Implementation of `phasestack try`: the daemon with a web page in place of its sensor and panels."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from runtime.daemon.supervise import run_daemon
 from runtime.page.connections import LOOPBACK, listening, server_of
 from runtime.page.server import application
 
-SIZE_PX = {"width_px": 960, "height_px": 540}  # default: small, for frequent solutions
-SCENE = "room"  # without a configuration
-WEBCAM_FOV_DEG = 65.0  # about right for most webcams; a configuration can set another
-SLOW_PAGE_S = 2.0  # after this long without a picture from a page's camera, it is lost
+SIZE_PX = {"width_px": 960, "height_px": 540}  # small by default, so that solutions are frequent
+SCENE = "room"  # scene without a configuration
+WEBCAM_FOV_DEG = 65.0  # typical for webcams; a configuration can set another
+SLOW_PAGE_S = 2.0  # the page's camera is lost after this long without a picture
 MEASURED_EVERY_S = 4.0  # interval between measurements of the light at the eyes
 
 
@@ -49,7 +49,7 @@ def settings_of(
 
 
 def try_display(settings: Settings, *, port: int, opens: bool, seconds: float | None, as_json: bool) -> None:
-    """Serve the page and run the daemon until stopped. Raises InputError."""
+    """Serve the page and run the daemon until it is stopped. Raises InputError."""
     is_sensor = settings.sensor.driver == "browser"
     link = BrowserLink(settings.stack.stack(), settings.content.fov_deg, is_sensor=is_sensor)
     ends_s = float("inf") if seconds is None else time.monotonic() + seconds
@@ -79,7 +79,7 @@ def _as_it_is(settings: Settings) -> Settings:
 
 
 def _as_wished(settings: Settings, link: BrowserLink) -> Settings:
-    """Return settings with the gap and sensor chosen on a page, and with the current scene and model."""
+    """Return the settings with the panel gap and sensor chosen on the page and the current scene and model."""
     wishes, link.wishes = link.wishes, {}
     account = link.shown[1]
     settings = with_options(settings, scene=account.get("scene"), model=account.get("model"))
@@ -95,7 +95,7 @@ def _as_wished(settings: Settings, link: BrowserLink) -> Settings:
 
 @contextmanager
 def _served(link: BrowserLink, socket: Path, port: int) -> Iterator[str]:
-    """Serve the page in a thread. Yields its address, including the token."""
+    """Serve the page in a thread and yield its address, including the token."""
     token, served = secrets.token_urlsafe(32), listening("try", port)
     server = server_of(application(DaemonClient((socket,)), token, link=link))
     sockets: dict[str, Any] = {"sockets": [served]}
