@@ -1,1 +1,1 @@
-"""The command line: one module per command, with heavy imports inside the functions so that `--help` is fast."""
+"""The command line: one module per command. Heavy imports are inside the functions."""

@@ -80,4 +80,4 @@ def options(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and exit")
     ] = False,
 ) -> None:
-    """Accept options that come before a command. (Typer shows the app's own help instead of this docstring.)"""
+    """Accept options that come before a command. `--help` shows the app's help, not this text."""

@@ -16,7 +16,7 @@ def bench(
     out: Annotated[Path | None, typer.Option(help="write the measurement to this JSON file")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
-    """Measure run time, memory and light PSNR of the shipped models at two sizes, or compare two measurements.
+    """Measure run time, memory and light PSNR of the shipped models, or compare two measurements.
 
     Example: phasestack bench --out bench.json
 

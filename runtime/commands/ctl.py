@@ -133,7 +133,7 @@ def status(
     config: Config = None,
     as_json: Annotated[bool, typer.Option("--json", help="print the status as one JSON object")] = False,
 ) -> None:
-    """Show the daemon's state and its reason, rates, eye positions with their uncertainty, times and faults.
+    """Show the daemon's state and its reason, rates, eye positions, uncertainty, times and faults.
 
     Exits with 1 if no daemon answers or if its loop has hung for five seconds.
 

@@ -76,7 +76,7 @@ def doctor(
 
 
 def _become_service() -> None:
-    """Switch this process to the service's user, groups and environment, but not its sandbox. Raises InputError."""
+    """Switch to the service's user, groups and environment, but not its sandbox. Raises InputError."""
     import grp
     import pwd
     import shlex

@@ -1,4 +1,4 @@
-"""`phasestack eyes`: find the viewer's pupils in pictures, films, recordings or the sensor's live frames."""
+"""`phasestack eyes`: find the viewer's pupils in pictures, films, recordings or live frames."""
 
 from __future__ import annotations
 

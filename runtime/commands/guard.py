@@ -51,7 +51,7 @@ def run_guarded(*, interrupts_leave: bool) -> None:
 
 
 def _interrupted(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt, or exit at once during an import, where Python would swallow the exception."""
+    """Raise KeyboardInterrupt, or exit during an import, where Python would swallow the exception."""
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
             os._exit(INTERRUPTED)

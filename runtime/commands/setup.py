@@ -18,7 +18,7 @@ def setup(
     seed: Annotated[int, typer.Option(min=0, help="seed of the simulated display")] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="print the result as one JSON object at the end")] = False,
 ) -> None:
-    """Set up a display: assign monitors, enter sizes, register panels, measure grey curves, calibrate the sensor.
+    """Set up a display: monitors, sizes, panel registration, grey curves and sensor calibration.
 
     Answer in the terminal or press keys on the panels' windows. Every step can be skipped or repeated. After q, the
     same command resumes where it stopped. The result is a valid configuration and a record of each step's figures.

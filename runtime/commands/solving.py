@@ -83,7 +83,7 @@ def solve_pair(
     backend: str | None,
     plan: bool,
 ) -> dict[str, Any]:
-    """Solve a pair, write the layers and pictures, and return the content of solve.json. Raises InputError."""
+    """Solve a pair, write layers and pictures, and return the content of solve.json. Raises InputError."""
     watch = Stopwatch()
     settings = with_options(Settings(), model=model, backend=backend).model
     cv2.setNumThreads(settings.threads)
@@ -164,7 +164,7 @@ def solve_pair(
 
 
 def taken(pictures: list[Any], eyes: Eyes, stack: PanelStack) -> tuple[list[Any], F64, float]:
-    """Return the pictures as seen by eyes that look at the stack's origin, the eyes and the field of view.
+    """Return the pictures for eyes that look at the stack's origin, the eyes and the field of view.
 
     Pictures from other cameras (--camera) are resampled.
     """

@@ -79,7 +79,7 @@ def _as_it_is(settings: Settings) -> Settings:
 
 
 def _as_wished(settings: Settings, link: BrowserLink) -> Settings:
-    """Return the settings with the panel gap and sensor chosen on the page and the current scene and model."""
+    """Return the settings with the gap and sensor chosen on the page and the current scene and model."""
     wishes, link.wishes = link.wishes, {}
     account = link.shown[1]
     settings = with_options(settings, scene=account.get("scene"), model=account.get("model"))
