@@ -21,7 +21,7 @@ def identify(
         Path | None, typer.Option(help="configuration file; without it, every monitor shows a card")
     ] = None,
 ) -> None:
-    """Show a test card on each panel: its index, its monitor, colour bars and an arrow that should point up.
+    """Show a test card on each panel: index, monitor, colour bars, an arrow that should point up.
 
     One panel at a time shows its card while the others are clear. Press Enter or n for the next panel, p for the
     previous one and q to quit. Configured panels are rotated, mirrored and registered as in a run. If no panel is
