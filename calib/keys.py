@@ -1,4 +1,4 @@
-"""Keyboard input: lines and single keys in the terminal, single keys in a panel's window."""
+"""Keyboard input: lines and single keys from the terminal, single keys from a panel's window."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from runtime.panels.base import PanelSink
 
 
 class Key(Enum):
-    """Keys, named by their meaning."""
+    """Keys, named after their meaning."""
 
     ACCEPT = auto()
     NEXT = auto()
@@ -24,7 +24,7 @@ class Key(Enum):
     QUIT = auto()
 
 
-# GLFW's names of each key, and its bytes in a terminal.
+# Names of each key in GLFW, and its byte sequences in a terminal.
 _MEANINGS: dict[Key, tuple[str, tuple[bytes, ...]]] = {
     Key.RIGHT: ("RIGHT", (b"\x1b[C",)),
     Key.LEFT: ("LEFT", (b"\x1b[D",)),
@@ -39,7 +39,7 @@ _OF_BYTES = {data: key for key, (_, pieces) in _MEANINGS.items() for data in pie
 
 
 def parse(data: bytes) -> tuple[list[Key], bytes]:
-    """Return the keys in a terminal's bytes, and any incomplete escape sequence at the end."""
+    """Return the keys in bytes from a terminal, and an incomplete escape sequence at their end."""
     keys: list[Key] = []
     while data:
         if data[:1] == b"\x1b" and len(data) < 3 and b"\x1b[".startswith(data[:2]):
@@ -52,14 +52,14 @@ def parse(data: bytes) -> tuple[list[Key], bytes]:
 
 
 class TerminalKeys:
-    """Keys and lines from standard input. A terminal is in character mode between `poll` and `close`."""
+    """Keys and lines from standard input. Between `poll` and `close` a terminal is in character mode."""
 
     def __init__(self, descriptor: int | None = None, *, quit_at_end: bool = True) -> None:
-        """quit_at_end: True if the end of input means `QUIT`; False if it means no more keys."""
+        """quit_at_end: report `QUIT` at the end of input; otherwise report no more keys."""
         self._quit_at_end = quit_at_end
         self._descriptor = _standard_input() if descriptor is None else descriptor
         self._rest = b""
-        self._mode: Any = None  # the terminal's previous mode
+        self._mode: Any = None  # previous mode of the terminal
 
     def poll(self) -> Key | None:
         """Return the next key, or None. Never waits."""

@@ -1,4 +1,4 @@
-"""`phasestack setup`: guide a person through the steps, which can be resumed, and write the figures."""
+"""`phasestack setup`: guide a person through the steps, which can be interrupted and resumed."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from runtime.errors import InputError, PhasestackError
 from runtime.support import untrusted_input
 from runtime.support.artifacts import write_json
 
-MAX_PROGRESS_BYTES = 4 << 20  # largest setup.json
+MAX_PROGRESS_BYTES = 4 << 20  # size limit for setup.json
 
 
 def progress_path(config: Path) -> Path:
-    """Return the path of the file, next to the configuration, that records the setup's progress."""
+    """Return the path of the file that records the setup's progress, next to the configuration."""
     return config.with_name(f"{config.stem}.setup.json")
 
 
 def read_progress(path: Path) -> dict[str, Any]:
-    """Read the figures of the finished steps, by name. Raises InputError."""
+    """Read the figures of finished steps, by step name. Raises InputError."""
     if not untrusted_input.is_there(path):
         return {}
     try:
         progress = untrusted_input.read_json(path, most_bytes=MAX_PROGRESS_BYTES)
         done = {step.name: dict(progress["done"][step.name]) for step in STEPS if step.name in progress["done"]}
     except (InputError, KeyError, TypeError, ValueError):
-        raise InputError(path, "done", "was not written by setup; delete the file to start over") from None
+        raise InputError(path, "done", "was not written by `phasestack setup`; delete the file to start over") from None
     return done
 
 
 def run_setup(
     config: Path, *, out: Path, photos: Path, simulate: bool, seed: int, to_stderr: bool
 ) -> tuple[dict[str, Any], str]:
-    """Run the setup. Returns the summary and its text. Raises InputError."""
+    """Run the setup and return its summary, also as text. Raises InputError."""
 
     def say(text: str) -> None:
         typer.echo(text, err=to_stderr)
@@ -62,14 +62,14 @@ def run_setup(
 
 
 def walk_through(setup: Setup) -> bool:
-    """Run the steps until the last one or q. Returns True if the end was reached."""
+    """Run the steps until the last one or q. Returns True if no step is left."""
     number = next((n for n, step in enumerate(STEPS) if step.name not in setup.done), 0)
     while number < len(STEPS):
         step = STEPS[number]
         state = "already done" if step.name in setup.done else "not done yet"
         setup.say(f"\nStep {number + 1} of {len(STEPS)}: {step.title}\n{step.what}\n({state})")
         try:
-            answer = setup.ask("Enter: start; n: skip (keeps earlier results); p: previous step", "do it")
+            answer = setup.ask("Enter: start, n: skip (keeps earlier results), p: previous step", "do it")
         except SetupStopped:
             return False
         if answer == "p":
@@ -84,17 +84,17 @@ def _is_done(setup: Setup, step: SetupStep) -> bool:
     try:
         figures = step.run(setup)
     except (SetupStopped, PhasestackError) as error:
-        stopped = "stopped: unfinished changes were not written to the configuration"
+        stopped = "stopped; unfinished changes were not written to the configuration"
         setup.say(stopped if isinstance(error, SetupStopped) else f"failed: {error}")
         return False
     setup.done[step.name] = figures
     write_json(progress_path(setup.config), {"done": setup.done})
-    setup.say(f"step {step.name}: done: {figures['text']}")
+    setup.say(f"step {step.name} is done: {figures['text']}")
     return True
 
 
 def summarise(setup: Setup, *, finished: bool) -> tuple[dict[str, Any], str]:
-    """Write the figures. Returns the summary and a text that ends with the next commands."""
+    """Write the figures and return the summary, also as text that ends with the commands to run next."""
     missing = [step.name for step in STEPS if step.name not in setup.done]
     summary: dict[str, Any] = {
         "config": str(setup.config),

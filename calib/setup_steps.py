@@ -1,4 +1,4 @@
-"""Steps of `phasestack setup`: their questions, changes to the configuration, and reports."""
+"""Steps of `phasestack setup`, with their questions, changes to the configuration and reports."""
 
 from __future__ import annotations
 
@@ -29,27 +29,27 @@ from runtime.support import untrusted_input
 from runtime.support.artifacts import OutputFolder, write_bytes, write_text
 
 Figures = dict[str, Any]
-MIN_PAIRS = 9  # least number of the 27 viewpoints needed for a calibration
+MIN_PAIRS = 9  # minimum number of viewpoints for a calibration, out of 27
 SERVICE_FOLDER = "/etc/phasestack"
-MAX_BYTES = 64 << 20  # largest file copied for the service
+MAX_BYTES = 64 << 20  # size limit for a file copied for the service
 ARROWS: dict[Key, Arrow] = {Key.UP: "up", Key.DOWN: "down", Key.LEFT: "left", Key.RIGHT: "right"}
 YES_NO = {Key.ACCEPT: True, Key.NEXT: False}
 
 
 class SetupStopped(Exception):
-    """Raised when the person stops the setup, to continue later."""
+    """Raised when the person interrupts the setup."""
 
 
 @dataclass
 class Setup:
-    """State that all steps share."""
+    """State shared by all steps."""
 
     config: Path
-    out: Path  # folder for reports and for files that the configuration names
+    out: Path  # folder for reports and for files used by the configuration
     hardware: SetupHardware
     say: Say
-    line: Callable[[], str]  # returns the next line typed
-    done: dict[str, Figures] = field(default_factory=dict)  # figures of earlier steps, by name
+    line: Callable[[], str]  # returns the next line that the person types
+    done: dict[str, Figures] = field(default_factory=dict)  # figures of finished steps, by step name
 
     @property
     def settings(self) -> Settings:
@@ -57,7 +57,7 @@ class Setup:
         return load_settings(self.config if untrusted_input.is_there(self.config) else None)
 
     def ask(self, question: str, default: str = "") -> str:
-        """Ask a question. Returns the line typed, or `default` if it is empty. Raises SetupStopped for q."""
+        """Ask a question and return the answer, or `default` for an empty line. Raises SetupStopped for q."""
         self.say(f"{question} [{default or 'Enter'}; q: stop]")
         answer = self.line()
         if answer == "q":
@@ -71,34 +71,34 @@ class SetupStep:
 
     name: str
     title: str
-    what: str  # one line of explanation
+    what: str  # explanation in one line
     run: Callable[[Setup], Figures]
 
 
 def identify(setup: Setup) -> Figures:
-    """Step 1: assign monitors to panels and find their mounting, with a card on one at a time."""
+    """Step 1: assign monitors to panels and find how they are mounted, using a card on one at a time."""
     hardware, count = setup.hardware, setup.settings.stack.stack().count
     monitors = hardware.monitors()
     if len(monitors) < count:
-        raise InputError(setup.config, "stack.x_m", f"{len(monitors)} monitors for {count} panels")
-    free = list(range(len(monitors)))  # monitors not assigned yet; the first one shows its card
+        raise InputError(setup.config, "stack.x_m", f"found {len(monitors)} monitors for {count} panels")
+    free = list(range(len(monitors)))  # unassigned monitors; the first one shows its card
     tables: list[dict[str, Any]] = []
 
     def ask(question: str, keys: str, answers: Mapping[Key, Any]) -> Any:
         hardware.show_card(free[0], [question, f"{keys}; q: stop"])
-        setup.say(f"{monitors[free[0]]} shows its card; the others are clear. {question} ({keys}; q: stop)")
+        setup.say(f"{monitors[free[0]]} shows its card while the others are clear. {question} ({keys}, q: stop)")
         while (key := hardware.key()) not in answers:
             if key is Key.QUIT:
                 raise SetupStopped
         return answers[key]
 
     while len(tables) < count:
-        place = {0: "the rearmost, at the backlight", count - 1: "the front one"}.get(len(tables), "the next one")
-        if not ask(f"Is this panel {len(tables)}, {place}?", "Enter: yes, n: try another monitor", YES_NO):
+        place = {0: "the rearmost, next to the backlight", count - 1: "the front one"}.get(len(tables), "the next one")
+        if not ask(f"Is this panel {len(tables)}, {place}?", "Enter: yes, n: no", YES_NO):
             free.append(free.pop(0))
             continue
-        arrow = ask("Which way does its arrow point, seen from the front?", "arrow keys", ARROWS)
-        readable = ask("Is its writing readable, not mirrored?", "Enter: yes, n: mirrored", YES_NO)
+        arrow = ask("Seen from the front, which way does its arrow point?", "arrow keys", ARROWS)
+        readable = ask("Can you read its text, or is it mirrored?", "Enter: yes, n: no, it is mirrored", YES_NO)
         rotation_deg, mirror = mounting_of(arrow, mirrored=not readable)
         name = _name_of(monitors[free.pop(0)], monitors)
         tables.append(name | {"rotation_deg": rotation_deg, "mirror": mirror})
@@ -107,17 +107,17 @@ def identify(setup: Setup) -> Figures:
 
 
 def _name_of(monitor: Monitor, monitors: Sequence[Monitor]) -> dict[str, Any]:
-    """Return the keys that identify a monitor: its serial number if unique, else its connector."""
+    """Return the settings that identify a monitor: its serial number if unique, otherwise its connector."""
     alone = [m.serial for m in monitors].count(monitor.serial) == 1
     return {"edid_serial": monitor.serial} if monitor.serial and alone else {"connector": monitor.connector}
 
 
 def geometry(setup: Setup) -> Figures:
-    """Step 2: ask for approximate sizes, gap and viewing distances. Registration refines the gap."""
+    """Step 2: ask for sizes, the approximate gap, which registration refines, and viewing distances."""
     stack, calibration = setup.settings.stack, setup.settings.calibration
 
     def length_m(question: str, value_m: float, unit_m: float = 1e-3) -> float:
-        """Ask for a length. Returns metres, or `value_m` unchanged for an empty line."""
+        """Ask for a length and return it in metres. An empty line keeps `value_m`."""
         while True:
             answer = setup.ask(f"{question}, {'mm' if unit_m == 1e-3 else 'm'}", f"{value_m / unit_m:.6g}")
             try:
@@ -128,17 +128,17 @@ def geometry(setup: Setup) -> Figures:
             return value_m if abs(typed - value_m) < 1e-8 else round(typed, 7)
 
     size: dict[str, Any] = {
-        "width_m": length_m("width of a panel's picture", stack.width_m),
+        "width_m": length_m("width of a panel's active area", stack.width_m),
         "height_m": length_m("its height", stack.height_m),
     }
     gap_m = (stack.x_m[-1] - stack.x_m[0]) / (len(stack.x_m) - 1)
-    typed_m = length_m("from panel to panel", gap_m)
-    if typed_m != gap_m:  # otherwise keep the measured distances
+    typed_m = length_m("distance from one panel to the next", gap_m)
+    if typed_m != gap_m:  # else keep distances that were measured
         middle = (len(stack.x_m) - 1) / 2
         size["x_m"] = [round((index - middle) * typed_m, 7) for index in range(len(stack.x_m))]
     near_m = length_m("nearest viewer", calibration.viewing_m[0], 1.0)
     far_m = length_m("farthest viewer", calibration.viewing_m[1], 1.0)
-    ipd_m = length_m("eye separation of the person calibrating (an optician's PD; 0: unknown)", calibration.ipd_m)
+    ipd_m = length_m("distance between the eyes of the person who calibrates (PD; 0: unknown)", calibration.ipd_m)
 
     def change(document: Any) -> None:
         put(document, "stack", size)
@@ -150,8 +150,8 @@ def geometry(setup: Setup) -> Figures:
 
 
 def registration(setup: Setup) -> Figures:
-    """Step 3: measure the panels' true poses from photographs of the boards."""
-    rewrite(setup.config, lambda document: None)  # creates an empty configuration if there is none
+    """Step 3: measure the actual poses of the panels from photographs of their test patterns."""
+    rewrite(setup.config, lambda document: None)  # creates an empty configuration if none exists
     settings = setup.settings
     pictures = setup.hardware.photographs(settings, boards(settings.stack.stack()), panel=None, say=setup.say)
     summary = register_photos(pictures, "photographs", setup.out / "registration", settings, config=setup.config)
@@ -161,7 +161,7 @@ def registration(setup: Setup) -> Figures:
 
 
 def grey(setup: Setup) -> Figures:
-    """Step 4: measure each panel's grey curve from photographs of its chart, and save it at once."""
+    """Step 4: measure each panel's grey curve from photographs of a chart, and save it immediately."""
     stack = setup.settings.stack.stack()
     known = [bool(panel.lut) for panel in setup.settings.output.panels] or [False] * stack.count
     residuals = [0.0]
@@ -176,14 +176,14 @@ def grey(setup: Setup) -> Figures:
             known[number] = True
             break
     if not any(known):
-        setup.say("no panel has a curve; the configured gammas are used")
+        setup.say("no panel has a curve, so the configured gammas are used")
         raise SetupStopped
     numbers = ", ".join(str(n) for n, has in enumerate(known) if has)
     return {"text": f"of panels {numbers}, measured to {100 * max(residuals):.2f}%"}
 
 
 def _measure_grey(setup: Setup, panel: int) -> float:
-    """Measure and configure one panel's LUT. Returns the relative error of the curve. Raises InputError."""
+    """Measure one panel's grey curve, add it to the configuration and return its relative error."""
     settings = setup.settings
     stack = settings.stack.stack()
     pictures = setup.hardware.photographs(settings, grey_charts(stack, panel), panel=panel, say=setup.say)
@@ -191,12 +191,12 @@ def _measure_grey(setup: Setup, panel: int) -> float:
     summary = lut_from_photographs(path, pictures, stack, panel=panel, source="photographs")
     rewrite(setup.config, lambda document: put_panels(document, "lut", {panel: str(path)}, panels=stack.count))
     residual = float(summary["residual"])
-    setup.say(f"panel {panel}: accepted, measured to {100 * residual:.2f}%")
+    setup.say(f"panel {panel}: curve accepted, with an error of {100 * residual:.2f}%")
     return residual
 
 
 def sensor(setup: Setup) -> Figures:
-    """Step 5: choose the depth sensor and test it."""
+    """Step 5: choose and test the depth sensor."""
     settings = setup.settings
     names = ["replay"] if setup.hardware.simulated else [name for name in DRIVERS if name not in ("replay", "fixed")]
     default = settings.sensor.driver if settings.sensor.driver in names else names[0]
@@ -216,20 +216,20 @@ def sensor(setup: Setup) -> Figures:
 
 
 def calibration(setup: Setup) -> Figures:
-    """Step 6: measure the sensor's pose with a person who moves from viewpoint to viewpoint."""
+    """Step 6: measure the sensor's pose with the help of a person who moves from viewpoint to viewpoint."""
     pairs_path, target = setup.out / "pairs.csv", setup.out / "calibration.toml"
     count = capture_live(pairs_path, setup.settings, setup.hardware, show=True, say=setup.say)["pairs"]
     if count < MIN_PAIRS:
-        setup.say(f"{pairs_path} contains {count} pairs; at least {MIN_PAIRS} are needed")
+        setup.say(f"{pairs_path} contains {count} pairs, but at least {MIN_PAIRS} are needed")
         raise SetupStopped
     summary = solve_file(pairs_path, target, settings=setup.settings)
     rewrite(setup.config, lambda document: put(document, "calibration", {"file": str(target.resolve())}))
-    text = f"{summary['eye_error_mm']:.1f} mm of error expected at the eye, from {summary['pairs']} pairs"
+    text = f"expected error at the eye {summary['eye_error_mm']:.1f} mm, from {summary['pairs']} pairs"
     return {"text": text, "notes": summary["warnings"]}
 
 
 def service(setup: Setup) -> Figures:
-    """Step 7: gather the service's files in a folder, and install them or print the commands for that."""
+    """Step 7: gather the service's files in a folder, then install them or print the commands to do so."""
     folder = (setup.out / "service").resolve()
     files = gather(setup.config, folder)
     sudo = "" if os.geteuid() == 0 else "sudo "
@@ -240,9 +240,9 @@ def service(setup: Setup) -> Figures:
     ]
     listed = "; ".join(commands)
     if setup.hardware.simulated or sudo:
-        setup.say("the service uses its own copy of these files; install it with\n  " + "\n  ".join(commands))
+        setup.say("the service uses a copy of these files; install it with\n    " + "\n  ".join(commands))
         return {"text": f"{len(files)} files; install them with: {listed}"}
-    setup.hardware.let_go()  # release the panels, because the service needs them
+    setup.hardware.let_go()  # the service needs the panels
     for command in commands:
         result = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)
         if result.returncode != 0:
@@ -251,18 +251,18 @@ def service(setup: Setup) -> Figures:
 
 
 def gather(config: Path, out: Path) -> list[str]:
-    """Copy the configuration, calibration and grey curves to a folder. Returns the files' names.
+    """Copy the configuration, calibration and grey curves to a folder, and return the file names.
 
-    Other files stay in place, with absolute paths. Raises InputError if a file cannot be read.
+    Other files stay where they are and get absolute paths. Raises InputError if a file cannot be read.
     """
     if not config.exists():
-        raise InputError(config, "", "does not exist yet: run the earlier steps first")
+        raise InputError(config, "", "does not exist yet; run the earlier steps first")
     settings = load_settings(config)
     document: Any = read_document(config)
     copies: dict[str, bytes] = {}
     for section, values in settings:
         for key, value in values:
-            if key in document.get(section, {}) and isinstance(value, str):  # paths are absolute here
+            if key in document.get(section, {}) and isinstance(value, str):  # all paths are absolute here
                 document[section][key] = value
     if settings.calibration.file:
         copies["calibration.toml"] = untrusted_input.read_bytes(settings.calibration.file, most_bytes=MAX_BYTES)
@@ -281,20 +281,23 @@ def gather(config: Path, out: Path) -> list[str]:
 
 
 STEPS = (
-    SetupStep("identify", "Which monitor is which panel", "each panel in turn shows a card; identify it", identify),
     SetupStep(
-        "geometry", "Sizes and distances", "size of the panels, approximate gap, distance of the viewers", geometry
+        "identify", "Assign monitors to panels", "each monitor shows a card in turn; say which panel it is", identify
     ),
     SetupStep(
-        "registration", "The panels' true positions", "a dozen hand-held photographs of the boards", registration
+        "geometry",
+        "Enter sizes and distances",
+        "size of the panels, approximate gap, distance of the viewers",
+        geometry,
     ),
-    SetupStep("grey", "The panels' grey curves", "two photographs of a chart for each panel", grey),
-    SetupStep("sensor", "The depth sensor", "the sensor that sees the viewer's eyes", sensor),
+    SetupStep("registration", "Register the panels", "a dozen hand-held photographs of test patterns", registration),
+    SetupStep("grey", "Measure the panels' grey curves", "two photographs of a chart on each panel", grey),
+    SetupStep("sensor", "Choose the depth sensor", "the sensor that tracks the viewer's eyes", sensor),
     SetupStep(
         "calibration",
-        "The sensor's position",
-        "stand where the lines fuse and press Enter, at 9 to 27 viewpoints (q: enough)",
+        "Calibrate the sensor",
+        "at 9 to 27 viewpoints, stand where the lines fuse and press Enter (q: enough)",
         calibration,
     ),
-    SetupStep("service", "The service", "collects the service's files and, as root, installs them", service),
+    SetupStep("service", "The service", "gather the service's files and, as root, install them", service),
 )

@@ -40,7 +40,13 @@ from tests.panels.xserver import HEIGHT_PX, WIDTH_PX, XServer
 LOST_EVERY_S = 30.0
 HARM_EVERY_S = 40.0  # a cable, or the panels' contexts
 FAILING = 0.002  # of the solver's steps
-REFUSED = ("favour of a newer change", "there is no next entry", "nobody's", "no answer from the display", "restarted")
+REFUSED = (
+    "favour of a newer change",
+    "there is no next entry",
+    "nobody's",
+    "the display loop did not answer",
+    "restarted",
+)
 DELAYS = (
     (solver_parts.RunningSolver, "draw", 0.02, 2.5), (solver_parts.RunningSolver, "solve", 0.02, 2.5),
     (solver_parts.RunningSolver, "close", 0.3, 1.5),

@@ -42,7 +42,7 @@ PANEL = '[[output.panels]]\nconnector = "DP-{}"\n'
         ("[model]\neffort = 'half'", "model.effort", "'auto' or 'full'"),
         ("[[output.panels]]\ngamma = 1e308", "output.panels.0.gamma", "beyond 10"),
         ("[[output.panels]]\nhomography = [[1, 0, 0], [0, 1, 0]]", "output.panels.0.homography.2", "required"),
-        (PANEL.format(1) + PANEL.format(2), "output.panels", "has 2 tables, needs 3"),
+        (PANEL.format(1) + PANEL.format(2), "output.panels", "must have 3 tables"),
         ("[modle]\nname = 'fast'", "modle", "did you mean model?"),
         ("[[output.panels]]\nedid_seril = 'A'", "output.panels.0.edid_seril", "did you mean edid_serial?"),
         ("[loop]\nzebra = 1", "loop.zebra", "is not a setting"),

@@ -1,4 +1,4 @@
-"""Validated, frozen settings from one TOML file. Defaults and meanings are in `settings.py`."""
+"""Validated, frozen settings from one TOML file. `settings.py` has their defaults and descriptions."""
 
 from runtime.config.files import changed, load_settings, load_stack, with_options
 from runtime.config.settings import (

@@ -1,4 +1,4 @@
-"""Loading of settings and panels files, and replacing settings by options or operators' choices."""
+"""Load settings and panels files, and override settings with options or an operator's choices."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from runtime.support.sections import Section, read_table, validated
 
 
 def load_settings(path: Path | None) -> Settings:
-    """Return the settings in a file, or the defaults without one. Raises InputError."""
+    """Read the settings from a file, or return the defaults. Raises InputError."""
     if path is None:
         return Settings()
     return validated(Settings, read_table(path), source=path, folder=path.absolute().parent)
 
 
 def load_stack(path: Path, *, width_px: int, height_px: int) -> PanelStack:
-    """Return the geometry in `--panels FILE`, with the images' size as default. Raises InputError."""
+    """Read `--panels FILE`, whose size in pixels defaults to the arguments. Raises InputError."""
     table = {"width_px": width_px, "height_px": height_px} | read_table(path)
     for name in ("width_m", "height_m", "x_m"):
         if name not in table:
-            hint = ": a configuration has it under [stack], a panels file at the top" if "stack" in table else ""
+            hint = "; in a panels file it belongs at the top, not under [stack]" if "stack" in table else ""
             raise InputError(path, name, f"is missing{hint}")
     if not 2 <= len(table["x_m"] if isinstance(table["x_m"], list) else ()) <= PANELS_MOST:
         raise InputError(path, "x_m", f"must list 2 to {PANELS_MOST} panels")
@@ -41,7 +41,7 @@ def with_options(
     model: str | None = None,
     backend: str | None = None,
 ) -> Settings:
-    """Return the settings with command-line options applied. Raises InputError, naming the option.
+    """Return the settings with command-line options applied. Raises InputError that names the option.
 
     loop: restart the recording when it ends.
     """
@@ -61,7 +61,7 @@ def with_options(
 
 
 def changed(settings: Settings, section: str, values: dict[str, Any], *, source: str) -> Settings:
-    """Return the settings with values of one section replaced. Raises InputError, naming `source`."""
+    """Return the settings with values of one section replaced. Raises InputError that names `source`."""
     old: Section = getattr(settings, section)
     new = validated(type(old), old.model_dump() | values, source=source)
     return settings.model_copy(update={section: new})

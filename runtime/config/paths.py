@@ -1,6 +1,6 @@
-"""Types of settings that name a file. Paths are relative to the folder of the configuration file.
+"""Types for settings that name a file. A path is relative to the folder of the configuration file.
 
-Paths from code or the command line stay as they are.
+Paths from code or the command line are left unchanged.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from runtime.support.plugins import located
 
 
 def path_in(folder: Path | None, value: str, *, or_name: bool = False) -> str:
-    """Return the path resolved against the folder.
+    """Return a path resolved against the configuration's folder.
 
-    or_name: leave a bare word without a suffix, which is a name, as it is.
+    or_name: leave a bare word without a suffix unchanged, because it is a name.
     """
     if folder is None or Path(value).name in ("", ".."):
         return value
@@ -24,5 +24,5 @@ def path_in(folder: Path | None, value: str, *, or_name: bool = False) -> str:
 
 
 PathText = Annotated[str, AfterValidator(lambda value, info: path_in(info.context, value))]
-# `demo` is a name, `demo.glb` a path.
+# `demo` is a name; `demo.glb` is a path.
 NameOrPath = Annotated[str, AfterValidator(lambda value, info: path_in(info.context, value, or_name=True))]

@@ -1,6 +1,6 @@
-"""All settings, each with its type, range, default and meaning.
+"""All settings, each with its type, range, default and description.
 
-Ranges cover all displays that can be built, so a value in the wrong unit is refused with a suggestion.
+The ranges cover every display that can be built, so a value in the wrong unit is refused with a suggestion.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from runtime.support.plausible import nearest, within
 from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG
 from runtime.support.sections import Section
 
-MOST = 1e9  # limit for any number without a narrower range
-PIXEL_ASPECT_TOLERANCE = 0.03  # relative; data sheets round the active area
-LEAST_GAP_M = 1e-5  # smallest gap between panels; any real panel is thicker
+MOST = 1e9  # limit for numbers without a narrower range
+PIXEL_ASPECT_TOLERANCE = 0.03  # relative; data sheets give a rounded active area
+LEAST_GAP_M = 1e-5  # minimum distance between panels; any real panel is thicker
 PANELS_MOST = 8  # most panels in a stack
 
 NonNegative = Annotated[float, Field(ge=0, le=MOST)]
 Unit = Annotated[float, Field(ge=0, le=1)]
 Entry = Annotated[float, Field(ge=-MOST, le=MOST)]  # element of a matrix
-Slope = Annotated[float, Field(ge=-0.2, le=0.2)]  # slope of a panel that should be upright
+Slope = Annotated[float, Field(ge=-0.2, le=0.2)]  # slope of a panel that is meant to be upright
 Coordinate = Annotated[float, within(-EYE_MOST_M, EYE_MOST_M, "m")]  # coordinate of an eye
 Point = tuple[Coordinate, Coordinate, Coordinate]
 Offset = Annotated[float, within(-10.0, 10.0, "m")]  # displacement of a scene
@@ -31,37 +31,37 @@ Turn = Annotated[float, within(-360.0, 360.0, "degrees")]
 
 
 class StackGeometry(Section):
-    """Geometry of the stack, as in `--panels FILE` and in the configuration's `[stack]`."""
+    """Geometry of the stack, from `--panels FILE` or the `[stack]` table of a configuration."""
 
     width_m: Annotated[float, within(0.005, 20.0, "m")] = Field(
-        0.5184, description="active width of every panel, metres"
+        0.5184, description="width of every panel's active area in metres"
     )
     height_m: Annotated[float, within(0.005, 20.0, "m")] = Field(
-        0.2916, description="active height of every panel, metres"
+        0.2916, description="height of every panel's active area in metres"
     )
     x_m: Annotated[
         tuple[Annotated[float, within(-10.0, 10.0, "m")], ...], Field(min_length=2, max_length=PANELS_MOST)
-    ] = Field((-0.06, 0.0, 0.06), description="panel positions along +x, rear to front, metres")
-    width_px: Annotated[int, Field(ge=16, le=16384)] = Field(1920, description="columns of every panel")
-    height_px: Annotated[int, Field(ge=16, le=16384)] = Field(1080, description="rows of every panel")
+    ] = Field((-0.06, 0.0, 0.06), description="positions of the panels along +x in metres, from rear to front")
+    width_px: Annotated[int, Field(ge=16, le=16384)] = Field(1920, description="width of every panel in pixels")
+    height_px: Annotated[int, Field(ge=16, le=16384)] = Field(1080, description="height of every panel in pixels")
     pixel_aspect: Annotated[float, within(0.1, 10.0, "")] = Field(
-        1.0, description="width of a pixel divided by its height; must agree with the sizes above to 3%"
+        1.0, description="width of a pixel divided by its height; must match the sizes above to 3%"
     )
 
     tilt: Annotated[tuple[tuple[Slope, Slope], ...], Field(max_length=PANELS_MOST)] = Field(
         (),
-        description="slope of x for each panel, to the viewer's right and upwards; "
-        "written by `calibrate panels`; empty: parallel panels",
+        description="slope of x on each panel, to the viewer's right and upwards, "
+        "as measured by `calibrate panels`; empty: parallel panels",
     )
     registered_from_m: Point = Field(
         (0.5, 0.0, 0.0),
-        description="eye position, in frame `stack`, from which the registered panels look parallel",
+        description="eye position in the stack frame from which the registered panels look parallel",
     )
 
     @model_validator(mode="after")
     def _tilted(self) -> StackGeometry:
         if len(self.tilt) not in (0, len(self.x_m)):
-            raise ValueError(f"tilt: has {len(self.tilt)} entries, but x_m has {len(self.x_m)}")
+            raise ValueError(f"tilt: must have one entry per panel ({len(self.x_m)}), but has {len(self.tilt)}")
         if any(any(slopes) for slopes in self.tilt) and self.registered_from_m[0] <= self.x_m[-1]:
             raise ValueError("registered_from_m: must be in front of the front panel")
         return self
@@ -70,7 +70,7 @@ class StackGeometry(Section):
     def _ascending(self) -> StackGeometry:
         gaps = [b - a for a, b in zip(self.x_m, self.x_m[1:], strict=False)]
         if any(gap <= 0 for gap in gaps):
-            raise ValueError("x_m: must ascend from rear to front")
+            raise ValueError("x_m: must increase from rear to front")
         if min(gaps) < LEAST_GAP_M:
             raise ValueError(f"x_m: two panels are {min(gaps):g} m apart; the minimum is {LEAST_GAP_M:g} m")
         return self
@@ -81,8 +81,8 @@ class StackGeometry(Section):
         if abs(aspect / self.pixel_aspect - 1) > PIXEL_ASPECT_TOLERANCE:
             square_m = self.width_m / self.width_px * self.height_px / self.pixel_aspect
             raise ValueError(
-                f"stack.height_m: {self.width_m:g} x {self.height_m:g} m of {self.width_px} x {self.height_px} pixels "
-                f"have pixels {aspect:.3g} times as wide as high, not {self.pixel_aspect:g}: did you mean "
+                f"stack.height_m: {self.width_m:g} x {self.height_m:g} m by {self.width_px} x {self.height_px} pixels "
+                f"make pixels {aspect:.3g} times as wide as high, not {self.pixel_aspect:g}; did you mean "
                 f"height_m = {square_m:.4g}? (or set stack.pixel_aspect)"
             )
 
@@ -95,74 +95,75 @@ class StackGeometry(Section):
 
 
 class SensorSettings(Section):
-    """Sensor that delivers eye positions or images."""
+    """The sensor, which delivers eye positions or images."""
 
     driver: str = Field(
-        "replay", description="replay, openni2, realsense, usb-camera, fixed, or a class of yours: `module:Class`"
+        "replay", description="replay, openni2, realsense, usb-camera, fixed, or your own class as `module:Class`"
     )
-    source: str = Field("demo", description="a recording, `demo`, a serial number or a device URI")
+    source: str = Field("demo", description="what to open: a recording, `demo`, a serial number or a device URI")
     timeout_s: Annotated[float, within(0.001, 600.0, "s")] = Field(
-        0.5, description="the sensor counts as stalled after this long without a sample"
+        0.5, description="time without a sample after which the sensor counts as stalled"
     )
     loop: bool = Field(False, description="driver `replay`: restart the recording when it ends")
     openni2_folder: PathText = Field(
-        "", description="driver `openni2`: folder with libOpenNI2.so and OpenNI2/Drivers; empty: the system's"
+        "", description="driver `openni2`: folder with libOpenNI2.so and OpenNI2/Drivers; empty: search the system"
     )
     fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
-        0.0, description="horizontal field of view of a camera that does not report it (usb-camera); 0: unknown"
+        0.0, description="horizontal field of view of a camera that does not report it, such as a webcam; 0: unknown"
     )
     fixed_eyes_m: tuple[Point, Point] | None = Field(
-        None, description="driver `fixed`: left and right eye in the stack frame"
+        None, description="driver `fixed`: positions of the left and right eye in the stack frame"
     )
     options: dict[str, Any] = Field(
-        default_factory=dict, description="options of a driver of yours, validated by its `Options`"
+        default_factory=dict, description="options for your own driver, validated by its `Options` class"
     )
 
     @field_validator("source")
     @classmethod
     def _resolve_source(cls, source: str, info: ValidationInfo) -> str:
-        # Other drivers' sources are serial numbers and URIs, which may contain slashes.
+        # Other drivers take serial numbers and URIs, which may contain slashes.
         if info.data.get("driver") == "replay" or source.endswith((".oni", ".bag", ".db3")):
             return path_in(info.context, source, or_name=source == "demo")
         return source
 
 
 class TrackerSettings(Section):
-    """Tracker of the two eyes."""
+    """The tracker, which follows the two eyes."""
 
     hold_s: Annotated[float, within(0.0, 60.0, "s")] = Field(
-        0.5, description="keep the last eye positions this long after losing the viewer, then show the flat picture"
+        0.5,
+        description="time to keep the last eye positions after losing the viewer, before the flat picture",
     )
     noise_m: Annotated[float, within(1e-6, 0.2, "m")] = Field(
-        0.003, description="standard deviation of a measured eye per axis, for sensors that do not report it"
+        0.003, description="standard deviation per axis of a measured eye, for sensors that do not report it"
     )
 
 
 class CalibrationSettings(Section):
-    """Calibration from the sensor's frame to the stack's, and the viewing range."""
+    """Calibration from the sensor frame to the stack frame, and the viewing range."""
 
-    file: PathText = Field("", description="calibration TOML; empty: the demo recording's")
+    file: PathText = Field("", description="calibration file (TOML); empty: the demo recording's")
     ipd_m: Annotated[float, within(0.04, 0.08, "m", zero=True)] = Field(
-        0.0, description="the viewer's eye separation, for calibration charts and cameras without depth; 0: unknown"
+        0.0, description="viewer's eye separation, for calibration charts and cameras without depth; 0: unknown"
     )
     viewing_m: tuple[Annotated[float, within(0.05, 20.0, "m")], Annotated[float, within(0.05, 20.0, "m")]] = Field(
         (0.4, 0.6),
-        description="distance of the nearest and farthest viewer, for calibration charts and registration",
+        description="distances of the nearest and the farthest viewer, for calibration charts and registration",
     )
     viewing_side_deg: Annotated[float, Field(ge=2, le=40)] = Field(
-        10.0, description="largest angle to either side at which viewers stand, measured at the display's centre"
+        10.0, description="largest horizontal angle of a viewer to either side, measured at the display's centre"
     )
     viewing_up_deg: tuple[float, float] = Field(
-        (0.0, 20.0), description="lowest and highest elevation of the viewers' eyes"
+        (0.0, 20.0), description="lowest and highest elevation angle of the viewers' eyes"
     )
 
     @model_validator(mode="after")
     def _viewing(self) -> CalibrationSettings:
         if self.viewing_m[1] < self.viewing_m[0] * 1.1:
-            raise ValueError("viewing_m: must be the nearest, then the farthest distance, at least a tenth larger")
+            raise ValueError("viewing_m: must be the nearest and the farthest distance, which is at least 10% larger")
         low, high = self.viewing_up_deg
         if not (-40 <= low < high <= 40 and high - low >= 2):
-            raise ValueError("viewing_up_deg: must be lowest, then highest, from -40 to 40, at least 2 degrees apart")
+            raise ValueError("viewing_up_deg: must be the lowest and highest angle, from -40 to 40, at least 2 apart")
         return self
 
 
@@ -172,122 +173,122 @@ LAYOUT = (
 
 
 class ContentSettings(Section):
-    """The content to show, and its placement."""
+    """The content and its placement."""
 
     scene: NameOrPath = Field(
-        "demo", description="a built-in scene, a preset, a file, a folder, or a class of yours: `module:Class`"
+        "demo", description="a built-in scene, a preset, a file, a folder, or your own class as `module:Class`"
     )
     options: dict[str, Any] = Field(
-        default_factory=dict, description="options for a scene given as a class; the scene `program` takes `port`"
+        default_factory=dict, description="options for a scene that is a class; the scene `program` takes `port`"
     )
     fov_deg: Annotated[float, within(*FOV_RANGE_DEG, "degrees")] = Field(
-        40.0, description="horizontal field of view of the eye images"
+        40.0, description="horizontal field of view of the eyes' images"
     )
     background: tuple[Unit, Unit, Unit] | None = Field(
-        None, description="colour behind the scene, 0-1; unset: dark, or white for the built-in scenes"
+        None, description="RGB colour behind the scene, 0-1; unset: dark, or white for built-in scenes"
     )
-    file: PathText = Field("", description="data file or folder of a preset: its .ply or .glb file, or its data set")
+    file: PathText = Field("", description="data of a preset: a .ply file, a .glb file or the folder of a data set")
     layout: Annotated[str, Field(pattern=LAYOUT)] = Field(
         "auto",
-        description="arrangement of views in a picture or video: mono, side-by-side, top-bottom, cross-eyed (the "
-        "right eye's on the left), each with half- before it, anaglyph, rgbd, a quilt's qs8x6a0.75; auto: by file name",
+        description="arrangement of the views: mono, side-by-side, top-bottom, cross-eyed (right view on the left), "
+        "each but the first also with half- in front, anaglyph, rgbd, or a quilt (qs8x6a0.75); auto: by file name",
     )
     cone_deg: Annotated[float, Field(gt=0, lt=180)] = Field(40.0, description="angle between a quilt's outermost views")
     depth_m: tuple[Annotated[float, within(-10.0, 10.0, "m")], Annotated[float, within(-10.0, 10.0, "m")]] = Field(
         (-0.05, 0.05),
-        description="depth range (rear, front) of an RGBD picture; a mesh scaled by `fit` may take up to twice this",
+        description="depth range (rear, front) of an RGBD picture; a mesh scaled by `fit` may be up to twice as deep",
     )
     picture_rate_hz: Annotated[float, within(0.01, 1000.0, "Hz")] = Field(
         30.0, description="frame rate of a folder of pictures"
     )
-    fit: bool = Field(True, description="scale and centre a mesh or splat without a preset to fit the display")
+    fit: bool = Field(True, description="scale and centre a mesh or splat, unless from a preset, to fit the display")
     axes: Annotated[str, Field(pattern=r"^(auto|[+-][xyz] [+-][xyz])$")] = Field(
         "auto",
-        description="axes of a mesh or splat that point up and to the viewer, such as `+z -y`; "
-        "auto: glTF's convention, otherwise guessed from the extent",
+        description="axes of a mesh or splat that point up and towards the viewer, such as `+z -y`; "
+        "auto: glTF's convention, or guessed from the extent for other files",
     )
     library: PathText = Field("", description="folder of pictures, films, models and playlists offered on the page")
     scale: Annotated[float, within(0.001, 1000.0, "")] = Field(
-        1.0, description="scale factor of the scene, about the display's centre"
+        1.0, description="scale factor of the scene about the display's centre"
     )
     offset_m: tuple[Offset, Offset, Offset] = Field(
-        (0.0, 0.0, 0.0), description="displacement of the scene: out of the screen, to the right, up; metres"
+        (0.0, 0.0, 0.0), description="displacement of the scene in metres: out of the screen, to the right, up"
     )
     rotation_deg: tuple[Turn, Turn, Turn] = Field(
         (0.0, 0.0, 0.0),
-        description="rotation of the scene about the axes out of the screen, to the right and up, in this order",
+        description="rotations of the scene about the axes out of the screen, right and up, applied in this order",
     )
     turntable_per_min: Annotated[float, within(-600.0, 600.0, "turns a minute")] = Field(
         0.0,
-        description="rotation speed of the scene about the vertical, in turns per minute; negative values reverse it",
+        description="rotation speed about the vertical axis in turns per minute; negative: clockwise from above",
     )
 
     @model_validator(mode="after")
     def _ordered(self) -> ContentSettings:
         if self.depth_m[0] >= self.depth_m[1]:
-            raise ValueError("depth_m: must be rear, then front")
+            raise ValueError("depth_m: must be the rear and the front limit, in this order")
         if self.axes != "auto" and self.axes[1] == self.axes[4]:
-            raise ValueError("axes: must be two different ones")
+            raise ValueError("axes: must name two different axes")
         return self
 
 
 def _accept_legacy_backend(name: Any) -> Any:
-    """Return the backend's current name. Old scripts call the processor `opencv`."""
+    """Return the backend's current name. Old scripts use `opencv` for `cpu`."""
     return "cpu" if name == "opencv" else name
 
 
 class ModelSettings(Section):
-    """The model, and the device on which it runs."""
+    """The model and the device on which it runs."""
 
     name: NameOrPath = Field("balanced", description="fast, balanced, best, sart, or an ONNX file with our contract")
     effort: Literal["auto", "full"] = Field(
         "auto",
-        description="raster and steps of each solution: auto (adapted to the viewer's movement) or full "
-        "(always the configured raster and all of the model's steps)",
+        description="resolution and number of steps of each solution: auto (adapted to the viewer's movement) or full "
+        "(always the panels' resolution and all of the model's steps)",
     )
     provider: Literal["cpu", "cuda", "tensorrt", "openvino"] = Field(
-        "cpu", description="the network's execution provider"
+        "cpu", description="ONNX Runtime execution provider for the network"
     )
     backend: Annotated[Literal["auto", "cpu", "gl"], BeforeValidator(_accept_legacy_backend)] = Field(
         "auto",
-        description="device for everything except the network: the processor, or the GPU through OpenGL; "
-        "auto: the faster one, measured at the start",
+        description="device for everything except the network: cpu, gl (the GPU through OpenGL) "
+        "or auto (the faster of the two, measured at the start)",
     )
-    threads: Annotated[int, Field(ge=0, le=256)] = Field(2, description="inference threads; 0: all cores")
+    threads: Annotated[int, Field(ge=0, le=256)] = Field(2, description="number of inference threads; 0: one per core")
     eye_sigma_mm: Literal["auto"] | NonNegative = Field(
         "auto",
-        description="tracking error that solutions allow for: standard deviation of the eyes' common position, "
-        "in mm per axis; 0: eyes known exactly; auto: from the tracker",
+        description="tracking error that solutions allow for: standard deviation of both eyes' common position "
+        "in mm per axis; 0: none; auto: as the tracker reports",
     )
     budget_ms: NonNegative = Field(
         0.0,
-        description="time limit of a solution, drawing included, after which no further step begins; 0: no limit",
+        description="time, including drawing, after which a solution begins no further step; 0: no limit",
     )
 
 
 class PanelSettings(Section):
     """One physical panel: its monitor, mounting and grey curve."""
 
-    edid_serial: str = Field("", description="EDID serial number of the panel's monitor (first choice)")
-    connector: str = Field("", description="connector of the panel's monitor, such as HDMI-1 (second choice)")
-    rotation_deg: Literal[0, 90, 180, 270] = Field(0, description="rotation of the mounted panel, counter-clockwise")
+    edid_serial: str = Field("", description="EDID serial number of the panel's monitor")
+    connector: str = Field("", description="connector of the monitor, such as HDMI-1; if both are set, both must match")
+    rotation_deg: Literal[0, 90, 180, 270] = Field(0, description="counter-clockwise rotation of the panel as mounted")
     mirror: Literal["none", "horizontal", "vertical"] = Field("none", description="mirroring, applied before rotation")
     homography: tuple[tuple[Entry, Entry, Entry], tuple[Entry, Entry, Entry], tuple[Entry, Entry, Entry]] = Field(
         ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-        description="3x3 matrix from ideal to true panel pixels, from `calibrate panels`",
+        description="3x3 matrix from ideal to actual panel pixels, from `calibrate panels`",
     )
-    lut: PathText = Field("", description="CSV of phase (0-1) and grey (0-1) per channel; empty: identity")
-    gamma: Annotated[float, within(0.1, 10.0, "")] = Field(1.0, description="without a LUT: grey = phase^(1/gamma)")
+    lut: PathText = Field("", description="CSV file of phase (0-1) and grey (0-1) per channel; empty: use `gamma`")
+    gamma: Annotated[float, within(0.1, 10.0, "")] = Field(1.0, description="without a LUT, grey = phase^(1/gamma)")
 
 
 class OutputSettings(Section):
     """Output to the panels."""
 
     kind: Literal["offscreen", "windows"] = Field(
-        "offscreen", description="offscreen: no windows; windows: one fullscreen window per panel"
+        "offscreen", description="offscreen (no windows) or windows (one fullscreen window per panel)"
     )
     panels: tuple[PanelSettings, ...] = Field(
-        (), max_length=PANELS_MOST, description="one table per panel, rear to front"
+        (), max_length=PANELS_MOST, description="one table per panel, from rear to front"
     )
 
 
@@ -302,16 +303,16 @@ def _check_stages(cost_ms: dict[str, float]) -> dict[str, float]:
 
 
 class LoopSettings(Section):
-    """Pacing, and the simulated clock."""
+    """Pacing of the display loop, and the simulated clock."""
 
     rate_hz: Annotated[float, within(1.0, 1000.0, "Hz")] = Field(
-        60.0, description="refreshes per second, for a display that does not report its rate"
+        60.0, description="refreshes per second of a display that does not report its rate"
     )
     sensor_latency_ms: Annotated[float, within(0.0, 10_000.0, "ms")] = Field(
-        15.0, description="delay of a replayed sample from capture to arrival"
+        15.0, description="delay from capture to arrival of a replayed sample"
     )
     scanout_ms: Annotated[float, within(0.0, 1000.0, "ms")] = Field(
-        8.0, description="delay from the buffer swap to the middle of the panel's light"
+        8.0, description="delay from the buffer swap to the middle of the time when the panels show the frame"
     )
     simulated_stage_ms: Annotated[dict[str, NonNegative], AfterValidator(_check_stages)] = Field(
         default_factory=lambda: {
@@ -324,30 +325,30 @@ class LoopSettings(Section):
             "present": 2.0,
             "wait": 0.0,
         },
-        description="cost of each stage on the simulated clock of --max-speed",
+        description="duration of each stage on the simulated clock (--max-speed)",
     )
     evaluate_every: Annotated[int, Field(ge=0)] = Field(
         20,
-        description="with --out: measure quality every N refreshes (less often in real time); 0: at the last one",
+        description="with --out: measure quality every N refreshes (less often in real time); 0: only at the last one",
     )
 
 
 class PlanSettings(Section):
-    """Savings that are allowed."""
+    """Savings that the solver and the loop may use."""
 
     enabled: bool = Field(
         True,
-        description="skip work that the scene or a resting head makes unnecessary; false: do all work",
+        description="skip work that the scene or a resting head makes unnecessary",
     )
     align: bool = Field(True, description="shift and scale the panels' pictures at every refresh to follow the eyes")
 
 
 class ServiceSettings(Section):
-    """The daemon's socket and black box."""
+    """The socket and the black box of the daemon."""
 
-    socket: PathText = Field("/run/phasestack/status.sock", description="status and control socket")
+    socket: PathText = Field("/run/phasestack/status.sock", description="path of the status and control socket")
     blackbox_minutes: Annotated[float, within(0.0, 60.0, "min")] = Field(
-        2.0, description="minutes kept in memory by the black box; 0: off"
+        2.0, description="length of the black box's history in memory, in minutes; 0: off"
     )
 
 
@@ -370,5 +371,7 @@ class Settings(Section):
         self.stack.check_pixels()
         tables, panels = len(self.output.panels), len(self.stack.x_m)
         if tables not in (0, panels):
-            raise ValueError(f"output.panels: has {tables} tables, needs {panels}: one per panel, rear to front")
+            raise ValueError(
+                f"output.panels: must have {panels} tables, one per panel from rear to front, but has {tables}"
+            )
         return self

@@ -1,1 +1,1 @@
-"""The daemon: building, supervising and reconfiguring a run; its socket, signals and notifications."""
+"""The daemon, which builds, supervises and reconfigures a run and answers on a local socket."""

@@ -44,9 +44,9 @@ from runtime.support.untrusted_input import LIMITS
 
 log = logging.getLogger("phasestack.build")
 
-SWITCH_INTERVAL_S = 0.0005  # interval at which Python switches threads: the presenter must not wait long for the solver
+SWITCH_INTERVAL_S = 0.0005  # Python's thread switching interval, short so that the presenter never waits long
 
-# Figures of summary.json that a simulated clock takes from the configuration.
+# Figures in summary.json that are configured rather than measured on a simulated clock.
 SIMULATED_FIGURES = (
     "seconds", "fps", "solutions_per_s", "interval_ms", "photon_ms", "stage_ms", "overhead_ms", "skew_ms",
     "solution_age_ms", "efforts",
@@ -55,17 +55,17 @@ SIMULATED_FIGURES = (
 
 @dataclass(frozen=True, slots=True)
 class RunOptions:
-    """Options of a run that only the command line sets."""
+    """Options of a run that are set only on the command line."""
 
     max_speed: bool = False
     measure: bool = False
     scale: float = 1.0
     keep_light: int = 0
-    frames: int | None = None  # number of refreshes; None: until the end
-    out: Path | None = None  # folder for the run's files
-    browser: BrowserLink | None = None  # a page shows the panels, and may be the sensor
-    until: Callable[[], str] = str  # reason to stop, or empty
-    fixed: Effort | None = None  # effort of every solution with model.effort = "full"; None: all of the model's steps
+    frames: int | None = None  # stop after this many refreshes; None: run to the end
+    out: Path | None = None  # folder for the files of the run
+    browser: BrowserLink | None = None  # page that shows the panels and may be the sensor
+    until: Callable[[], str] = str  # returns a reason to stop, or ""
+    fixed: Effort | None = None  # effort with model.effort = "full"; None: all steps of the model
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,18 +79,18 @@ class Run:
 
     @property
     def parts(self) -> RunningSolver:
-        """The present solver."""
+        """Parts of the current solver."""
         assert self.maker.parts is not None
         return self.maker.parts
 
     def plan_items(self) -> list[dict[str, Any]]:
-        """Return the savings in use; a time or cost that was not measured is None."""
+        """Return the savings in use. A time or cost that was not measured is None."""
         solver = self.parts.solver
         known = replace(solver.measured, reuse=Saving(saves_ms=self.presenter.stats.reuse_saves_ms()))
         return [asdict(item) for item in solver.plan_items(known)]
 
     def summary(self) -> dict[str, Any]:
-        """Return summary.json (docs/contracts.md)."""
+        """Return the content of summary.json (docs/contracts.md)."""
         return {
             "clock": "simulated" if self.simulated else "real",
             "configured": list(SIMULATED_FIGURES) if self.simulated else [],  # not measured
@@ -103,7 +103,7 @@ class Run:
 
 
 def scaled_stack(settings: Settings, scale: float) -> PanelStack:
-    """Return the configured stack with `scale` times its pixels."""
+    """Return the configured stack with its width and height in pixels scaled by `scale`."""
     stack = settings.stack.stack()
     if scale == 1.0:
         return stack
@@ -113,20 +113,20 @@ def scaled_stack(settings: Settings, scale: float) -> PanelStack:
 
 
 class Host(Supervisor):
-    """Owner of a run, called while it starts. This base class does nothing."""
+    """Callbacks for the start of a run. This base class does nothing."""
 
-    recorder: Any = None  # an additional observer; its `watches` is called before the first refresh
+    recorder: Any = None  # additional observer, informed before the first refresh through `watches`
 
     def starting(self, doing: str) -> bool:
-        """Report that a long step of the start begins. Returns False to stop the start."""
+        """Called before each long step of the start. Returns False to cancel the start."""
         return True
 
     def wait_for_panel(self, why: str) -> bool:
-        """Wait for a missing panel. Returns True to try again."""
+        """Called when a panel is missing. Waits and returns True to try again."""
         return False
 
     def watches(self, run: Run) -> None:
-        """Receive the complete run before its first refresh."""
+        """Called with the complete run before its first refresh."""
 
 
 def build_run(
@@ -138,13 +138,13 @@ def build_run(
     output: Output | None = None,
     on_account: Callable[[RefreshAccount], None] | None = None,
 ) -> Run:
-    """Return a run that is ready for its first refresh; `cleanup` closes all its parts.
+    """Build a run that is ready for its first refresh. Closing `cleanup` closes all its parts.
 
     Raises FatalError, PanelLost, and Stopped on the host's request.
     """
     host = host or Host()
     if options.scale != 1.0 and settings.output.kind != "offscreen":
-        raise InputError("run", "--scale", "requires --headless, because real monitors cannot show a scaled stack")
+        raise InputError("run", "--scale", "requires --headless, because monitors cannot show a scaled stack")
     cv2.setNumThreads(settings.model.threads or -1)
     simulated, stage_ms = options.max_speed, settings.loop.simulated_stage_ms
     clock: Clock = SimulatedClock() if simulated else MonotonicClock()
@@ -230,11 +230,11 @@ def build_run(
     if host.recorder is not None:
         host.recorder.watches(presenter, in_stack_frame=in_stack_frame)
     if not simulated:
-        # Garbage collection over all of the libraries' objects would stop every Python thread for several refreshes.
+        # Exclude the libraries' objects from garbage collection, which would stop every thread for several refreshes.
         gc.collect()
         gc.freeze()
         cleanup.callback(gc.unfreeze)
-        cleanup.enter_context(niceness(PRESENTER_NICENESS))  # this thread's, set once all others have started
+        cleanup.enter_context(niceness(PRESENTER_NICENESS))  # for this thread only, after all others have started
     run = Run(presenter, observer, maker, simulated)
     host.watches(run)
     return run

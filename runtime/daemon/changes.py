@@ -1,4 +1,4 @@
-"""Changes by operators: the configuration, the choices that override it, and the change being loaded."""
+"""Changes made by operators: choices that override the configuration, and the change being loaded."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ NEEDS_RESTART = (
     "loop",
     "model.backend",
     "calibration.ipd_m",
-)  # read only at the start
+)  # used only at the start
 
 
 @dataclass(frozen=True, slots=True)
 class Choices:
-    """The configuration as last read, with the operator's choices, which override it."""
+    """The configuration as last read, and the operator's choices that override it."""
 
     configured: Settings
     chosen: dict[tuple[str, str], Any] = field(default_factory=dict)  # by section and key
@@ -46,20 +46,20 @@ class Choices:
         return settings
 
     def choosing(self, section: str, **values: Any) -> Choices:
-        """Return the choices with values of one section added."""
+        """Return the choices with these values of one section added."""
         return replace(self, chosen=self.chosen | {(section, key): value for key, value in values.items()})
 
     def another_scene(self, scene: str) -> Choices:
-        """Return the choices with another scene in its configured placement."""
+        """Return the choices with another scene, which starts in its configured placement."""
         kept = {setting: value for setting, value in self.chosen.items() if setting[1] not in PLACING}
         return replace(self, chosen=kept).choosing("content", scene=scene)
 
     def reloaded(self, read: Callable[[], Settings]) -> Choices:
-        """Return the new configuration, with the choices for which it has no new value. Raises InputError."""
+        """Return the new configuration with every choice whose setting it has not changed. Raises InputError."""
         settings, before = read(), self.configured
         frozen = [name for name in NEEDS_RESTART if attrgetter(name)(settings) != attrgetter(name)(before)]
         if frozen:
-            raise InputError("reload", ", ".join(frozen), "changing this requires a restart of the service")
+            raise InputError("reload", ", ".join(frozen), "cannot change while the service runs; restart it")
         same = {at: value for at, value in self.chosen.items() if _value(settings, at) == _value(before, at)}
         return Choices(settings, same)
 
@@ -70,15 +70,15 @@ def _value(settings: Settings, at: tuple[str, str]) -> Any:
 
 @dataclass(slots=True)
 class _Change:
-    """A change of settings, made for a command."""
+    """A change of settings that a command asks for."""
 
     command: Command
-    choose: Callable[[Choices], Choices]  # on the loading thread; raises InputError
+    choose: Callable[[Choices], Choices]  # runs on the loading thread; raises InputError
     reload_content: bool = False
-    choices: Choices | None = None  # set by the loading thread before its job is done
+    choices: Choices | None = None  # set by the loading thread before its job ends
 
     def settings(self, before: Choices) -> Settings:
-        """Apply the choice and return the new settings. Raises InputError."""
+        """Apply the operator's choice and return the new settings. Raises InputError."""
         self.choices = self.choose(before)
         return self.choices.settings()
 
@@ -86,27 +86,27 @@ class _Change:
 class Changes:
     """Changes to a run, loaded one at a time.
 
-    Only the presenter's thread uses this object. Other threads get copies of their inputs and return their outcome
-    through a queue: a job reads and loads settings (`Reconfiguration`), and the solver's thread moves the scene.
+    Only the presenter's thread uses this object. A job reads and loads settings (`Reconfiguration`) and the solver's
+    thread moves the scene. Both get copies of their inputs and return their outcome through a queue.
     """
 
     def __init__(self, presenter: Presenter) -> None:
         self._presenter = presenter
         self.choices = Choices(presenter.run_cell.state.settings)
-        self.refused = ""  # why the last change was refused; empty if it was accepted
+        self.refused = ""  # reason for refusing the last change; empty if it was accepted
         self._loading: tuple[_Change, Reconfiguration] | None = None
-        self._next: _Change | None = None  # starts once the current change has ended
+        self._next: _Change | None = None  # starts when the current change has ended
         self._outcomes: SimpleQueue[Callable[[], None]] = SimpleQueue()  # outcomes of work on the solver's thread
 
     @property
     def loading(self) -> Reconfiguration | None:
-        """Return the change that is being loaded."""
+        """Return the change being loaded, if any."""
         return None if self._loading is None else self._loading[1]
 
     def carry_on(self) -> None:
-        """Process the results of other threads, and start the next change. Called once per refresh."""
+        """Process results of other threads and start the next change. Called once per refresh."""
         finished = self._loading is not None and self._loading[1].finished
-        while not self._outcomes.empty():  # first, because they may belong to the scene that a change replaces
+        while not self._outcomes.empty():  # first, because they may concern the scene that a change replaces
             self._outcomes.get()()
         if self._loading is not None and finished:
             (change, loading), self._loading = self._loading, None
@@ -117,9 +117,10 @@ class Changes:
             self.attempt(change.command, partial(self._load, change))
 
     def begin(self, command: Command, choose: Callable[[Choices], Choices], *, reload_content: bool = False) -> None:
-        """Start a change. If another one is loading, that one is abandoned first.
+        """Start a change. A change that is still loading is abandoned first.
 
-        choose: computes the new choices, on the loading thread; reload_content: even if its settings are unchanged.
+        choose: computes the new choices on the loading thread.
+        reload_content: reload the content even if its settings have not changed.
         """
         change = _Change(command, choose, reload_content)
         if self._loading is None:
@@ -133,7 +134,7 @@ class Changes:
         self._next = change
 
     def place(self, command: Command) -> None:
-        """Move the scene: settings and content change together, on the solver's thread. Raises InputError."""
+        """Move the scene, on the solver's thread so that settings and content agree. Raises InputError."""
         values = command.value or status.placing_in(self.choices.configured)
         changed(self._presenter.run_cell.state.settings, "content", values, source="place")
 
@@ -154,20 +155,20 @@ class Changes:
 
         def skip(parts: Any) -> str:
             skipped = parts.run.state.content.skip(time_ns=self._presenter.clock.now_ns())
-            return "" if skipped else "there is no next entry: the scene is not a playlist, or shows its last entry"
+            return "" if skipped else "there is no next entry; the scene is not a playlist or shows its last entry"
 
         self._between_steps(command, skip)
 
     def attempt(self, command: Command, work: Callable[[], None]) -> None:
-        """Run `work`. If it raises, the command is refused and the run continues."""
+        """Run `work`. If it raises, refuse the command and let the run continue."""
         if problem := _problem_of(command, work):
             self.answer(command, problem)
 
     def answer(self, command: Command, problem: str) -> None:
-        """Report a change's outcome to its client, the log and the status. problem: why it was refused."""
+        """Report a change's outcome to client, log and status. problem: reason for a refusal, or ""."""
         self.refused = problem
         if problem:
-            log.error("change refused, nothing has changed: %s", problem)
+            log.error("change refused: %s", problem)
             command.refuse(problem)
         else:
             command.done(**status.holds(self._presenter))
@@ -180,7 +181,7 @@ class Changes:
         self._presenter.solver.do(loading.advance)
 
     def _finish(self, change: _Change, loading: Reconfiguration) -> None:
-        """Adopt the choices of a change that has taken effect, and answer its command."""
+        """Adopt the choices of a change that has taken effect and answer its command."""
         if not loading.problem and change.choices is not None:
             state = self._presenter.run_cell.state
             moved = moved_since(loading.settings.content, state.settings.content)  # while it was loading
@@ -191,9 +192,9 @@ class Changes:
     def _between_steps(
         self, command: Command, work: Callable[[Any], str], succeeded: Callable[[], None] = lambda: None
     ) -> None:
-        """Run `work` on the solver's thread between two solutions, then answer on this thread.
+        """Run `work` on the solver's thread between two solutions, then answer the command on this thread.
 
-        work: returns the reason for a refusal, or nothing; succeeded: runs on the presenter's thread.
+        work: returns the reason for a refusal, or an empty string. succeeded: runs on the presenter's thread.
         """
 
         def finish(problem: str) -> None:
@@ -211,12 +212,12 @@ class Changes:
 
 
 def _problem_of(command: Command, work: Callable[[], None]) -> str:
-    """Run `work`, and return the problem or an empty string. Unexpected errors are logged."""
+    """Run `work` and return its problem, or an empty string. Logs unexpected errors."""
     try:
         work()
     except PhasestackError as error:
         return str(error)
     except (Exception, SystemExit) as error:
         log.exception("%s", command.name)
-        return f"unexpected error ({type(error).__name__}): see the log"
+        return f"unexpected {type(error).__name__}; see the log"
     return ""

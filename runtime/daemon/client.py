@@ -1,4 +1,4 @@
-"""Client of the running daemon: finds its socket, sends one JSON line and reads the answer."""
+"""Client for the running daemon. Finds its socket, sends one JSON line and reads the answer."""
 
 from __future__ import annotations
 
@@ -15,47 +15,47 @@ from typing import Any
 
 from runtime.errors import TransientError
 
-# `ServiceSettings().socket`, without loading all settings.
+# Copy of `ServiceSettings().socket` that is available without loading the settings.
 DEFAULT_SOCKET = "/run/phasestack/status.sock"
 UNIT = "phasestack"
-REQUEST_MAX_BYTES = 65536  # limit for one request, which bounds the memory that a client can use
-REQUEST_S = 5.0  # time limit for a whole request to arrive, and for its answer to be read
+REQUEST_MAX_BYTES = 65536  # maximum length of a request, which bounds the memory that a client can occupy
+REQUEST_S = 5.0  # time limit for receiving a request, and for sending its answer
 LOOKED_UP_AGAIN_S = {"status": 0.2, "pictures": 0.3, "log": 0.5, "about": 2.0}
-LOOKED_UP_WITHIN_S = 3.0  # time limit for answers that need no work by the loop; after it, the page reports a hang
-LOADED_WITHIN_S = 60.0  # the daemon answers a command after this time even if its scene or model is still loading
-ANSWERED_WITHIN_S = LOADED_WITHIN_S + 10.0  # longest wait of a client for an answer
-HUNG_AFTER_S = 5.0  # the loop counts as hung after this long without a completed turn
+LOOKED_UP_WITHIN_S = 3.0  # time limit for answers that do not involve the loop; then the page reports a hang
+LOADED_WITHIN_S = 60.0  # after this time a command is answered even if its scene or model is still loading
+ANSWERED_WITHIN_S = LOADED_WITHIN_S + 10.0  # time limit for the client
+HUNG_AFTER_S = 5.0  # time without a completed turn after which the loop counts as hung
 
 
 def user_socket() -> Path | None:
-    """Return the socket of a daemon in a user's session; None outside a session."""
+    """Return the socket of a daemon started in a user's session, or None outside a session."""
     runtime_dir = os.environ.get("XDG_RUNTIME_DIR", "")
     return Path(runtime_dir) / "phasestack" / "status.sock" if runtime_dir else None
 
 
 def candidates(configured: str) -> tuple[Path, ...]:
-    """Return the sockets to try, in order: the configured one, then the user's own."""
+    """Return the sockets to try in this order: the configured one, then the one of the user's session."""
     own = user_socket()
     return (Path(configured),) if own is None else (Path(configured), own)
 
 
 def sockets(config: Path | None) -> tuple[Path, ...]:
-    """Return the sockets to try for a configuration file. Raises InputError, naming file and field."""
+    """Return the sockets to try for a configuration file. Raises InputError."""
     if config is None:
-        return candidates(DEFAULT_SOCKET)  # settings are not loaded, so that clients start quickly
+        return candidates(DEFAULT_SOCKET)  # avoids loading the settings, so that clients start quickly
     from runtime.config import load_settings
 
     return candidates(load_settings(config).service.socket)
 
 
 class NotRunning(TransientError):
-    """No daemon answers at the socket; the message gives the reason and a remedy."""
+    """No daemon answers. The message gives the reason and a remedy for each socket."""
 
-    hangs = False  # True if a daemon accepted the connection but did not answer in time
+    hangs = False  # True if a daemon accepted the connection but did not answer
 
 
 def ask(paths: Iterable[Path], request: dict[str, Any], *, timeout_s: float = 10.0) -> dict[str, Any]:
-    """Return the daemon's answer. Raises NotRunning if none answers at any path. timeout_s: per step."""
+    """Send a request and return the answer. Raises NotRunning. timeout_s: limit per socket operation."""
     problems, hangs = [], False
     for path in paths:
         try:
@@ -69,13 +69,13 @@ def ask(paths: Iterable[Path], request: dict[str, Any], *, timeout_s: float = 10
 
 
 def _exchanged(path: Path, request: dict[str, Any], timeout_s: float) -> dict[str, Any]:
-    """Send one line and read the answer."""
+    """Send one line and return the answer."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as channel:
         channel.settimeout(timeout_s)
         channel.connect(str(path))
         with contextlib.suppress(
             BrokenPipeError, ConnectionResetError
-        ):  # the request was refused; the answer gives the reason
+        ):  # a refused request; the answer gives the reason
             channel.sendall(json.dumps(request).encode() + b"\n")
         with channel.makefile("rb") as answers:
             line = answers.readline()
@@ -90,16 +90,16 @@ def _advice(error: Exception) -> str:
         case FileNotFoundError():
             return "no daemon"
         case PermissionError():
-            return "not permitted (join the group phasestack)"
+            return "permission denied (add this user to the group phasestack)"
         case ConnectionRefusedError():
-            return "the daemon has died, leaving its socket behind"
+            return "the daemon has died"
         case TimeoutError():
-            return "no answer in time (the daemon hangs)"
+            return "the daemon does not answer in time"
     return str(error) or type(error).__name__
 
 
 def unit_properties(*names: str) -> dict[str, str]:
-    """Return properties of the systemd unit; empty if it is not installed."""
+    """Return properties of the systemd unit, or nothing if the unit is not installed."""
     command = ["systemctl", "show", UNIT, f"--property=LoadState,{','.join(names)}"]
     try:
         shown = subprocess.run(command, capture_output=True, text=True, timeout=5.0).stdout
@@ -110,25 +110,25 @@ def unit_properties(*names: str) -> dict[str, str]:
 
 
 def unit_advice() -> str:
-    """Return the systemd unit's state with its last error and a remedy; empty without a unit."""
+    """Describe the systemd unit's state, last error and remedy; empty if the unit is not installed."""
     unit = unit_properties("ActiveState", "Result", "ExecMainStatus", "StatusText")
     if not unit:
         return ""
     why = f"{unit['Result']}, exit status {unit['ExecMainStatus']}: {unit['StatusText'] or 'no message'}"
     match unit["ActiveState"], unit["Result"]:
         case "failed", "start-limit-hit":
-            return f"{UNIT} failed too often: sudo systemctl reset-failed {UNIT}; sudo systemctl start {UNIT}"
+            return f"{UNIT} failed too often; run: sudo systemctl reset-failed {UNIT}; sudo systemctl start {UNIT}"
         case "failed", _:
-            return f"{UNIT} has failed ({why}); fix that, then: sudo systemctl restart {UNIT}"
+            return f"{UNIT} has failed ({why}); fix this, then run: sudo systemctl restart {UNIT}"
         case "inactive", _:
-            return f"{UNIT} is stopped: sudo systemctl start {UNIT}"
+            return f"{UNIT} is stopped; run: sudo systemctl start {UNIT}"
         case "activating" | "deactivating", _:
-            return f"{UNIT} is restarting; for the reason: journalctl -u {UNIT} -n 20"
-    return f"{UNIT} is {unit['ActiveState']}: does its configuration name another service.socket (--config)?"
+            return f"{UNIT} is restarting; see the log: journalctl -u {UNIT} -n 20"
+    return f"{UNIT} is {unit['ActiveState']}; if its configuration sets service.socket, pass that file with --config"
 
 
 class DaemonClient:
-    """The page's connection to the daemon. Answers are cached for all browsers. Thread-safe."""
+    """The page's connection to the daemon. Caches answers for all browsers. Thread-safe."""
 
     def __init__(self, sockets: tuple[Path, ...]) -> None:
         """sockets: paths to try."""
@@ -137,7 +137,7 @@ class DaemonClient:
         self._answers: dict[str, tuple[float, dict[str, Any]]] = {}
 
     def look_up(self, name: str) -> dict[str, Any]:
-        """Return the answer to `status`, `pictures`, `log` or `about`; without a daemon `ok` is False."""
+        """Return the answer to `status`, `pictures`, `log` or `about`. `ok` is False if no daemon answers."""
         with self._locks[name]:
             asked_s, answer = self._answers.get(name, (float("-inf"), {}))
             if time.monotonic() - asked_s < LOOKED_UP_AGAIN_S[name]:

@@ -1,4 +1,4 @@
-"""Operators' commands to the running daemon. They are checked before they reach the loop."""
+"""Operators' commands to the running daemon, which are checked before they reach the loop."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ from runtime.support.untrusted_input import shown
 
 Name = Literal["scene", "next", "place", "model", "pause", "resume", "flat", "reload", "blackbox"]
 NAMES: tuple[Name, ...] = get_args(Name)
-PLACING = ("scale", "offset_m", "rotation_deg", "turntable_per_min")  # of `place`: settings of [content]
+PLACING = ("scale", "offset_m", "rotation_deg", "turntable_per_min")  # settings in [content] that `place` changes
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """An operator's command, which the loop starts between two refreshes and answers exactly once.
+    """A command that the loop starts between two refreshes and answers exactly once.
 
-    It may be run only after `take` has returned True, so that a command whose client has given up is never run.
-    `flat` shows the 2D picture until `resume`; `pause` freezes the picture until `resume`.
+    Run it only after `take` has returned True, because its client may have given up.
     """
 
     name: Name
@@ -26,25 +25,25 @@ class Command:
     answer: Future[dict[str, Any]] = field(default_factory=Future)
 
     def take(self) -> bool:
-        """Claim the command for execution. Returns False if its client has given up; then it must not be run."""
+        """Claim the command for execution. Returns False if its client has given up."""
         return self.answer.set_running_or_notify_cancel()
 
     def done(self, **state: Any) -> None:
-        """Report success to the client, with the new state."""
+        """Report success to the client, together with the new state."""
         self.answer.set_result({"ok": True, **state})
 
     def refuse(self, why: str) -> None:
-        """Report a refusal to the client; the state is unchanged."""
+        """Report to the client that the command was refused and nothing has changed."""
         self.answer.set_result({"ok": False, "error": why or "refused"})
 
 
 def parse(request: Any) -> Command:
-    """Parse the command in a request from the socket. Raises ValueError with a one-line message."""
+    """Return the command in a request from the socket. Raises ValueError with a one-line message."""
     if not isinstance(request, dict):
         raise ValueError("a request must be one JSON object")
     name, value = request.get("command"), request.get("value")
     if name not in NAMES:
-        raise ValueError(f"command: unknown command; must be one of status, {', '.join(NAMES)}")
+        raise ValueError(f"command: must be one of status, {', '.join(NAMES)}")
     if name in ("scene", "model") and not (isinstance(value, str) and value):
         raise ValueError(f"value: {name} requires a name")
     if name == "place":

@@ -1,4 +1,4 @@
-"""The part that `demo` and `run` share: run the loop, show progress, write the files and the summary."""
+"""Shared part of `demo` and `run`: run the loop, show progress, and write the files and the summary."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from runtime.support import progress
 from runtime.support.background import wait_for_all
 from runtime.support.figures import lines_of
 
-JOBS_END_WITHIN_S = 0.5  # longest wait for jobs at the end
-USUAL_M, IPD_M = 0.6, 0.063  # a typical viewer, used if none was seen
+JOBS_END_WITHIN_S = 0.5  # time limit for background jobs at the end
+USUAL_M, IPD_M = 0.6, 0.063  # distance and eye separation of a typical viewer, used if none was seen
 
 
 def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> dict[str, Any]:
-    """Run to the end and return the summary."""
+    """Build a run, run it to its end and return its summary."""
     done = 0
 
     def advance(account: RefreshAccount) -> None:
@@ -39,9 +39,9 @@ def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> 
         on_account = advance if options.max_speed else None
         run = build_run(settings, options, cleanup, host, output=output, on_account=on_account)
         reason = run.presenter.run(frames=options.frames)
-        run.presenter.panels.close()  # turns the panels dark at once, because writing the run's files may take seconds
+        run.presenter.panels.close()  # darkens the panels before the files are written, which may take seconds
         for sample in run.presenter.samples.recorded_ahead():
-            run.observer.sampled(sample)  # true eyes at the last display times
+            run.observer.sampled(sample)  # adds the true eyes at the last display times
         if output is not None:
             output.run_is_over()
         run.observer.finish(lambda: host is not None and bool(host.stop_reason()))
@@ -57,30 +57,30 @@ def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> 
 
 
 def _unseen(layers: U8, account: RefreshAccount, run: Run, settings: Settings) -> str:
-    """Return a viewer page that shows the last refresh, for a run in which nothing was measured."""
+    """Return a viewer page with the last refresh, for a run in which nothing was measured."""
     stack, is_flat = run.presenter.stack, account.solved_for_m is None
     away_m = max(USUAL_M, stack.x_m[-1] + USUAL_M / 2)
     eyes_m = np.array([[away_m, -IPD_M / 2, 0.0], [away_m, IPD_M / 2, 0.0]])
     eyes_m = eyes_m if account.eyes_m is None else account.eyes_m
-    title = "Flat picture (no viewer was seen)" if is_flat else "Last refresh (not measured)"
+    title = "Flat picture, because no viewer was seen" if is_flat else "Last refresh, not measured"
     fov_deg = settings.content.fov_deg
     return viewer_html(layers, (), stack, eyes_m=eyes_m, fov_deg=fov_deg, text=[title], follows=not is_flat)
 
 
 def print_summary(summary: dict[str, Any], out: Path | None) -> None:
-    """Print a readable summary: measured figures first, then the figure to quote."""
+    """Print a readable summary, which ends with the figure to quote."""
     configured = summary["configured"]
     for line in lines_of({name: value for name, value in summary.items() if name not in (*configured, "configured")}):
         print(line)
     if configured:
-        print("configured for the simulated clock (not measured):")
+        print("configured for the simulated clock, not measured:")
         for line in lines_of({name: summary[name] for name in configured}):
             print(f"  {line}")
     if summary["live_db"] is not None:
-        print("live_db (light PSNR at the true eyes, against each refresh's target) is the figure to quote for motion")
+        print("quote live_db for motion: light PSNR at the true eyes, against the target of each refresh")
     if summary["light_db"] is not None:
-        print("light_db (pupils at the eyes used, 1 mm of tracking error) is the figure to quote for a head at rest")
+        print("quote light_db for a head at rest: light PSNR at the eyes used, for a tracking error of 1 mm")
     if not summary["inferences"]:
-        print("no solution was shown: no viewer was seen, or the run ended before the first solution (--frames)")
+        print("no solution was shown because no viewer was seen or the run ended too early (--frames)")
     if out is not None:
-        print(f"see {out}/contact-sheet.png; interactive: {out}/viewer.html")
+        print(f"see {out}/contact-sheet.png or, to look around, {out}/viewer.html")

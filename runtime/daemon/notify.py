@@ -1,4 +1,4 @@
-"""Notifications to systemd (sd_notify, watchdog). Without systemd, every call does nothing."""
+"""Notifications to systemd (sd_notify and watchdog). Without systemd, every call does nothing."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from runtime.clock import Clock
 from runtime.records import State
 
 NS_PER_US = 1000
-START_STEP_S = 60.0  # duration of the longest step of a start, on the slowest machine
-SETTLED_AFTER = 100  # presented refreshes: the first ones compile shaders, which takes seconds on a slow machine
+START_STEP_S = 60.0  # longest step of a start, on the slowest machine
+SETTLED_AFTER = 100  # presented refreshes; the first ones compile shaders, which may take seconds
 
 
 class Notifier:
-    """Sends the daemon's messages to systemd. Never blocks, never raises."""
+    """Sender of the daemon's messages to systemd. Its methods never block or raise."""
 
     def __init__(self, clock: Clock, environment: Mapping[str, str] = os.environ) -> None:
-        """environment: contains the watchdog's period (sd_watchdog_enabled)."""
+        """environment: variables that give the watchdog's period (see sd_watchdog_enabled)."""
         self._clock = clock
         self._channel: Any = None
-        if "NOTIFY_SOCKET" in os.environ:  # otherwise sdnotify would leave a socket open
+        if "NOTIFY_SOCKET" in os.environ:  # without it, sdnotify would leave a socket open
             import sdnotify
 
             self._channel = sdnotify.SystemdNotifier()
@@ -29,31 +29,31 @@ class Notifier:
             self._channel.socket.setblocking(False)
         self._watchdog_ns = watchdog_ns(environment)
         self._fed_ns = -self._watchdog_ns
-        self._settling = 0  # presented refreshes until the watchdog's normal period applies
+        self._settling = 0  # refreshes left until the normal watchdog period applies
         self._status = ""
         self._ready = False
 
     @property
     def supervised(self) -> bool:
-        """True under systemd, where a start waits for missing parts instead of failing."""
+        """True under systemd, where the start waits for missing panels instead of failing."""
         return self._channel is not None and self._channel.socket is not None
 
     def ready(self) -> None:
-        """Report that the first frame is shown, or that the daemon waits for panels. Later calls do nothing."""
+        """Report that the first frame is shown or that the daemon waits for panels. Later calls do nothing."""
         if not self._ready:
             self._ready = True
             self._send("READY=1")
             self.starting()
 
     def status(self, text: str) -> None:
-        """Set the status line of `systemctl status`. It is sent only when it changes."""
+        """Set the line that `systemctl status` shows. Sends it only if it has changed."""
         line = " ".join(text.split())
         if line != self._status:
             self._status = line
             self._send(f"STATUS={line}")
 
     def starting(self) -> None:
-        """Report progress of the start, which extends its timeout or the watchdog's."""
+        """Report a step of the start, which extends the timeout of the start or of the watchdog."""
         step_us = round(START_STEP_S * 1e6)
         if not self._ready:
             self._send(f"EXTEND_TIMEOUT_USEC={step_us}")
@@ -62,11 +62,11 @@ class Notifier:
             self._send(f"WATCHDOG_USEC={step_us}\nWATCHDOG=1")
 
     def refreshed(self, state: State, missing: tuple[str, ...], *, presented: bool) -> None:
-        """Feed the watchdog after a presented refresh, at most four times per period.
+        """Reset the watchdog after a refresh, at most four times per period.
 
-        The solver does not feed it: while it fails or restarts, the last solution stays on the panels, aligned to the
-        eyes. While a panel is missing, a completed refresh is enough. Before READY the start's own limit applies, and
-        for a hundred refreshes after it a longer period.
+        The solver has no part in this: while it fails or restarts, the last solution stays on the panels, aligned to
+        the eyes. A refresh counts even if a panel is missing. Before READY the timeout of the start applies, and for
+        the first hundred refreshes a longer watchdog period.
         """
         alive = presented or (state is State.DEGRADED and "panel" in missing)
         if not (alive and self._watchdog_ns):
@@ -81,17 +81,17 @@ class Notifier:
             self._send("WATCHDOG=1")
 
     def reloading(self) -> None:
-        """Report that the configuration is being read, until `reloaded`. Silent before the first READY."""
+        """Report that the configuration is being reloaded. Does nothing before the first READY."""
         if self._ready:
             self._send(f"RELOADING=1\nMONOTONIC_USEC={self._clock.now_ns() // NS_PER_US}")
 
     def reloaded(self) -> None:
-        """Report that the new configuration was accepted or refused."""
+        """Report that reloading has ended, with either outcome."""
         if self._ready:
             self._send("READY=1")
 
     def stopping(self, reason: str) -> None:
-        """Report that the daemon is stopping deliberately."""
+        """Report that the daemon is stopping on purpose."""
         self._send(f"STOPPING=1\nSTATUS=stopping: {' '.join(reason.split())}")
 
     def close(self) -> None:
@@ -106,6 +106,6 @@ class Notifier:
 
 
 def watchdog_ns(environment: Mapping[str, str]) -> int:
-    """Return the watchdog's period, or 0 if this process has no watchdog."""
+    """Return the watchdog's period in nanoseconds, or 0 if this process has no watchdog."""
     ours = int(environment.get("WATCHDOG_PID", os.getpid())) == os.getpid()
     return int(environment.get("WATCHDOG_USEC", "0")) * NS_PER_US if ours else 0

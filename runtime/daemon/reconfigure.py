@@ -1,4 +1,4 @@
-"""Changes of settings during a run: loaded in the background and adopted between two solutions."""
+"""Changes of settings during a run, loaded in the background and adopted between two solutions."""
 
 from __future__ import annotations
 
@@ -25,41 +25,40 @@ from runtime.support.memory import give_back
 from runtime.support.progress import listening
 from runtime.support.untrusted_input import LIMITS
 
-MODEL_S = 30.0  # to load a model and solve with it twice, at 1920x1080 on a slow PC
+MODEL_S = 30.0  # enough to load a model and solve twice at 1920x1080 on a slow PC
 Ready = tuple[Opener | None, Predictor | None]  # None: unchanged
 
 
 class Reconfiguration:
-    """A change of settings that takes effect, as a whole or not at all, once everything is loaded.
+    """A change of settings that takes effect once everything is loaded, as a whole or not at all.
 
-    A job loads; then `advance`, a task of the solver's thread, adopts the result. The presenter's thread polls
-    `finished`, then reads `problem`.
+    A background job loads the parts, then `advance` adopts them on the solver's thread. The presenter's thread polls
+    `finished` and then reads `problem`.
     """
 
     def __init__(
         self, read: Callable[[], Settings], old: Settings, stack: PanelStack, *, reload_content: bool = False
     ) -> None:
         """Start loading. read: returns the new settings; called by the job; may raise InputError.
-
-        reload_content: even if its settings are unchanged.
+        reload_content: reload the content even if its settings have not changed.
         """
         self._read, self._old, self._stack, self._reload_content = read, old, stack, reload_content
         self.settings = old
         self._calibration: Calibration
         self.abandoned = False
         self._begun_s = time.monotonic()
-        self.progress = ""  # the current stage of loading, for the status
-        self.problem = ""  # one line with the reason if the change was refused
-        self._adopter: RunningSolver | None = None  # the solver that will adopt the change
+        self.progress = ""  # stage of loading, for the status
+        self.problem = ""  # reason for a refusal, in one line
+        self._adopter: RunningSolver | None = None  # solver that will adopt the change
         self._finished = False
         self._job = BackgroundJob("reconfiguration", self._make_ready)
 
     def abandon(self) -> None:
-        """Cancel the change and discard its results."""
+        """Cancel the change and discard what was loaded."""
         self.abandoned = True
 
     def advance(self, parts: Any) -> bool:
-        """Adopt the loaded parts, on the solver's thread. Returns True once adopted, refused or abandoned."""
+        """Adopt the loaded parts on the solver's thread. Returns True once the change has any outcome."""
         assert isinstance(parts, RunningSolver)
         if not self._job.done:
             return False
@@ -73,20 +72,20 @@ class Reconfiguration:
             else:
                 self._adopter = parts
                 self._take_over(parts, opener, predictor)
-        BackgroundJob("memory", give_back)  # the replaced parts may be large
+        BackgroundJob("memory", give_back)  # return the memory of the replaced parts, which may be large
         self._finished = True
         return True
 
     @property
     def finished(self) -> bool:
-        """Return True once the change is adopted or refused, or if its solver or its abandoned job hangs."""
+        """Return True once the change is adopted or refused, or if the thread that it waits for hangs."""
         if not self._finished and self._adopter is not None and not self._adopter.is_newest:
             self.problem, self._finished = LEFT_BEHIND, True
         is_stuck = self.abandoned and time.monotonic() - self._begun_s > LIMITS.load_s
         return self._finished or is_stuck
 
     def _make_ready(self) -> Ready:
-        """Load everything that takes a long time, on the job's thread."""
+        """Load everything that takes long, on the job's thread."""
         opener = predictor = None
         self.settings = settings = self._read()
         file = settings.calibration.file
@@ -108,14 +107,14 @@ class Reconfiguration:
 
     def _listen(self, what: str, done: int, total: int | None) -> None:
         if self.abandoned:
-            raise Stopped("superseded by a newer change")
+            raise Stopped("replaced by a newer change")
         if what:
             self.progress = f"{what}: {done} of {total}" if total else f"{what}: {done}" if done else what
 
     def _take_over(self, parts: RunningSolver, opener: Opener | None, predictor: Predictor | None) -> None:
-        """Replace the state and close the replaced parts. If the upload fails, keep everything."""
+        """Replace the run's state and close the old parts. If the upload fails, keep the old state."""
         now, moved = parts.run.state.settings.content, {}
-        if now.scene == self.settings.content.scene:  # another scene is placed as configured
+        if now.scene == self.settings.content.scene:  # another scene starts in its configured placement
             moved = moved_since(self._old.content, now)
         placed = self.settings.content.model_copy(update=moved)
         settings = self.settings.model_copy(update={"content": placed})
@@ -136,7 +135,7 @@ class Reconfiguration:
             except PhasestackError as error:
                 self.problem = str(error)
                 return
-            except (Exception, SystemExit) as error:  # from a GL driver or a library: keep the current scene
+            except (Exception, SystemExit) as error:  # raised by a GL driver or a library; keep the current scene
                 self.problem = f"{self.settings.content.scene}: {written(error)}"
                 return
             undo.pop_all()
@@ -147,15 +146,15 @@ class Reconfiguration:
 
 
 def _tried(settings: Settings) -> None:
-    """Load an untrusted model and solve with it in a child process, so that it cannot crash the daemon."""
+    """Load an untrusted model and solve with it in a child process, where a crash cannot harm the daemon."""
     ready_predictor(settings, settings.stack.stack()).close()
 
 
 def moved_since(before: ContentSettings, now: ContentSettings) -> dict[str, Any]:
-    """Return the settings of the scene's placement that have changed, with their new values."""
+    """Return the placement settings that have changed, with their new values."""
     return {key: getattr(now, key) for key in PLACING if getattr(now, key) != getattr(before, key)}
 
 
 def _model_part(settings: Settings) -> Any:
-    """Return the model settings that require a new predictor if they change."""
+    """Return the model settings whose change requires a new predictor."""
     return settings.model.model_copy(update={"budget_ms": 0.0, "eye_sigma_mm": "auto"})

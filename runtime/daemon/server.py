@@ -1,7 +1,7 @@
-"""Status and control socket: JSON lines over a local socket, served on its own thread.
+"""Status and control socket, which exchanges JSON lines and runs on a separate thread.
 
-Slow, hanging or numerous clients cannot block it. Requests and answers have time limits, and clients share one
-thread. When all connections are in use, a new client replaces the one whose request has been incomplete longest.
+Slow, hanging or numerous clients cannot block it, because requests and answers have time limits. If all connections
+are in use, a new client replaces the client whose request has been incomplete longest.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ from runtime.support.background import BACKGROUND_NICENESS, begin, patience_s, s
 log = logging.getLogger("phasestack.service")
 
 CLIENTS_MAX = 64  # simultaneous connections
-LOOP_ANSWERS_WITHIN_S = 5.0  # a command that the loop has not started by then is refused
+LOOP_ANSWERS_WITHIN_S = 5.0  # time limit for the loop to start a command
 LOOKED_AGAIN_S = 0.1  # interval between checks that the client is still connected
 
 
 class Refusal(Exception):
-    """A client is disconnected; the message is the reason."""
+    """Reason for disconnecting a client."""
 
 
 class StatusServer:
-    """Answers `status` from the last published snapshot, and queues commands for the loop.
+    """Server that answers `status` from the last published snapshot and queues commands for the loop.
 
-    The presenter's loop calls `publish` and takes `commands`, and never waits for a client. `status` also answers when
+    The presenter's loop calls `publish`, takes `commands` and never waits for a client. `status` is answered even if
     the loop hangs, and gives the age of its last turn.
     """
 
@@ -51,9 +51,7 @@ class StatusServer:
         """Start serving. Raises SocketInUse, InputError, TransientError."""
         self.path = path
         self.commands: queue.SimpleQueue[Command] = queue.SimpleQueue()
-        self.lookups: dict[
-            str, Callable[[], dict[str, Any]]
-        ] = {}  # functions that answer a request on the server's thread
+        self.lookups: dict[str, Callable[[], dict[str, Any]]] = {}  # called on the server's thread
         self._clock = clock
         self._started_ns = clock.now_ns()
         self._snapshot: tuple[int, Callable[[], dict[str, Any]]] = (self._started_ns, dict)
@@ -68,30 +66,30 @@ class StatusServer:
         self._thread: threading.Thread | None = begin("status", self._run)
 
     def publish(self, snapshot: Callable[[], dict[str, Any]]) -> None:
-        """Replace the function that creates the status, once per turn of the loop.
+        """Set the function that creates the status. Called once per turn of the loop.
 
-        It is called on the server's thread when a client asks, so a turn without clients costs nothing. It may read
-        only values that no longer change.
+        The function runs on the server's thread when a client asks, so turns without clients cost nothing. It may only
+        read values that no longer change.
         """
         self._snapshot = (self._clock.now_ns(), snapshot)
 
     def close(self) -> None:
-        """Answer pending requests, stop, and remove the socket. May be called twice."""
+        """Answer pending requests, stop and remove the socket. May be called twice."""
         thread, self._thread = self._thread, None
         if thread is None:
             return
         self._loop.call_soon_threadsafe(self._loop.stop)
         thread.join(patience_s(2.0))
         with contextlib.suppress(OSError):
-            if self.path.lstat().st_ino == self._own:  # otherwise it is another daemon's
+            if self.path.lstat().st_ino == self._own:  # else it belongs to another daemon
                 self.path.unlink()
 
     def answer(self, line: bytes) -> dict[str, Any] | Command:
-        """Return the answer to a request, or a command for the loop."""
+        """Return the answer to a request, or the command for the loop."""
         try:
             request = json.loads(line)
         except (ValueError, RecursionError):
-            return {"ok": False, "error": "a request is one JSON object on one line"}
+            return {"ok": False, "error": "a request must be one JSON object on one line"}
         name = request.get("command") if isinstance(request, dict) else None
         if name == "status":
             return self._status()
@@ -113,7 +111,7 @@ class StatusServer:
             **snapshot(),
         }
 
-    # On the server's thread.
+    # The methods below run on the server's thread.
 
     def _run(self) -> None:
         set_niceness(BACKGROUND_NICENESS)
@@ -123,11 +121,11 @@ class StatusServer:
 
     async def _end(self) -> None:
         self._server.close()
-        for _ in range(16):  # let clients that have just connected send their requests, so that they are answered, too
+        for _ in range(16):  # so that clients that have just connected are answered, too
             await asyncio.sleep(0)
         clients = asyncio.all_tasks() - {asyncio.current_task()}
         for client in clients:
-            client.cancel("the daemon stops")
+            client.cancel("the daemon is stopping")
         await asyncio.gather(*clients, return_exceptions=True)
         await asyncio.sleep(0)  # closes their connections
 
@@ -135,7 +133,7 @@ class StatusServer:
         """Answer a client's requests until it disconnects."""
         task = asyncio.current_task()
         assert task is not None
-        writer.transport.set_write_buffer_limits(high=0)  # `drain` waits until the whole answer has been sent
+        writer.transport.set_write_buffer_limits(high=0)  # makes `drain` wait until the whole answer is sent
         try:
             self._make_room()
             self._clients.add(task)
@@ -145,7 +143,7 @@ class StatusServer:
                     await writer.drain()
         except (Refusal, asyncio.CancelledError) as why:
             writer.write(_line({"ok": False, "error": why.args[0]}))
-        except (OSError, TimeoutError):  # disconnected, or not reading
+        except (OSError, TimeoutError):  # the client has disconnected or does not read
             writer.transport.abort()
         finally:
             self._clients.discard(task)
@@ -154,17 +152,17 @@ class StatusServer:
             writer.close()
 
     def _make_room(self) -> None:
-        """Disconnect the client that has waited longest for a request. Raises Refusal if none waits."""
+        """Disconnect the client whose request has been incomplete longest. Raises Refusal if there is none."""
         if len(self._clients) >= CLIENTS_MAX:
             longest = next(iter(self._reading), None)
             if longest is None:
                 raise Refusal("too many clients")
             self._reading.pop(longest)
-            self._clients.discard(longest)  # at once, because more clients may connect before the task ends
+            self._clients.discard(longest)  # before its task ends, because more clients may connect
             longest.cancel("too many clients")
 
     async def _request(self, reader: StreamReader, task: asyncio.Task[None]) -> bytes:
-        """Return the next request with its newline, or a partial one at the end of input. Raises Refusal."""
+        """Return the next request with its newline, or the incomplete rest of the input. Raises Refusal."""
         self._reading[task] = None
         try:
             async with asyncio.timeout(REQUEST_S):
@@ -183,10 +181,10 @@ class StatusServer:
             answer = self.answer(line)
         except Exception:
             log.exception("request failed")
-            answer = {"ok": False, "error": "the request failed: see the log"}
+            answer = {"ok": False, "error": "the request failed; see the log"}
         if isinstance(answer, Command):
             if _is_gone(writer):
-                raise Refusal("nothing was done")
+                raise Refusal("the command was not run")
             log.info("command: %s", answer.name if answer.value is None else f"{answer.name} {answer.value}")
             self.commands.put(answer)
             answer = await _outcome(answer, writer)
@@ -194,7 +192,7 @@ class StatusServer:
 
 
 def _log_error(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Log an error such as a lack of descriptors, after which asyncio retries in a second."""
+    """Log an error such as a lack of file descriptors, after which asyncio retries."""
     log.warning("status: %s", one_line(f"{context.get('message')} ({context.get('exception')})"))
 
 
@@ -203,7 +201,7 @@ def _line(answer: dict[str, Any]) -> bytes:
 
 
 def _is_gone(writer: StreamWriter) -> bool:
-    """Return True if a client has disconnected, not merely stopped sending."""
+    """Return True if a client has disconnected, rather than only stopped sending."""
     if writer.is_closing():
         return True
     hung_up = select.poll()
@@ -212,7 +210,7 @@ def _is_gone(writer: StreamWriter) -> bool:
 
 
 async def _outcome(command: Command, writer: StreamWriter) -> dict[str, Any]:
-    """Wait for a command's outcome; cancel it if it does not begin in time, or the client is gone."""
+    """Wait for the outcome of a command. Cancel it if the loop does not start it in time or the client is gone."""
     answer = asyncio.wrap_future(command.answer)
     until_s = time.monotonic() + LOOP_ANSWERS_WITHIN_S
     try:
@@ -220,21 +218,21 @@ async def _outcome(command: Command, writer: StreamWriter) -> dict[str, Any]:
         while not done and time.monotonic() < until_s and not _is_gone(writer):
             done, _ = await asyncio.wait({answer}, timeout=min(LOOKED_AGAIN_S, LOOP_ANSWERS_WITHIN_S))
         if not done and command.answer.cancel():
-            problem = f"no answer from the display loop within {LOOP_ANSWERS_WITHIN_S:g} s: nothing was done"
+            problem = f"the display loop did not answer within {LOOP_ANSWERS_WITHIN_S:g} s; the command was not run"
             return {"ok": False, "error": problem}
         done, _ = await asyncio.wait({answer}, timeout=LOADED_WITHIN_S)
     except asyncio.CancelledError as stops:
-        raise Refusal(stops.args[0] + (": nothing was done" if command.answer.cancel() else "")) from None
+        raise Refusal(stops.args[0] + ("; the command was not run" if command.answer.cancel() else "")) from None
     if done:
         return answer.result()
-    return {"ok": True, "note": f"still loading after {LOADED_WITHIN_S:g} s: see `phasestack status`"}
+    return {"ok": True, "note": f"still loading after {LOADED_WITHIN_S:g} s; see `phasestack status`"}
 
 
 def open_status_server(settings: ServiceSettings, *, clock: Clock, supervised: bool) -> StatusServer | None:
-    """Open the configured socket; in a user's session without permission, the user's own.
+    """Open the configured socket or, if only the user's session folder is writable, the one there.
 
-    Under a supervisor, raises SocketInUse if another phasestack owns it, InputError if it cannot be created. A run by
-    hand logs a warning and continues without one.
+    If the socket cannot be opened, a run by hand logs a warning and continues without one. A supervised run raises
+    SocketInUse if another phasestack owns it, or InputError.
     """
     path = Path(settings.socket)
     own = user_socket()
@@ -245,7 +243,7 @@ def open_status_server(settings: ServiceSettings, *, clock: Clock, supervised: b
     except (InputError, SocketInUse) as error:
         if supervised:
             raise
-        log.warning("no status socket: %s", error)
+        log.warning("running without a status socket: %s", error)
         return None
 
 

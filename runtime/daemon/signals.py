@@ -12,9 +12,9 @@ from runtime.support.background import STOPS_WITHIN_S, ends_by
 
 
 class Signals:
-    """Flags of SIGTERM and SIGINT (stop) and SIGHUP (reload). A second SIGINT raises KeyboardInterrupt.
+    """Flags set by SIGTERM, SIGINT (stop) and SIGHUP (reload). A second SIGINT raises KeyboardInterrupt.
 
-    A context manager on the main thread, which restores the previous handlers.
+    Context manager for the main thread. Restores the previous handlers on exit.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""The status socket's file, of mode 0660. One daemon owns it; a crashed daemon's file is replaced."""
+"""The status socket's file (mode 0660). One daemon owns it. A crashed daemon's file is replaced."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from runtime.errors import InputError, TransientError
 log = logging.getLogger("phasestack.service")
 
 GROUP = "phasestack"  # members may use the socket
-BACKLOG = 64  # connections waiting to be accepted
-LOCKED_WITHIN_S = 2.0  # longest wait for the folder's lock, which is held only briefly
+BACKLOG = 64  # maximum number of connections not yet accepted
+LOCKED_WITHIN_S = 2.0  # time limit for the folder's lock, which is held only briefly
 
 
 class SocketInUse(TransientError):
-    """Another phasestack owns the socket; the text names it."""
+    """Another phasestack owns the socket. The message names that process."""
 
 
 def listening_socket(path: Path) -> socket.socket:
-    """Return a new listening socket. Raises SocketInUse, InputError if it cannot be created."""
+    """Create a listening socket. Raises SocketInUse, or InputError if it cannot be created."""
     made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with _locked(path.parent):
             _remove_dead(path)
-            # umask instead of chmod, so that the mode is right from the first moment.
+            # umask rather than chmod, so that the file never has another mode.
             mask = os.umask(0o117)
             try:
                 made.bind(str(path))
@@ -49,20 +49,20 @@ def listening_socket(path: Path) -> socket.socket:
         raise
     try:
         group = grp.getgrnam(GROUP).gr_gid
-        if path.lstat().st_gid != group:  # a service's sandbox may refuse even a chown without effect
+        if path.lstat().st_gid != group:  # a sandbox may refuse even a chown that changes nothing
             os.chown(path, -1, group)
     except (KeyError, PermissionError):
-        log.info("only this user can use the status socket: no group %s, or not a member", GROUP)
+        log.info("only this user can use the status socket; the group %s does not exist or lacks this user", GROUP)
     return made
 
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Lock a folder, so that only one daemon at a time replaces a dead socket."""
+    """Lock a folder so that only one daemon at a time replaces a dead socket."""
     opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         until_s = time.monotonic() + LOCKED_WITHIN_S
-        while time.monotonic() < until_s:  # give up in the end: another program may never release it
+        while time.monotonic() < until_s:  # not forever, because another program may never release it
             with contextlib.suppress(BlockingIOError):
                 fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
@@ -73,7 +73,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _remove_dead(path: Path) -> None:
-    """Remove a dead daemon's socket. Raises InputError if it is something else, SocketInUse if a daemon listens."""
+    """Remove the socket of a dead daemon. Raises SocketInUse if a daemon listens, InputError if it is no socket."""
     if not os.path.lexists(path):
         return
     if not stat.S_ISSOCK(path.lstat().st_mode):
@@ -87,7 +87,7 @@ def _remove_dead(path: Path) -> None:
             path.unlink()
             return
         except BlockingIOError:
-            pass  # its backlog is full
+            pass  # its backlog is full, so a daemon listens
         else:
             pid, _, _ = struct.unpack("3i", probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
             owner = f" (pid {pid})"

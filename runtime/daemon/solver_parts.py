@@ -29,27 +29,27 @@ log = logging.getLogger("phasestack.solver")
 
 @dataclass(eq=False)
 class RunningSolver:
-    """`SolverParts` of a real run, created and used on a single thread."""
+    """`SolverParts` of a real run. Created and used on one thread."""
 
     run: RunCell
     solver: Solver
-    backend: Choice  # the device, which every model uses
-    context: Any  # current on this thread
-    owns_context: bool  # True if the context is released with the rest
+    backend: Choice  # device that all models use
+    context: Any  # GL context, current on this thread
+    owns_context: bool  # release the context with the other parts
     contexts_lost: Callable[[], int]
     generation: int
-    _owned: RunState = field(init=False)  # this solver closes its content and model
+    _owned: RunState = field(init=False)  # state whose content and model this solver closes
 
     def __post_init__(self) -> None:
         self._owned, self._lost_before = self.run.state, self.contexts_lost()
 
     @property
     def is_newest(self) -> bool:
-        """Return False once another solver has begun, after which this one must not change anything."""
+        """True until another solver begins. From then on, this one must not change anything."""
         return self.run.generation == self.generation
 
     def replace(self, **changes: Any) -> RunState:
-        """Call `RunCell.replace` for this solver. Raises Stopped if another solver has begun."""
+        """Replace parts of the run's state (`RunCell.replace`). Raises Stopped if another solver has begun."""
         before = self.run.replace(self.generation, **changes)
         self._owned = replace(before, **changes)
         return before
@@ -79,7 +79,7 @@ class RunningSolver:
         """Return the state to draw with. Raises ContextLost, Stopped if this solver must not be used any more."""
         if self.contexts_lost() != self._lost_before:
             raise ContextLost("the panels have lost their OpenGL context")
-        state = self.run.state  # read before checking whether it belongs to another solver
+        state = self.run.state  # read first, then check whether another solver has begun
         if not self.is_newest:
             raise Stopped("this solver was abandoned")
         self._owned = state
@@ -97,15 +97,12 @@ class RunningSolver:
         for release in (state.content.close, state.predictor.close, self.backend.backend.close, *own):
             try:
                 release()
-            except Exception as error:  # in a lost context there is nothing to release
+            except Exception as error:  # for example because the context is lost
                 log.warning("closing the solver: %s", error)
 
 
 class SolverMaker:
-    """Creates a solver on the calling thread.
-
-    After a hang it creates another one with the current settings.
-    """
+    """Factory for solvers, called on the solver's thread and again after a hang."""
 
     def __init__(
         self,
@@ -115,16 +112,19 @@ class SolverMaker:
         *,
         contexts_lost: Callable[[], int] = lambda: 0,
     ) -> None:
-        """contexts_lost: returns how many GL contexts the panels have lost; called on any thread."""
+        """contexts_lost: returns the number of GL contexts that the panels have lost. May be called on any thread."""
         self._settings, self._stack, self._calibration = settings, stack, calibration
-        self.run: RunCell | None = None  # set by the first solver
-        self.parts: RunningSolver | None = None  # the newest
+        self.run: RunCell | None = None  # set when the first solver is made
+        self.parts: RunningSolver | None = None  # of the newest solver
         self._device: Wanted = settings.model.backend
         self._contexts_lost = contexts_lost
-        self._prepared: tuple[ContentSettings, Opener] | None = None  # content that has been read but not opened
+        self._prepared: tuple[ContentSettings, Opener] | None = None  # content that was read but not opened
 
     def __call__(self, *, context: Any = None, simulated: bool = False) -> RunningSolver:
-        """context: shared with the panels, or None for a new one. Raises FatalError, leaving nothing open."""
+        """Create a solver with the current settings. Raises FatalError and leaves nothing open.
+
+        context: the context to share with the panels; None creates a new one.
+        """
         own = context is None
         generation = self.run.begin() if self.run is not None else 0
         settings = self.run.state.settings if self.run is not None else self._settings
@@ -160,16 +160,16 @@ class SolverMaker:
         return parts
 
     def _opener(self, content: ContentSettings) -> Opener:
-        """Read the content, or reuse the previous solver's if that solver never opened it."""
+        """Read the content, or reuse what the previous solver read but never opened."""
         prepared = self._prepared
         if prepared is None or prepared[0] != content:
             prepared = self._prepared = content, prepare_content(content, self._stack)
         return prepared[1]
 
     def _chosen(self, predictor: Predictor, context: Any, *, simulated: bool) -> Choice:
-        """Choose the device. A restarted solver keeps the first choice.
+        """Choose the device. A restarted solver keeps the choice of the first one.
 
-        On a simulated clock a faster device gains nothing, and runs must be identical to the byte.
+        On a simulated clock the choice is fixed, because runs must be identical to the byte.
         """
         device = "cpu" if simulated and self._device == "auto" else self._device
         choice = choose(device, predictor, lambda: context)
@@ -178,7 +178,7 @@ class SolverMaker:
 
 
 def ready_predictor(settings: Settings, stack: PanelStack) -> Predictor:
-    """Return the configured model, warmed up. Raises InputError, MissingPart."""
+    """Load and warm up the configured model. Raises InputError, MissingPart."""
     predictor = load_predictor(settings.model.name, stack, settings.model)
     try:
         predictor.warm_up(np.array(EYES_M))

@@ -1,4 +1,4 @@
-"""Answers of the socket about a run: its status, constant facts and pictures."""
+"""Answers of the socket about a run: its status, its constant facts and its pictures."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def placing_in(settings: Settings) -> dict[str, Any]:
 
 
 def holds(presenter: Presenter) -> dict[str, Any]:
-    """Return the operator's current choices, which answer every command."""
+    """Return the operator's current choices, which are part of every answer to a command."""
     state = presenter.run_cell.state
     return {
         "scene": state.settings.content.scene,
@@ -51,7 +51,7 @@ def holds(presenter: Presenter) -> dict[str, Any]:
 
 
 def shown(presenter: Presenter, account: RefreshAccount, link: BrowserLink) -> dict[str, Any]:
-    """Return the figures of a refresh, for a page that shows the panels."""
+    """Return the figures of one refresh for a page that shows the panels."""
     assert presenter.last is not None
     frame, solution = presenter.last.frame, presenter.last.solution
     return {
@@ -92,7 +92,7 @@ def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
         "eyes_label": account.eyes_label,
         "eye_sigma_now_mm": account.eye_sigma_mm,
         "solution": account.solution,
-        # A solution for an instant after this display time has no age yet.
+        # A solution for a later time than this display time has no age yet.
         "solution_age_now_ms": None if account.solution_age_ms is None else max(0.0, account.solution_age_ms),
         "effort": account.effort,
         "light_db": None if run.observer.moment is None else run.observer.moment.light_db,
@@ -107,14 +107,14 @@ def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
 
 
 def _view_error_now_mm(account: RefreshAccount) -> float | None:
-    """Distance from the tracked eyes to those solved for; None without a viewer or a solution."""
+    """Return the distance between the tracked eyes and the eyes solved for, or None if either is missing."""
     if account.eyes_m is None or account.solved_for_m is None:
         return None
     return round(view_error_mm(account.eyes_m, account.solved_for_m), 2)
 
 
 def about(run: Run) -> dict[str, Any]:
-    """Return the facts that do not change during a run, and the available scenes, for the page."""
+    """Return the constant facts of a run and the available scenes, for the page."""
     settings, stack = run.presenter.run_cell.state.settings, run.presenter.stack
     return {
         "version": version(),
@@ -128,9 +128,9 @@ def about(run: Run) -> dict[str, Any]:
 
 
 def library_scenes(settings: ContentSettings) -> tuple[str, ...]:
-    """Return the paths of the library folder's scenes, up to the page's limit.
+    """Return the paths of the scenes in the library folder, up to the page's limit.
 
-    Names that are not printable UTF-8 are skipped, because settings cannot contain them.
+    Skips names that are not printable UTF-8, because settings cannot contain them.
     """
     if not settings.library:
         return ()
@@ -144,7 +144,7 @@ def library_scenes(settings: ContentSettings) -> tuple[str, ...]:
 
 
 def pictures(run: Run) -> dict[str, Any]:
-    """Return the current pictures, as JPEGs in base64, for the page."""
+    """Return the current pictures for the page, as JPEGs in base64."""
     refresh = run.presenter.last
     if refresh is None:
         return {"frame": None, "jpegs": {}}
@@ -153,15 +153,14 @@ def pictures(run: Run) -> dict[str, Any]:
     return {"frame": refresh.account.frame, "jpegs": {name: b64encode(jpeg).decode() for name, jpeg in jpegs.items()}}
 
 
-WIDTH_PX = 256  # width of the page's small pictures
+WIDTH_PX = 256  # width of the thumbnails on the page
 JPEG_QUALITY = 80
 
 
 def pictures_of(refresh: Refresh, stack: PanelStack, *, fov_deg: float) -> dict[str, bytes]:
-    """Return JPEGs of a refresh: `layer-0` (rear) onwards, `seen-left`, `seen-right`.
+    """Return thumbnails of a refresh as JPEGs: `layer-0` (rear) onwards, `seen-left` and `seen-right`.
 
-    The layers are the solution's, reduced, and the views are from the eyes solved for: exact ones would take longer
-    than a refresh.
+    The views are computed from reduced layers at the eyes solved for. Exact ones would take longer than a refresh.
     """
     frame, account = refresh.frame, refresh.account
     is_flat = frame.solved is None or (frame.flat is not None and frame.flatness > 0.5)
@@ -173,7 +172,7 @@ def pictures_of(refresh: Refresh, stack: PanelStack, *, fov_deg: float) -> dict[
     size = small.width_px, small.height_px
     part = slice(
         None, None, max(1, shown.shape[2] // (2 * width))
-    )  # sampled at twice the size: averaging all pixels takes 15 ms
+    )  # sampled at twice the size, because averaging all pixels takes 15 ms
     parts = (np.ascontiguousarray(layer[part, part]) for layer in shown)
     resized = [cv2.resize(layer, size, interpolation=cv2.INTER_AREA) for layer in parts]
     layers: U8 = np.stack(resized).astype(np.uint8, copy=False)
@@ -186,8 +185,8 @@ def pictures_of(refresh: Refresh, stack: PanelStack, *, fov_deg: float) -> dict[
 
 
 def _jpeg(image: U8) -> bytes:
-    """Return an (h, w, 3 or 4) picture as JPEG, without its fourth channel."""
+    """Encode an (h, w, 3 or 4) picture as JPEG. Drops the fourth channel."""
     done, coded = cv2.imencode(".jpg", image[..., 2::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not done:
-        raise ValueError("JPEG encoding failed")
+        raise ValueError("OpenCV could not encode a picture as JPEG")
     return coded.tobytes()

@@ -1,4 +1,4 @@
-"""Supervision of a run: signals, systemd, the status socket and operators' commands."""
+"""Supervision of a run, which handles signals, systemd, the status socket and operators' commands."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ from runtime.support.memory import keep_freed_memory
 
 log = logging.getLogger("phasestack.daemon")
 
-PANEL_RETRY_S = 1.0  # interval between checks for a panel that is missing at the start
+PANEL_RETRY_S = 1.0  # interval between attempts to find a missing panel
 
 
 class Daemon(Host):
-    """Supervises a run: between refreshes it handles signals and commands and publishes the status.
+    """Supervisor of a run. Handles signals and commands and publishes the status between refreshes.
 
-    Only the presenter's thread calls its methods and accesses its attributes. The status server's thread calls the
-    functions in `lookups` and the last published snapshot, which read frozen values and thread-safe counters.
+    Only the presenter's thread may use it. The status server's thread calls the functions in `lookups` and the last
+    published snapshot, which read only frozen values and thread-safe counters.
     """
 
     def __init__(
@@ -51,15 +51,15 @@ class Daemon(Host):
         recorder: Recorder | None = None,
         options: RunOptions | None = None,
     ) -> None:
-        """read_settings: reads the current configuration, on the loading thread; raises InputError."""
+        """read_settings: reads the current configuration on the loading thread; raises InputError."""
         self._until = (options or RunOptions()).until
         self._link = (options or RunOptions()).browser
         self._read_settings = read_settings
         self._signals, self._notifier, self._server = signals, notifier, server
         self.recorder = recorder
-        self.run: Run | None = None  # set once the run is complete, together with the changes
+        self.run: Run | None = None  # set with the changes when the run is complete
         self.changes: Changes | None = None
-        self._waits_for = ""  # before the first refresh: the reason for waiting for a panel
+        self._waits_for = ""  # reason for waiting for a panel before the first refresh
 
     def stop_reason(self) -> str:
         return f"{self._signals.stop} received" if self._signals.stop else self._until()
@@ -74,7 +74,7 @@ class Daemon(Host):
             changes.attempt(command, partial(self._carry_out, presenter, changes, command))
         while self._server is not None and not self._server.commands.empty():
             command = self._server.commands.get()
-            if command.take():  # False: its client has given up
+            if command.take():  # else its client has given up
                 changes.attempt(command, partial(self._carry_out, presenter, changes, command))
         changes.carry_on()
 
@@ -98,7 +98,7 @@ class Daemon(Host):
             self._server.lookups |= {"log": self.recorder.look_at_log} if self.recorder is not None else {}
 
     def wait_for_panel(self, why: str) -> bool:
-        """Report a missing panel and wait a second, if run as a service. By hand, refuse to start."""
+        """Report a missing panel and wait a second as a service, or refuse to start if run by hand."""
         if not self._notifier.supervised or self._signals.stop:
             return False
         if why != self._waits_for:
@@ -112,7 +112,7 @@ class Daemon(Host):
         return not self._signals.stop
 
     def starting(self, doing: str) -> bool:
-        """Report the current step of the start, and ask systemd for more time."""
+        """Report the current step of the start and ask systemd for more time."""
         self._notifier.starting()
         self._notifier.status(f"starting ({doing})")
         if self._server is not None:
@@ -145,9 +145,9 @@ class Daemon(Host):
                 self._write_black_box(command)
 
     def _write_black_box(self, command: Command) -> None:
-        """Write the black box to a file. The writer's thread answers the command."""
+        """Write the black box to a file. The writing thread answers the command."""
         if self.recorder is None:
-            command.refuse("this run has no black box")
+            command.refuse("this run has no black box (service.blackbox_minutes is 0)")
             return
 
         def saved(problem: str, path: Path | None) -> None:
@@ -160,7 +160,7 @@ class Daemon(Host):
 
 
 def _news(loading: Reconfiguration | None, refused: str, recorder: Recorder | None) -> dict[str, Any]:
-    """Return the status entries about the change being loaded, the last refusal and the black box."""
+    """Return status entries about the change being loaded, the last refusal and the black box."""
     news: dict[str, Any] = {} if loading is None else {"loading": loading.progress}
     if refused:
         news["refused"] = refused
@@ -169,11 +169,11 @@ def _news(loading: Reconfiguration | None, refused: str, recorder: Recorder | No
 
 @retry_advised()
 def run_daemon(read_settings: Callable[[], Settings], options: RunOptions) -> dict[str, Any]:
-    """Run `phasestack run` from start to stop, and return the summary.
+    """Run the daemon from start to stop and return its summary.
 
-    Raises FatalError for a wrong configuration or file, TransientError if another start may help.
+    Raises FatalError for a wrong configuration or file, and TransientError if another start may help.
     """
-    keep_freed_memory()  # before any thread starts
+    keep_freed_memory()  # must precede the start of any thread
     settings = read_settings()
     service, clock = settings.service, MonotonicClock()
     logs.configure()
@@ -199,7 +199,7 @@ def run_daemon(read_settings: Callable[[], Settings], options: RunOptions) -> di
         except PanelLost:
             if not signals.stop:
                 raise
-            summary = {"stopped": daemon.stop_reason()}  # stopped while it waited for a panel
+            summary = {"stopped": daemon.stop_reason()}  # stopped while waiting for a panel
         notifier.stopping(summary["stopped"])
     log.info("stopped: %s", summary["stopped"])
     return summary

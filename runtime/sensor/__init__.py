@@ -1,1 +1,1 @@
-"""Drivers for depth cameras and eye trackers, recordings, and the thread that reads them."""
+"""Drivers for depth cameras and eye trackers, recordings, and the thread that reads a driver."""

@@ -1,4 +1,4 @@
-"""Interface of sensor drivers, and conversion of device clocks."""
+"""Interface of sensor drivers, and conversion of device time to the host's clock."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from runtime.config import Section
 from runtime.errors import EndOfRecording, SensorLost, SensorTimeout
 from runtime.records import SensorFrame
 
-ARRIVED_MAX = 1024  # samples returned per call; the rest follow in later calls
-WINDOW_NS = 5_000_000_000  # window for estimating a device clock's offset
+ARRIVED_MAX = 1024  # maximum number of samples returned per call
+WINDOW_NS = 5_000_000_000  # window over which a device clock's offset is estimated
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,50 +24,50 @@ class Capabilities:
 
     colour: bool = False
     depth: bool = False
-    eye_points: bool = False  # the sensor finds the eyes itself, so our detector is not used
-    in_stack_frame: bool = False  # its eye points are already in frame `stack`, so no calibration is applied
-    may_pause: bool = False  # gaps and constant samples are not faults (a recording)
+    eye_points: bool = False  # the sensor finds the eyes, so our detector is not used
+    in_stack_frame: bool = False  # eye points are in the stack frame and need no calibration
+    may_pause: bool = False  # gaps and constant samples are not faults, as in a recording
 
 
 class Sensor(ABC):
-    """One depth sensor, eye tracker or recording.
+    """Depth sensor, eye tracker or recording.
 
-    The constructor only stores settings; `open` acquires the device, and cleans up after itself if it fails. Only one
-    thread uses a driver, and that thread may be abandoned if an SDK hangs.
+    The constructor only stores settings. `open` acquires the device and cleans up if it fails. A driver is used by one
+    thread only, which may be abandoned if an SDK hangs.
 
     A custom class is configured by `sensor.driver = "module:Class"` and constructed as `Class(options, clock=clock)`,
     with `options` an `Options` validated from `[sensor.options]` and `clock` the run's clock, on which capture times
     must be based.
     """
 
-    Options: ClassVar[type[BaseModel]] = Section  # schema of [sensor.options] for a user's class
+    Options: ClassVar[type[BaseModel]] = Section  # schema of [sensor.options] for a custom class
 
     name: str
     capabilities: Capabilities
-    serial: str = ""  # set by `open`; empty if the device has none. If set before, `open` accepts only that device
-    skipped: int = 0  # samples that `read_newest` skipped in favour of newer ones
+    serial: str = ""  # set by `open`, "" if unknown; if set before, `open` accepts only that device
+    skipped: int = 0  # samples that `read_newest` dropped because newer ones had arrived
 
     @abstractmethod
     def open(self) -> None:
-        """Acquire the device. Raises SensorLost if it is absent (retry), FatalError for anything permanent."""
+        """Acquire the device. Raises SensorLost if a retry may succeed, FatalError for a permanent failure."""
 
     @abstractmethod
     def read_newest(self, timeout_s: float) -> SensorFrame:
-        """Return the newest unread frame, with its capture time, waiting up to `timeout_s` for one.
+        """Return the newest unread frame. Waits up to `timeout_s` for one.
 
         Raises SensorTimeout (nothing new), SensorLost (close and reopen), EndOfRecording.
         """
 
     def read_arrived(self, timeout_s: float) -> list[SensorFrame]:
-        """Return all unread frames, oldest first, waiting up to `timeout_s` for the first one.
+        """Return all unread frames, oldest first. Waits up to `timeout_s` for the first one.
 
-        By default this returns only the newest. Raises the same exceptions as `read_newest`.
+        By default this is only the newest one. Raises the same exceptions as `read_newest`.
         """
         return [self.read_newest(timeout_s)]
 
     @abstractmethod
     def close(self) -> None:
-        """Release everything. Never raises; may be called twice, or after a failed `open`."""
+        """Release the device. Never raises. May be called twice or after a failed `open`."""
 
     def __enter__(self) -> Self:
         self.open()
@@ -78,16 +78,15 @@ class Sensor(ABC):
 
 
 class SteppedSensor(Sensor):
-    """A driver that can also deliver each sample without waiting, for runs on a simulated clock.
+    """Driver that can also deliver samples without waiting, for runs on a simulated clock.
 
-    `open` passes the samples to `_begin`. `read_newest` and `read_arrived` return the samples that have arrived by its
-    clock.
+    `open` passes the samples to `_begin`. `read_newest` and `read_arrived` return those that have arrived by its clock.
     """
 
     def __init__(self, source: str, clock: Clock, *, latency_ms: float = 0.0) -> None:
-        """source: its name in messages; latency_ms: time from a sample's capture to its arrival."""
+        """source: name used in messages. latency_ms: delay of each sample from capture to arrival."""
         self._source, self._clock, self._latency_ns = source, clock, round(latency_ms * NS_PER_MS)
-        self._frames: Iterator[SensorFrame] | None = None  # samples after the next one; None: not open
+        self._frames: Iterator[SensorFrame] | None = None  # samples after the next one; None if not open
         self._next: SensorFrame | None = None
 
     def _begin(self, frames: Iterator[SensorFrame]) -> None:
@@ -103,15 +102,15 @@ class SteppedSensor(Sensor):
         return self._next
 
     def next_sample(self) -> SensorFrame:
-        """Return the next sample in order, immediately. Raises EndOfRecording, SensorLost."""
+        """Return the next sample without waiting. Raises EndOfRecording, SensorLost."""
         frame = self.peek()
         if frame is None or self._frames is None:
-            raise EndOfRecording(f"{self._source}: no more samples")
+            raise EndOfRecording(f"{self._source}: the recording has ended")
         self._next = next(self._frames, None)
         return frame
 
     def available_ns(self, frame: SensorFrame) -> int:
-        """Return the sample's arrival time on the run's clock; the caller advances its clock to this time."""
+        """Return when a sample arrives on the run's clock. The caller advances its clock to this time."""
         return frame.capture_ns + self._latency_ns
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
@@ -131,7 +130,7 @@ class SteppedSensor(Sensor):
         return following is not None and self.available_ns(following) <= now_ns
 
     def _first_due(self, timeout_s: float) -> SensorFrame:
-        """Return the oldest unread sample once available. Raises SensorTimeout, EndOfRecording, SensorLost."""
+        """Wait for the oldest unread sample. Raises SensorTimeout, EndOfRecording, SensorLost."""
         following = self.peek()
         if following is None:
             return self.next_sample()  # raises EndOfRecording
@@ -139,26 +138,26 @@ class SteppedSensor(Sensor):
         deadline_ns = self._clock.now_ns() + round(timeout_s * NS_PER_S)
         self._clock.sleep_until_ns(min(due_ns, deadline_ns))
         if due_ns > deadline_ns:
-            raise SensorTimeout(f"{self.name}: no sample within {timeout_s} s")
+            raise SensorTimeout(f"{self.name}: no sample arrived within {timeout_s} s")
         return self.next_sample()
 
 
 class DeviceClock:
-    """Converts device timestamps to the host's clock, using the offset of the fastest recent delivery.
+    """Converter of device timestamps to the host's clock, based on the fastest recent delivery.
 
-    Every delivery is delayed, but the minimum delay over a window is nearly constant. A new window every few seconds
-    follows the drift between the two clocks.
+    The delay of a delivery varies, but its minimum over a window is nearly constant. A new window every few seconds
+    follows the drift between both clocks.
     """
 
     def __init__(self) -> None:
         self._start_ns = 0
-        self._offsets: list[int] = []  # minima of the previous window and of this one
+        self._offsets: list[int] = []  # minima of the previous and the current window
         self._last_ns: int | None = None
 
     def host_ns(self, device_ns: int, *, arrival_ns: int) -> int:
-        """Convert a device's time to the host's clock; never later than the arrival."""
+        """Convert a device timestamp to the host's clock, no later than its arrival."""
         offset = arrival_ns - device_ns
-        if self._last_ns is None or device_ns < self._last_ns:  # the first sample, or the device was restarted
+        if self._last_ns is None or device_ns < self._last_ns:  # first sample or restarted device
             self._offsets, self._start_ns = [offset], arrival_ns
         elif arrival_ns - self._start_ns > WINDOW_NS:
             self._offsets, self._start_ns = [self._offsets[-1], offset], arrival_ns

@@ -15,14 +15,14 @@ from runtime.errors import SensorLost, SensorTimeout
 from runtime.records import EyePoints, Intrinsics, SensorFrame
 from runtime.sensor.base import Capabilities, DeviceClock, Sensor
 
-AGAIN_NS = NS_PER_S // 30  # the last position is repeated, because a page reports eyes only when they move
-SILENT_NS = 5 * NS_PER_S  # after this long without a message from a page there is no viewer
-LEAST_SIGMA_M = 5e-5  # floor that keeps the covariance of noise-free samples from being singular
-PICTURE_MAX_PX = 2048  # longer side of a page's camera picture
+AGAIN_NS = NS_PER_S // 30  # period at which a position is repeated, because pages report only movements
+SILENT_NS = 5 * NS_PER_S  # time without a message from a page after which there is no viewer
+LEAST_SIGMA_M = 5e-5  # lower limit, so that noise-free samples have a regular covariance
+PICTURE_MAX_PX = 2048  # limit for the longer side of a page's camera picture
 
 
 class BrowserEyes(Sensor):
-    """Delivers the samples that pages send, and repeats the last one in between."""
+    """Driver that delivers eye positions sent by pages and repeats the last one in between."""
 
     name = "browser"
     capabilities = Capabilities(eye_points=True, in_stack_frame=True, may_pause=True)
@@ -30,7 +30,7 @@ class BrowserEyes(Sensor):
     def __init__(self, link: BrowserLink, clock: Clock) -> None:
         self._link, self._clock = link, clock
         self._random = np.random.default_rng(0)
-        self._waiting: deque[tuple[int, SensorFrame]] | None = None  # samples with their arrival times
+        self._waiting: deque[tuple[int, SensorFrame]] | None = None  # samples and their arrival times
         self._times, self._heard_ns, self._sampled_ns, self._count = DeviceClock(), 0, 0, 0
         self._last, self._captured_ns = SeenEyes(None, 0.0), 0
 
@@ -84,9 +84,9 @@ class BrowserEyes(Sensor):
 
 
 class BrowserCamera(Sensor):
-    """Delivers camera frames sent by a web page.
+    """Driver that delivers camera frames sent by a web page.
 
-    The camera gives no depth, so the distance is estimated from the eye separation.
+    Without depth, the viewer's distance is estimated from the eye separation.
     """
 
     name = "browser"
@@ -108,7 +108,7 @@ class BrowserCamera(Sensor):
         self._link.captured(capture_ns, page_ms)
         picture: Any = cv2.imdecode(np.frombuffer(coded, np.uint8), cv2.IMREAD_COLOR)
         if picture is None or max(picture.shape) > PICTURE_MAX_PX:
-            raise SensorTimeout("the page sent an invalid camera picture")
+            raise SensorTimeout("the page sent a camera picture that cannot be decoded")
         self._number += 1
         self._captured_ns = max(capture_ns, self._captured_ns + 1)
         height, width = picture.shape[:2]
@@ -117,4 +117,4 @@ class BrowserCamera(Sensor):
         return SensorFrame(self._number, self._captured_ns, colour=colour, intrinsics=intrinsics)
 
     def close(self) -> None:
-        """Do nothing."""
+        """Do nothing, because there is no device."""

@@ -24,36 +24,37 @@ from runtime.sensor.openni2_library import load
 
 SERIAL_PROPERTY = 3  # ONI_DEVICE_PROPERTY_SERIAL_NUMBER
 DEPTH_1_MM, DEPTH_100_UM, RGB888, GRAY8 = 100, 101, 200, 202
-PAIR_APART_US = 40_000  # most time between the depth and colour of a pair: a period of an unsynchronised camera
+PAIR_APART_US = 40_000  # largest difference within a pair of depth and colour: one period of an unsynchronised camera
 PAIR_WAIT_S = 0.02  # how long a depth picture waits for its colour
-THREADS_STOP_S = 0.5  # fifteen periods of a recording's threads; with three there were crashes on a busy machine
-DRAIN_MAX = 32  # frames skipped in one call, so that a fast source can't block it
+THREADS_STOP_S = 0.5  # fifteen periods of a recording's threads; three led to crashes on a busy machine
+DRAIN_MAX = 32  # maximum number of frames skipped per call, so that a fast source cannot block it
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
-_idle: list[_PersistentThread] = []  # threads for reuse; one that hangs is never returned
+_idle: list[_PersistentThread] = []  # threads for reuse; a hanging one is never returned
 _lock = threading.Lock()
 
 
 class _Picture(NamedTuple):
-    number: int  # the device's frame number
+    number: int  # frame number from the device
     time_us: int
     pixels: Any  # U8 (h, w, 3) or U16 (h, w)
 
 
 class OpenNI2Driver(Sensor):
-    """Delivers colour, and depth in millimetres, registered to colour if the camera supports that.
+    """Driver for OpenNI2 cameras. Delivers colour, and depth in millimetres.
 
-    Calls into the library run on a thread that outlives the calling one (`_PersistentThread`).
+    Depth is registered to colour if possible. Calls into the library run on a thread that outlives the calling one
+    (`_PersistentThread`).
     """
 
     name = "openni2"
     capabilities = Capabilities(colour=True, depth=True)
 
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
-        """settings.source: empty or `demo` for the only camera, a serial number, a device URI, or a .oni file."""
+        """settings.source: a serial number, a device URI, a .oni file, or empty or `demo` for the only camera."""
         self._settings, self._clock = settings, clock
-        self._thread: _PersistentThread | None = None  # while open
+        self._thread: _PersistentThread | None = None  # only while open
         self._openni: Any = None
         self._device: Any = None
         self._streams: dict[str, Any] = {}
@@ -82,7 +83,7 @@ class OpenNI2Driver(Sensor):
             self._start_streams()
         except SensorLost:
             raise
-        except Exception as error:  # the package raises its own errors, ctypes' and AssertionError
+        except Exception as error:  # the package raises its own errors, those of ctypes and AssertionError
             raise SensorLost(f"OpenNI2: {_text(error)}") from None
 
     def _find_device(self) -> Any:
@@ -103,7 +104,7 @@ class OpenNI2Driver(Sensor):
         for device in matches:
             device.close()
         if matches:
-            raise SensorLost(f"{len(matches)} OpenNI2 cameras match: set sensor.source to a serial number")
+            raise SensorLost(f"{len(matches)} OpenNI2 cameras match sensor.source; set it to a serial number")
         raise SensorLost(f"no OpenNI2 camera {wanted!r} among {len(uris)}" if wanted else "no OpenNI2 camera found")
 
     def _start_streams(self) -> None:
@@ -111,13 +112,13 @@ class OpenNI2Driver(Sensor):
         streams = {"depth": device.create_depth_stream(), "colour": device.create_color_stream()}
         self._streams = {kind: stream for kind, stream in streams.items() if stream is not None}
         if not self._streams:
-            raise SensorLost("the camera has neither depth nor colour")
+            raise SensorLost("the camera delivers neither depth nor colour")
         both = len(self._streams) == 2
         mode = openni.IMAGE_REGISTRATION_DEPTH_TO_COLOR
         if both and device.is_image_registration_mode_supported(mode):
             device.set_image_registration_mode(mode)
         elif both and not device.is_file():
-            log.warning("OpenNI2: this camera does not register depth to colour, so parallax will displace the eyes")
+            log.warning("OpenNI2: the camera does not register depth to colour, so parallax will shift eye positions")
         for stream in self._streams.values():
             if stream.is_property_supported(7):  # mirroring
                 stream.set_mirroring_enabled(False)
@@ -130,15 +131,15 @@ class OpenNI2Driver(Sensor):
         self._times, self._newest, self._index = DeviceClock(), {}, 0
 
     def _read_intrinsics(self, stream: Any) -> Intrinsics | None:
-        """Return a centred pinhole with the camera's field of view, else the settings'; None if unknown."""
-        try:  # recordings claim to have the property but fail to return it
+        """Return a centred pinhole camera with the reported or configured field of view, or None if unknown."""
+        try:  # recordings claim to support the property but fail to return it
             fov_x, fov_y = stream.get_horizontal_fov(), stream.get_vertical_fov()
         except Exception:
             fov_x = fov_y = 0.0
         if not 0 < fov_x < math.pi:
             fov_x, fov_y = math.radians(self._settings.fov_deg), 0.0
         if fov_x == 0.0:
-            log.warning("OpenNI2: the camera does not report its field of view: set sensor.fov_deg")
+            log.warning("OpenNI2: the camera does not report its field of view; set sensor.fov_deg")
             return None
         mode = stream.video_mode
         camera = Intrinsics.centred(mode.resolutionX, mode.resolutionY, fov_rad=fov_x)
@@ -184,16 +185,16 @@ class OpenNI2Driver(Sensor):
         return "depth" if "depth" in self._streams else "colour"
 
     def _lacks_colour(self) -> bool:
-        """Return True if the colour picture that belongs to the newest depth may still arrive."""
+        """Return True if the colour picture for the newest depth picture may still arrive."""
         colour = self._newest.get("colour")
         return "colour" in self._streams and (
             colour is None or self._newest[self._main].time_us - colour.time_us > PAIR_APART_US
         )
 
     def _take(self, timeout_s: float) -> bool:
-        """Copy one frame from whichever stream has one. Returns False if none arrived in time."""
+        """Copy one frame from any stream. Returns False if none arrived in time."""
         try:
-            # With a wait of 0, the library reports an error for some devices.
+            # With a timeout of 0 the library reports an error for some devices.
             stream = self._openni.wait_for_any_stream(list(self._streams.values()), max(timeout_s, 0.001))
             if stream is None:
                 return False
@@ -209,8 +210,8 @@ class OpenNI2Driver(Sensor):
 
     def _nothing(self, timeout_s: float) -> None:
         if self._device.playback is not None and not self._settings.loop:
-            raise EndOfRecording(f"{self._settings.source}: no more frames")
-        raise SensorTimeout(f"no frame for {timeout_s:g} s")
+            raise EndOfRecording(f"{self._settings.source}: the recording has ended")
+        raise SensorTimeout(f"no frame arrived for {timeout_s:g} s")
 
     def close(self) -> None:
         thread, self._thread = self._thread, None
@@ -225,7 +226,7 @@ class OpenNI2Driver(Sensor):
         for stream in streams.values():
             _quietly(stream.stop)
         if streams and self._settings.source.endswith(".oni"):
-            # The library does not wait for a recording's threads to stop: without a pause they write to freed memory.
+            # The library does not wait until a recording's threads stop. Without a pause they write to freed memory.
             time.sleep(THREADS_STOP_S)
         for handle in (*streams.values(), device):
             if handle is not None:
@@ -233,15 +234,15 @@ class OpenNI2Driver(Sensor):
 
 
 def _quietly(call: Callable[[], object]) -> None:
-    """Call a function that may fail if the camera is unplugged, and log the error."""
+    """Call a function and log its error, such as that of an unplugged camera."""
     try:
         call()
     except Exception as error:
-        log.debug("OpenNI2: closing: %s", _text(error))
+        log.debug("OpenNI2: error while closing: %s", _text(error))
 
 
 def _serial(device: Any) -> str:
-    """Return a device's serial number, or an empty string if it has none."""
+    """Return the serial number of a device, or an empty string if it has none."""
     import ctypes
 
     if not device.is_property_supported(SERIAL_PROPERTY):
@@ -251,13 +252,13 @@ def _serial(device: Any) -> str:
 
 
 def _text(error: Exception) -> str:
-    """Return the library's error message, without the package's wrapping."""
+    """Return the library's error message without the text that the package adds."""
     words = error.args[1] if len(error.args) > 1 else str(error) or type(error).__name__
     return words.decode(errors="replace").strip() if isinstance(words, bytes) else str(words)
 
 
 def _pixels(frame: Any) -> U8 | U16:
-    """Copy a frame's pixels: depth as (h, w) uint16 millimetres, colour as (h, w, 3) RGB. Raises ValueError."""
+    """Copy depth as (h, w) uint16 in millimetres, or colour as (h, w, 3) RGB. Raises ValueError."""
     pixel_format, height, width = frame.videoMode.pixelFormat.value, frame.height, frame.width
     data = np.frombuffer(frame.get_buffer_as_uint8(), np.uint8)
     kinds = {DEPTH_1_MM: (2, 1), DEPTH_100_UM: (2, 1), RGB888: (1, 3), GRAY8: (1, 1)}
@@ -265,7 +266,7 @@ def _pixels(frame: Any) -> U8 | U16:
         raise ValueError(f"pixel format {pixel_format} is not supported")
     size, channels = kinds[pixel_format]
     if data.size < height * frame.stride or frame.stride < width * size * channels:
-        raise ValueError("a frame contains fewer bytes than its size requires")
+        raise ValueError("a frame has fewer bytes than its width and height require")
     rows = data[: height * frame.stride].reshape(height, frame.stride)[:, : width * size * channels]
     if size == 2:
         depth = np.ascontiguousarray(rows).view("<u2").astype(np.uint16)
@@ -276,10 +277,10 @@ def _pixels(frame: Any) -> U8 | U16:
 
 
 class _PersistentThread:
-    """Runs calls one at a time on a thread that lives as long as the process; callers wait for the result.
+    """Thread that lives as long as the process and runs calls one at a time. Callers wait for the result.
 
-    At exit OpenNI2 accesses every thread that ever called it, and crashes if one has ended and its stack was freed. A
-    `ThreadPoolExecutor` is not suitable: Python ends its threads earlier, and waits for one that hangs in a call.
+    At exit OpenNI2 accesses every thread that ever called it and crashes if the stack of one was freed. A
+    `ThreadPoolExecutor` would not do, because Python ends its threads earlier and waits for one that hangs in a call.
     """
 
     def __init__(self, name: str) -> None:
@@ -297,6 +298,6 @@ class _PersistentThread:
             outcome, call = self._calls.get()
             try:
                 outcome.set_result(call())
-            except BaseException as error:  # raised by the caller
+            except BaseException as error:  # raised again in the caller
                 outcome.set_exception(error)
-            del outcome, call  # so that no object stays alive until the next call
+            del outcome, call  # else objects would stay alive until the next call

@@ -1,8 +1,8 @@
-"""Finding and loading libOpenNI2 and its drivers.
+"""Loader for libOpenNI2 and its drivers.
 
 The `openni` package expects a folder with `libOpenNI2.so` and `OpenNI2/Drivers/`. Distributions install them under
-other names, so a folder of links is created. Drivers are kept in memory: some leave threads running after closing a
-device, and unloading their code would crash the process.
+other names, so a folder of links is created. Drivers stay in memory, because some leave threads running after closing a
+device and unloading their code would crash the process.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ LIBRARY_FOLDERS = (
     "/usr/lib",
     "/usr/local/lib",
 )
-DUMMY = "DummyDevice"  # sample driver, which would add a device to every camera
-INSTALL = "OpenNI2 is not installed (Debian: apt install libopenni2-0), or set sensor.openni2_folder"
+DUMMY = "DummyDevice"  # sample driver, which would add a fake device
+INSTALL = "OpenNI2 was not found; install it (Debian: apt install libopenni2-0) or set sensor.openni2_folder"
 
 _lock = threading.Lock()
 _loaded = False
 
 
 def find_library(folder: str = "") -> tuple[Path, Path]:
-    """Find the library file and the folder of its drivers. Raises MissingPart."""
+    """Return the paths of the library file and of its driver folder. Raises MissingPart."""
     for place in (folder,) if folder else LIBRARY_FOLDERS:
         drivers = Path(place) / "OpenNI2" / "Drivers"
         for library in sorted(Path(place).glob("libOpenNI2.so*")):
             if drivers.is_dir():
                 return library, drivers
-    raise MissingPart(f"{folder}: libOpenNI2.so is missing next to OpenNI2/Drivers" if folder else INSTALL)
+    raise MissingPart(f"{folder} must contain libOpenNI2.so and OpenNI2/Drivers" if folder else INSTALL)
 
 
 def load(folder: str = "") -> Any:
-    """Import `openni.openni2` with its library loaded. Raises MissingPart, SensorLost."""
+    """Load the library and return the module `openni.openni2`. Raises MissingPart, SensorLost."""
     global _loaded
     try:
         from openni import openni2
@@ -60,7 +60,7 @@ def load(folder: str = "") -> Any:
         (links / "libOpenNI2.so").symlink_to(library)
         for file in sorted(drivers.glob("lib*.so*")):
             if DUMMY not in file.name:
-                # Debian's library looks for lib*.so.0, the original for lib*.so.
+                # Debian's library looks for lib*.so.0, the original one for lib*.so.
                 for name in {file.name, f"{file.name.split('.so')[0]}.so", f"{file.name.split('.so')[0]}.so.0"}:
                     (links / "OpenNI2" / "Drivers" / name).symlink_to(file)
         try:

@@ -1,6 +1,6 @@
 """Driver `realsense`: RealSense depth cameras, and recordings made with their SDK.
 
-It has been tested with recordings that the SDK plays (tests/sensor/test_realsense.py), not yet with a camera.
+Tested with recordings that the SDK plays (tests/sensor/test_realsense.py), but not yet with a camera.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from runtime.records import U8, U16, Intrinsics, SensorFrame
 from runtime.sensor.base import Capabilities, DeviceClock, Sensor
 
 RATE_HZ = 30
-FILES = (".bag", ".db3")  # older and newer recordings of the SDK
-STAMP_AGE_NS = NS_PER_S  # older timestamps on the host's clock, and future ones, are ignored
-DRAIN_MAX = 32  # frames skipped in one call
+FILES = (".bag", ".db3")  # old and new recording formats of the SDK
+STAMP_AGE_NS = NS_PER_S  # host timestamps older than this, or in the future, are ignored
+DRAIN_MAX = 32  # maximum number of frames skipped per call
 # Indices of the R, G and B channels.
 COLOURS = {"rgb8": [0, 1, 2], "bgr8": [2, 1, 0], "rgba8": [0, 1, 2], "bgra8": [2, 1, 0]}
 
@@ -29,13 +29,16 @@ log = logging.getLogger(__name__)
 
 
 class RealSenseDriver(Sensor):
-    """Delivers colour, depth in millimetres (aligned to colour by the SDK), and the camera's intrinsics."""
+    """Driver for RealSense cameras. Delivers colour, depth in millimetres and intrinsics.
+
+    The SDK aligns depth to colour.
+    """
 
     name = "realsense"
     capabilities = Capabilities(colour=True, depth=True)
 
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
-        """settings.source: `demo` or empty for the only camera; otherwise a serial number or a recording (`FILES`)."""
+        """settings.source: a serial number, a recording (`FILES`), or empty or `demo` for the only camera."""
         import pyrealsense2
 
         self._rs, self._settings, self._clock = pyrealsense2, settings, clock
@@ -67,13 +70,13 @@ class RealSenseDriver(Sensor):
         self._playback = device.as_playback() if device.is_playback() else None
         if not {rs.stream.depth, rs.stream.color} <= streams:
             self.close()
-            raise SensorLost("RealSense: depth and colour are both required, and one is missing")
+            raise SensorLost("RealSense: the camera must deliver both depth and colour")
         self.serial = device.get_info(rs.camera_info.serial_number)
         self._align = rs.align(rs.stream.color)
         self._times, self._number = DeviceClock(), -1
 
     def _serial_to_open(self) -> str:
-        """Return the serial number of the configured camera, or of the only one. Raises SensorLost."""
+        """Return the serial number of the configured or only camera. Raises SensorLost."""
         source = self._settings.source
         configured = self.serial or ("" if source in ("", "demo", "any") else source)
         info = self._rs.camera_info.serial_number
@@ -81,10 +84,10 @@ class RealSenseDriver(Sensor):
         matches = [serial for serial in serials if configured in ("", serial)]
         if len(matches) > 1:
             choices = ", ".join(matches)
-            raise SensorLost(f"RealSense cameras {choices}: set sensor.source to one of these serial numbers")
+            raise SensorLost(f"several RealSense cameras found; set sensor.source to one of {choices}")
         if not matches:
             camera = f"RealSense camera {configured!r}" if configured else "RealSense camera"
-            raise SensorLost(f"no {camera} among {len(serials)}")
+            raise SensorLost(f"no {camera} is connected ({len(serials)} others)")
         return matches[0]
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
@@ -101,29 +104,29 @@ class RealSenseDriver(Sensor):
             aligned = self._align.process(frames)
             depth, colour = aligned.get_depth_frame(), aligned.get_color_frame()
             if not (depth and colour):
-                raise SensorTimeout("RealSense: a depth picture arrived without colour")
+                raise SensorTimeout("RealSense: a depth picture arrived without a colour picture")
             return self._frame(depth, colour)
         except RuntimeError as error:
             raise SensorLost(f"RealSense: {error}") from None
 
     def _next(self, deadline_ns: int) -> Any:
-        """Wait for frames that contain an unread depth picture. Raises SensorTimeout, EndOfRecording, RuntimeError."""
+        """Wait for an unread depth picture. Raises SensorTimeout, EndOfRecording, RuntimeError."""
         while True:
             remaining_ms = max(1, (deadline_ns - self._clock.now_ns()) // NS_PER_MS)
             done, frames = self._pipeline.try_wait_for_frames(remaining_ms)
             if done and self._is_new(frames):
                 return frames
             if not done and self._is_over():
-                raise EndOfRecording(f"{self._settings.source}: no more frames")
+                raise EndOfRecording(f"{self._settings.source}: the recording has ended")
             if self._clock.now_ns() >= deadline_ns:
-                raise SensorTimeout("RealSense: no new frame")
+                raise SensorTimeout("RealSense: no new frame arrived")
 
     def _is_over(self) -> bool:
         playing = self._rs.playback_status.playing
         return self._playback is not None and not self._settings.loop and self._playback.current_status() != playing
 
     def _is_new(self, frames: Any) -> bool:
-        """Return True if the depth picture is new: the SDK may pair one with several colour pictures."""
+        """Return True if the depth picture is new. The SDK may pair one with several colour pictures."""
         depth = frames.get_depth_frame()
         if not depth or not frames.get_color_frame() or depth.get_frame_number() == self._number:
             return False
@@ -142,7 +145,7 @@ class RealSenseDriver(Sensor):
         )
 
     def _capture_ns(self, frame: Any) -> int:
-        """Return when the depth picture was captured: the SDK's host timestamp, or else the device's."""
+        """Return the capture time of the depth picture from the SDK's host timestamp or else the device's."""
         now_ns, stamp_ns = self._clock.now_ns(), round(frame.get_timestamp() * NS_PER_MS)
         age_ns: int = time.time_ns() - stamp_ns
         on_host = frame.get_frame_timestamp_domain() != self._rs.timestamp_domain.hardware_clock
@@ -155,20 +158,20 @@ class RealSenseDriver(Sensor):
         if pipeline is not None:
             try:
                 pipeline.stop()
-            except RuntimeError as error:  # the camera was unplugged
-                log.debug("RealSense: closing: %s", error)
+            except RuntimeError as error:  # for example an unplugged camera
+                log.debug("RealSense: error while closing: %s", error)
 
 
 def _rgb(frame: Any) -> U8:
     """Copy a colour frame as (h, w, 3) RGB. Raises SensorLost if its format is not in `COLOURS`."""
     kind = frame.profile.format().name
     if kind not in COLOURS:
-        raise SensorLost(f"RealSense: colour is {kind}, not {', '.join(COLOURS)}")
+        raise SensorLost(f"RealSense: colour format {kind} is not supported ({', '.join(COLOURS)})")
     return np.ascontiguousarray(np.asanyarray(frame.get_data())[..., COLOURS[kind]])
 
 
 def _millimetres(frame: Any) -> U16:
-    """Copy a depth frame as (h, w) millimetres, 0 where nothing was measured."""
+    """Copy a depth frame as (h, w) millimetres. 0 means not measured."""
     raw: U16 = np.asanyarray(frame.get_data())
     unit_mm = float(frame.get_units()) * 1e3
     if abs(unit_mm - 1) < 1e-4:
@@ -178,5 +181,5 @@ def _millimetres(frame: Any) -> U16:
 
 
 def _intrinsics(camera: Any) -> Intrinsics:
-    """Convert the SDK's intrinsics, whose pixel centres are integers, to ours, whose centres are half-integers."""
+    """Convert intrinsics from the SDK's pixel centres at integers to ours at half-integers."""
     return Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.ppx + 0.5, camera.ppy + 0.5)

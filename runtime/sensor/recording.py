@@ -1,7 +1,4 @@
-"""Recordings as MCAP files.
-
-Chunks are small, so that every complete sample is readable after a crash.
-"""
+"""Recordings as MCAP files. Small chunks keep every complete sample readable after a crash."""
 
 from __future__ import annotations
 
@@ -29,29 +26,29 @@ from runtime.support.background import BackgroundJob
 from runtime.support.untrusted_input import LIMITS, MIB
 
 CHUNK_BYTES = 4096  # about 20 eye samples
-INDEX_SHARE = 1.1  # size with chunk indices over size without
-SUMMARY_BYTES = 10_000  # with the schemas
-MAX_S, MAX_BYTES = 600.0, 2 << 30  # limits at which a recording ends
+INDEX_SHARE = 1.1  # ratio of the size with chunk indices to that without
+SUMMARY_BYTES = 10_000  # including the schemas
+MAX_S, MAX_BYTES = 600.0, 2 << 30  # limits of a recording
 MAGIC = b"\x89MCAP0\r\n"
 RECORD, CHUNK = struct.Struct("<BQ"), b"\x06"  # header of a record: kind and length; a chunk's kind
-CHUNK_HEAD = struct.Struct("<BQQQQII")  # with times, size, checksum, and the length of the compression's name
-EXPANDED_MOST = 8  # for a truncated chunk: unpacked bytes per byte
-WINDOW_BYTES = 1 << 27  # largest window of zstandard
-NEEDED = "replay requires it and the topic `/eyes` (docs/sensors.md); to read other recordings, write a driver"
-KINDS = {  # kinds of other files, by their first bytes
+CHUNK_HEAD = struct.Struct("<BQQQQII")  # times, size, checksum, and the length of the compression's name
+EXPANDED_MOST = 8  # assumed compression ratio of a truncated chunk
+WINDOW_BYTES = 1 << 27  # maximum window of zstandard
+NEEDED = "replay requires it and the topic `/eyes` (docs/sensors.md); other recordings need a driver of your own"
+KINDS = {  # hints for other file types, by their first bytes
     b"#ROSBAG ": " (a ROS 1 bag; convert it with `mcap convert`)",
     b"SQLite f": " (a ROS 2 bag in SQLite; convert it with `ros2 bag convert`)",
     b"version ": " (a Git LFS pointer; fetch the file with `git lfs pull`)",
 }
 
-SYNCED_WITHIN_S = 30.0  # maximum wait for a slow disk when closing a file
-SYNC_EVERY_NS = 2 * NS_PER_S  # maximum loss in a power cut, on a disk that keeps up
+SYNCED_WITHIN_S = 30.0  # time limit for a slow disk when a file is closed
+SYNC_EVERY_NS = 2 * NS_PER_S  # time that a power cut may lose, if the disk keeps up
 
 log = logging.getLogger(__name__)
 
 
 class RecordingWriter:
-    """Writes samples to an open binary file, until a limit is reached and `write` returns False."""
+    """Writer of samples to an open binary file. At a limit `write` returns False."""
 
     def __init__(
         self,
@@ -61,12 +58,12 @@ class RecordingWriter:
         max_s: float = MAX_S,
         on_first: Callable[[], object] = lambda: None,
     ) -> None:
-        """on_first: called when the first sample has been written."""
+        """on_first: called after the first sample has been written."""
         from mcap.writer import CompressionType, IndexType, Writer
 
         self._file, self._max_ns, self._on_first = file, round(max_s * NS_PER_S), on_first
         self._images = header.colour or header.depth
-        # Eye points alone are small; uncompressed, their bytes don't depend on a library's version.
+        # Without compression, files of eye points do not depend on a library's version.
         compression = CompressionType.LZ4 if self._images else CompressionType.NONE
         index = IndexType.CHUNK | IndexType.METADATA
         self._writer: Any = Writer(file, chunk_size=CHUNK_BYTES, compression=compression, index_types=index)
@@ -87,7 +84,7 @@ class RecordingWriter:
         return self._channels[topic]
 
     def write(self, frame: SensorFrame) -> bool:
-        """Append a sample, images first. Returns False without writing if this would exceed a limit."""
+        """Append a sample, images first. Returns False and writes nothing if this would exceed a limit."""
         at = frame.capture_ns
         messages: list[tuple[str, bytes]] = []
         if self._images and frame.intrinsics is not None and frame.intrinsics != self._intrinsics:
@@ -110,12 +107,12 @@ class RecordingWriter:
             self._on_first()
         if time.monotonic_ns() - self._synced_ns >= SYNC_EVERY_NS and (self._sync is None or self._sync.done):
             self._synced_ns = time.monotonic_ns()
-            # In the background, so that a slow disk loses no sample.
+            # In the background, so that a slow disk does not cause lost samples.
             self._sync = BackgroundJob("recording", lambda: os.fsync(self._file.fileno()))
         return True
 
     def finish(self) -> None:
-        """Write the last chunk and the summary; the file stays open."""
+        """Write the last chunk and the summary, but leave the file open."""
         self._writer.finish()
         self._file.flush()
         if self._sync is not None:
@@ -124,11 +121,10 @@ class RecordingWriter:
 
 @contextmanager
 def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -> Iterator[RecordingWriter]:
-    """Open a writer whose file appears under its name, replacing any older one, at the first sample.
+    """Open a writer for a new recording. Its file replaces any older one at the first sample.
 
-    Until then an older file of that name stays. After a crash the file is readable up to its last complete sample. A
-    recording with pictures is readable by its owner alone. Raises InputError if the file can't be written, or if
-    another process is writing it.
+    After a crash the file is readable up to its last complete sample. Only its owner can read a recording with
+    pictures. Raises InputError if the file cannot be written or another process is writing it.
     """
     part, file = path.with_name(f".{path.name}.part"), None
     try:
@@ -137,7 +133,7 @@ def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -
             with path.open("rb") as present:
                 fcntl.flock(present, fcntl.LOCK_SH | fcntl.LOCK_NB)
         file = os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600), "wb")
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # held until the file is closed, also after it is renamed
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # held until the file is closed, even if it is renamed
         file.truncate()
         os.fchmod(file.fileno(), 0o600 if header.colour or header.depth else 0o644)  # faces are private
     except OSError as error:
@@ -158,22 +154,22 @@ def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -
                 else:
                     part.unlink(missing_ok=True)
     except OSError as error:
-        if error.filename is None and error.errno is not None:  # from writing, such as a full disk
+        if error.filename is None and error.errno is not None:  # a failed write, such as on a full disk
             raise InputError(path, "", f"cannot be written ({error.strerror})") from None
         raise
 
 
 class Recording:
-    """An open recording. Samples are read one at a time, so that images do not fill the memory."""
+    """Open recording, which reads one sample at a time so that images do not fill the memory."""
 
     def __init__(self, path: Path) -> None:
-        """Read the header and the first sample. Raises InputError, naming the file."""
-        self.path, self.is_whole = path, True  # is_whole: no damage found so far
+        """Read the header and the first sample. Raises InputError."""
+        self.path, self.is_whole = path, True  # is_whole: no damage was found so far
         self._written_by = ("", "")  # profile and library
         self.header = self._read_header()
         first = next(self.samples(), None)
         if first is None:
-            cut_off = "" if self.is_whole else " (the file ends within the first one)"
+            cut_off = "" if self.is_whole else "  (the file ends within the first sample)"
             raise InputError(path, "", f"contains no complete sample{cut_off}")
         self.first = first
 
@@ -181,7 +177,7 @@ class Recording:
         return untrusted_input.open_regular(self.path, most_bytes=LIMITS.file_bytes)
 
     def _read_header(self) -> RecordingHeader:
-        """Return the header from the metadata record, which repair tools write at the end."""
+        """Return the header from the metadata record, which repair tools move to the end of a file."""
         foreign = ""
         for topic, record in self._records():
             if topic and topic not in fmt.SCHEMAS:
@@ -193,12 +189,12 @@ class Recording:
                 except ValueError as error:
                     raise InputError(self.path, fmt.METADATA_NAME, str(error)) from None
         if not foreign and not self.is_whole:
-            raise InputError(self.path, "", "is an MCAP recording that ends before its first sample")
+            raise InputError(self.path, "", "is an MCAP recording without any sample")
         by = ", ".join(filter(None, (*self._written_by, foreign)))
         raise InputError(self.path, fmt.METADATA_NAME, f"is missing from this MCAP recording ({by}): {NEEDED}")
 
     def _records(self) -> Iterator[tuple[str, Any]]:
-        """Yield messages with their topics, and metadata with an empty topic, up to the end or a damaged record."""
+        """Yield each message with its topic, and metadata with an empty topic, up to a damaged record."""
         from mcap.records import Channel, Header, Message, Metadata
 
         topics: dict[int, str] = {}
@@ -223,14 +219,14 @@ class Recording:
             raise
         except OSError as error:
             raise InputError(self.path, "", f"cannot be read ({error.strerror})") from None
-        except Exception as error:  # mcap, lz4 and zstandard raise their own errors for a damaged file
+        except Exception as error:  # the errors of mcap, lz4 and zstandard for a damaged file
             if self.is_whole:
                 problem = str(error) or type(error).__name__
                 log.warning("%s: the file is truncated or damaged; reading the intact part (%s)", self.path, problem)
             self.is_whole = False
 
     def samples(self) -> Iterator[SensorFrame]:
-        """Yield all complete samples in order. A message of eye points completes a sample. Raises InputError."""
+        """Yield all complete samples in order. A sample is complete with its eye points. Raises InputError."""
         parts: dict[str, Any] = {}
         intrinsics: Intrinsics | None = None
         for topic, message in self._records():
@@ -249,11 +245,10 @@ class Recording:
 
 
 def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[Any]:
-    """Yield all records up to the footer, including those in chunks, whose unpacked sizes are checked.
+    """Yield all records up to the footer, including those inside chunks.
 
-    max_bytes: limit for a record, and for an unpacked chunk. Raises InputError for a chunk over the limit. For a
-    damaged file, raises the errors of mcap or a decompressor, but first yields the complete records of a chunk that is
-    truncated by the end of the file.
+    max_bytes: size limit for a record and for an unpacked chunk. Raises InputError for a larger chunk. For a damaged
+    file, yields the complete records of a chunk that is cut off, then raises the error of mcap or a decompressor.
     """
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader, breakup_chunk
@@ -269,12 +264,12 @@ def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[
                 yield from breakup_chunk(replace(record, compression="", data=data), validate_crc=True)
             else:
                 yield record
-            # mcap skips records of unknown kinds
+            # mcap skips unknown records
             if end in indexed and os.pread(file.fileno(), len(CHUNK), end) != CHUNK:
                 raise ValueError(f"the chunk at byte {end} is not marked as one")
     except InputError:
         raise
-    except Exception:  # mcap, lz4 and zstandard raise their own errors
+    except Exception:  # the errors of mcap, lz4 and zstandard
         file.seek(-len(MAGIC), os.SEEK_END)
         is_whole = file.read() == MAGIC  # a damaged file, whose lengths cannot be trusted
         file.seek(end)
@@ -284,7 +279,7 @@ def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[
 
 
 def _indexed_chunks(file: IO[bytes], *, max_bytes: int) -> set[int]:
-    """Return where chunks begin according to the file's summary; empty if it has no readable summary."""
+    """Return where chunks begin according to the file's summary; empty without a readable summary."""
     from mcap.reader import FOOTER_SIZE
     from mcap.records import ChunkIndex
     from mcap.stream_reader import StreamReader
@@ -297,12 +292,12 @@ def _indexed_chunks(file: IO[bytes], *, max_bytes: int) -> set[int]:
         begin = file.seek(next(records(file.read())).summary_start)
         summary = records(file.read() if end - begin < max_bytes else b"")
         return {record.chunk_start_offset for record in summary if isinstance(record, ChunkIndex)}
-    except Exception:  # a truncated or damaged file, or one of another kind
+    except Exception:  # truncated, damaged or not an MCAP file
         return set()
 
 
 def _cut_off_chunk(data: bytes) -> bytes:
-    """Return the complete records of a truncated chunk at the end of a file, uncompressed, or empty bytes."""
+    """Return the complete records of a chunk that the end of the file cuts off, unpacked."""
     if data[:1] != CHUNK or RECORD.unpack_from(data.ljust(RECORD.size, b"\0"))[1] <= len(data) - RECORD.size:
         return b""
     name = CHUNK_HEAD.unpack_from(data.ljust(CHUNK_HEAD.size, b"\0"))[-1]
@@ -318,15 +313,15 @@ def _cut_off_chunk(data: bytes) -> bytes:
 
 
 def _unpacked(chunk: Any, *, source: Path, max_bytes: int) -> bytes:
-    """Return a chunk's records as bytes. Raises InputError over the limit, else the decompressor's exception."""
+    """Return the records of a chunk as bytes. Raises InputError for a large chunk."""
     declared: int = chunk.uncompressed_size
-    room = min(declared, max_bytes) + 1  # unpackers allocate up to their limit
+    room = min(declared, max_bytes) + 1  # decompressors allocate up to their limit
     data = _expanded(chunk.compression, chunk.data, room=room)
     if len(data) > max_bytes:
         size = f"a chunk of {len(chunk.data)} bytes unpacks to {max(declared, len(data)) / MIB:.1f} MiB"
         raise InputError(source, "", f"{size}; the maximum is {max_bytes / MIB:g} MiB")
     if len(data) != declared:
-        raise ValueError(f"a chunk does not unpack to the declared {declared} bytes")
+        raise ValueError(f"a chunk does not unpack to the {declared} bytes that it declares")
     return data
 
 

@@ -1,4 +1,4 @@
-"""Format of recordings: topics, messages and their schemas, with encoding and decoding."""
+"""Format of recordings: topics, messages and schemas, with functions that encode and decode them."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ SCHEMA_VERSION = 1
 METADATA_NAME = "phasestack.recording"
 EYES_TOPIC, COLOUR_TOPIC, DEPTH_TOPIC, CALIBRATION_TOPIC = "/eyes", "/colour", "/depth", "/camera"
 POSITION_DIGITS = 7  # 0.1 µm, far below any sensor's noise
-JPEG_QUALITY = 92  # of recorded colour pictures
-NUMBER_MAX = 1 << 62  # sums and differences of two still fit 64 bits; 146 years in nanoseconds
-COORDINATE_MAX_M = 1e6  # beyond any sensor's range in any unit; the tracker checks for plausible values
+JPEG_QUALITY = 92  # for recorded colour pictures
+NUMBER_MAX = 1 << 62  # sums of two numbers fit in 64 bits; 146 years in nanoseconds
+COORDINATE_MAX_M = 1e6  # beyond any sensor's range in any unit; the tracker checks plausibility
 IMAGE_SIDE_MAX_PX = 1 << 15  # larger than any camera's pictures
 
 Count = Annotated[int, Field(ge=0, le=NUMBER_MAX)]
@@ -128,24 +128,24 @@ class RecordingHeader:
     depth: bool = False
 
     def metadata(self) -> dict[str, str]:
-        """Return the header as MCAP metadata, which maps text to text."""
+        """Return the header as MCAP metadata, which maps strings to strings."""
         flags = {name: str(int(value)) for name, value in asdict(self).items() if isinstance(value, bool)}
-        # `eye_points`: every sample contains the eyes, or null without a face.
+        # `eye_points`: every sample contains the eyes or, without a face, null.
         texts = {"schema_version": str(SCHEMA_VERSION), "driver": self.driver, "serial": self.serial, "eye_points": "1"}
         return texts | flags
 
     @classmethod
     def from_metadata(cls, metadata: dict[str, str]) -> RecordingHeader:
-        """Parse what `metadata` returned. Raises ValueError for another version."""
+        """Parse the result of `metadata`. Raises ValueError for another version."""
         version = metadata.get("schema_version", "missing")
         if version != str(SCHEMA_VERSION):
-            raise ValueError(f"schema version {version}; this program reads {SCHEMA_VERSION}")
+            raise ValueError(f"schema version {version} is not supported; this program reads version {SCHEMA_VERSION}")
         flags = {f.name: metadata.get(f.name) == "1" for f in fields(cls) if f.type == "bool"}
         return cls(metadata.get("driver", ""), metadata.get("serial", ""), **flags)
 
 
 def _read(kind: type[M], data: bytes) -> M:
-    """Parse a message. Raises ValueError with one line that names the field."""
+    """Parse a message. Raises ValueError that names the field, in one line."""
     try:
         return kind.model_validate_json(data)
     except ValidationError as error:
@@ -164,7 +164,7 @@ def _array(points: tuple[Point, Point] | None) -> F64 | None:
 
 
 def eyes_message(frame: SensorFrame) -> bytes:
-    """Encode a sample's eye points as JSON; coordinates that are not finite become null."""
+    """Encode the eye points of a sample as JSON. Non-finite coordinates become null."""
     record: dict[str, Any] = {"sequence": frame.sequence, "capture_ns": frame.capture_ns}
     record["eyes_m"] = _points(frame.eyes.eyes_m if frame.eyes else None)
     if frame.eyes is not None:
@@ -179,7 +179,7 @@ def eyes_message(frame: SensorFrame) -> bytes:
 
 
 def frame_from_eyes_message(data: bytes) -> SensorFrame:
-    """Decode `eyes_message`. Raises ValueError for another message."""
+    """Decode the result of `eyes_message`. Raises ValueError."""
     sample = _read(EyeSample, data)
     eyes_m, covariance_m2 = _array(sample.eyes_m), sample.covariance_m2
     eyes = None
@@ -196,19 +196,19 @@ def _stamped(capture_ns: int, **values: Any) -> bytes:
 
 
 def colour_message(colour: U8, *, capture_ns: int) -> bytes:
-    """Encode (h, w, 3) RGB as a JPEG in JSON."""
+    """Encode an (h, w, 3) RGB picture as a JPEG in JSON."""
     done, jpeg = cv2.imencode(".jpg", colour[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not done:
-        raise ValueError("JPEG encoding failed")
+        raise ValueError("OpenCV could not encode a picture as JPEG")
     return _stamped(capture_ns, data=base64.b64encode(jpeg.tobytes()).decode(), format="jpeg")
 
 
 def colour_from_message(data: bytes, *, max_pixels: int = 1 << 26) -> U8:
-    """Decode `colour_message` to (h, w, 3); JPEG is lossy. Raises ValueError."""
+    """Decode the result of `colour_message` to (h, w, 3), apart from JPEG's losses. Raises ValueError."""
     coded = base64.b64decode(_read(ColourImage, data).data)
     width, height = picture_size(coded)
     if max(width, height) > IMAGE_SIDE_MAX_PX or width * height > max_pixels:
-        raise ValueError(f"a colour image has {width} by {height} pixels; the maximum is {max_pixels:,} pixels")
+        raise ValueError(f"a colour image of {width} by {height} pixels exceeds the maximum of {max_pixels:,} pixels")
     image = None if is_cut_off(coded) else cv2.imdecode(np.frombuffer(coded, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
         raise ValueError("a colour image cannot be decoded")
@@ -216,23 +216,23 @@ def colour_from_message(data: bytes, *, max_pixels: int = 1 << 26) -> U8:
 
 
 def depth_message(depth_mm: U16, *, capture_ns: int) -> bytes:
-    """Encode (h, w) depth as raw 16-bit little-endian numbers in JSON."""
+    """Encode an (h, w) depth picture as 16-bit little-endian numbers in JSON."""
     height, width = depth_mm.shape
     raw = base64.b64encode(np.ascontiguousarray(depth_mm, dtype="<u2").tobytes()).decode()
     return _stamped(capture_ns, width=width, height=height, encoding="16UC1", step=2 * width, data=raw)
 
 
 def depth_from_message(data: bytes) -> U16:
-    """Decode `depth_message` to (h, w) millimetres, exactly. Raises ValueError."""
+    """Decode the result of `depth_message` to exact (h, w) millimetres. Raises ValueError."""
     image = _read(DepthImage, data)
     raw = base64.b64decode(image.data)
     if len(raw) != 2 * image.width * image.height:
-        raise ValueError(f"{len(raw)} bytes do not match {image.width} by {image.height} pixels of 16 bits")
+        raise ValueError(f"a depth image has {len(raw)} bytes, but {image.width} by {image.height} pixels of 16 bits")
     return np.frombuffer(raw, "<u2").reshape(image.height, image.width).astype(np.uint16)
 
 
 def calibration_message(intrinsics: Intrinsics, *, capture_ns: int) -> bytes:
-    """Encode pinhole intrinsics. Foxglove's pixel centres are integers, ours half-integers."""
+    """Encode intrinsics. Pixel centres are integers in Foxglove's schema, and half-integers in ours."""
     i = intrinsics
     matrix = [i.fx_px, 0.0, i.cx_px - 0.5, 0.0, i.fy_px, i.cy_px - 0.5, 0.0, 0.0, 1.0]
     projection = [*matrix[:3], 0.0, *matrix[3:6], 0.0, *matrix[6:], 0.0]
@@ -242,9 +242,9 @@ def calibration_message(intrinsics: Intrinsics, *, capture_ns: int) -> bytes:
 
 
 def intrinsics_from_message(data: bytes) -> Intrinsics:
-    """Decode `calibration_message`. Raises ValueError."""
+    """Decode the result of `calibration_message`. Raises ValueError."""
     camera = _read(Camera, data)
     k = camera.K
     if k[0] <= 0 or k[4] <= 0:
-        raise ValueError(f"K: focal lengths of {k[0]:g} and {k[4]:g} pixels")
+        raise ValueError(f"K: focal lengths must be positive, but are {k[0]:g} and {k[4]:g} pixels")
     return Intrinsics(camera.width, camera.height, k[0], k[4], k[2] + 0.5, k[5] + 0.5)

@@ -1,4 +1,4 @@
-"""Sensor drivers by name. A driver's module and its SDK are imported only when they are used."""
+"""Registry of sensor drivers. A driver's module and its SDK are imported only when they are used."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ DRIVERS = {  # included in phasestack
 
 
 def open_sensor(settings: SensorSettings, clock: Clock, *, latency_ms: float = 0.0) -> Sensor:
-    """Create the configured driver, unopened: a built-in one, or a custom class (`module:Class`).
+    """Create the configured driver, built-in or custom (`module:Class`), without opening it.
 
-    latency_ms: from capture to arrival, for replay. Raises InputError for an unknown name or for options that the class
-    refuses, MissingPart if an SDK is not installed.
+    latency_ms: delay from capture to arrival of replayed samples. Raises InputError for an unknown name or options that
+    the class refuses, and MissingPart if an SDK is not installed.
     """
     name = settings.driver
     if is_plugin(name):
         return _plugin(name, settings, clock)
     if name not in DRIVERS:
         known = f"{', '.join(DRIVERS)}, or your own class: module:Class"
-        raise InputError("sensor", "driver", f"unknown: {name!r}{nearest(name, DRIVERS)}; known: {known}")
+        raise InputError("sensor", "driver", f"unknown driver {name!r}{nearest(name, DRIVERS)}; must be one of {known}")
     driver = plugin_class(f"runtime.sensor.{DRIVERS[name]}", Sensor, field="sensor.driver")
     replayed = {"loop": settings.loop, "latency_ms": latency_ms}
     sensor: Sensor = driver(settings.source, clock, **replayed) if name == "replay" else driver(settings, clock)

@@ -1,4 +1,4 @@
-"""Driver `replay`: plays a recording as if it were a sensor, in real time or as fast as it is read."""
+"""Driver `replay`: plays a recording in real time, or as fast as it is read."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ def demo_recording_path() -> Path:
 
 
 class ReplayDriver(SteppedSensor):
-    """Plays a recording with its original rate and gaps, on the run's clock, starting at `open`.
+    """Driver that plays a recording with its original rate and gaps. The recording starts at `open`.
 
-    A sample arrives at its capture time plus the latency. Samples not later than their predecessor are skipped, and
-    the first skipped one is logged.
+    A sample arrives at its capture time plus the latency. Samples that are not later than their predecessor are
+    skipped. The first one is logged.
     """
 
     name = "replay"
 
     def __init__(self, source: str, clock: Clock, *, loop: bool = False, latency_ms: float = 0.0) -> None:
-        """source: a recording's path, or `demo`. latency_ms: from a sample's capture to its arrival."""
+        """source: path of a recording, or `demo`. latency_ms: delay of each sample from capture to arrival."""
         self.path, self._loop = demo_recording_path() if source == "demo" else Path(source), loop
         super().__init__(str(self.path), clock, latency_ms=latency_ms)
         self.capabilities = Capabilities(eye_points=True, may_pause=True)
@@ -47,7 +47,7 @@ class ReplayDriver(SteppedSensor):
         self._begin(self._shifted(recording))
 
     def _ordered(self, recording: Recording) -> Iterator[SensorFrame]:
-        """Yield samples with increasing capture times. Raises InputError if the recording is too long."""
+        """Yield samples in order of their capture times. Raises InputError if the recording is too long."""
         last_ns, is_logged = -1, False
         for number, frame in enumerate(recording.samples()):
             if frame.capture_ns <= last_ns:
@@ -65,7 +65,7 @@ class ReplayDriver(SteppedSensor):
             yield frame
 
     def _shifted(self, recording: Recording) -> Iterator[SensorFrame]:
-        """Yield samples on the run's clock. A loop restarts after the recording's last interval."""
+        """Yield samples with their times on the run's clock. A loop restarts one sample interval after the end."""
         last_ns = interval_ns = sequence_shift = last_sequence = shift_ns = 0
         is_first_round = True
         while True:

@@ -1,4 +1,4 @@
-"""Sources of samples: a sensor thread in real time, or a recording on a simulated clock."""
+"""Sources of samples: a sensor's thread in real time, or a recording on a simulated clock."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.base import Sensor, SteppedSensor
 
 FindEyes = Callable[[SensorFrame], EyePoints | None]
-AHEAD_NS = NS_PER_S // 10  # longer than the time from a sample to the display of a refresh that uses it
+AHEAD_NS = NS_PER_S // 10  # longer than the delay from a sample to the display of its refresh
 
 
 class Samples(ABC):
-    """The presenter's interface to the sensor. No method waits."""
+    """Interface between presenter and sensor. No method waits."""
 
-    stale_inputs: int  # samples superseded by a newer one before use
-    serial: str  # the sensor's serial number, if known
+    stale_inputs: int  # samples replaced by a newer one before use
+    serial: str  # serial number of the sensor, if known
 
     @abstractmethod
     def arrived(self, now_ns: int) -> list[SensorFrame]:
-        """Return the samples that arrived since the last call, in order. Raises EndOfRecording, FatalError."""
+        """Return the samples that have arrived since the last call. Raises EndOfRecording, FatalError."""
 
     def fault(self) -> str:
-        """Return why there is no working sensor, or an empty string if there is one."""
+        """Return the reason why the sensor does not work, or an empty string."""
         return ""
 
     def recorded_ahead(self) -> list[SensorFrame]:
-        """Return a recording's samples just after the last refresh, to evaluate it; [] for a live sensor."""
+        """Return the recorded samples shortly after the last refresh, for evaluation. Empty if live."""
         return []
 
     @abstractmethod
@@ -39,17 +39,17 @@ class Samples(ABC):
 
 
 def searched(frame: SensorFrame, find: FindEyes | None, *, keep_images: bool = False) -> SensorFrame:
-    """Find the eyes in a sample's pictures, then drop the pictures unless `keep_images` is set."""
+    """Find the eyes in the pictures of a sample. Drops the pictures unless `keep_images` is set."""
     if find is not None:
         frame = replace(frame, eyes=find(frame))
     return frame if keep_images else replace(frame, colour=None, depth_mm=None)
 
 
 class RecordedSamples(Samples):
-    """A recording on the simulated clock: each sample arrives the configured latency after its capture."""
+    """Recording on the simulated clock. Each sample arrives at its capture time plus the latency."""
 
     def __init__(self, driver: Sensor) -> None:
-        """Raise InputError if the driver is not a recording's, or if the recording can't be read."""
+        """Raises InputError if the driver is not a recording's or the recording cannot be read."""
         if not isinstance(driver, SteppedSensor):
             raise InputError("run", "--max-speed", f"requires a recording, not the sensor {driver.name}")
         self._driver = driver
@@ -59,7 +59,7 @@ class RecordedSamples(Samples):
 
     def arrived(self, now_ns: int) -> list[SensorFrame]:
         if self._driver.peek() is None:
-            raise EndOfRecording("no more samples")
+            raise EndOfRecording("the recording has ended")
         frames = self._next_while(lambda frame: self._driver.available_ns(frame) <= now_ns)
         self.stale_inputs += max(0, len(frames) - 1)
         return frames

@@ -1,4 +1,4 @@
-"""Driver `usb-camera`: a webcam through V4L2. The eyes' distance follows from their separation."""
+"""Driver `usb-camera`: a webcam through V4L2. The viewer's distance follows from the eye separation."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from runtime.records import Intrinsics, SensorFrame
 from runtime.sensor.base import Capabilities, Sensor
 from runtime.support.film import open_film
 
-WAITED_NS = 3 * NS_PER_MS  # a picture that arrives sooner was already queued in the driver, which may hold newer ones
-QUEUE_MAX = 8  # maximum number of pictures taken from the driver's queue in one read
-STAMP_AGE_NS = NS_PER_S  # older timestamps, and future ones, are ignored
-STREAMS = ("rtsp", "rtsps", "http", "https")  # other protocols of FFmpeg may listen or open files
+WAITED_NS = 3 * NS_PER_MS  # a picture that arrives sooner was queued, and newer ones may follow
+QUEUE_MAX = 8  # maximum number of queued pictures skipped per read
+STAMP_AGE_NS = NS_PER_S  # timestamps older than this, or in the future, are ignored
+STREAMS = ("rtsp", "rtsps", "http", "https")  # FFmpeg's other protocols may open files or listen on ports
 
 
 class UsbCameraDriver(Sensor):
-    """Delivers the newest picture, with the kernel's timestamp of when its exposure ended."""
+    """Driver that delivers the newest picture with the kernel's timestamp for the end of its exposure."""
 
     name = "usb-camera"
     capabilities = Capabilities(colour=True)
 
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
-        """settings.source: empty or `demo` (the first camera), a number, a device, a file, or a `STREAMS` URL.
+        """settings.source: a number, a device, a file, a URL (`STREAMS`), or empty or `demo` for the first camera.
 
-        Raises InputError for any other URL, or if the field of view, which no webcam reports, is not set.
+        Raises InputError for other URLs, or if the field of view is not configured (webcams do not report it).
         """
         if not settings.fov_deg:
-            raise InputError("sensor", "fov_deg", "is required by usb-camera: the horizontal field of view in degrees")
+            raise InputError("sensor", "fov_deg", "must be the camera's horizontal field of view in degrees")
         source = settings.source if settings.source != "demo" else ""
         protocol = re.match(r"([\w+.-]+):", source)
         if protocol is not None and protocol[1] not in STREAMS:
-            raise InputError("sensor", "source", f"{protocol[1]}: not supported; use one of {', '.join(STREAMS)}")
+            raise InputError("sensor", "source", f"{protocol[1]} is not supported; use one of {', '.join(STREAMS)}")
         self._source = f"/dev/video{source or 0}" if re.fullmatch(r"\d*", source) else source
         self._fov_rad, self._clock = radians(settings.fov_deg), clock
         self._capture: Any = None
@@ -57,7 +57,7 @@ class UsbCameraDriver(Sensor):
         if not capture.isOpened():
             capture.release()
             raise SensorLost(
-                f"{self._source}: cannot be opened (in use by another program, or no permission: join the group video)"
+                f"{self._source} cannot be opened; it may be in use, or this user may not be in the group video"
             )
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         self._capture = capture
@@ -72,8 +72,8 @@ class UsbCameraDriver(Sensor):
             raise SensorLost("not open")
         for _ in range(QUEUE_MAX):
             begin_ns = self._clock.now_ns()
-            if not self._capture.grab():  # blocks until the next one; the worker's timeout handles a hang
-                raise SensorLost(f"{self._source}: stopped delivering pictures")
+            if not self._capture.grab():  # waits for the next picture; the worker handles a hang
+                raise SensorLost(f"{self._source} has stopped delivering pictures")
             self._number += 1
             now_ns = self._clock.now_ns()
             if not self._is_device or now_ns - begin_ns > WAITED_NS:
@@ -81,7 +81,7 @@ class UsbCameraDriver(Sensor):
             self.skipped += 1
         done, bgr = self._capture.retrieve()
         if not done:
-            raise SensorLost(f"{self._source}: sent a picture that can't be decoded")
+            raise SensorLost(f"{self._source} sent a picture that cannot be decoded")
         stamp_ns = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * NS_PER_MS)
         is_stamp = self._is_device and 0 <= now_ns - stamp_ns < STAMP_AGE_NS
         height, width = bgr.shape[:2]

@@ -16,7 +16,7 @@ SUPER_SPEED = 4  # libusb's constant for USB 3
 
 
 class KnownDevice(NamedTuple):
-    """A USB device that the driver `openni2` or `realsense` can open."""
+    """USB device that the driver `openni2` or `realsense` can open."""
 
     vendor_id: int
     product_id: int
@@ -44,13 +44,13 @@ _BY_ID = {(device.vendor_id, device.product_id): device for device in KNOWN_DEVI
 
 @dataclass(frozen=True, slots=True)
 class UsbDevice:
-    """A known device that is connected."""
+    """Known device that is connected."""
 
     known: KnownDevice
     bus: int
     address: int
-    serial: str  # empty if missing or not readable
-    speed: int  # libusb's constant; 0: unknown
+    serial: str  # empty if unknown or not readable
+    speed: int  # constant of libusb; 0: unknown
     is_accessible: bool
 
     def __str__(self) -> str:
@@ -58,12 +58,12 @@ class UsbDevice:
         return f"{self.known.name} ({usb_id}, {SPEEDS.get(self.speed, 'unknown')})"
 
     def problems(self) -> list[str]:
-        """List the problems that prevent its use, each with a remedy."""
+        """Return the problems that prevent its use, each with a remedy."""
         problems = []
         if self.known.needs_usb3 and 0 < self.speed < SUPER_SPEED:
-            problems.append(f"connected at {SPEEDS[self.speed]}, needs USB 3: use a blue port and the original cable")
+            problems.append(f"connected at {SPEEDS[self.speed]}, needs USB 3; use a blue port and the original cable")
         if not self.is_accessible:
-            problems.append(f"permission denied: install the udev rule {UDEV_RULE} and reconnect the device")
+            problems.append(f"permission denied; install the udev rule {UDEV_RULE} and reconnect the device")
         return problems
 
 
@@ -75,14 +75,14 @@ def _described(device: Any, known: KnownDevice) -> UsbDevice:
     try:
         serial = device.serial_number or ""
     except (usb.core.USBError, NotImplementedError, ValueError):
-        accessible = False  # pyusb raises ValueError ("no langid") without permission to read strings
+        accessible = False  # without permission to read strings, pyusb raises ValueError ("no langid")
     finally:
-        usb.util.dispose_resources(device)  # reading the serial number opened the device
+        usb.util.dispose_resources(device)  # reading the serial number has opened the device
     return UsbDevice(known, device.bus or 0, device.address or 0, serial, device.speed or 0, accessible)
 
 
 def find_devices(backend: Any = None) -> list[UsbDevice]:
-    """Find all known devices, ordered by bus and address. Raises MissingPart without libusb."""
+    """Return all known devices, ordered by bus and address. Raises MissingPart without libusb."""
     try:
         import usb.core
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""The sensor thread: queues samples, reopens lost sensors and abandons SDK calls that hang."""
+"""The sensor thread, which queues samples, reopens lost sensors and abandons hanging SDK calls."""
 
 from __future__ import annotations
 
@@ -19,39 +19,39 @@ from runtime.sensor.samples import FindEyes, Samples, searched
 from runtime.support.background import begin, patience_s
 from runtime.support.extras import missing_extra
 
-TIMEOUTS_TO_REOPEN = 2  # consecutive timeouts without an error after which the sensor is reopened
-REOPEN_AFTER_S, REOPEN_AFTER_MAX_S = 0.25, 0.5  # the wait before reopening a lost sensor doubles up to the second
-OPEN_TIMEOUT_S = 10.0  # an attempt to open the sensor that takes longer is abandoned and repeated
-HANG_MARGIN_S = 0.5  # time beyond its timeout after which a read counts as hung
-ABANDONED_MAX = 8  # with more abandoned threads, the sensor is not reopened
-QUEUE_MAX = 1024  # queued samples: four seconds of the fastest sensor
-PICTURES_MAX = 8  # queued samples with pictures
-AHEAD_NS = NS_PER_S // 1000  # a capture time later than its arrival by more than this is on another clock
-BEHIND_NS = 60 * NS_PER_S  # so is one earlier by more than this
-FROZEN_NS = 2 * NS_PER_S  # identical pictures or eye points for this long are a fault: real ones have noise
-COMPARED = slice(None, None, 4)  # rows and columns of a picture that are compared
+TIMEOUTS_TO_REOPEN = 2  # consecutive timeouts after which the sensor is reopened
+REOPEN_AFTER_S, REOPEN_AFTER_MAX_S = 0.25, 0.5  # delay before reopening a lost sensor; doubles up to the maximum
+OPEN_TIMEOUT_S = 10.0  # a longer attempt to open the sensor is abandoned and repeated
+HANG_MARGIN_S = 0.5  # a read counts as hung this long after its timeout
+ABANDONED_MAX = 8  # maximum number of abandoned threads
+QUEUE_MAX = 1024  # maximum number of queued samples: four seconds of the fastest sensor
+PICTURES_MAX = 8  # maximum number of queued samples with pictures
+AHEAD_NS = NS_PER_S // 1000  # a capture time this long after its arrival is on another clock
+BEHIND_NS = 60 * NS_PER_S  # and so is one this long before its arrival
+FROZEN_NS = 2 * NS_PER_S  # data that stay identical for this long are a fault, because real data have noise
+COMPARED = slice(None, None, 4)  # rows and columns of a picture to compare
 
 log = logging.getLogger(__name__)
 
 
 class SensorState(StrEnum):
-    """States of the sensor."""
+    """State of the sensor."""
 
     OPENING = "opening"
     RUNNING = "running"
-    STALLED = "stalled"  # open, but without new samples
-    LOST = "lost"  # closed; reopened with back-off
-    HUNG = "hung"  # a call into the SDK does not return; a new attempt follows
-    ENDED = "ended"  # the recording is over
-    FAILED = "failed"  # fatal: no retry
+    STALLED = "stalled"  # open, but delivers no samples
+    LOST = "lost"  # closed, will be reopened
+    HUNG = "hung"  # a call into the SDK does not return; another attempt follows
+    ENDED = "ended"  # the recording has ended
+    FAILED = "failed"  # permanent failure, no retry
     STOPPED = "stopped"
 
 
 class _Attempt:
-    """One thread that runs one driver. Once it is `abandoned`, its results are ignored."""
+    """Thread that runs one driver. Once it is `abandoned`, its results are ignored."""
 
     def __init__(self, number: int, run: Callable[[_Attempt], None], *, wait_s: float, deadline_ns: int) -> None:
-        """Start the thread. Raises TransientError if the system has no thread to spare."""
+        """Start the thread. Raises TransientError if the system cannot create one."""
         self.number, self.abandoned = number, threading.Event()
         self.wait_s, self.deadline_ns = wait_s, deadline_ns
         self.received = 0
@@ -59,7 +59,7 @@ class _Attempt:
 
 
 class SensorWorker(Samples):
-    """Runs a driver in its own thread. Only `close` blocks, up to its timeout."""
+    """Runs a driver in a separate thread. Only `close` blocks, up to its timeout."""
 
     def __init__(
         self,
@@ -70,7 +70,7 @@ class SensorWorker(Samples):
         *,
         keep_images: bool = False,
     ) -> None:
-        """make_driver: creates an unopened driver; make_find: creates an eye finder for drivers without one."""
+        """make_driver: creates an unopened driver. make_find: creates the eye finder for drivers of cameras."""
         self._make, self._settings, self._clock = make_driver, settings, clock
         self._make_find, self._keep_images = make_find, keep_images
         self._lock, self._watching = threading.Lock(), threading.Lock()
@@ -78,12 +78,12 @@ class SensorWorker(Samples):
         self._attempt: _Attempt | None = None
         self._hung: list[_Attempt] = []
         self._state, self.reason = SensorState.STOPPED, ""
-        self._was_well = False  # True once there was a valid sample
-        self._delivered: dict[str, tuple[int, int]] = {}  # checksum of the newest data, and when it last changed
-        self._untimely = ""  # problem with the latest timestamp
-        self._skipped = 0  # samples superseded by a newer one, apart from those that the current driver counts
+        self._was_well = False  # True after the first valid sample
+        self._delivered: dict[str, tuple[int, int]] = {}  # checksum of the data and time of their last change
+        self._untimely = ""  # what is wrong with the latest timestamp
+        self._skipped = 0  # samples replaced by newer ones, except those counted by the current driver
         self._driver: Sensor | None = None
-        self.serial = ""  # the device's serial number once opened, used to reopen the same device
+        self.serial = ""  # serial number of the opened device, to reopen the same one
         self.error: FatalError | None = None
 
     def start(self) -> None:
@@ -105,7 +105,7 @@ class SensorWorker(Samples):
         return frames
 
     def arrived(self, now_ns: int) -> list[SensorFrame]:
-        state = self.state  # read first: the last samples arrive before the state changes to ended
+        state = self.state  # read before the queue, because the last samples precede the change to ended
         frames = self.take()
         if not frames and state is SensorState.ENDED:
             raise EndOfRecording(self.reason)
@@ -122,7 +122,7 @@ class SensorWorker(Samples):
 
     @property
     def state(self) -> SensorState:
-        """Return the sensor's state; `reason` explains it."""
+        """State of the sensor, which `reason` explains."""
         self._watch()
         return self._state
 
@@ -132,11 +132,11 @@ class SensorWorker(Samples):
 
     @property
     def capabilities(self) -> Capabilities | None:
-        """Return the driver's capabilities, once it is open."""
+        """Capabilities of the driver, known once it is open."""
         return self._driver.capabilities if self._driver else None
 
     def close(self, timeout_s: float = 1.0) -> None:
-        """Close the driver, or abandon it once the timeout has passed."""
+        """Close the driver, or abandon it after the timeout."""
         attempt, self._attempt = self._attempt, None
         if attempt is not None:
             attempt.abandoned.set()
@@ -144,9 +144,9 @@ class SensorWorker(Samples):
         self._state, self.reason = SensorState.STOPPED, ""
 
     def _watch(self) -> None:
-        """Abandon a thread whose call takes too long, and start a new one."""
+        """Abandon a thread whose call takes too long and start another one."""
         if not self._watching.acquire(blocking=False):
-            return  # another thread is already doing it
+            return  # another thread is already doing this
         try:
             self._abandon_if_hung(self._attempt)
         finally:
@@ -156,7 +156,7 @@ class SensorWorker(Samples):
         if attempt is None or self._clock.now_ns() <= attempt.deadline_ns or not attempt.thread.is_alive():
             return
         self._hung = [a for a in self._hung if a.thread.is_alive()]
-        reason = f"a call into the sensor's driver does not return ({len(self._hung) + 1} abandoned)"
+        reason = f"the sensor's driver hangs ({len(self._hung) + 1} threads abandoned)"
         if not attempt.abandoned.is_set():
             log.warning("sensor: %s", reason)
             self._set(attempt, SensorState.HUNG, reason)
@@ -164,7 +164,7 @@ class SensorWorker(Samples):
             self._account(self._driver)
             self._hung.append(attempt)
         if len(self._hung) <= ABANDONED_MAX:
-            with suppress(TransientError):  # no thread at present: the next `_watch` retries
+            with suppress(TransientError):  # no thread can be created now; the next `_watch` retries
                 self._begin(REOPEN_AFTER_S)
 
     def _set(self, attempt: _Attempt, state: SensorState, reason: str) -> None:
@@ -175,7 +175,7 @@ class SensorWorker(Samples):
                 self._state, self.reason = state, reason
 
     def _account(self, driver: Sensor | None) -> None:
-        """Add up the counts of a driver that is about to be discarded."""
+        """Add the counts of a driver that is about to be discarded to the total."""
         with self._lock:
             if driver is not None and driver is self._driver:
                 self._skipped += driver.skipped
@@ -204,7 +204,7 @@ class SensorWorker(Samples):
                         self.error = error
                     self._set(attempt, SensorState.FAILED, str(error))
                     return
-                self._set(attempt, SensorState.LOST, str(error))  # no descriptor or memory: may be temporary
+                self._set(attempt, SensorState.LOST, str(error))  # no descriptor or memory; may be temporary
             except TransientError as error:
                 self._set(attempt, SensorState.LOST, str(error))
             except BaseException as error:
@@ -212,7 +212,7 @@ class SensorWorker(Samples):
                     self.error = missing
                     self._set(attempt, SensorState.FAILED, str(missing))
                     return
-                # An SDK's exception or `sys.exit()` must not end the daemon, because the sensor may recover.
+                # An exception or `sys.exit()` in an SDK must not end the daemon, because the sensor may recover.
                 log.exception("sensor")
                 self._set(attempt, SensorState.LOST, f"{type(error).__name__}: {error}")
             finally:
@@ -252,7 +252,7 @@ class SensorWorker(Samples):
                 timeouts += 1
                 self._set(attempt, SensorState.STALLED, str(error))
                 if timeouts >= TIMEOUTS_TO_REOPEN:
-                    raise SensorLost(f"no new samples for {timeouts * s.timeout_s:g} s") from error
+                    raise SensorLost(f"the sensor has delivered no samples for {timeouts * s.timeout_s:g} s") from error
                 continue
             timeouts, now_ns = 0, self._clock.now_ns()
             if not (frames := self._timely(frames, now_ns)):
@@ -262,7 +262,7 @@ class SensorWorker(Samples):
             well_ns, self._was_well = now_ns, True
             if not driver.capabilities.may_pause:
                 self._check_changing(frames[-1], now_ns)
-            # Finding eyes takes as long as a camera's period, so only the newest frame is searched.
+            # Only in the newest frame, because finding eyes takes as long as the period of a camera.
             overtaken = 0 if find is None else len(frames) - 1
             frames = [searched(frame, find, keep_images=self._keep_images) for frame in frames[overtaken:]]
             attempt.received += 1
@@ -276,11 +276,11 @@ class SensorWorker(Samples):
                 self._set(attempt, SensorState.RUNNING, "")
 
     def _timely(self, frames: list[SensorFrame], now_ns: int) -> list[SensorFrame]:
-        """Return the frames with plausible capture times. Raises FatalError if no frame ever had one."""
+        """Return the frames with plausible capture times. Raises FatalError if none ever was."""
         timely = [frame for frame in frames if -AHEAD_NS <= now_ns - frame.capture_ns <= BEHIND_NS]
         if len(timely) < len(frames):
             ahead_s = (frames[-1].capture_ns - now_ns) / NS_PER_S
-            self._untimely = f"capture times are {ahead_s:+.3f} s from the current time: not on the run's clock"
+            self._untimely = f"capture times are {ahead_s:+.3f} s off; they must be on the run's clock"
             if not self._was_well:
                 raise FatalError(self._untimely)
             with self._lock:
@@ -288,9 +288,9 @@ class SensorWorker(Samples):
         return timely
 
     def _check_changing(self, frame: SensorFrame, now_ns: int) -> None:
-        """Raise SensorLost if a picture or the eyes have not changed for `FROZEN_NS`.
+        """Raise SensorLost if pictures or eyes have stayed identical for `FROZEN_NS`.
 
-        Missing eye points, or depth pictures without measurements, may persist indefinitely.
+        Missing eye points and depth pictures without measurements are allowed to persist.
         """
         compared = {
             "picture has": None if frame.colour is None else frame.colour[COMPARED, COMPARED],

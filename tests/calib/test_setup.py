@@ -84,7 +84,7 @@ def test_keys_alone_lead_from_nothing_to_a_configuration_that_is_valid(tmp_path:
     told = json.loads((folder / "out" / "setup.json").read_text())
     assert told["finished"]
     assert set(told["done"]) == {step.name for step in STEPS}
-    assert "mm of error expected at the eye" in told["done"]["calibration"]["text"]
+    assert "expected error at the eye" in told["done"]["calibration"]["text"]
     settings = load_settings(folder / "new.toml")
     for index, panel in enumerate(settings.output.panels):
         monitor = hardware.order.index(index)

@@ -260,7 +260,7 @@ def test_it_comes_back(pc: Pc, harm: str) -> None:
 @pytest.mark.parametrize("after_s", [0.5, 1.5, 3.0, 4.0, 10.0])
 def test_it_stops_within_two_seconds(pc: Pc, after_s: float) -> None:
     pc.done("systemctl stop phasestack")
-    assert "is stopped: sudo systemctl start phasestack" in pc.run("phasestack status").stderr
+    assert "is stopped; run: sudo systemctl start phasestack" in pc.run("phasestack status").stderr
     pc.done("systemctl start --no-block phasestack")
     time.sleep(after_s)
     begun_s = time.monotonic()

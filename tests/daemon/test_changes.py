@@ -248,7 +248,7 @@ def test_a_reload_refuses_what_is_read_only_at_the_start(
     """`[loop]` and `calibration.ipd_m` were accepted, and changed nothing."""
     served.config.write_text(configuration(**change))
     answer = served.asked("reload")
-    assert answer == {"ok": False, "error": f"reload: {name}: changing this requires a restart of the service"}
+    assert answer == {"ok": False, "error": f"reload: {name}: cannot change while the service runs; restart it"}
 
 
 def test_only_the_presenter_s_thread_writes_what_was_chosen(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:

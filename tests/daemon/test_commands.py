@@ -81,8 +81,12 @@ def test_without_a_daemon_status_fails_with_one_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("state", "result", "told"),
     [
-        ("inactive", "success", "is stopped: sudo systemctl start phasestack"),
-        ("failed", "exit-code", "exit status 2: a.toml: stack: no); fix that, then: sudo systemctl restart phasestack"),
+        ("inactive", "success", "is stopped; run: sudo systemctl start phasestack"),
+        (
+            "failed",
+            "exit-code",
+            "exit status 2: a.toml: stack: no); fix this, then run: sudo systemctl restart phasestack",
+        ),
         ("failed", "start-limit-hit", "sudo systemctl reset-failed phasestack"),
         ("activating", "success", "journalctl -u phasestack"),
     ],

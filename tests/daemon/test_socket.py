@@ -181,7 +181,7 @@ def test_a_command_that_was_refused_as_too_late_is_never_done(
     monkeypatch.setattr(server_module, "LOOP_ANSWERS_WITHIN_S", 0.05)
     answer = ask([path], {"command": "pause"})
     assert not answer["ok"]
-    assert "nothing was done" in answer["error"]
+    assert "the command was not run" in answer["error"]
     assert not server.commands.get(timeout=60).take()
 
 
@@ -190,7 +190,7 @@ def test_when_the_daemon_stops_waiting_clients_are_told_and_nothing_follows(serv
         asked = pool.submit(ask, [path], {"command": "pause"})
         command = server.commands.get(timeout=60)
         server.close()
-        assert "stops: nothing was done" in asked.result(timeout=60)["error"]
+        assert "stopping; the command was not run" in asked.result(timeout=60)["error"]
     assert not command.take()
 
 
