@@ -1,1 +1,1 @@
-"""The browser as viewer and display: scripts, and pages that show one solution."""
+"""The browser as viewer and display: its scripts, and pages that show one solution."""

@@ -1,4 +1,4 @@
-"""Link between the loop and the live pages, which send eye positions and receive layers."""
+"""Link between the loop and live pages, which send eye positions and receive layers."""
 
 from __future__ import annotations
 
@@ -15,47 +15,47 @@ import numpy as np
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, EyePoints, PanelFrame, SensorFrame
 
-SAMPLES_MAX = 256  # samples waiting for the sensor
-CAPTURES_MAX = 512  # captures whose page time is remembered
-OVERLAY_PX = 320  # width of the camera picture sent to pages
+SAMPLES_MAX = 256  # maximum number of samples that wait for the sensor
+CAPTURES_MAX = 512  # number of captures whose page time is remembered
+OVERLAY_PX = 320  # width of camera pictures sent to pages
 
 
 @dataclass(frozen=True, slots=True)
 class SeenEyes:
-    """Eye positions that a page reports."""
+    """Eye positions reported by a page."""
 
-    eyes_m: F64 | None  # (2, 3), frame `stack`; None: no viewer
-    page_ms: float  # time on the page's clock
+    eyes_m: F64 | None  # (2, 3) in the stack frame; None without a viewer
+    page_ms: float  # on the page's clock
 
 
 @dataclass(eq=False)
 class BrowserLink:
-    """Thread-safe link to the pages. One page is the viewer; the others only watch."""
+    """Thread-safe link to the pages. One page is the viewer, and the others only watch."""
 
-    stack: PanelStack  # the stack that is shown now
+    stack: PanelStack  # stack that is currently shown
     fov_deg: float
-    is_sensor: bool = True  # True: the viewer's eyes come from the page; False: from a camera
-    noise_mm: float = 0.2  # standard deviation per axis of the simulated sensor
+    is_sensor: bool = True  # True if the eyes come from the page, False if from a camera
+    noise_mm: float = 0.2  # simulated noise of the sensor, standard deviation per axis
     latency_ms: float = 0.0
-    is_camera: bool = False  # the viewer's page sends its camera's pictures
-    camera_fov_deg: float = 65.0  # horizontal; 65 fits most webcams
-    wishes: dict[str, float] = field(default_factory=dict)  # choices that need a restart: gap_mm, camera
-    moment: Any = None  # newest measured moment: layers and targets
-    found: dict[str, Any] | None = None  # newest camera picture and the pupils in it
-    frame: PanelFrame | None = None  # newest frame handed to the panels
-    shown: tuple[PanelFrame | None, dict[str, Any]] = (None, {})  # frame of the newest refresh, and its record
-    news: dict[object, Callable[[], None]] = field(default_factory=dict)  # callback for each refresh, by page
+    is_camera: bool = False  # the page of the viewer sends camera pictures
+    camera_fov_deg: float = 65.0  # horizontal field of view; 65 degrees is typical for webcams
+    wishes: dict[str, float] = field(default_factory=dict)  # choices that require a restart: gap_mm, camera
+    moment: Any = None  # layers and targets of the newest measured refresh
+    found: dict[str, Any] | None = None  # newest camera picture, with the pupils found in it
+    frame: PanelFrame | None = None  # newest frame given to the panels
+    shown: tuple[PanelFrame | None, dict[str, Any]] = (None, {})  # frame and record of the newest refresh
+    news: dict[object, Callable[[], None]] = field(default_factory=dict)  # called at each refresh, by page
     _arrived: threading.Condition = field(default_factory=threading.Condition)
-    _picture: tuple[bytes, float] | None = None  # coded camera picture and its time on the page's clock
+    _picture: tuple[bytes, float] | None = None  # encoded camera picture, and its time on the page's clock
     _samples: deque[SeenEyes] = field(default_factory=lambda: deque(maxlen=SAMPLES_MAX))
     _captures: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=CAPTURES_MAX))
 
     def is_viewer(self, page: object) -> bool:
-        """Return True if this page is the viewer, that is, the one that has been connected longest."""
+        """True if this page is the viewer, that is, has been connected longest."""
         return next(iter(self.news), None) is page
 
     def see(self, eyes_m: Any, page_ms: float) -> None:
-        """Add a sample. Raises ValueError unless these are two eyes in front of the panels."""
+        """Add a sample. Raises ValueError unless it consists of two eyes in front of the panels."""
         eyes = None
         if eyes_m is not None:
             eyes = np.array(eyes_m, np.float64)
@@ -66,7 +66,7 @@ class BrowserLink:
             self._arrived.notify()
 
     def seen(self, timeout_s: float) -> list[SeenEyes]:
-        """Take the unread samples, oldest first, waiting for the first one."""
+        """Take the unread samples, oldest first. Waits for the first one."""
         with self._arrived:
             if not self._samples:
                 self._arrived.wait(timeout_s)
@@ -75,13 +75,13 @@ class BrowserLink:
         return samples
 
     def send_picture(self, coded: bytes, page_ms: float) -> None:
-        """Store the newest camera picture, dropping an unread one."""
+        """Store the newest camera picture. An unread one is dropped."""
         with self._arrived:
             self._picture = coded, page_ms
             self._arrived.notify()
 
     def picture(self, timeout_s: float) -> tuple[bytes, float] | None:
-        """Take the newest unread picture, waiting for one."""
+        """Take the newest unread picture. Waits for one."""
         with self._arrived:
             if self._picture is None:
                 self._arrived.wait(timeout_s)
@@ -89,7 +89,7 @@ class BrowserLink:
         return taken
 
     def reporting(self, finder: Any) -> Callable[[SensorFrame], EyePoints | None]:
-        """Wrap an eye finder for a page's camera, so that its results are also sent to the pages."""
+        """Wrap an eye finder for the page's camera so that the pages also receive its results."""
 
         def find(frame: SensorFrame) -> EyePoints | None:
             eyes: EyePoints | None = finder.find(frame)
@@ -108,15 +108,15 @@ class BrowserLink:
         return find
 
     def captured(self, capture_ns: int, page_ms: float) -> None:
-        """Remember the page's time for a capture."""
+        """Remember the time of a capture on the page's clock."""
         self._captures.append((capture_ns, page_ms))
 
     def page_ms_of(self, capture_ns: int) -> float | None:
-        """Return the page time of the newest sample captured by `capture_ns`."""
+        """Return the page's time for the newest sample captured no later than `capture_ns`."""
         return next((page_ms for ns, page_ms in reversed(tuple(self._captures)) if ns <= capture_ns), None)
 
     def refreshed(self, account: dict[str, Any]) -> None:
-        """Publish a refresh. frame: what the panels show; account: its figures, as far as they are known."""
+        """Publish a refresh. frame: what the panels show. account: the figures known so far."""
         self.shown = self.frame, account
         self._notify()
 

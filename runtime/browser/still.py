@@ -1,4 +1,4 @@
-"""Self-contained HTML file of a solution: its layers, and the script that renders the eyes' views."""
+"""Self-contained HTML file with the layers of a solution and a script that renders what eyes see."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from runtime.support.artifacts import png_bytes, to_json
 from runtime.support.threads import parallel_map
 
 WEBP_MAX_PX = 16383
-EXTRA_BYTES = 60 << 10  # a page's size beyond its layers as PNG files
+EXTRA_BYTES = 60 << 10  # size of a page in addition to its layers as PNG files
 PAGE_BYTES = 8_000_000  # maximum size of a page
-LAYERS_BYTES = 6_400_000  # share for layers; larger ones (4K) are not stored exactly
-QUALITY_BYTES = 512  # share for the lines that report the compression's quality
-QUALITIES = (92, 84, 76, 66, 54)  # AVIF qualities; the first one that fits is used
+LAYERS_BYTES = 6_400_000  # share of the layers; larger ones (4K) are stored with losses
+QUALITY_BYTES = 512  # share of the lines that report the quality of the compression
+QUALITIES = (92, 84, 76, 66, 54)  # AVIF qualities, of which the first that fits is used
 CODINGS: dict[str, dict[str, Any]] = {
     "png": {},
     "webp": {"lossless": True, "method": 2},
@@ -36,7 +36,7 @@ CODINGS: dict[str, dict[str, Any]] = {
 
 
 def asset(name: str) -> str:
-    """Return the text of one of the browser's files."""
+    """Return the text of one of the browser's asset files."""
     return (files("runtime.browser") / "assets" / name).read_text(encoding="utf-8")
 
 
@@ -51,9 +51,10 @@ def viewer_html(
     relief: F32 | None = None,
     follows: bool = True,
 ) -> str:
-    """Return a viewer page of layers (N, h, w, 3 or 4), rear to front, for eyes (2, 3) in frame `stack`.
+    """Return a viewer page for layers (N, h, w, 3 or 4) that were solved for eyes (2, 3).
 
-    Layers are stored losslessly if they fit in `LAYERS_BYTES`, otherwise as AVIF; the page states the PSNR.
+    Layers are ordered rear to front, and eyes are in the stack frame. Layers are stored losslessly if they fit in
+    `LAYERS_BYTES`, otherwise as AVIF with the PSNR stated on the page.
     wanted: target pictures (h, w, 3), one per eye, `fov_deg` wide, compressed into the remaining size; () for none.
     text: the title, and lines below the controls. relief: (h, w), of the layers' content (`optics.relief`).
     follows: outer panels follow the head until the user switches that off.
@@ -81,12 +82,12 @@ def viewer_html(
 
 
 def half_floats(relief: F32) -> bytes:
-    """Encode a relief for the script: 16-bit floats, little-endian, row after row."""
+    """Encode a relief for the script as little-endian 16-bit floats, row by row."""
     return np.clip(relief, -1e3, 1e3).astype("<f2").tobytes()
 
 
 def stack_table(stack: PanelStack) -> dict[str, Any]:
-    """Return the stack's geometry and its panels' rest code as a table for the script."""
+    """Return the geometry of the stack and its rest code as a table for the script."""
     fields = ("width_m", "height_m", "x_m", "width_px", "height_px")
     table: dict[str, Any] = {name: getattr(stack, name) for name in fields}
     table["rest_code"] = rest_code(stack.count)
@@ -97,18 +98,18 @@ def stack_table(stack: PanelStack) -> dict[str, Any]:
 
 @cache
 def _script() -> str:
-    """Concatenate the modules into one script, without comments, imports and exports."""
+    """Concatenate the modules to one script without comments, imports and exports."""
     text = "\n".join(asset(name) for name in ("display.js", "look.js", "still.js"))
     return re.sub(r"^ *//.*\n| +// .*$|^ +|^export |^import .*\n", "", text, flags=re.MULTILINE)
 
 
 def _exact(layer: U8) -> str:
-    """Lossless data URL of a layer. WebP is a third smaller than PNG, which compensates for base64."""
+    """Encode a layer losslessly as a data URL. WebP is a third smaller than PNG, which offsets base64."""
     return _url(layer, "webp" if max(layer.shape) <= WEBP_MAX_PX else "png")
 
 
 def _stored(pictures: Sequence[U8], room: int, *, qualities: Sequence[int] = QUALITIES) -> tuple[list[str], float]:
-    """Encode pictures as data URLs, within `room` bytes if possible. Also returns the coding's mean squared error."""
+    """Encode pictures as data URLs within `room` bytes if possible. Also returns the mean squared error."""
     urls: list[str] = []
     for quality in qualities:
         urls = parallel_map(partial(_url, kind="avif", quality=quality), list(pictures))
@@ -126,5 +127,5 @@ def _url(picture: U8, kind: Literal["png", "webp", "avif"], quality: int = 20) -
 
 
 def _embedded(value: Any) -> str:
-    """Encode as JSON that can't end a script element."""
+    """Encode as JSON that cannot end a script element."""
     return to_json(value).replace("<", "\\u003c")

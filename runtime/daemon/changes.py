@@ -219,5 +219,5 @@ def _problem_of(command: Command, work: Callable[[], None]) -> str:
         return str(error)
     except (Exception, SystemExit) as error:
         log.exception("%s", command.name)
-        return f"unexpected {type(error).__name__}; see the log"
+        return f"unexpected error ({type(error).__name__}); see the log"
     return ""

@@ -94,7 +94,7 @@ def _advice(error: Exception) -> str:
         case ConnectionRefusedError():
             return "the daemon has died"
         case TimeoutError():
-            return "the daemon does not answer in time"
+            return "no answer in time; the daemon hangs"
     return str(error) or type(error).__name__
 
 

@@ -43,7 +43,7 @@ def parse(request: Any) -> Command:
         raise ValueError("a request must be one JSON object")
     name, value = request.get("command"), request.get("value")
     if name not in NAMES:
-        raise ValueError(f"command: must be one of status, {', '.join(NAMES)}")
+        raise ValueError(f"command: unknown command; must be one of status, {', '.join(NAMES)}")
     if name in ("scene", "model") and not (isinstance(value, str) and value):
         raise ValueError(f"value: {name} requires a name")
     if name == "place":

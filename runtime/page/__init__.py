@@ -1,1 +1,1 @@
-"""Operator's page: a separate process that talks to the running daemon over its socket."""
+"""The operator's page, a separate process that talks to the running daemon over its socket."""

@@ -1,4 +1,4 @@
-"""uvicorn connections with limits, so that idle ones do not block others."""
+"""Limited uvicorn connections, so that idle ones do not block others."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CONNECTIONS_MAX = 64  # simultaneous connections
 
 
 class LimitedConnection(H11Protocol):
-    """A connection that is closed when idle; if there are too many, the longest-idle one is closed."""
+    """Connection that closes when idle. If there are too many, the one idle longest is closed."""
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
@@ -25,7 +25,7 @@ class LimitedConnection(H11Protocol):
         self._timer: asyncio.TimerHandle = self.loop.call_later(REQUEST_S, self._let_go)
         if len(self.connections) > CONNECTIONS_MAX:
             waiting = [one for one in self.connections if isinstance(one, LimitedConnection) and one.waits]
-            min(waiting, key=lambda one: one.made_s).transport.abort()  # possibly this one
+            min(waiting, key=lambda one: one.made_s).transport.abort()  # may be this one
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._timer.cancel()
@@ -38,20 +38,20 @@ class LimitedConnection(H11Protocol):
         return cycle is None or bool(cycle.response_complete)
 
     def _let_go(self) -> None:
-        if self.waits and self in self.connections:  # False after an upgrade to another protocol
+        if self.waits and self in self.connections:  # not after an upgrade to another protocol
             self.transport.abort()
 
 
 def listening(command: str, port: int) -> sockets.socket:
-    """Return a bound socket on loopback. Raises InputError if the port is in use."""
+    """Bind a socket on loopback. Raises InputError if the port is in use."""
     try:
         return sockets.create_server((LOOPBACK, port))
     except OSError as error:
-        raise InputError(command, "--port", f"{port}: cannot listen ({error.strerror})") from None
+        raise InputError(command, "--port", f"cannot listen on port {port} ({error.strerror})") from None
 
 
 def server_of(application: Any) -> uvicorn.Server:
-    """Return a uvicorn server for an application, with the same limits for all pages."""
+    """Return a uvicorn server with the limits that all pages share."""
     return uvicorn.Server(
         uvicorn.Config(
             application,

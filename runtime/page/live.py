@@ -1,4 +1,4 @@
-"""WebSocket of a live page, which sends the viewer's eyes and receives layers and refreshes."""
+"""WebSocket of a live page, which sends eye positions and receives layers and refreshes."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from runtime.optics.retina import as_codes
 from runtime.records import F32, U8
 from runtime.support.artifacts import to_json
 
-PAGES_MAX = 8  # live pages; each of them is sent pictures
+PAGES_MAX = 8  # maximum number of live pages, because each receives pictures
 RANGES = {"noise_mm": (0.0, 50.0), "latency_ms": (0.0, 1000.0), "camera_fov_deg": (20.0, 150.0)}
 RANGES |= {"gap_mm": (1.0, 500.0), "camera": (0.0, 1.0)}  # changing these restarts the loop
 
 
 async def live(socket: WebSocket, link: BrowserLink, *, protocol: str | None) -> None:
-    """Serve one authorised page until it disconnects."""
+    """Serve an authorised page until it disconnects."""
     if len(link.news) >= PAGES_MAX:
-        await socket.close(1013, "too many pages")
+        await socket.close(1013, "too many pages are open")
         return
     await socket.accept(protocol)
     page = _Page(socket, link)
@@ -48,19 +48,19 @@ async def live(socket: WebSocket, link: BrowserLink, *, protocol: str | None) ->
 
 
 def _tell(loop: asyncio.AbstractEventLoop, news: asyncio.Event) -> None:
-    with contextlib.suppress(RuntimeError):  # the server's loop has ended
+    with contextlib.suppress(RuntimeError):  # the server's event loop has ended
         loop.call_soon_threadsafe(news.set)
 
 
 class _Page:
-    """State of one page. The next picture is sent once the page has drawn the previous one."""
+    """State of one page. It gets the next picture once it has drawn the previous one."""
 
     def __init__(self, socket: WebSocket, link: BrowserLink) -> None:
         self._socket, self._link = socket, link
         self.news, self._sent = asyncio.Event(), {"solved": 0, "flat": 0}
-        self._under_way = False  # True until the page has drawn the layers last sent
+        self._under_way = False  # the page has not drawn the last layers yet
         self._stack: Any = None
-        self._checks, self._moment = False, None  # checks: the page shows the newest measured refresh instead
+        self._checks, self._moment = False, None  # checks: show the newest measured refresh instead of the live one
 
     async def send(self, me: object) -> None:
         sent: dict[str, Any] = {}
@@ -91,14 +91,14 @@ class _Page:
             self.news.clear()
 
     async def _send_layers(self, kind: str, layers: U8, relief: F32 | None, solved_for_m: Any) -> None:
-        """Send RGBA layers, followed by the relief of their content as 16-bit floats if it is known."""
+        """Send RGBA layers and, if known, the relief of their content as 16-bit floats."""
         data = await asyncio.to_thread(lambda: layers.tobytes() + (b"" if relief is None else half_floats(relief)))
         message = {"layers": kind, "solved_for_m": solved_for_m, "size": layers.shape[2:0:-1]}
         await self._say(message if relief is None else message | {"relief": relief.shape[::-1]})
         await self._socket.send_bytes(data)
 
     async def _send_moment(self, moment: Any) -> None:
-        """Send layers followed by both eyes' targets, all RGBA."""
+        """Send layers and the targets of both eyes, all as RGBA."""
         views = moment.eye_views
 
         def packed() -> bytes:

@@ -1,4 +1,4 @@
-"""Figures of the status in Prometheus's text format, with their JSON names."""
+"""Figures of the status in the text format of Prometheus, under their JSON names."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ TEXTS = ("state", "effort", "model", "scene")
 
 
 def exposition(status: Mapping[str, Any]) -> str:
-    """Format all numbers of a status, with labels for quantiles, tables and texts. Nulls are skipped."""
+    """Format all numbers of a status, with labels for quantiles, tables and texts. Skips nulls."""
     return "".join(f"{line}\n" for line in _lines(status))
 
 
@@ -33,7 +33,7 @@ def _lines(status: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _key(field: str, key: str) -> str:
-    """Return an entry's label: `p95` is the quantile 0.95, `max` the quantile 1."""
+    """Return the label of an entry. `p95` is the quantile 0.95, and `max` the quantile 1."""
     if field in TABLES:
         return _label(TABLES[field], key)
     if key[:1] == "p" and key[1:].isdigit():

@@ -1,7 +1,7 @@
-"""Web application of the page; all access to the daemon needs the token.
+"""Web application of the operator's page. All access to the daemon requires the token.
 
-The page's script stores the token (`session.js`) and sends it with every request. Browsers do not give it to another
-site or port. Without a cookie, another site's request cannot carry it.
+The script stores the token (`session.js`) and sends it with every request. Other sites and ports cannot read it and,
+because it is no cookie, their requests cannot carry it.
 """
 
 from __future__ import annotations
@@ -51,20 +51,20 @@ Handler = Callable[[Request], Awaitable[Response]]
 
 
 class JsonAnswer(JSONResponse):
-    """JSON response in ASCII, because file names need not be UTF-8."""
+    """JSON response in ASCII, because file names may not be UTF-8."""
 
     def render(self, content: Any) -> bytes:
         return to_json(content).encode()
 
 
 class TooLong(ValueError):
-    """A request's body is too long."""
+    """The body of a request is too long."""
 
 
 def application(daemon: DaemonClient, token: str, *, link: BrowserLink | None = None) -> Starlette:
-    """Return the application, for loopback.
+    """Create the application, which must listen on loopback only.
 
-    link: for a page that is the display itself; its address contains the token.
+    link: makes the page the display itself. Its address contains the token.
     """
 
     def permitted(request: HTTPConnection) -> bool:
@@ -74,7 +74,7 @@ def application(daemon: DaemonClient, token: str, *, link: BrowserLink | None = 
     def guarded(handler: Handler) -> Handler:
         async def answer(request: Request) -> Response:
             if not permitted(request):
-                return JsonAnswer({"ok": False, "error": "log in first"}, 401, {"WWW-Authenticate": "Bearer"})
+                return JsonAnswer({"ok": False, "error": "not logged in"}, 401, {"WWW-Authenticate": "Bearer"})
             return await handler(request)
 
         return answer
@@ -86,7 +86,7 @@ def application(daemon: DaemonClient, token: str, *, link: BrowserLink | None = 
         return HTMLResponse(_asset("page.html"))
 
     async def connected(socket: WebSocket) -> None:
-        # The only header of a WebSocket that a browser's script can set is the list of protocols.
+        # A browser's script can set only one header of a WebSocket, the list of protocols.
         offered = [one.strip() for one in socket.headers.get("sec-websocket-protocol", "").split(",")]
         if link is None or not (permitted(socket) or any(same(one, token) for one in offered)):
             await socket.close(1008)
@@ -121,7 +121,7 @@ def application(daemon: DaemonClient, token: str, *, link: BrowserLink | None = 
         except (InputError, ValueError):
             command = None
         if not isinstance(command, dict) or command.get("command") not in NAMES:
-            return JsonAnswer({"ok": False, "error": f"command: one of {', '.join(NAMES)}"}, 400)
+            return JsonAnswer({"ok": False, "error": f"command: must be one of {', '.join(NAMES)}"}, 400)
         answer = await run_in_threadpool(daemon.tell, command["command"], command.get("value"))
         code = 200 if answer.get("ok") else 503 if answer.get("running") is False else 409
         return JsonAnswer(answer, code)
@@ -139,14 +139,14 @@ def application(daemon: DaemonClient, token: str, *, link: BrowserLink | None = 
 
 
 async def _guard(request: Request, handler: Handler) -> Response:
-    """Add the security headers to every answer."""
+    """Add security headers to every answer."""
     answer = await handler(request)
     answer.headers.update(HEADERS)
     return answer
 
 
 async def _body(request: Request) -> bytes:
-    """Return a request's body. Raises TooLong, and ValueError if it does not arrive in time."""
+    """Return the body of a request. Raises TooLong, or ValueError if it does not arrive in time."""
     received = b""
     try:
         async with asyncio.timeout(REQUEST_S):

@@ -1,4 +1,4 @@
-"""The page's token, in a file that only its owner can read."""
+"""The page's token, stored in a file that only its owner can read."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from pathlib import Path
 
 from runtime.errors import InputError
 
-TOKEN_BYTES = 32  # random bytes of a new token
-LEAST_CHARACTERS = 16  # least length of a hand-written token; a shorter one could be guessed
-MOST_BYTES = 4096  # largest part of the file that is read
+TOKEN_BYTES = 32  # length of a new token
+LEAST_CHARACTERS = 16  # minimum length of a token; a shorter one could be guessed
+MOST_BYTES = 4096  # maximum number of bytes read from the file
 
 
 def token_of(path: Path) -> str:
-    """Return the token in a file, which is created if missing. Raises InputError, naming the file."""
+    """Read the token from a file, which is created if missing. Raises InputError."""
     token, name = secrets.token_urlsafe(TOKEN_BYTES), ""
     try:
         if not os.path.lexists(path):
@@ -25,10 +25,10 @@ def token_of(path: Path) -> str:
             file, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)  # mode 0600
             with os.fdopen(file, "w", encoding="ascii") as opened:
                 opened.write(token + "\n")
-            os.link(name, path)  # atomically
+            os.link(name, path)  # atomic
             return token
     except FileExistsError:
-        pass  # another process created it first
+        pass  # another process was faster
     except OSError as error:
         raise InputError(path, "", f"cannot be created ({error.strerror})") from None
     finally:
@@ -45,19 +45,19 @@ def _read(path: Path) -> str:
     with os.fdopen(file, "rb") as opened:
         status = os.fstat(opened.fileno())
         if not stat.S_ISREG(status.st_mode):
-            raise InputError(path, "", "is not a file")
+            raise InputError(path, "", "is not a regular file")
         if status.st_uid != os.geteuid():
-            raise InputError(path, "", f"belongs to another user (uid {status.st_uid}), who knows the token")
+            raise InputError(path, "", f"belongs to another user (uid {status.st_uid}), who therefore knows the token")
         if status.st_mode & 0o077:
             raise InputError(
-                path, "", f"others may read it (mode {status.st_mode & 0o777:o}): chmod it to 600, or delete it"
+                path, "", f"is readable by others (mode {status.st_mode & 0o777:o}); set its mode to 600 or delete it"
             )
         token = (opened.read(MOST_BYTES) or b"").decode("ascii", "replace").strip()
     if len(token) < LEAST_CHARACTERS or not token.isprintable() or " " in token:
         raise InputError(
             path,
             "",
-            f"contains no token of at least {LEAST_CHARACTERS} characters on one line",
+            f"must contain a token of at least {LEAST_CHARACTERS} characters on one line",
         )
     return token
 

@@ -1,4 +1,4 @@
-"""Interface of the panel sinks: windows, offscreen, browser."""
+"""Interface of the outputs to the panels."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ from runtime.records import PanelFrame, PresentReport
 
 
 class PanelSink(ABC):
-    """An output to all panels of the stack. A frame is shown on all of them or on none."""
+    """Output to all panels of the stack. A frame appears on all of them or on none."""
 
     name: str
-    contexts_lost = 0  # GL contexts lost since the start. After a GPU reset, every other context is lost as well
+    contexts_lost = 0  # number of GL contexts lost; a GPU reset loses all other contexts, too
 
     @property
     def period_ns(self) -> int | None:
-        """Return the interval between vertical blanks of the monitor that sets the pace, or None if unknown."""
+        """Refresh period of the monitor that sets the pace, or None if unknown."""
         return None
 
     @property
     def window_handles(self) -> list[Any]:
-        """Return the GLFW handles of the open windows, for reading their keys."""
+        """GLFW handles of the open windows, from which keys can be read."""
         return []
 
     @abstractmethod
     def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
-        """Show a frame on every panel: the solution is aligned, then mixed with the flat picture.
+        """Show a frame on every panel. The solution is aligned, then mixed with the flat picture.
 
-        The frame's arrays must not change until another frame has been presented: until then a sink may read them.
+        The arrays of the frame must not change until another frame has been presented, because a sink may read them.
         unchanged: the caller guarantees that this frame shows the same picture as the previous one. Panels that still
-        show it skip upload, drawing and swap, so the flat picture costs almost nothing while there is no viewer.
-        Raises PanelLost; a later call rebuilds the panels.
+        show it do nothing, so the flat picture costs almost nothing while there is no viewer. Raises PanelLost, after
+        which a later call rebuilds the panels.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Release windows and contexts. Never raises; may be called twice."""
+        """Release windows and contexts. Never raises. May be called twice."""

@@ -1,4 +1,4 @@
-"""Test card of `identify`, which shows a panel's index, orientation, colours and edges."""
+"""Test card of `phasestack identify`, which shows a panel's index, orientation, colours and edges."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def identity_card(width_px: int, height_px: int, *, title: str, lines: Sequence[str]) -> U8:
-    """Draw an upright (height_px, width_px, 4) card: title, lines, upward arrow, colour bars, grey steps.
+    """Draw a card (height_px, width_px, 4) with text, an upward arrow, colour bars and grey steps.
 
-    A one-pixel line runs along every edge; if one is missing, the panel is cropped or misaligned. Text stays away from
-    the edges, because nearby viewers see the front panel's rim without a lit panel behind it.
+    A one-pixel line runs along every edge. If one is invisible, the panel is cropped or misaligned. Text keeps away
+    from the edges, because nearby viewers see the rim of the front panel without a lit panel behind it.
     """
     card = np.empty((height_px, width_px, 4), np.uint8)
     card[:] = PAPER
@@ -41,7 +41,7 @@ def identity_card(width_px: int, height_px: int, *, title: str, lines: Sequence[
 
 
 def alone(cards: Sequence[U8], index: int) -> U8:
-    """Return (N, H, W, 4) layers with the card on one panel and the other panels clear."""
+    """Return layers (N, H, W, 4) with the card on one panel while the others are clear."""
     layers = np.zeros((len(cards), *cards[index].shape), np.uint8)
     layers[..., 3] = 255
     layers[index] = cards[index]
@@ -67,7 +67,7 @@ def _arrow(card: U8, *, x_px: int, top: int, bottom: int, unit: float) -> None:
 
 
 def _text(card: U8, text: str, *, x_px: int, y_px: int, height: float, room: float) -> None:
-    # OpenCV's Hershey fonts are ASCII only.
+    # OpenCV's Hershey fonts contain only ASCII.
     plain = text.encode("ascii", "replace").decode()
     (full, tall), _ = cv2.getTextSize(plain, FONT, 1.0, 1)
     scale = min(height / tall, room / max(full, 1))

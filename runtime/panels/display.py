@@ -1,4 +1,4 @@
-"""GLFW on X11: monitors, and windows whose GL contexts share one root's objects. Main thread only."""
+"""GLFW on X11: monitors, and windows that share GL objects. For the main thread only."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from runtime.support.gl import MINIMUM_VERSION
 
 log = logging.getLogger("phasestack.panels")
 
-glfw: Any = _glfw  # its stubs are wrong about bytes, None and pointers
+glfw: Any = _glfw  # untyped, because its stubs are wrong about bytes, None and pointers
 
-# By default the binding turns errors into warnings; here every error is an exception.
+# The binding would otherwise turn errors into warnings.
 glfw.ERROR_REPORTING = "exception"
 
 
 @cache
 def gl_function(name: str) -> int:
-    """Return the address of an OpenGL function, which is the same in all contexts, or 0 if it is missing.
+    """Return the address of an OpenGL function, or 0 if it is missing. It is the same in all contexts.
 
-    The result is cached, because moderngl keeps references to all of them, 20 KiB per context.
+    Cached, because moderngl keeps references to all functions, which take 20 KiB per context.
     """
     return int(glfw.get_proc_address(name) or 0)
 
 
 class WindowContext:
-    """Adapts a GLFW window for moderngl: loads functions and makes the context current."""
+    """Adapter of a GLFW window for moderngl, which loads functions and makes the context current."""
 
     def __init__(self, window: Any) -> None:
         self._window = window
@@ -52,30 +52,30 @@ class WindowContext:
         """Leave the context current."""
 
     def release(self) -> None:
-        """Do nothing: the window owns its context."""
+        """Do nothing, because the window owns the context."""
 
 
 @dataclass(eq=False)
 class Window:
-    """A GLFW window and its moderngl context."""
+    """GLFW window with its moderngl context."""
 
     handle: Any
     context: moderngl.Context
-    faults: list[str] = field(default_factory=list)  # faults reported by its callback
+    faults: list[str] = field(default_factory=list)  # faults reported by callbacks
 
     def make_current(self) -> None:
-        """Make its context current on this thread."""
+        """Make the window's context current on this thread."""
         glfw.make_context_current(self.handle)
 
 
-watch: xlib.ServerWatch | None = None  # watches the process's connection
+watch: xlib.ServerWatch | None = None  # watches the connection of this process
 
 
 def _connect() -> None:
-    """Connect GLFW to the X server for the lifetime of the process. Raises PanelLost, MissingPart.
+    """Connect GLFW to the X server until the process ends. Raises PanelLost, MissingPart.
 
-    When the panels lose their contexts, a drawing thread may still have a context of the same EGL display current. If
-    GLFW then closed the display, Mesa would use freed memory.
+    The connection stays open because, when the panels lose their contexts, another thread may still use a context of
+    the same EGL display. If GLFW closed that display, Mesa would use freed memory.
     """
     global watch
     if watch is not None:
@@ -86,21 +86,21 @@ def _connect() -> None:
             glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_X11)
         glfw.init()
     except glfw.GLFWError as error:
-        raise PanelLost(f"no X server: {_text(error)} (DISPLAY and XAUTHORITY select it)") from None
+        raise PanelLost(f"no X server can be reached: {_text(error)} (check DISPLAY and XAUTHORITY)") from None
     if glfw.get_platform() != glfw.PLATFORM_X11:
-        raise MissingPart("GLFW runs without X11, but only on X11 can a window be placed on a chosen monitor")
+        raise MissingPart("GLFW does not use X11, which is required to place a window on a chosen monitor")
     xlib.take_over_errors()
     watch = xlib.ServerWatch(_pointer())
 
 
 class Display:
-    """Windows on the X server, including a hidden root window whose GL objects all others share.
+    """Windows on the X server. A hidden root window owns the GL objects that all others share.
 
-    No window outlives `close`. If the X server dies, the process ends (see `xlib.take_over_errors`).
+    `close` closes every window. If the X server dies, the process ends (see `xlib.take_over_errors`).
     """
 
     def __init__(self) -> None:
-        """Connect. Raises PanelLost (no X server or no access; may be temporary), MissingPart (no X11 library)."""
+        """Connect. Raises PanelLost if the X server cannot be used, and MissingPart without an X11 library."""
         self.faults: list[str] = []
         self._windows: list[Window] = []
         self._outputs: dict[str, int] = {}
@@ -109,9 +109,9 @@ class Display:
 
     @property
     def root(self) -> Window:
-        """Return the hidden window. It is created on first use, because listing monitors needs no OpenGL.
+        """Hidden root window, created on first use because listing monitors needs no OpenGL.
 
-        Raises PanelLost if the X server has no OpenGL.
+        Raises PanelLost if the X server does not support OpenGL.
         """
         if not self._windows:
             _hints()
@@ -119,7 +119,7 @@ class Display:
             try:
                 self._adopt(glfw.create_window(16, 16, "phasestack", None, None))
             except glfw.GLFWError as error:
-                raise PanelLost(f"no OpenGL on the X server: {_text(error)}") from None
+                raise PanelLost(f"the X server does not support OpenGL: {_text(error)}") from None
         return self._windows[0]
 
     def monitors(self) -> tuple[Monitor, ...]:
@@ -127,7 +127,7 @@ class Display:
         return in_order([monitor for monitor, _ in self._pairs()])
 
     def fullscreen_window(self, monitor: Monitor, *, title: str) -> Window:
-        """Open a borderless window that fills a monitor, and make its context current. Raises PanelLost."""
+        """Open a borderless window that fills a monitor and make its context current. Raises PanelLost."""
         share = self.root.handle
         handles = {connected.connector: handle for connected, handle in self._pairs()}
         if monitor.connector not in handles:
@@ -137,13 +137,13 @@ class Display:
         return self._adopt(handle)
 
     def poll(self) -> str:
-        """Process X events. Returns any faults that make the windows useless, or an empty string."""
+        """Process X events. Returns faults that make the windows useless, or an empty string."""
         glfw.poll_events()
         faults = self.faults + [fault for window in self._windows for fault in window.faults]
         return "; ".join(faults)
 
     def close_windows(self) -> None:
-        """Close all windows except the root."""
+        """Close all windows except the hidden root."""
         self._close_from(1)
         self.faults.clear()
         if self._windows:
@@ -175,12 +175,12 @@ class Display:
         return window
 
     def output_state(self, connector: str) -> xlib.OutputState | None:
-        """Return the current mode and monitor of an output, or None if it is off or disconnected."""
+        """Return the mode and monitor of an output, or None if it is off or disconnected."""
         output = self._outputs.get(connector)
         return xlib.output_state(_pointer(), output) if output else None
 
     def window_state(self, window: Window) -> tuple[bool, Rectangle] | None:
-        """Return whether a window and its ancestors are mapped, and its position; None if it was destroyed."""
+        """Return whether a window is mapped and its position, or None if it was destroyed."""
         refused = xlib.refusals()
         place = Rectangle(*glfw.get_window_pos(window.handle), *glfw.get_window_size(window.handle))
         is_viewable = bool(glfw.get_window_attrib(window.handle, glfw.VISIBLE))
@@ -195,7 +195,7 @@ class Display:
             x_px, y_px = glfw.get_monitor_pos(handle)
             state = self.output_state(connector)
             identity = edid.parse(state.edid) if state is not None and state.edid else None
-            # GLFW rounds the rate to a whole number.
+            # GLFW rounds the refresh rate to an integer.
             refresh_hz = state.refresh_hz if state is not None and state.refresh_hz else float(mode.refresh_rate)
             monitor = Monitor(
                 connector=connector,
@@ -216,19 +216,19 @@ class Display:
 
     @property
     def has_windows(self) -> bool:
-        """Return True if there are windows other than the hidden root."""
+        """True if there are windows other than the hidden root."""
         return len(self._windows) > 1
 
 
 def connected_monitors() -> tuple[Monitor, ...]:
-    """Return the active monitors, left to right. Raises PanelLost (no X server or monitor), MissingPart."""
+    """Return the active monitors, left to right. Raises PanelLost without an X server or a monitor."""
     display = Display()
     try:
         monitors = display.monitors()
     finally:
         display.close()
     if not monitors:
-        raise PanelLost("the X server has no active monitor")
+        raise PanelLost("no monitor is active on the X server")
     return monitors
 
 
@@ -239,7 +239,7 @@ def _attach(handle: Any) -> moderngl.Context:
 
 def _hints() -> None:
     glfw.default_window_hints()
-    # EGL, as for the offscreen context: a thread can't switch between GLX and EGL contexts.
+    # EGL, like the offscreen context, because a thread cannot switch between GLX and EGL contexts.
     glfw.window_hint(glfw.CONTEXT_CREATION_API, glfw.EGL_CONTEXT_API)
     glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, MINIMUM_VERSION // 100)
     glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, MINIMUM_VERSION // 10 % 10)

@@ -1,4 +1,4 @@
-"""Parser for a monitor's EDID (VESA E-EDID 1.3/1.4, base block)."""
+"""Parser for the EDID of a monitor (base block of VESA E-EDID 1.3 and 1.4)."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ SERIAL_TAG, NAME_TAG = 0xFF, 0xFC
 
 @dataclass(frozen=True, slots=True)
 class Edid:
-    """Manufacturer, model and serial number of a monitor."""
+    """Identity of a monitor."""
 
-    maker: str  # three letters
-    serial: str  # from the text descriptor, otherwise the header; unique only together with the model
+    maker: str  # manufacturer, three letters
+    serial: str  # unique only within a model
     name: str
 
 
 def parse(data: bytes) -> Edid | None:
-    """Parse the base block of an EDID. Returns None if its length, header or checksum is wrong."""
+    """Parse the base block of an EDID. Returns None for a wrong length, header or checksum."""
     block = data[:BLOCK_BYTES]
     if len(block) < BLOCK_BYTES or not block.startswith(HEADER) or sum(block) % 256:
         return None
@@ -29,7 +29,7 @@ def parse(data: bytes) -> Edid | None:
     number = int.from_bytes(block[12:16], "little")
     return Edid(
         maker=maker,
-        # Makers write 0 or 0x01010101 if there is no number.
+        # Manufacturers write 0 or 0x01010101 for no number.
         serial=_text(block, SERIAL_TAG) or (str(number) if number not in (0, 0x01010101) else ""),
         name=_text(block, NAME_TAG),
     )

@@ -1,4 +1,4 @@
-"""Mapping from a monitor's pixels to a layer's pixels: registration, mirroring and mounting."""
+"""Mapping from pixels of a monitor to pixels of a layer, with registration, mirroring and mounting."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from runtime.records import F64
 
 
 def panel_size_px(*, screen_width_px: int, screen_height_px: int, rotation_deg: int) -> tuple[int, int]:
-    """Number of columns and rows of a panel as the viewer sees it."""
+    """Return the numbers of columns and rows of a panel as the viewer sees it."""
     if rotation_deg in (90, 270):
         return screen_height_px, screen_width_px
     return screen_width_px, screen_height_px
 
 
 def panel_from_screen(*, screen_width_px: int, screen_height_px: int, rotation_deg: int, mirror: str) -> F64:
-    """3x3 from a monitor's pixels to panel pixels as the viewer sees them, both continuous, v down.
+    """Return the 3x3 matrix from monitor pixels to panel pixels as seen by the viewer, both v down.
 
-    If a monitor is mounted `rotation_deg` counter-clockwise, seen from the front, its picture is rotated clockwise.
-    Mirroring applies to the viewer's picture, before the rotation.
+    The picture of a monitor that is mounted `rotation_deg` counter-clockwise, as seen from the front, is rotated
+    clockwise. Mirroring is applied to the viewer's picture before the rotation.
     """
     width, height = float(screen_width_px), float(screen_height_px)
     turned = {
@@ -52,17 +52,17 @@ def layer_from_screen(
     mirror: str,
     homography: Sequence[Sequence[float]],
 ) -> F64:
-    """3x3 matrix from the monitor's pixels to layer pixels, up to scale.
+    """Return the 3x3 matrix from monitor pixels to layer pixels, up to scale.
 
-    homography: from ideal to true pixels, at the panel's resolution, which may differ from the layers'.
-    Raises ValueError for a singular homography.
+    homography: from ideal to actual pixels at the panel's resolution, which may differ from that of the layers. Raises
+    ValueError if it is singular.
     """
     columns, rows = panel_size_px(
         screen_width_px=screen_width_px, screen_height_px=screen_height_px, rotation_deg=rotation_deg
     )
     true_from_ideal = np.asarray(homography, dtype=np.float64)
     if not np.isfinite(true_from_ideal).all() or abs(np.linalg.det(true_from_ideal)) < 1e-12:
-        raise ValueError("a panel's homography must be invertible")
+        raise ValueError("the homography of a panel must be invertible")
     true_from_screen = panel_from_screen(
         screen_width_px=screen_width_px, screen_height_px=screen_height_px, rotation_deg=rotation_deg, mirror=mirror
     )
@@ -72,7 +72,7 @@ def layer_from_screen(
 
 
 def permutes_pixels(matrix: F64) -> bool:
-    """Return True if a 3x3 maps pixel centres to pixel centres, so that no interpolation is needed."""
+    """True if a 3x3 matrix maps pixel centres to pixel centres, so that no interpolation is needed."""
     if matrix[2, 2] == 0.0:
         return False
     m = matrix / matrix[2, 2]
@@ -90,10 +90,10 @@ DIRECTIONS: dict[Arrow, tuple[int, int]] = {"up": (0, -1), "down": (0, 1), "left
 
 
 def mounting_of(arrow: Arrow, *, mirrored: bool) -> tuple[int, str]:
-    """Return a panel's `rotation_deg` and `mirror`, from how the arrow and the text on its card appear."""
+    """Return `rotation_deg` and `mirror` of a panel, given how its card's arrow and text appear."""
     mirror = "horizontal" if mirrored else "none"
     for rotation_deg in ROTATIONS:
         seen = panel_from_screen(screen_width_px=1, screen_height_px=1, rotation_deg=rotation_deg, mirror=mirror)
         if tuple(round(value) for value in seen[:2, :2] @ [0.0, -1.0]) == DIRECTIONS[arrow]:
             return rotation_deg, mirror
-    raise ValueError(f"no mounting turns the arrow to point {arrow}")
+    raise ValueError(f"no mounting makes the arrow point {arrow}")

@@ -1,4 +1,4 @@
-"""Grey curves, which give the grey level for each phase on a panel."""
+"""Grey curves, which give a panel's grey level for each phase."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ COLUMNS = ("phase", "red", "green", "blue")
 
 
 def measured_curve(path: Path) -> F32:
-    """Read (256, 3) grey from a CSV with columns phase, red, green, blue (or phase, grey) in [0, 1].
+    """Read a (256, 3) table of grey from a CSV file with phase, red, green, blue (or phase, grey).
 
-    The file needs at least two rows with ascending phases. The curve is linear between them and constant beyond them.
-    Raises InputError, naming the file and the row or column.
+    All values are in [0, 1], and at least two rows must have ascending phases. The curve is linear between them and
+    constant beyond them. Raises InputError that names the file and the row or column.
     """
     lines = [line for line in untrusted_input.read_text(path).splitlines() if line.strip() and line[0] != "#"]
     header = tuple(name.strip().lower() for name in lines[0].split(",")) if lines else ()
     if header not in (COLUMNS, ("phase", "grey")):
         raise InputError(path, "columns", "must have the columns phase, red, green, blue (or phase, grey)")
     if len(lines) < 3:
-        raise InputError(path, "phase", "needs at least two rows")
+        raise InputError(path, "phase", "must have at least two rows")
     try:
         table = np.loadtxt(lines[1:], delimiter=",", usecols=range(len(header)))
     except ValueError as error:
@@ -42,7 +42,7 @@ def measured_curve(path: Path) -> F32:
 
 
 def curve(*, lut: str, gamma: float) -> F32:
-    """Return (256, 3) grey in [0, 1] by 8-bit phase and channel: measured, or with phase = grey^gamma.
+    """Return grey (256, 3) in [0, 1] by 8-bit phase and channel: measured, or with phase = grey^gamma.
 
     Raises InputError.
     """

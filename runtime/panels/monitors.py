@@ -1,6 +1,6 @@
-"""Assignment of monitors to panels by EDID serial or connector, with checks of their modes and rates.
+"""Assignment of monitors to panels by EDID serial number or connector, and checks of their modes.
 
-Monitors are never guessed and pictures never rescaled: phases must reach the panels unchanged, at one refresh rate.
+A monitor is never guessed and a picture never rescaled, because phases must reach the panels unchanged.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from runtime.config import PanelSettings
 from runtime.errors import InputError, PanelLost
 from runtime.panels.geometry import panel_size_px
 
-REFRESH_TOLERANCE_HZ = 0.05  # 59.94 and 60 Hz drift apart by a frame in 17 s
+REFRESH_TOLERANCE_HZ = 0.05  # 59.94 and 60 Hz would drift apart by a frame in 17 s
 
 
 class Rectangle(NamedTuple):
-    """A region of the X screen, pixels from its top left corner."""
+    """Region of the X screen, in pixels from its top left corner."""
 
     x_px: int
     y_px: int
@@ -30,12 +30,12 @@ class Rectangle(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Monitor:
-    """One active monitor of the X screen."""
+    """Active monitor of the X screen."""
 
     connector: str
-    serial: str  # from the EDID; empty if it has none
+    serial: str  # from the EDID; empty if unknown
     model: str
-    x_px: int  # position of its top left corner on the X screen
+    x_px: int  # top left corner on the X screen
     y_px: int
     width_px: int
     height_px: int
@@ -43,12 +43,12 @@ class Monitor:
 
     @property
     def place(self) -> Rectangle:
-        """Return the region of the X screen that the monitor shows."""
+        """Region of the X screen that the monitor shows."""
         return Rectangle(self.x_px, self.y_px, self.width_px, self.height_px)
 
     @property
     def setting(self) -> str:
-        """Return the line for `[[output.panels]]` that identifies this monitor."""
+        """Line for `[[output.panels]]` that identifies this monitor."""
         return f'edid_serial = "{self.serial}"' if self.serial else f'connector = "{self.connector}"'
 
     def __str__(self) -> str:
@@ -63,20 +63,20 @@ def in_order(monitors: Sequence[Monitor]) -> tuple[Monitor, ...]:
 
 
 def bind(panels: Sequence[PanelSettings], monitors: Sequence[Monitor]) -> tuple[Monitor, ...]:
-    """Find the monitor of each panel, rear to front.
+    """Return the monitor of each panel, rear to front.
 
-    A monitor must match both serial and connector if a panel gives both. Monitors with equal serials are distinguished
-    by their connectors.
+    If a panel gives both serial number and connector, its monitor must match both. This distinguishes monitors with
+    equal serial numbers.
 
-    Raises InputError if a panel has neither, since waiting can't help; PanelLost if a panel's monitor is missing,
-    ambiguous or already bound to another panel. The message names the panel, the criteria and the monitors found.
+    Raises InputError if a panel gives neither, and PanelLost if a monitor is missing, ambiguous or already assigned,
+    which may be temporary. The message names the panel, the criteria and the connected monitors.
     """
     ordered = in_order(monitors)
     bound: list[Monitor] = []
     for number, panel in enumerate(panels):
         monitor = _find(number, panel, ordered)
         if monitor in bound:
-            raise PanelLost(f"panels {bound.index(monitor)} and {number} are bound to the same monitor {monitor}")
+            raise PanelLost(f"panels {bound.index(monitor)} and {number} cannot both use the monitor {monitor}")
         bound.append(monitor)
     return tuple(bound)
 
@@ -94,7 +94,7 @@ def _find(number: int, panel: PanelSettings, monitors: tuple[Monitor, ...]) -> M
         raise InputError(
             "output",
             f"panels.{number}",
-            "names no monitor: set edid_serial or connector (see `phasestack identify`)",
+            "names no monitor; set edid_serial or connector as shown by `phasestack identify`",
         )
     if len(matches) == 1:
         return matches[0]
@@ -104,9 +104,9 @@ def _find(number: int, panel: PanelSettings, monitors: tuple[Monitor, ...]) -> M
 
 
 def check_modes(panels: Sequence[PanelSettings], monitors: Sequence[Monitor], *, width_px: int, height_px: int) -> None:
-    """Raise PanelLost if a monitor's resolution differs from the stack's.
+    """Raise PanelLost if the resolution of a monitor differs from that of the stack.
 
-    Rescaling would mix the phases of neighbouring pixels and destroy both eyes' pictures.
+    Rescaling would mix the phases of neighbouring pixels and destroy the pictures for both eyes.
     """
     for number, (panel, monitor) in enumerate(zip(panels, monitors, strict=True)):
         columns, rows = panel_size_px(
@@ -115,16 +115,16 @@ def check_modes(panels: Sequence[PanelSettings], monitors: Sequence[Monitor], *,
         if (columns, rows) != (width_px, height_px):
             raise PanelLost(
                 f"panel {number}: {monitor.connector} shows {columns}x{rows} (mounted at {panel.rotation_deg} degrees),"
-                f" the stack is {width_px}x{height_px}: phases would be rescaled. Set its mode or rotation_deg, or "
-                "stack.width_px and height_px"
+                f" but the stack is {width_px}x{height_px}. Change its mode or rotation_deg, or stack.width_px "
+                "and height_px"
             )
 
 
 def refresh_difference(monitors: Sequence[Monitor]) -> str:
-    """Warn in one line if monitors' refresh rates differ, else return an empty string. 0: unknown rate."""
+    """Return a warning in one line if known refresh rates differ, otherwise an empty string."""
     known = [monitor for monitor in monitors if monitor.refresh_hz > 0]
     rates = [monitor.refresh_hz for monitor in known]
     if not rates or max(rates) - min(rates) <= REFRESH_TOLERANCE_HZ:
         return ""
     each = ", ".join(f"{monitor.connector} {monitor.refresh_hz:.2f} Hz" for monitor in known)
-    return f"the panels refresh at different rates ({each}), so their frames do not change at the same time"
+    return f"the panels have different refresh rates ({each}), so their frames do not change at the same time"

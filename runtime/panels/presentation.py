@@ -1,4 +1,4 @@
-"""Presentation shader: aligns a layer, mixes in the flat picture and draws to a panel's framebuffer."""
+"""Presentation shader, which aligns a layer, mixes it with the flat picture and draws it to a panel."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ void main() {
 }
 """
 
-# The reference for `shown` is runtime.optics.alignment.shown_layers. Aligned layers are sampled with full-precision
-# weights (hardware filters have steps of 1/256) and have the rest value outside. Layers moved by a homography are
-# sampled once, for registration and alignment together, with cubic weights: bilinear ones cost 0.15 dB more.
-# Each case has its own program: a software rasteriser executes both branches of every `if`, and a single program for
-# all cases would take several times as long as the slowest of them.
+# The reference for `shown` is runtime.optics.alignment.shown_layers. Aligned layers are sampled with weights of full
+# precision (hardware filters have steps of 1/256) and have the rest value outside. Layers moved by a homography are
+# sampled once for registration and alignment together, with cubic weights; bilinear ones would cost 0.15 dB more.
+# Each case has a separate program, because a software rasteriser executes both branches of every `if`. One program
+# for all cases would take several times as long as the slowest of these.
 FRAGMENT = """
 uniform sampler2D solved;        // this panel's layer of the solution
 uniform sampler2D flat_picture;
@@ -140,7 +140,7 @@ void main() {
 """
 
 
-Case = tuple[str, ...]  # names defined for the fragment shader
+Case = tuple[str, ...]  # macros defined for the fragment shader
 CASES: tuple[Case, ...] = (
     (),
     *(("SOLVED", *how, *mixed) for how in ((), ("ALIGNED",), ("ALIGNED", "DISPLACED")) for mixed in ((), ("MIXED",))),
@@ -148,37 +148,37 @@ CASES: tuple[Case, ...] = (
 
 
 class FrameTextures:
-    """Textures with the newest frame's layers, which are uploaded whenever their version changes."""
+    """Textures with the layers of the newest frame, uploaded whenever their version changes."""
 
     def __init__(self, context: moderngl.Context, size_px: tuple[int, int], *, count: int) -> None:
-        """size_px: columns and rows of a panel."""
+        """size_px: width and height of a panel."""
         self._context = context
         self.size_px, self.count = size_px, count
-        self._textures: dict[tuple[str, tuple[int, int]], tuple[moderngl.Texture, ...]] = {}  # by kind and raster
+        self._textures: dict[tuple[str, tuple[int, int]], tuple[moderngl.Texture, ...]] = {}  # by kind and size
         self._solved: tuple[moderngl.Texture, ...] = ()
         self._flat: tuple[moderngl.Texture, ...] = ()
-        self._reliefs: dict[tuple[int, int], moderngl.Texture] = {}  # by raster
-        self._relief: moderngl.Texture | None = None  # the current solution's relief
+        self._reliefs: dict[tuple[int, int], moderngl.Texture] = {}  # by size
+        self._relief: moderngl.Texture | None = None  # relief of the current solution
         self._solved_version: int | None = None
         self._flat_version: int | None = None
 
     @property
     def solved_px(self) -> tuple[int, int]:
-        """Return the number of columns and rows of the solution."""
+        """Width and height of the solution in pixels."""
         return self._solved[0].size if self._solved else self.size_px
 
     def lacks(self, frame: PanelFrame) -> tuple[bool, bool]:
-        """Return two flags: the frame's solution, and its flat picture, is visible but not uploaded yet."""
+        """Return two flags: whether the solution and the flat picture are visible but not yet uploaded."""
         return (
             shows_solved(frame) and frame.solved_version != self._solved_version,
             shows_flat(frame) and frame.flat_version != self._flat_version,
         )
 
     def upload(self, frame: PanelFrame) -> None:
-        """Upload the frame's visible pictures unless they have been uploaded already."""
+        """Upload the visible pictures of a frame unless this has been done already."""
         lacks_solved, lacks_flat = self.lacks(frame)
         if lacks_solved and frame.solved is not None:
-            self._solved_version = None  # until it is uploaded completely
+            self._solved_version = None  # set again once it is completely uploaded
             self._solved = self._written("solved", frame.solved)
             self._relief = None if frame.relief is None else self._relief_of(frame.relief)
             self._solved_version = frame.solved_version
@@ -188,7 +188,7 @@ class FrameTextures:
             self._flat_version = frame.flat_version
 
     def use(self, index: int) -> None:
-        """Bind one panel's textures, in the current context, to the units that a Painter reads."""
+        """Bind the textures of one panel in the current context to the units that `Painter` reads."""
         for unit, uploaded in enumerate((self._solved, self._flat)):
             if uploaded:
                 uploaded[index].use(unit)
@@ -213,7 +213,7 @@ class FrameTextures:
         return self._reliefs[key]
 
     def _written(self, kind: str, layers: U8) -> tuple[moderngl.Texture, ...]:
-        """Write layers to one texture per panel, created when the first layers of their size arrive."""
+        """Write layers to one texture per panel. Textures are created with the first layers of their size."""
         key = kind, (layers.shape[2], layers.shape[1])
         if key not in self._textures:
             self._textures[key] = tuple(self._context.texture(key[1], 4) for _ in range(self.count))
@@ -226,17 +226,17 @@ class FrameTextures:
 
 
 def shows_solved(frame: PanelFrame) -> bool:
-    """Return True if the solution is visible."""
+    """True if the solution is visible."""
     return frame.solved is not None and frame.flatness < 1.0
 
 
 def shows_flat(frame: PanelFrame) -> bool:
-    """Return True if the flat picture is visible."""
+    """True if the flat picture is visible."""
     return frame.solved is None or frame.flatness > 0.0
 
 
 class Painter:
-    """The presentation shader in one GL context, which also owns the vertex arrays and framebuffers."""
+    """Presentation shader in one GL context, to which its vertex arrays and framebuffers belong."""
 
     def __init__(
         self,
@@ -246,7 +246,7 @@ class Painter:
         screen_px: tuple[int, int],
         layer_px: tuple[int, int],
     ) -> None:
-        """Prepare one panel. Raises InputError for an invalid curve, ValueError for an invalid homography."""
+        """Prepare one panel. Raises InputError for an invalid grey curve, ValueError for a homography."""
         matrix = layer_from_screen(
             screen_width_px=screen_px[0],
             screen_height_px=screen_px[1],
@@ -256,7 +256,7 @@ class Painter:
             mirror=settings.mirror,
             homography=settings.homography,
         )
-        # A homography's sign is arbitrary; the shader needs a positive third coordinate in the panel's middle.
+        # The sign of a homography is arbitrary; the shader requires a positive third coordinate in the panel's middle.
         matrix = matrix / (matrix[2] @ np.array([screen_px[0] / 2, screen_px[1] / 2, 1.0]))
         mounting = ["EXACT"] * permutes_pixels(matrix) + ["CURVED"] * bool(settings.lut or settings.gamma != 1)
         table = np.ascontiguousarray(lut.curve(lut=settings.lut, gamma=settings.gamma).T)
@@ -270,7 +270,7 @@ class Painter:
         self._cases = {case: _compiled(context, (*mounting, *case), fixed) for case in CASES}
 
     def draw(self, textures: FrameTextures, frame: PanelFrame, index: int) -> None:
-        """Draw panel `index` of the uploaded frame over the whole of the bound framebuffer."""
+        """Draw panel `index` of the uploaded frame on the whole bound framebuffer."""
         matrix = frame.solved_from_shown[index] if frame.solved_from_shown else np.eye(3)
         (width, height), (solved_width, solved_height) = textures.size_px, textures.solved_px
         coarse = (width, height) != (solved_width, solved_height)
@@ -317,7 +317,7 @@ class Painter:
 def _compiled(
     context: moderngl.Context, names: Sequence[str], fixed: Mapping[str, Any]
 ) -> tuple[moderngl.Program, moderngl.VertexArray]:
-    """Compile the shader with these names defined and these uniforms set."""
+    """Compile the shader with these macros defined and these uniforms set."""
     head = "#version 330 core\n" + "".join(f"#define {name}\n" for name in names)
     program = context.program(vertex_shader=VERTEX, fragment_shader=head + FRAGMENT)
     _set(program, fixed)
@@ -325,7 +325,7 @@ def _compiled(
 
 
 def _set(program: moderngl.Program, values: Mapping[str, Any]) -> None:
-    """Set uniforms, except those that the compiler removed from this case."""
+    """Set uniforms, except those that the compiler has removed."""
     for name, value in values.items():
         uniform: Any = program.get(name, None)
         if uniform is not None:

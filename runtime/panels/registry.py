@@ -1,4 +1,4 @@
-"""Opening of the configured panels, and offscreen panels for replay and tests."""
+"""Functions that open the configured panels, and offscreen panels for replay and tests."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class OffscreenPanels(PanelSink):
-    """Panels without a screen, which accept frames without drawing them."""
+    """Panels without a screen, which accept frames but do not draw them."""
 
     name = "offscreen"
 
@@ -27,7 +27,7 @@ class OffscreenPanels(PanelSink):
         return PresentReport(frame.number, self._clock.now_ns(), 0.0)
 
     def close(self) -> None:
-        """Do nothing."""
+        """Do nothing, because nothing was opened."""
 
 
 class BrowserPanels(PanelSink):
@@ -47,14 +47,14 @@ class BrowserPanels(PanelSink):
 
 
 def panel_settings(settings: OutputSettings, count: int) -> tuple[PanelSettings, ...]:
-    """Return one table of settings per panel: as configured, or the defaults."""
+    """Return the settings of each panel, or defaults if none are configured."""
     return settings.panels or tuple(PanelSettings() for _ in range(count))
 
 
 def open_panels(settings: OutputSettings, stack: PanelStack, clock: Clock, context: moderngl.Context) -> PanelSink:
-    """Open the output configured in `[output]`. `context` is current again after each of its methods.
+    """Open the output of `[output]`. After each of its calls `context` is current again.
 
-    Raises InputError for unsuitable settings, PanelLost if a monitor is missing (wait and retry).
+    Raises InputError for unsuitable settings, and PanelLost if a monitor is missing, which may be temporary.
     """
     if settings.kind != "offscreen":
         from runtime.panels.window import WindowPanels

@@ -1,8 +1,8 @@
-"""Checks that windows and monitors have not changed since they were bound, one X query at a time.
+"""Checks that windows and monitors have not changed since the start, with one X query at a time.
 
-GLFW reports monitors that come and go, and windows that are closed or resized. It does not report a window that another
-program destroyed, unmapped or moved, or a monitor whose position or mode changed. In these cases a picture is on the
-wrong panel or on none, although every swap succeeds.
+GLFW reports monitors that are connected or disconnected and windows that are closed or resized. It does not report that
+another program destroyed, unmapped or moved a window, or that a monitor's position or mode changed. A picture is then
+on the wrong panel or on none, although every swap succeeds.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from runtime.panels import xlib
 from runtime.panels.display import Display, Window
 from runtime.panels.monitors import Monitor
 
-EVERY_NS = NS_PER_S  # period in which every window and monitor is queried once
+EVERY_NS = NS_PER_S  # period in which each window and monitor is queried once
 REFRESH_TOLERANCE = 1e-3  # relative
 
 
 class PlacementWatch:
-    """Checks one window or monitor per call, each once in EVERY_NS.
+    """Watch that checks one window or monitor per call, and each of them once in EVERY_NS.
 
-    If the X server has refused a request since the last call, something has disappeared, and it checks all of them.
+    If the X server has refused a request since the last call, something has disappeared and all of them are checked.
     """
 
     def __init__(self, display: Display, monitors: Sequence[Monitor], windows: Sequence[Window], clock: Clock) -> None:
-        """monitors, windows: as bound, one per panel. The first query is after EVERY_NS."""
+        """monitors, windows: one per panel, as assigned at the start. The first query follows after EVERY_NS."""
         self._display, self._clock = display, clock
-        # EDIDs to compare with. A changed position or mode shows as a difference from the monitor as bound.
+        # Initial EDIDs. A changed position or mode shows as a difference from `monitors`.
         self._states = [display.output_state(monitor.connector) for monitor in monitors]
         self._monitors, self._windows = monitors, windows
         self._questions: list[Callable[[], str]] = [
@@ -40,10 +40,10 @@ class PlacementWatch:
         self._refusals = xlib.refusals()
 
     def look(self) -> str:
-        """Return faults, naming the panel; empty without a fault or a due query."""
+        """Return the faults found, which name the panel, or an empty string."""
         if xlib.refusals() != self._refusals:
             faults = [fault for fault in (question() for question in self._questions) if fault]
-            self._refusals = xlib.refusals()  # read after the queries, because these may be refused, too
+            self._refusals = xlib.refusals()  # read after the queries, which may be refused, too
             return "; ".join(faults)
         now_ns = self._clock.now_ns()
         if now_ns < self._due_ns:

@@ -1,4 +1,4 @@
-"""Panels on monitors: a fullscreen window for each panel, or a test card on every monitor."""
+"""Panels on monitors, with a fullscreen window for each panel or a test card on every monitor."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ from runtime.support.gl import offscreen_context
 
 log = logging.getLogger("phasestack.panels")
 
-RETRY_NS = NS_PER_S // 2  # between attempts to reopen lost panels
-LOOK_NS = 5 * NS_PER_S  # interval between checks for monitors when X sends no notification
+RETRY_NS = NS_PER_S // 2  # interval between attempts to reopen lost panels
+LOOK_NS = 5 * NS_PER_S  # interval between searches for monitors without a notification from X
 
 
 class WindowPanels(PanelSink):
-    """All panels of the stack on X11 monitors.
+    """Panels of the stack on X11 monitors.
 
-    `present` uploads a new solution once, to textures shared by all windows. It draws all windows, aligned, waits for
-    the GPU, then swaps them in immediate succession: a fault before the first swap leaves the old frame on all panels.
-    Only the first window waits for its vertical blank, because N waiting windows would divide the rate by N. `skew_ms`
-    is the time between the first and the last return from a swap; it does not include the phase between the monitors'
-    blanks.
+    `present` uploads a new solution once to textures shared by all windows. It draws all windows, waits for the GPU,
+    then swaps them in immediate succession, so a fault before the first swap leaves the old frame on all panels. Only
+    the first window waits for its vertical blank, because N waiting windows would divide the rate by N. `skew_ms` is
+    the time between the first and the last return from a swap. It does not include the phase between the vertical
+    blanks of the monitors.
 
-    Once a second every window and monitor is compared with its state at binding (one query per refresh, about 0.1 ms).
-    If a monitor, window or context is lost or has changed, all windows are closed and `present` raises PanelLost. A
-    later `present` reopens them, after half a second or when X reports a monitor. The hidden window's shared context
-    survives unless it was lost itself. If the X server dies, the process ends with exit status 75 and must be
-    restarted. GLFW requires the main thread. The `content` context is current again after every call.
+    Every window and monitor is compared with its initial state once a second (one query per refresh, about 0.1 ms). If
+    a monitor, window or context is lost or has changed, all windows are closed and `present` raises PanelLost. A later
+    call reopens them, after half a second or when X reports a monitor. The shared context of the hidden window survives
+    unless it is lost, too. If the X server dies, the process ends with exit status 75 and must be restarted. GLFW
+    requires the main thread. After every call the context `content` is current again.
     """
 
     name = "windows"
@@ -49,10 +49,10 @@ class WindowPanels(PanelSink):
         self, panels: tuple[PanelSettings, ...], stack: PanelStack, clock: Clock, content: moderngl.Context, *,
         any_shape: bool = False,
     ) -> None:  # fmt: skip
-        """any_shape: accept monitors in modes other than the stack's, and fill them (for `identify`).
+        """any_shape: also accept and fill monitors with a resolution other than the stack's, for `identify`.
 
-        Raises InputError (settings); PanelLost (a panel is missing or ambiguous, or there is no X server; both may be
-        temporary).
+        Raises InputError for wrong settings, and PanelLost if a monitor or the X server is missing, which may be
+        temporary.
         """
         self._any_shape = any_shape
         self._panels, self._stack = panels, stack
@@ -62,8 +62,8 @@ class WindowPanels(PanelSink):
         self._textures: FrameTextures | None = None
         self._watch: PlacementWatch | None = None
         self._retry_ns, self._lost = 0, ""
-        self._shown = False  # True while the windows show the previous frame
-        self._away = False  # True if a context other than `content` may be current
+        self._shown = False  # the windows show the previous frame
+        self._away = False  # a context other than `content` may be current
         self._context_lost = False
         self.monitors: tuple[Monitor, ...] = ()
         try:
@@ -76,7 +76,7 @@ class WindowPanels(PanelSink):
 
     @property
     def period_ns(self) -> int | None:
-        """Return the refresh period of the first panel's monitor, whose vertical blank paces the swaps."""
+        """Refresh period of the first panel's monitor, whose vertical blank paces the swaps."""
         refresh_hz = self.monitors[0].refresh_hz if self.monitors else 0.0
         return round(NS_PER_S / refresh_hz) if refresh_hz else None
 
@@ -85,7 +85,7 @@ class WindowPanels(PanelSink):
         return [window.handle for window, _ in self._surfaces]
 
     def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
-        """Show a frame on all panels, or skip it if it is unchanged and still shown. Raises PanelLost."""
+        """Show a frame on all panels, unless it is unchanged and still shown. Raises PanelLost."""
         if not self._surfaces and not self._may_try():
             raise PanelLost(self._lost)
         try:
@@ -117,7 +117,7 @@ class WindowPanels(PanelSink):
         if any(textures.lacks(frame)):
             display.root.make_current()
             textures.upload(frame)
-            # Other contexts may use the upload only once it is finished.
+            # Other contexts may use the textures only after the upload has finished.
             display.root.context.finish()
         for panel, (window, painter) in enumerate(self._surfaces):
             self._draw(panel, window, painter, textures, frame)
@@ -136,7 +136,7 @@ class WindowPanels(PanelSink):
         context.finish()
         if fault := _reset_status() or _error(context):
             self._context_lost = True
-            raise PanelLost(f"the GL context of panel {panel}: {fault}")
+            raise PanelLost(f"the GL context of panel {panel} was lost: {fault}")
 
     def _swap(self, window: Window) -> int:
         window.make_current()
@@ -144,7 +144,7 @@ class WindowPanels(PanelSink):
         return self._clock.now_ns()
 
     def _may_try(self) -> bool:
-        """Return True if it is time to reopen the panels: after a delay, or after a monitor came or went."""
+        """True if it is time to reopen the panels: after a delay or a change of connected monitors."""
         display = self._display
         if display is not None and display.poll():
             display.faults.clear()
@@ -171,7 +171,7 @@ class WindowPanels(PanelSink):
         self._watch = PlacementWatch(display, self.monitors, [window for window, _ in self._surfaces], self._clock)
 
     def _retreat(self) -> None:
-        """Close the windows after a failure. Keep the connection and, if it is intact, the shared context."""
+        """Close the windows after a failure. Keeps the connection and, if intact, the shared context."""
         if self._display is None or self._context_lost:
             self._drop()
         elif self._display.has_windows:
@@ -208,7 +208,7 @@ class WindowPanels(PanelSink):
                 log.exception("closing the display")
 
     def _forget(self) -> None:
-        """Clear the state of the closed windows, and schedule their reopening."""
+        """Clear the state of the closed windows and schedule reopening them."""
         self._surfaces, self._textures, self._watch, self._shown = [], None, None, False
         self._retry_ns = self._clock.now_ns() + RETRY_NS
 
@@ -225,18 +225,18 @@ def _error(context: moderngl.Context) -> str:
 
 
 def _reset_status() -> str:
-    """Return the driver's report of a lost context (GPU reset); empty if it is intact or cannot be queried."""
+    """Return the driver's reason for a lost context (GPU reset), or an empty string if none is reported."""
     address = gl_function("glGetGraphicsResetStatus")
     status: int = ctypes.CFUNCTYPE(ctypes.c_uint)(address)() if address else 0
     return f"was reset (0x{status:x})" if status else ""
 
 
 def every_monitor() -> tuple[WindowPanels, list[U8], tuple[Monitor, ...]]:
-    """Open windows on all monitors. Returns them, the identity cards and the monitors. Raises PanelLost."""
+    """Open windows on all monitors. Returns these, their test cards and the monitors. Raises PanelLost."""
     monitors = connected_monitors()
     width, height = max(m.width_px for m in monitors), max(m.height_px for m in monitors)
     bound = tuple(PanelSettings(connector=monitor.connector) for monitor in monitors)
-    # The stack is nominal, since the cards fill monitors of any shape.
+    # The geometry does not matter, because the cards fill monitors of any shape.
     stack = PanelStack(1.0, 1.0, tuple(0.01 * index for index in range(len(monitors))), width, height)
     panels = WindowPanels(bound, stack, MonotonicClock(), offscreen_context(), any_shape=True)
     cards = []

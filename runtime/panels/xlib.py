@@ -1,6 +1,6 @@
-"""Xlib and RandR functions that GLFW lacks: the state of outputs, and handlers for X errors.
+"""Xlib and RandR functions missing from GLFW: the state of outputs, and handlers for X errors.
 
-ctypes binds them from libraries that GLFW needs anyway. By default Xlib ends the process on any error.
+They are bound with ctypes from libraries that GLFW needs anyway. By default Xlib ends the process on any error.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class _Resources(ctypes.Structure):
 
 
 class _Output(ctypes.Structure):
-    """The beginning of XRROutputInfo."""
+    """First fields of XRROutputInfo."""
 
     _fields_ = (("timestamp", c_ulong), ("crtc", c_ulong))
 
@@ -76,11 +76,11 @@ class _Crtc(ctypes.Structure):
 
 @dataclass(frozen=True, slots=True)
 class OutputState:
-    """Mode of one output of the graphics card, and its monitor."""
+    """Mode and monitor of an output of the graphics card."""
 
     place: Rectangle
     refresh_hz: float  # 0: unknown
-    edid: bytes  # empty: none
+    edid: bytes  # empty if there is none
 
 
 @functools.cache
@@ -107,11 +107,11 @@ def _libraries() -> tuple[ctypes.CDLL, ctypes.CDLL]:
     return x11, randr
 
 
-_refused = 0  # requests refused in this process
+_refused = 0  # number of refused requests
 
 
 def refusals() -> int:
-    """Number of requests that the X server has refused.
+    """Return the number of requests that the X server has refused.
 
     An increase means that a window or monitor has disappeared.
     """
@@ -126,22 +126,22 @@ def _note_error(_display: int, _event: int) -> int:
 
 
 def _end(_display: int = 0) -> int:
-    log.critical("the X server died: exiting with status %d for a restart", SERVER_DIED)
+    log.critical("the X server died; exiting with status %d for a restart", SERVER_DIED)
     for handler in (*logging.getLogger("phasestack").handlers, *logging.getLogger().handlers):
         handler.flush()
     os._exit(SERVER_DIED)
 
 
-# Xlib keeps their addresses for the life of the process.
+# Xlib keeps their addresses until the process ends.
 _ERROR_HANDLER = ErrorHandler(_note_error)
 _IO_ERROR_HANDLER = IOErrorHandler(_end)
 
 
 def take_over_errors() -> None:
-    """Install error handlers, so that a refused X request (an unplugged monitor) is only logged.
+    """Install error handlers so that a refused X request, as for an unplugged monitor, is only logged.
 
-    The server's death ends the process immediately, with a line in the log. That can happen in the middle of a call,
-    after which Xlib, EGL and GLFW hang or crash even when releasing objects.
+    If the server dies, the process ends immediately with a line in the log. This may happen during a call, after which
+    Xlib, EGL and GLFW would hang or crash even when releasing objects.
     """
     x11 = _libraries()[0]
     x11.XSetErrorHandler(_ERROR_HANDLER)
@@ -149,13 +149,13 @@ def take_over_errors() -> None:
 
 
 class ServerWatch:
-    """Detects the server's death while the main thread is in a call that never returns.
+    """Watch that detects the death of the server while the main thread hangs in a call.
 
-    After the connection breaks, Mesa's software renderer loops forever in a swap, and Xlib does not notice.
+    When the connection breaks, Mesa's software renderer loops forever in a swap and Xlib does not notice.
     """
 
     def __init__(self, display: int) -> None:
-        """display: an open Display pointer; call `stop` before closing it."""
+        """display: pointer to an open Display; call `stop` before closing it."""
         x11 = _libraries()[0]
         x11.XConnectionNumber.argtypes = [c_void_p]
         self._connection: int = x11.XConnectionNumber(display)
@@ -164,7 +164,7 @@ class ServerWatch:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop watching, before closing the connection deliberately."""
+        """Stop watching. Call this before closing the connection on purpose."""
         os.write(self._stop_writing, b".")
         self._thread.join()
         os.close(self._stop_reading)
@@ -172,7 +172,7 @@ class ServerWatch:
 
     def _watch(self) -> None:
         poll = select.poll()
-        poll.register(self._connection, 0)  # reports only hang-ups, not input
+        poll.register(self._connection, 0)  # only hang-ups, not input
         poll.register(self._stop_reading, select.POLLIN)
         for file, _ in poll.poll():
             if file == self._connection:
@@ -180,7 +180,7 @@ class ServerWatch:
 
 
 def output_state(display: int, output: int) -> OutputState | None:
-    """Current state of an output, in four round trips; None if it is off or disconnected."""
+    """Return the state of an output, or None if it is off or disconnected. Takes four round trips."""
     x11, randr = _libraries()
     resources = randr.XRRGetScreenResourcesCurrent(display, x11.XDefaultRootWindow(display))
     if not resources:

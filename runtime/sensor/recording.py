@@ -189,7 +189,7 @@ class Recording:
                 except ValueError as error:
                     raise InputError(self.path, fmt.METADATA_NAME, str(error)) from None
         if not foreign and not self.is_whole:
-            raise InputError(self.path, "", "is an MCAP recording without any sample")
+            raise InputError(self.path, "", "is an MCAP recording that ends before its first sample")
         by = ", ".join(filter(None, (*self._written_by, foreign)))
         raise InputError(self.path, fmt.METADATA_NAME, f"is missing from this MCAP recording ({by}): {NEEDED}")
 

@@ -35,7 +35,7 @@ class UsbCameraDriver(Sensor):
         Raises InputError for other URLs, or if the field of view is not configured (webcams do not report it).
         """
         if not settings.fov_deg:
-            raise InputError("sensor", "fov_deg", "must be the camera's horizontal field of view in degrees")
+            raise InputError("sensor", "fov_deg", "is required: the camera's horizontal field of view in degrees")
         source = settings.source if settings.source != "demo" else ""
         protocol = re.match(r"([\w+.-]+):", source)
         if protocol is not None and protocol[1] not in STREAMS:

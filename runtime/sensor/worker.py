@@ -280,7 +280,7 @@ class SensorWorker(Samples):
         timely = [frame for frame in frames if -AHEAD_NS <= now_ns - frame.capture_ns <= BEHIND_NS]
         if len(timely) < len(frames):
             ahead_s = (frames[-1].capture_ns - now_ns) / NS_PER_S
-            self._untimely = f"capture times are {ahead_s:+.3f} s off; they must be on the run's clock"
+            self._untimely = f"capture times are off by {ahead_s:+.3f} s, so they are not on the run's clock"
             if not self._was_well:
                 raise FatalError(self._untimely)
             with self._lock:

@@ -244,7 +244,11 @@ def test_connections_that_ask_nothing_shut_nobody_out(page: Page, loop: Loop) ->
 
 @pytest.mark.parametrize(
     ("text", "mode", "problem"),
-    [("a" * 40, 0o640, "others may read it"), ("short", 0o600, "contains no token"), ("", 0o600, "contains no token")],
+    [
+        ("a" * 40, 0o640, "is readable by others"),
+        ("short", 0o600, "must contain a token"),
+        ("", 0o600, "must contain a token"),
+    ],
 )
 def test_a_token_file_that_is_none_is_refused(tmp_path: Path, text: str, mode: int, problem: str) -> None:
     path = tmp_path / "token"
