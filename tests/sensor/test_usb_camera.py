@@ -53,7 +53,7 @@ def test_what_is_no_camera_is_told() -> None:
     with pytest.raises(InputError, match="fov_deg: is required"):
         open_sensor(SensorSettings(driver="usb-camera"), MonotonicClock())
     for source in ("tcp://127.0.0.1:9?listen=1", "concat:a.avi|b.avi"):  # one that listens, one that opens others
-        with pytest.raises(InputError, match=r"source: [a-z]+: not supported; use one of rtsp, rtsps, http, https"):
+        with pytest.raises(InputError, match=r"source: [a-z]+ is not supported; use one of rtsp, rtsps, http, https"):
             open_sensor(settings(source), MonotonicClock())
     for source in ("97", "/dev/video97", "/dev/null"):
         with pytest.raises(SensorLost, match="/dev/"):
