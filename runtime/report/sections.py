@@ -139,7 +139,8 @@ def moving_plot(found: Sequence[Moving]) -> Figure:
                 if fixed := [(x, own[name]) for x, name in enumerate(efforts) if name in own and name != "auto"]:
                     axes.plot(*zip(*fixed, strict=True), "o-", color=f"C{number}", markersize=5, label=motion)
                 if "auto" in own:
-                    axes.plot(len(FIXED), own["auto"], "*", color=f"C{number}", markersize=13)
+                    label = None if fixed else motion  # the page grows: no fixed effort may be measured yet
+                    axes.plot(len(FIXED), own["auto"], "*", color=f"C{number}", markersize=13, label=label)
                     axes.axhline(own["auto"], color=f"C{number}", linewidth=0.8, linestyle=":")
         above.set(ylabel="live quality, dB")
         above.legend(ncols=len(motions), loc="lower center", bbox_to_anchor=(0.5, 1.0))

@@ -134,6 +134,13 @@ def test_added_models_stand_beside_the_curves_and_every_pair_is_a_dot(monkeypatc
     assert sum(len(dots.get_offsets()) for dots in axes.collections) == 8
 
 
+def test_a_motion_measured_with_auto_alone_is_in_the_legend(monkeypatch: pytest.MonkeyPatch) -> None:
+    figures: list[Any] = []
+    monkeypatch.setattr(sections, "png", lambda figure: (figures.append(figure), b"")[1])
+    sections.moving_plot([Moving("still", "auto", 25.0, (3.0, 7.0), {"auto": 5.0}, 9)])
+    assert [text.get_text() for text in figures[0].axes[0].get_legend().get_texts()] == ["still"]
+
+
 def test_the_page_needs_nothing_from_elsewhere() -> None:
     page = report_page()
     html = page.html()
