@@ -48,8 +48,7 @@ REFUSED = (
     "restarted",
 )
 DELAYS = (
-    (solver_parts.RunningSolver, "draw", 0.02, 2.5), (solver_parts.RunningSolver, "solve", 0.02, 2.5),
-    (solver_parts.RunningSolver, "close", 0.3, 1.5),
+    (solver_parts.RunningSolver, "step", 0.02, 2.5), (solver_parts.RunningSolver, "close", 0.3, 1.5),
     (solver_parts, "prepare_content", 0.3, 2.5), (reconfigure, "prepare_content", 0.3, 2.5),
     (reconfigure.Reconfiguration, "_take_over", 0.3, 2.5), (changes.Changes, "carry_on", 0.05, 0.3),
 )  # fmt: skip  # where, how often, seconds at most
@@ -174,7 +173,7 @@ def soak(seconds: float, *, growth_mib: int, windows: bool = False) -> None:
             cleanup.callback(server.stop)
             cleanup.enter_context(patch.dict(os.environ, DISPLAY=server.name))
             parts = solver_parts.RunningSolver
-            cleanup.enter_context(patch.object(parts, "draw", run.failing(parts.draw)))
+            cleanup.enter_context(patch.object(parts, "step", run.failing(parts.step)))
             cleanup.enter_context(patch.object(window, "_reset_status", run.reset(window._reset_status)))
             beside.append(threading.Timer(8.0, run.harm, (server,)))
         for thread in beside:

@@ -17,7 +17,7 @@ from runtime.errors import ContextLost, Stopped
 from runtime.eyes.calibration import Calibration
 from runtime.frame.effort import Costs, simulated_costs
 from runtime.frame.run_state import RunCell, RunState
-from runtime.frame.solver import DrawnRequest, Solver, SolverUpdate
+from runtime.frame.solver import Solver, SolverUpdate
 from runtime.model.backends import EYES_M, Choice, Wanted, choose
 from runtime.model.predictor import Predictor, load_predictor
 from runtime.optics.stack import PanelStack
@@ -59,31 +59,14 @@ class RunningSolver:
         """Return the current content."""
         return self.run.state.content
 
-    @property
-    def overlaps(self) -> bool:
-        return self.backend.backend.name == "cpu"
-
     def step(self, request: SolveRequest) -> SolverUpdate:
-        return self.solver.step(request, self._usable_state())
-
-    def draw(self, request: SolveRequest) -> DrawnRequest | SolverUpdate:
-        return self.solver.draw(request, self._usable_state(), apart=self.overlaps)
-
-    def solve(self, drawn: DrawnRequest) -> SolverUpdate:
-        return self.solver.solve(drawn)
-
-    def settle(self, drawn: DrawnRequest, update: SolverUpdate) -> None:
-        self.solver.settle(drawn, update)
-
-    def _usable_state(self) -> RunState:
-        """Return the state to draw with. Raises ContextLost, Stopped if this solver must not be used any more."""
         if self.contexts_lost() != self._lost_before:
             raise ContextLost("the panels have lost their OpenGL context")
         state = self.run.state  # read first, then check whether another solver has begun
         if not self.is_newest:
             raise Stopped("this solver was abandoned")
         self._owned = state
-        return state
+        return self.solver.step(request, state)
 
     def simulated_costs(self) -> Costs:
         return simulated_costs(self.run.state.settings.loop.simulated_stage_ms, self.run.state.predictor.reductions)

@@ -48,8 +48,8 @@ class Aim:
         whole = self._fixed or Effort(1, predictor.steps)
         effort, expected_m2 = whole, 0.0
         if eyes.eyes_m is not None and state.settings.model.effort == "auto":
-            outlook = self._outlook(timing, eyes, costs)
-            horizon_s = self._horizon_s(timing, speed_m_s=outlook(whole).speed_m_s)
+            outlook = self._outlook(timing, eyes)
+            horizon_s = self._horizon_s(timing, speed_m_s=outlook(0.0).speed_m_s)
             error = self._shown_error(eyes, shown, time_ns=timing.photon_ns)
             period_ms = self._period_ns / NS_PER_MS
             timed = tuple(by for by in predictor.reductions if by in costs.stages)  # a new model may not be timed yet
@@ -60,8 +60,10 @@ class Aim:
             if shown is not None and eyes.label == "rested":
                 most = predictor.refined_steps
                 refined = self._refined(shown, most, costs, shown_error=error, horizon_s=horizon_s)
-            expected_m2 = outlook(effort).moved_m2(max(costs.interval_ms(effort), period_ms) / 1e3)
-        then_ns, then_m, label = self._eyes_then(timing, eyes, middle_ns=self._middle_ns(timing, effort, costs))
+            cost_ms = costs.ms(effort)
+            expected_m2 = outlook(cost_ms).moved_m2(max(cost_ms, period_ms) / 1e3)
+        cost_ns = round(costs.ms(effort) * NS_PER_MS)
+        then_ns, then_m, label = self._eyes_then(timing, eyes, cost_ns=cost_ns)
         self._expected[then_ns] = expected_m2
         while len(self._expected) > REQUESTS_KEPT:
             self._expected.pop(next(iter(self._expected)))
@@ -80,18 +82,16 @@ class Aim:
             self._learned = shown.number
             self._chooser.pictures.learn(shown.measures, shown.effort)
 
-    def _middle_ns(self, timing: FrameTiming, effort: Effort, costs: Costs) -> int:
+    def _middle_ns(self, timing: FrameTiming, cost_ns: int) -> int:
         """Return the middle of the time for which a solution started now will be shown.
 
         It is complete after its cost, appears half a period later on average, and is shown until the next one appears.
         """
-        cost_ns, interval_ns = (round(ms * NS_PER_MS) for ms in (costs.ms(effort), costs.interval_ms(effort)))
-        return timing.photon_ns + cost_ns + (self._period_ns + max(interval_ns, self._period_ns)) // 2
+        return timing.photon_ns + cost_ns + (self._period_ns + max(cost_ns, self._period_ns)) // 2
 
-    def _eyes_then(
-        self, timing: FrameTiming, eyes: EyesEstimate, *, middle_ns: int
-    ) -> tuple[int, F64 | None, EyesLabel]:
+    def _eyes_then(self, timing: FrameTiming, eyes: EyesEstimate, *, cost_ns: int) -> tuple[int, F64 | None, EyesLabel]:
         """Return the instant to solve for and its predicted eyes, no farther ahead than the tracker is reliable."""
+        middle_ns = self._middle_ns(timing, cost_ns)
         reach_ns = min(middle_ns, timing.photon_ns + HORIZON_NS)
         then = self._viewer.ahead(reach_ns) if eyes.eyes_m is not None else eyes
         if then.eyes_m is None or eyes.eyes_m is None:
@@ -100,17 +100,17 @@ class Aim:
         share = moved_m2 / (moved_m2 + 2 * then.sigma_m**2) if moved_m2 > 0.0 and then.label != "rested" else 1.0
         return middle_ns, eyes.eyes_m + share * (then.eyes_m - eyes.eyes_m), then.label
 
-    def _outlook(self, timing: FrameTiming, eyes: EyesEstimate, costs: Costs) -> Callable[[Effort], Outlook]:
+    def _outlook(self, timing: FrameTiming, eyes: EyesEstimate) -> Callable[[float], Outlook]:
         near = self._viewer.ahead(timing.photon_ns + self._period_ns)
         far = self._viewer.ahead(timing.photon_ns + HORIZON_NS)
         if near.eyes_m is None or far.eyes_m is None or eyes.eyes_m is None or far.label == "rested":
-            return lambda effort: Outlook()
+            return lambda cost_ms: Outlook()
         speed_m_s = self._usual_speed_m_s(float(np.linalg.norm((near.eyes_m - eyes.eyes_m).mean(axis=0))), eyes)
 
         growth_m = max(far.sigma_m - near.sigma_m, 0.0) / (HORIZON_NS - self._period_ns)
 
-        def outlook(effort: Effort) -> Outlook:
-            ahead_ns = self._middle_ns(timing, effort, costs) - timing.photon_ns
+        def outlook(cost_ms: float) -> Outlook:
+            ahead_ns = self._middle_ns(timing, round(cost_ms * NS_PER_MS)) - timing.photon_ns
             sigma_m = near.sigma_m + growth_m * (ahead_ns - self._period_ns)
             beyond_s = max(ahead_ns - HORIZON_NS, 0) / NS_PER_S
             return Outlook(sigma_m, speed_m_s, beyond_s * speed_m_s)

@@ -1,9 +1,8 @@
 """Choice of each solution's effort: the raster and step count with the least expected error.
 
-A solution takes c seconds. It stays on the panels for T, the time between solutions or one refresh, whichever is
-longer, and is computed for the eyes at the middle of that interval. T equals c, or less if the next pictures are drawn
-while it is solved. Averaged over T, its squared error of light at the true eyes is the error for a viewer who keeps
-still plus that of a stale view (docs/mathematics.md, "Effort"):
+A solution that takes c seconds stays on the panels for T = max(c, refresh period) and is computed for the eyes at the
+middle of that interval. Averaged over that time, its squared error of light at the true eyes is the error for a viewer
+who keeps still plus that of a stale view (docs/mathematics.md, "Effort"):
 
     J = Q(raster, steps) + D(sqrt(2·sigma² + v²·T²/12 + l²), T/sqrt(12)),
     D(d, t) = y / (1 + y/D_max),    y = a·d²/(d + d0) + b·t²
@@ -54,7 +53,6 @@ class Costs:
     """Time of each effort on this machine and scene, in milliseconds."""
 
     stages: Mapping[int, Mapping[str, float]]  # by reduction and SOLVING_STAGES; `step` is the time of one step
-    overlaps: bool = False  # True if the next pictures are drawn while a solution is computed
 
     def ms(self, effort: Effort) -> float:
         """Return the time from start to complete layers."""
@@ -62,14 +60,6 @@ class Costs:
         steps = effort.steps - (effort.continued_from or 0)
         begun = ("finish",) if effort.continued_from is not None else ("render", "prepare", "inference", "finish")
         return sum(stages.get(stage, 0.0) for stage in begun) + steps * stages.get("step", 0.0)
-
-    def interval_ms(self, effort: Effort) -> float:
-        """Return the time between successive solutions."""
-        cost_ms = self.ms(effort)
-        if not self.overlaps or effort.continued_from is not None:
-            return cost_ms
-        render_ms = self.stages[effort.reduction].get("render", 0.0)
-        return max(render_ms, cost_ms - render_ms)
 
 
 def simulated_costs(stage_ms: Mapping[str, float], reductions: Iterable[int]) -> Costs:
@@ -80,9 +70,9 @@ def simulated_costs(stage_ms: Mapping[str, float], reductions: Iterable[int]) ->
 class CostBook:
     """Running means of stage times by raster. Those of rasters that have long been unused are forgotten."""
 
-    def __init__(self, first: Mapping[int, Mapping[str, float]], *, overlaps: bool = False) -> None:
+    def __init__(self, first: Mapping[int, Mapping[str, float]]) -> None:
         """first: times by reduction and stage, measured with full pictures before the first refresh."""
-        self.first, self._overlaps = first, overlaps
+        self.first = first
         self._measured: dict[int, dict[str, float]] = {}
         self._unused: dict[int, int] = {}  # by reduction: solutions on other rasters since its last one
 
@@ -119,7 +109,7 @@ class CostBook:
                 costs[by] = {stage: min(ms, most.get(stage, ms)) for stage, ms in costs[by].items()}
             costs[by] |= self._measured.get(by, {})
             finer = by, costs[by]
-        return Costs(costs, self._overlaps)
+        return Costs(costs)
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,7 +211,7 @@ class EffortChooser:
         self,
         efforts: list[Effort],
         costs: Costs,
-        outlook: Callable[[Effort], Outlook],
+        outlook: Callable[[float], Outlook],
         *,
         shown_error: float,
         period_ms: float,
@@ -229,13 +219,12 @@ class EffortChooser:
     ) -> Effort:
         """Return the effort with the least mean error over the horizon.
 
-        outlook: the forecast for an effort; shown_error: error of the displayed picture.
+        outlook: maps a solution's cost in milliseconds to its forecast; shown_error: error of the displayed picture.
         """
         means: dict[Effort, float] = {}
         for effort in efforts:
             cost_ms = costs.ms(effort)
-            life_s = max(costs.interval_ms(effort), period_ms) / 1e3
-            error = self.expected_error(effort, outlook(effort), life_s=life_s)
+            error = self.expected_error(effort, outlook(cost_ms), life_s=max(cost_ms, period_ms) / 1e3)
             means[effort] = self.mean_error(error, cost_ms, shown_error=shown_error, horizon_s=horizon_s)
         least = min(means.values())
         best = min((effort for effort in means if means[effort] <= EQUAL * least), key=costs.ms)

@@ -39,26 +39,8 @@ class SolverUpdate:
     missing: dict[str, str] = field(default_factory=dict)  # failed parts (content, model), with the reason
 
 
-@dataclass(frozen=True, slots=True)
-class DrawnRequest:
-    """A request whose pictures are drawn: the input of one solution."""
-
-    request: SolveRequest
-    state: RunState
-    job: Job
-    effort: Effort
-    key: SolutionKey
-    replaced: SolutionKey | None  # key of the solution before, which stays the newest if this one fails
-    seeing: tuple[bool, bool]  # left and right eye
-    render_ms: float
-    is_apart: bool  # True if another thread may solve it while this one draws
-
-
 class Solver:
-    """Computes one solution or flat picture per step, from the run's state at the start of the step.
-
-    A step is `draw`, `solve` and `settle`. Another thread may do `solve` (`DrawnRequest.is_apart`).
-    """
+    """Computes one solution or flat picture per step, from the run's state at the start of the step."""
 
     def __init__(self, run: RunCell, stack: PanelStack, *, timed: bool = True) -> None:
         """timed: apply `model.budget_ms`; False on a simulated clock, where results must not depend on the machine."""
@@ -81,20 +63,6 @@ class Solver:
 
         state: the state to draw and solve with; None for the newest. Raises ContextLost if this solver is unusable.
         """
-        drawn = self.draw(request, state)
-        if isinstance(drawn, SolverUpdate):
-            return drawn
-        update = self.solve(drawn)
-        self.settle(drawn, update)
-        return update
-
-    def draw(
-        self, request: SolveRequest, state: RunState | None = None, *, apart: bool = False
-    ) -> DrawnRequest | SolverUpdate:
-        """Decide what a request needs and draw it. Returns the complete update if nothing has to be solved.
-
-        apart: copy the pictures, so that they can be solved on another thread while the next ones are drawn.
-        """
         state = state or self.run.state
         self._replan(state, request.eyes_m)
         time_ns = request.time_ns
@@ -114,58 +82,51 @@ class Solver:
             return self._draw_flat(state, revision=revision, time_ns=time_ns)
         if job.eyes_m is not None:
             wanted = request.refined_to if job.kind == "refine" else request.effort
-            if wanted is None or wanted.reduction not in state.predictor.reductions:  # for the model before
+            if wanted is None or wanted.reduction not in state.predictor.reductions:  # chosen for the model before
                 wanted = Effort(1, state.predictor.steps)
-            return self._draw_targets(state, request, job.eyes_m, wanted, revision=revision, apart=apart)
+            return self._solve(state, request, job.eyes_m, wanted, revision=revision)
         if request.eyes_m is not None and not request.paused:
             self._missing = {}  # the newest solution already satisfies the request
         return SolverUpdate(missing=dict(self._missing))
 
-    def _draw_targets(
-        self, state: RunState, request: SolveRequest, eyes_m: F64, effort: Effort, *, revision: int, apart: bool
-    ) -> DrawnRequest | SolverUpdate:
-        watch = Stopwatch()
+    def _solve(
+        self, state: RunState, request: SolveRequest, eyes_m: F64, effort: Effort, *, revision: int
+    ) -> SolverUpdate:
+        settings, watch = state.settings.model, Stopwatch()
+        sigma_m = request.sigma_m if settings.eye_sigma_mm == "auto" else settings.eye_sigma_mm / 1e3
+        limited = self._timed and settings.budget_ms > 0
+        deadline_ns = perf_counter_ns() + round(settings.budget_ms * NS_PER_MS) if limited else None
+        continued = effort.continued_from is not None and self._kept is not None
         try:
-            if effort.continued_from is not None and self._kept is not None:
-                job = replace(self._kept, continued=True)
+            if continued:
+                assert self._kept is not None
+                job = self._kept
             else:
                 job = self._drawn(state, request, eyes_m, effort.reduction)
         except ContextLost:  # content and model live in the context: the owner starts another solver
             raise
         except (Exception, SystemExit) as error:
             return SolverUpdate(missing=self._failed("content", error, expected=ContentFailure))
-        is_apart = apart and state.predictor.backend == "cpu" and not _on_gpu(job)
-        if is_apart and job.targets is not (self._kept and self._kept.targets):
-            job = _copied(job)
-        before, self._solved = self._solved, SolutionKey(state.version, revision, eyes_m, effort)
-        self._windows[effort.reduction] = job.window if job.window is not None and job.window.box.width_px else None
-        self._middle_m = eyes_m.mean(axis=0)
-        seeing = self.plan.eyes if self.plan is not None else (True, True)
-        render_ms = watch.lap("render")
-        return DrawnRequest(request, state, job, effort, self._solved, before, seeing, render_ms, is_apart)
-
-    def solve(self, drawn: DrawnRequest) -> SolverUpdate:
-        """Solve a drawn request. Raises ContextLost."""
-        state, request, watch = drawn.state, drawn.request, Stopwatch("render")
-        settings = state.settings.model
-        watch.stage_ms["render"] = drawn.render_ms
-        sigma_m = request.sigma_m if settings.eye_sigma_mm == "auto" else settings.eye_sigma_mm / 1e3
-        limited = self._timed and settings.budget_ms > 0
-        deadline_ns = perf_counter_ns() + round(settings.budget_ms * NS_PER_MS) if limited else None
-        job = replace(drawn.job, eye_sigma_m=sigma_m, deadline_ns=deadline_ns, steps=drawn.effort.steps)
+        watch.lap("render")
+        job = replace(job, eye_sigma_m=sigma_m, deadline_ns=deadline_ns, steps=effort.steps, continued=continued)
         try:
             prediction = state.predictor.solve(job, watch)
         except ContextLost:
             raise
         except (Exception, SystemExit) as error:
             return SolverUpdate(missing=self._failed("model", error, expected=ModelFailure))
-        effort = Effort(drawn.effort.reduction, prediction.steps, prediction.continued_from)
+        effort = Effort(effort.reduction, prediction.steps, prediction.continued_from)
+        self._missing = {}
+        self._windows[effort.reduction] = job.window if job.window is not None and job.window.box.width_px else None
+        self.measured = replace(self.measured, left_out=prediction.savings)
+        self._solved = SolutionKey(state.version, revision, eyes_m, effort)
+        self._middle_m = eyes_m.mean(axis=0)
         solution = Solution(
             self.run.next_number(),
             prediction.layers,
-            drawn.job.eyes_m,
+            eyes_m,
             request.time_ns,
-            seeing=drawn.seeing,
+            seeing=self.plan.eyes if self.plan is not None else (True, True),
             eye_sigma_m=sigma_m,
             stage_ms=watch.stage_ms,
             effort=effort,
@@ -173,15 +134,6 @@ class Solver:
             relief=job.relief,
         )
         return SolverUpdate(solution=solution)
-
-    def settle(self, drawn: DrawnRequest, update: SolverUpdate) -> None:
-        """Record the outcome of a drawn request, which later requests are compared with."""
-        solution = update.solution
-        if solution is not None:
-            self._missing = {}
-            self.measured = replace(self.measured, left_out=drawn.job.savings)
-        if self._solved is drawn.key:  # otherwise the next one is drawn already
-            self._solved = replace(drawn.key, effort=solution.effort) if solution is not None else drawn.replaced
 
     def _drawn(self, state: RunState, request: SolveRequest, eyes_m: F64, reduction: int) -> Job:
         """Draw the targets, and keep those of a resting head, so that its solution can be refined."""
@@ -196,8 +148,9 @@ class Solver:
             in_depth=state.settings.plan.align,
         )
         self._kept = None
-        if request.eyes_label == "rested" and not _on_gpu(job):
-            job = self._kept = _copied(job)
+        if request.eyes_label == "rested" and not any(isinstance(v.picture, DrawnPicture) for v in job.views):
+            left, right = (TargetView(view.pixels.copy(), view.plane_from_picture) for view in job.views)
+            job = self._kept = replace(job, targets=replace(job.targets, views=(left, right)))
         return job
 
     def _draw_flat(self, state: RunState, *, revision: int, time_ns: int) -> SolverUpdate:
@@ -248,14 +201,3 @@ class Solver:
         else:
             log.exception("%s", part)
         return dict(self._missing)
-
-
-def _on_gpu(job: Job) -> bool:
-    """Return True if a picture is a texture, which only the thread of its context can read."""
-    return any(isinstance(view.picture, DrawnPicture) for view in job.views)
-
-
-def _copied(job: Job) -> Job:
-    """Return the job with its own copies of the pictures, which the source overwrites when it draws again."""
-    left, right = (TargetView(view.pixels.copy(), view.plane_from_picture) for view in job.views)
-    return replace(job, targets=replace(job.targets, views=(left, right)))

@@ -9,7 +9,7 @@ from typing import Protocol
 
 from runtime.clock import NS_PER_MS, Clock
 from runtime.frame.effort import Costs
-from runtime.frame.solver import DrawnRequest, SolverUpdate
+from runtime.frame.solver import SolverUpdate
 from runtime.records import SolveRequest
 
 FIRST_REQUEST = SolveRequest(0, None, "none", 0.0, flat_wanted=True)  # before the first refresh: flat picture
@@ -20,21 +20,8 @@ SHOWN_STAGES = ("render", "prepare", "inference", "finish")  # stages in frames.
 class SolverParts(Protocol):
     """A solver and the resources of its thread, such as a GL context."""
 
-    @property
-    def overlaps(self) -> bool:
-        """Return True if a request can be solved while the next one is drawn."""
-
     def step(self, request: SolveRequest) -> SolverUpdate:
         """Carry out one request."""
-
-    def draw(self, request: SolveRequest) -> DrawnRequest | SolverUpdate:
-        """Draw what a request needs. Returns the complete update if nothing has to be solved."""
-
-    def solve(self, drawn: DrawnRequest) -> SolverUpdate:
-        """Solve a drawn request; on any thread if `drawn.is_apart`."""
-
-    def settle(self, drawn: DrawnRequest, update: SolverUpdate) -> None:
-        """Record the outcome of a drawn request."""
 
     def simulated_costs(self) -> Costs:
         """Return the current costs of solutions on a simulated clock."""

@@ -10,13 +10,11 @@ from collections import defaultdict, deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock
 from runtime.errors import ContextLost, FatalError, PhasestackError, Stopped, TransientError
 from runtime.frame.effort import CostBook, Costs
-from runtime.frame.solve_worker import SolveWorker
-from runtime.frame.solver import DrawnRequest, SolverUpdate
+from runtime.frame.solver import SolverUpdate
 from runtime.frame.solver_host import FIRST_REQUEST, SolverHost, SolverParts, Task, taken_in
 from runtime.records import SolveRequest
 from runtime.support.background import SOLVER_NICENESS, ThreadAbandoned, abandon, begin, patience_s, set_niceness
@@ -28,7 +26,6 @@ log = logging.getLogger("phasestack.solver")
 LATE_S = 0.5  # a longer step is late; a single step of twice this is a fault
 ABANDON_S = 10.0  # a step that takes longer is abandoned and a new solver started
 # Starting a solver may take `LIMITS.start_s`; a task, which loads content, `LIMITS.load_s`.
-FINISH_POLL_S = 0.1
 IDLE_S = 0.02  # interval between checks for tasks while requests are absent
 USUAL_S = 0.2  # when stopping, a running step gets this long to finish
 LATE_STEPS = 3  # this many consecutive late steps raise a fault, this many on time clear it
@@ -42,26 +39,17 @@ class _Attempt:
     def __init__(self, number: int) -> None:
         self.number, self.abandoned = number, threading.Event()
         self.ready = threading.Event()
-        self.begun_ns = 0  # start of the step or task on this thread; 0: idle
-        self.worker: SolveWorker | None = None  # solves while this thread draws
+        self.busy_since_ns = 0  # 0: idle
         self.is_at_task = False
         self.took_ns: deque[int] = deque(maxlen=LATE_STEPS)  # durations of the last steps
         self.costs: CostBook | None = None  # measured on this machine and scene
         self.error: BaseException | None = None
         self.thread: threading.Thread | None = None
 
-    @property
-    def busy_since_ns(self) -> int:
-        """Return the start of the oldest step that is not complete; 0: idle."""
-        starts = self.begun_ns, self.worker.since_ns if self.worker is not None else 0
-        return min(filter(None, starts), default=0)
-
     def leave(self) -> None:
         """Abandon a step between two drawing calls, because a drawing thread keeps taking the GIL."""
         if self.thread is not None and self.thread is not threading.current_thread():
             abandon(self.thread)
-        if self.worker is not None:
-            self.worker.leave()
 
 
 class SolverThread(SolverHost):
@@ -163,7 +151,7 @@ class SolverThread(SolverHost):
 
     def _begin(self, number: int) -> _Attempt:
         attempt = _Attempt(number)
-        attempt.begun_ns = self._clock.now_ns() if number > 1 else 0
+        attempt.busy_since_ns = self._clock.now_ns() if number > 1 else 0
         attempt.thread = begin(f"solver-{number}", self._live, attempt)
         return attempt
 
@@ -181,51 +169,45 @@ class SolverThread(SolverHost):
         parts: SolverParts | None = None
         try:
             parts = self._make()
-            attempt.costs = CostBook(parts.first_costs(), overlaps=parts.overlaps)
+            attempt.costs = CostBook(parts.first_costs())
             first = parts.step(FIRST_REQUEST)
         except BaseException as error:
             if parts is not None:
                 parts.close()
-            attempt.error, attempt.begun_ns = error, self._clock.now_ns()
+            attempt.error, attempt.busy_since_ns = error, self._clock.now_ns()
             attempt.ready.set()
             if attempt.number > 1 and not isinstance(error, PhasestackError | ThreadAbandoned):
                 log.exception("solver: restart failed")
             return
         self._publish(attempt, first)
         self._costs = attempt.costs.costs()
-        attempt.worker = SolveWorker(
-            f"solver-{attempt.number}-worker", partial(self._solved, attempt, parts), self._clock
-        )
-        attempt.begun_ns = 0
+        attempt.busy_since_ns = 0
         attempt.ready.set()
         try:
-            while not self._is_over(attempt):
+            while not (attempt.abandoned.is_set() or self._closing.is_set()):
                 self._do_tasks(attempt, parts)
                 self._adopt_model(attempt, parts)
-                attempt.worker.wait(self._spare_s(attempt))
-                self._settle(attempt, parts)
                 request = self._next_request()
                 if request is not None:
                     self._step(attempt, parts, request)
         except (ContextLost, Stopped) as error:
             log.error("solver: %s", _line(error))  # log only text, because the error's frames keep large objects alive
-            attempt.error, attempt.begun_ns = error.with_traceback(None), self._clock.now_ns()
+            attempt.error, attempt.busy_since_ns = error.with_traceback(None), self._clock.now_ns()
         except ThreadAbandoned:
             raise
         except BaseException as error:  # not an expected failure, but a bug here or in a library
             log.exception("solver")
-            attempt.error, attempt.begun_ns = error.with_traceback(None), self._clock.now_ns()
+            attempt.error, attempt.busy_since_ns = error.with_traceback(None), self._clock.now_ns()
         finally:
-            attempt.worker.close()
             parts.close()
             if attempt.abandoned.is_set():  # no longer needed, and its frames keep large objects alive
                 attempt.error = None
 
     def _adopt_model(self, attempt: _Attempt, parts: SolverParts) -> None:
-        """Begin new measurements if a task has changed the model: its rasters and costs are others."""
+        """Start new measurements if a task has replaced the model, whose rasters and costs may differ."""
         assert attempt.costs is not None
         if (first := parts.first_costs()) != attempt.costs.first:
-            attempt.costs = CostBook(first, overlaps=parts.overlaps)
+            attempt.costs = CostBook(first)
             self._costs = attempt.costs.costs()
 
     def _next_request(self) -> SolveRequest | None:
@@ -236,59 +218,14 @@ class SolverThread(SolverHost):
         return request
 
     def _step(self, attempt: _Attempt, parts: SolverParts, request: SolveRequest) -> None:
-        """Draw a request, and solve it: on the worker if it can be solved apart, else on this thread."""
-        assert attempt.worker is not None
-        attempt.begun_ns = self._clock.now_ns()
-        drawn = parts.draw(request)
-        if not self._finish(attempt, parts):
-            return
-        if isinstance(drawn, SolverUpdate):
-            attempt.took_ns.append(self._clock.now_ns() - attempt.begun_ns)
-            self._publish(attempt, drawn)
-        elif drawn.is_apart:
-            attempt.worker.begin(drawn)
-        else:
-            parts.settle(drawn, self._solved(attempt, parts, drawn))
-        attempt.begun_ns = 0
-
-    def _solved(self, attempt: _Attempt, parts: SolverParts, drawn: DrawnRequest) -> SolverUpdate:
-        """Solve a drawn request, publish the result and learn its cost."""
-        begun_ns = self._clock.now_ns()
-        update = parts.solve(drawn)
-        attempt.took_ns.append(self._clock.now_ns() - begun_ns + round(drawn.render_ms * NS_PER_MS))
-        if self._publish(attempt, update) and update.solution is not None:
-            assert attempt.costs is not None and update.solution.effort is not None
-            attempt.costs.learn(update.solution.effort, update.solution.stage_ms)
+        attempt.busy_since_ns = self._clock.now_ns()
+        step = parts.step(request)
+        attempt.took_ns.append(self._clock.now_ns() - attempt.busy_since_ns)
+        attempt.busy_since_ns = 0
+        if self._publish(attempt, step) and step.solution is not None:
+            assert attempt.costs is not None and step.solution.effort is not None
+            attempt.costs.learn(step.solution.effort, step.solution.stage_ms)
             self._costs = attempt.costs.costs()
-        return update
-
-    def _finish(self, attempt: _Attempt, parts: SolverParts) -> bool:
-        """Wait for the worker and record its result. Returns False if this attempt is over."""
-        assert attempt.worker is not None
-        while not attempt.worker.wait(FINISH_POLL_S):
-            if self._is_over(attempt):
-                return False
-        self._settle(attempt, parts)
-        return True
-
-    @staticmethod
-    def _settle(attempt: _Attempt, parts: SolverParts) -> None:
-        """Record what the worker has finished. Raises the exception that ended its request."""
-        assert attempt.worker is not None
-        if (done := attempt.worker.take()) is not None:
-            parts.settle(*done)
-
-    def _spare_s(self, attempt: _Attempt) -> float:
-        """Return how long drawing can wait and still end with the solution under way: newer eyes are better."""
-        assert attempt.worker is not None
-        drawn, since_ns = attempt.worker.drawn, attempt.worker.since_ns
-        if drawn is None or not since_ns:
-            return 0.0
-        elapsed_ms = (self._clock.now_ns() - since_ns) / NS_PER_MS
-        return max(0.0, self.costs.ms(drawn.effort) - 2 * drawn.render_ms - elapsed_ms) / 1e3
-
-    def _is_over(self, attempt: _Attempt) -> bool:
-        return attempt.abandoned.is_set() or self._closing.is_set()
 
     def _publish(self, attempt: _Attempt, step: SolverUpdate) -> bool:
         """Add a step's result to the news; return False if this attempt has been abandoned."""
@@ -300,16 +237,16 @@ class SolverThread(SolverHost):
     def _do_tasks(self, attempt: _Attempt, parts: SolverParts) -> None:
         """Run each task once; unfinished ones are queued again for after the next step."""
         for _ in range(self._tasks.qsize()):
-            if attempt.abandoned.is_set() or not self._finish(attempt, parts):
+            if attempt.abandoned.is_set():
                 return
             task = self._tasks.get()
-            attempt.begun_ns, attempt.is_at_task = self._clock.now_ns(), True
+            attempt.busy_since_ns, attempt.is_at_task = self._clock.now_ns(), True
             try:
                 done = task(parts)
             except Exception:
                 log.exception("solver: a task failed")
                 done = True
-            attempt.begun_ns, attempt.is_at_task = 0, False
+            attempt.busy_since_ns, attempt.is_at_task = 0, False
             if not done:
                 self._tasks.put(task)
 

@@ -15,7 +15,7 @@ from runtime.frame.effort import Costs, simulated_costs
 from runtime.frame.pacing import Pacer
 from runtime.frame.presenter import Presenter, Refresh
 from runtime.frame.run_state import RunCell
-from runtime.frame.solver import DrawnRequest, SolverUpdate
+from runtime.frame.solver import SolverUpdate
 from runtime.frame.solver_host import SolverHost, Task
 from runtime.frame.viewer import Viewer
 from runtime.optics.stack import PanelStack
@@ -139,8 +139,6 @@ class FakePanels(PanelSink):
 class FakeParts:
     """`SolverParts` whose steps are a test's own function."""
 
-    overlaps = False
-
     def __init__(self, step: Callable[[SolveRequest], SolverUpdate], stage_ms: dict[str, float] | None = None) -> None:
         self.behave, self.stage_ms = step, stage_ms or {}
         self.asked: list[SolveRequest] = []
@@ -149,15 +147,6 @@ class FakeParts:
     def step(self, request: SolveRequest) -> SolverUpdate:
         self.asked.append(request)
         return self.behave(request)
-
-    def draw(self, request: SolveRequest) -> DrawnRequest | SolverUpdate:
-        return self.step(request)
-
-    def solve(self, drawn: DrawnRequest) -> SolverUpdate:
-        raise AssertionError("every step is complete once it is drawn")
-
-    def settle(self, drawn: DrawnRequest, update: SolverUpdate) -> None:
-        raise AssertionError("every step is complete once it is drawn")
 
     def simulated_costs(self) -> Costs:
         return simulated_costs(self.stage_ms, (1,))

@@ -34,7 +34,7 @@ def chosen(speed_m_s: float, *, sigma_m: float = 5e-4, slower: float = 1.0, show
     return EffortChooser().choose(
         candidates(REDUCTIONS, 4),
         costs,
-        lambda effort: Outlook(sigma_m, speed_m_s, max(costs.ms(effort) / 1e3 - 0.1, 0.0) * speed_m_s),
+        lambda cost_ms: Outlook(sigma_m, speed_m_s, max(cost_ms / 1e3 - 0.1, 0.0) * speed_m_s),
         shown_error=shown_error,
         period_ms=PERIOD_MS,
     )
@@ -53,16 +53,6 @@ def test_costs_of_the_simulated_clock_follow_the_contract() -> None:
     assert costs.ms(Effort(2, 1)) == pytest.approx((153.0 + 85.0) / 4)
     assert costs.ms(Effort(4, 0)) == pytest.approx(153.0 / 16)
     assert costs.ms(Effort(1, 6, continued_from=4)) == pytest.approx(38.0 + 2 * 85.0), "nothing is drawn or proposed"
-
-
-def test_solutions_follow_each_other_sooner_if_drawing_overlaps_solving() -> None:
-    stages = {1: {"render": 44.0, "inference": 20.0, "finish": 36.0, "step": 10.0}}
-    apart, together = Costs(stages), Costs(stages, overlaps=True)
-    for effort, interval_ms in ((Effort(1, 0), 56.0), (Effort(1, 4), 96.0), (Effort(1, 6, continued_from=4), 56.0)):
-        assert apart.interval_ms(effort) == apart.ms(effort) == together.ms(effort)
-        assert together.interval_ms(effort) == interval_ms
-    drawn_slowly = Costs({1: {"render": 80.0, "finish": 30.0}}, overlaps=True)
-    assert drawn_slowly.interval_ms(Effort(1, 0)) == 80.0
 
 
 @given(st.floats(0.0, 2.0), st.floats(0.0, 2.0))
@@ -99,7 +89,7 @@ def test_the_present_effort_is_kept_while_another_is_hardly_better() -> None:
             chooser.choose(
                 candidates(REDUCTIONS, 4),
                 costs,
-                lambda effort, speed=speed: Outlook(5e-4, speed, max(costs.ms(effort) / 1e3 - 0.1, 0.0) * speed),
+                lambda cost_ms, speed=speed: Outlook(5e-4, speed, max(cost_ms / 1e3 - 0.1, 0.0) * speed),
                 shown_error=5e-3,
                 period_ms=PERIOD_MS,
             )

@@ -168,27 +168,6 @@ def test_a_model_that_fails_is_named_and_tried_again(
     assert solver.step(wish()).missing == {}
 
 
-def test_solving_while_the_next_pictures_are_drawn_changes_no_layer(solver: Solver, cell: RunCell) -> None:
-    """The source overwrites its pictures when it draws again, so a request that is solved apart needs copies."""
-    places = [aside(k / 50) for k in range(3)]
-    drawn = [solver.draw(wish(place), apart=True) for place in places]
-    apart = [solver.solve(one).solution.layers.copy() for one in drawn]
-    alone = Solver(cell, SMALL)
-    alone.step(wish(None, flat=True))
-    assert all(one.is_apart for one in drawn)
-    for layers, place in zip(apart, places, strict=True):
-        assert np.array_equal(layers, alone.step(wish(place)).solution.layers)
-
-
-def test_a_failure_while_the_next_request_is_drawn_leaves_that_request_alone(solver: Solver) -> None:
-    first, second = (solver.draw(wish(aside(k / 50)), apart=True) for k in (1, 2))
-    solver.settle(first, SolverUpdate(missing={"model": "out of memory"}))
-    update = solver.solve(second)
-    solver.settle(second, update)
-    assert update.solution is not None
-    assert solver.step(wish(aside(2 / 50))) == SolverUpdate(), "it is solved"
-
-
 def test_where_even_the_flat_picture_fails_a_uniform_one_is_shown(
     cell: RunCell, content: ContentSource, monkeypatch: pytest.MonkeyPatch
 ) -> None:
