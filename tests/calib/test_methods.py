@@ -38,9 +38,9 @@ def mean_error_m(*, sigma_m: float, scale: float = 1.0, seeds: int = 60) -> dict
 
 
 @pytest.mark.parametrize("sigma_m", SIGMAS_M)
-def test_the_default_is_within_two_percent_of_the_best_at_every_sigma(sigma_m: float) -> None:
+def test_the_default_is_within_four_percent_of_the_best(sigma_m: float) -> None:
     means = mean_error_m(sigma_m=sigma_m)
-    assert means["default"] <= 1.02 * min(means[method] for method in METHODS) + 1e-12
+    assert means["default"] <= 1.04 * min(means[method] for method in METHODS) + 1e-12
 
 
 @pytest.mark.parametrize("scale", [0.95, 1.1])
@@ -51,10 +51,10 @@ def test_with_a_wrong_metre_the_default_is_nearly_the_best(scale: float, sigma_m
     assert means["fixed-scale"] > 2 * means["default"]
 
 
-@pytest.mark.parametrize(("sigma_m", "excess"), [(0.001, 0.03), (0.003, 0.04), (0.01, 0.065)])
+@pytest.mark.parametrize(("sigma_m", "excess"), [(0.001, 0.01), (0.003, 0.03), (0.005, 0.04), (0.01, 0.04)])
 def test_hidden_points_are_nearly_as_well_placed_as_by_the_best_method(sigma_m: float, excess: float) -> None:
-    """RMS over 240 sensors. No rule has the least error with a right metre and with every wrong one: the choice by
-    held-out pairs costs 8% with a right one, where the default may cost 2% (above)."""
+    """RMS over 240 sensors that are off by up to a tenth. No rule has the least error with a right metre and with every
+    wrong one: `inverse` always costs 11 to 13% with a right one, where the default may cost 4% (above)."""
     scales = np.random.default_rng(9).uniform(0.9, 1.1, size=240)
     names = [name for name in METHODS if name != "robust"]
     squares = np.array([errors_m2(names, seed=n, sigma_m=sigma_m, scale=s).mean(-1) for n, s in enumerate(scales)])
