@@ -80,9 +80,8 @@ HEAD = """\
     phasestack bench compare old.json new.json
 
 **Quote [light](contracts.md#error) at a tracking error of 1 mm** (`light_db`, `"1"`). *One ray* is `psnr_db`. The time
-of a solution runs from two decoded pictures to 8-bit layers. Every method runs in its own process, whose peak memory
-is reported. Run times depend on the machine and its load, so compare ratios. To include the published network
-(`eyereal`), export its checkpoint and pass `--model FILE.onnx`.
+of a solution runs from two decoded pictures to 8-bit layers; memory is the peak of the method's own process. Run times
+depend on the machine and its load, so compare ratios.
 
 `bench compare` divides times by a reference measured in the same run and skips them if the machine was busy. It exits
 with 1 if a model became slower by more than the noise, lost 0.1 dB or took 15% more memory.

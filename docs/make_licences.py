@@ -16,9 +16,9 @@ PAGE = ROOT / "THIRD_PARTY.md"
 HEAD = """\
 # Third-party licences
 
-phasestack is licensed under Apache-2.0. A running phasestack uses the packages below; each is installed from
-PyPI, unchanged, and brings its licence texts along in its `*.dist-info`. Made by `python docs/make_licences.py` from
-`requirements/runtime.lock` and the packages' own metadata.
+phasestack is licensed under Apache-2.0. It runs with the packages below, which are installed from PyPI, unchanged, with
+their licence texts in `*.dist-info`. `python docs/make_licences.py` writes this page from `requirements/runtime.lock`
+and the packages' metadata.
 
 | package | version | licence |
 | --- | --- | --- |
