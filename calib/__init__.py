@@ -1,1 +1,1 @@
-"""Calibration: pose of the sensor, registration of the panels, and their grey curves."""
+"""Calibration of a display: the sensor's pose, the registration of the panels and their grey curves."""

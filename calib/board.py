@@ -1,10 +1,10 @@
-"""Coded calibration boards: marks that identify a panel and a position on it.
+"""Coded calibration boards, whose marks identify a panel and a position on it.
 
-A mark is a white square with an ArUco marker inside and a smaller white square at each of its corners. Where two
-squares touch, there is a saddle point. Because it is symmetric under a half turn, it can be located to a few hundredths
-of a pixel despite blur and the camera's tone curve. The rest of the board is black (phase 0), which lets the other
-panels' marks show through. One photograph therefore shows the marks of all panels, and no tripod is needed. Marks are
-scattered, so that two which overlap from one viewpoint do not overlap from another.
+A mark is a white square with an ArUco marker inside and a smaller white square at each corner. Where two squares touch
+there is a saddle point. It is symmetric under a half turn, so it can be located to a few hundredths of a pixel despite
+blur and the camera's tone curve. The rest of the board is black (phase 0), so the marks of other panels show through.
+One photograph therefore shows the marks of all panels, and no tripod is needed. Marks are scattered so that two that
+overlap from one viewpoint are separate from another.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from runtime.records import F64, U8
 
 MARKER_BITS = 4
 DICTIONARY_SIZE = 100
-ACROSS, DOWN = 5, 4  # marks across and down a panel
+ACROSS, DOWN = 5, 4  # number of marks across and down a panel
 PER_PANEL = ACROSS * DOWN
-BITS_ON_SHORT_SIDE = 216  # a bit is 5 pixels at 1080 rows
-# In bits: marker (its black border counts), quiet zone on each side, corner squares.
+BITS_ON_SHORT_SIDE = 216  # bits along the shorter side; a bit is 5 pixels at 1080 rows
+# In bits: the marker with its black border, the quiet zone on each side, the corner squares.
 MARKER, QUIET, CORNER = MARKER_BITS + 2, 2, 3
 SQUARE = MARKER + 2 * QUIET
 TILE = SQUARE + 2 * CORNER
 
 
 def dictionary() -> Any:
-    """ArUco dictionary of the markers."""
+    """Return the ArUco dictionary of the markers."""
     return cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_100)
 
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """One mark of a board."""
+    """Mark of a board."""
 
-    number: int  # the marker's id
+    number: int  # id of the marker
     panel: int
     left_px: int  # left edge of the white square
     top_px: int
@@ -69,15 +69,17 @@ class Mark:
 def marks(stack: PanelStack) -> tuple[Mark, ...]:
     """Lay out the marks of all panels. Raises InputError if panels are too many or too small."""
     if stack.count * PER_PANEL > DICTIONARY_SIZE:
-        raise InputError("stack", "x_m", f"boards support at most {DICTIONARY_SIZE // PER_PANEL} panels")
+        raise InputError("stack", "x_m", f"calibration boards support at most {DICTIONARY_SIZE // PER_PANEL} panels")
     unit = max(2, round(min(stack.width_px * 9 / 16, stack.height_px) / BITS_ON_SHORT_SIDE))
     tile = TILE * unit
     cell = np.array([stack.width_px / ACROSS, stack.height_px / DOWN])
     room = cell - tile - 2
     if room.min() < 0:
-        raise InputError("stack", "width_px", f"boards need panels of at least {ACROSS * tile}x{DOWN * tile} pixels")
+        raise InputError(
+            "stack", "width_px", f"must be larger; boards need panels of {ACROSS * tile}x{DOWN * tile} pixels"
+        )
     every = []
-    random = np.random.default_rng(16)  # a fixed seed, because photographs are compared with the board
+    random = np.random.default_rng(16)  # fixed seed, because photographs are compared with the board
     for panel in range(stack.count):
         for place in range(PER_PANEL):
             corner = np.array([place % ACROSS, place // ACROSS]) * cell + 1 + random.uniform(size=2) * room
@@ -87,7 +89,7 @@ def marks(stack: PanelStack) -> tuple[Mark, ...]:
 
 
 def board(stack: PanelStack, panel: int) -> U8:
-    """Draw the (H, W) board of one panel, in 0 and 255."""
+    """Draw the board of one panel (H, W), with values 0 and 255."""
     picture = np.zeros((stack.height_px, stack.width_px), np.uint8)
     for mark in marks(stack):
         if mark.panel != panel:
@@ -104,5 +106,5 @@ def board(stack: PanelStack, panel: int) -> U8:
 
 
 def boards(stack: PanelStack) -> U8:
-    """Draw the (N, H, W) boards of all panels."""
+    """Draw the boards of all panels (N, H, W)."""
     return np.stack([board(stack, index) for index in range(stack.count)])

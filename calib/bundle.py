@@ -1,9 +1,10 @@
-"""Bundle adjustment of one camera, its poses, and six degrees of freedom of every panel.
+"""Bundle adjustment of one camera, its poses and six degrees of freedom of every panel.
 
 The panels' pixel pitch sets the scale. The reference panel, at its ideal pose, defines the stack's frame. A robust fit
-(soft L1) finds outliers; plain least squares of the other points gives an unbiased covariance. Derivatives are exact,
-and the normal equations are small: about a hundred unknowns, thousands of coordinates. scipy's `least_squares` gives
-the same covariance (to 1e-11) but takes 30 times as long, since it decomposes the whole Jacobian.
+(soft L1) finds outliers, then plain least squares of the other points gives an unbiased covariance. Derivatives are
+exact, and the normal equations are small, with about a hundred unknowns for thousands of coordinates. scipy's
+`least_squares` gives the same covariance (to 1e-11) but takes 30 times as long, because it decomposes the whole
+Jacobian.
 """
 
 from __future__ import annotations
@@ -26,17 +27,17 @@ LENS = 9  # fx fy cx cy k1 k2 p1 p2 k3
 POSE = 6  # turn, shift
 FOCAL_GUESSES = (0.6, 0.8, 1.1, 1.6, 2.4)  # initial focal lengths, relative to the longer side
 ROBUST_PX = 0.3  # scale of the soft L1 norm
-OUTLIER_SIGMAS = 4.0  # distance beyond which a point is an outlier
-MIN_SIGMA_PX = 0.01  # least noise assumed for the points, so that exact data have no outliers
-NO_FIT_PX = 5.0  # median distance of points beyond which the photographs do not show the configured stack
+OUTLIER_SIGMAS = 4.0  # distance from which a point is an outlier
+MIN_SIGMA_PX = 0.01  # minimum noise assumed for the points, so that exact data have no outliers
+NO_FIT_PX = 5.0  # median distance from which the photographs do not show the configured stack
 MAX_STEPS, MAX_DAMPING = 60, 1e8
-# Prior standard deviations for any camera: square pixels, a centred lens, distortion of a few per cent. They are
-# negligible compared with twelve photographs.
+# Prior standard deviations for any camera: square pixels, a centred lens, a few percent of distortion. Twelve
+# photographs outweigh them by far.
 SQUARE_SIGMA, CENTRE_SIGMA, DISTORTION_SIGMAS = 0.003, 0.03, (0.3, 0.5, 0.005, 0.005, 0.5)
 
 
 class Undetermined(ValueError):
-    """Raised when the photographs do not determine the panels; the message explains why."""
+    """Raised when the photographs do not determine the panels. The message explains why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +47,13 @@ class Bundle:
     panels: tuple[PlacedPanel, ...]  # rear to front, frame of the reference panel
     reference: int
     places_m: F64  # (P, 3) positions of the camera, frame `stack`
-    covariance: F64  # (6(N-1), 6(N-1)) of rotation about its middle (rad) and shift (m) of each moving panel
+    covariance: F64  # (6(N-1), 6(N-1)) of each moving panel's rotation about its middle (rad) and shift (m)
     sigma_px: float  # standard deviation of one coordinate of a saddle in a photograph
     used: NDArray[np.bool_]  # (K,) True for points that are not outliers
     photograph: Any  # (K,) index of each point's photograph
 
     def sigma_of(self, derived: Any) -> F64:
-        """Return the standard deviation of a function of the panels, to first order, in the result's shape."""
+        """Return the first-order standard deviation of a function of the panels, in the shape of its result."""
         columns = []
         for number, step in enumerate(np.sqrt(np.diag(self.covariance)) * 0.1):
             up, down = (np.asarray(derived(self._stepped(number, signed))) for signed in (step, -step))
@@ -87,7 +88,7 @@ class _State:
 
 
 class _Problem:
-    """The detected points, and the layout of a step: lens, all panels except the reference, camera poses."""
+    """Detected points and the layout of a step: lens, all panels except the reference, camera poses."""
 
     def __init__(self, seen: Sequence[SeenMarks], stack: PanelStack, *, reference: int) -> None:
         self.stack, self.reference, self.photographs = stack, reference, len(seen)
@@ -120,13 +121,13 @@ class _Problem:
         return np.asarray(seen.reshape(-1, 2) - self.image_px, dtype=np.float64)
 
     def residuals(self, state: _State) -> F64:
-        """Return (2K + priors,): `residual_px`, then the priors' residuals in standard deviations."""
+        """Return `residual_px` and the priors' residuals in standard deviations, (2K + priors,)."""
         lens = state.lens
         prior = np.concatenate([[lens[0] - lens[1]], lens[2:4] - self.middle, lens[4:]]) * self.prior_scale
         return np.concatenate([self.residual_px(state).ravel(), prior])
 
     def slopes(self, state: _State) -> F64:
-        """Return (2K + priors, unknowns) derivatives of `residuals` with respect to a step."""
+        """Return the derivatives of `residuals` with respect to a step, (2K + priors, unknowns)."""
         count = len(self.local_m)
         slopes = cv2.projectPoints(self.camera_m(state), np.zeros(3), np.zeros(3), state.camera, state.lens[4:])[1]
         by_point = slopes[:, 3:6].reshape(count, 2, 3) @ state.poses[self.photograph, :3, :3]
@@ -157,9 +158,9 @@ class _Problem:
         return _State(state.lens + step[:LENS], turns, middles_m, change @ state.poses)
 
     def start(self, *, reverse: bool = False) -> _State:
-        """Return ideal panels with the focal length and camera poses that explain the photographs best.
+        """Return ideal panels and the focal length and camera poses that explain the photographs best.
 
-        reverse: assume that the panels are in the reverse of the configured order.
+        reverse: assume that the panels are in reverse order.
         """
         count, origin_m = self.stack.count, self.stack.x_m[self.reference]
         middles_m = np.zeros((count, 3))
@@ -182,7 +183,7 @@ class _Problem:
 
 
 def _solved(problem: _Problem, state: _State, used: NDArray[np.bool_], *, robust: bool) -> _State:
-    """Minimise by Levenberg-Marquardt; robust: minimise the soft L1 norm, by iterative reweighting."""
+    """Minimise by Levenberg-Marquardt. robust: minimise the soft L1 norm by iterative reweighting."""
     kept = np.concatenate([np.repeat(used, 2), np.ones(len(problem.prior_scale), bool)])
 
     def cost_of(residuals: F64) -> float:
@@ -213,8 +214,8 @@ def _solved(problem: _Problem, state: _State, used: NDArray[np.bool_], *, robust
 def _refuse_reverse(problem: _Problem, state: _State) -> None:
     """Raise Undetermined if the panels are in the reverse of the configured order.
 
-    Cameras behind a stack that is mirrored front to rear would take the same pictures. Otherwise the configured order
-    does not fit, but the reverse does.
+    This is the case if only the reverse order fits, or if both fit but one needs cameras behind the stack. (Such
+    cameras would take the same pictures of a stack mirrored front to rear.)
     """
     depth_m = problem.camera_m(state)[:, 2]
     behind = any(np.median(depth_m[problem.photograph == number]) <= 0 for number in range(problem.photographs))
@@ -223,7 +224,7 @@ def _refuse_reverse(problem: _Problem, state: _State) -> None:
         other = _solved(problem, problem.start(reverse=True), everything, robust=True)
         behind = _median_px(problem, other) < NO_FIT_PX
     if behind:
-        raise Undetermined("the panels are in the reverse of the configured order: panel 0 must be the rear one")
+        raise Undetermined("the panels are in the reverse of the configured order; panel 0 must be the one at the rear")
 
 
 def _median_px(problem: _Problem, state: _State) -> float:
@@ -248,7 +249,10 @@ def adjust(seen: Sequence[SeenMarks], stack: PanelStack, *, reference: int) -> B
         used = good
     freedom = 2 * int(used.sum()) - problem.size
     if freedom <= 0:
-        raise Undetermined(f"{int(used.sum())} consistent points are too few for {problem.size} unknowns")
+        raise Undetermined(
+            f"the photographs have only {int(used.sum())} consistent points for {problem.size} "
+            "unknowns; take more of them"
+        )
     residual = problem.residual_px(state)
     sigma = float(np.sqrt((residual[used] ** 2).sum() / freedom))
     return Bundle(
@@ -263,13 +267,13 @@ def adjust(seen: Sequence[SeenMarks], stack: PanelStack, *, reference: int) -> B
 
 
 def _covariance(problem: _Problem, state: _State, used: NDArray[np.bool_], *, sigma: float) -> F64:
-    """Return the covariance of a step if the points' noise is `sigma`. Raises Undetermined."""
+    """Return the covariance of a step for points with noise `sigma`. Raises Undetermined."""
     slopes = problem.slopes(state)
     slopes[: 2 * len(used)] /= sigma
     weighted = slopes[np.concatenate([np.repeat(used, 2), np.ones(len(problem.prior_scale), bool)])]
     lengths = np.linalg.norm(weighted, axis=0)
     values, axes = np.linalg.svd(np.linalg.qr(weighted / lengths, mode="r"))[1:]
     if values[-1] < 1e-9 * values[0]:
-        raise Undetermined("the photographs do not determine all unknowns: take them from more directions")
+        raise Undetermined("the photographs do not determine all unknowns; take them from more directions")
     root = (axes.T / values) / lengths[:, None]
     return np.asarray(root @ root.T)

@@ -1,4 +1,4 @@
-"""`calibrate capture`: guide a person through the viewpoints, and store the accepted pairs."""
+"""`calibrate capture`: guide a person through the viewpoints and store the accepted pairs."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from runtime.sensor.registry import open_sensor
 from runtime.sensor.samples import RecordedSamples
 
 WINDOW_NS = NS_PER_S // 2  # a pair is the median over this window
-MAX_SPREAD_M = 0.010  # largest motion or scatter of the eyes in the window
-MIN_SAMPLES = 5  # samples in the window, for a meaningful spread
+MAX_SPREAD_M = 0.010  # maximum motion or scatter of the eyes in the window
+MIN_SAMPLES = 5  # minimum number of samples in the window for a meaningful spread
 
 
 def midpoint(eyes: EyePoints | None) -> F64 | None:
-    """Return the (3,) midpoint of two measured eyes, or None if one is missing, uncertain or filled in."""
+    """Return the midpoint of two measured eyes, or None if one is missing, uncertain or filled in."""
     if eyes is None or eyes.completed or eyes.confidence.min() < CONFIDENCE_MIN:
         return None
     middle = eyes.eyes_m.mean(axis=0)
@@ -38,13 +38,13 @@ def midpoint(eyes: EyePoints | None) -> F64 | None:
 
 
 class EyeWindow:
-    """Window over the samples of the last half second."""
+    """Samples of the last half second."""
 
     def __init__(self) -> None:
         self._samples: deque[tuple[int, F64]] = deque()  # capture time, midpoint of the eyes
 
     def add(self, capture_ns: int, eyes: EyePoints | None) -> None:
-        """Add a sample in frame `sensor`. An unusable one only advances the window's time."""
+        """Add a sample in the sensor frame. An unusable one only advances the time of the window."""
         middle = midpoint(eyes)
         if middle is not None:
             self._samples.append((capture_ns, middle))
@@ -52,7 +52,7 @@ class EyeWindow:
             self._samples.popleft()
 
     def measure(self) -> tuple[F64, float] | None:
-        """Return the window's (3,) median, frame `sensor`, and robust RMS spread; None for too few samples."""
+        """Return the median (3,) in the sensor frame and robust RMS spread, or None for too few samples."""
         if len(self._samples) < MIN_SAMPLES:
             return None
         points = np.array([point for _, point in self._samples])
@@ -62,7 +62,7 @@ class EyeWindow:
 
 
 class Walk:
-    """Progress of a person through the viewpoints. Uses no clock and no threads."""
+    """Progress of a person through the viewpoints. Uses neither a clock nor threads."""
 
     def __init__(
         self,
@@ -72,7 +72,7 @@ class Walk:
         say: Callable[[str], None],
         chart: Callable[[Viewpoint], None] | None = None,
     ) -> None:
-        """chart: shows a viewpoint's chart; None if the charts are shown elsewhere."""
+        """chart: shows the chart of a viewpoint; None if charts are shown elsewhere."""
         self._file, self._say, self._chart = file, say, chart
         self._left = [v for v in viewpoints if v.name not in file.viewpoints]
         self._window = EyeWindow()
@@ -89,19 +89,19 @@ class Walk:
     def begin(self) -> None:
         """Announce the first viewpoint."""
         if self.finished:
-            self._say("every viewpoint already has a pair")
+            self._say("all viewpoints already have a pair")
         else:
             self._announce()
 
     def see(self, capture_ns: int, eyes: EyePoints | None, serial: str) -> None:
-        """Add a sample in frame `sensor`."""
+        """Add a sample in the sensor frame."""
         if self.finished:
             return
         self._serial = serial
         self._window.add(capture_ns, eyes)
 
     def press(self, key: Key | None) -> None:
-        """Act on a key, if one was pressed."""
+        """Act on a key press, if any."""
         if self.finished:
             return
         match key:
@@ -127,18 +127,18 @@ class Walk:
     def _accept(self) -> None:
         viewpoint, seen = self.current, self._window.measure()
         if seen is None:
-            self._say(f"{viewpoint.name}: rejected: the sensor does not see both eyes")
+            self._say(f"{viewpoint.name}: rejected because the sensor does not see both eyes")
             return
         middle_m, spread_m = seen
         spread = f"{spread_m * 1e3:.1f}"
         if spread_m > MAX_SPREAD_M:
-            self._say(f"{viewpoint.name}: rejected: the eyes moved or scattered by {spread} mm; hold still")
+            self._say(f"{viewpoint.name}: rejected because the eyes moved or scattered by {spread} mm; hold still")
             return
         self._file.accept(
             PairRow.of(middle_m, viewpoint.midpoint_m, viewpoint.name, serial=self._serial, spread_mm=spread)
         )
         self._accepted += 1
-        self._say(f"{viewpoint.name}: accepted, spread {spread} mm, {len(self._file)} pairs in all")
+        self._say(f"{viewpoint.name}: accepted with a spread of {spread} mm; {len(self._file)} pairs so far")
         if self._index + 1 == len(self._left):
             self.finished = True
         else:
@@ -148,7 +148,7 @@ class Walk:
         index = min(max(self._index + step, 0), len(self._left) - 1)
         if index != self._index:
             self._index = index
-            self._window = EyeWindow()  # earlier samples belong to the previous viewpoint
+            self._window = EyeWindow()  # drop samples of the previous viewpoint
             self._announce()
 
     def _announce(self) -> None:
@@ -166,7 +166,7 @@ class Walk:
 def capture_live(
     out: Path, settings: Settings, hardware: SetupHardware, *, show: bool, say: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Walk through the viewpoints with a person in front of the display. Raises InputError, FatalError."""
+    """Guide a person in front of the display through the viewpoints. Raises InputError, FatalError."""
     file = PairsFile(out)
     say(f"sensor: {hardware.open_sensor(settings)}")
     try:
@@ -201,6 +201,6 @@ def capture_recording(out: Path, settings: Settings, *, source: str) -> dict[str
                 pairs.append(PairRow.of(middle, frame.true_eyes_m.mean(axis=0), name, serial=samples.serial))
     if not pairs:
         problem = "the sample has no usable eyes" if known else "the recording has no true eye positions"
-        raise InputError(source, "", f"{problem}: capture from the live sensor")
+        raise InputError(source, "", f"{problem}; capture from the live sensor instead")
     file.accept(*pairs)
     return {"file": str(out), "pairs": len(file), "accepted": len(pairs)}

@@ -1,6 +1,6 @@
-"""Calibration charts with black lines at the thirds of each eye's image (EyeReal, 2.3, figure S4).
+"""Calibration charts with black lines at the thirds of each eye's image (EyeReal, 2.3, S4).
 
-One set of layers serves both eyes. Seen from the viewpoint, the lines fuse into clean single ones; elsewhere, they show
+One set of layers serves both eyes. From the viewpoint the lines fuse into clean single lines. From elsewhere they show
 ghosts and stripes.
 """
 
@@ -23,12 +23,12 @@ from runtime.support.artifacts import OutputFolder, write_json, write_png
 from runtime.support.progress import tracked
 
 MODEL = "best"
-LINE_PX = 10.0  # width of a line of the chart
+LINE_PX = 10.0  # width of a line
 WIDEST_FOV_DEG = 40.0  # horizontal field of view of the eyes' images, as in the published code
 
 
 def chart_fov_deg(viewpoint: Viewpoint, stack: PanelStack) -> float:
-    """Horizontal field of view of a viewpoint's images: the published one, or the display's if smaller.
+    """Return the field of view of a viewpoint's images: the published one, or the display's if smaller.
 
     This keeps the lines on the panels at any distance.
     """
@@ -36,20 +36,20 @@ def chart_fov_deg(viewpoint: Viewpoint, stack: PanelStack) -> float:
 
 
 def line_picture(*, width_px: int, height_px: int) -> U8:
-    """(h, w, 3) picture for one eye, with lines 10 pixels wide at the thirds of its width and height."""
+    """Draw the picture of one eye (h, w, 3), with lines at the thirds of its width and height."""
     ink = np.maximum(_ink(width_px), _ink(height_px)[:, None])
     return np.repeat(np.rint(255 * (1 - ink)).astype(np.uint8)[..., None], 3, axis=2)
 
 
 def _ink(length_px: int) -> F64:
-    """(length,) share of each pixel that lines at the thirds cover."""
+    """Return the share of each pixel that is covered by lines at the thirds, (length,)."""
     position = np.arange(length_px, dtype=np.float64) + 0.5
     distance = np.minimum(np.abs(position - length_px / 3), np.abs(position - 2 * length_px / 3))
     return np.clip(LINE_PX / 2 - distance + 0.5, 0.0, 1.0)
 
 
 class Charts:
-    """Draws the charts for one stack."""
+    """Charts for one stack."""
 
     def __init__(self, settings: Settings) -> None:
         """Load the model that computes the layers. Raises InputError, MissingPart."""
@@ -58,7 +58,7 @@ class Charts:
         self._predictor = load_predictor(MODEL, self.stack, settings.model)
 
     def layers(self, viewpoint: Viewpoint) -> U8:
-        """(N, H, W, 4) layers that show the lines to both eyes at the viewpoint."""
+        """Solve for layers (N, H, W, 4) that show the lines to both eyes at the viewpoint."""
         picture = line_picture(width_px=self.stack.width_px, height_px=self.stack.height_px)
         eyes_m, fov_deg = viewpoint.eyes_m(self.ipd_m), chart_fov_deg(viewpoint, self.stack)
         prediction = solve_still(picture, picture, eyes_m=eyes_m, fov_deg=fov_deg, predictor=self._predictor)
@@ -70,7 +70,7 @@ class Charts:
 
 
 def make_charts(out: Path, viewpoints: Sequence[Viewpoint], settings: Settings) -> dict[str, Any]:
-    """Write one PNG per panel and viewpoint, and `charts.json`. Raises InputError, MissingPart."""
+    """Write a PNG for each panel and viewpoint, and `charts.json`. Raises InputError, MissingPart."""
     charts = []
     with OutputFolder(out) as folder, closing(Charts(settings)) as drawn:
         for viewpoint in tracked("charts", viewpoints):

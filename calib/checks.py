@@ -1,4 +1,4 @@
-"""Checks of calibration pairs and solutions: refusals (InputError) and warnings, one line each."""
+"""Checks of calibration pairs and solutions, which lead to refusals (InputError) or warnings."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from runtime.records import F64
 
 RESIDUAL_LIMIT_M = 0.05  # as in the EyeReal supplement (figure S5)
 SENSOR_NOISE_FLOOR_M = 0.001  # no depth camera measures a face better than this
-REFUSE_EYE_ERROR_M = 0.05  # expected error at the eye that makes a calibration useless
-WARN_EYE_ERROR_M = 0.01  # expected error at the eye that causes visible ghosts
-COPLANAR = 0.01  # ratio of the third extent to the first
-MIRROR_GAIN = 0.5  # maximum ratio of errors, with the sensor mirrored and not, that means mirrored data
-NAMED = 8  # most pairs named in a message
+REFUSE_EYE_ERROR_M = 0.05  # expected error at the eye above which a calibration is useless
+WARN_EYE_ERROR_M = 0.01  # expected error at the eye above which ghosts are visible
+COPLANAR = 0.01  # ratio of the third extent of the points to the first
+MIRROR_GAIN = 0.5  # data count as mirrored if mirroring the sensor reduces the error to this share
+NAMED = 8  # maximum number of pairs named in a message
 
 
 def check_pairs(pairs: Pairs) -> list[str]:
-    """Return warnings about pairs, before solving. Raises InputError, naming the pairs' file.
+    """Return warnings about pairs before solving. Raises InputError that names the pairs' file.
 
-    It refuses fewer than 3 pairs, coincident or collinear points, points beyond double precision, mirrored axes and
-    mixed units.
+    Refuses fewer than 3 pairs, coincident or collinear points, points beyond double precision, mirrored axes and mixed
+    units.
     """
     if _is_mirrored(pairs):
         raise InputError(
@@ -40,16 +40,16 @@ def check_pairs(pairs: Pairs) -> list[str]:
         raise InputError(pairs.source, "pairs", str(error)) from None
     for wrong, side in ((1e-3, "sensor"), (1e3, "stack")):
         if 0.8 < scale / wrong < 1.25:
-            problem = f"units are mixed (scale {scale:.4g}): {side} seems to be in millimetres; use metres"
+            problem = f"must be in metres, but {side} seems to be in millimetres (scale {scale:.4g})"
             raise InputError(pairs.source, f"{side}_x", problem)
     first, _, third = extents(pairs.stack_m)
     if third > COPLANAR * first:
         return []
-    return ["the viewpoints lie in one plane: enough for the rotation, but mirrored axes would go unnoticed"]
+    return ["all viewpoints are in one plane, which suffices for the rotation but hides mirrored axes"]
 
 
 def check_solution(pairs: Pairs, solution: CalibrationSolution, volume_m: F64) -> list[str]:
-    """Return warnings about a solution. volume_m: (..., 3), the viewing volume. Raises InputError."""
+    """Return warnings about a solution. volume_m: points (..., 3) that viewers use. Raises InputError."""
     warnings = []
     check_similarity(solution.similarity.matrix, source=pairs.source)
     axis = "xyz"[int(np.argmax(solution.axis_rms_m))]

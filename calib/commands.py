@@ -1,4 +1,4 @@
-"""`phasestack calibrate`: panels, grey curves and the sensor's pose. Heavy imports are deferred."""
+"""`phasestack calibrate`: measure the panels, their grey curves and the sensor's pose."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from runtime.support.ranges import SCALE
 if TYPE_CHECKING:
     from runtime.config import Settings
 
-ConfigOption = Annotated[Path | None, typer.Option(help="configuration (TOML); without one, the defaults")]
-JsonOption = Annotated[bool, typer.Option("--json", help="one JSON object on stdout")]
+ConfigOption = Annotated[Path | None, typer.Option(help="configuration file; default: built-in settings")]
+JsonOption = Annotated[bool, typer.Option("--json", help="print the result as one JSON object")]
 
 app = typer.Typer(
     no_args_is_help=True,
-    help="Run the steps of `phasestack setup` one by one: the panels' poses, their grey curves, the camera's pose.\n\n"
+    help="Run the steps of `phasestack setup` one by one.\n\n"
     "Run them in this order: `panels`, `grey`, `charts`, `capture`, `solve`, `report`.\n\n"
     "Example: phasestack calibrate charts --out charts",
 )
@@ -28,18 +28,18 @@ app = typer.Typer(
 
 @app.command()
 def panels(
-    out: Annotated[Path | None, typer.Option(help="folder for the registration")] = None,
+    out: Annotated[Path | None, typer.Option(help="folder to write the registration to")] = None,
     photos: Annotated[Path | None, typer.Option(help="folder with 8 to 20 photographs of the boards")] = None,
     show: Annotated[bool, typer.Option("--show", help="show the boards on the panels until Enter or q")] = False,
     write: Annotated[bool, typer.Option("--write", help="write distances, tilts and homographies to --config")] = False,
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure every panel's pose from photographs of coded boards, with standard errors.
+    """Measure the pose of every panel, with standard errors, from photographs of coded boards.
 
-    First show the boards with --show. In a dim room, take 8 to 20 hand-held photographs with one camera and one zoom
-    setting, so that the display fills most of the picture: from the middle, the left, the right, above and below, up to
-    40 degrees off the axis, and a few with the camera rotated to portrait. Then pass their folder as --photos.
+    First show the boards with --show. In a dim room, take 8 to 20 hand-held photographs in which the display fills most
+    of the picture, all with the same camera and zoom. Take them from the middle, left, right, above and below, up to 40
+    degrees off the axis, and a few in portrait. Then pass their folder as --photos.
 
     Example: phasestack calibrate panels --photos photos --config phasestack.toml --write --out registration
     """
@@ -64,8 +64,8 @@ def panels(
 
 @app.command()
 def grey(
-    out: Annotated[Path | None, typer.Option(help="the panel's LUT, CSV")] = None,
-    panel: Annotated[int, typer.Option(help="0 is the rear panel", min=0)] = 0,
+    out: Annotated[Path | None, typer.Option(help="CSV file to write the LUT to")] = None,
+    panel: Annotated[int, typer.Option(help="index of the panel; 0 is the one at the rear", min=0)] = 0,
     photos: Annotated[Path | None, typer.Option(help="folder with two or three photographs of the chart")] = None,
     show: Annotated[bool, typer.Option("--show", help="show the chart on the panel until Enter or q")] = False,
     config: ConfigOption = None,
@@ -74,8 +74,8 @@ def grey(
     """Measure one panel's grey curve and write its inverse as a LUT.
 
     First show the chart with --show. In a dark room, photograph it with any camera from two or three positions. Lock
-    the exposure, keep the whole chart in the picture, and avoid clipped whites. Then pass the photographs' folder as
-    --photos.
+    the exposure, keep the whole chart in the picture and avoid overexposure. Then pass the folder with the photographs
+    as --photos.
 
     Example: phasestack calibrate grey --panel 2 --photos photos --out panel-2.csv
     """
@@ -100,11 +100,11 @@ def grey(
 
 @app.command()
 def charts(
-    out: Annotated[Path, typer.Option(help="folder for the charts")],
+    out: Annotated[Path, typer.Option(help="folder to write the charts to")],
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw the calibration charts, whose lines fuse only when the eyes are at the chart's viewpoint.
+    """Draw the calibration charts, whose lines fuse only for eyes at the viewpoint of the chart.
 
     Example: phasestack calibrate charts --out charts
     """
@@ -117,18 +117,18 @@ def charts(
 
 @app.command()
 def capture(
-    out: Annotated[Path, typer.Option(help="CSV file for the pairs; an existing one is resumed")],
+    out: Annotated[Path, typer.Option(help="CSV file for the pairs; capture continues an existing one")],
     config: ConfigOption = None,
     replay: Annotated[
-        str | None, typer.Option(help="recording to use instead of the sensor; `demo` for the built-in one")
+        str | None, typer.Option(help="recording to use instead of the sensor; `demo` is built in")
     ] = None,
     show: Annotated[bool, typer.Option("--show", help="show the charts on the panels")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Pair each chart's viewpoint with the measured eyes. Every accepted pair is saved immediately.
+    """Pair the viewpoint of each chart with the measured eyes, and save every accepted pair at once.
 
     With a live sensor, move until the lines of the chart fuse, then press Enter. Press n for the next chart, p to go
-    back and replace a pair, q to stop. A recording must contain true eye positions, as the demo does.
+    back and replace a pair, or q to stop. A recording must contain true eye positions, as the demo does.
 
     Example: phasestack calibrate capture --config /etc/phasestack/phasestack.toml --show --out pairs.csv
     """
@@ -152,18 +152,16 @@ def capture(
 
 @app.command()
 def solve(
-    pairs: Annotated[Path, typer.Option(help="CSV or JSON file with sensor_x.., stack_x.. in metres")],
-    out: Annotated[Path, typer.Option(help="calibration file (TOML); a previous one is kept next to it")],
+    pairs: Annotated[Path, typer.Option(help="CSV or JSON file of pairs (sensor_x, .. and stack_x, ..) in metres")],
+    out: Annotated[Path, typer.Option(help="calibration file to write (TOML); a previous one is kept")],
     method: Annotated[
-        str, typer.Option(help="seed, least-squares, inverse, robust or fixed-scale; default: the best for the pairs")
+        str, typer.Option(help="seed, least-squares, inverse, robust or fixed-scale; default: the best for these pairs")
     ] = "",
-    scale: Annotated[float, number(*SCALE, help="the known scale for fixed-scale")] = 1.0,
+    scale: Annotated[float, number(*SCALE, help="the scale, for the method fixed-scale")] = 1.0,
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compute stack_from_sensor from pairs, and the expected error at the eye.
-
-    Inadequate pairs are refused.
+    """Compute the sensor's pose (stack_from_sensor) from pairs. Inadequate pairs are refused.
     Example: phasestack calibrate solve --pairs pairs.csv --out calibration.toml
     """
     from calib.solve_run import solve_file
@@ -174,11 +172,11 @@ def solve(
 @app.command()
 def report(
     file: Annotated[Path, typer.Argument(help="calibration file (TOML)")],
-    out: Annotated[Path, typer.Option(help="folder for index.html and its pictures")],
+    out: Annotated[Path, typer.Option(help="folder to write index.html and its pictures to")],
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a page with a calibration's figures and error plots.
+    """Write a page with the figures and error plots of a calibration.
 
     Example: phasestack calibrate report calibration.toml --out report
     """
@@ -195,7 +193,7 @@ def _settings(config: Path | None) -> Settings:
 
 
 def _report(summary: dict[str, Any], as_json: bool) -> None:
-    """Print a command's summary as one JSON object, or one line per field."""
+    """Print the summary of a command as one JSON object or as one line per field."""
     from runtime.support.artifacts import to_json
     from runtime.support.figures import shown
 

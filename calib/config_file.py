@@ -1,7 +1,4 @@
-"""Editing of configuration files.
-
-Comments and previous versions are kept, and only valid files are written.
-"""
+"""Editor for configuration files that keeps comments and old versions and writes only valid files."""
 
 from __future__ import annotations
 
@@ -23,14 +20,14 @@ if TYPE_CHECKING:
     from tomlkit import TOMLDocument
 
 
-KEPT_VERSIONS = 20  # backups of a configuration or calibration
-KEPT_BYTES_MAX = 64 << 20  # size of the largest file that is backed up
+KEPT_VERSIONS = 20  # number of backups kept per file
+KEPT_BYTES_MAX = 64 << 20  # size limit for a file that is backed up
 
 
 def save(path: Path, text: str) -> Path | None:
-    """Write a file (or a link's target) atomically, and keep the version that it replaces.
+    """Write a file, or the target of a link, atomically and keep the version that it replaces.
 
-    Returns the path of the kept version, which has the same permissions as the file.
+    Returns the path of the old version, which has the permissions of the file.
     """
     path, kept = path.resolve(), None
     if untrusted_input.is_there(path):
@@ -50,7 +47,7 @@ def _version(path: Path, number: int) -> Path:
 
 
 def read_document(config: Path) -> TOMLDocument:
-    """Read a configuration, which is empty if the file does not exist yet. Raises InputError."""
+    """Read a configuration. It is empty if the file does not exist yet. Raises InputError."""
     if not untrusted_input.is_there(config):
         return tomlkit.document()
     load_settings(config)
@@ -61,10 +58,7 @@ def read_document(config: Path) -> TOMLDocument:
 
 
 def rewrite(config: Path, change: Callable[[TOMLDocument], None]) -> Path | None:
-    """Change a configuration if the result is valid. Returns the path of the previous version.
-
-    Raises InputError.
-    """
+    """Change a configuration if the result is valid. Returns the old version's path. Raises InputError."""
     document = read_document(config)
     change(document)
     text = tomlkit.dumps(document)
@@ -76,14 +70,14 @@ def rewrite(config: Path, change: Callable[[TOMLDocument], None]) -> Path | None
 
 
 def put(document: TOMLDocument, section: str, values: Mapping[str, Any]) -> None:
-    """Set keys of a table, creating it if missing."""
+    """Set keys of a table, which is created if missing."""
     table: Any = document.setdefault(section, tomlkit.table())
     for key, value in values.items():
         table[key] = value
 
 
 def put_panels(document: TOMLDocument, key: str, values: Mapping[int, Any], *, panels: int) -> None:
-    """Set a key (homography, grey curve) in some panels' tables, creating those that are missing."""
+    """Set a key, such as `lut`, in the tables of some panels. Missing tables are created."""
     output: Any = document.setdefault("output", tomlkit.table())
     if "panels" not in output:
         output["panels"] = tomlkit.aot()
@@ -94,9 +88,9 @@ def put_panels(document: TOMLDocument, key: str, values: Mapping[int, Any], *, p
 
 
 def put_monitors(document: TOMLDocument, tables: Sequence[Mapping[str, Any]]) -> None:
-    """Set each panel's monitor and mounting, rear to front.
+    """Set the monitor and mounting of each panel, rear to front.
 
-    Panels whose monitor and mounting are unchanged keep their other keys (registration, grey curve).
+    A panel whose monitor and mounting have not changed keeps its registration and grey curve.
     """
     output: Any = document.setdefault("output", tomlkit.table())
     past = [dict(table.unwrap()) for table in output.get("panels", ())]

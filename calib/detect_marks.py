@@ -1,4 +1,4 @@
-"""Detection of the boards' saddle points in a photograph, to hundredths of a pixel."""
+"""Detection of the saddle points of boards in a photograph, to hundredths of a pixel."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from calib.board import MARKER, Mark, dictionary, marks
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 
-DETECTION_PX = 2400  # size at which photographs are searched; corners are located at full resolution
-MIN_MARKS = 3  # per panel, that is, twelve points
-MIN_EXTENT = 0.3  # share of a panel that its marks must span, because one corner hardly determines the rest
-MIN_UNIT_PX = 1.7  # least size of a marker's bit in the photograph for reliable reading
-BLURRED_BITS = 1.1  # maximum width of an edge, in bits of a marker
-MIN_CONTRAST = 0.35  # least contrast of a saddle, relative to its mark's
-MIN_DYNAMIC = 24  # least difference between black and white, in codes
+DETECTION_PX = 2400  # size at which marks are searched; corners are located at full resolution
+MIN_MARKS = 3  # minimum number per panel; twelve points
+MIN_EXTENT = 0.3  # share of a panel that its marks must span, because one corner hardly determines the panel
+MIN_UNIT_PX = 1.7  # minimum size of a marker's bit in the photograph
+BLURRED_BITS = 1.1  # maximum width of an edge in bits of a marker
+MIN_CONTRAST = 0.35  # minimum contrast of a saddle relative to its mark
+MIN_DYNAMIC = 24  # minimum difference between black and white in codes
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,9 +30,9 @@ class SeenMarks:
     height_px: int
     panel: Any  # (K,) index of the panel
     panel_px: F64  # (K, 2) position on the panel
-    image_px: F64  # (K, 2) position in the photograph; pixel centres at whole numbers
-    marks: tuple[int, ...]  # number found, per panel
-    fault: str  # reason why the photograph is unusable; empty if it is usable
+    image_px: F64  # (K, 2) position in the photograph; pixel centres are integers
+    marks: tuple[int, ...]  # number found on each panel
+    fault: str  # why the photograph is unusable, or empty
 
 
 def _detector() -> Any:
@@ -40,13 +40,13 @@ def _detector() -> Any:
     parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = 11, 43
     parameters.adaptiveThreshWinSizeStep = 16
     parameters.minMarkerPerimeterRate = 0.008
-    parameters.errorCorrectionRate = 0.3  # low, so that overlapping marks are not mistaken for others
+    parameters.errorCorrectionRate = 0.3  # low, so that overlapping marks are not misread
     parameters.minDistanceToBorder = 2
     return cv2.aruco.ArucoDetector(dictionary(), parameters)
 
 
 def _markers(picture: U8, known: dict[int, Mark]) -> list[tuple[Mark, F64]]:
-    """Return the marks with readable codes and their (4, 2) corners; codes read twice are dropped."""
+    """Return the readable marks and their corners (4, 2). Codes found twice are dropped."""
     scale = min(2.0, DETECTION_PX / max(picture.shape))
     kind = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=kind)
@@ -62,7 +62,7 @@ def _markers(picture: U8, known: dict[int, Mark]) -> list[tuple[Mark, F64]]:
 
 
 def find_marks(picture: U8, stack: PanelStack, *, name: str) -> SeenMarks:
-    """Find the saddle points of all panels' boards in a grey photograph (h, w)."""
+    """Find the saddle points of all boards in a grey photograph (h, w)."""
     known = {mark.number: mark for mark in marks(stack)}
     markers = _markers(picture, known)
     panel, panel_px, image_px, edges = [], [np.zeros((0, 2))], [np.zeros((0, 2))], []
@@ -97,51 +97,54 @@ def find_marks(picture: U8, stack: PanelStack, *, name: str) -> SeenMarks:
 
 
 def _mirrored(picture: U8, known: dict[int, Mark], counts: list[int]) -> str:
-    """Return a fault if a picture's marks appear only in its mirror image; otherwise an empty string."""
+    """Return a fault if marks appear only in the mirror image of a picture, otherwise an empty string."""
     if min(counts) >= MIN_MARKS:
         return ""
     turned = [mark.panel for mark, _ in _markers(np.ascontiguousarray(picture[:, ::-1]), known)]
     for panel, count in enumerate(counts):
         if count < MIN_MARKS <= turned.count(panel):
             if max(counts) < MIN_MARKS:
-                return "is mirrored (by a selfie camera, or the panels' `mirror` is wrong)"
-            return f"shows panel {panel} mirrored: its `mirror` in the configuration is wrong"
+                return "is mirrored, either by a selfie camera or because `mirror` is wrong for all panels"
+            return f"shows panel {panel} mirrored, so its `mirror` in the configuration is wrong"
     return ""
 
 
 def _unreadable(counts: list[int], edges: list[float], unit_px: float) -> str:
-    """Return a fault in sharpness, or an empty string. edges: width of each mark's edge in marker bits."""
+    """Return a fault in sharpness, or an empty string. edges: width of each edge in marker bits."""
     if sum(counts) == 0:
-        return "shows no mark of a board: it is blurred or too dark, or shows something else"
+        return "shows no mark of a board; it may be blurred, too dark or of something else"
     edge_bits = float(np.median(edges))
     if edge_bits > BLURRED_BITS:
-        return f"is blurred: its edges are {edge_bits * unit_px:.1f} px wide"
+        return f"is blurred; its edges are {edge_bits * unit_px:.1f} px wide"
     if unit_px < MIN_UNIT_PX:
-        return f"shows marks that are too small ({unit_px:.1f} px per bit): go nearer or use a higher resolution"
+        return f"shows marks that are too small ({unit_px:.1f} px per bit); go nearer or use a higher resolution"
     return ""
 
 
 def _covered(counts: list[int], places: F64, owners: Any) -> str:
-    """Return why a panel can't be located, or an empty string. places: (K, 2) saddles in panel widths and heights."""
+    """Return why a panel cannot be located, or an empty string.
+
+    places: saddles (K, 2) in panel widths and heights.
+    """
     fewest = min(counts)
     if fewest < MIN_MARKS:
         panel = counts.index(fewest)
-        return f"shows {fewest} marks of panel {panel}, fewer than {MIN_MARKS}: it is covered, cut off or too oblique"
+        return f"shows {fewest} marks of panel {panel}, fewer than {MIN_MARKS}; it is covered, cut off or too oblique"
     for panel in range(len(counts)):
         share = float(np.ptp(places[owners == panel], axis=0).min())
         if share < MIN_EXTENT:
-            return f"is covered or cut off: only {100 * share:.0f}% of panel {panel}'s width or height is visible"
+            return f"shows only {100 * share:.0f}% of the width or height of panel {panel}, which is covered or cut off"
     return ""
 
 
 def _unit_px(quad: F64) -> float:
-    """Return the photograph's pixels per bit of a marker, along its shortest side."""
+    """Return the pixels per bit of a marker in the photograph, along its shortest side."""
     sides = np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1)
     return float(sides.min()) / MARKER
 
 
 def _refined(picture: U8, guess: F64, quad: F64, *, window: int) -> tuple[Any, F64]:
-    """Return a mask of the saddles (white inside and outside, black at the sides), and their positions."""
+    """Return a mask of the true saddles (white inside and outside, black at the sides) and their positions."""
     height, width = picture.shape
     inside = (
         (guess[:, 0] > window + 2) & (guess[:, 0] < width - window - 3)
@@ -154,7 +157,7 @@ def _refined(picture: U8, guess: F64, quad: F64, *, window: int) -> tuple[Any, F
     cv2.cornerSubPix(picture, points, (window, window), (-1, -1), criteria)
     refined = points.reshape(-1, 2).astype(np.float64)
     near = np.linalg.norm(refined - guess, axis=1) < 0.8 * window
-    # A step of one bit along the diagonals of the mark, and across them.
+    # Steps of one bit along and across the diagonals of the mark.
     out = (guess - guess.mean(axis=0)) / 5 * 0.9
     arms = np.stack([refined + out, refined - out, refined + _quarter(out, guess), refined - _quarter(out, guess)])
     values = _samples(picture, arms)
@@ -165,7 +168,7 @@ def _refined(picture: U8, guess: F64, quad: F64, *, window: int) -> tuple[Any, F
 
 
 def _quarter(out: F64, guess: F64) -> F64:
-    """Return the other diagonal at each corner, estimated from its two neighbours to account for perspective."""
+    """Estimate the other diagonal at each corner from both neighbours, to allow for perspective."""
     following, before = np.roll(guess, -1, axis=0) - guess, np.roll(guess, 1, axis=0) - guess
     return np.asarray((following - before) / 10 * 0.9, dtype=np.float64)
 
@@ -178,7 +181,7 @@ def _samples(picture: U8, points: F64) -> F64:
 
 
 def _edge_px(picture: U8, quad: F64) -> float:
-    """Return the width of a marker's outer edge in pixels: contrast over steepest slope, median over its sides."""
+    """Return the width in pixels of a marker's outer edge: contrast over steepest slope, median of sides."""
     widths = []
     centre = quad.mean(axis=0)
     for first, second in zip(quad, np.roll(quad, -1, axis=0), strict=True):

@@ -18,7 +18,7 @@ IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class PanelDisplay:
-    """All panels, which show one set of layers until the next, and the keys pressed in their windows."""
+    """Panels that keep showing one set of layers, and the keys pressed in their windows."""
 
     def __init__(self, sink: PanelSink) -> None:
         self._sink = sink
@@ -33,10 +33,7 @@ class PanelDisplay:
         self._sink.present(PanelFrame(self._number, layers, self._number))
 
     def key(self) -> Key | None:
-        """Return the next key or None. Presents the layers again, which keeps the windows responsive.
-
-        Raises PanelLost.
-        """
+        """Return the next key or None. Presents the layers again, so that windows respond. Raises PanelLost."""
         if self._layers is not None:
             self.show(self._layers)
         return self._keys.poll()
@@ -47,7 +44,7 @@ class PanelDisplay:
 
 
 def open_display(settings: Settings, *, registered: bool = False, grey_curve: bool = True) -> PanelDisplay:
-    """Open the configured panels. registered, grey_curve: False to measure them without correction.
+    """Open the configured panels. registered, grey_curve: apply these corrections.
 
     Raises InputError, MissingPart, PanelLost.
     """
@@ -58,7 +55,7 @@ def open_display(settings: Settings, *, registered: bool = False, grey_curve: bo
     panels = tuple(panel.model_copy(update=changes) for panel in panel_settings(settings.output, stack.count))
     output = settings.output.model_copy(update={"panels": panels})
     if output.kind == "offscreen":
-        typer.echo("warning: output.kind is offscreen: the charts are not visible", err=True)
+        typer.echo("warning: the charts are not visible because output.kind is offscreen", err=True)
     return PanelDisplay(open_panels(output, stack, MonotonicClock(), offscreen_context()))
 
 

@@ -1,11 +1,11 @@
-"""Chart for measuring a panel's grey curve with a camera whose tone curve is unknown.
+"""Chart that measures a panel's grey curve with a camera whose tone curve is unknown.
 
-The patches of each grey are scattered over the chart, so that uneven light can be separated from the greys. Patches of
-black and white pixels in known proportions have a known intensity regardless of the panel's grey curve: they calibrate
-the camera. The board's marks between the patches locate them in a photograph.
+The patches of each grey are scattered over the chart, so that uneven light can be separated from the greys. Patches
+that mix black and white pixels in known proportions calibrate the camera, because their intensity does not depend on
+the panel's grey curve. Marks of the board between the patches locate them in a photograph.
 
-Between crossed polarizers, with the other panels at zero, a panel of phase p shows dark + range·sin²(pi/2·p) (EyeReal,
-(4)). Full white is assumed to be phase 1; intensities cannot reveal a panel that does not reach it.
+Between crossed polarizers, with the other panels at zero, a panel with phase p shows dark + range·sin²(pi/2·p)
+(EyeReal, (4)). Full white is assumed to be phase 1. Intensities cannot reveal a panel that does not reach it.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from runtime.support.artifacts import write_text
 
 GREYS = tuple(round(255 * step / 12) for step in range(13))
 SHARES = tuple(step / 16 for step in (1, 2, 4, 6, 8, 11, 14))  # of white pixels in a mixed patch
-PATCHES_ACROSS = 32  # across a panel's width
-MARGIN = 0.15  # of a panel on each side: from nearby, its rim has no other panel behind it and no light
+PATCHES_ACROSS = 32  # number of patches across the width of a panel
+MARGIN = 0.15  # share of a panel on each side, because its rim is dark when seen from nearby
 INNER = 0.5  # share of a patch's side that is measured
 SAMPLES = 24  # per side of a patch
 MIN_MARKS = 4  # for the homography of a panel's patches
-FALLS = 0.01  # of the range: largest decrease from one grey to the next brighter one
-CLIPPED = 0.02  # share of clipped pixels in the white patches above which a photograph is overexposed
+FALLS = 0.01  # maximum decrease from a grey to the next brighter one, as a share of the range
+CLIPPED = 0.02  # share of clipped pixels in white patches above which a photograph is overexposed
 LUT_ROWS = 256  # one per 8-bit phase
 BAYER = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]])
 
@@ -55,9 +55,9 @@ class Patch:
 
 @lru_cache(maxsize=8)
 def patches(stack: PanelStack, panel: int) -> tuple[Patch, ...]:
-    """Return the chart's patches, between the board's marks, with their kinds scattered in a fixed order."""
+    """Return the patches between the marks of the board, with their kinds scattered in a fixed order."""
     pitch = stack.width_px // PATCHES_ACROSS
-    side = pitch * 5 // 6 // 8 * 8  # the measured half holds whole periods of the mixing pattern
+    side = pitch * 5 // 6 // 8 * 8  # so that the measured half contains whole periods of the mixing pattern
     free = [
         (left, top)
         for top in range(round(MARGIN * stack.height_px), round((1 - MARGIN) * stack.height_px) - side, pitch)
@@ -74,7 +74,7 @@ def patches(stack: PanelStack, panel: int) -> tuple[Patch, ...]:
 
 
 def _is_covered(stack: PanelStack, panel: int, left: int, top: int, side: int) -> bool:
-    """Return True if a square overlaps one of the board's marks or nearly does."""
+    """Return True if a square overlaps or nearly overlaps a mark of the board."""
     for mark in marks(stack):
         gap, tile = 2 * mark.unit_px, TILE * mark.unit_px
         u, v = (place - CORNER * mark.unit_px - gap for place in (mark.left_px, mark.top_px))
@@ -85,7 +85,7 @@ def _is_covered(stack: PanelStack, panel: int, left: int, top: int, side: int) -
 
 
 def grey_chart(stack: PanelStack, panel: int) -> U8:
-    """Draw a panel's (H, W) chart, to be shown without resampling or LUT while the others are clear."""
+    """Draw the chart of a panel (H, W), to be shown without resampling or LUT while others are clear."""
     picture = board(stack, panel)
     for patch in patches(stack, panel):
         area = picture[patch.top_px : patch.top_px + patch.side_px, patch.left_px : patch.left_px + patch.side_px]
@@ -98,7 +98,7 @@ def grey_chart(stack: PanelStack, panel: int) -> U8:
 
 
 def grey_charts(stack: PanelStack, panel: int) -> U8:
-    """Return (N, H, W) pictures for all panels: the chart on one, the others clear."""
+    """Return pictures (N, H, W) for all panels, with the chart on one while the others are clear."""
     charts = np.zeros((stack.count, stack.height_px, stack.width_px), np.uint8)
     charts[panel] = grey_chart(stack, panel)
     return charts
@@ -107,7 +107,7 @@ def grey_charts(stack: PanelStack, panel: int) -> U8:
 def lut_from_photographs(
     out: Path, pictures: Iterable[tuple[str, U8]], stack: PanelStack, *, panel: int, source: str
 ) -> dict[str, Any]:
-    """Compute and write a panel's LUT from named photographs (h, w) of its chart. Raises InputError."""
+    """Compute and write the LUT of a panel from named photographs (h, w) of its chart. Raises InputError."""
     measured = [histograms(picture, stack, panel, source=f"{source}, {name}") for name, picture in pictures]
     intensity, residual = measure(measured, stack, panel, source=source)
     write_lut(out, intensity)
@@ -115,8 +115,8 @@ def lut_from_photographs(
 
 
 def write_lut(out: Path, intensity: F64) -> None:
-    """Write a panel's LUT (256 rows of phase and grey, 0 to 1) from intensities (13,) of `GREYS`."""
-    # The root of the intensity is smooth at both ends, for a bare panel and for a monitor with a tone curve.
+    """Write a LUT (256 rows of phase and grey, 0 to 1) from the intensities (13,) of `GREYS`."""
+    # The root of the intensity is smooth at both ends, for bare panels and for monitors with a tone curve.
     root = PchipInterpolator(np.array(GREYS) / 255, np.sqrt(np.maximum.accumulate(intensity)))
     fine, rows = np.linspace(0.0, 1.0, 4097), np.linspace(0.0, 1.0, LUT_ROWS)
     greys = np.interp(rows, phase_from_intensity(np.clip(root(fine), 0.0, 1.0) ** 2, branch=1), fine)
@@ -132,7 +132,10 @@ def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F6
     seen = find_marks(picture, stack, name="")
     mine, marks_seen = seen.panel == panel, seen.marks[panel]
     if marks_seen < MIN_MARKS:
-        problem = f"shows {marks_seen} marks of panel {panel}: blurred, too small, cut off, or another panel's chart"
+        problem = (
+            f"shows {marks_seen} marks of panel {panel}; it may be blurred, cut off, too small or of "
+            "another panel's chart"
+        )
         raise InputError(source, "", problem)
     image_from_panel, _ = cv2.findHomography(seen.panel_px[mine], seen.image_px[mine], cv2.RANSAC, 8.0)
     step = (np.arange(SAMPLES) + 0.5) / SAMPLES * INNER + (1 - INNER) / 2
@@ -147,18 +150,18 @@ def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F6
     counts = np.array(rows)
     white = np.array([patch.grey == 255 for patch in patches(stack, panel)])
     if counts[white, 253:].sum(axis=1).mean() > CLIPPED:
-        raise InputError(source, "", "is overexposed: white is clipped; expose less")
+        raise InputError(source, "", "is overexposed (white is clipped); reduce the exposure")
     if (counts[white] @ np.arange(256)).mean() < 60:
-        raise InputError(source, "", "is too dark: increase the exposure")
+        raise InputError(source, "", "is too dark; increase the exposure")
     return counts
 
 
 def measure(pictures: list[F64], stack: PanelStack, panel: int, *, source: str) -> tuple[F64, float]:
-    """Estimate the (13,) intensities of `GREYS` from photographs' histograms, and the median residual.
+    """Estimate the intensities (13,) of `GREYS` from histograms, and the median residual.
 
-    All photographs must have the same exposure. Jointly fits the camera's tone curve, each photograph's uneven light
-    (its logarithm is a quadratic) and the greys. The residual is relative, per patch. Raises InputError if the greys do
-    not ascend.
+    All photographs must have the same exposure. The fit includes the camera's tone curve, the uneven light of each
+    photograph (a quadratic in its logarithm) and the greys. The residual is relative to the intensity of a patch.
+    Raises InputError if the greys do not increase.
     """
     chart = patches(stack, panel)
     place = np.array([[p.left_px / stack.width_px - 0.5, p.top_px / stack.height_px - 0.5] for p in chart])
@@ -194,6 +197,6 @@ def measure(pictures: list[F64], stack: PanelStack, panel: int, *, source: str) 
     if falls.size:
         lower, upper = GREYS[int(falls[0])], GREYS[int(falls[0]) + 1]
         problem = f"grey {upper} is darker than grey {lower}, so this is not a grey curve"
-        causes = "possible causes: a reflection, a change of exposure, the wrong LUT"
+        causes = "possible causes are a reflection, a change of exposure or a wrong LUT"
         raise InputError(source, "greys", f"{problem} ({causes})")
     return np.clip(levels, 0.0, 1.0), float(np.median(np.abs(fit.fun)))

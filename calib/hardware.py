@@ -1,4 +1,4 @@
-"""Hardware for the setup: keys, monitors, panels, photographs and a depth sensor."""
+"""Hardware that the setup uses: keys, monitors, panels, photographs and a depth sensor."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ from runtime.sensor.worker import OPEN_TIMEOUT_S, SensorWorker
 
 Poll = Callable[[], Key | None]
 Say = Callable[[str], None]
-Named = tuple[str, U8]  # name of a photograph, and its pixels (h, w)
-Sample = tuple[int, EyePoints | None, str]  # capture time, eyes in frame `sensor`, the sensor's serial
+Named = tuple[str, U8]  # name and pixels (h, w) of a photograph
+Sample = tuple[int, EyePoints | None, str]  # capture time, eyes in the sensor frame, serial number of the sensor
 POLL_NS = 20 * NS_PER_MS  # interval between polls for keys and samples
-CARD_CHARACTERS = 32  # per line of a card
+CARD_CHARACTERS = 32  # maximum length of a line on a card
 
 
 class SetupHardware:
-    """The real hardware: monitors on X11, a sensor, photographs in a folder, and a person at the keys."""
+    """Real hardware: monitors on X11, a sensor, a folder of photographs and a person at the keys."""
 
     simulated = False
 
     def __init__(self, keys: Poll, *, photos: Path = Path("photos")) -> None:
-        """keys: the terminal's keys, which are used in addition to those of the panels' windows."""
+        """keys: keys from the terminal, used in addition to those from the panels' windows."""
         self._keys, self._photos = keys, photos
         self._clock = MonotonicClock()
         self._display: PanelDisplay | None = None  # the open windows, if any
         self._charts: Charts | None = None
         self._cards: tuple[list[U8], tuple[Monitor, ...]] = ([], ())
         self._worker: SensorWorker | None = None
-        self._frames: list[SensorFrame] = []  # received from the worker, not yet returned by `sample`
+        self._frames: list[SensorFrame] = []  # received, but not yet returned by `sample`
 
     def poll(self) -> Key | None:
-        """Return a key pressed in the terminal or in a panel's window. Polling keeps the windows responsive."""
+        """Return a key pressed in the terminal or a panel's window. Also keeps the windows responsive."""
         return self._keys() or (self._display.key() if self._display is not None else None)
 
     def key(self) -> Key:
@@ -70,7 +70,7 @@ class SetupHardware:
         return monitors
 
     def show_card(self, number: int, words: Sequence[str]) -> None:
-        """Show an identity card with `words` on monitor `number`, in its own orientation; clear the others."""
+        """Show a card with `words` on monitor `number`, in its orientation, and clear the others."""
         cards, monitors = self._cards
         height, width = cards[number].shape[:2]
         lines = [line for text in words for line in wrap(text, CARD_CHARACTERS)]
@@ -79,20 +79,20 @@ class SetupHardware:
             self._display.show(alone([*cards[:number], card, *cards[number + 1 :]], number))
 
     def photographs(self, settings: Settings, pictures: U8, *, panel: int | None, say: Say) -> Iterator[Named]:
-        """Show pictures (N, H, W) on the uncorrected panels, wait for photographs of them, and yield these.
+        """Show pictures (N, H, W) on the uncorrected panels, wait for photographs and yield them.
 
-        The pictures are the boards, or for `panel` its grey chart. Raises InputError, PanelLost.
+        The pictures are the boards or, if `panel` is given, its grey chart. Raises InputError, PanelLost.
         """
         self.let_go()
         folder = self._photos if panel is None else self._photos / f"grey-{panel}"
-        count = "8 to 20 photographs of the boards" if panel is None else "two or three photographs of it"
+        count = "8 to 20 photographs of the boards" if panel is None else "two or three photographs of the chart"
         self._display = open_display(settings, grey_curve=panel is None)
         try:
             self._display.show(grey_layers(pictures))
             say(f"put {count} into {folder}, then press Enter (q: stop)")
             while (key := self.key()) is not Key.ACCEPT:
                 if key is Key.QUIT:
-                    raise InputError("photographs", "", "stopped before any were taken")
+                    raise InputError("photographs", "", "no photographs were taken")
         finally:
             self.let_go()
         return photographs(folder)
@@ -100,7 +100,7 @@ class SetupHardware:
     def open_sensor(self, settings: Settings) -> str:
         """Start the sensor and wait until it works. Returns its name. Raises InputError."""
         self._stop_sensor()
-        open_sensor(settings.sensor, self._clock)  # unknown names are refused before anything starts
+        open_sensor(settings.sensor, self._clock)  # refuses unknown names before anything starts
         worker = SensorWorker(
             lambda: open_sensor(settings.sensor, self._clock),
             settings.sensor,
@@ -120,14 +120,13 @@ class SetupHardware:
             self.wait()
         if worker.capabilities.in_stack_frame:
             self._stop_sensor()
-            raise InputError("sensor", "driver", "delivers eyes in the stack's frame; there is nothing to calibrate")
+            raise InputError("sensor", "driver", "delivers eyes in the stack frame, so there is nothing to calibrate")
         return f"{settings.sensor.driver} {worker.serial}".strip()
 
     def sample(self, standing_at: Viewpoint) -> Sample | None:
-        """Return the next sample in order, if there is one.
+        """Return the next sample, if any.
 
-        No sample is lost if the panels are slow. standing_at: the position at which the person was asked to stand, for
-        simulations.
+        No sample is lost if the panels are slow. standing_at: where the person was asked to stand, for simulations.
         """
         if self._worker is None:
             return None
@@ -141,7 +140,7 @@ class SetupHardware:
         return frame.capture_ns, frame.eyes, self._worker.serial
 
     def chart(self, settings: Settings) -> Callable[[Viewpoint], None] | None:
-        """Return a function that shows a viewpoint's chart, or None if charts can't be shown."""
+        """Return a function that shows the chart of a viewpoint, or None if charts cannot be shown."""
         self.let_go()
         charts, display = Charts(settings), open_display(settings, registered=True)
         self._charts, self._display = charts, display
@@ -153,7 +152,7 @@ class SetupHardware:
         self._stop_sensor()
 
     def let_go(self) -> None:
-        """Close any open windows, and the model that computes their layers."""
+        """Close any open windows and the model that computes their layers."""
         for part in (self._display, self._charts):
             if part is not None:
                 part.close()

@@ -1,4 +1,4 @@
-"""Pairs of a measured sensor point and a known stack point: reading, checking and storing."""
+"""Pairs of a measured sensor point and a known stack point, which are read, checked and stored here."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from runtime.records import F64
 from runtime.support import untrusted_input
 from runtime.support.artifacts import write_text
 
-MAX_PAIRS = 1_000_000  # most pairs in a file
-MAX_LISTED = 3  # most mistakes listed in an error
-MAX_MAGNITUDE = 1e9  # largest coordinate, in any unit
+MAX_PAIRS = 1_000_000  # maximum number of pairs in a file
+MAX_LISTED = 3  # maximum number of mistakes listed in a message
+MAX_MAGNITUDE = 1e9  # maximum coordinate in any unit
 
 
 def _no_truth_value(value: Any) -> Any:
@@ -39,7 +39,7 @@ Number = Annotated[float, BeforeValidator(_no_truth_value), AfterValidator(_boun
 
 
 class PairRow(BaseModel):
-    """One pair as a row of the file, in metres, including the informative columns that `capture` adds."""
+    """One pair as a row of the file, in metres, with the informative columns that `capture` adds."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", coerce_numbers_to_str=True)
 
@@ -68,13 +68,13 @@ COLUMNS = tuple(name for name, field in PairRow.model_fields.items() if field.is
 
 @dataclass(frozen=True, slots=True)
 class Pairs:
-    """K pairs, with their names for messages."""
+    """K pairs and their names for messages."""
 
     sensor_m: F64  # (K, 3)
     stack_m: F64  # (K, 3)
     names: tuple[str, ...]
     source: str
-    sensor_serial: str = ""  # serial number of the device that measured all pairs; empty: unknown
+    sensor_serial: str = ""  # of the device that measured all pairs; empty if unknown
 
     def __len__(self) -> int:
         return len(self.names)
@@ -87,7 +87,7 @@ def read_pairs(path: Path) -> Pairs:
     """
     labels, rows = _read_rows(path)
     if len(rows) > MAX_PAIRS:
-        raise InputError(path, "", f"contains {len(rows)} pairs; the maximum is {MAX_PAIRS}")
+        raise InputError(path, "", f"contains {len(rows)} pairs, but the maximum is {MAX_PAIRS}")
     serials = {row.sensor_serial for row in rows} - {""}
     if len(serials) > 1:
         raise InputError(path, "sensor_serial", f"contains pairs of different sensors: {', '.join(sorted(serials))}")
@@ -99,7 +99,7 @@ def read_pairs(path: Path) -> Pairs:
 
 
 def _read_rows(path: Path) -> tuple[list[str], list[PairRow]]:
-    """Return labels (line or number) and pairs. Raises InputError, naming the wrong rows and columns."""
+    """Return labels (line or number) and pairs. Raises InputError that names wrong rows and columns."""
     text = untrusted_input.read_text(path)
     if path.suffix.lower() == ".json":
         value = untrusted_input.parsed_json(text, source=path)
@@ -145,10 +145,10 @@ def points_of(rows: Iterable[PairRow]) -> tuple[F64, F64]:
 
 
 class PairsFile:
-    """CSV file written during capture. Every accepted pair is on disk before the next one is measured."""
+    """CSV file written during capture. Every accepted pair is stored before the next is measured."""
 
     def __init__(self, path: Path) -> None:
-        """Resume an existing file or start a new one. Raises InputError if the file exists but has no pairs."""
+        """Continue an existing file or start a new one. Raises InputError if a file contains no pairs."""
         self.path = path
         self.rows: list[PairRow] = []
         if untrusted_input.is_there(path):
@@ -163,7 +163,7 @@ class PairsFile:
         return len(self.rows)
 
     def accept(self, *pairs: PairRow) -> None:
-        """Write one sensor's pairs to the file, replacing those at the same viewpoints.
+        """Write pairs from one sensor to the file. They replace those at the same viewpoints.
 
         Raises InputError if the file has pairs of another sensor.
         """

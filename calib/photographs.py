@@ -1,4 +1,4 @@
-"""Reading of photographs from a folder."""
+"""Photographs read from a folder."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from runtime.records import U8
 from runtime.support import untrusted_input
 from runtime.support.picture_header import is_cut_off, read_coded
 
-MAX_PHOTOGRAPHS = 100  # most photographs in a folder
+MAX_PHOTOGRAPHS = 100  # maximum number of photographs in a folder
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
 
 
 def photographs(folder: Path) -> Iterator[tuple[str, U8]]:
-    """Yield names and grey pixels (h, w) of a folder's photographs, sorted by name. Raises InputError."""
+    """Yield names and grey pixels (h, w) of the photographs in a folder, by name. Raises InputError."""
     if not untrusted_input.is_there(folder, folder=True):
         raise InputError(folder, "", "is not a folder")
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
     if not paths:
         raise InputError(folder, "", "contains no photographs (" + ", ".join(sorted(SUFFIXES)) + ")")
     if len(paths) > MAX_PHOTOGRAPHS:
-        raise InputError(folder, "", f"contains {len(paths)} pictures; the maximum is {MAX_PHOTOGRAPHS}")
+        raise InputError(folder, "", f"contains {len(paths)} pictures, but the maximum is {MAX_PHOTOGRAPHS}")
     for path in paths:
         yield path.name, read_photograph(path)
 
 
 def read_photograph(path: Path) -> U8:
-    """Read (h, w) grey pixels as the sensor recorded them, ignoring EXIF orientation. Raises InputError."""
+    """Read grey pixels (h, w) as the sensor recorded them, without EXIF rotation. Raises InputError."""
     data, _ = read_coded(path)
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
     picture = None if is_cut_off(data) else cv2.imdecode(np.frombuffer(data, np.uint8), flags)

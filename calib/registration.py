@@ -1,9 +1,9 @@
 """Registration of the panels from photographs of their test patterns: poses and standard errors.
 
-The stack's frame is that of the reference (middle) panel, whose picture is not resampled. Every other panel gets its
-true distance, and a homography that moves each pixel to its position on a panel parallel to the reference. If the panel
-is parallel, this is exact for every eye position. If it is tilted, this is exact only for the viewing position, and the
-models correct for the tilt at other positions.
+The stack frame is that of the reference (middle) panel, whose picture is not resampled. Every other panel gets its
+actual distance and a homography that moves each pixel to its position on a panel parallel to the reference. For a
+parallel panel this is exact at every eye position. For a tilted one it is exact only at the viewing position, and the
+models correct the tilt at other positions.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from runtime.records import F64, U8
 from runtime.support.artifacts import write_json
 from runtime.support.progress import status_line
 
-MIN_PHOTOGRAPHS = 5  # least number of usable photographs
-MIN_SPAN_DEG = 15.0  # between the two directions farthest apart
+MIN_PHOTOGRAPHS = 5  # minimum number of usable photographs
+MIN_SPAN_DEG = 15.0  # minimum angle between the two directions farthest apart
 DISAGREES = 0.4  # a photograph with a larger share of outliers is excluded
-MISFIT_PX = 1.5  # residual above which the stack is not rigid, or something moved
-IMPLAUSIBLE_M = 0.010  # displacement of a panel that is too large for manual assembly
+MISFIT_PX = 1.5  # residual above which the stack is not rigid or has moved
+IMPLAUSIBLE_M = 0.010  # displacement of a panel that exceeds errors of manual assembly
 DOUBTFUL_PX = 0.3  # uncertainty of a corner above which a registration is refused
 
 
@@ -42,9 +42,9 @@ class Registration:
     """Registered panels, with their uncertainties."""
 
     bundle: Bundle
-    stack: PanelStack  # the geometry to configure, with true distances and tilts
+    stack: PanelStack  # geometry to configure, with actual distances and tilts
     gap_sigma_m: F64  # (N-1,)
-    homographies: F64  # (N, 3, 3) from the ideal pixels of `stack` to true ones
+    homographies: F64  # (N, 3, 3) from ideal pixels of `stack` to actual ones
     corners_px: F64  # (N, 4, 2) displacement of the corners (0, 0), (W, 0), (W, H), (0, H)
     corner_sigma_px: F64  # (N, 4, 2)
     eye_m: F64  # (3,) the viewing position
@@ -53,18 +53,18 @@ class Registration:
 
     @property
     def sigma_panel_px(self) -> F64:
-        """(N,) RMS uncertainty of a panel's corners, in panel pixels."""
+        """RMS uncertainty of the corners of each panel (N,), in panel pixels."""
         return np.asarray(np.sqrt((self.corner_sigma_px**2).sum(-1).mean(-1)), dtype=np.float64)
 
     def eye_error_mm(self) -> float:
-        """Displacement of the eye that is equivalent to the worst panel's uncertainty."""
+        """Displacement of an eye that is equivalent to the uncertainty of the worst panel, in mm."""
         gap_m = np.abs(np.array(self.stack.x_m) - self.stack.x_m[self.bundle.reference])
         pitch_m, others = self.stack.width_m / self.stack.width_px, gap_m > 0
         return float((self.sigma_panel_px[others] * pitch_m * self.eye_m[0] / gap_m[others]).max()) * 1e3
 
 
 def homographies(panels: Sequence[PlacedPanel], stack: PanelStack, eye_m: F64) -> F64:
-    """(N, 3, 3) homographies from ideal to true pixels, as an eye sees them."""
+    """Return the homographies (N, 3, 3) from ideal to actual pixels as an eye sees them."""
     return np.stack([true_from_ideal_seen(panel, eye_m, stack, index) for index, panel in enumerate(panels)])
 
 
@@ -94,11 +94,11 @@ def register_photographs(seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m:
         if max(unfit) <= DISAGREES:
             break
         odd = good.pop(int(np.argmax(unfit)))
-        excluded[odd.name] = "does not agree with the other photographs: it shows another stack, or something moved"
+        excluded[odd.name] = "does not agree with the other photographs; it shows another stack, or something has moved"
     _refuse_one_place(bundle)
     if bundle.sigma_px > MISFIT_PX:
         raise Undetermined(
-            f"the photographs do not show one rigid stack: points are {bundle.sigma_px:.1f} px off on average"
+            f"the photographs do not show one rigid stack; points are off by {bundle.sigma_px:.1f} px on average"
         )
     model = geometry_of(bundle.panels, stack, eye_m=eye_m)
     _refuse_implausible(bundle, stack)
@@ -112,7 +112,7 @@ def register_photographs(seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m:
     worst_px = float(np.linalg.norm(corner_sigma_px, axis=-1).max())
     if worst_px > DOUBTFUL_PX:
         raise Undetermined(
-            f"the photographs leave a panel's corner uncertain by {worst_px:.2f} px: take more, from more directions"
+            f"the photographs leave a corner of a panel uncertain by {worst_px:.2f} px; take more, from more directions"
         )
     return Registration(
         bundle=bundle,
@@ -123,14 +123,14 @@ def register_photographs(seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m:
         corner_sigma_px=corner_sigma_px,
         eye_m=eye_m,
         used=len(good),
-        notes=[f"{name} {reason}: not used" for name, reason in excluded.items()],
+        notes=[f"{name} is not used because it {reason}" for name, reason in excluded.items()],
     )
 
 
 def _other_sizes(good: Sequence[SeenMarks]) -> dict[str, str]:
     sizes = [(s.width_px, s.height_px) for s in good]
     width, height = max(sizes, key=sizes.count, default=(0, 0))
-    text = f"differs in size from the others ({width}x{height}): use one camera with one setting"
+    text = f"differs in size from the others ({width}x{height}); use one camera with one setting"
     return {s.name: text for s, size in zip(good, sizes, strict=True) if size != (width, height)}
 
 
@@ -220,7 +220,7 @@ def registration_summary(registered: Registration) -> dict[str, Any]:
     panels = [
         {
             "x_m": stack.x_m[index],
-            "tilt_deg": tilt_deg[index],  # tilt of its right edge and of its top edge towards the viewer
+            "tilt_deg": tilt_deg[index],  # tilt of its right and top edges towards the viewer
             "turn_deg": np.degrees(np.arctan2(rows[index, 2], rows[index, 1])),  # counter-clockwise in its plane
             "homography": registered.homographies[index],
             "corner_off_px": np.linalg.norm(registered.corners_px[index], axis=1).max(),
@@ -231,7 +231,8 @@ def registration_summary(registered: Registration) -> dict[str, Any]:
     notes = list(registered.notes)
     if not stack.is_evenly_spaced:
         notes.append(
-            f"the gaps differ by more than {100 * UNEVEN_MOST:.0f}%, so the networks cannot be used: use the model sart"
+            f"the gaps differ by more than {100 * UNEVEN_MOST:.0f}%, which the networks do not "
+            "support; use the model sart"
         )
     return {
         "reference": bundle.reference,

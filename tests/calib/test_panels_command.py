@@ -112,7 +112,7 @@ def test_photographs_register_the_panels_in_the_configuration(
     ("spoil", "why"),
     [
         (blurred, "blurred"),
-        (half_covered, "is covered or cut off: only"),
+        (half_covered, "which is covered or cut off"),
         (lambda picture: picture[:, ::-1], "is mirrored"),
         (lambda picture: np.full_like(picture, 30), "shows no mark"),
     ],

@@ -86,7 +86,7 @@ def test_millimetres_on_one_side_are_refused(tmp_path: Path, scale: float, side:
     mixed = (measured(scale=scale), KNOWN_M) if scale < 1 else (measured(), KNOWN_M * 1000)
     path = write_pairs(tmp_path, *mixed)
     message = refusal(path, tmp_path)
-    assert "units are mixed" in message
+    assert "must be in metres" in message
     assert f"{side} seems to be in millimetres" in message
 
 
