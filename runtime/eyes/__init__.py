@@ -1,1 +1,1 @@
-"""Finding both eyes in pictures, and tracking and predicting them in the `stack` frame."""
+"""Eye finder, which locates eyes in pictures, and tracker, which predicts them in the stack frame."""

@@ -1,4 +1,4 @@
-"""Calibration from the sensor's frame to the stack's: loading, checking, applying, error estimate.
+"""Calibration from the sensor frame to the stack frame: loading, checks, use and error estimate.
 
 Its seven parameters are a rotation vector (3, rad, about the axes of `stack`), a shift (3, m) and a log scale (1),
 about a pivot w0 (the pairs' centre, in `stack`), which makes them nearly uncorrelated. A small change d moves a point
@@ -21,25 +21,25 @@ from runtime.errors import InputError
 from runtime.records import F64, EyePoints
 
 DEMO_FILE = Path(__file__).parent / "data" / "demo-calibration.toml"
-SIMILARITY_TOLERANCE = 1e-3  # relative; accepts matrices printed with four digits, but not sheared ones
-PLAUSIBLE_SCALE = (0.8, 1.25)  # both frames are in metres
-SCALE = (5e-4, 2e3)  # wide enough for millimetres on one side; anything outside is an error
-NEAR_M, MAX_DISTANCE_M = 5.0, 20.0  # distance from sensor to display: warn beyond the first, refuse beyond the second
+SIMILARITY_TOLERANCE = 1e-3  # relative; accepts matrices with four digits, but not sheared ones
+PLAUSIBLE_SCALE = (0.8, 1.25)  # scale between two frames in metres
+SCALE = (5e-4, 2e3)  # allows for millimetres on one side; anything outside is an error
+NEAR_M, MAX_DISTANCE_M = 5.0, 20.0  # distance from sensor to display above which to warn or to refuse
 
-Number = Annotated[float, Field(strict=True, ge=-MOST, le=MOST)]  # "1.0" and true are not numbers
+Number = Annotated[float, Field(strict=True, ge=-MOST, le=MOST)]  # refuses "1.0" and true
 Row4 = tuple[Number, Number, Number, Number]
 Vector3 = tuple[Number, Number, Number]
 Row7 = tuple[Number, Number, Number, Number, Number, Number, Number]
 
 
 class Lenient(Section):
-    """A table in which unknown keys are ignored, because later versions may have written them."""
+    """Table that ignores unknown keys, because later versions may have written them."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
 
 class Residuals(Lenient):
-    """`[residuals]`: distances between the pairs after calibration, in metres, in `stack`."""
+    """`[residuals]`: distances between the pairs after calibration, in metres of the stack frame."""
 
     rms_m: Annotated[float, Field(ge=0)]
 
@@ -52,13 +52,13 @@ class CovarianceTable(Lenient):
 
 
 class CalibrationFile(Lenient):
-    """A calibration file's tables; only `stack_from_sensor` is required."""
+    """Tables of a calibration file, of which only `stack_from_sensor` is required."""
 
     stack_from_sensor: tuple[Row4, Row4, Row4, Row4]
     units: Literal["m"] = "m"
     method: str = ""
     date: str | datetime.date = ""
-    sensor_serial: str = ""  # empty: any device
+    sensor_serial: str = ""  # empty for any device
     condition: Annotated[float, Field(ge=0)] | None = None
     residuals: Residuals | None = None
     covariance: CovarianceTable | None = None
@@ -66,25 +66,25 @@ class CalibrationFile(Lenient):
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """A similarity from `sensor` to `stack`, its source and its warnings."""
+    """Similarity from the sensor frame to the stack frame, with its source and warnings."""
 
     stack_from_sensor: F64  # (4, 4) [sR t; 0 1]
     file: CalibrationFile
-    source: str  # the file's name, for messages
+    source: str  # name of the file, for messages
     warnings: tuple[str, ...]  # lines for the user
 
     @property
     def scale(self) -> float:
-        """Metres of `stack` per metre of `sensor`."""
+        """Metres in the stack frame per metre in the sensor frame."""
         return float(np.cbrt(np.linalg.det(self.stack_from_sensor[:3, :3])))
 
     def points(self, sensor_m: ArrayLike) -> F64:
-        """(..., 3) points in `stack`, metres, from (..., 3) points in `sensor` (EyeReal supplement, (28))."""
+        """Transform points (..., 3) in metres to the stack frame (EyeReal supplement, (28))."""
         points = np.asarray(sensor_m, dtype=np.float64)
         return points @ self.stack_from_sensor[:3, :3].T + self.stack_from_sensor[:3, 3]
 
     def apply(self, eyes: EyePoints) -> EyePoints:
-        """Transform eyes from `sensor` to `stack`."""
+        """Transform eyes to the stack frame."""
         turn, covariance = self.stack_from_sensor[:3, :3], eyes.covariance_m2
         return replace(
             eyes,
@@ -93,7 +93,7 @@ class Calibration:
         )
 
     def position_error_m(self, stack_m: ArrayLike) -> F64 | None:
-        """(...) RMS error in metres at points (..., 3) in `stack` due to the calibration; None if unknown."""
+        """RMS error in metres that the calibration causes at points (..., 3) in the stack frame, if known."""
         if self.file.covariance is None:
             return None
         jacobian = position_jacobian(stack_m, pivot_m=self.file.covariance.pivot_m)
@@ -102,16 +102,16 @@ class Calibration:
         return error_m
 
     def serial_warning(self, serial: str) -> str:
-        """Return a one-line warning if this is not the calibrated sensor, else an empty string."""
+        """Return a warning in one line if this is not the calibrated sensor, otherwise an empty string."""
         calibrated = self.file.sensor_serial
         if not calibrated or serial == calibrated:
             return ""
         actual = f"the sensor is {serial}" if serial else "the connected sensor reports no serial number"
-        return f"{self.source}: calibrated for sensor {calibrated}, but {actual}: calibrate again"
+        return f"{self.source}: the calibration is for sensor {calibrated}, but {actual}; calibrate again"
 
 
 def position_jacobian(stack_m: ArrayLike, *, pivot_m: ArrayLike) -> F64:
-    """(..., 3, 7) derivative of points (..., 3) in `stack` with respect to the seven parameters."""
+    """Return the derivative (..., 3, 7) of points in the stack frame by the seven parameters."""
     arm = np.asarray(stack_m, dtype=np.float64) - np.asarray(pivot_m, dtype=np.float64)
     jacobian = np.zeros((*arm.shape, 7))
     jacobian[..., 0, 1], jacobian[..., 0, 2] = arm[..., 2], -arm[..., 1]
@@ -123,9 +123,9 @@ def position_jacobian(stack_m: ArrayLike, *, pivot_m: ArrayLike) -> F64:
 
 
 def similarity_defect(matrix: ArrayLike) -> float:
-    """Distance of the upper left 3x3 from a scaled rotation: max |A^T A / s² - I|.
+    """Return how far the upper left 3x3 is from a scaled rotation: max |A^T A / s² - I|.
 
-    It is 0 for an exact similarity (or a reflected one) and infinite for a zero matrix.
+    This is 0 for an exact similarity, even a reflected one, and infinite for a zero matrix.
     """
     linear = np.asarray(matrix, dtype=np.float64)[:3, :3]
     largest = float(np.abs(linear).max())
@@ -136,7 +136,7 @@ def similarity_defect(matrix: ArrayLike) -> float:
 
 
 def check_similarity(matrix: F64, *, source: str | Path) -> None:
-    """Raise InputError, naming the field, unless the 4x4 matrix is a plausible similarity transform.
+    """Raise InputError that names the field unless the 4x4 matrix is a plausible similarity.
 
     The determinant must be positive, the scale within `SCALE`, and the sensor within `MAX_DISTANCE_M`.
     """
@@ -144,7 +144,7 @@ def check_similarity(matrix: F64, *, source: str | Path) -> None:
     if not np.abs(matrix).max() <= MOST:
         raise InputError(source, name, f"has an entry beyond {MOST:g}")
     if not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
-        raise InputError(source, name, "its last row must be 0, 0, 0, 1")
+        raise InputError(source, name, "must have 0, 0, 0, 1 as its last row")
     defect = similarity_defect(matrix)
     if not defect <= SIMILARITY_TOLERANCE:
         raise InputError(
@@ -153,13 +153,13 @@ def check_similarity(matrix: F64, *, source: str | Path) -> None:
     largest = float(np.abs(matrix[:3, :3]).max())
     volume = float(np.linalg.det(matrix[:3, :3] / largest))
     if volume <= 0.0:
-        raise InputError(source, name, "mirrors space (determinant not positive): check the axes' directions")
-    scale = largest * float(np.cbrt(volume))  # the determinant of the unscaled matrix may overflow
+        raise InputError(source, name, "mirrors space (determinant not positive); check the directions of the axes")
+    scale = largest * float(np.cbrt(volume))  # without scaling, the determinant could overflow
     if not SCALE[0] <= scale <= SCALE[1]:
-        raise InputError(source, name, f"has scale {scale:.3g}: with both frames in metres it must be about 1")
+        raise InputError(source, name, f"has scale {scale:.3g}; between two frames in metres it must be about 1")
     distance_m = float(np.linalg.norm(matrix[:3, 3]))
     if distance_m > MAX_DISTANCE_M:
-        problem = f"puts the sensor {distance_m:.4g} m from the display; the maximum is {MAX_DISTANCE_M:g} m"
+        problem = f"puts the sensor {distance_m:.4g} m from the display, but the maximum is {MAX_DISTANCE_M:g} m"
         raise InputError(source, name, problem)
 
 
@@ -174,21 +174,22 @@ def _warnings(matrix: F64, source: str) -> tuple[str, ...]:
     distance_m = float(np.linalg.norm(matrix[:3, 3]))
     if distance_m > NEAR_M:
         warnings.append(
-            f"{source}: stack_from_sensor: the sensor is {distance_m:.3g} m from the display: is that right?"
+            f"{source}: stack_from_sensor: the sensor is {distance_m:.3g} m from the display, which is unusual"
         )
     return tuple(warnings)
 
 
 def load_calibration(path: Path | None) -> Calibration:
-    """Load and check a calibration file, or the demo recording's built-in one if `path` is None.
+    """Load and check a calibration file, or the demo recording's if `path` is None.
 
-    Raises InputError, naming file and field, if it is missing, malformed, of the wrong shape, not finite, not a
-    similarity, or mirrored. A scale far from 1 only warns (`Calibration.warnings`).
+    Raises InputError that names file and field if the file is missing or malformed, or if its matrix has the wrong
+    shape, is not finite, is no similarity or is mirrored. A scale far from 1 is only a warning
+    (`Calibration.warnings`).
     """
     file = DEMO_FILE if path is None else path
     table = read_table(file)
     if "stack_from_sensor" not in table:
-        raise InputError(file, "stack_from_sensor", "missing; four rows of four numbers are required")
+        raise InputError(file, "stack_from_sensor", "is missing; four rows of four numbers are required")
     parsed = validated(CalibrationFile, table, source=file)
     matrix = np.array(parsed.stack_from_sensor, dtype=np.float64)
     check_similarity(matrix, source=file)
@@ -197,7 +198,7 @@ def load_calibration(path: Path | None) -> Calibration:
 
 
 def demo_stack_from_sensor() -> F64:
-    """4x4 rigid transform for the demo's sensor, which faces +x and is tilted 10 degrees down."""
+    """Return the 4x4 transform of the demo's sensor, which faces +x and is tilted 10 degrees down."""
     return load_calibration(None).stack_from_sensor
 
 

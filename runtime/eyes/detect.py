@@ -1,4 +1,4 @@
-"""Eye positions and their covariance from a sensor's pictures: the viewer's pupils and distance."""
+"""Eye positions and their covariance from pictures, via the viewer's pupils and distance."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ from runtime.eyes.face_depth import EyeDepths, FaceDepth
 from runtime.eyes.pupils import SIDES, PupilFinder, Pupils
 from runtime.records import F64, EyePoints, Intrinsics, SensorFrame
 
-# Sigma of the midpoint over that of one pupil. Sideways errors of the two pupils are nearly independent, vertical
-# errors are shared.
+# Standard deviation of the midpoint relative to one pupil. Sideways errors of both pupils are nearly independent, but
+# vertical errors are shared.
 MIDDLE_SIDEWAYS, MIDDLE_UP = 0.55, 1.1
 RANGE_MAX_M = 4.0  # faces farther away are not viewers
-LOCK_NS = NS_PER_S  # a viewer unseen for this long is replaced; shorter gaps happen when another person walks past
+LOCK_NS = NS_PER_S  # a viewer unseen for this long is replaced; when another person walks past, gaps are shorter
 FILLED_IN_CONFIDENCE = 0.4  # confidence of a hidden eye
 
 log = logging.getLogger(__name__)
 
 
 class EyeFinder:
-    """Finds the eyes of one viewer in a sensor's pictures.
+    """Finder for the eyes of one viewer in pictures.
 
     `choice`: how the viewer was chosen; `reason`: why the last frame gave no eyes.
     """
 
     def __init__(self, settings: Settings | None = None) -> None:
-        """Use the viewer's eye separation from `settings.calibration`, if known."""
+        """Takes the viewer's eye separation, if known, from `settings.calibration`."""
         settings = settings or Settings()
         self._new_depth = partial(FaceDepth, eye_distance_m=settings.calibration.ipd_m)
         self._finder = PupilFinder(lock_ns=LOCK_NS)
         self._depth, self._viewer = self._new_depth(), 0
         self.reason = ""
-        self.pupils: Pupils | None = None  # pupils in the last frame, even if their distance is unknown
+        self.pupils: Pupils | None = None  # pupils in the last frame, even without a distance
 
     def forget(self) -> None:
-        """Reset the finder, so that the next frame counts as the first."""
+        """Reset the finder. The next frame counts as the first."""
         self._finder.forget()
 
     @property
@@ -47,13 +47,13 @@ class EyeFinder:
         return self._finder.choice
 
     def find(self, frame: SensorFrame) -> EyePoints | None:
-        """Return the viewer's eyes in the `sensor` frame, or None, with the cause in `reason`.
+        """Return the viewer's eyes in the sensor frame, or None with the cause in `reason`.
 
         The frame must have colour and intrinsics. Depth is optional, but must be registered to colour.
         """
         self.pupils = None
         if frame.colour is None:
-            self.reason = "the sensor delivers no colour"
+            self.reason = "the sensor delivers no colour picture"
             return None
         self.pupils = pupils = self._finder.find(frame.colour, time_ns=frame.capture_ns)
         if self._finder.viewer != self._viewer:
@@ -64,7 +64,7 @@ class EyeFinder:
             self.reason = self.reason or "the camera reports no intrinsics, so the eyes' distance is unknown"
             return None
         scale = np.ones(2)
-        if frame.depth_mm is not None:  # registered pictures may differ in size
+        if frame.depth_mm is not None:  # the registered pictures may differ in size
             scale = np.array(frame.depth_mm.shape[::-1]) / np.array(frame.colour.shape[1::-1])
         depths = self._depth.at(pupils, frame.depth_mm, frame.intrinsics, scale)
         if frame.depth_mm is not None and not self._depth.has_measured:
@@ -90,9 +90,9 @@ def _eye_points(pupils: Pupils, depths: EyeDepths, intrinsics: Intrinsics) -> Ey
 
 
 def covariance(point: F64, line: F64, sideways_m: float, up_m: float, along_m: float) -> F64:
-    """(3, 3) covariance, m², from the standard deviations across and along the line of sight to a point.
+    """Return the covariance (3, 3) in m², given standard deviations across and along the line of sight.
 
-    line: (3,) vector between the eyes; its component perpendicular to the line of sight defines sideways.
+    line: vector (3,) between the eyes, whose component perpendicular to the line of sight defines sideways.
     """
     sight = point / np.linalg.norm(point)
     sideways = line - (line @ sight) * sight

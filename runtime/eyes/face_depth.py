@@ -1,8 +1,8 @@
-"""Distance from the camera to a viewer's eyes, measured on the rigid face and averaged over time.
+"""Distance from the camera to the eyes, measured on the rigid face and averaged over time.
 
 The filter estimates one number: the viewer's eye separation in metres, from depth measurements. Distance is that
 number times the focal length over the separation in pixels (measured along the line between the eyes in space, from the
-mesh). So holes and bad frames do no harm, and averaging reduces depth noise without lag. Without depth, the
+mesh). Holes and bad frames therefore do no harm, and averaging reduces depth noise without lag. Without depth, the
 separation comes from the settings, or is learnt from the size of the irises.
 """
 
@@ -21,10 +21,10 @@ EYE_DISTANCE_M = (0.063, 0.0036)  # adults: mean and standard deviation
 KNOWN_SIGMA_M = 0.001  # standard deviation of an eye distance measured by an optician
 IRIS_M, IRIS_SIGMA = 0.0117, 0.07  # diameter of an iris; relative spread, people's and the network's together
 PERSON_M = (0.045, 0.085)  # people's eye separations, including children; other depths are rejected
-FLYING_M = 0.03  # deviation from the other points that marks a flying pixel or the wall
-POINTS_MIN = 8  # least number of rigid mesh points with depth
+FLYING_M = 0.03  # deviation from the other points that identifies a flying pixel or the wall
+POINTS_MIN = 8  # minimum number of rigid mesh points with depth
 RELIEF_MAX, RELIEF_PICTURES = 1.3, 30  # times the mesh's relief; pictures averaged
-POINT_SIGMA_M = 0.0005  # least sigma of the mean of many points, whose errors are not independent
+POINT_SIGMA_M = 0.0005  # lower limit for the mean of many points, whose errors are not independent
 SHAPE_SIGMA_M = 0.006  # deviation of this viewer's eyes from the mesh's, along the line of sight
 EYE_SIGMA_M, EYE_GATE_M = 0.002, 0.02  # sigma of one measurement at an eye; larger deviations (glasses) are rejected
 EYE_WINDOW = 0.12  # radius of the depth window at an eye, in eye distances
@@ -40,10 +40,10 @@ class EyeDepths:
 
 
 class FaceDepth:
-    """Estimates the depth of one viewer's face; every new viewer needs a new instance."""
+    """Estimator of the depth of one viewer's face. Every viewer needs a new instance."""
 
     def __init__(self, *, eye_distance_m: float = 0.0) -> None:
-        """eye_distance_m: this viewer's eye separation, or 0 to learn it."""
+        """eye_distance_m: eye separation of this viewer; 0 to learn it."""
         self._known = eye_distance_m > 0
         self._distance, sigma = (eye_distance_m, KNOWN_SIGMA_M) if self._known else EYE_DISTANCE_M
         self._variance = sigma**2
@@ -54,7 +54,7 @@ class FaceDepth:
         self.has_measured = False
 
     def at(self, pupils: Pupils, depth_mm: U16 | None, intrinsics: Intrinsics, depth_from_colour: F64) -> EyeDepths:
-        """Estimate both eyes' distances from the camera in one picture.
+        """Estimate the distances of both eyes from the camera in one picture.
 
         depth_mm: (h, w), 0 where nothing was measured; depth_from_colour: (2,) depth pixels per colour pixel.
         """
@@ -95,7 +95,7 @@ class FaceDepth:
             self._variance += (PICTURE_SHARE**2 + turn**2) * self._distance**2
 
     def _learn(self, ratio: float) -> None:
-        """Estimate the eye separation without depth, from the irises, which vary less between people than faces do."""
+        """Estimate the eye separation without depth from the irises, whose size varies least between people."""
         self._irises = [*self._irises[-99:], ratio]
         iris = IRIS_M * float(np.median(self._irises))
         weights = np.array([EYE_DISTANCE_M[1], IRIS_SIGMA * iris]) ** -2.0
@@ -146,7 +146,7 @@ class FaceDepth:
         self.has_measured = True
 
     def _fit_relief(self, depths: F64, shape: F64) -> None:
-        """Update the ratio of this face's relief to the mesh's, which is near 0 for a printed face."""
+        """Update the ratio of this face's relief to that of the mesh. It is near 0 for a printed face."""
         off = shape - shape.mean()
         seen = float(np.clip(off @ (depths - depths.mean()) / max(float(off @ off), 1e-12), 0, RELIEF_MAX))
         self._reliefs = min(self._reliefs + 1, RELIEF_PICTURES)
@@ -154,7 +154,7 @@ class FaceDepth:
 
 
 def _sampled(depth_mm: U16, points: F64) -> F64:
-    """Return the (n,) depths in metres at continuous pixels, 0 outside the picture."""
+    """Return the depths (n,) in metres at continuous pixels, or 0 outside the picture."""
     height, width = depth_mm.shape
     x, y = np.floor(points).astype(int).T
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
@@ -163,7 +163,7 @@ def _sampled(depth_mm: U16, points: F64) -> F64:
 
 
 def _window(depth_mm: U16, centre: F64, radius: float) -> F64:
-    """Return the (n,) depths in metres of the pixels around a point."""
+    """Return the depths (n,) in metres of the pixels around a point."""
     height, width = depth_mm.shape
     x0, y0 = np.clip(np.floor(centre - radius), 0, [width, height]).astype(int)
     x1, y1 = np.clip(np.floor(centre + radius) + 1, 0, [width, height]).astype(int)

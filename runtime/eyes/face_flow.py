@@ -1,7 +1,7 @@
-"""Motion of a face between pictures, to 1/50 pixel, from the optical flow of its rigid parts.
+"""Motion of a face between pictures to 1/50 pixel, from the optical flow of its rigid parts.
 
-The networks' errors are independent from picture to picture; optical flow between two pictures is far more precise.
-The pupils therefore follow the flow, and the networks correct them slowly.
+The errors of the networks are independent from picture to picture, while optical flow between two pictures is far more
+precise. The pupils therefore follow the flow, and the networks correct them slowly.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ RIGID = np.array([
 ])  # fmt: skip
 BRIDGE = 168  # mesh point on the bridge of the nose, between the eyes
 SIZE = 192  # side of the grey crop, pixels
-EYE_DISTANCE = 64.0  # between the eyes in the crop, pixels
+EYE_DISTANCE = 64.0  # distance between the eyes in the crop, pixels
 WINDOW = 17  # side of the window compared around a point, pixels of the crop
-RETURNS_WITHIN = 0.4  # pixels: forward-backward error above which a point is discarded
+RETURNS_WITHIN = 0.4  # forward-backward error in pixels above which a point is discarded
 POINTS_MIN, INLIERS_MIN = 10, 8
 
 
 class FaceFlow:
-    """Measures how a remembered face moves between pictures."""
+    """Measurement of how a remembered face moves between pictures."""
 
     def __init__(self) -> None:
         self._grey: Any = None
@@ -37,14 +37,14 @@ class FaceFlow:
         self._mesh = np.zeros((0, 2))
 
     def remember(self, picture: U8, mesh: F64, eye_distance: float) -> None:
-        """Store this picture's face. mesh: (468, 3) px; eye_distance: px."""
+        """Remember the face in this picture. mesh: (468, 3) in pixels. eye_distance: in pixels."""
         scale = EYE_DISTANCE / eye_distance
         offset = SIZE / 2 - scale * mesh[BRIDGE, :2]
         self._crop_from_picture = np.array([[scale, 0, offset[0]], [0, scale, offset[1]]])
         self._grey, self._mesh = self._crop(picture), mesh[RIGID, :2].copy()
 
     def moved(self, picture: U8, mesh: F64) -> F64 | None:
-        """Return a (2, 3) similarity from the remembered face's pixels to the new picture's, or None."""
+        """Return the similarity (2, 3) from pixels of the remembered face to the new picture, or None."""
         grey = self._crop(picture)
         matrix = self._crop_from_picture
         start = (transformed(matrix, self._mesh) - 0.5).astype(np.float32)
@@ -68,7 +68,10 @@ class FaceFlow:
 
 
 def _flow(before: Any, after: Any, start: Any, guess: Any) -> tuple[Any, Any]:
-    """(n, 2) positions in `after` of points in `before`, and an (n, 1) mask of the points found. Overwrites `guess`."""
+    """Return the positions (n, 2) in `after` of points in `before`, and a mask (n, 1) of those found.
+
+    Overwrites `guess`.
+    """
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
     ends, is_found, _ = cv2.calcOpticalFlowPyrLK(
         before, after, start, guess,

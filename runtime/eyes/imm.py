@@ -35,20 +35,20 @@ class Belief(NamedTuple):
 
 
 def _response(times_s: F64) -> F64:
-    """(3, n) position, velocity and acceleration that result from an initial acceleration of 1."""
+    """Return position, velocity and acceleration (3, n) after an initial acceleration of 1."""
     x = times_s / FADE_S
     gone = -np.expm1(-x)
     return np.array([FADE_S**2 * (x - gone), FADE_S * gone, 1 - gone])
 
 
 def _of_each_axis(matrix: F64) -> F64:
-    """(9, 9) matrix that applies a (3, 3) matrix to each of x, y and z: its Kronecker product with the identity."""
+    """Return the matrix (9, 9) that applies a (3, 3) matrix to each of x, y and z."""
     return (matrix[:, None, :, None] * _AXES[:, None, :]).reshape(9, 9)
 
 
 @lru_cache(maxsize=8)
 def _transition(dt_s: float) -> F64:
-    """(9, 9) transition matrix from the current state to the state dt_s later."""
+    """Return the transition matrix (9, 9) to the state dt_s later."""
     step = np.eye(3)
     step[0, 1] = dt_s
     step[:, 2] = _response(np.array([dt_s]))[:, 0]
@@ -57,16 +57,16 @@ def _transition(dt_s: float) -> F64:
 
 @lru_cache(maxsize=8)
 def _noise(dt_s: float) -> F64:
-    """(9, 9) covariance that acceleration noise of 1 m/s² (standard deviation) adds in dt_s.
+    """Return the covariance (9, 9) that acceleration noise of 1 m/s² (standard deviation) adds in dt_s.
 
-    It is integrated by Gauss-Legendre quadrature, which stays positive where the closed form suffers from cancellation.
+    Gauss-Legendre quadrature stays positive where the closed form suffers from cancellation.
     """
     response = _response(dt_s * (_NODES + 1) / 2)
     return _of_each_axis((response * (_SHARES * dt_s / FADE_S)) @ response.T)
 
 
 def started(place: F64, *, noise: F64, speed: float, acceleration: Sequence[float]) -> Belief:
-    """Return the belief after a first measurement (3,) with covariance (3, 3); its mean velocity is zero.
+    """Return the belief after a first measurement (3,) with covariance (3, 3). Its mean velocity is zero.
 
     speed (m/s) and acceleration (m/s², one value per model) are standard deviations per axis.
     """
@@ -80,7 +80,10 @@ def started(place: F64, *, noise: F64, speed: float, acceleration: Sequence[floa
 
 
 def predicted(belief: Belief, dt_s: float, *, acceleration: Sequence[float], stay_s: float) -> Belief:
-    """Predict the belief dt_s >= 0 ahead: mix the models, then move them. stay_s: mean time in one model."""
+    """Predict the belief dt_s >= 0 ahead by mixing the models, then moving them.
+
+    stay_s: mean time in one model.
+    """
     count = len(belief.weight)
     leave = -math.expm1(-dt_s / stay_s) / count  # probability of a switch to each model, including this one
     change = np.full((count, count), leave) + (1 - count * leave) * np.eye(count)
@@ -98,7 +101,7 @@ def predicted(belief: Belief, dt_s: float, *, acceleration: Sequence[float], sta
 
 
 def surprise(belief: Belief, measured: F64, *, noise: F64) -> float:
-    """Smallest squared Mahalanobis distance of a measurement from any model.
+    """Return the smallest squared Mahalanobis distance of a measurement from any model.
 
     For a good measurement it follows chi² with three degrees of freedom.
     """
@@ -106,14 +109,14 @@ def surprise(belief: Belief, measured: F64, *, noise: F64) -> float:
 
 
 def _total(belief: Belief, noise: F64) -> F64:
-    """(n, 3, 3) covariance of the innovation, regularized: rounding can make it singular after a long jump (metres)."""
+    """Return the covariance (n, 3, 3) of the innovation, regularized against rounding after a long jump."""
     total = belief.covariance[:, :3, :3] + noise
     spread: F64 = np.trace(total, axis1=1, axis2=2)[:, None, None] * ROUNDING
     return np.asarray(total + spread * np.eye(3), np.float64)
 
 
 def _chi2(off: F64, covariance: F64) -> F64:
-    """(n,) squared Mahalanobis lengths of vectors (n, 3) with covariances (n, 3, 3)."""
+    """Return the squared Mahalanobis lengths (n,) of vectors (n, 3) with covariances (n, 3, 3)."""
     result: F64 = (off * np.linalg.solve(covariance, off[..., None])[..., 0]).sum(1)
     return result
 
@@ -134,7 +137,7 @@ def corrected(belief: Belief, measured: F64, *, noise: F64) -> Belief:
 
 
 def _positive(covariance: F64) -> F64:
-    """(n, 9, 9) covariance, its eigenvalues made positive if rounding (after a long jump) left any negative."""
+    """Return covariances (n, 9, 9) with positive eigenvalues, in case rounding after a long jump made any negative."""
     try:
         np.linalg.cholesky(covariance)
     except np.linalg.LinAlgError:
@@ -146,13 +149,13 @@ def _positive(covariance: F64) -> F64:
 
 
 def ahead(belief: Belief, dt_s: float) -> F64:
-    """(3,) position predicted dt_s ahead: the mean over all models, weighted by probability."""
+    """Predict the position (3,) dt_s ahead as the mean over all models, weighted by probability."""
     position: F64 = _transition(dt_s)[:3] @ (belief.weight @ belief.state)
     return position
 
 
 def spread(belief: Belief, dt_s: float, *, acceleration: Sequence[float], about: F64) -> F64:
-    """(3, 3) second moment, m², of the predicted position about a point (3,)."""
+    """Return the second moment (3, 3), in m², of the predicted position about a point (3,)."""
     step = _transition(dt_s)[:3]
     added = np.square(acceleration)[:, None, None] * _noise(dt_s)[:3, :3]
     apart = belief.state @ step.T - about

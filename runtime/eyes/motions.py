@@ -1,4 +1,4 @@
-"""Simulated head motions, and simulated samples of a depth camera, for benchmarks and tests."""
+"""Simulated head motions and depth camera samples for benchmarks and tests."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NECK_TO_EYES_M = np.array([-0.09, 0.0, 0.14])  # forward (towards the display), 
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """A sample as the tracker receives it."""
+    """Sample as the tracker receives it."""
 
     capture_ns: int
     points: EyePoints | None  # frame `stack`
@@ -28,7 +28,7 @@ Motion = Callable[[F64], tuple[F64, F64]]  # times (n,) s -> neck (n, 3) m, fram
 
 
 def minimum_jerk(times_s: F64, *, knots_s: F64, values: F64) -> F64:
-    """Minimum-jerk movements that stop at each knot (Flash and Hogan 1985); values: (k, ...)."""
+    """Interpolate values (k, ...) by minimum-jerk movements that stop at knots (Flash and Hogan 1985)."""
     index = np.clip(np.searchsorted(knots_s, times_s, side="right") - 1, 0, len(knots_s) - 2)
     s = np.clip((times_s - knots_s[index]) / (knots_s[index + 1] - knots_s[index]), 0, 1)
     blend = s**3 * (10 + s * (6 * s - 15))
@@ -36,20 +36,20 @@ def minimum_jerk(times_s: F64, *, knots_s: F64, values: F64) -> F64:
 
 
 def _still(times_s: F64) -> tuple[F64, F64]:
-    """Seated viewer: breathing and a sway of a few millimetres."""
+    """Sit still, with breathing and a sway of a few millimetres."""
     sway = [0.0015 * np.sin(1.7 * times_s), 0.002 * np.sin(0.9 * times_s + 1), 0.0015 * np.sin(1.6 * times_s)]
     return np.stack(sway, 1), np.zeros_like(times_s)
 
 
 def _lean(times_s: F64) -> tuple[F64, F64]:
-    """Lean from side to side by 30 cm without stopping, at 0.3 m/s at most."""
+    """Lean from side to side by 30 cm without stopping, at up to 0.3 m/s."""
     phase = 2 * np.pi * times_s / 3.2
     neck, pitch = _still(times_s)
     return neck + np.stack([0.03 * np.cos(phase), 0.15 * np.sin(phase), -0.03 * np.sin(phase) ** 2], 1), pitch
 
 
 def _nod(times_s: F64) -> tuple[F64, F64]:
-    """Three nods of 12 degrees at 1 Hz, then a pause, repeatedly."""
+    """Nod three times by 12 degrees at 1 Hz, pause, and repeat."""
     neck, _ = _still(times_s)
     within = times_s % 5.0
     envelope = np.clip(np.minimum(within, 3.0 - within) / 0.5, 0, 1)
@@ -57,7 +57,7 @@ def _nod(times_s: F64) -> tuple[F64, F64]:
 
 
 def _walk(times_s: F64) -> tuple[F64, F64]:
-    """Walk back and forth in front of the display over 2.4 m, at up to 1 m/s, bobbing at 1.9 steps a second."""
+    """Walk back and forth over 2.4 m in front of the display, at up to 1 m/s with 1.9 steps a second."""
     knots = np.arange(0.0, times_s.max() + 4.0, 3.5)
     side = minimum_jerk(times_s, knots_s=knots, values=np.where(np.arange(len(knots)) % 2, 1.0, -1.0))
     bob = 0.02 * np.sin(2 * np.pi * 1.9 * times_s)
@@ -66,7 +66,7 @@ def _walk(times_s: F64) -> tuple[F64, F64]:
 
 
 def _stop_and_go(times_s: F64) -> tuple[F64, F64]:
-    """Quick moves of 10 to 30 cm, each lasting half a second to a second, separated by pauses of similar length."""
+    """Move quickly by 10 to 30 cm in half a second to a second, with pauses of similar length."""
     random = np.random.default_rng(7)
     knots, places, place = [0.0], [np.zeros(3)], np.zeros(3)
     while knots[-1] <= times_s.max():
@@ -84,7 +84,7 @@ MOTIONS: dict[str, Motion] = {"still": _still, "lean": _lean, "nod": _nod, "walk
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """One viewer's variant of a motion: its phase, speed, extent and initial direction."""
+    """Variant of a motion, with its phase, speed, extent and initial direction."""
 
     start_s: float = 0.0
     pace: float = 1.0
@@ -96,7 +96,7 @@ BENCHMARK_PATH = Path()
 
 
 def path_of(seed: int) -> Path:
-    """Return the random path of a seed; seed 0 gives the benchmark's path."""
+    """Return the random path of a seed. Seed 0 gives the path of the benchmark."""
     if seed == 0:
         return BENCHMARK_PATH
     random = np.random.default_rng([seed, 0x70617468])
@@ -106,7 +106,7 @@ def path_of(seed: int) -> Path:
 
 
 def true_eyes(motion: str, times_s: F64, *, path: Path = BENCHMARK_PATH) -> F64:
-    """(n, 2, 3) left and right eye in `stack`, metres."""
+    """Return the left and right eye (n, 2, 3) in the stack frame, in metres."""
     neck, pitch = MOTIONS[motion](path.start_s + path.pace * times_s)
     neck, pitch = path.size * neck * [1.0, path.side, 1.0], path.size * pitch
     forward, _, up = NECK_TO_EYES_M
@@ -131,7 +131,7 @@ def observe(
     seed: int = 1,
     path: Path = BENCHMARK_PATH,
 ) -> list[Observation]:
-    """Simulate a sensor's samples of a motion; `seed` selects the noise.
+    """Simulate samples that a sensor takes of a motion. `seed` selects the noise.
 
     Outliers displace one or both eyes by 4 to 20 cm. If `dropout_every_s` is 0, there are no dropouts.
     """

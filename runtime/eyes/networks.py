@@ -1,7 +1,7 @@
-"""The three face networks, and the square crops that they take as input.
+"""The three face networks and the square crops that they take as input.
 
-Pixels are continuous: the centre of the first one is (0.5, 0.5). *Left* is the viewer's own left, on the right of an
-unmirrored picture; it comes first. `docs/sensors.md` gives the models' origin.
+Pixels are continuous: the centre of the first one is (0.5, 0.5). *Left* is the viewer's left, which is on the right of
+an unmirrored picture, and comes first. `docs/sensors.md` gives the origin of the models.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from runtime.support.onnx_runtime import onnxruntime
 
 MODELS = Path(str(files("runtime.eyes") / "models"))
 STRIDES = (8, 16, 32)  # pixels per cell of YuNet's three grids
-OVERLAP_MAX = 0.3  # intersection over union of two of YuNet's boxes; above, they are the same face
+OVERLAP_MAX = 0.3  # intersection over union above which two of YuNet's boxes are the same face
 CROP_BLUR = 0.45  # standard deviation of the anti-aliasing filter, in the crop's pixels
 
 
 def load_network(name: str) -> Any:
-    """Load a single-threaded onnxruntime session and warm it up: its first run is several times slower.
+    """Load a single-threaded onnxruntime session and warm it up, because the first run is slow.
 
-    name: a file name in the `models` folder.
+    name: name of a file in the folder `models`.
     """
     ort = onnxruntime()
     options = ort.SessionOptions()
@@ -40,13 +40,13 @@ def load_network(name: str) -> Any:
 
 
 def transformed(matrix: F64, points: F64) -> F64:
-    """Apply an affine (2, 3) matrix to (n, 2) points."""
+    """Apply an affine matrix (2, 3) to points (n, 2)."""
     result: F64 = points @ matrix[:, :2].T + matrix[:, 2]
     return result
 
 
 def inverse(matrix: F64) -> F64:
-    """Return the inverse of an affine (2, 3) matrix."""
+    """Return the inverse of an affine matrix (2, 3)."""
     return np.asarray(cv2.invertAffineTransform(matrix), np.float64)
 
 
@@ -69,20 +69,20 @@ def resampled(picture: U8, size: tuple[int, int], crop_from_picture: F64) -> U8:
 
 @dataclass(frozen=True, slots=True)
 class Square:
-    """A square region of a picture, rotated to align with the face in it."""
+    """Square region of a picture, rotated to align with the face in it."""
 
     centre: F64  # (2,) px
     side: float  # px
     angle: float  # of its lower edge, radians clockwise on the screen
 
     def picture_from_crop(self, size: int, *, mirrored: bool = False) -> F64:
-        """(2, 3) matrix from continuous pixels of a `size`-pixel crop to continuous pixels of the picture."""
+        """Return the matrix (2, 3) from continuous pixels of a `size`-pixel crop to those of the picture."""
         c, s = np.cos(self.angle) * self.side / size, np.sin(self.angle) * self.side / size
         matrix = np.array([[-c if mirrored else c, -s], [-s if mirrored else s, c]])
         return np.column_stack([matrix, self.centre - matrix @ [size / 2, size / 2]])
 
     def crop(self, picture: U8, size: int, *, mirrored: bool = False) -> tuple[F32, F64]:
-        """Return a (1, size, size, 3) crop with values in [0, 1], and its `picture_from_crop` matrix."""
+        """Return the crop (1, size, size, 3) with values in [0, 1], and its matrix `picture_from_crop`."""
         matrix = self.picture_from_crop(size, mirrored=mirrored)
         pixels = resampled(picture, (size, size), inverse(matrix))
         return np.divide(pixels[None], 255, dtype=np.float32), matrix
@@ -90,7 +90,7 @@ class Square:
 
 @dataclass(frozen=True, slots=True)
 class FoundFace:
-    """A face found by YuNet."""
+    """Face found by YuNet."""
 
     score: float  # 0 to 1
     box: F64  # (4,) x, y, width, height, px
@@ -102,7 +102,7 @@ class FoundFace:
         return float(np.sqrt(self.box[2] * self.box[3]))
 
     def square(self) -> Square:
-        """Square region around the face, as input for the mesh network."""
+        """Square region around the face, used as input for the mesh network."""
         eyes, mouth = self.points[:2].mean(axis=0), self.points[3:].mean(axis=0)
         line = self.points[1] - self.points[0]
         size = max(np.linalg.norm(line), 0.95 * np.linalg.norm(mouth - eyes))
@@ -110,13 +110,13 @@ class FoundFace:
 
 
 class FaceNetwork:
-    """YuNet: finds faces anywhere in a picture."""
+    """YuNet, which finds faces anywhere in a picture."""
 
     def __init__(self) -> None:
         self._session = load_network("yunet.onnx")
 
     def find(self, picture: U8, *, longest_px: int, score_min: float) -> list[FoundFace]:
-        """Return the faces in an (h, w, 3) RGB picture, reduced to `longest_px` if larger, best first."""
+        """Find the faces in an RGB picture (h, w, 3), reduced to `longest_px` if larger, best first."""
         height, width = picture.shape[:2]
         scale = min(1.0, longest_px / max(height, width))
         small = picture
@@ -132,7 +132,7 @@ class FaceNetwork:
 
     @staticmethod
     def _decoded(outputs: list[F32], width: int, score_min: float) -> list[FoundFace]:
-        """Decode the grid cells that contain a face; among overlapping faces keep the best score."""
+        """Decode the grid cells that contain a face. Of overlapping faces, keep the one with the best score."""
         faces = []
         for level, stride in enumerate(STRIDES):
             classes, objects, boxes, points = (outputs[kind * len(STRIDES) + level][0] for kind in range(4))
@@ -149,7 +149,7 @@ class FaceNetwork:
 
 
 class MeshNetwork:
-    """Finds 468 face points, numbered as in MediaPipe, in a square region of the picture."""
+    """Network that finds 468 face points, numbered as in MediaPipe, in a square region of the picture."""
 
     SIZE = 192
 
@@ -157,7 +157,7 @@ class MeshNetwork:
         self._session = load_network("face_mesh.onnx")
 
     def points(self, picture: U8, square: Square) -> tuple[F64, float]:
-        """Return (468, 3) points, px, z away from the camera, and the probability that this is a face."""
+        """Return points (468, 3) in pixels, z away from the camera, and the probability that this is a face."""
         crop, matrix = square.crop(picture, self.SIZE)
         mesh, presence = self._session.run(None, {"input_1": crop})
         points = mesh.reshape(468, 3).astype(np.float64)
@@ -166,7 +166,7 @@ class MeshNetwork:
 
 
 class IrisNetwork:
-    """Finds the iris in a square around an eye; trained on left eyes in pictures, so others are mirrored."""
+    """Network that finds the iris in a square around an eye. Right eyes of the viewer are mirrored."""
 
     SIZE = 64
 
@@ -174,7 +174,7 @@ class IrisNetwork:
         self._session = load_network("iris.onnx")
 
     def points(self, picture: U8, square: Square, *, is_left: bool) -> tuple[F64, F64]:
-        """Return (5, 2) centre and edge points of the iris and (16, 2) lid points, lower lid first; px."""
+        """Return centre and edge points of the iris (5, 2) and lid points (16, 2), lower lid first."""
         crop, matrix = square.crop(picture, self.SIZE, mirrored=is_left)
         names = ["output_iris", "output_eyes_contours_and_brows"]
         iris, lids = self._session.run(names, {"input_1": crop})

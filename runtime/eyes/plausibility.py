@@ -1,4 +1,4 @@
-"""Checks for points that cannot be a viewer's eyes: swapped, in millimetres, or behind the display.
+"""Checks for points that cannot be eyes: swapped, in millimetres, or behind the display.
 
 Nothing here reads a clock. Eyes are in metres in frame `stack` (+x out of the screen, +y the viewer's right, +z up).
 """
@@ -20,28 +20,28 @@ BEHIND = "not in front of the panels"
 TOO_DISTANT = "too far away for a viewer"
 EXCHANGED = "left and right swapped"
 
-IPD_MIN_M, IPD_MAX_M = 0.050, 0.078  # a person's eye separation
-WINDOW = 30  # samples: a second of a common depth camera
-SAMPLES_MIN = 10  # least number of samples before a reason is reported
-WARNING_SHARE = 0.5  # share of the window refused for one reason that raises a warning
-UNIT_SLACK = 1.25  # factor on the limits when checking for millimetres: 40 to 98
+IPD_MIN_M, IPD_MAX_M = 0.050, 0.078  # range of people's eye separations
+WINDOW = 30  # samples; one second of a typical depth camera
+SAMPLES_MIN = 10  # minimum number of samples before a reason is reported
+WARNING_SHARE = 0.5  # share of samples refused for one reason above which to warn
+UNIT_SLACK = 1.25  # factor applied to the limits when checking for millimetres
 DISTANT_M = 20.0  # distance from the display beyond which no sensor sees a face
-UPSIDE_DOWN_COSINE = -0.5  # a roll of more than 120 degrees means that the eyes are swapped
+UPSIDE_DOWN_COSINE = -0.5  # with a roll of more than 120 degrees, the eyes are swapped
 
 MISTAKES = (NOT_NEWER, NOT_A_NUMBER, MILLIMETRES, TOO_CLOSE, TOO_FAR_APART, BEHIND, TOO_DISTANT, EXCHANGED)
 _HINTS = {
-    NOT_NEWER: "the driver must report each sample's capture time",
+    NOT_NEWER: "the driver must report the capture time of each sample",
     MILLIMETRES: "the driver must deliver metres",
-    EXCHANGED: "`left` must be the viewer's own left eye, and the camera's picture must not be mirrored",
+    EXCHANGED: "`left` must be the viewer's left eye, and the camera's picture must not be mirrored",
     BEHIND: "calibrate again; the calibration may be for another sensor",
     TOO_DISTANT: "calibrate again; the calibration may be for another sensor",
 }
 
 
 def reason_against(eyes_m: F64, *, in_front_m: float = 0.0) -> str:
-    """Return why (2, 3) points can't be a viewer's eyes, or an empty string. in_front_m: minimum x.
+    """Return why points (2, 3) cannot be the eyes of a viewer, or an empty string.
 
-    Eyes count as swapped if the line from left to right points to the viewer's left.
+    in_front_m: minimum x. Eyes are swapped if the line from left to right points to the viewer's left.
     """
     (lx, ly, lz), (rx, ry, rz) = eyes_m.tolist()
     if not all(map(math.isfinite, (lx, ly, lz, rx, ry, rz))):
@@ -62,12 +62,12 @@ def reason_against(eyes_m: F64, *, in_front_m: float = 0.0) -> str:
 
 
 class RefusalWatch:
-    """Counts refused samples by reason, and warns once if most are refused for the same reason."""
+    """Counter of refused samples by reason, which warns once if most are refused for the same one."""
 
     def __init__(self) -> None:
         self._last: deque[str] = deque(maxlen=WINDOW)
         self._counts: Counter[str] = Counter()
-        self.warning = ""  # current problem; empty: none
+        self.warning = ""  # current problem, or empty
 
     @property
     def counts(self) -> Mapping[str, int]:
@@ -75,7 +75,7 @@ class RefusalWatch:
         return self._counts
 
     def update(self, reason: str) -> str:
-        """Count a sample by its refusal (empty: accepted). Returns a line to log if the warning changes."""
+        """Count a sample by reason for refusal, or "". Returns a line to log when the warning changes."""
         self._last.append(reason if reason in MISTAKES else "")
         if reason:
             self._counts[reason] += 1

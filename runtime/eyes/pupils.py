@@ -1,4 +1,4 @@
-"""Find and follow one viewer's pupils in pictures, ignoring other people's."""
+"""Finder that follows one viewer's pupils in pictures and ignores those of other people."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ Seen = Literal["found", "followed", "filled in"]
 Side = Literal["", "left", "right"]
 SIDES: tuple[Side, Side] = ("left", "right")
 
-LEVELS_PX = (320, 640)  # longer side of the picture searched; the finer one if the first shows no face
-SCORE_MIN = 0.8  # least score of a face: people in the dark at 1.5 m score 0.85, most dogs less than 0.8
+LEVELS_PX = (320, 640)  # longer side of the searched picture; the second if the first shows no face
+SCORE_MIN = 0.8  # minimum score of a face; people in the dark at 1.5 m score 0.85, most dogs less than 0.8
 PRESENCE_FOUND, PRESENCE_FOLLOWED = 0.9, 0.5  # minimum probability of a face in the mesh's crop
-CANDIDATES_MAX = 4  # faces examined when looking for the viewer
-FARTHEST_OUT = 0.7  # relative penalty for a face in the picture's corner when a viewer is chosen
+CANDIDATES_MAX = 4  # maximum number of faces examined when looking for the viewer
+FARTHEST_OUT = 0.7  # relative penalty for a face in the corner of the picture when choosing a viewer
 CORNERS = ((362, 263), (33, 133))  # mesh points at the corners of the left and right eye
 EYE_SQUARE = 2.7  # side of the iris network's input, in eye widths; the most accurate value from 1.8 to 3.1
 FACE_SQUARE = 1.5  # side of the mesh network's input, in sizes of the face
-MOVED_FAR = 0.35  # movement between pictures, in eye separations, beyond which the mesh network runs again
+MOVED_FAR = 0.35  # movement in eye separations after which the mesh network runs again
 
 # A human iris measures 11.7 mm, and the eyes are 50 to 75 mm apart. This excludes dogs and monkeys.
 IRIS_RANGE = (0.12, 0.33)  # diameter in eye distances; turning the head shortens the distance
-IRIS_RATIO_MAX = 1.4  # largest ratio of the two irises
+IRIS_RATIO_MAX = 1.4  # maximum ratio of the two irises
 # The upper lid hides part of the iris and the network returns the centre of the visible rest: too low by this share of
 # the eye distance (0.6 mm), independent of camera and distance. Fitted to all 51 faces measured; fitted to random
 # halves of them, the error on the other half is 0.61 to 0.67 mm up to 1 m.
 TOO_LOW = 0.0093
-OPEN_MIN = 0.12  # least height of an open eye over its width; in a blink the iris is hidden
+OPEN_MIN = 0.12  # minimum height of an open eye over its width; a blink hides the iris
 
 PULL = 0.1  # share of the deviation from the networks' estimate that each picture corrects
 # Gaze changes: the gain rises by GAZE_PULL as the distance goes from GAZE_FROM to GAZE_FULL eye distances.
@@ -43,7 +43,7 @@ GAZE_FROM, GAZE_FULL, GAZE_PULL = 0.02, 0.06, 0.6
 # network only guesses its position. It is then moved with the face for at most CARRIED_MAX pictures.
 APART_MAX, CARRIED_MAX = 0.06, 30
 
-SAME_LOOKS = 0.75  # minimum correlation between two views of one person; 19 in 20 other people score less
+SAME_LOOKS = 0.75  # minimum correlation of two views of one person; 19 in 20 other people are below
 SAME_LOOKS_FOLLOWED = 0.6  # the same for a face at the viewer's last position
 LOOKS_PULL = 0.05  # rate at which the stored appearance adapts to light and pose
 
@@ -54,14 +54,14 @@ SIGMA_PERSON, SIGMA_PICTURE_PX, SIGMA_SURPRISE = 0.0088, 0.14, 0.5
 
 @dataclass(frozen=True, slots=True)
 class Pupils:
-    """One viewer's pupils in one picture."""
+    """Pupils of one viewer in one picture."""
 
     eyes_px: F64  # (2, 2) left, right; continuous pixels
     sigma_px: float  # standard deviation of one pupil along one axis
-    mesh_px: F64  # (468, 3) the face; z in the same pixels, away from the camera
+    mesh_px: F64  # (468, 3) face points; z in pixels, away from the camera
     iris_px: float  # mean diameter of the irises
     seen: Seen
-    hidden: Side  # the hidden eye, filled in from the rest of the face
+    hidden: Side  # eye that is hidden and was estimated from the rest of the face
     certainty: float  # probability that this is a face
 
     @property
@@ -71,7 +71,7 @@ class Pupils:
 
 @dataclass(frozen=True, slots=True)
 class _Look:
-    """The networks' estimates for one face in one picture."""
+    """Estimates of the networks for one face in one picture."""
 
     mesh: F64  # (468, 3) px
     presence: float
@@ -92,20 +92,20 @@ class _Look:
 
 
 class PupilFinder:
-    """Finds one viewer's pupils and follows them from picture to picture.
+    """Finder that follows one viewer's pupils from picture to picture.
 
     `reason`: why the last picture gave no pupils; `choice`: how the viewer was chosen.
     """
 
     def __init__(self, *, lock_ns: int = 0) -> None:
-        """lock_ns: time unseen after which another viewer may take over."""
+        """lock_ns: time after which another person may replace an unseen viewer."""
         self._faces, self._meshes, self._irises = FaceNetwork(), MeshNetwork(), IrisNetwork()
         self._flow, self._lock_ns = FaceFlow(), lock_ns
         self.viewer = 0  # incremented with every new viewer
         self.forget()
 
     def forget(self) -> None:
-        """Reset: treat the next picture as the first."""
+        """Reset the finder, so that the next picture counts as the first."""
         self._looks: F64 | None = None  # the viewer's face, kept while unseen
         self._last: _Look | None = None  # the viewer in the previous picture
         self._eyes = np.zeros((2, 2))  # px, returned for the previous picture
@@ -114,7 +114,7 @@ class PupilFinder:
         self.reason, self.choice = "", "no viewer yet"
 
     def find(self, picture: U8, *, time_ns: int = 0) -> Pupils | None:
-        """Return the viewer's pupils in an (h, w, 3) RGB picture, or None, with the cause in `reason`."""
+        """Return the viewer's pupils in an RGB picture (h, w, 3), or None with the cause in `reason`."""
         if self._looks is not None and time_ns - self._seen_ns > self._lock_ns:
             self.forget()
             self.choice = "none: the viewer left"
@@ -129,7 +129,7 @@ class PupilFinder:
         return self._steadied(picture, look, "followed" if seen == "followed" else "found")
 
     def _follow(self, picture: U8) -> _Look | None:
-        """Look for the viewer at the previous picture's position."""
+        """Look for the viewer at the position in the previous picture."""
         if self._last is None or self._looks is None:
             return None
         last = self._last
@@ -157,7 +157,7 @@ class PupilFinder:
                 continue
             look = self._measured(picture, mesh, presence)
             if not look.are_human():
-                self.reason = "a face without a person's eyes"
+                self.reason = "there is a face, but its eyes are not a person's"
             elif self._looks is None:
                 self.choice = f"locked on the foremost of {len(faces)} face(s)"
                 self.viewer += 1
@@ -165,7 +165,7 @@ class PupilFinder:
             elif look.looks @ self._looks > SAME_LOOKS:
                 return look
             else:
-                self.reason = "another person's face"
+                self.reason = "there is only another person's face"
         return None
 
     def _measured(self, picture: U8, mesh: F64, presence: float) -> _Look:
@@ -179,11 +179,11 @@ class PupilFinder:
             iris[side] = (np.linalg.norm(points[1] - points[3]) + np.linalg.norm(points[2] - points[4])) / 2
             openness[side] = np.linalg.norm(lids[4] - lids[12]) / np.linalg.norm(lids[0] - lids[8])
         line = eyes[0] - eyes[1]
-        eyes -= TOO_LOW * np.array([-line[1], line[0]])  # towards the chin for any roll of the head
+        eyes -= TOO_LOW * np.array([-line[1], line[0]])  # towards the chin, for any roll of the head
         return _Look(mesh, presence, eyes, iris, openness, _looks(picture, mesh, float(np.linalg.norm(line))))
 
     def _steadied(self, picture: U8, look: _Look, seen: Seen) -> Pupils:
-        """Reduce the networks' jitter by moving the previous picture's pupils, if any, along with the face."""
+        """Reduce the jitter of the networks by moving the previous pupils, if any, along with the face."""
         eyes, surprise, hidden = look.eyes.copy(), np.zeros(2), np.zeros(2, bool)
         last = self._last if self._steps else None
         if last is not None:
@@ -219,13 +219,13 @@ class PupilFinder:
 
 
 def _worth(face: FoundFace, middle: F64) -> float:
-    """Score for choosing this face as the viewer's: its size, reduced towards the picture's edges."""
+    """Return the score of a face when choosing the viewer: its size, reduced towards the edges."""
     away = np.abs(face.box[:2] + face.box[2:] / 2 - middle) / middle
     return face.size * (1 - FARTHEST_OUT * float(np.linalg.norm(away) / np.sqrt(2)))
 
 
 def _square_of(mesh: F64) -> Square:
-    """Region of the next input to the mesh network, from a previous mesh."""
+    """Return the region of the next input to the mesh network, given a previous mesh."""
     line = mesh[CORNERS[0][1], :2] - mesh[CORNERS[1][0], :2]
     angle = float(np.arctan2(line[1], line[0]))
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -235,7 +235,7 @@ def _square_of(mesh: F64) -> Square:
 
 
 def _looks(picture: U8, mesh: F64, eye_distance: float) -> F64:
-    """(468,) grey values at the mesh's points, of mean 0 and norm 1: for one person similar in any light."""
+    """Return grey values (468,) at the face points, with mean 0 and norm 1 to be independent of light."""
     margin = max(2, round(eye_distance / 4))
     height, width = picture.shape[:2]
     x0, y0 = np.clip(mesh[:, :2].min(axis=0).astype(int) - margin, 0, [width - 1, height - 1])
@@ -251,7 +251,7 @@ def _looks(picture: U8, mesh: F64, eye_distance: float) -> F64:
 
 
 def _similarity(last: F64, mesh: F64) -> F64:
-    """(2, 3) similarity that maps the old corners of the eyes to the new ones."""
+    """Return the similarity (2, 3) that maps the old corners of the eyes to the new ones."""
     corners = np.ravel(CORNERS)
     matrix, _ = cv2.estimateAffinePartial2D(last[corners, :2], mesh[corners, :2], method=cv2.LMEDS)
     return np.eye(2, 3) if matrix is None else np.asarray(matrix, np.float64)
@@ -263,7 +263,7 @@ def _still_finder() -> PupilFinder:
 
 
 def find_eyes(picture: U8) -> Pupils | None:
-    """Return the nearest viewer's pupils in an (h, w, 3) uint8 RGB picture, None without a viewer."""
+    """Return the nearest viewer's pupils in an RGB picture (h, w, 3), or None without a viewer."""
     finder = _still_finder()
     finder.forget()
     return finder.find(picture)

@@ -1,4 +1,4 @@
-"""Detection of a head at rest, from the accepted samples.
+"""Detection of a head at rest from accepted samples.
 
 The tracker's predictions jitter by several times the sensor's noise, because the prediction horizon amplifies the noise
 in the estimated velocity. For a head at rest, the median of its samples is the best estimate of its position, and the
@@ -16,10 +16,10 @@ REST_NS = NS_PER_S  # a head counts as at rest if it has not moved for this long
 LOST_NS = NS_PER_S  # a longer gap between samples resets the detector
 DRIFT_NS = 3 * NS_PER_S  # time span of the median that measures drift
 EVERY = 8  # samples between measurements of noise and drift, which change slowly
-FEWEST = 8  # least number of samples for any conclusion
+FEWEST = 8  # minimum number of samples for any conclusion
 KEPT = 256  # samples kept of a resting head
 GRACE_M = 0.0005  # added to every threshold, for sensors without noise
-NOISE_MAX_M = 0.005  # with more noise than this no head counts as resting, because a departure would go unnoticed
+NOISE_MAX_M = 0.005  # with more noise no head counts as resting, because a departure would go unnoticed
 # In standard deviations of one sample; white noise at 60 samples a second exceeds each once in hours.
 SINGLE = 4.5  # two consecutive samples, off in the same direction
 MEDIAN_OF_FIVE = 2.6  # of the newest five samples
@@ -31,10 +31,10 @@ NEAREST_M = 0.1  # nearest distance from the display; smaller ones are raised to
 
 
 class RestWatch:
-    """Detects a resting head, and its position, from accepted samples. Not thread-safe; reads no clock."""
+    """Detector of a resting head and its position. Not thread-safe; reads no clock."""
 
     def __init__(self, *, max_drift_m: float) -> None:
-        """max_drift_m: drift, in excess of the noise, that updates a resting head's position."""
+        """max_drift_m: drift in excess of the noise that updates the position of a resting head."""
         self._max_drift_m = max_drift_m
         self._times = np.zeros(2 * KEPT, np.int64)
         self._eyes = np.zeros((2 * KEPT, 2, 3))
@@ -44,7 +44,7 @@ class RestWatch:
         self.sigma_m = 0.0  # standard deviation of `place` along an axis, undetected drift included
 
     def update(self, eyes_m: F64, *, capture_ns: int) -> None:
-        """Add one sample (2, 3), frame `stack`."""
+        """Add one sample (2, 3) in the stack frame."""
         if self._count and not 0 < capture_ns - self._times[self._count - 1] < LOST_NS:
             self.forget()
         self._append(eyes_m, capture_ns)
@@ -82,7 +82,7 @@ class RestWatch:
         self._count = count
 
     def _since(self, time_ns: int) -> F64:
-        """Return (n, 2, 3) samples from `time_ns` onwards, plus earlier ones if there are fewer than `FEWEST`."""
+        """Return samples (n, 2, 3) from `time_ns` on, plus earlier ones if there are fewer than `FEWEST`."""
         first = min(int(np.searchsorted(self._times[: self._count], time_ns)), self._count - FEWEST)
         return self._eyes[first : self._count]
 
@@ -96,7 +96,7 @@ class RestWatch:
         self.sigma_m = float(np.hypot(median_sigma_m, drift_m / 2**0.5))  # drift is mostly in one direction
 
     def _measure_noise(self) -> None:
-        """Measure noise as each sample's distance from the line between its neighbours: steady motion adds none."""
+        """Measure noise as the distance of samples from the line between neighbours, to exclude steady motion."""
         first = max(0, self._count - KEPT // 2)
         times, shifts = self._times[first : self._count], _shifts(self._eyes[first : self._count], self._eyes[first])
         later = ((times[1:-1] - times[:-2]) / (times[2:] - times[:-2]))[:, None]  # neighbours may be missing
@@ -120,7 +120,7 @@ class RestWatch:
         return not self._left(np.median(recent, axis=0))
 
     def _left(self, place: F64) -> bool:
-        """Return True if the newest samples deviate by more than noise can explain."""
+        """Return True if the newest samples deviate more than noise explains."""
         shifts = _shifts(self._eyes[self._count - 5 : self._count], place)
         if (np.abs(np.median(shifts, axis=0)) > MEDIAN_OF_FIVE * self.noise_m + GRACE_M).any():
             return True
@@ -143,9 +143,10 @@ class RestWatch:
 
 
 def _shifts(eyes_m: F64, place: F64) -> F64:
-    """(n, 6) displacements, m, of samples (n, 2, 3) from a place (2, 3), weighted by their effect on the display.
+    """Return displacements (n, 6) of samples (n, 2, 3) from a place (2, 3), by effect on the display.
 
-    For each eye: right and up as seen from the display's centre, and the effect of its distance on off-centre points.
+    For each eye these are right and up as seen from the display's centre, and the effect of its distance on off-centre
+    points, all in metres.
     """
     away = eyes_m - place
     distance = np.maximum(place[:, :1], NEAREST_M)

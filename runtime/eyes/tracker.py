@@ -1,4 +1,4 @@
-"""Tracker of the eyes: gating, filtering, history and prediction."""
+"""Tracker of the eyes, with gating, filtering, history and prediction."""
 
 from __future__ import annotations
 
@@ -58,13 +58,13 @@ class _Head(NamedTuple):
         return (time_ns - self.capture_ns) / NS_PER_S
 
     def eyes_m(self, ahead_s: float) -> F64:
-        """Return (2, 3) left and right eye, `ahead_s` seconds after the newest sample."""
+        """Return the left and right eye (2, 3) `ahead_s` seconds after the newest sample."""
         middle, half = imm.ahead(self.middle, ahead_s), imm.ahead(self.half, ahead_s)
         return np.array([middle - half, middle + half])
 
 
 class _Sample(NamedTuple):
-    """One measurement that passed the plausibility checks."""
+    """Measurement that has passed the plausibility checks."""
 
     capture_ns: int
     middle_m: F64  # (3,)
@@ -78,7 +78,7 @@ class _Sample(NamedTuple):
         return _Head(self.capture_ns, middle, half, 1, 0.0)
 
     def continued(self, head: _Head) -> _Head | None:
-        """Update a head with this sample; None if the sample cannot belong to that head."""
+        """Return a head updated with this sample, or None if the sample cannot belong to it."""
         age_s = head.age_s(self.capture_ns)
         if age_s > KEEP_S:
             return None
@@ -109,14 +109,14 @@ class _Sample(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Shown:
-    """The viewer's head after a sample, and the jump that still has to be smoothed out."""
+    """Viewer's head after a sample, with the jump that is still to be smoothed out."""
 
     head: _Head
     jump_m: F64  # (2, 3) from the measured eyes to those last shown, at `jump_ns`; decays afterwards
     jump_ns: int
 
     def eyes_m(self, ahead_s: float, time_ns: int) -> F64:
-        """Return the (2, 3) eyes to show at `time_ns`, predicted `ahead_s` seconds ahead."""
+        """Return the eyes (2, 3) to show at `time_ns`, predicted `ahead_s` seconds ahead."""
         eyes = self.head.eyes_m(ahead_s)
         if self.jump_m is not NO_JUMP:
             fraction = min(max((time_ns - self.jump_ns) / NS_PER_S / REVIVE_S, 0.0), 1.0)
@@ -125,14 +125,14 @@ class _Shown:
 
 
 class _Other(NamedTuple):
-    """A head seen somewhere other than the viewer's position."""
+    """Head seen away from the viewer."""
 
     head: _Head
     may_be_viewer: bool  # True if the viewer could have moved there
 
 
 class Tracker:
-    """Tracks one viewer's eyes.
+    """Tracker of one viewer's eyes.
 
     `update` takes samples as they arrive; `at` returns the eye positions for a given time. The first person seen
     remains the viewer while visible. When eyes return after a loss, the output moves smoothly from the last position
@@ -146,7 +146,7 @@ class Tracker:
         panel_m: tuple[float, float] = PANEL_M,
         in_front_m: float = 0.0,
     ) -> None:
-        """panel_m: (width, height), which sets the weight of depth errors; in_front_m: minimum x of an eye."""
+        """panel_m: (width, height), which sets the weight of depth errors. in_front_m: minimum x of an eye."""
         self.settings = settings or TrackerSettings()
         self._panel_m, self._in_front_m = panel_m, in_front_m
         self._history: deque[_Shown] = deque(maxlen=HISTORY)
@@ -156,7 +156,7 @@ class Tracker:
         self._asked_ns = 0  # display time of the last picture: the latest argument of `at`
 
     def update(self, points: EyePoints | None, *, capture_ns: int) -> str:
-        """Add a sample in the `stack` frame, or None if the sensor saw no face.
+        """Add a sample in the stack frame, or None if the sensor saw no face.
 
         Returns the reason for a refusal, or an empty string. Samples are refused if they are old, uncertain (a blink),
         implausible for a person, or away from the viewer. If two consecutive samples are at a position that the viewer
@@ -184,7 +184,7 @@ class Tracker:
         self._newest_ns, self._asked_ns = -1, 0
 
     def _noise(self, points: EyePoints) -> F64:
-        """Return the (3, 3) covariance, m², of the eyes' midpoint: the driver's, with a floor, or the settings'."""
+        """Return the covariance (3, 3), in m², of the midpoint, from the driver (with a floor) or the settings."""
         noise: F64 = self.settings.noise_m**2 / 2 * np.eye(3)
         if points.covariance_m2 is not None and np.isfinite(points.covariance_m2).all():
             variances, axes = np.linalg.eigh((points.covariance_m2 + points.covariance_m2.T) / 2)
@@ -218,7 +218,7 @@ class Tracker:
             and len(self._history) > 1
             and (head := sample.continued(self._history[-2].head))
         ):
-            self._history.pop()  # a mistake: the last two samples fit better without it
+            self._history.pop()  # the last two samples fit better without this one
             self._follow(head, is_return=True)
         elif age_s > min(ANOTHER_AFTER_S, self.settings.hold_s) or (is_second and last.head.samples < ESTABLISHED):
             self._history.clear()
@@ -229,7 +229,7 @@ class Tracker:
         return ""
 
     def _follow(self, head: _Head, *, is_return: bool = False) -> None:
-        """Make `head` the viewer's. is_return: it follows a loss or a jump, so blend from the last position shown."""
+        """Make `head` the viewer's. is_return: blend from the last position shown, after a loss or a jump."""
         jump_m, jump_ns = (self._history[-1].jump_m, self._history[-1].jump_ns) if self._history else (NO_JUMP, 0)
         if is_return:
             jump_ns = max(self._asked_ns, head.capture_ns)
@@ -241,14 +241,14 @@ class Tracker:
             self._other = None
 
     def ahead(self, time_ns: int) -> EyesEstimate:
-        """Estimate as `at` does, for a time that is not shown (yet), without affecting later calls to `at`."""
+        """Estimate like `at` for a time that is not shown, without affecting later calls to `at`."""
         asked_ns = self._asked_ns
         estimate = self.at(time_ns)
         self._asked_ns = asked_ns
         return estimate
 
     def at(self, time_ns: int) -> EyesEstimate:
-        """Return the eyes at a display time, given on the samples' clock.
+        """Return the eyes at a display time on the clock of the samples.
 
         Labels: `exact` at a sample; `interpolated` between two samples; `predicted` at most `HORIZON_S` after the
         newest; `held` when the face is lost and the eyes slow to rest; `none` if they were never seen, were lost for
@@ -284,7 +284,7 @@ class Tracker:
         return self._estimate(time_ns, after.head, eyes_m, "interpolated")
 
     def _estimate(self, time_ns: int, head: _Head, eyes_m: F64, label: EyesLabel) -> EyesEstimate:
-        """Add the standard deviation of `eyes_m`, based on how far the head may have moved since its newest sample."""
+        """Add the standard deviation of `eyes_m`, given how far the head may have moved since its sample."""
         age_s = min(max(head.age_s(time_ns), 0.0), SIGMA_AHEAD_S)
         middle_m, half_m = (eyes_m[0] + eyes_m[1]) / 2, (eyes_m[1] - eyes_m[0]) / 2
         if label in ("exact", "interpolated"):
@@ -296,11 +296,11 @@ class Tracker:
 
 
 def sideways_sigma_m(error_m2: F64, eye_m: F64, *, panel_m: tuple[float, float]) -> float:
-    """Sideways standard deviation that affects the picture as much as an eye's (3, 3) covariance does.
+    """Return the sideways standard deviation with the same effect on the picture as a covariance (3, 3).
 
-    If an eye is nearer than its estimated distance x by d, the effect at a display point is that of a sideways
-    displacement of d·u/x, where u is the distance from that point to the foot of the eye's perpendicular. The result is
-    the root mean square over the display.
+    If an eye is nearer than its estimated distance x by d, a display point is affected as by a sideways displacement of
+    d·u/x, where u is the distance from that point to the foot of the eye's perpendicular. The result is the root mean
+    square over the display.
     """
     x, y, z = max(float(eye_m[0]), NEAREST_M), float(eye_m[1]), float(eye_m[2])
     lever2 = (y * y + z * z + (panel_m[0] ** 2 + panel_m[1] ** 2) / 12) / (x * x)
