@@ -157,7 +157,7 @@ class PupilFinder:
                 continue
             look = self._measured(picture, mesh, presence)
             if not look.are_human():
-                self.reason = "there is a face, but its eyes are not a person's"
+                self.reason = "a face without a person's eyes"
             elif self._looks is None:
                 self.choice = f"locked on the foremost of {len(faces)} face(s)"
                 self.viewer += 1
@@ -165,7 +165,7 @@ class PupilFinder:
             elif look.looks @ self._looks > SAME_LOOKS:
                 return look
             else:
-                self.reason = "there is only another person's face"
+                self.reason = "another person's face"
         return None
 
     def _measured(self, picture: U8, mesh: F64, presence: float) -> _Look:

@@ -93,7 +93,7 @@ def test_the_published_prototype_matrix_is_a_similarity_to_its_printed_digits(tm
     ("text", "wanted"),
     [
         *((toml(np.diag([scale, scale, scale, 1.0])), "stack_from_sensor") for scale in (1e200, 1e-200, 1e6, 1e-6)),
-        ("", "stack_from_sensor: missing"),
+        ("", "stack_from_sensor: is missing"),
         ("stack_from_sensor = [[1,", "malformed"),
         ("stack_from_sensor = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]", "stack_from_sensor"),
         ("stack_from_sensor = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0]]", "stack_from_sensor.0"),
