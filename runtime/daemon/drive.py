@@ -47,11 +47,13 @@ def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> 
         run.observer.finish(lambda: host is not None and bool(host.stop_reason()))
         summary = run.summary() | {"stopped": reason}
         if output is not None:
-            last = run.presenter.last
+            last, moment = run.presenter.last, run.observer.moment
             has_picture = last is not None and (last.frame.solved is not None or last.frame.flat is not None)
             layers = shown_layers(last.frame) if last is not None and has_picture else None
-            unseen = "" if last is None or layers is None else _unseen(layers, last.account, run, settings)
-            output.finish(summary, layers, run.observer.moment, unseen=unseen)
+            unseen = ""
+            if last is not None and layers is not None and moment is None:
+                unseen = _unseen(layers, last.account, run, settings)
+            output.finish(summary, layers, moment, unseen=unseen)
     wait_for_all(JOBS_END_WITHIN_S)
     return summary
 

@@ -16,7 +16,7 @@ from runtime.evaluation.refresh_quality import Pictures
 from runtime.records import U8
 from runtime.support.artifacts import OutputFolder, to_json, write_json, write_png, write_text
 from runtime.support.background import MEASURING_NICENESS, set_niceness
-from runtime.support.threads import parallel_map
+from runtime.support.threads import fresh_threads, parallel_map
 
 log = logging.getLogger("phasestack.output")
 
@@ -105,6 +105,7 @@ class RunOutput:
         """Block on disk writes and speed them up from now on: they can no longer delay a refresh."""
         self._every_one = True
         set_niceness(0, self._writer)
+        fresh_threads()  # the solver's and the measurements' have a low priority
 
     def finish(
         self, summary: dict[str, Any], layers: U8 | None, moment: Moment | None = None, *, unseen: str = ""

@@ -34,6 +34,11 @@ def on_rows(work: Callable[[int, int], None], rows: int, *, threads: int | None 
     parallel_map(lambda span: work(*span), list(pairwise(rows * part // parts for part in range(parts + 1))))
 
 
+def fresh_threads() -> None:
+    """Have later calls of `parallel_map` start new threads, which inherit the niceness of the first caller."""
+    _pool.cache_clear()
+
+
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
     """Return the thread pool, which is kept because starting a thread takes two milliseconds."""
