@@ -35,7 +35,7 @@ def on_rows(work: Callable[[int, int], None], rows: int, *, threads: int | None 
 
 
 def fresh_threads() -> None:
-    """Have later calls of `parallel_map` start new threads, which inherit the niceness of the first caller."""
+    """Have `parallel_map` start new threads, which inherit the niceness of its next caller."""
     _pool.cache_clear()
 
 
