@@ -1,4 +1,4 @@
-"""Checkpoints. They are read as weights only, so no code from the file runs, and written atomically."""
+"""Checkpoints, which are read as weights only (no code from them runs) and written atomically."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from runtime.errors import InputError, one_line
 from runtime.support import untrusted_input
 from runtime.support.artifacts import write_bytes
 
-FILE_BYTES_MAX = 4 << 30  # largest checkpoint
+FILE_BYTES_MAX = 4 << 30  # maximum size of a checkpoint
 WIDTH_KEY = "subnets.in_conv.0.weight"
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """Read a checkpoint's table, which contains at least `model`, a table of tensors. Raises InputError.
+    """Read a checkpoint: a table with at least `model`, a table of tensors. Raises InputError.
 
     Only plain values, tensors and an `argparse.Namespace` of plain values (saved by the published code) are
-    deserialised; no code from the file runs.
+    deserialised.
     """
     data = untrusted_input.read_bytes(path, most_bytes=FILE_BYTES_MAX)
     try:
@@ -33,7 +33,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         raise InputError(path, "", f"is not a checkpoint of plain weights ({one_line(str(error), most=120)})") from None
     state = table.get("model") if isinstance(table, dict) else None
     if not isinstance(state, Mapping) or not state or not all(isinstance(v, Tensor) for v in state.values()):
-        raise InputError(path, "model", 'is missing; a checkpoint must contain {"model": state_dict}')
+        raise InputError(path, "model", 'is missing; a checkpoint must have the form {"model": state_dict}')
     return table
 
 
@@ -46,7 +46,7 @@ def eyereal_width(state: Mapping[str, Tensor], *, source: Path) -> int:
 
 
 def fill(net: nn.Module, state: Mapping[str, Tensor], *, source: str | Path, arch: str) -> None:
-    """Load exactly the weights that a network has. Raises InputError, naming the first wrong one."""
+    """Load the weights, which must match the network. Raises InputError that names the first wrong one."""
     expected = net.state_dict()
     missing = [key for key in expected if key not in state]
     # Old checkpoints lack this counter, which inference does not use.

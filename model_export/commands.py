@@ -17,16 +17,16 @@ def require(*modules: str) -> None:
     """Raise MissingPart with the package to install if a module of the `export` extra is missing."""
     for module in modules:
         if importlib.util.find_spec(module) is None:
-            raise MissingPart(f"{module} is not installed: pip install 'phasestack[export]'")
+            raise MissingPart(f"{module} is not installed; run: pip install 'phasestack[export]'")
 
 
-Arch = Annotated[str, typer.Option(help="eyereal, unrolled, or module:Class for a torch.nn.Module on Python's path")]
+Arch = Annotated[str, typer.Option(help="eyereal, unrolled, or module:Class for your own torch.nn.Module")]
 Options = Annotated[
     list[str] | None,
     typer.Option(
         "--option",
         metavar="NAME=VALUE",
-        help="an option of the network, or steps=N for the number of solver steps after it; repeatable",
+        help="option NAME=VALUE of the network, or steps=N solver steps after it; may be repeated",
     ),
 ]
 
@@ -36,26 +36,27 @@ def train(
     arch: Arch,
     option: Options = None,
     data: Annotated[
-        Path | None, typer.Option(help="folder of pairs in EyeReal's format; default: procedural pairs")
+        Path | None, typer.Option(help="folder of pairs in the format of EyeReal; default: procedural pairs")
     ] = None,
     scene: Annotated[str, typer.Option(help="scene or file to draw, at random rotations and eye positions")] = "",
-    pairs: Annotated[int, typer.Option(min=0, help="number of distinct pairs; 0: unlimited")] = 0,
+    pairs: Annotated[int, typer.Option(min=0, help="number of different pairs; 0: unlimited")] = 0,
     panels: Annotated[
-        Path | None, typer.Option(help="configuration of the panels; default: any three evenly spaced ones")
+        Path | None,
+        typer.Option(help="configuration of the panels; default: random stacks of three"),
     ] = None,
-    iterations: Annotated[int, typer.Option(min=1, help="total gradient steps")] = 2000,
+    iterations: Annotated[int, typer.Option(min=1, help="total number of gradient steps")] = 2000,
     batch: Annotated[int, typer.Option(min=1, help="pairs per iteration")] = 1,
     learning_rate: Annotated[float, number(1e-8, 1, help="initial learning rate, with cosine decay to zero")] = 1e-3,
     width: Annotated[int, typer.Option(min=32, max=8192, help="of panels and pictures in training, pixels")] = 480,
     height: Annotated[int, typer.Option(min=32, max=8192, help="of panels and pictures in training, pixels")] = 270,
-    eye_sigma_mm: Annotated[float, number(0, 20, "mm", help="standard deviation of the tracking error")] = 1.0,
-    seed: Annotated[int, typer.Option(min=0, help="of weights and pairs")] = 1,
+    eye_sigma_mm: Annotated[float, number(0, 20, "mm", help="standard deviation of the tracking error in mm")] = 1.0,
+    seed: Annotated[int, typer.Option(min=0, help="seed of weights and pairs")] = 1,
     validate_every: Annotated[int, typer.Option(min=1, help="iterations between points of the curve")] = 100,
     device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="auto: a GPU if torch finds one")] = "auto",
-    resume: Annotated[bool, typer.Option("--resume", help="continue from --out's checkpoint")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="continue from the checkpoint in --out")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="the result as one object on stdout")] = False,
 ) -> None:
-    """Train a picture network by gradient descent on the light that reaches the eyes.
+    """Train a picture network by gradient descent on the light at the eyes.
 
     Example: phasestack train --arch my_network:MyNetwork --out out/mine
     """
@@ -91,7 +92,7 @@ def options_of(texts: list[str] | None) -> dict[str, Any]:
     for text in texts or []:
         name, equals, value = text.partition("=")
         if not (name and equals):
-            raise InputError("--option", "", f"{text!r} is not NAME=VALUE")
+            raise InputError("--option", "", f"must have the form NAME=VALUE, not {text!r}")
         try:
             options[name] = json.loads(value)
         except ValueError:
@@ -103,21 +104,22 @@ def export(
     arch: Annotated[str, typer.Option(help="fast, balanced, best, eyereal, unrolled, or module:Class")],
     out: Annotated[Path, typer.Option(help="the ONNX file")],
     checkpoint: Annotated[
-        Path | None, typer.Option(help="weights from `phasestack train`, or published ones for eyereal")
+        Path | None,
+        typer.Option(help="weights from `phasestack train` or, for eyereal, the published ones"),
     ] = None,
-    random_init: Annotated[int | None, typer.Option(min=0, help="untrained weights from this seed")] = None,
-    width: Annotated[int, typer.Option(help="panels' width in pixels")] = 1920,
-    height: Annotated[int, typer.Option(help="panels' height in pixels")] = 1080,
+    random_init: Annotated[int | None, typer.Option(min=0, help="use untrained weights with this seed")] = None,
+    width: Annotated[int, typer.Option(help="width of the panels in pixels")] = 1920,
+    height: Annotated[int, typer.Option(help="height of the panels in pixels")] = 1080,
     eye_order: Annotated[
-        Literal["left-right", "right-left"], typer.Option(help="eyereal: order of the eyes in its training data")
+        Literal["left-right", "right-left"], typer.Option(help="for eyereal: order of the eyes in the training data")
     ] = "left-right",
     option: Options = None,
     as_json: Annotated[bool, typer.Option("--json", help="the checks as one object on stdout")] = False,
 ) -> None:
-    """Write a model as ONNX with its contract, if its results agree with torch's.
+    """Write a model and its contract as ONNX, if its results agree with those of torch.
 
-    fast, balanced and best are built from their recipes, without --checkpoint or --random-init.
-    Exits with 1 if a check fails.
+    fast, balanced and best are built from their recipes, without --checkpoint or --random-init. If a check fails, exits
+    with 1.
 
     Example: phasestack export --arch eyereal --checkpoint published.pth --out eyereal.onnx
     """
@@ -136,7 +138,7 @@ def export(
     )
     typer.echo(report.json() if as_json else report.table())
     if not report.passed:
-        typer.echo(f"{out}: not written, because a check failed", err=True)
+        typer.echo(f"{out} was not written because a check failed", err=True)
         raise typer.Exit(1)
 
 
@@ -144,7 +146,7 @@ def validate(
     file: Annotated[Path, typer.Argument(help="the ONNX file")],
     as_json: Annotated[bool, typer.Option("--json", help="the checks as one object on stdout")] = False,
 ) -> None:
-    """Check a model file: contract, names, shapes, and finite values on stress inputs.
+    """Check the contract, names and shapes of a model file, and its values for stress inputs.
 
     Exits with 1 if a check fails.
 

@@ -53,7 +53,7 @@ def test_a_command_names_the_extra_that_it_needs(
         (tmp_path / "openni2.toml").write_text('[sensor]\ndriver = "openni2"\n')
         command = [*command, "--config", "openni2.toml"]
     done = without(package, command=command)
-    told = f"phasestack: {package} is not installed: pip install 'phasestack[{extra}]'"
+    told = f"phasestack: {package} is not installed; run: pip install 'phasestack[{extra}]'"
     assert done.returncode == 2 and told in done.stderr.splitlines()  # a log's thread may write after it
     assert "Traceback" not in done.stderr and "unexpected" not in done.stderr
 
@@ -61,6 +61,6 @@ def test_a_command_names_the_extra_that_it_needs(
 def test_the_doctor_lists_what_is_not_installed_and_goes_on() -> None:
     done = without("moderngl", "usb", command=["doctor"])
     assert done.returncode == 1
-    assert "fail  opengl: moderngl is not installed: pip install 'phasestack[content]'" in done.stdout
-    assert "skip  usb: pyusb is not installed: pip install 'phasestack[sensors]'" in done.stdout
+    assert "fail  opengl: moderngl is not installed; run: pip install 'phasestack[content]'" in done.stdout
+    assert "skip  usb: pyusb is not installed; run: pip install 'phasestack[sensors]'" in done.stdout
     assert "service:" in done.stdout

@@ -1,4 +1,4 @@
-"""Atomic writing of files and pictures: written under a temporary name, synced, then renamed."""
+"""Atomic output of files and pictures, which are written under a temporary name, synced and renamed."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def put_in_place(part: Path, path: Path) -> None:
 
 
 def write_bytes(path: Path, data: bytes, *, like: Path | None = None) -> None:
-    """Write a file atomically, creating its parents. Raises InputError.
+    """Write a file and its folders atomically. Raises InputError.
 
     like: file whose owner and mode are copied; None for the replaced file, if there is one.
     """
@@ -58,7 +58,7 @@ def write_bytes(path: Path, data: bytes, *, like: Path | None = None) -> None:
         with os.fdopen(handle, "wb") as file:
             file.write(data)
         if before is not None:
-            with suppress(PermissionError):  # replacing another user's file makes it ours
+            with suppress(PermissionError):  # the replaced file may belong to another user
                 os.chown(name, before.st_uid, before.st_gid)
         Path(name).chmod(0o644 if before is None else stat.S_IMODE(before.st_mode))
         if any(part.startswith(STAGING) for part in path.parts):  # OutputFolder syncs all files at its end
@@ -67,7 +67,7 @@ def write_bytes(path: Path, data: bytes, *, like: Path | None = None) -> None:
             put_in_place(Path(name), path)
     except BaseException as error:
         Path(name).unlink(missing_ok=True)
-        if isinstance(error, OSError):  # for example, a full or failing disk
+        if isinstance(error, OSError):  # for example because the disk is full
             raise InputError(path, "", f"cannot be written ({error.strerror})") from None
         raise
 
@@ -89,7 +89,7 @@ def _listed(item: Any) -> Any:
     """Convert objects that the encoder does not know."""
     if isinstance(item, np.ndarray | np.generic):
         return item.tolist()
-    raise TypeError(f"objects of type {type(item).__name__} can't be written as JSON")
+    raise TypeError(f"objects of type {type(item).__name__} cannot be written as JSON")
 
 
 def _finite(item: Any) -> Any:
@@ -114,7 +114,7 @@ def png_bytes(image: U8) -> bytes:
     bgr = image if image.ndim == 2 else np.ascontiguousarray(image[..., 2::-1])
     done, buffer = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not done:
-        raise ValueError("PNG encoding failed")
+        raise ValueError("OpenCV could not encode a picture as PNG")
     return buffer.tobytes()
 
 
@@ -124,7 +124,7 @@ def write_png(path: Path, image: U8) -> None:
 
 
 class OutputFolder:
-    """A folder whose new files appear all together at the end, or not at all.
+    """Folder whose new files appear all together at the end, or not at all.
 
     Use it as a context manager and write to `staging`. On success all files are renamed into `target`, replacing files
     of the same names. After an error no new file remains. The next writer removes staged files of a killed process.
@@ -190,7 +190,7 @@ class OutputFolder:
 
 
 def _sweep(target: Path) -> None:
-    """Remove staging folders of killed processes. Their lock is missing, which also shows across namespaces."""
+    """Remove staging folders of killed processes, which hold no lock. This works across namespaces."""
     for stale in target.glob(f"{STAGING}*"):
         with suppress(OSError):
             opened = os.open(stale, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
@@ -214,7 +214,7 @@ def _check_free(place: Path, *, within: Path) -> None:
 
 @contextmanager
 def held_back() -> Iterator[None]:
-    """Suppress libraries' output to stderr's file descriptor within the block.
+    """Suppress what libraries write to the file descriptor of stderr.
 
     Does nothing if other threads run, because the descriptor belongs to the whole process.
     """

@@ -1,4 +1,4 @@
-"""Background threads: priorities (presenter, solver, then the rest), abandonment and one-off jobs."""
+"""Background threads, with priorities (presenter, solver, then the rest), abandonment and jobs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PRESENTER_NICENESS = -10
 SOLVER_NICENESS = 5
 BACKGROUND_NICENESS = 10
 MEASURING_NICENESS = 15  # for measurements and writing files, which are not urgent
-STOPS_WITHIN_S = 1.2  # time limit after a stop request; the rest of the two seconds is for calls without a timeout
+STOPS_WITHIN_S = 1.2  # time limit after a stop request; leaves time for calls without a timeout within two seconds
 T = TypeVar("T")
 
 _ends_by_s = math.inf
@@ -47,7 +47,7 @@ def wait_for_all(timeout_s: float) -> int:
 
 
 def begin(name: str, run: Callable[..., None], *args: Any) -> threading.Thread:
-    """Start a thread. Raises TransientError if the system refuses another."""
+    """Start a thread. Raises TransientError if the system cannot create one."""
     thread = threading.Thread(target=run, args=args, name=name, daemon=True)
     try:
         thread.start()
@@ -57,16 +57,16 @@ def begin(name: str, run: Callable[..., None], *args: Any) -> threading.Thread:
 
 
 class ThreadAbandoned(BaseException):
-    """Raised on an abandoned thread: its result is no longer wanted."""
+    """Raised on an abandoned thread, whose result is no longer wanted."""
 
 
 def abandon(thread: threading.Thread) -> None:
-    """Abandon a thread: its next call to `raise_if_abandoned` raises."""
+    """Abandon a thread, whose next call to `raise_if_abandoned` raises."""
     _abandoned.add(thread)
 
 
 def raise_if_abandoned() -> None:
-    """Raise ThreadAbandoned on an abandoned thread; called between operations such as drawing.
+    """Raise ThreadAbandoned on an abandoned thread. Called between operations such as drawing.
 
     An asynchronous exception could arrive inside a call to moderngl, which would crash.
     """
@@ -75,13 +75,13 @@ def raise_if_abandoned() -> None:
 
 
 class BackgroundJob(Generic[T]):
-    """A job that starts on construction. `done`, `problem` and `take` never block."""
+    """Job that starts on construction. `done`, `problem` and `take` never block."""
 
     def __init__(self, name: str, work: Callable[[], T], *, niceness: int = BACKGROUND_NICENESS) -> None:
         self._name, self._work, self._niceness = name, work, niceness
         self._result: T | None = None
         self.done = False
-        self.problem = ""  # one line with the reason if the job failed
+        self.problem = ""  # reason in one line if the job failed
         self._thread: threading.Thread | None = None
         try:
             self._thread = begin(f"job {name}", self._run)
@@ -94,7 +94,7 @@ class BackgroundJob(Generic[T]):
             self._thread.join(patience_s(timeout_s))
 
     def take(self) -> T | None:
-        """Hand over the result, or None if there is none yet or it has already been taken."""
+        """Return the result, or None if there is none yet or it has been taken."""
         result, self._result = self._result, None
         return result
 

@@ -1,7 +1,7 @@
 """Processing of untrusted files in a child process with limits on memory and time.
 
-Parsers hold Python's lock, and even a small file can make them use all memory. Arrays of the result are returned in
-shared memory. Progress, log lines and errors are forwarded as if the work ran in this process.
+Parsers hold Python's lock, and even a small file can make them use all memory. Arrays are returned in shared memory.
+Progress, log lines and errors are forwarded as if the work ran in this process.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def in_child(
             result = _outcome(ours, str(source), seconds)
             if result is None:
                 limit = f"needs more than {memory_bytes // MIB} MiB to read"
-                raise InputError(source, "", f"{limit}, or crashes the process that reads it ({child.wait()})")
+                raise InputError(source, "", f"{limit} or crashes the process that reads it ({child.wait()})")
             return pickle.loads(result[0], buffers=_mapped(memory, result[1]))  # type: ignore[no-any-return]
         finally:
             child.kill()
@@ -106,7 +106,7 @@ def _outcome(channel: Connection, source: str, seconds: float) -> tuple[bytes, l
 
 
 def _mapped(memory: int, sizes: list[int]) -> list[memoryview | bytearray]:
-    """Map the arrays copy-on-write. Small ones are copied, so that they don't keep the mapping alive."""
+    """Map the arrays copy-on-write. Small ones are copied, so that they do not keep the mapping alive."""
     total = sum(map(_room, sizes))
     whole = memoryview(mmap.mmap(memory, total, flags=mmap.MAP_PRIVATE) if total else b"")
     ends = [sum(map(_room, sizes[: number + 1])) for number in range(len(sizes))]
@@ -119,7 +119,7 @@ def _room(size: int) -> int:
 
 
 class _Forwarded(logging.Handler):
-    """Sends log records to the parent process."""
+    """Handler that sends log records to the parent process."""
 
     def __init__(self, channel: Connection) -> None:
         super().__init__()
@@ -135,7 +135,7 @@ def main(channel: Connection, memory: int) -> None:
     work, args, source, limits, (memory_bytes, seconds) = channel.recv()
     for name, limit in limits.items():
         setattr(LIMITS, name, limit)
-    processor_s = (os.cpu_count() or 1) * int(seconds) + 10  # a limit in case the parent can't kill the child
+    processor_s = (os.cpu_count() or 1) * int(seconds) + 10  # in case the parent cannot kill the child
     for kind, most in (
         (resource.RLIMIT_DATA, memory_bytes),
         (resource.RLIMIT_CPU, processor_s),

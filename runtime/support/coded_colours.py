@@ -24,7 +24,7 @@ SAMPLES = 4096  # number of samples of a transfer curve
 
 
 def stated_profile(coded: bytes) -> bytes:
-    """ICC profile of a picture's declared colours; empty for sRGB or unknown colours."""
+    """Return the ICC profile of a picture's declared colours, or nothing for sRGB or unknown colours."""
     found = NCLX.search(coded[:SEARCHED]) if coded[4:8] == b"ftyp" else None
     if found is None:
         return b""
@@ -49,7 +49,7 @@ def _fixed(*values: float) -> bytes:
 
 
 def _table(transfer: int) -> bytes:
-    """Table from codes to light in units of paper white; brighter light is clipped to white."""
+    """Return the light of each code in units of paper white, where brighter light is clipped."""
     code = np.linspace(0.0, 1.0, SAMPLES)
     light = _pq(code) if transfer == PQ else _hlg(code) / _hlg(np.array(0.75))  # where HLG has paper white
     values = np.rint(np.clip(light, 0.0, 1.0) * 65535).astype(">u2")
@@ -57,13 +57,13 @@ def _table(transfer: int) -> bytes:
 
 
 def _pq(code: F64) -> F64:
-    """Perceptual quantizer (PQ), SMPTE ST 2084."""
+    """Decode the perceptual quantizer (PQ), SMPTE ST 2084."""
     root = code ** (1 / 78.84375)
     shown = np.maximum(root - 0.8359375, 0.0) / (18.8515625 - 18.6875 * root)
     return np.asarray(shown ** (1 / 0.1593017578125) * (PQ_NITS / PAPER_NITS))
 
 
 def _hlg(code: F64) -> F64:
-    """Hybrid log-gamma (HLG), ARIB STD-B67, with the system gamma of a 1000-nit screen, per channel."""
+    """Decode hybrid log-gamma (HLG, ARIB STD-B67), per channel, with the gamma of a 1000-nit screen."""
     a, b, c = 0.17883277, 0.28466892, 0.55991073
     return np.asarray(np.where(code <= 0.5, code**2 / 3, (np.exp((code - c) / a) + b) / 12) ** 1.2)

@@ -1,4 +1,4 @@
-"""Reports of unexpected exceptions: the traceback goes to a file, and one line to the user."""
+"""Reports of unexpected exceptions. The traceback goes to a file, and one line to the user."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from runtime.errors import one_line, without_secrets
 from runtime.support.folders import state_folder
 
 STEM = "phasestack-error-"
-KEPT = 20  # files kept per folder, so that a service that fails repeatedly does not fill the disk
+KEPT = 20  # number of files kept, so that a service that fails repeatedly does not fill the disk
 
 
 def written(error: BaseException) -> str:
-    """Write an exception's report. Returns one line that names the file. Never raises."""
+    """Write the report of an exception. Returns one line that names the file. Never raises."""
     from runtime.support.version import version
 
     summary = one_line(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__)
@@ -50,7 +50,7 @@ def written(error: BaseException) -> str:
 
 
 def watch_threads() -> None:
-    """Report exceptions that end a thread or that Python can't raise, one line each."""
+    """Report exceptions that end a thread or that Python cannot raise, one line each."""
     threading.excepthook = lambda hook: _say(hook.exc_value, hook.exc_type)
     sys.unraisablehook = lambda hook: _say(hook.exc_value, hook.exc_type)
 
@@ -59,7 +59,7 @@ def _say(error: BaseException | None, kind: type[BaseException]) -> None:
     if issubclass(kind, SystemExit):
         return
     if issubclass(kind, KeyboardInterrupt):
-        # Python drops an interrupt that arrives in a finaliser or callback, or here: send the signal again.
+        # Send the signal again, because Python drops an interrupt that arrives in a finaliser or callback.
         again = threading.Timer(0.01, signal.raise_signal, (signal.SIGINT,))
         again.daemon = True
         again.start()

@@ -1,4 +1,4 @@
-"""Lookup of the extra of phasestack that installs a missing optional package."""
+"""Lookup of the phasestack extra that installs a missing optional package."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def missing_extra(error: BaseException) -> MissingPart | None:
     module = error.name.partition(".")[0]
     package = IMPORTED_AS.get(module, module).replace("_", "-")
     for extra in _extras_with(package):
-        return MissingPart(f"{package} is not installed: pip install 'phasestack[{extra}]'")
+        return MissingPart(f"{package} is not installed; run: pip install 'phasestack[{extra}]'")
     return None
 
 

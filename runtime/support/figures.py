@@ -1,4 +1,4 @@
-"""Formatting of a record as readable lines, with the same names as in JSON."""
+"""Formatting of records as readable lines, with the same names as in JSON."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Opening of films with OpenCV's FFmpeg backend, restricted to the named file."""
+"""Films opened with OpenCV's FFmpeg backend, which is restricted to the named file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _alone = threading.Lock()
 
 
 def open_film(path: Path) -> cv2.VideoCapture:
-    """Open a film. FFmpeg's and OpenCV's messages are suppressed, because our errors name the file.
+    """Open a film. Messages of FFmpeg and OpenCV are suppressed, because our errors name the file.
 
     FFmpeg is restricted, because a playlist or script with a film's suffix, or a name that looks like a URL, could make
     it open other files and connections. Raises InputError for anything but a file.

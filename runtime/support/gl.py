@@ -1,4 +1,4 @@
-"""Offscreen OpenGL context, through EGL with any driver (at least Mesa's llvmpipe)."""
+"""Offscreen OpenGL context through EGL, with any driver (at least Mesa's llvmpipe)."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ def offscreen_context() -> moderngl.Context:
         return moderngl.create_context(require=MINIMUM_VERSION, standalone=True, **EGL)
     except Exception as error:  # moderngl and glcontext raise plain Exception
         raise MissingPart(
-            f"no OpenGL without a screen ({str(error).strip() or 'EGL failed'}): "
+            f"no OpenGL without a screen ({str(error).strip() or 'EGL failed'}); "
             f"install Debian's packages {DEBIAN_PACKAGES}"
         ) from None
 
 
 def leave_context() -> None:
-    """Make no context current on this thread, because releasing the current one would leak it."""
+    """Make no context current on this thread. Releasing a current one would leak it."""
     egl, pointer = ctypes.CDLL(EGL["libegl"]), ctypes.c_void_p
     egl.eglGetCurrentDisplay.restype, egl.eglMakeCurrent.argtypes = pointer, [pointer] * 4
     egl.eglMakeCurrent(egl.eglGetCurrentDisplay(), None, None, None)
@@ -65,12 +65,12 @@ def finish() -> None:
 
 @dataclass(frozen=True, slots=True)
 class DrawnPicture:
-    """An 8-bit RGBA picture on the GPU; row 0 is the top."""
+    """8-bit RGBA picture on the GPU, with row 0 at the top."""
 
     texture: moderngl.Texture
     target: moderngl.Framebuffer  # contains `texture`
     held: U8  # (h, w, 4) the renderer's buffer for reading pixels back
-    grey: bool = False  # True if it is known to have no colour
+    grey: bool = False  # True if known to be without colour
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -78,7 +78,7 @@ class DrawnPicture:
         return self.held.shape
 
     def pixels(self) -> U8:
-        """(h, w, 4) pixels, valid until the next picture is drawn. Call on the thread of its context."""
+        """Return the pixels (h, w, 4), valid until the next drawing. Call on the thread of the context."""
         finish()
         self.target.read_into(self.held, components=4)
         return self.held

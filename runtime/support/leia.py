@@ -1,4 +1,4 @@
-"""Search for the second view of a Leia picture (LIF) from a Lume Pad: a JPEG followed by fields.
+"""Reader for the second view of a Leia picture (LIF, from a Lume Pad), a JPEG followed by fields.
 
 The file ends with the total length of the fields and a marker. The fields begin with their count; each has an
 identifier, a size and its bytes. One field describes the views in JSON: the position of each and the field that
@@ -19,7 +19,7 @@ JSON_BYTES_MAX = 65536
 
 
 def other_view(file: IO[bytes]) -> tuple[slice, bool] | None:
-    """Return a pair's other JPEG and whether it is the left eye's; None for other or damaged files."""
+    """Return the other JPEG of a pair and whether it is the left eye's, or None for other files."""
     size = file.seek(0, 2)
     if size < 6:
         return None
@@ -40,7 +40,7 @@ def other_view(file: IO[bytes]) -> tuple[slice, bool] | None:
     try:
         views = parsed_json(file.read(told.stop - told.start), source="LIF")["views"]
         across = sorted((float(view["xLocation"]), int(view["albedoId"])) for view in views)
-        # With more than two views, use the outermost, because neighbouring ones are closer together than eyes.
+        # Of more than two views use the outermost, because neighbours are closer together than eyes.
         left, right = across[0][1], across[-1][1]
         return (fields[right], False) if left == OWN else (fields[left], True) if right == OWN else None
     except (InputError, LookupError, TypeError, ValueError):

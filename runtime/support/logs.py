@@ -31,22 +31,22 @@ PRIORITY = {
 }
 ROOTS = ("phasestack", "runtime")  # loggers named by subject, and loggers named by module
 BURST = 5  # identical messages passed within `QUIET_NS`
-REMEMBERED = 1000  # different messages counted
+REMEMBERED = 1000  # maximum number of different messages counted
 QUIET_NS = 30 * NS_PER_S  # time after which a suppressed message passes again
-QUEUED_MAX = 4096  # lines waiting for a reader
-CLOSE_S = 1.0  # longest wait for the last lines
+QUEUED_MAX = 4096  # maximum number of lines that wait for a reader
+CLOSE_S = 1.0  # time limit for writing the last lines
 LINE_MAX = 4000  # characters
 
 
 class TextFormat(logging.Formatter):
-    """Formats messages with a priority under journald, which adds the time, else with time and level."""
+    """Formatter that adds a priority under journald, which adds the time, otherwise time and level."""
 
     def __init__(self, *, journald: bool) -> None:
         super().__init__()
         self._journald = journald
 
     def format(self, record: logging.LogRecord) -> str:
-        text = one_line(record.getMessage(), most=LINE_MAX)  # one line, so that names and messages can't forge another
+        text = one_line(record.getMessage(), most=LINE_MAX)  # one line, so that a name or message cannot forge another
         if record.exc_info and record.exc_info[1]:
             text += f": {written(record.exc_info[1])}"  # the text names the file with the traceback
         if self._journald:
@@ -56,9 +56,9 @@ class TextFormat(logging.Formatter):
 
 
 class RateLimit(logging.Filter):
-    """Passes five identical messages per 30 seconds. The next one gives the number suppressed.
+    """Filter that passes five identical messages per 30 s. The next one gives the number suppressed.
 
-    Records with `extra={"always": True}` (state transitions) always pass.
+    Records with `extra={"always": True}`, such as changes of state, always pass.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -86,7 +86,7 @@ class RateLimit(logging.Filter):
 
 
 class _Lines(logging.Handler):
-    """Writes lines to a descriptor. It blocks if the reader is slow, so only the listener's thread uses it."""
+    """Handler that writes lines to a descriptor. Blocks if the reader is slow, so only the listener uses it."""
 
     def __init__(self, descriptor: int) -> None:
         super().__init__()
@@ -102,7 +102,7 @@ class _Lines(logging.Handler):
 
 
 class QueuedLines(QueueHandler):
-    """Puts records into a bounded queue for a writer thread, and drops lines when the queue is full."""
+    """Handler with a bounded queue and a writer thread. Drops lines when the queue is full."""
 
     def __init__(self, descriptor: int, form: logging.Formatter) -> None:
         self.queue: queue.Queue[Any] = queue.Queue(QUEUED_MAX)
@@ -130,7 +130,7 @@ class QueuedLines(QueueHandler):
 
     def close(self) -> None:
         self.flush()
-        if not self.queue.unfinished_tasks:  # otherwise its thread is blocked and ends with the process
+        if not self.queue.unfinished_tasks:  # else its thread is blocked and ends with the process
             self._listener.stop()
         super().close()
 
@@ -143,7 +143,7 @@ def configure(
         if isinstance(old, QueuedLines):
             old.close()
     form = TextFormat(journald="JOURNAL_STREAM" in environment)
-    handler = QueuedLines(os.dup((stream or sys.stderr).fileno()), form)  # a copy, safe if the stream is closed
+    handler = QueuedLines(os.dup((stream or sys.stderr).fileno()), form)  # a copy, in case the stream is closed
     handler.addFilter(RateLimit(clock or MonotonicClock()))
     for name in ROOTS:
         root = logging.getLogger(name)

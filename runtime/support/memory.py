@@ -1,4 +1,4 @@
-"""Control over freed memory: keep it for the next frame or return it to the system."""
+"""Control over freed memory, which can be kept for the next frame or returned to the system."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from functools import cache
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8  # malloc.h of glibc
 LARGEST_KEPT = 32 << 20  # largest block kept, bytes; the maximum that every glibc accepts
 MOST_KEPT = 1 << 30  # free bytes kept at the heap's end
-ARENAS = 2  # heaps for all threads; by default there are eight per processor, and only the first returns memory
+ARENAS = 2  # number of heaps; the default is eight per processor, of which only the first returns memory
 
 
 def give_back() -> None:

@@ -1,4 +1,4 @@
-"""Numeric command-line options with ranges; errors name the option."""
+"""Numeric command-line options with ranges, whose errors name the option."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ OPTION_OF = {("content", "scene"): "scene", ("model", "name"): "model"}
 
 
 def number(low: float, high: float, unit: str = "", *, help: str) -> Any:
-    """Return an option whose numbers must be in [low, high], both finite.
+    """Return an option for numbers in [low, high], both finite.
 
     Any other value, NaN included, raises InputError during parsing, naming command and option.
     """
@@ -23,13 +23,13 @@ def number(low: float, high: float, unit: str = "", *, help: str) -> Any:
 
 
 def place(*, help: str) -> Any:
-    """Return an option for an eye's position: three coordinates in metres, within the settings' range."""
+    """Return an option for an eye position: three coordinates in metres, in the range of the settings."""
     return typer.Option(help=help, metavar="X Y Z", callback=_checked(-EYE_MOST_M, EYE_MOST_M, "m"))
 
 
 @contextmanager
 def blame_option(command: str, **options: Any) -> Iterator[None]:
-    """Make an InputError about a setting name the command-line option, if any, that set it."""
+    """Make an InputError about a setting name the option that set it, if any."""
     try:
         yield
     except InputError as error:

@@ -1,4 +1,4 @@
-"""Reading of stills, stereo pairs and animations as upright 8-bit sRGB over a background colour."""
+"""Reader for stills, stereo pairs and animations, as upright 8-bit sRGB over a background colour."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ log = logging.getLogger("phasestack.pictures")
 
 Colour = tuple[float, float, float]  # 0-1
 WHITE: Colour = (1.0, 1.0, 1.0)
-ROWS_AT_ONCE = 64  # rows converted together, to bound the memory
+ROWS_AT_ONCE = 64  # number of rows converted together, to bound the memory
 LATTICE = 9  # values per channel at which a colour profile is compared with sRGB
-SRGB_CODES = 2  # largest difference for a profile to count as sRGB
-STILL_MS = 100.0  # duration of an animation's frame that declares 0, as in browsers
+SRGB_CODES = 2  # maximum difference of a profile that counts as sRGB
+STILL_MS = 100.0  # duration of an animation frame that declares 0, as in browsers
 DEEP = {"I;16": "<u2", "I;16L": "<u2", "I;16B": ">u2", "I;16N": "=u2"}  # Pillow's 16-bit modes
 
 
 def read_image(path: Path, *, background: Colour = WHITE) -> U8:
-    """Read the (first) picture of a file as (h, w, 3) 8-bit sRGB, composed over a colour.
+    """Read the first picture of a file as 8-bit sRGB (h, w, 3), composed over a colour.
 
-    Raises InputError, naming the file, before decoding if the picture would need too much memory.
+    Raises InputError that names the file, before decoding if the picture would need too much memory.
     """
     return read_views(path, background=background)[0]
 
@@ -66,7 +66,7 @@ def read_animation(path: Path, *, background: Colour = WHITE) -> tuple[list[U8],
         numbers = range(1 if image.info.get("default_image") else 0, image.n_frames)
     if len(numbers) * header.width_px * header.height_px > LIMITS.pixels:
         size = f"{header.width_px} x {header.height_px}"
-        total = f"{len(numbers)} frames of {size} pixels; the maximum is {LIMITS.pixels:,} pixels in all"
+        total = f"{len(numbers)} frames of {size} pixels, more than {LIMITS.pixels:,} pixels in all"
         log.warning("%s has %s; showing only its first frame", path, total)
         numbers = numbers[:1]
     frames = list(_decoded(path, data, tuple(numbers), background))
@@ -103,7 +103,7 @@ def rgb_of(image: Any, source: object, *, background: Colour = WHITE) -> U8:
     image = _upright(image)
     if image.mode == "F" or (image.mode == "I" and image.format not in (None, "PPM")):
         raise InputError(
-            str(source), "", "its 32-bit values have no defined range: save it with 8 or 16 bits per channel"
+            str(source), "", "its 32-bit values have no defined range; save it with 8 or 16 bits per channel"
         )
     colours = "CMYK" if image.mode == "CMYK" else "L" if image.mode in ("1", "L", "LA", *DEEP) else "RGB"
     to_srgb = _to_srgb(profile, colours, source) if profile else None
@@ -144,7 +144,7 @@ def _eight_bits(image: Any) -> Any:
 
 
 def _to_srgb(profile: bytes, colours: str, source: object) -> Any:
-    """Return a function that converts from a profile's colours to sRGB; None for sRGB or a broken profile."""
+    """Return a function that converts from a profile to sRGB, or None for sRGB or a broken profile."""
     try:
         transform = ImageCms.buildTransform(
             ImageCms.ImageCmsProfile(io.BytesIO(profile)),
@@ -154,7 +154,7 @@ def _to_srgb(profile: bytes, colours: str, source: object) -> Any:
             renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
             flags=ImageCms.Flags.BLACKPOINTCOMPENSATION,
         )
-    except Exception as error:  # a broken profile, or one for another colour space, is ignored, as in browsers
+    except Exception as error:  # like browsers, ignore a broken profile or one for another colour space
         log.info("%s: its colour profile is ignored (%s)", source, error)
         return None
     if colours == "CMYK":

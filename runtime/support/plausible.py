@@ -1,4 +1,4 @@
-"""Checks of settings: ranges that suggest the right unit, valid paths, misspelt names."""
+"""Checks of settings: ranges with a hint about units, valid paths, misspelt names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Users' own classes, named `module:Class`, such as `mypackage.tunnel:Tunnel`."""
+"""Classes of the user's, named `module:Class`, such as `mypackage.tunnel:Tunnel`."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def plugin_class(name: str, base: type, *, field: str) -> Any:
 
 
 def strict(options: type[BaseModel]) -> type[BaseModel]:
-    """Make a plugin's options refuse unknown keys, unless the class sets `extra` itself."""
+    """Make the options of a plugin refuse unknown keys, unless the class sets `extra`."""
     if "extra" in options.model_config:
         return options
     return type(options.__name__, (options,), {"__module__": __name__, "model_config": {"extra": "forbid"}})

@@ -1,4 +1,4 @@
-"""Progress of long work, reported to an optional listener, which may stop the work.
+"""Progress of long work, reported to an optional listener that may stop the work.
 
 Functions call `tell` as they proceed, and `listening` installs a listener. An exception in the listener ends the work,
 so a signal takes effect within one step.
@@ -15,7 +15,7 @@ from typing import Any, TextIO, TypeVar
 T = TypeVar("T")
 NOW_AND_THEN_S = 10.0  # interval between lines if stderr is not a terminal
 
-Listener = Callable[[str, int, int | None], None]  # task, steps done, steps in all (None: unknown)
+Listener = Callable[[str, int, int | None], None]  # task, steps done, total steps or None if unknown
 
 _LISTENER: ContextVar[Listener | None] = ContextVar("progress", default=None)
 
@@ -31,7 +31,7 @@ def tell(what: str, done: int, total: int | None = None) -> None:
 def task(what: str, *, seconds: float, too_slow: Exception) -> Iterator[None]:
     """Report the beginning (0 done) and end (empty name) of a task with a time limit.
 
-    A `tell` within it after the limit raises `too_slow`; an outer listener still receives the reports.
+    After the limit, `tell` within the task raises `too_slow`. An outer listener still receives the reports.
     """
     end, outer = time.monotonic() + seconds, _LISTENER.get()
 
@@ -86,7 +86,7 @@ def tracked(title: str, items: Sequence[T]) -> Iterator[T]:
 
 
 class ShownProgress:
-    """Listener that shows long tasks: as a bar on a terminal, else as an occasional line."""
+    """Listener that shows long tasks as a bar on a terminal, otherwise as occasional lines."""
 
     def __init__(self, stream: TextIO, *, after_s: float = 1.0, now_and_then_s: float = NOW_AND_THEN_S) -> None:
         self._stream, self._after_s, self._now_and_then_s = stream, after_s, now_and_then_s

@@ -1,15 +1,15 @@
-"""Ranges of numbers in settings, options and files. Imports nothing heavy."""
+"""Ranges of numbers in settings, options and files. Cheap to import."""
 
 from __future__ import annotations
 
 import math
 
 EYE_MOST_M = 50.0  # largest absolute coordinate of an eye
-SEPARATION_MIN_M = 0.005  # between two eyes; the tracker checks for a person's
+SEPARATION_MIN_M = 0.005  # minimum distance between two eyes; the tracker checks for a person's
 FOV_RANGE_DEG = (0.1, 179.0)  # horizontal field of view of a picture
 RECORD_MOST_S = 604_800.0  # a week
 SCALE = (1e-6, 1e6)  # range of scales between two frames' units, from micrometres to metres and back
-# Units that are often used by mistake, by the proper unit: factor and name.
+# Units used by mistake, with factor and name, by the proper unit.
 OTHER_UNITS = {
     "m": ((1e-3, "millimetres"), (1e-2, "centimetres")),
     "s": ((1e-3, "milliseconds"),),
@@ -18,7 +18,7 @@ OTHER_UNITS = {
 
 
 def refusal(value: float, low: float, high: float, unit: str = "") -> str:
-    """Error message for a number outside [low, high], both finite; empty if the number is inside.
+    """Return an error message for a number outside [low, high], both finite, or an empty string.
 
     >>> refusal(518.4, 0.005, 20.0, "m")
     '518.4 m is beyond 20 m: did you mean millimetres (0.5184)?'

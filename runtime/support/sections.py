@@ -1,4 +1,4 @@
-"""Reading and validation of TOML and JSON tables; errors name the field."""
+"""Reader and validation of TOML and JSON tables, with errors that name the field."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from runtime.support import untrusted_input
 from runtime.support.plausible import check_text, nearest
 
 TABLE_BYTES_MAX = 4 << 20
-KEY_PARTS_MAX = 16  # parts of a dotted key: tomllib's time and memory grow with their square
+KEY_PARTS_MAX = 16  # maximum parts of a dotted key, because tomllib's time and memory grow with their square
 STRINGS_AND_COMMENTS = re.compile(
     r'''"""(?:[^\\]|\\.)*?"""|\'{3}.*?\'{3}|"(?:[^"\\\n]|\\.)*"|'[^'\n]*'|#[^\n]*''', re.DOTALL
 )
@@ -23,7 +23,7 @@ M = TypeVar("M", bound=BaseModel)
 
 
 class Section(BaseModel):
-    """A frozen table: no unknown keys, only finite numbers, and only texts that are valid names or paths."""
+    """Frozen table without unknown keys, whose numbers are finite and texts are valid names or paths."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -34,7 +34,7 @@ class Section(BaseModel):
 
 
 def read_table(path: Path) -> dict[str, Any]:
-    """Return the table in a TOML or JSON file. Raises InputError, naming the file and the line."""
+    """Read the table in a TOML or JSON file. Raises InputError that names the file and the line."""
     text = untrusted_input.read_text(path, most_bytes=TABLE_BYTES_MAX)
     table = untrusted_input.parsed_json(text, source=path) if path.suffix.lower() == ".json" else _toml(text, path)
     if not isinstance(table, dict):
@@ -57,7 +57,7 @@ def _toml(text: str, path: Path) -> Any:
 def validated(model: type[M], table: dict[str, Any], *, source: str | Path, folder: Path | None = None) -> M:
     """Return the table as a validated record. Raises InputError that names every wrong field.
 
-    folder: base for relative paths (`runtime.config.paths`); without one they stay as they are.
+    folder: base for relative paths (`runtime.config.paths`), which stay unchanged without it.
     """
     try:
         return model.model_validate(table, context=folder)
@@ -68,7 +68,7 @@ def validated(model: type[M], table: dict[str, Any], *, source: str | Path, fold
 
 
 def _wrong_field(model: type[BaseModel], error: Any) -> tuple[str, str]:
-    """Return the full name of the field that one of pydantic's errors is about, and the problem."""
+    """Return the full name of the field in an error from pydantic, and the problem."""
     name = ".".join(str(part) for part in error["loc"])
     message = error["msg"].removeprefix("Value error, ")
     if error["type"] == "extra_forbidden":
@@ -80,7 +80,7 @@ def _wrong_field(model: type[BaseModel], error: Any) -> tuple[str, str]:
 
 
 def _keys(model: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
-    """Return the keys allowed in the model's table at a path."""
+    """Return the allowed keys of the table at a path."""
     table: Any = model
     for part in path:
         if isinstance(part, str) and part in getattr(table, "model_fields", ()):

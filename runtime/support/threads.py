@@ -1,4 +1,4 @@
-"""Parallel loops over work that releases the interpreter's lock (numpy, OpenCV, C++)."""
+"""Parallel loops over work that releases Python's lock (numpy, OpenCV, C++)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Result = TypeVar("Result")
 
 
 def parallel_map(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    """Call `work` on every item, on as many threads as OpenCV may use; its exceptions propagate."""
+    """Call `work` on every item, on as many threads as OpenCV may use. Its exceptions propagate."""
     threads = cv2.getNumThreads()
     if threads < 2 or len(items) < 2:
         return [work(item) for item in items]

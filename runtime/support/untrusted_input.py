@@ -1,7 +1,7 @@
-"""Reading of untrusted input (paths, files, JSON, numbers) within limits.
+"""Reader for untrusted input (paths, files, JSON, numbers) within limits.
 
-Every reader of untrusted bytes uses this module. Faults raise InputError with one line that names the file and the
-field. If a value exceeds a limit, the line also gives the limit.
+All untrusted bytes are read with this module. Faults raise InputError with one line that names the file, the field and,
+if it is exceeded, the limit.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ LIMITS = Limits()  # not configurable; tests lower them
 
 
 def checked_path(path: str | Path, *, source: str | Path = "", field: str = "") -> Path:
-    """Check that a path is valid on this system, whether it exists or not. Raises InputError.
+    """Check that a path is valid on this system, even if it does not exist. Raises InputError.
 
     source, field: names for the error if the path came from elsewhere.
     """
     try:
         os.lstat(path)
     except ValueError:
-        raise InputError(source or str(path), field, "the path contains a NUL character, or is not UTF-8") from None
+        raise InputError(source or str(path), field, "the path contains a NUL character or is not UTF-8") from None
     except OSError as error:
         if error.errno == errno.ENAMETOOLONG:
             raise InputError(source or str(path), field, f"is not a valid path ({error.strerror})") from None
@@ -70,7 +70,7 @@ def is_there(path: str | Path, *, folder: bool = False) -> bool:
 def open_regular(
     path: str | Path, *, most_bytes: int | None = None, source: str | Path = "", field: str = ""
 ) -> IO[bytes]:
-    """Open a regular file for reading. Raises InputError for any other kind, or if it is too large.
+    """Open a regular file for reading. Raises InputError for other kinds of files or large ones.
 
     Opening never waits, as it would for a FIFO without a writer. The check applies to the opened file itself.
     """
@@ -85,7 +85,7 @@ def open_regular(
         if not stat.S_ISREG(status.st_mode):
             raise InputError(name, field, f"is {_kind(status.st_mode)}, not a file")
         if most_bytes is not None and status.st_size > most_bytes:
-            raise InputError(name, field, f"has {_size(status.st_size)}; the maximum is {_size(most_bytes)}")
+            raise InputError(name, field, f"has {_size(status.st_size)}, but the maximum is {_size(most_bytes)}")
         return os.fdopen(number, "rb")
     except BaseException:
         os.close(number)
@@ -98,8 +98,8 @@ def read_bytes(path: str | Path, *, most_bytes: int, source: str | Path = "", fi
     with open_regular(path, most_bytes=most_bytes, source=source, field=field) as file:
         try:
             size = min(os.fstat(file.fileno()).st_size, most_bytes)
-            data = file.read(size + 1)  # allocates the current size, not the limit
-            if len(data) > size:  # the file grew while it was read
+            data = file.read(size + 1)  # allocates only the current size
+            if len(data) > size:  # the file has grown meanwhile
                 data += file.read(most_bytes + 1 - len(data))
         except OSError as error:
             raise InputError(name, field, f"cannot be read ({error.strerror})") from None
@@ -161,7 +161,7 @@ def _whole(digits: str) -> int | float:
 
 
 def whole_from_text(text: str, *, source: str | Path, field: str) -> int:
-    """Parse a non-negative whole number in decimal digits. Raises InputError."""
+    """Parse a non-negative integer in decimal digits. Raises InputError."""
     # `isdigit` accepts a superscript two, and `int` other scripts' digits.
     if not (text.isascii() and text.isdigit()):
         raise InputError(source, field, f"is not a whole number: {shown(text)}")
@@ -171,13 +171,13 @@ def whole_from_text(text: str, *, source: str | Path, field: str) -> int:
 
 
 def within(count: int | float, most: int | float, *, source: str | Path, field: str) -> None:
-    """Raise InputError, which gives both numbers, if a count exceeds its limit."""
+    """Raise InputError if a count exceeds its limit."""
     if count > most:
         raise InputError(source, field, f"{count:,} exceeds the limit of {most:,}")
 
 
 def shown(value: Any, *, most: int = 40) -> str:
-    """Make an untrusted value printable and short."""
+    """Return an untrusted value in a short, printable form."""
     if isinstance(value, int) and value.bit_length() > 256:
         return f"a number of about {int(value.bit_length() * 0.30103) + 1} digits"
     text = value if isinstance(value, str) else repr(value)

@@ -7,7 +7,7 @@ from functools import cache
 
 @cache
 def version() -> str:
-    """Version of the installed package; `unknown` if it is run without installation."""
+    """Return the version of the installed package, or `unknown` without an installation."""
     from importlib.metadata import PackageNotFoundError
     from importlib.metadata import version as installed
 

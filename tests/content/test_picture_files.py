@@ -373,7 +373,7 @@ def test_an_animation_over_the_limit_is_a_still_and_says_so(tmp_path: Path, monk
     pictures[0].save(tmp_path / "a.gif", save_all=True, append_images=pictures[1:])
     monkeypatch.setattr(LIMITS, "pixels", 2 * 160 * 90)
     assert open_frames(tmp_path / "a.gif", AUTO).count == 1
-    assert "3 frames of 160 x 90 pixels; the maximum is" in caplog.text
+    assert "3 frames of 160 x 90 pixels, more than" in caplog.text
     assert "showing only its first frame" in caplog.text
 
 

@@ -53,7 +53,9 @@ def test_only_regular_files_are_read_and_opening_never_waits(tmp_path: Path, kin
 def test_a_file_is_read_up_to_its_limit_and_refused_beyond(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"x" * 1000)
     assert untrusted_input.read_bytes(tmp_path / "a", most_bytes=1000) == b"x" * 1000
-    assert "1000 bytes; the maximum is 999 bytes" in refused(untrusted_input.read_bytes, tmp_path / "a", most_bytes=999)
+    assert "1000 bytes, but the maximum is 999 bytes" in refused(
+        untrusted_input.read_bytes, tmp_path / "a", most_bytes=999
+    )
 
 
 def test_whether_something_is_there_is_asked_of_names_that_can_be(tmp_path: Path) -> None:
