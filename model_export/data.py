@@ -1,4 +1,4 @@
-"""Endless procedural training pairs: scenes made of textured planes, seen from random positions."""
+"""Endless procedural training pairs, made of textured planes that are seen from random positions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack, stack_from_eye
 from runtime.records import F64, U8
 
-PITCH_WIDTH_M = 0.5184  # width of the prototype's panels
+PITCH_WIDTH_M = 0.5184  # width of the prototype panels
 CENTRE = 1  # index of the middle of three panels
 WIDEST_DEG = 100.0  # largest horizontal field of view of a training picture
 LEAST_COMMON = 0.4  # share of the centre panel's size that each eye must see through all panels
@@ -20,7 +20,7 @@ LEAST_COMMON = 0.4  # share of the centre panel's size that each eye must see th
 
 @dataclass(frozen=True, slots=True)
 class TrainingPair:
-    """A left/right pair of pictures and the eye positions that they are rendered for."""
+    """Pair of pictures and the eye positions for which they were rendered."""
 
     stack: PanelStack
     eyes_m: F64  # (2, 3) left, right; frame `stack`
@@ -29,7 +29,7 @@ class TrainingPair:
 
 
 def random_stack(random: Random, *, width_px: int, height_px: int) -> PanelStack:
-    """Draw random, evenly spaced panels: the prototype, coarser; part of it; or another size."""
+    """Return random, evenly spaced panels: the prototype with fewer pixels, a part of it or another size."""
     width_m = PITCH_WIDTH_M * math.exp(random.uniform(math.log(0.25), math.log(1.6)))
     gap_m = math.exp(random.uniform(math.log(0.005), math.log(0.5)))
     if random.random() < 0.6:  # a practical range
@@ -38,7 +38,7 @@ def random_stack(random: Random, *, width_px: int, height_px: int) -> PanelStack
 
 
 def random_eyes(random: Random, stack: PanelStack) -> F64:
-    """Draw (2, 3) random eyes, 0.1 to 4 m from the centre and at least 0.1 m in front of the panels."""
+    """Return random eyes (2, 3), 0.1 to 4 m from the centre and at least 0.1 m in front of the panels."""
     front_m = stack.x_m[-1]
     distance_m = math.exp(random.uniform(math.log(0.1 + front_m), math.log(4.0)))
     if random.random() < 0.5:
@@ -76,7 +76,7 @@ def is_served(eyes_m: F64, stack: PanelStack) -> bool:
 def random_place(
     random: Random, *, width_px: int, height_px: int, stack: PanelStack | None = None
 ) -> tuple[PanelStack, F64]:
-    """Return panels (`stack`, or random ones) and random eyes (2, 3) that see enough of them."""
+    """Return panels (`stack` or random ones) and random eyes (2, 3) that see enough of them."""
     while True:
         panels = stack or random_stack(random, width_px=width_px, height_px=height_px)
         eyes = random_eyes(random, panels)
@@ -97,6 +97,6 @@ def random_pair(
 
 
 def filling_fov_deg(stack: PanelStack, eye_m: F64) -> float:
-    """Horizontal field of view of the panels from an eye's distance, at most WIDEST_DEG."""
+    """Return the horizontal field of view of the panels at an eye's distance, at most WIDEST_DEG."""
     distance_m = float(np.linalg.norm(eye_m))
     return min(WIDEST_DEG, math.degrees(2 * math.atan(stack.width_m / 2 / distance_m)))

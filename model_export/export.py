@@ -40,13 +40,13 @@ def export_model(
     eye_order: EyeOrder = "left-right",
     options: dict[str, Any] | None = None,
 ) -> Report:
-    """Build a model, check it, and write it if all checks pass. Raises InputError."""
+    """Build and check a model, and write it if all checks pass. Raises InputError."""
     check_known(arch, *SHIPPED)
     if checkpoint is not None and random_init is not None:
-        raise InputError("export", "--random-init", "and --checkpoint exclude each other")
+        raise InputError("export", "--random-init", "cannot be combined with --checkpoint")
     for option, value in (("--width", width_px), ("--height", height_px)):
         if value < LEAST_PX or value > 8192 or value % 2:
-            raise InputError("export", option, f"{value} must be an even number from {LEAST_PX} to 8192")
+            raise InputError("export", option, f"must be an even number from {LEAST_PX} to 8192, not {value}")
     if arch not in SHIPPED:
         network, origin = picture_network(arch, checkpoint, random_init, options or {})
         module = network.net
@@ -54,7 +54,7 @@ def export_model(
         data = picture_file(network, origin, eye_order=eye_order, **size)
     else:
         if checkpoint is not None or random_init is not None:
-            problem = f"{arch} is built from its recipe: --checkpoint and --random-init cannot be used with it"
+            problem = f"{arch} is built from its recipe, without --checkpoint or --random-init"
             raise InputError("export", "--arch", problem)
         data, module = spectral_model(arch)
     report = check_model(data, source=str(out), reference=in_torch(module))
@@ -64,7 +64,7 @@ def export_model(
 
 
 def in_torch(module: nn.Module) -> Reference:
-    """Wrap a module as the reference for its export."""
+    """Wrap a module as the reference with which its export is compared."""
 
     def run(feeds: Feeds) -> Sequence[np.ndarray]:
         with torch.no_grad():
@@ -75,7 +75,7 @@ def in_torch(module: nn.Module) -> Reference:
 
 
 def spectral_model(name: str) -> tuple[bytes, nn.Module]:
-    """Build a shipped model from its recipe: its ONNX file with the contract, and its module."""
+    """Build a shipped model from its recipe. Returns its ONNX file with the contract, and its module."""
     recipe = read_recipe(name)
     net = SpectralSolver(recipe.cell_px).eval()
     contract = Contract(
@@ -106,9 +106,9 @@ def spectral_model(name: str) -> tuple[bytes, nn.Module]:
 def picture_network(
     arch: str, checkpoint: Path | None, random_init: int | None, options: dict[str, Any]
 ) -> tuple[Network, str]:
-    """Return a picture network, with a checkpoint's weights or untrained, and a digest of their source.
+    """Return a picture network, trained or untrained, and a digest of the source of its weights.
 
-    A checkpoint of `phasestack train` contains the network's options, and must be of network `arch`.
+    A checkpoint of `phasestack train` contains the options of the network and must be of network `arch`.
     """
     if checkpoint is None:
         if random_init is None:
@@ -132,7 +132,7 @@ def picture_network(
 def picture_file(
     network: Network, origin: str, *, width_px: int, height_px: int, eye_order: EyeOrder = "left-right"
 ) -> bytes:
-    """Export a picture network as ONNX for one size. Raises InputError if that is impossible."""
+    """Export a picture network as ONNX for one size. Raises InputError if torch cannot export it."""
     form, net, size = network.form, network.net.eval(), {"width_px": width_px, "height_px": height_px}
     probe(network, **size)
     check_static(network, **size)
@@ -150,7 +150,7 @@ def picture_file(
         layout="NCHW",
         eye_order=eye_order,
         value_range=(least, 1 + least),
-        trained_for=None,  # checkpoints do not record the stack they were trained for
+        trained_for=None,  # unknown, because checkpoints do not record it
         recipe_sha256=origin,
         **form.model_dump(exclude={"steps"}),
         steps=steps,

@@ -1,7 +1,4 @@
-"""The published network (EyeReal's U-Net).
-
-Parameters keep their published names, so that its checkpoints load.
-"""
+"""The published network (EyeReal's U-Net), with the parameter names of its published checkpoints."""
 
 from __future__ import annotations
 
@@ -14,10 +11,10 @@ from torch.nn import functional
 
 from runtime.config import Section
 
-PICTURE_FOV_DEG = 40.0  # horizontal; the published code feeds black outside it
+PICTURE_FOV_DEG = 40.0  # horizontal field of view; the published code feeds black outside it
 OFFSET = 0.2  # the published code shows sigmoid(y) - 0.2, clipped at the panel
 INPUT, OUTPUT = "eyes", "panels"
-LEAST_PX = 32  # smallest side, which is halved five times
+LEAST_PX = 32  # minimum side, because it is halved five times
 NORM_MOMENTUM = 0.02  # of running means; with one pair per batch, torch's default (0.1) would average only ten pairs
 
 
@@ -40,7 +37,7 @@ class Up(nn.Module):
         self.conv = _block(channels, channels // 2, out)
 
     def forward(self, deep: Tensor, skip: Tensor) -> Tensor:
-        """(n, a, h, w) and (n, b, H, W) -> (n, out, H, W)."""
+        """Map (n, a, h, w) and (n, b, H, W) to (n, out, H, W)."""
         up = functional.interpolate(deep, scale_factor=2, mode="bilinear", align_corners=True)
         rows, columns = skip.shape[2] - up.shape[2], skip.shape[3] - up.shape[3]
         up = functional.pad(up, [columns // 2, columns - columns // 2, rows // 2, rows - rows // 2])
@@ -65,7 +62,7 @@ class UNet(nn.Module):
         self.out_conv = nn.Sequential(nn.Conv2d(w, out, 1))
 
     def forward(self, x: Tensor) -> Tensor:
-        """(n, 18, h, w) intensities -> (n, 9, h, w), before the sigmoid."""
+        """Map intensities (n, 18, h, w) to (n, 9, h, w), before the sigmoid."""
         skips = [self.in_conv(x)]
         for down in (self.down1, self.down2, self.down3, self.down4, self.down5):
             skips.append(down(skips[-1]))
@@ -77,7 +74,7 @@ class UNet(nn.Module):
 
 
 class EyeRealNet(nn.Module):
-    """Maps the eyes' pictures, warped to every panel's pixels, to panel values.
+    """Network from the eyes' pictures, warped to the pixels of every panel, to panel values.
 
     Input channels: panel-major, then eye, then RGB, intensities in [0, 1]. Output channels: panel-major, then RGB, in
     [-0.2, 0.8], as published; the panel clips negative values.
@@ -89,12 +86,12 @@ class EyeRealNet(nn.Module):
     class Options(Section):
         """Size of the network."""
 
-        width: Annotated[int, Field(ge=1, le=256)] = Field(32, description="channels of its first layer")
+        width: Annotated[int, Field(ge=1, le=256)] = Field(32, description="number of channels of its first layer")
 
     def __init__(self, width: int = 32) -> None:
         super().__init__()
         self.subnets = UNet(width)
 
     def forward(self, eyes: Tensor) -> Tensor:
-        """(1, 18, h, w) -> (1, 9, h, w)."""
+        """Map (1, 18, h, w) to (1, 9, h, w)."""
         return torch.sigmoid(self.subnets(eyes)) - OFFSET

@@ -47,12 +47,12 @@ from runtime.optics.views import image_from_stack
 NEAR_PX = 0.5  # rays count if they are at least this far inside every panel
 SIZE = 0.8  # size of steps after a learned network; larger ones overshoot from poor starts
 MOMENTUM, FLOOR = 0.7, 0.1
-LEAST_ERROR = 1e-6  # least squared error, which limits the PSNR to 60 dB
+LEAST_ERROR = 1e-6  # minimum squared error, which limits the PSNR to 60 dB
 
 
 @dataclass(frozen=True, slots=True)
 class Views:
-    """E sets of rays, alternating left and right eye, one pair per position of the head."""
+    """E sets of rays, alternating between left and right eye, with one pair per position of the head."""
 
     panels_from_rays: Tensor  # (E, N, 3, 3) float64, from the rays' raster to panel pixels, centres at halves
     width_px: int  # of the rays' raster
@@ -69,7 +69,7 @@ class Views:
         fov_deg: float | None,
         places_m: ArrayLike = ((0.0, 0.0, 0.0),),
     ) -> Views:
-        """Rays through the pixels of a picture `fov_deg` wide; None: through the centre panel's.
+        """Return rays through the pixels of a picture `fov_deg` wide or, if None, of the centre panel.
 
         eyes_m: (2, 3) left, right, frame `stack`; places_m: displacements of both eyes, whose rays pass through the
         same points of the centre panel. Raises ValueError for an eye in the centre panel's plane.
@@ -86,9 +86,9 @@ class Views:
 
 
 def light(panels: Tensor, views: Views) -> tuple[Tensor, Tensor]:
-    """Intensities (E, C, h, w) of panels (N, C, H, W) by (L1), (L2), and a mask (E, 1, h, w) of rays.
+    """Return intensities (E, C, h, w) of panels (N, C, H, W) by (L1), (L2), and a mask of rays.
 
-    Differentiable with respect to the panels. The results have their device and dtype.
+    Differentiable with respect to the panels, whose device and dtype the results have.
     """
     bundles, counts = _bundles(panels, views)
     return torch.stack([(1 - reduce(torch.mul, z).real) / 2 for z in bundles]), counts
@@ -97,7 +97,7 @@ def light(panels: Tensor, views: Views) -> tuple[Tensor, Tensor]:
 def traced(
     panels: Tensor, views: Views, *, rays: int = 2, random: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Unbiased intensities from rays x rays random rays per pixel, and a mask of valid pixels."""
+    """Estimate unbiased intensities from rays x rays random rays per pixel, with a mask of valid pixels."""
     size, angle = (views.height_px, views.width_px), torch.pi * panels
     total, counts = torch.zeros((), dtype=panels.dtype, device=panels.device), torch.tensor(True, device=panels.device)
     for stratum in range(rays * rays):
@@ -133,7 +133,7 @@ def step(
     momentum: float | Tensor = MOMENTUM,
     floor: float = FLOOR,
 ) -> tuple[Tensor, Tensor]:
-    """One step (L5): x' and y' from panels x and their extrapolation y, both (N, C, H, W).
+    """Compute one step (L5): x' and y' from panels x and their extrapolation y, both (N, C, H, W).
 
     targets: (2, C, h, w) of the left and the right eye. If the views have fewer rows, head positions alternate from row
     to row of the targets.
@@ -161,7 +161,7 @@ def improved(panels: Tensor, targets: Tensor, views: Views, sizes: Sequence[Any]
 
 
 def _bundles(panels: Tensor, views: Views) -> tuple[list[Tensor], Tensor]:
-    """z_n of every ray set, (N, C, h, w) complex each, and a mask of the rays that count (E, 1, h, w)."""
+    """Return z_n of every ray set, complex (N, C, h, w), and a mask (E, 1, h, w) of the rays that count."""
     angle = torch.pi * panels
     parts = torch.cat([torch.cos(angle), torch.sin(angle)], dim=1)  # (N, 2C, H, W)
     bundles, counts = [], []
@@ -175,7 +175,7 @@ def _bundles(panels: Tensor, views: Views) -> tuple[list[Tensor], Tensor]:
 def _sample(
     images: Tensor, matrices: Tensor, size: Sequence[int], *, near_px: float, within: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Sample images (N, K, H, W) to (N, K, h, w) through homographies (N, 3, 3) from the result's pixels.
+    """Sample images (N, K, H, W) to (N, K, h, w) through homographies (N, 3, 3) from pixels of the result.
 
     Bilinear at pixel centres, or nearest at positions `within` (2, h, w) the pixels, columns and rows in [0, 1].
     Samples not `near_px` inside an image are zero; the second result, (N, 1, h, w), is the mask of those inside.

@@ -1,4 +1,4 @@
-"""Picture networks: the published one, and any `torch.nn.Module` given as `module:Class`."""
+"""Picture networks: the published one, and any `torch.nn.Module` as `module:Class`."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from runtime.support.plugins import is_plugin, plugin_class, strict
 
 KNOWN = {"eyereal": "model_export.eyereal:EyeRealNet", "unrolled": "model_export.unrolled:Unrolled"}
 PANELS, COLOURS = 3, 3
-STEPS_MOST = 64  # most steps in a contract
+STEPS_MOST = 64  # maximum number of steps in a contract
 
 
 class Form(Section):
-    """Input and output format of a picture network, from class attributes or defaults."""
+    """Input and output format of a picture network, given by class attributes or defaults."""
 
     input_frame: Literal["centre", "panel"] = Field(
         "centre", description="both eyes' pictures, resampled to the pixels of the centre panel or of every panel"
@@ -46,13 +46,13 @@ class Form(Section):
 
     @property
     def channels(self) -> int:
-        """Number of input channels: panel-major, then eye, then RGB."""
+        """Number of input channels, ordered by panel, then eye, then RGB."""
         return (PANELS if self.input_frame == "panel" else 1) * 2 * COLOURS
 
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """An instance of a module, with its format and options."""
+    """Instance of a module, with its format and options."""
 
     arch: str
     net: nn.Module
@@ -60,7 +60,7 @@ class Network:
     options: dict[str, Any]
 
     def steps(self) -> tuple[Sequence[Any], Sequence[Any]]:
-        """Sizes and momenta of the solver steps after the network, learned by the module or constant."""
+        """Sizes and momenta of the solver steps after the network, either learned or constant."""
         learned = [getattr(self.net, name, None) for name in ("step_sizes", "step_momenta")]
         if isinstance(learned[0], Tensor) and isinstance(learned[1], Tensor):
             return list(learned[0].clamp(1e-3, 3)), list(learned[1].clamp(0, 0.99))
@@ -69,7 +69,7 @@ class Network:
 
 @contextmanager
 def blamed(arch: str, field: str) -> Iterator[None]:
-    """Convert any exception from a user's module to a one-line InputError."""
+    """Convert any exception of a user's module to an InputError in one line."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -88,7 +88,7 @@ def check_known(arch: str, *others: str) -> None:
 
 
 def make_network(arch: str, options: dict[str, Any], *, seed: int = 0) -> Network:
-    """Create a network with weights from a seed. Raises InputError: no such class, or bad attributes."""
+    """Create a network with weights from a seed. Raises InputError for a wrong class or wrong attributes."""
     check_known(arch)
     kind = plugin_class(KNOWN.get(arch, arch), nn.Module, field="--arch")
     attributes = {name: getattr(kind, name) for name in Form.model_fields if hasattr(kind, name)}
@@ -104,7 +104,7 @@ def make_network(arch: str, options: dict[str, Any], *, seed: int = 0) -> Networ
 
 
 def probe(network: Network, *, width_px: int, height_px: int) -> None:
-    """Raise InputError unless the network maps a picture of that size to finite panels."""
+    """Raise InputError unless the network maps pictures of that size to finite panels."""
     arch, form = network.arch, network.form
     example = torch.rand(1, form.channels, height_px, width_px, generator=torch.Generator().manual_seed(1))
     expected = (1, PANELS * COLOURS, height_px, width_px)
@@ -124,20 +124,20 @@ def probe(network: Network, *, width_px: int, height_px: int) -> None:
 
 
 def check_static(network: Network, *, width_px: int, height_px: int) -> None:
-    """Raise InputError if the module branches on values, which a graph can't represent."""
+    """Raise InputError if the module branches on values, which a graph cannot represent."""
     example = torch.zeros(1, network.form.channels, height_px, width_px)
     try:
-        with quiet(), redirect_stderr(StringIO()), torch.no_grad():  # torch prints graphs that it can't trace
+        with quiet(), redirect_stderr(StringIO()), torch.no_grad():  # torch prints graphs that it cannot trace
             torch.export.export(network.net.eval(), (example,), strict=False)
-    except Exception as error:  # other failures are reported by the exporter itself
+    except Exception as error:  # the exporter reports other failures
         if "data-dependent" in str(error).lower():
-            problem = "branches on the values of its input, which a graph can't represent (use torch.where)"
+            problem = "branches on the values of its input, which a graph cannot represent; use torch.where"
             raise InputError(network.arch, "forward", problem) from None
 
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Suppress the exporter's warnings, meant for its developers, and graphs printed from C++."""
+    """Suppress warnings meant for developers of the exporter, and graphs printed from C++."""
     sys.stdout.flush()
     level, output = logging.root.manager.disable, os.dup(1)
     with Path(os.devnull).open("wb") as nothing:

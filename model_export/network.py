@@ -1,4 +1,4 @@
-"""The shipped network: closed-form solving along the eyes' baseline for a given tracking error."""
+"""The shipped network, which solves in closed form along the eyes' baseline for a tracking error."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ IN_SCALE = 64  # codes per unit of the transformed inputs, which in codes would 
 
 
 class SpectralSolver(nn.Module):
-    """Computes both outer panels from the eyes' residuals, chain by chain.
+    """Solver for both outer panels, given the eyes' residuals, one epipolar row at a time.
 
     Let front = h + g and rear = h - g about the middle of their range, s the parallax in columns of half the eyes'
     separation on either panel, e that of the centre panel, and w a frequency along the eyes' line. The difference of
@@ -125,7 +125,7 @@ class SpectralSolver(nn.Module):
 
 
 def _same(channels: int, *, like: Tensor) -> Tensor:
-    """(C, 1, C) identity over channels."""
+    """Return the identity over channels (C, 1, C)."""
     one = torch.arange(channels, device=like.device)
     return (one[:, None, None] == one).to(torch.float32)
 
@@ -142,13 +142,13 @@ def _by_rows(x: Tensor, *, like: Tensor) -> Tensor:
 
 
 def _size(x: Tensor) -> Tensor:
-    """(1,) norm of x. It is finite only if x is, with a margin for later products with moderate matrices."""
+    """Return the norm (1,) of x. It is finite only if x is, with a margin for later products."""
     size: Tensor = torch.linalg.vector_norm(x)  # squares overflow long before later results would
     return size.reshape(1)
 
 
 def _fourier(size: int) -> tuple[Tensor, Tensor]:
-    """Orthonormal real Fourier basis (size, size), a wave per row, and the waves' frequencies in radians per sample."""
+    """Return the orthonormal real Fourier basis (size, size), one wave per row, and frequencies in rad per sample."""
     at = torch.arange(size, dtype=torch.float64)
     rows, w = [torch.ones(size, dtype=torch.float64) / math.sqrt(size)], [0.0]
     for k in range(1, (size + 1) // 2):
@@ -162,7 +162,7 @@ def _fourier(size: int) -> tuple[Tensor, Tensor]:
 
 
 def _cosines(size: int) -> tuple[Tensor, Tensor]:
-    """Orthonormal cosine basis (size, size), a wave per row, and the waves' frequencies in radians per sample."""
+    """Return the orthonormal cosine basis (size, size), one wave per row, and frequencies in rad per sample."""
     k, at = torch.arange(size, dtype=torch.float64)[:, None], torch.arange(size, dtype=torch.float64) + 0.5
     basis = torch.cos(math.pi * k * at / size) * math.sqrt(2 / size)
     basis[0] /= math.sqrt(2)

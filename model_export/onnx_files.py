@@ -1,4 +1,4 @@
-"""Conversion of torch modules to ONNX files that contain the contract."""
+"""Conversion of torch modules to ONNX files with a contract."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def picture_bytes(net: nn.Module, *, channels: int, width_px: int, height_px: in
 
 
 def with_contract(data: bytes, contract: Contract) -> bytes:
-    """Add the contract to a model as the metadata entry that the runtime reads."""
+    """Add the contract to a model, as the metadata entry that the runtime reads."""
     model = onnx.load_from_string(data)
     del model.metadata_props[:]
     known = digest(model.SerializeToString(deterministic=True))
@@ -71,7 +71,7 @@ def _exported(
     *,
     folded: bool = True,
 ) -> bytes:
-    """Export a module; folded: fold constants, else keep every weight's name (onnxruntime folds on loading)."""
+    """Export a module. folded: fold constants; otherwise keep the names of weights."""
     buffer = io.BytesIO()
     with quiet(), torch.no_grad():
         torch.onnx.export(

@@ -35,20 +35,20 @@ PICTURE_FOV_DEG = 40.0  # field of view of pictures in the published data set
 
 @dataclass(frozen=True)
 class TrainingPairs(Dataset[dict[str, Tensor]]):
-    """Dataset for training a picture network; each pair depends only on (seed, number)."""
+    """Dataset for training a picture network. Each pair depends only on (seed, number)."""
 
     form: Form
     seed: int
     width_px: int
     height_px: int
     eye_sigma_mm: float
-    count: int = 0  # number of different pairs, which are repeated; 0: unlimited
+    count: int = 0  # number of different pairs before they repeat; 0: unlimited
     stack: PanelStack | None = None  # None: random panels
-    folder: tuple[Pair, ...] = ()  # pictures to use; empty: procedural pairs
-    scene: str = ""  # scene for the runtime to draw instead, rotated about the vertical axis
+    folder: tuple[Pair, ...] = ()  # pairs to use; empty: procedural ones
+    scene: str = ""  # scene to draw instead, rotated about the vertical axis
 
     def __getitem__(self, number: int) -> dict[str, Tensor]:
-        """Network input, targets, and rays of the estimated and of the true eyes."""
+        """Return network input, targets, and rays of the estimated and the true eyes."""
         pair = self.pair(number)
         random = np.random.default_rng([self.seed, number, 1])
         pose = stack_from_eye(pair.eyes_m.mean(axis=0))
@@ -71,7 +71,7 @@ class TrainingPairs(Dataset[dict[str, Tensor]]):
         return self.count
 
     def pair(self, number: int) -> TrainingPair:
-        """Pictures and eyes of pair `number`."""
+        """Return the pictures and eyes of pair `number`."""
         if self.folder:
             pair = self.folder[number % len(self.folder)]
             return photographed(
@@ -104,7 +104,7 @@ def opened(scene: str, stack: PanelStack, _process: int) -> ContentSource:
 
 
 def folder_pairs(folder: Path) -> tuple[Pair, ...]:
-    """Read a folder in the published data set's format, named after its scene. Raises InputError."""
+    """Read a folder in the format of the published data set, named after its scene. Raises InputError."""
     name = next((name for name in preset_names() if name in folder.resolve().name), "")
     if not name:
         raise InputError(folder, "name", f"contains none of {', '.join(preset_names())}")
@@ -119,7 +119,7 @@ def prototype(*, width_px: int, height_px: int) -> PanelStack:
 
 
 def photographed(pair: Pair, stack: PanelStack, fov_deg: float) -> TrainingPair:
-    """Resample a folder's pair to the panels' raster, as seen by eyes that look at the display's middle."""
+    """Resample a pair to the raster of the panels, for eyes that look at the middle of the display."""
     size, images = {"width_px": stack.width_px, "height_px": stack.height_px}, []
     for side, eye_m in enumerate(pair.eyes_m):
         size_px = stack.width_px, stack.height_px
@@ -131,7 +131,7 @@ def photographed(pair: Pair, stack: PanelStack, fov_deg: float) -> TrainingPair:
 
 
 def network_input(pair: TrainingPair, form: Form) -> F32:
-    """(channels, H, W) input of a picture network, as at runtime: panel-major, then eye, then RGB."""
+    """Return the input (channels, H, W) of a picture network, by panel, then eye, then RGB."""
     stack, table = pair.stack, np.arange(256, dtype=np.float32) / np.float32(255)
     if form.input_value == "phase":
         table = phase_from_intensity(table, form.branch)
@@ -147,7 +147,7 @@ def network_input(pair: TrainingPair, form: Form) -> F32:
 
 
 def _warped(picture: U8, picture_from_raster: F64, stack: PanelStack, border: int) -> U8:
-    """Resample a picture bilinearly to the panels' pixels; OpenCV puts pixel centres at integers."""
+    """Resample a picture bilinearly to the pixels of the panels. OpenCV's pixel centres are integers."""
     to_centres = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
     matrix = np.linalg.inv(to_centres) @ picture_from_raster @ to_centres
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP

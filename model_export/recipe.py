@@ -1,4 +1,4 @@
-"""Recipes for the shipped models, one small JSON file each."""
+"""Recipes of the shipped models, each a small JSON file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DESIGN_RANGE = TrainedFor(
 
 
 class Recipe(Section):
-    """A shipped model: a closed-form network and the steps after it."""
+    """Recipe of a shipped model: a closed-form network and the steps after it."""
 
     name: str
     arch: Literal["spectral"] = "spectral"
@@ -29,7 +29,7 @@ class Recipe(Section):
     steps: Steps = ()
 
     def sha256(self) -> str:
-        """Digest of the recipe's canonical JSON, for the contract."""
+        """Digest of the canonical JSON of the recipe, for the contract."""
         text = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()
 

@@ -1,4 +1,4 @@
-"""Scenes of textured cards with exact geometry, drawn from any eye directly to a raster."""
+"""Scenes of textured cards with exact geometry, drawn for any eye directly to a raster."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8
 
 FINER = 2  # supersampling factor, for antialiasing
-TEXELS = (24, 768)  # smallest and largest side of a texture
+TEXELS = (24, 768)  # minimum and maximum side of a texture
 Random = np.random.Generator
 
 
 @dataclass(frozen=True, slots=True)
 class Plane:
-    """A textured parallelogram. Texture (u, v) in [0, 1]² is at corner + u·across + v·down."""
+    """Textured parallelogram. Texture (u, v) in [0, 1]² is at corner + u·across + v·down."""
 
     texture: U8  # (h, w, 4) RGBA
     corner_m: F64  # (3,) frame `stack`
@@ -30,7 +30,7 @@ Scene = tuple[Plane, ...]
 
 
 def draw(scene: Scene, projection: F64, *, width_px: int, height_px: int) -> U8:
-    """Draw a scene, (h, w, 3), through a 3x4 projection from `stack` to pixels.
+    """Draw a scene (h, w, 3) through a 3x4 projection from the stack frame to pixels.
 
     The nearest plane wins, by its exact depth in each pixel; half-transparent edges blend with planes drawn earlier.
     Nothing behind the eye is drawn.
@@ -52,7 +52,7 @@ def draw(scene: Scene, projection: F64, *, width_px: int, height_px: int) -> U8:
 
 
 def _part(raster_from_plane: F64, width: int, height: int) -> tuple[slice, slice] | None:
-    """(rows, columns) of a raster that a plane's unit square can cover; None: none, or the plane is edge-on."""
+    """Return the rows and columns that the unit square of a plane can cover, or None."""
     corners = raster_from_plane @ np.array([[0, 1, 1, 0], [0, 0, 1, 1], [1, 1, 1, 1]], dtype=np.float64)
     area = np.linalg.det(raster_from_plane)
     if not np.isfinite(area) or abs(area) < 1e-12 or (corners[2] <= 0).all():
@@ -85,23 +85,23 @@ def _draw_plane(texture: U8, raster_from_plane: F64, part: tuple[slice, slice], 
 
 
 def _shift(right: float, down: float) -> F64:
-    """(3, 3) translation by pixels."""
+    """Return a translation (3, 3) by pixels."""
     return np.array([[1.0, 0.0, right], [0.0, 1.0, down], [0.0, 0.0, 1.0]])
 
 
 def random_scene(random: Random, stack: PanelStack, middle_m: F64) -> Scene:
-    """Random backdrop and cards at many depths around the panels, for a viewer near `middle_m`."""
+    """Return a random backdrop and cards at many depths around the panels, for a viewer near `middle_m`."""
     centre_m = stack.x_m[1]
     distance_m = middle_m[0] - centre_m
     deep_m = (stack.x_m[-1] - centre_m) * math.exp(random.uniform(math.log(0.3), math.log(6.0)))
     rear_m, front_m = -deep_m, min(deep_m, 0.35 * distance_m)
     panel_m, pixel_m = np.array([stack.width_m, stack.height_m]), stack.width_m / stack.width_px / FINER
-    # Most real pictures are not saturated, so most of these are not either.
+    # Most colours are unsaturated, as in real pictures.
     contrast, level = (1.0, 0.0) if random.random() < 0.4 else (random.uniform(0.15, 0.8), random.uniform(-0.25, 0.25))
     tones = np.clip(np.rint((np.arange(256) - 127.5) * contrast + 127.5 + 255 * level), 0, 255).astype(np.uint8)
 
     def card(x_m: float, size_m: F64, aside: F64, *, slant: float, see_through: bool) -> Plane:
-        """aside: position of the card's middle as seen on the centre panel, in panel sizes."""
+        """Return a card. aside: position of its middle as seen on the centre panel, in panel sizes."""
         share = (x_m - centre_m) / distance_m
         middle = aside * panel_m * (1 - share) + middle_m[1:] * share
         turns = random.uniform(-slant, slant, 2)
@@ -125,7 +125,10 @@ def random_scene(random: Random, stack: PanelStack, middle_m: F64) -> Scene:
 
 
 def _texture(random: Random, width: int, height: int, tones: U8, *, see_through: bool) -> U8:
-    """(height, width, 4) noise with power falling with frequency, or discs and boxes; see_through: only on lines."""
+    """Return noise (height, width, 4) with power that falls with frequency, or discs and boxes.
+
+    see_through: opaque only on lines.
+    """
     picture = np.full((height, width, 4), 255, np.uint8)
     if random.random() < 0.5:
         fu, fv = np.fft.rfftfreq(width), np.fft.fftfreq(height)[:, None]

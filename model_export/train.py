@@ -1,4 +1,4 @@
-"""`phasestack train`: gradient training of a picture network, with light as the loss.
+"""`phasestack train`: gradient training of a picture network, with the light at the eyes as the loss.
 
 AdamW with cosine decay of the learning rate. Pair k and all random numbers of iteration k depend only on (seed, k), so
 a resumed training gives the same result as an uninterrupted one.
@@ -34,17 +34,17 @@ from runtime.report.page import drawing, png
 from runtime.support.artifacts import write_bytes, write_text
 from runtime.support.progress import progress_bar
 
-HELD_OUT_SEED = 9_000_001  # seed of the validation pairs; training seeds are smaller
-HELD_OUT, HELD_OUT_SHARE = 6, 8  # procedural validation pairs; of a folder's pairs, one in this many
+HELD_OUT_SEED = 9_000_001  # seed of the validation pairs; greater than any training seed
+HELD_OUT, HELD_OUT_SHARE = 6, 8  # number of procedural validation pairs; one in this many pairs of a folder
 FIRST_SAVED = 10  # iteration of the first checkpoint, so that a short training can be resumed
-SMALL_PX = 30_000  # up to this many pixels in a batch, one thread is faster (17 s instead of 24 at 160x90)
+SMALL_PX = 30_000  # pixels of a batch up to which one thread is faster (17 s instead of 24 at 160x90)
 COLUMNS = ("iteration", "light_db", "held_out_light_db")
 Device = Literal["auto", "cpu", "cuda"]
 Batch = dict[str, Tensor]
 
 
 class Training(Section):
-    """Everything that determines a training's result; stored in checkpoints."""
+    """Everything that determines the result of a training. Stored in checkpoints."""
 
     arch: str
     options: Annotated[dict[str, Any], Field(default_factory=dict)]
@@ -63,7 +63,7 @@ class Training(Section):
 
 
 def run_training(out: Path, training: Training, *, device: Device = "auto", resume: bool = False) -> dict[str, Any]:
-    """Train, writing checkpoint, curve and its plot along the way. Raises InputError."""
+    """Train, and regularly write the checkpoint, the curve and its plot. Raises InputError."""
     place, start = _placed(device), time.monotonic()
     network = make_network(training.arch, training.options, seed=training.seed)
     probe(network, width_px=training.width_px, height_px=training.height_px)
@@ -107,7 +107,7 @@ def run_training(out: Path, training: Training, *, device: Device = "auto", resu
             if stop:
                 save(number)
                 line = (
-                    f"train: stopped after iteration {number} of {training.iterations}: --resume continues from there"
+                    f"train: stopped after iteration {number} of {training.iterations}; --resume continues from there"
                 )
                 print(line, file=sys.stderr)
                 raise SystemExit(128 + stop[0])
@@ -133,7 +133,7 @@ def run_training(out: Path, training: Training, *, device: Device = "auto", resu
 
 @contextlib.contextmanager
 def _signals() -> Iterator[list[int]]:
-    """Yield a list that receives SIGINT or SIGTERM, to stop after the iteration; a second signal stops immediately."""
+    """Yield a list that receives SIGINT or SIGTERM, to stop after the iteration. A second one stops at once."""
     came: list[int] = []
 
     def take(number: int, frame: FrameType | None) -> None:
@@ -159,7 +159,7 @@ def displayed(panels: Tensor) -> Tensor:
 
 
 def _loss(network: Network, batch: Batch) -> Tensor:
-    """Negative mean of the light in dB, which gives easy and hard pairs equal weight."""
+    """Return the negative mean of the light in dB, which gives easy and hard pairs equal weight."""
     with torch.autocast(batch["input"].device.type, torch.bfloat16, enabled=batch["input"].is_cuda):
         answer = network.net.train()(batch["input"])
     losses = []
@@ -172,7 +172,7 @@ def _loss(network: Network, batch: Batch) -> Tensor:
 
 
 def _shown(network: Network, answer: Tensor, batch: Batch) -> Iterator[Tensor]:
-    """Yield each pair's displayed panels: the network's output after the solver's steps for the estimated eyes."""
+    """Yield the displayed panels of each pair: the output after the solver steps for the estimated eyes."""
     for panels, targets, matrices in zip(displayed(answer.float()), batch["targets"], batch["believed"], strict=True):
         views = Views(matrices, targets.shape[-1], targets.shape[-2])
         x = panels.reshape(PANELS, COLOURS, *panels.shape[1:])
@@ -181,7 +181,7 @@ def _shown(network: Network, answer: Tensor, batch: Batch) -> Iterator[Tensor]:
 
 @torch.no_grad()
 def _held_out_db(network: Network, batches: list[Batch], device: torch.device) -> float:
-    """Mean light of the held-out pairs, estimated without bias by random rays through square pixels."""
+    """Return the mean light of the held-out pairs, estimated without bias by random rays."""
     lights_db = []
     for number, batch in enumerate(_on(batch, device) for batch in batches):
         with blamed(network.arch, "validation"):
@@ -195,15 +195,15 @@ def _held_out_db(network: Network, batches: list[Batch], device: torch.device) -
 
 
 def _data(training: Training, form: Form) -> tuple[TrainingPairs, TrainingPairs]:
-    """Training and held-out pairs. Raises InputError."""
+    """Return the training and the held-out pairs. Raises InputError."""
     width_px, height_px = training.width_px, training.height_px
     stack = load_stack(Path(training.panels), width_px=width_px, height_px=height_px) if training.panels else None
     if stack is not None:
         stack = replace(stack, width_px=width_px, height_px=height_px)
         if stack.count != PANELS:
-            raise InputError(training.panels, "x_m", f"has {stack.count} panels; picture networks need {PANELS}")
+            raise InputError(training.panels, "x_m", f"has {stack.count} panels, but picture networks need {PANELS}")
     if training.data and training.scene:
-        raise InputError("train", "--data", "and --scene exclude one another")
+        raise InputError("train", "--data", "cannot be combined with --scene")
     folder = folder_pairs(Path(training.data)) if training.data else ()
     held = folder[::-HELD_OUT_SHARE] if len(folder) > 1 else folder
     kept = tuple(pair for pair in folder if pair not in held) or folder
@@ -215,7 +215,7 @@ def _data(training: Training, form: Form) -> tuple[TrainingPairs, TrainingPairs]
 
 
 def _loader(pairs: TrainingPairs, training: Training, first: int, last: int) -> DataLoader[Batch]:
-    """Load the batches of iterations `first` to `last`, which depend only on their numbers."""
+    """Load the batches of iterations `first` to `last`. They depend only on their numbers."""
     size = training.batch
     workers = min(8, len(os.sched_getaffinity(0)) - 1) if torch.cuda.is_available() else 0
     return DataLoader(pairs, size, sampler=range(first * size, last * size), num_workers=workers)
@@ -223,7 +223,7 @@ def _loader(pairs: TrainingPairs, training: Training, first: int, last: int) -> 
 
 def _placed(device: Device) -> torch.device:
     if device == "cuda" and not torch.cuda.is_available():
-        raise InputError("train", "--device", "cuda: torch finds none here")
+        raise InputError("train", "--device", "cuda is not available, because torch finds no GPU")
     return torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
 
 
@@ -234,7 +234,7 @@ def _on(batch: Batch, device: torch.device) -> Batch:
 def _resumed(
     out: Path, training: Training, network: Network, *parts: Any
 ) -> tuple[int, list[list[float]], list[float]]:
-    """Restore weights, optimizer and rate; returns iterations done, the curve, and lights since its last point.
+    """Restore weights, optimizer and rate. Returns iterations done, the curve, and lights since its last point.
 
     Raises InputError.
     """
@@ -245,7 +245,7 @@ def _resumed(
         raise InputError(path, "training", "missing: not a checkpoint of phasestack train")
     for name, value in now.items():
         if was.get(name) != value:
-            raise InputError(path, name, f"was {was.get(name)!r}, now {value!r}: to resume it must be the same")
+            raise InputError(path, name, f"must be {was.get(name)!r}, as before, to resume the training, not {value!r}")
     fill(network.net, table["model"], source=path, arch=training.arch)
     with blamed(str(path), "optimizer"):
         for part, name in zip(parts, ("optimizer", "rate"), strict=True):

@@ -1,4 +1,4 @@
-"""The solver's steps as a trainable network: their sizes and momenta are its weights."""
+"""The steps of the solver as a trainable network, whose weights are their sizes and momenta."""
 
 from __future__ import annotations
 
@@ -13,16 +13,13 @@ from runtime.config import Section
 
 
 class Unrolled(nn.Module):
-    """Network of solver steps.
-
-    They start from panels that share the pictures' mean equally, and training optimises them.
-    """
+    """Network of trainable solver steps, which start from panels with equal shares of the mean picture."""
 
     class Options(Section):
         """Number of steps and their initial size."""
 
         steps: Annotated[int, Field(ge=1, le=64)] = 4
-        size: Annotated[float, Field(gt=0, le=3)] = Field(SIZE, description="of every step, before training")
+        size: Annotated[float, Field(gt=0, le=3)] = Field(SIZE, description="size of every step before training")
 
     def __init__(self, steps: int, size: float) -> None:
         super().__init__()
@@ -30,7 +27,7 @@ class Unrolled(nn.Module):
         self.step_momenta = nn.Parameter(torch.full((steps,), MOMENTUM))
 
     def forward(self, eyes: Tensor) -> Tensor:
-        """(n, 6, h, w) intensities -> (n, 9, h, w): a third of the phase sum of the pictures' mean."""
+        """Map intensities (n, 6, h, w) to (n, 9, h, w): a third of the phase sum of the mean picture each."""
         mean = (eyes[:, :3] + eyes[:, 3:]) / 2
         phase = torch.asin(mean.clamp(0, 1).sqrt()) * (2 / torch.pi)
         return ((2 - phase) / 3).repeat(1, 3, 1, 1)

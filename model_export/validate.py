@@ -1,4 +1,4 @@
-"""Checks of a model file: the runtime's requirements, then values on ordinary and on stress inputs.
+"""Checks of a model file: requirements of the runtime, then values for ordinary and stress inputs.
 
 Values are compared with the torch module being exported. For an existing file, they are compared with the same graph
 run without onnxruntime's optimisations, so every file that the runtime accepts can be checked.
@@ -26,9 +26,9 @@ from runtime.optics.stack import PanelStack
 from runtime.support import untrusted_input
 from runtime.support.progress import tracked
 
-FILE_BYTES_MAX = 4 << 30  # largest model file
-LIMIT = 0.25 / 255  # largest difference in panel values: a quarter of a code
-SMALL = (96, 160)  # size of the pictures for a model without a fixed size
+FILE_BYTES_MAX = 4 << 30  # maximum size of a model file
+LIMIT = 0.25 / 255  # maximum difference of panel values: a quarter of a code
+SMALL = (96, 160)  # size of pictures for a model without a fixed size
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class Check:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Every check of one file."""
+    """Results of all checks of one file."""
 
     file: str
     checks: tuple[Check, ...]
@@ -53,11 +53,11 @@ class Report:
         return all(check.passed for check in self.checks)
 
     def json(self) -> str:
-        """One object."""
+        """Return the report as a JSON object."""
         return json.dumps({"file": self.file, "passed": self.passed, "checks": [asdict(c) for c in self.checks]})
 
     def table(self) -> str:
-        """Return a readable table: check, found, wanted."""
+        """Return a readable table of checks, with what was found and required."""
         rows = [f"{'ok' if c.passed else 'FAILED':8}{c.name}: {c.found}; wanted: {c.wanted}" for c in self.checks]
         failed = sum(not check.passed for check in self.checks)
         end = f"{failed} of {len(self.checks)} checks failed" if failed else f"all {len(self.checks)} checks passed"
@@ -68,7 +68,7 @@ Reference = Callable[[Feeds], Sequence[np.ndarray]]
 
 
 def validate_file(path: Path) -> Report:
-    """Check a file. Raises InputError for a file that every command refuses."""
+    """Check a file. Raises InputError if every command would refuse it."""
     session = ModelSession(path)
     contract = session.contract
     if contract.input_frame != "chain":
@@ -79,14 +79,14 @@ def validate_file(path: Path) -> Report:
 
 
 def check_model(data: bytes, *, source: str, reference: Reference | None = None) -> Report:
-    """Check a model's bytes against its torch source or, without that, against its own graph.
+    """Check a model against its torch module or, without one, against its unoptimised graph.
 
     Raises InputError if the bytes are not an ONNX model or have no known contract.
     """
     try:
         model = onnx.load_from_string(data)
         onnx.checker.check_model(model)
-    except Exception as error:  # protobuf and onnx raise their own
+    except Exception as error:  # the errors of protobuf and onnx
         raise InputError(source, "", f"is not an ONNX model ({_said(error)})") from None
     contract = parse_contract({item.key: item.value for item in model.metadata_props}, source=source)
     checks = [Check("contract", f"{contract.arch} {contract.name}", f"version {VERSION}", True)]
@@ -107,7 +107,7 @@ def check_model(data: bytes, *, source: str, reference: Reference | None = None)
 
 
 def _size(shape: Sequence[Any], contract: Contract) -> tuple[int, int]:
-    """Height and width of the pictures to check with: the graph's, the contract's, or small ones."""
+    """Return the height and width of test pictures, from the graph or the contract, or small ones."""
     graph, given = (*shape[2:], None, None)[:2], (contract.height_px, contract.width_px)
     found = [g if isinstance(g, int) else c or s for g, c, s in zip(graph, given, SMALL, strict=True)]
     return found[0], found[1]
@@ -127,7 +127,7 @@ def _run(session: onnxruntime.InferenceSession) -> Reference:
 
 
 def _ports(session: onnxruntime.InferenceSession, contract: Contract) -> list[Check]:
-    """Check that names and ranks of the graph's inputs and outputs match its contract."""
+    """Check that names and ranks of the graph's inputs and outputs match the contract."""
     checks = []
     for what, items, ports in (
         ("inputs", session.get_inputs(), contract.inputs),
@@ -140,7 +140,10 @@ def _ports(session: onnxruntime.InferenceSession, contract: Contract) -> list[Ch
 
 
 def _panels(answer: Sequence[np.ndarray]) -> np.ndarray:
-    """Return a model's outputs as panel values in one row: panels in sixteenths of codes, or one tensor of values."""
+    """Return the outputs of a model as panel values in one row.
+
+    Outputs are panels in sixteenths of codes, or one tensor of values.
+    """
     if any(part.size == 1 and not np.isfinite(part).all() for part in answer):
         return np.full(1, np.nan, np.float32)
     scale = [1.0 if np.issubdtype(part.dtype, np.floating) else FULL for part in answer]
@@ -150,7 +153,7 @@ def _panels(answer: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _compared(name: str, run: Reference, reference: Reference, feeds: Feeds) -> Check:
-    """Run one input through both, and check shape, finite values and largest difference."""
+    """Run one input through both models and check shape, finite values and the maximum difference."""
     name = f"{'values' if name.startswith(ORDINARY) else 'drift'}, {name}"
     try:
         found = _panels(run(feeds))

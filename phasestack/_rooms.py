@@ -1,6 +1,6 @@
-"""Import phasestack's own `runtime`, `calib` and `model_export`, even next to others of these names.
+"""Import `runtime`, `calib` and `model_export` of phasestack, even next to others of these names.
 
-Raises ImportError if the program has already imported another module with one of these names.
+Raises ImportError if the program has already imported another module of one of these names.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ def _import_ours(name: str) -> None:
     loaded = sys.modules.get(name)
     if loaded is not None:
         if not loaded.__file__ or Path(loaded.__file__).resolve() != init:
-            raise ImportError(f"phasestack has its own `{name}`; rename yours: {loaded.__file__ or loaded.__path__}")
+            raise ImportError(f"phasestack has a package `{name}`; rename yours ({loaded.__file__ or loaded.__path__})")
         return
     spec = spec_from_file_location(name, init, submodule_search_locations=[str(init.parent)])
     assert spec is not None and spec.loader is not None

@@ -1,4 +1,4 @@
-"""An example stereo pair, rendered by phasestack and free to use."""
+"""Example stereo pair, rendered by phasestack and free to use."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SCENE, EYES_M, FOV_DEG = "room", ((0.6, -0.0315, 0.03), (0.6, 0.0315, 0.03)), 40
 
 @dataclass(frozen=True)
 class ExamplePair:
-    """A pair of pictures with the eye positions, stack and field of view for which they were rendered."""
+    """Pair of pictures with the eye positions, stack and field of view for which they were rendered."""
 
     left: U8  # (360, 640, 3)
     right: U8

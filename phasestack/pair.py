@@ -1,4 +1,4 @@
-"""Solving pairs of pictures, and measuring the quality of any layers."""
+"""Functions that solve pairs of pictures, and measure the quality of any layers."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ from runtime.support.artifacts import OutputFolder, write_json
 from runtime.support.progress import ShownProgress
 from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG, SEPARATION_MIN_M, refusal
 
-EVERY_LEAST = 20  # least number of sampled pixels along a picture's shorter side
-SAME_PLACE_M = 0.001  # largest distance between an eye and its camera
+EVERY_LEAST = 20  # minimum number of sampled pixels along the shorter side of a picture
+SAME_PLACE_M = 0.001  # maximum distance between an eye and its camera
 _one_at_a_time = Lock()  # a loaded model reuses its buffers
 
 Eyes = Sequence[Sequence[float]] | Sequence[F64] | F64
@@ -46,16 +46,16 @@ Cameras = Sequence[Sequence[Sequence[float]]] | Sequence[F64] | F64
 
 @dataclass(frozen=True)
 class _Pair:
-    """A validated request: pictures as seen by pinhole eyes that look at the stack's origin."""
+    """Validated request, with pictures as seen by pinhole eyes that look at the stack's origin."""
 
     pictures: tuple[Picture, ...]
     eyes_m: F64
     stack: PanelStack
     fov_deg: float
-    is_resampled: bool  # from the caller's cameras
+    is_resampled: bool  # True if the caller gave cameras
 
     def judged(self, layers: U8) -> SolvedPair:
-        """Return the layers together with both eyes' views of them."""
+        """Return the layers with the views that both eyes have of them."""
         return SolvedPair(layers, self.pictures, self.stack, self.eyes_m, self.fov_deg)
 
 
@@ -65,7 +65,7 @@ class Measuring(TypedDict, total=False):
     sigmas_mm: Sequence[
         float
     ]  # tracking errors to measure, 0, 1 and 2 by default; each except 0 takes four more measurements
-    every: int  # N: measure every Nth pixel of every Nth row of the pictures; 1: all of them
+    every: int  # N: measure every Nth pixel of every Nth row; 1: all pixels
 
 
 class Result:
@@ -86,7 +86,7 @@ class Result:
 
     @property
     def quality(self) -> PairQuality:
-        """Quality of the eyes' views, measured on first access, which may take longer than solving.
+        """Quality of the eyes' views. Measured on first access, which may take longer than solving.
 
         Warns if `notes` explains why the quality is poor.
         """
@@ -95,7 +95,7 @@ class Result:
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
-        """Reasons why the eyes see ghosts, if the pictures' disparity explains that."""
+        """Reasons why the eyes see ghosts, if the disparity of the pictures explains them."""
         asked = self._asked
         return tuple(
             disparity_doubts(
@@ -114,7 +114,7 @@ class Result:
 
     @property
     def seen(self) -> U8:
-        """(2, h, w, 3) views of the eyes, left first."""
+        """Views of the eyes (2, h, w, 3), left first."""
         return np.stack(self._pair.seen)
 
     @cached_property
@@ -253,7 +253,7 @@ def evaluate(
         last = given.ndim == 4 and given.shape[1] in (3, 4) and given.shape[3] not in (3, 4)
         advice = "; channels must come last: np.moveaxis(layers, 1, -1)" if last else ""
         advice = "; for grey layers use np.stack([layers] * 3, -1)" if given.shape == wanted else advice
-        raise ValueError(f"layers: have the shape {given.shape}, the stack's are {(*wanted, 3)}{advice}")
+        raise ValueError(f"layers: must have the shape {(*wanted, 3)} of the stack, not {given.shape}{advice}")
     if np.issubdtype(given.dtype, np.floating) and 1 < given.max() <= np.pi / 2:
         raise ValueError(
             f"layers: values are up to {given.max():g}, not 1; if they are angles in radians, divide by pi/2"
@@ -279,7 +279,7 @@ def _measured(pair: SolvedPair, how: Measuring) -> PairQuality:
 
 
 def camera(eye_m: Sequence[float] | F64, *, width_px: int, height_px: int, fov_deg: float = 40.0) -> F64:
-    """(3, 4) pinhole camera at an eye, from homogeneous metres of `stack` to homogeneous pixels.
+    """Return the pinhole camera (3, 4) at an eye, from homogeneous metres to homogeneous pixels.
 
     It looks at the stack's origin, with x parallel to the ground, and is the default for pictures.
 
@@ -321,12 +321,12 @@ def _checked(
     """Raises ValueError, naming the argument."""
     pictures = [as_picture(name, picture) for name, picture in zip(("left", "right"), given, strict=True)]
     if pictures[0].shape != pictures[1].shape:
-        raise ValueError(f"right: is {pictures[1].shape}, left is {pictures[0].shape}: both must have the same size")
+        raise ValueError(f"right: is {pictures[1].shape}, left is {pictures[0].shape}: both must have the same shape")
     stack = checked_stack(stack)
     fov_deg = _number("fov_deg", fov_deg, *FOV_RANGE_DEG, "degrees")
     if cameras is None:
         if eyes_m is None:
-            raise ValueError("eyes_m: required (left and right eye in metres), unless cameras are given")
+            raise ValueError("eyes_m: must be given (left and right eye in metres) unless cameras are")
         eyes = _eyes(eyes_m, stack)
     else:
         try:

@@ -1,4 +1,4 @@
-"""Conversion of callers' pictures (arrays, tensors, Pillow images), and finding eyes in them."""
+"""Conversion of callers' pictures (arrays, tensors, Pillow images), and a finder for eyes in them."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from runtime.records import U8
 from runtime.support.picture_file import rgb_of
 
 LEAST_PX = 16
-SLACK = 1e-3  # rounding may exceed the range by this: a quarter of a code
+SLACK = 1e-3  # tolerance for rounding: a quarter of a code
 OVERSHOOT = 0.3  # resampling may overshoot by this fraction of white
 
 
 def as_picture(name: str, given: Any) -> Picture:
-    """Return (h, w, 3) uint8, or float32 intensities in [0, 1]. White shows through transparent pixels.
+    """Return uint8 or float32 intensities in [0, 1], (h, w, 3). White shows through transparent pixels.
 
     given: an array, a tensor, or a Pillow image in any mode. Raises ValueError, naming the argument.
     """
@@ -49,7 +49,7 @@ def as_array(name: str, given: Any) -> Any:
     """Return an array, or a tensor on any device, as a numpy one. Raises ValueError, naming the argument."""
     if isinstance(given, str | os.PathLike):
         raise ValueError(f"{name}: is a file name; read the file first, e.g. with PIL.Image.open({os.fspath(given)!r})")
-    if hasattr(given, "detach"):  # a torch tensor, with or without a gradient
+    if hasattr(given, "detach"):  # a torch tensor
         given = given.detach().cpu()
         given = given.float() if given.is_floating_point() else given
     try:

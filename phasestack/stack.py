@@ -1,4 +1,4 @@
-"""The display's geometry, for programs."""
+"""Geometry of a display, for programs."""
 
 from __future__ import annotations
 
