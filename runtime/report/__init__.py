@@ -1,1 +1,1 @@
-"""Measurements of quality against run time, in motion and of stability, with their pages and plots."""
+"""Measurements of quality against run time, of moving viewers and of stability, with pages and plots."""

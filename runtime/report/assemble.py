@@ -1,4 +1,4 @@
-"""The whole report: runs the measurements in order, and rewrites page and record after each."""
+"""The whole report, which runs the measurements in order and rewrites page and record after each."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Progress = Callable[[str], None]
 
 
 class GrowingPage:
-    """index.html, report.json and plots, rewritten with every result, so that a stopped report is usable."""
+    """index.html, report.json and plots, rewritten with every result so that a stopped report is usable."""
 
     def __init__(self, out: Path, command: str, progress: Progress) -> None:
         self.out, self._command, self._progress = out, command, progress
@@ -39,7 +39,7 @@ class GrowingPage:
         self.record["measuring"] = what
 
     def put(self, name: str, section: PageSection) -> None:
-        """Add a section, or replace the section of that name."""
+        """Add a section or replace the one of the same name."""
         self._sections[name] = section
         self.write()
 
@@ -54,9 +54,9 @@ class GrowingPage:
         doing = self.record.get("measuring")
         notes = [f"Not finished: this page grows as figures come in. Last known step: {doing}."] if doing else []
         if busy := too_busy(self.record["yardsticks_ms"]):
-            notes.append(f"The machine was busy ({busy}): do not compare these times, not even their ratios.")
+            notes.append(f"The machine was busy ({busy}), so do not compare these times or their ratios.")
         sections, machine = list(self._sections.values()), self.record["machine"]
-        lead = "Light, at a tracking error of 1 mm, is the figure to quote; higher is better."
+        lead = "Quote the light at a tracking error of 1 mm. Higher is better."
         page = Page("Light against run time", lead, sections, machine, self._command, notes)
         page.write(self.out, record="report.json", data=self.record)
 
@@ -71,9 +71,9 @@ def whole_report(
     command: str = "phasestack report",
     progress: Progress = lambda name: None,
 ) -> dict[str, Any]:
-    """Measure everything into a folder; return report.json. `quick`: quarter size, fewer references.
+    """Measure everything into a folder and return report.json. quick: quarter size, fewer references.
 
-    Raises InputError for invalid case files and models, before the first measurement.
+    Raises InputError for invalid case files and models before the first measurement.
     """
     cases = read_pairs(pairs) if pairs is not None else []
     stack = StackGeometry().stack()
@@ -106,7 +106,7 @@ def _by_size(cases: Sequence[StillPair]) -> dict[str, list[StillPair]]:
 def _frontier(
     page: GrowingPage, methods: Sequence[Method], pairs: Iterable[StillPair], *, title: str, name: str, key: str
 ) -> None:
-    """Measure a section of pairs of one resolution; key: list in the record that its methods are added to."""
+    """Measure pairs of one resolution. key: list in the record to which the methods are added."""
     title = f"Light against run time: {title}"
     page.doing(f"{title}: drawing")
     before, results = page.record.get(key, []), dict[str, MethodResult]()

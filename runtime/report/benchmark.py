@@ -1,4 +1,4 @@
-"""Regression file: time, light and memory of the shipped models, and the machine's reference time."""
+"""Regression file with time, light and memory of the shipped models, and a reference time."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from runtime.report.page import describe
 from runtime.report.pairs import FOV_DEG, PairPainter, eyes_at
 
 SIZES = ((960, 540), (1920, 1080))
-WORSE_DB = 0.1  # change that rounding and thread order cannot explain
-SLOWER = 0.15  # least relative change that is reported; larger if the runs scatter more
-MORE_MEMORY = 0.15  # relative change that is reported
-UNSTEADY = 1.3  # times are not compared if the slowest and fastest yardstick differ by a larger factor
+WORSE_DB = 0.1  # larger than changes caused by rounding and thread order
+SLOWER = 0.15  # minimum relative change that is reported; more if the runs scatter
+MORE_MEMORY = 0.15  # minimum relative change that is reported
+UNSTEADY = 1.3  # maximum ratio of yardsticks for which times are compared
 SCATTERS = 3.0  # a difference must exceed this many times the medians' scatter
 
 
 class BenchEntry(BaseModel):
-    """Compared figures of one method at one size."""
+    """Figures of one method at one size that are compared."""
 
     name: str
     width_px: int
@@ -44,7 +44,7 @@ class BenchEntry(BaseModel):
 
 
 class RegressionFile(BaseModel):
-    """Compared part of a regression file."""
+    """Part of a regression file that is compared."""
 
     version: Literal[2]
     yardstick_ms: PositiveFloat
@@ -53,7 +53,7 @@ class RegressionFile(BaseModel):
 
 
 def too_busy(yardsticks_ms: Sequence[float]) -> str:
-    """Reason why times can't be compared (other load on the machine); empty if they can."""
+    """Reason why times cannot be compared (other load on the machine), or empty."""
     least, most = min(yardsticks_ms), max(yardsticks_ms)
     if most > UNSTEADY * least:
         return f"the same work took {least:.1f} to {most:.1f} ms during the measurement"
@@ -61,12 +61,12 @@ def too_busy(yardsticks_ms: Sequence[float]) -> str:
 
 
 def read(path: Path) -> RegressionFile:
-    """Read a regression file. Raises InputError with file and field for anything else."""
+    """Read a regression file. Raises InputError that names file and field."""
     return validated(RegressionFile, read_table(path), source=path)
 
 
 def yardstick_ms() -> float:
-    """Median time of nine runs of a fixed workload: warp, look-up table, matrix product."""
+    """Return the median time of nine runs of a fixed workload: warp, look-up table, matrix product."""
     picture = np.random.default_rng(0).integers(0, 256, (1080, 1920, 4), dtype=np.uint8)
     left = np.random.default_rng(1).random((1080, 240), dtype=np.float32)
     right = np.random.default_rng(2).random((240, 1920), dtype=np.float32)
@@ -81,7 +81,7 @@ def yardstick_ms() -> float:
 
 
 def scatter(values: Sequence[float]) -> float:
-    """Relative standard error of the median: 1.4826·MAD·1.25/sqrt(n)."""
+    """Return the relative standard error of the median: 1.4826·MAD·1.25/sqrt(n)."""
     middle = float(np.median(values))
     deviation = float(np.median(np.abs(np.asarray(values) - middle)))
     relative: float = 1.4826 * 1.2533 * deviation / middle / len(values) ** 0.5
@@ -94,7 +94,7 @@ def measured(
     sizes: Sequence[tuple[int, int]] = SIZES,
     progress: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
-    """Measure the content of a regression file; takes about a minute."""
+    """Measure the content of a regression file. Takes about a minute."""
     yardsticks, entries = [yardstick_ms()], []
     methods = [Method(name, "network", name) for name in models]
     for width, height in sizes:
@@ -122,7 +122,7 @@ def _entry(result: MethodResult) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One difference between two files, beyond noise."""
+    """Difference between two files that exceeds the noise."""
 
     what: str
     worse: bool
@@ -130,9 +130,9 @@ class Change:
 
 
 def compare(old: RegressionFile, new: RegressionFile) -> list[Change]:
-    """Changes between two regression files, with times relative to each file's yardstick.
+    """Return the changes between two regression files, with times relative to the yardstick of each.
 
-    Times are not compared if the machine was too busy in either (`too_busy`).
+    Times are not compared if the machine was too busy during either measurement (`too_busy`).
     """
     later = {entry.title: entry for entry in new.methods}
     machine = new.yardstick_ms / old.yardstick_ms

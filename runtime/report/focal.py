@@ -1,4 +1,4 @@
-"""Focal parallax (supplement, 1.4): an eye with a finite pupil focuses through the layers.
+"""Focal parallax (supplement, 1.4), where an eye with a finite pupil focuses through the layers.
 
 The eye sees the mean of the pictures through all points of its pupil. Focusing at a distance f along the gaze shifts
 these pictures so that they agree there: the pinhole picture through the pupil's point (right, up) is shifted by
@@ -36,7 +36,7 @@ PLANES_M = (-0.11, -0.08, -0.05, -0.025, 0.0, 0.022, 0.045, 0.07, 0.095)  # x of
 
 @dataclass(frozen=True, slots=True)
 class Slice:
-    """One setting of the eye's lens."""
+    """View with one setting of the eye's lens."""
 
     plane_m: float  # x of the plane in focus
     shown: F32  # (h, w, 3) view through the layers
@@ -45,7 +45,7 @@ class Slice:
 
 @dataclass(frozen=True, slots=True)
 class Accommodation:
-    """Distances at which the eyes converge on a card and at which its picture is sharpest."""
+    """Distances at which the eyes converge on a card and at which its picture is sharpest, in metres."""
 
     card_m: float  # distance from the eye to the point where the lines of sight meet
     sharpest_shown_m: float
@@ -54,7 +54,7 @@ class Accommodation:
 
 @dataclass(frozen=True, slots=True)
 class FocalStack:
-    """One eye's focal stack through a model's layers."""
+    """Focal stack of one eye through the layers of a model."""
 
     model: str
     slices: tuple[Slice, ...]
@@ -62,7 +62,7 @@ class FocalStack:
 
 
 def projection(eye_m: F64, point: F64, *, focus_m: float) -> F64:
-    """3x4 projection of `stack` points through a pupil's point (right, up), focused on a plane.
+    """Return the 3x4 projection through a point of the pupil (right, up), focused on a plane.
 
     Its third coordinate is the distance from the eye along the gaze.
     """
@@ -74,7 +74,7 @@ def projection(eye_m: F64, point: F64, *, focus_m: float) -> F64:
 
 
 def card_windows(eye_m: F64) -> list[tuple[slice, slice]]:
-    """Rows and columns of the cards in the eye's picture, a little inside their edges."""
+    """Return the rows and columns of the cards in the eye's picture, slightly inside their edges."""
     windows = []
     matrix = projection(eye_m, np.zeros(2), focus_m=DISTANCE_M)
     for x, y in zip(CARDS_M, OFFSETS_M, strict=True):
@@ -86,13 +86,13 @@ def card_windows(eye_m: F64) -> list[tuple[slice, slice]]:
 
 
 def contrast(image: F32, window: tuple[slice, slice]) -> float:
-    """RMS of the brightness gradient in a window: largest where the picture is sharp."""
+    """Return the RMS brightness gradient in a window, which is largest for a sharp picture."""
     grey = image[window].mean(axis=2)
     return float(np.sqrt((np.diff(grey, axis=1) ** 2).mean() + (np.diff(grey, axis=0) ** 2).mean()))
 
 
 def sharpest(distances_m: Sequence[float], values: Sequence[float]) -> float:
-    """Distance of the maximum of a parabola through the largest value and its neighbours."""
+    """Return the distance at the maximum of a parabola through the largest value and its neighbours."""
     best = int(np.argmax(values))
     if not 0 < best < len(values) - 1:
         return distances_m[best]
@@ -103,7 +103,7 @@ def sharpest(distances_m: Sequence[float], values: Sequence[float]) -> float:
 def focal_stack(
     painter: PairPainter, stack: PanelStack, *, model: str, progress: Callable[[int, int], None] = lambda done, of: None
 ) -> FocalStack:
-    """Solve the layers for two pinhole eyes, then focus the right one at every plane."""
+    """Solve for two pinhole eyes, then focus the right one at every plane."""
     eyes = eyes_at(distance_m=DISTANCE_M)
     predictor = load_predictor(model, stack, ModelSettings())
     raster = stack.panel(stack.count // 2)
@@ -134,14 +134,14 @@ def focal_stack(
 
 
 def seen_through(matrix: F64, layers: U8, stack: PanelStack) -> Retina:
-    """Picture of the layers through a projection, and a mask of the rays that cross every panel."""
+    """Return the picture of the layers through a projection, and a mask of rays that cross every panel."""
     rays = Rays(matrix, np.arange(WIDTH_PX) + np.float64(0.5), (np.arange(HEIGHT_PX) + np.float64(0.5))[:, None])
     panels = [stack.panel(index) for index in range(stack.count)]
     return through_layers(layers, lambda rows: (rays.on(panel, rows) for panel in panels), rays.toward_panels(), stack)
 
 
 def cards_painter(stack: PanelStack) -> PairPainter:
-    """Painter of three finely textured cards: behind, in and in front of the middle panel."""
+    """Return a painter of three finely textured cards: behind, in and in front of the middle panel."""
     card = shapes.card(0.034, 0.036, repeat=(3.4, 3.6))
     things = tuple(
         Thing(card, "checker", (x, y, 0.0), colour, lit=False)

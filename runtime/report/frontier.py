@@ -1,4 +1,4 @@
-"""Light against run time: every method on every pair, each method in its own process."""
+"""Light against run time of every method on every pair, with each method in a separate process."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ Kind = Literal["network", "iterative"]
 SHIPPED = ("balanced", "fast", "best")  # the default model comes first in a report
 SART = (1, 3, 10, 30)
 ENOUGH_S = 2.0  # seconds of timed runs per pair; slow methods run once
-MOST_RUNS = 25  # timed runs of one method on one pair
-FEWEST_RUNS = 3  # timed runs, unless the first is slow
+MOST_RUNS = 25  # maximum number of timed runs of one method on one pair
+FEWEST_RUNS = 3  # minimum number of timed runs, unless the first is slow
 SLOW_S = 4.0  # if the first run takes longer than this, it counts and is the only one
 OFF_STEP = 3  # for displaced eyes, every third ray of every third row is enough
 QUOTED = "1"  # key of `light_db`: tracking error 1 mm
@@ -45,7 +45,7 @@ QUOTED = "1"  # key of `light_db`: tracking error 1 mm
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """A method that computes layers."""
+    """Method that computes layers."""
 
     name: str
     kind: Kind
@@ -64,7 +64,7 @@ class Method:
 
 
 def shipped_and_references(models: Sequence[str] = (), *, quick: bool = False) -> list[Method]:
-    """The shipped models, further ONNX files, and the iterative reference; `quick`: without the slowest."""
+    """Return the shipped models, further ONNX files and the iterative reference. quick: omit the slowest."""
     methods = [Method(name, "network", name) for name in SHIPPED]
     methods += [Method(Path(name).stem, "network", name) for name in models]
     return methods + [Method(f"SART-{n}", "iterative", "sart", n) for n in (SART[:-1] if quick else SART)]
@@ -72,7 +72,7 @@ def shipped_and_references(models: Sequence[str] = (), *, quick: bool = False) -
 
 @dataclass(frozen=True, slots=True)
 class MethodRun:
-    """One method on one pair, measured in its process."""
+    """Measurements of one method on one pair, in a separate process."""
 
     layers: U8
     run_ms: tuple[float, ...]  # times of whole solutions, from two decoded images to N 8-bit layers
@@ -95,7 +95,7 @@ class PairResult:
 
 @dataclass(frozen=True, slots=True)
 class MethodResult:
-    """A method's means over the pairs of one resolution: an entry of `methods` in report.json."""
+    """Means of a method over the pairs of one resolution: an entry of `methods` in report.json."""
 
     name: str
     kind: Kind
@@ -123,7 +123,7 @@ class MethodResult:
 
     @property
     def quoted_db(self) -> float:
-        """The figure to quote; NaN if displaced eyes see no part of the panels."""
+        """Figure to quote, or NaN if displaced eyes see no part of the panels."""
         return self.light_db.get(QUOTED, math.nan)
 
 
@@ -132,8 +132,8 @@ def measure(
 ) -> Iterator[tuple[str, MethodResult]]:
     """Measure every method, pair by pair, at one resolution.
 
-    viewers: folder for viewers of the first method. Yields, after each measurement, its name and the method's result
-    up to then. Raises FatalError if one fails.
+    viewers: folder for viewers of the first method. After each measurement, yields its name and the result of the
+    method so far. Raises FatalError if one fails.
     """
     results: dict[str, list[PairResult]] = {method.name: [] for method in methods}
     for pair in pairs:
@@ -145,7 +145,7 @@ def measure(
 
 
 def apart(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-    """Call an importable function in a fresh process with its own memory. Raises FatalError."""
+    """Call an importable function in a new process. Raises FatalError."""
     # Its stdout goes to stderr, because ours may be JSON.
     with ProcessPoolExecutor(1, get_context("spawn"), initializer=os.dup2, initargs=(2, 1)) as pool:
         try:
@@ -162,7 +162,7 @@ def _called(function: Callable[..., T], args: Any, kwargs: Any) -> T:
 
 
 def run_method(method: Method, pair: StillPair, threads: int) -> MethodRun:
-    """Load, warm up and time a method, and record its peak memory; runs in a separate process."""
+    """Load, warm up and time a method, and record its peak memory. Runs in a separate process."""
     import cv2
 
     from runtime.model.still import solve_still
@@ -233,7 +233,7 @@ def _together(method: Method, pair: StillPair, run: MethodRun, pairs: list[PairR
 
 
 def _means(tables: Sequence[Any]) -> dict[str, float]:
-    """Mean for each key, over the tables that have a finite value for it."""
+    """Return the mean for each key over the tables that have a finite value for it."""
     keys = dict.fromkeys(key for table in tables for key in table)
     values_of = {key: [table[key] for table in tables if math.isfinite(table.get(key, math.nan))] for key in keys}
     return {key: float(np.mean(values)) for key, values in values_of.items() if values}

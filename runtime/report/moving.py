@@ -1,4 +1,4 @@
-"""Live quality for moving viewers, from simulated runs with fixed efforts and with the loop's choice."""
+"""Live quality for moving viewers, in simulated runs with fixed efforts and with the loop's choice."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ FIXED = (FULL, Effort(1, 1), Effort(1, 0), Effort(2, 0), Effort(3, 0), Effort(4,
 # Costs of the full raster on a slow processor.
 COSTS_MS = {"render": 44, "prepare": 40, "inference": 31, "finish": 38, "step": 85}
 SECONDS, NOISE_MM, SEED = 6.0, 0.3, 5
-EVERY = 23  # refreshes between samples; not a multiple of the refreshes per solution
+EVERY = 23  # refreshes between samples; no multiple of the refreshes per solution
 
 
 @dataclass(frozen=True, slots=True)
 class Moving:
-    """One motion with one effort."""
+    """Result for one motion with one effort."""
 
     motion: str
-    effort: str  # a fixed one's name, or `auto`
+    effort: str  # name of a fixed effort, or `auto`
     live_db: float  # docs/contracts.md, Error
     view_error_mm: tuple[float, float]  # p50 and p95, true eyes to those that the layers were solved for
     efforts: Mapping[str, float]  # seconds on the panels, by name
@@ -45,7 +45,7 @@ def simulated_run(
     keep_light: int = 0,
     output: Output | None = None,
 ) -> dict[str, Any]:
-    """summary.json of a simulated run. Raises FatalError."""
+    """Return summary.json of a simulated run. Raises FatalError."""
     options = RunOptions(max_speed=True, measure=True, scale=scale, fixed=fixed, keep_light=keep_light)
     with ExitStack() as cleanup:
         run = build_run(settings, options, cleanup, output=output)
@@ -56,7 +56,7 @@ def simulated_run(
 
 
 def settings_for(recording: Path, *, scene: str, effort: str) -> Settings:
-    """Default settings for a recording, on a simulated clock with COSTS_MS."""
+    """Return the default settings for a recording on a simulated clock with COSTS_MS."""
     table = Settings().model_dump()
     table["sensor"] |= {"driver": "replay", "source": str(recording), "loop": False}
     table["content"]["scene"] = scene

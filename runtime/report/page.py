@@ -1,4 +1,4 @@
-"""Self-contained HTML pages for reports, the style of their plots, and a description of the machine."""
+"""Self-contained HTML pages of reports, the style of their plots, and a description of the machine."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PACKAGES = (
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """A picture and its caption."""
+    """Picture and its caption."""
 
     name: str  # file name without .png
     png: bytes
@@ -38,7 +38,7 @@ class Figure:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table: rows of text under headings."""
+    """Table of text under headings."""
 
     headings: Sequence[str]
     rows: Sequence[Sequence[str]]
@@ -47,7 +47,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class PageSection:
-    """One section of a page."""
+    """Section of a page."""
 
     title: str
     text: Sequence[str] = ()  # paragraphs, plain text
@@ -58,13 +58,13 @@ class PageSection:
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """A complete report page."""
+    """Complete report page."""
 
     title: str
     lead: str  # the main result in a sentence
     sections: Sequence[PageSection]
     machine: Mapping[str, str] = field(default_factory=dict)
-    command: str = ""  # reproduces this page; empty: not shown
+    command: str = ""  # command that reproduces this page; empty: not shown
     notes: Sequence[str] = ()  # caveats
 
     def html(self) -> str:
@@ -80,10 +80,7 @@ class Page:
         return [figure for section in self.sections for figure in section.figures]
 
     def write(self, out: Path, *, record: str, data: Any) -> None:
-        """Write index.html, its PNGs and `data` as the JSON file `record` into `out`, all or none.
-
-        Raises InputError.
-        """
+        """Write index.html, its PNGs and `data` (as `record`) into `out`, all or none. Raises InputError."""
         with OutputFolder(out) as folder:
             write_json(folder.staging / record, data)
             write_text(folder.staging / "index.html", self.html())

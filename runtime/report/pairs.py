@@ -40,7 +40,7 @@ class OffView:
 
 @dataclass(frozen=True, slots=True)
 class StillPair:
-    """A left/right pair of pictures, the eye positions that they fit, and the panels."""
+    """Pair of pictures, the eye positions that they fit, and the panels."""
 
     name: str
     stack: PanelStack
@@ -51,7 +51,7 @@ class StillPair:
 
 
 class OffEntry(BaseModel):
-    """Target for a displaced eye, as a case file states it."""
+    """Target for a displaced eye in a case file."""
 
     mm: Annotated[float, Field(strict=True, ge=0, le=1000 * EYE_MOST_M)]
     eye: Place
@@ -59,7 +59,7 @@ class OffEntry(BaseModel):
 
 
 class CaseFile(BaseModel):
-    """A case file (docs/contracts.md)."""
+    """Content of a case file (docs/contracts.md)."""
 
     panels: dict[str, Any]
     eyes: tuple[Place, Place]  # left, right
@@ -69,7 +69,7 @@ class CaseFile(BaseModel):
 
 
 def read_pairs(folder: Path) -> list[StillPair]:
-    """Read every case file in a folder, in order of names; ignore other JSON.
+    """Read every case file in a folder, in order of names, and ignore other JSON.
 
     Raises InputError, naming file and field, for an invalid case or a folder without cases.
     """
@@ -105,7 +105,7 @@ def _case(path: Path, table: dict[str, Any]) -> StillPair:
 
 
 def eyes_at(*, distance_m: float, angle_deg: float = 0.0, height_m: float = 0.0, ipd_m: float = 0.063) -> F64:
-    """Return (2, 3) eyes that face the origin, at a given distance and angle from +x towards +y."""
+    """Return eyes (2, 3) that face the origin, at a distance and at an angle from +x towards +y."""
     angle = math.radians(angle_deg)
     level = math.sqrt(max(distance_m**2 - height_m**2, 0.0))
     middle = np.array([level * math.cos(angle), level * math.sin(angle), height_m])
@@ -114,17 +114,17 @@ def eyes_at(*, distance_m: float, angle_deg: float = 0.0, height_m: float = 0.0,
 
 
 def beside(eye_m: ArrayLike, mm: float) -> list[F64]:
-    """(3,) positions `mm` away from an eye: right, up, left, down in its frame."""
+    """Return positions (3,) `mm` away from an eye: right, up, left and down in its frame."""
     pose = stack_from_eye(eye_m)
     directions = ((1, 0), (0, 1), (-1, 0), (0, -1))
     return [pose[:3, 3] + mm / 1000 * (right * pose[:3, 0] + up * pose[:3, 1]) for right, up in directions]
 
 
 class PairPainter:
-    """Draws a built-in scene from anywhere. It owns a GL context, so use it on one thread and close it."""
+    """Painter of a built-in scene, from anywhere. Owns a GL context: use it on one thread and close it."""
 
     def __init__(self, scene: str | Scene, stack: PanelStack) -> None:
-        """Open the scene. Raises InputError for an unknown one, MissingPart without OpenGL."""
+        """Open a scene. Raises InputError for an unknown one, MissingPart without OpenGL."""
         from runtime.content.procedural import ProceduralSource
         from runtime.support.gl import offscreen_context
 
@@ -139,21 +139,21 @@ class PairPainter:
         self.context.release()
 
     def draw(self, eye_m: ArrayLike, pixels_from_stack: F64, *, width_px: int, height_px: int) -> U8:
-        """Draw an (h, w, 4) picture of the scene through any projection."""
+        """Draw a picture (h, w, 4) of the scene through any projection."""
         from runtime.content.base import View
 
         eye = np.asarray(eye_m, dtype=np.float64)
         return self.content.render(View(eye, 0, pixels_from_stack, width_px, height_px), time_ns=0).copy()
 
     def image(self, eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg: float = FOV_DEG) -> U8:
-        """Draw the (h, w, 3) retina picture of an eye that looks at the stack's origin."""
+        """Draw the retina picture (h, w, 3) of an eye that looks at the stack's origin."""
         projection = image_from_stack(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
         return np.ascontiguousarray(self.draw(eye_m, projection, width_px=width_px, height_px=height_px)[..., :3])
 
     def pair(
         self, name: str, eyes_m: F64, stack: PanelStack, *, fov_deg: float = FOV_DEG, off_mm: Sequence[float] = OFF_MM
     ) -> StillPair:
-        """Draw a pair at the stack's resolution, with pictures for positions around both eyes."""
+        """Draw a pair at the resolution of the stack, with pictures for positions around both eyes."""
         size = {"width_px": stack.width_px, "height_px": stack.height_px}
         left, right = (self.image(eye, **size, fov_deg=fov_deg) for eye in eyes_m)
         off = tuple(

@@ -17,7 +17,7 @@ NAMES = ("behind the panels", "in the middle panel", "in front of the panels")
 
 
 def frontier_section(results: Sequence[MethodResult], *, title: str, name: str) -> PageSection:
-    """Plot and table of the methods measured so far at one resolution."""
+    """Return plot and table of the methods measured so far at one resolution."""
     pairs = "; ".join(pair.pair for pair in results[0].pairs)
     text = [
         f"Every method on {pairs}, in one run. Light is the figure to quote: panel pixels are squares, pupils 4 mm "
@@ -80,7 +80,7 @@ def kind_of(result: MethodResult) -> str:
 
 
 def method_table(results: Sequence[MethodResult]) -> Table:
-    """Table of all figures, fastest first, with times also as multiples of the fastest."""
+    """Return a table of all figures, fastest first, with times also as multiples of the fastest."""
     ordered = sorted(results, key=lambda r: r.ms_p50)
     beside = list(dict.fromkeys(key for result in results for key in result.psnr_db_off_eye))
     headings = ["method", "× fastest", "p50 ms", "p99 ms", "MiB", "parameters", "light 1 mm dB", "0 mm", "2 mm"]
@@ -99,7 +99,7 @@ def method_table(results: Sequence[MethodResult]) -> Table:
 
 
 def moving_section(found: Sequence[Moving]) -> PageSection:
-    """Live quality and view error for every motion and effort measured so far."""
+    """Return live quality and view error for every motion and effort measured so far."""
     costs = ", ".join(f"{stage} {ms}" for stage, ms in COSTS_MS.items())
     text = [
         "A solution takes longer than a refresh, and the head keeps moving. At every refresh the outer panels are "
@@ -156,7 +156,7 @@ def moving_plot(found: Sequence[Moving]) -> Figure:
 
 
 def focal_section(stack: FocalStack) -> PageSection:
-    """Table of distances and the focal slices."""
+    """Return the table of distances and the focal slices."""
     headings = ["card", "lines of sight meet at, mm", "sharpest through the layers, mm", "sharpest in truth, mm"]
     rows = []
     for name, card in zip(NAMES, stack.cards, strict=True):

@@ -1,4 +1,4 @@
-"""Cases of calibration (supplement, (15)-(28)) from pairs that hardly determine a known similarity."""
+"""Cases of calibration (supplement, (15)-(28)) with pairs that hardly determine a known similarity."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ HALF_TURN = Rotation.from_quat([1, 2, 2, 0]).as_matrix()
 
 
 def cloud(*, aspect: float = 1.0, size_m: float = 0.3, count: int = 27) -> F64:
-    """Return (n, 3) points within `size_m` along one axis and `aspect` of it along the others."""
+    """Return points (n, 3) within `size_m` along one axis and `aspect` times that along the others."""
     return np.random.default_rng(11).uniform(-1, 1, (count, 3)) * [size_m, size_m * aspect, size_m * aspect]
 
 

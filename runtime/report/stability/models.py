@@ -42,18 +42,18 @@ NETWORK_FLOOR = 0.0005  # an eighth of a code, for different rounding on other p
 
 @lru_cache(maxsize=4)
 def ready(model: str, stack: PanelStack) -> Predictor:
-    """Return a model's predictor, which is cached because most cases share the same panels."""
+    """Return the predictor of a model. Cached, because most cases share the same panels."""
     return load_predictor(model, stack, ModelSettings(threads=1))
 
 
 def layers_of(model: str, images: Sequence[U8], eyes_m: F64, stack: PanelStack, *, fov_deg: float = FOV_DEG) -> U8:
-    """Return the model's (N, h, w, 3) layers, copied out of the predictor."""
+    """Return a copy of the model's layers (N, h, w, 3)."""
     still = solve_still(images[0], images[1], eyes_m=eyes_m, fov_deg=fov_deg, predictor=ready(model, stack))
     return np.array(still.layers[..., :3])
 
 
 def waves(parts: Sequence[tuple[int, float]]) -> F64:
-    """Return a sum of sines with different phases across the picture, (WIDTH_PX,)."""
+    """Return a sum of sines (WIDTH_PX,) with different phases across the picture."""
     u = (np.arange(WIDTH_PX) + 0.5) / WIDTH_PX
     result: F64 = np.sum([size * np.sin(2 * np.pi * cycles * u + cycles - 1) for cycles, size in parts], axis=0)
     return result
@@ -67,7 +67,7 @@ def hats(positions: F64, count: int) -> F64:
 
 @dataclass(frozen=True)
 class StiffProblem:
-    """Problem with two eyes whose targets are a common grey picture plus a difference between the eyes."""
+    """Problem whose targets are a common grey picture plus a difference between the eyes."""
 
     gap_m: float = 0.06
     ipd_m: float = 0.06
@@ -110,7 +110,7 @@ class StiffProblem:
         return weights, np.broadcast_to(self.target(side), u.shape)[inside]
 
     def residual(self, layers: F64) -> float:
-        """Return the RMS residual of (3, h, w) layers over both eyes, relative to the targets' variation."""
+        """Return the RMS residual of layers (3, h, w) over both eyes, relative to the targets' variation."""
         missing, whole = 0.0, 0.0
         for weights, target in map(self.rays, (0, 1)):
             sums = sum(
@@ -133,7 +133,7 @@ def optimum(problem: StiffProblem) -> float:
 
 
 def solved(model: str, problem: StiffProblem) -> Answer:
-    """Compare a model's residual with the smallest that any panels could leave."""
+    """Compare the residual of a model with the smallest that any panels could leave."""
     stack = PanelStack(WIDTH_M, HEIGHT_M, (-problem.gap_m, 0.0, problem.gap_m), WIDTH_PX, HEIGHT_PX)
     eyes_m = np.array([[problem.eye_x_m, side * problem.ipd_m / 2, 0.0] for side in (-1, 1)])
     greys = [np.rint(255 * np.sin(np.pi / 2 * problem.target(side)) ** 2).astype(np.uint8) for side in (0, 1)]

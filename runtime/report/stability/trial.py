@@ -1,7 +1,4 @@
-"""Trials: extreme cases that have not been run yet.
-
-Running one returns a Case, even if the tested code raises.
-"""
+"""Trials, extreme cases that have not been run yet. Running one gives a Case even if the code raises."""
 
 from __future__ import annotations
 
@@ -15,15 +12,15 @@ from runtime.errors import PhasestackError
 
 Behaviour = Literal["answers", "refuses"]
 EPS64 = 2.0**-52
-WORSE = 1.05  # largest accepted ratio of an error to the recorded one
+WORSE = 1.05  # maximum accepted ratio of an error to the recorded one
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """A result, measured against the reference."""
+    """Result compared with the reference."""
 
     forward_error: float  # error of the result, in the trial's measure
-    tolerance: float  # largest forward error that passes, fixed before the trial is run
+    tolerance: float  # maximum forward error that passes, fixed before the trial is run
     condition: float = 1.0  # factor by which the problem itself amplifies a relative error of its input
     backward_error: float | None = None  # change of the input that explains the result; None: as the forward error
     note: str = ""
@@ -31,7 +28,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One extreme case that has not been run yet."""
+    """Extreme case that has not been run yet."""
 
     stage: str
     name: str
@@ -49,7 +46,7 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One extreme case with its outcome, which is an entry of `stability.json`."""
+    """Extreme case with its outcome, an entry of `stability.json`."""
 
     name: str
     stage: str
@@ -70,7 +67,7 @@ def settle(trial: Trial, *, limit: float | None = None) -> Case:
     """
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # about inf and NaN: the result is checked anyway
+            warnings.simplefilter("ignore", RuntimeWarning)  # about inf and NaN, because the result is checked anyway
             answer = trial.run()
     except Exception as error:
         is_refusal = isinstance(error, PhasestackError | ValueError)
