@@ -1,13 +1,13 @@
 #!/bin/sh
-# Installs phasestack for the whole machine; `sh systemd/install.sh --help` explains it.
+# Installs phasestack for the whole machine. See `sh systemd/install.sh --help`.
 set -eu
 usage() {
   cat <<'HELP'
-Installs phasestack for the whole machine: sh systemd/install.sh (as root), or `make install`.
+Install phasestack for the whole machine. Run `sh systemd/install.sh` as root, or `make install`.
 
-  DESTDIR=/some/root  build a package's tree there; nothing on this machine is started or reloaded
-  PYTHON=python3.11   the Python that will run it (3.11 or later)
-  APP=no              only units, rules and configuration: the program comes from elsewhere
+  DESTDIR=/some/root  build the tree of a package there, and start or reload nothing on this machine
+  PYTHON=python3.11   Python that will run phasestack (3.11 or later)
+  APP=no              install only units, rules and configuration; the program comes from elsewhere
 
 Example: DESTDIR=/tmp/tree PYTHON=python3.12 sh systemd/install.sh
 HELP
@@ -54,7 +54,7 @@ if [ "${APP:-yes}" != no ]; then
   "$python" -m pip install --quiet --root-user-action=ignore --no-deps --target "$DESTDIR$library.new" "$kept/source"
 fi
 
-# A running program must not load modules of the new one.
+# A running program must not load modules of the new version.
 if [ "$live" = yes ]; then
   for unit in phasestack-page phasestack phasestack-x; do
     case $(systemctl show --property=ActiveState --value "$unit") in

@@ -1,4 +1,4 @@
-"""Print the udev rules of all known sensors: python systemd/make_udev_rules.py."""
+"""Prints the udev rules for all known sensors. Run `python systemd/make_udev_rules.py`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FOOTER = 'LABEL="phasestack_end"\n'
 
 
 def rules() -> str:
-    """Text of the rules file."""
+    """Return the text of the rules file."""
     lines = []
     for device in KNOWN_DEVICES:
         lines.append(f"# {device.name}")

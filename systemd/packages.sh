@@ -1,5 +1,5 @@
 #!/bin/sh
-# Debian's packages for the runtime built from source; with `test` also for the tests, with `slow` for the slow ones.
+# Debian packages for a runtime built from source; `test` adds those for the tests, `slow` those for the slow tests.
 # Installs them as root; otherwise prints the command.
 set -u
 runtime="g++ libegl1 libgl1-mesa-dri libgles2 libgl1 libusb-1.0-0 libopenni2-0"
@@ -10,7 +10,7 @@ case ${1:-} in
   slow) wanted="$runtime $testing $slow" ;;
   *) wanted=$runtime ;;
 esac
-command -v dpkg-query >/dev/null || { echo "Not Debian: please install the equivalents of: $wanted"; exit 0; }
+command -v dpkg-query >/dev/null || { echo "This is not Debian; please install the equivalents of: $wanted"; exit 0; }
 missing=""
 for name in $wanted; do
   dpkg-query -W -f='${Status}' "$name" 2>/dev/null | grep -q "install ok installed" || missing="$missing $name"

@@ -1,12 +1,12 @@
 #!/bin/sh
-# Removes the files of install.sh; `sh systemd/uninstall.sh --help` explains it.
+# Removes the files of install.sh. See `sh systemd/uninstall.sh --help`.
 set -eu
 usage() {
   cat <<'HELP'
-Removes what install.sh has put there: sh systemd/uninstall.sh (as root), or `make uninstall`.
+Remove what install.sh has installed. Run `sh systemd/uninstall.sh` as root, or `make uninstall`.
 
-  DESTDIR=/some/root  the tree that it was installed in
-  PURGE=yes           also the configuration and the state
+  DESTDIR=/some/root  tree in which it was installed
+  PURGE=yes           also remove the configuration and the state
 
 Example: PURGE=yes sh systemd/uninstall.sh
 HELP
@@ -46,6 +46,6 @@ if [ "$live" = yes ]; then
 fi
 echo "phasestack is removed${DESTDIR:+ from $DESTDIR}"
 for left in /etc/phasestack /var/lib/phasestack; do
-  [ ! -e "$DESTDIR$left" ] || echo "  left: $DESTDIR$left (PURGE=yes takes it)"
+  [ ! -e "$DESTDIR$left" ] || echo "  left: $DESTDIR$left (PURGE=yes removes it)"
 done
 [ "$live" = no ] || ! id phasestack >/dev/null 2>&1 || echo "  left: the user and group phasestack (userdel phasestack)"

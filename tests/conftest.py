@@ -1,4 +1,4 @@
-"""Fixtures of all tests: separate folders, one thread per library, logs restored, no time limits for hypothesis."""
+"""Fixtures for all tests: separate folders, one thread per library, restored logs, no time limits."""
 
 from __future__ import annotations
 

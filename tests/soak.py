@@ -1,4 +1,4 @@
-"""The daemon for a while: delays in its threads, four clients that change it, two losses of the sensor a minute.
+"""Runs the daemon with delays in its threads, four clients that change it, and losses of the sensor.
 
     python -m tests.soak --seconds 1200
     python -m tests.soak --seconds 3600 --windows    # on an X server with OpenGL's solver; cables are pulled, contexts

@@ -1,4 +1,4 @@
-"""The command line: a user's mistake is one line and exit 2, and leaves no files."""
+"""Tests that a user's mistake on the command line gives one line, exit code 2 and no files."""
 
 from __future__ import annotations
 

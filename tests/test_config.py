@@ -1,4 +1,4 @@
-"""A configuration must make sense, not only have the form: units, counts, names, files, and where paths start."""
+"""Tests that a configuration is checked for units, counts, names and files as well as form."""
 
 from __future__ import annotations
 

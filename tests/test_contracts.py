@@ -1,4 +1,4 @@
-"""The product is what docs/contracts.md says: commands, options, files, fields, the model's contract, the error."""
+"""Tests that commands, options, files and fields are as docs/contracts.md says."""
 
 from __future__ import annotations
 

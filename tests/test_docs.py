@@ -1,4 +1,4 @@
-"""Links and names in pages exist, and their commands, Python and TOML are valid."""
+"""Tests that links and names in pages exist, and that their commands, Python and TOML are valid."""
 
 from __future__ import annotations
 

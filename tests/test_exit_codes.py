@@ -1,4 +1,4 @@
-"""Every command ends in an exit code and at most one line on stderr, never in a traceback."""
+"""Tests that every command ends with an exit code and at most one line on stderr."""
 
 from __future__ import annotations
 

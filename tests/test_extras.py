@@ -1,4 +1,4 @@
-"""A missing package of an extra is reported where it is needed, in one line that names the extra."""
+"""Tests that a missing optional package is reported in one line that names its extra."""
 
 from __future__ import annotations
 

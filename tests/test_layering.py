@@ -1,4 +1,4 @@
-"""Import rules that pyproject.toml (`make lint`) can't express: no cycles, and modules a command may load."""
+"""Tests import rules that pyproject.toml cannot express: no cycles, and limits for each command."""
 
 from __future__ import annotations
 

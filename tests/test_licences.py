@@ -1,4 +1,4 @@
-"""The page of third-party licences is complete and up to date."""
+"""Tests that the page of third-party licences is complete and up to date."""
 
 from __future__ import annotations
 

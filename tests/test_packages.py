@@ -1,4 +1,4 @@
-"""The wheel and the sdist: everything that a clean machine needs for the demo, and nothing of this checkout."""
+"""Tests that wheel and sdist contain everything that a clean machine needs, and nothing else."""
 
 from __future__ import annotations
 

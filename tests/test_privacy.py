@@ -1,4 +1,4 @@
-"""A run leaves no file but in --out and opens no connection: seen from outside, by tracing every system call."""
+"""Tests with a system call tracer that a run writes only to --out and opens no connection."""
 
 from __future__ import annotations
 

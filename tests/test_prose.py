@@ -1,4 +1,4 @@
-"""Prose without the phrases that `[tool.prose]` in pyproject.toml forbids, in the rooms that it lists."""
+"""Tests that prose contains no phrase that `[tool.prose]` in pyproject.toml forbids."""
 
 from __future__ import annotations
 

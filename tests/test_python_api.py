@@ -1,4 +1,4 @@
-"""`import phasestack`: what docs/contracts.md promises to programs."""
+"""Tests what docs/contracts.md promises for `import phasestack`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures as programs have them: each becomes codes, or a ValueError whose advice works."""
+"""Tests that pictures of programs become codes, or a ValueError with advice that works."""
 
 from __future__ import annotations
 

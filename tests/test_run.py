@@ -1,4 +1,4 @@
-"""A recorded run, end to end: production code with a replayed sensor, a simulated clock and offscreen panels."""
+"""Tests a recorded run end to end, with a simulated clock and offscreen panels."""
 
 from __future__ import annotations
 

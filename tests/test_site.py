@@ -1,4 +1,4 @@
-"""The site is built from the pages without a warning, and the code that pages show runs."""
+"""Tests that the site builds without warnings and that code on the pages runs."""
 
 from __future__ import annotations
 

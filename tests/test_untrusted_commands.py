@@ -1,4 +1,4 @@
-"""Invalid files, paths and JSON as any command's options: one line that names them, exit 2, no delay."""
+"""Tests that invalid files, paths and JSON as options give one line and exit code 2, without delay."""
 
 from __future__ import annotations
 

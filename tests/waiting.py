@@ -1,4 +1,4 @@
-"""Waiting in tests for what another thread or process does."""
+"""Helpers that wait for what another thread or process does."""
 
 from __future__ import annotations
 

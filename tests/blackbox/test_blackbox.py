@@ -1,4 +1,4 @@
-"""The black box of a run: bounded, written at a fault, an error, or when asked; a recording that can be replayed."""
+"""Tests that the black box stays bounded, is written at faults and on request, and can be replayed."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The browser as eyes and panels."""
+"""Tests of the browser as viewer and panels."""

@@ -1,4 +1,4 @@
-"""`phasestack try`: in Debian's Chromium, and its connection without one."""
+"""Tests of `phasestack try` in Debian's Chromium, and of its connection without a browser."""
 
 from __future__ import annotations
 

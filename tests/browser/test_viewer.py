@@ -1,4 +1,4 @@
-"""`viewer.html` in Debian's Chromium against an independent tracer; the script's optics against the runtime's."""
+"""Compares `viewer.html` in Chromium with an independent tracer, and the script's optics with the runtime's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An eye's light through layers, ray by ray, with nothing of the runtime's: planes, even boxes, many rays a pixel."""
+"""Traces an eye's light through layers ray by ray, without code of the runtime."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A camera before the stack, and pairs that it would measure."""
+"""Simulated camera in front of the stack, and the pairs that it measures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Simulated photographs of a misaligned stack, or their points alone where pictures would take time.
+"""Simulates photographs of a misaligned stack, or only their points where pictures would take too long.
 
 A photograph adds the panels' phases along every ray, each panel at its true place; the intensity is sin² of the sum
 (EyeReal, (7)). The lens is a pinhole that darkens the corners, the sensor adds shot and read noise.

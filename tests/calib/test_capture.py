@@ -1,4 +1,4 @@
-"""From samples to pairs: a median over half a second, on disk when it is accepted, from a person or a recording."""
+"""Tests that samples become pairs: a median over half a second, stored as soon as it is accepted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Viewpoints of calibration, and their charts: straight lines at the viewpoint, ghosts elsewhere."""
+"""Tests that the lines of a chart are straight at its viewpoint and show ghosts elsewhere."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Grey curves by any camera: the chart through a simulated panel and camera, against the panel's own curve."""
+"""Compares grey curves measured with a simulated panel and camera with the panel's actual curve."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Methods of `calibrate solve`: their error at the eye, the error they predict, and gross errors they leave out."""
+"""Tests the actual and expected error at the eye of each method, and how gross errors are left out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pairs from people's files: read, or refused with the row and the column; captured pairs are saved immediately."""
+"""Tests that pairs are read, or refused with row and column, and that captured pairs are saved at once."""
 
 from __future__ import annotations
 

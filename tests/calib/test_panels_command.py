@@ -1,4 +1,4 @@
-"""`calibrate panels` on simulated photographs: from pictures to the configuration."""
+"""Tests `calibrate panels` from simulated photographs to the configuration."""
 
 from __future__ import annotations
 

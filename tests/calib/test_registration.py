@@ -1,4 +1,4 @@
-"""Registration by photographs, on points alone: results, their standard errors, and refusals."""
+"""Tests results, standard errors and refusals of the registration, on points without pictures."""
 
 from __future__ import annotations
 

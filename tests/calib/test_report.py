@@ -1,4 +1,4 @@
-"""The page: complete, self-contained, and made even of a calibration that holds only its matrix."""
+"""Tests that the page is complete and self-contained, even for a calibration with only a matrix."""
 
 from __future__ import annotations
 

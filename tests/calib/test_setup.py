@@ -1,4 +1,4 @@
-"""`phasestack setup`: every line and key of a scripted terminal, from nothing to a configuration that is right."""
+"""Tests `phasestack setup` with a scripted terminal, from nothing to a correct configuration."""
 
 from __future__ import annotations
 

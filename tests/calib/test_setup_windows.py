@@ -1,4 +1,4 @@
-"""`phasestack setup` and `calibrate` on real windows of a real X server, with keys that are really pressed."""
+"""Tests `phasestack setup` and `calibrate` on windows of a real X server, with simulated key presses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Closed forms: exact data are recovered, each scale is the optimum that it claims to be, bad data are refused."""
+"""Tests that closed forms recover exact data, that each scale is optimal, and that bad data are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`calibrate solve`: a file that the runtime loads, or one clear refusal and nothing written."""
+"""Tests that `calibrate solve` writes a file that the runtime loads, or refuses in one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Shared fixtures of the content tests: one GL context, the paper's display, and views of it."""
+"""Fixtures for tests of content: one GL context, the display of the paper, and views of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""glTF files written by hand: arrays in one buffer, and the tests' tables."""
+"""Writes glTF files with arrays in one buffer."""
 
 from __future__ import annotations
 

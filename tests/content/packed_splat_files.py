@@ -1,4 +1,4 @@
-"""Splats packed as SuperSplat, .splat, SPZ and SOG have them, from the reference implementation's table."""
+"""Writes splats in the formats of SuperSplat, .splat, SPZ and SOG."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Picture files as cameras, phones and browsers write them, made here."""
+"""Writes picture files in the way of cameras, phones and browsers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The splat equations again, slowly and exactly: float64, one splat at a time. Shares no code."""
+"""Slow, exact reference for splats in float64, one at a time. Shares no code with the product."""
 
 from __future__ import annotations
 

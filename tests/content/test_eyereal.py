@@ -1,4 +1,4 @@
-"""Folders of the published data set."""
+"""Tests of folders in the format of the published data set."""
 
 from __future__ import annotations
 

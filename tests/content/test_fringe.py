@@ -1,4 +1,4 @@
-"""Classification of edges as outlines."""
+"""Tests which edges count as outlines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A closed source leaves no GL object, so that scenes can change without limit."""
+"""Tests that a closed source leaves no GL object."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""glTF 2.0 by its specification's text: each section's own kind of file, made here, is drawn as it says."""
+"""Tests that glTF 2.0 files of each kind are drawn as the specification says."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Meshes from files: placed, coloured, textured; and messages for broken files."""
+"""Tests that meshes are placed, coloured and textured, and that broken files are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Depth of drawn content: where rays meet it, in blocks of pixels; none where a source has none."""
+"""Tests that the depth of drawn content is where rays meet it, in blocks of pixels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures as cameras, phones and browsers write them: views, colours, movement, and refusals."""
+"""Tests views, colours, animations and refusals of picture files."""
 
 from __future__ import annotations
 

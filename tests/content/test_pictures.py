@@ -1,4 +1,4 @@
-"""Pictures, folders and videos: which view an eye gets, where it hangs, and what happens at the end."""
+"""Tests which view of a picture, folder or video an eye gets, where it appears, and how it ends."""
 
 from __future__ import annotations
 

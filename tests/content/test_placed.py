@@ -1,4 +1,4 @@
-"""Placing: any scene moved, turned, scaled or turning, as the settings say."""
+"""Tests that any scene can be moved, turned, scaled and put on a turntable."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Playlists: the scene shown at each time, settings of entries, and messages for wrong ones."""
+"""Tests which scene of a playlist is shown at each time, and how wrong entries are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A custom scene: one file on Python's path, one line of TOML; and messages for wrong ones."""
+"""Tests a custom scene in one file and one line of TOML, and how wrong ones are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The built-in scenes: where points land, which surface is in front, and equality from run to run."""
+"""Tests where points of the built-in scenes appear, what is in front, and that runs are equal."""
 
 from __future__ import annotations
 

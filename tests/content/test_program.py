@@ -1,4 +1,4 @@
-"""`scene = "program"`: a real client over a real connection."""
+"""Tests `scene = "program"` with a real client and connection."""
 
 from __future__ import annotations
 

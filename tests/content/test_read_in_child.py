@@ -1,4 +1,4 @@
-"""Untrusted files are read in another process: same pictures, limited memory and time.
+"""Tests that untrusted files are read in another process with limited memory and time.
 
 Sizes in comments: memory that the same file used to take in the display's process.
 """

@@ -1,4 +1,4 @@
-"""Gaussian splats: the same picture as an exact renderer of the same equations; files as others write them."""
+"""Compares splats with an exact renderer of the same equations, and reads files of other programs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What files state of their views and colours: Leia pictures, tags of films, colours by numbers."""
+"""Tests what files declare about views and colours: Leia pictures, tags of films, coded colours."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files that declare too much, nest too deep or are not files: refused by their headers, in one line, quickly."""
+"""Tests that files beyond the limits are refused by their headers, quickly and in one line."""
 
 from __future__ import annotations
 

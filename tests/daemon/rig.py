@@ -1,4 +1,4 @@
-"""Small real run with real content, network and offscreen panels, whose parts break on request."""
+"""Small run with real content, network and offscreen panels, whose parts can be made to fail."""
 
 from __future__ import annotations
 

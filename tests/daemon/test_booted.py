@@ -1,4 +1,4 @@
-"""The display PC, really booted: systemd in a container (systemd-nspawn) on a fresh Debian, installed by the book.
+"""Tests an installed display PC, booted in a container (systemd-nspawn) with a fresh Debian.
 
 Its tests are one story, in their order; ten minutes on two cores. BOOTED=/some/folder keeps its root for another run.
 """

@@ -1,4 +1,4 @@
-"""Another scene, model or configuration while it runs: loaded in the background, taken over or refused as a whole.
+"""Tests that changes of scene, model or configuration load in the background and apply as a whole.
 
 No change loses a refresh: the presenter keeps showing the existing solution.
 """

@@ -1,4 +1,4 @@
-"""`phasestack status` and `phasestack ctl` against a real socket."""
+"""Tests `phasestack status` and `phasestack ctl` with a real socket."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`phasestack run` as systemd runs it: a process, a notification socket, signals, a configuration that changes."""
+"""Tests `phasestack run` under a notification socket, with signals and a changing configuration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The whole daemon on real windows: three virtual monitors, one that goes and returns, an X server that dies."""
+"""Tests the daemon on three virtual monitors, with a monitor that disappears and an X server that dies."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The doctor finds faults, names remedies, and has an exit code for scripts."""
+"""Tests that the doctor finds faults, names remedies and sets its exit code."""
 
 from __future__ import annotations
 

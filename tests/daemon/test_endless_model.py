@@ -1,4 +1,4 @@
-"""Files that never load: a model with a loop of 2^62 turns, a scene that takes all memory. The daemon does not hang."""
+"""Tests that a model with an endless loop and a scene that takes all memory do not hang the daemon."""
 
 from __future__ import annotations
 

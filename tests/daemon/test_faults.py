@@ -1,4 +1,4 @@
-"""Faults injected into a real run: it degrades with a reason, loses no refresh, and recovers."""
+"""Tests that a run with injected faults degrades with a reason, loses no refresh and recovers."""
 
 from __future__ import annotations
 

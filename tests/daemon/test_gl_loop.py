@@ -1,4 +1,4 @@
-"""The loop's solver with the OpenGL backend: same solutions as the processor's, and lost contexts leak nothing."""
+"""Tests that the OpenGL backend finds the processor's solutions, and that lost contexts leak nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The image, built from the Dockerfile by buildah, and what runs in it.
+"""Tests the image that buildah builds from the Dockerfile.
 
 Its base is not the Dockerfile's, which a registry has: Debian 12 with its Python 3.11, by debootstrap.
 """

@@ -1,4 +1,4 @@
-"""Messages to systemd, on a real datagram socket."""
+"""Tests messages to systemd on a real datagram socket."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One change of settings: taken over as a whole between two steps, or refused without effect."""
+"""Tests that a change of settings is adopted as a whole between two steps, or refused without effect."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Temporary faults are distinguished from permanent ones: carry on or exit with 75, against exit with 2."""
+"""Tests that temporary faults (exit 75) are distinguished from permanent ones (exit 2)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Signals become flags."""
+"""Tests that signals become flags."""
 
 from __future__ import annotations
 

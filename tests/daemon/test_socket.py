@@ -1,4 +1,4 @@
-"""The status and control socket: permissions, answers, crowds and attackers; the loop never waits for it."""
+"""Tests permissions, answers and limits of the status and control socket."""
 
 from __future__ import annotations
 

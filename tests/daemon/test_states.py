@@ -1,4 +1,4 @@
-"""The daemon's states: decided by each refresh's findings; each transition is reported once with its reason."""
+"""Tests which state each refresh leads to, and that each change is reported once with its reason."""
 
 from __future__ import annotations
 

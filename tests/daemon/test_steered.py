@@ -1,4 +1,4 @@
-"""Operator's changes to a running daemon other than the scene: placement, model, restart."""
+"""Tests an operator's changes of placement and model, and a restart."""
 
 from __future__ import annotations
 

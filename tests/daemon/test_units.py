@@ -1,4 +1,4 @@
-"""Units, rules, installer, image and locks: checked by systemd's own tools; bounded; no other file than was meant."""
+"""Tests units, rules, installer, image and locks with systemd's own tools."""
 
 from __future__ import annotations
 

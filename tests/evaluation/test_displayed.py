@@ -1,4 +1,4 @@
-"""Displayed quality of pictures as they come in files: of any aspect, of 16 bits, transparent."""
+"""Tests the displayed quality of pictures with any aspect ratio, 16 bits or transparency."""
 
 from __future__ import annotations
 

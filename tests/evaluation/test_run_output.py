@@ -1,4 +1,4 @@
-"""The files of a run: contents, and behaviour when the disk fails."""
+"""Tests the files of a run, and what happens if the disk fails."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The timer of trials: counts and order of calls."""
+"""Tests number and order of the calls that the timer makes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A calibration file is a similarity with a positive determinant, in metres, or it is refused by name."""
+"""Tests that a calibration file must contain a similarity in metres, with a positive determinant."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`phasestack eyes`: pictures, films and recordings to pupils and overlays; mistakes are one line."""
+"""Tests that `phasestack eyes` finds pupils in pictures, films and recordings, and draws overlays."""
 
 from __future__ import annotations
 

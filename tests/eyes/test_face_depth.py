@@ -1,4 +1,4 @@
-"""Distance of the eyes from faulty depth, or without depth."""
+"""Tests the distance of the eyes with faulty depth, and without depth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The filters behind the tracker: against a textbook Kalman filter, and safe where numbers are extreme."""
+"""Compares the tracker's filters with a textbook Kalman filter, also for extreme numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A benchmark's motion as a recording: the pipeline replays the samples of the benchmark's tracker."""
+"""Tests that a recorded motion replays the samples of the tracker's benchmark."""
 
 from __future__ import annotations
 

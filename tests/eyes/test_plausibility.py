@@ -1,4 +1,4 @@
-"""Implausible eyes are reported with the likely mistake, and counted."""
+"""Tests that implausible eyes are counted and reported with the likely mistake."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tracker's prediction against filters tuned for the very motion, which it cannot know beforehand."""
+"""Compares the tracker's prediction with filters that are tuned for each motion."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pupils of real faces: found, followed, steady, and nobody else's."""
+"""Tests that pupils of real faces are found and followed steadily, and only the viewer's."""
 
 from __future__ import annotations
 

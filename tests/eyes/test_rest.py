@@ -1,4 +1,4 @@
-"""A head at rest is distinguished from a moving one at any sensor noise."""
+"""Tests that a resting head is distinguished from a moving one at any sensor noise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tracker answers where the eyes are at any instant, says how it knows, and is fooled by little."""
+"""Tests that the tracker gives the eyes at any time, with a label, and resists bad samples."""
 
 from __future__ import annotations
 

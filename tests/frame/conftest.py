@@ -1,4 +1,4 @@
-"""Real content and a real model, small, for the tests of what solves and of who looks."""
+"""Fixtures with small real content and a small real model."""
 
 from __future__ import annotations
 

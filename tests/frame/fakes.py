@@ -1,4 +1,4 @@
-"""Fakes of the presenter's neighbours, driven by a test clock; they never wait."""
+"""Fakes for the presenter's partners, which use a test clock and never wait."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The choice of effort: less work for a head that moves, more for one that rests, by measured costs and errors."""
+"""Tests that moving heads get less work and resting ones more, by measured costs and errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Observers of refreshes: lines that wait for the truth, sampled and live quality, kept light."""
+"""Tests observers of refreshes: lines that wait for the truth, sampled quality, kept layers."""
 
 from __future__ import annotations
 

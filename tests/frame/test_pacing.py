@@ -1,4 +1,4 @@
-"""Refreshes are on the display's grid; late ones are counted, intentionally skipped ones are not."""
+"""Tests that refreshes stay on the display's grid, and that only late ones are counted."""
 
 from __future__ import annotations
 

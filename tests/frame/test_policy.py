@@ -1,4 +1,4 @@
-"""Choice of the next job: a solution, the flat picture, or nothing. Decisions alone."""
+"""Tests the choice of the next job: a solution, the flat picture or nothing."""
 
 from __future__ import annotations
 

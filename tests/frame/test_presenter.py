@@ -1,4 +1,4 @@
-"""Refreshes on a test clock: aligned to the eyes at their display time, independent of the solver."""
+"""Tests that refreshes are aligned to the eyes at their display time, independent of the solver."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The parts of a run are one value that changes as a whole or not at all."""
+"""Tests that the parts of a run change as a whole or not at all."""
 
 from __future__ import annotations
 

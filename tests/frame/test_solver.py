@@ -1,4 +1,4 @@
-"""One solution a step, from real content and a real model; failures are named, and existing results stay valid."""
+"""Tests solutions of real content and a real model, and that failures leave earlier results valid."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The solver in simulated time: handed over when its configured cost has passed, and the newest wish wins."""
+"""Tests the solver in simulated time: results appear after the configured cost, the newest request wins."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The solver's thread: exceptions, hangs and delays are reported and it is restarted; the presenter never stalls."""
+"""Tests that exceptions, hangs and delays of the solver are reported and never stall the presenter."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run's figures: counted as in the contract, now and since the start; None if not measured."""
+"""Tests the figures of a run, now and since the start. A figure that was not measured is None."""
 
 from __future__ import annotations
 

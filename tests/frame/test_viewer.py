@@ -1,4 +1,4 @@
-"""From samples to the eyes at any instant: rested where the head rests, none where none could see the display."""
+"""Tests the eyes at any time, fixed for a resting head and absent where the display is invisible."""
 
 from __future__ import annotations
 

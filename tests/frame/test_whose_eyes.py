@@ -1,4 +1,4 @@
-"""Whose eyes are served, by the production viewer from a sensor's samples: never somebody else's, never a mixture.
+"""Tests that the viewer's eyes are served, never another person's and never a mixture.
 
 A viewer sits or leans before a sensor of 30 Hz; 60 refreshes a second ask for the eyes 45 ms after they begin, and a
 sample arrives 15 ms after its capture. What is refused, and whose samples come between, is the case.

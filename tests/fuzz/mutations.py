@@ -1,4 +1,4 @@
-"""Good files made bad: flipped, cut, spliced, and with numbers and texts in them that hurt."""
+"""Damages good files: flips, cuts and splices bytes, and inserts bad numbers and texts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every reader of untrusted bytes: good files to begin with, and how it is called."""
+"""Lists every reader of untrusted bytes, with good files and how to call it."""
 
 from __future__ import annotations
 

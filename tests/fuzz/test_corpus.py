@@ -1,4 +1,4 @@
-"""Files that once broke a reader, and new bad ones: refused in one line, quickly, in little memory."""
+"""Tests that files which once broke a reader, and new ones, are refused quickly and in little memory."""
 
 from __future__ import annotations
 

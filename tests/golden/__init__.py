@@ -1,1 +1,1 @@
-"""Golden runs: recordings through the production path, compared field by field with stored references."""
+"""Golden runs, which compare recorded runs of the production code with stored references."""

@@ -1,4 +1,4 @@
-"""Golden runs from the command line: compare (the default), renew on purpose, rewrite the recordings."""
+"""Compares golden runs (the default), renews them on purpose or rewrites their recordings."""
 
 from __future__ import annotations
 

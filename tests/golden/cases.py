@@ -1,4 +1,4 @@
-"""Cases of the golden runs: recording, settings, and the operator's actions or faults during the run."""
+"""Cases of the golden runs: recordings, settings, and actions or faults during a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Differences between a stored and a new run: by field, with a tolerance each, in readable lines."""
+"""Finds differences between a stored and a new run, by field and tolerance."""
 
 from __future__ import annotations
 

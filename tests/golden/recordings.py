@@ -1,4 +1,4 @@
-"""The recordings that golden runs play: kept in `data`, made by `python -m tests.golden --record`.
+"""Recordings for golden runs, kept in `data` and made by `python -m tests.golden --record`.
 
 They are stored, so that a change of a random generator never moves a reference.
 """

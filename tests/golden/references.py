@@ -1,4 +1,4 @@
-"""References on disk: a JSON line for the summary and one a refresh, and a lossless WebP for each kept refresh."""
+"""Stores references: a JSON line for the summary and each refresh, and a lossless WebP for kept ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The golden runs: nothing of a recorded run moves unless somebody meant it to (`make golden` renews them)."""
+"""Tests that nothing in a recorded run changes by accident (`make golden` renews the references)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Account of OpenGL's draws, reads, writes and bus transfers, counted around the runtime."""
+"""Counts draws, reads, writes and bus transfers of OpenGL."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page's server, run for real on a free port of loopback."""
+"""Runs the page's server on a free port of loopback."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page in Debian's Chromium, driven, on a running daemon: every control, live figures, a daemon that dies.
+"""Tests the page in Chromium with a running daemon: controls, live figures, a daemon that dies.
 
 Needs chromium, node, and a folder NODE_PATH with playwright-core and axe-core (npm).
 """

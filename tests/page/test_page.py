@@ -1,4 +1,4 @@
-"""The operator's page without a browser: nothing without the token, nothing done by GET, and the daemon's own words."""
+"""Tests the operator's page without a browser: the token is required, and GET changes nothing."""
 
 from __future__ import annotations
 

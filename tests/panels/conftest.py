@@ -1,4 +1,4 @@
-"""Contexts and X servers that the panels' tests share."""
+"""Contexts and X servers that tests of panels share."""
 
 from __future__ import annotations
 

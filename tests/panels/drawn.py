@@ -1,4 +1,4 @@
-"""Offscreen panels that draw what their monitors would be sent, by the presentation shader, and read it back."""
+"""Offscreen panels that draw with the presentation shader what monitors would receive, and read it back."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""EDID blocks as monitors send them, laid out by VESA's table 3.1."""
+"""Builds EDID blocks by VESA's table 3.1."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Identity of a monitor from its EDID."""
+"""Tests that a monitor is identified by its EDID."""
 
 from __future__ import annotations
 

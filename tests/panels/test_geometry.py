@@ -1,4 +1,4 @@
-"""A monitor's pixel shows the layer's pixel at its position for the viewer, for any mounting."""
+"""Tests that each monitor pixel shows the right layer pixel for any mounting."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`phasestack identify` and the doctor's view of monitors, on real windows."""
+"""Tests `phasestack identify` and the doctor's view of monitors, on real windows."""
 
 from __future__ import annotations
 

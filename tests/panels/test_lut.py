@@ -1,4 +1,4 @@
-"""Phase to grey: a gamma, or a measured curve for each colour."""
+"""Tests that grey follows phase by a gamma or a measured curve per colour."""
 
 from __future__ import annotations
 

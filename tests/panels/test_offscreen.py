@@ -1,4 +1,4 @@
-"""Pixels sent to each panel's monitor, drawn by the real shader."""
+"""Tests the pixels sent to each monitor, drawn by the real shader."""
 
 from __future__ import annotations
 

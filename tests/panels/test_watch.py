@@ -1,4 +1,4 @@
-"""Changes to the panels' windows and monitors made behind GLFW's back, on a real X server."""
+"""Tests that changes to windows and monitors that GLFW does not report are found."""
 
 from __future__ import annotations
 

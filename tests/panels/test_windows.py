@@ -1,4 +1,4 @@
-"""Real windows on three virtual monitors of a real X server, judged by screenshots."""
+"""Tests windows on three virtual monitors of a real X server, by screenshots."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A real X server with three virtual monitors (Xorg's dummy driver), and a test's requests to it."""
+"""Starts an X server with three virtual monitors (Xorg's dummy driver) and sends it requests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`phasestack bench compare`: names what got slower or worse beyond noise, and nothing else."""
+"""Tests that `phasestack bench compare` lists what got slower or worse by more than noise, and only that."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Focal parallax: pinholes of a pupil agree on the plane in focus, and cards are sharpest at their own depth."""
+"""Tests that cards are sharpest at their depth when a finite pupil focuses on them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Displayed quality next to the eyes, and methods measured in separate processes."""
+"""Tests displayed quality next to the eyes, and methods measured in separate processes."""
 
 from __future__ import annotations
 

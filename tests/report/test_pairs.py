@@ -1,4 +1,4 @@
-"""Case files, eyes and neighbouring views."""
+"""Tests case files, eyes and views from neighbouring positions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Random pairs of the design range: drawn right, and served no worse than a stated bar."""
+"""Tests that random pairs of the design range are drawn right and served above a stated quality."""
 
 from __future__ import annotations
 

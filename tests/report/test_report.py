@@ -1,4 +1,4 @@
-"""`phasestack report`: refuses bad input before measuring, shows results as they arrive, writes page and JSON."""
+"""Tests that `phasestack report` refuses bad input first, shows results early, and writes page and JSON."""
 
 from __future__ import annotations
 

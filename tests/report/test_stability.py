@@ -1,4 +1,4 @@
-"""`phasestack stability`: enough cases, all of them pass, and a case can fail."""
+"""Tests that `phasestack stability` has enough cases, that all pass, and that a case can fail."""
 
 from __future__ import annotations
 

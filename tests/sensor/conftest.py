@@ -1,4 +1,4 @@
-"""Shared fixtures of the sensor tests."""
+"""Fixtures for tests of sensors."""
 
 from __future__ import annotations
 

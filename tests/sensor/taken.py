@@ -1,4 +1,4 @@
-"""Samples that a recording's driver has delivered by a time."""
+"""Collects the samples that a recording's driver has delivered by some time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A device's time is mapped on to the host's by the quickest of many deliveries."""
+"""Tests that the fastest of many deliveries relates device time to the host's clock."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Drivers are found by name, without importing any SDK; a user's own is one file and one line of TOML."""
+"""Tests that drivers are found without importing an SDK, and that a custom one needs one file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The real OpenNI2 library, on recordings that the test makes itself."""
+"""Tests the real OpenNI2 library with recordings that the test makes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Disk contents after a power cut: the image of a real file system, mounted again."""
+"""Tests what is on the disk after a power cut, using the image of a real file system."""
 
 from __future__ import annotations
 

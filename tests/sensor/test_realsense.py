@@ -1,4 +1,4 @@
-"""The real RealSense SDK, on recordings that it makes itself of a device that it simulates."""
+"""Tests the real RealSense SDK with recordings of a device that it simulates."""
 
 from __future__ import annotations
 

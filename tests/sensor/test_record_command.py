@@ -1,4 +1,4 @@
-"""`phasestack record` writes the sensor's samples: eyes always, pictures only on request."""
+"""Tests that `phasestack record` writes eyes always and pictures only on request."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A recording comes back as it was, loses at most a chunk to a crash, and stays within its limits."""
+"""Tests that a recording is read as written, survives crashes and stays within its limits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A replayed recording is a sensor, at its own pace or sample after sample; and the built-in one."""
+"""Tests that a replayed recording is a sensor, at its pace or sample by sample."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A recording of any rate and with any gap plays through once, at its own times; invalid samples are reported."""
+"""Tests that recordings of any rate, with gaps, play once and at their times."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Driver `usb-camera`, on a film in place of a camera: no machine of ours has one."""
+"""Tests the driver `usb-camera` with a film in place of a camera, which no test machine has."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The doctor lists the connected depth cameras and their problems."""
+"""Tests that the doctor lists connected depth cameras and their problems."""
 
 from __future__ import annotations
 

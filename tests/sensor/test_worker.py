@@ -1,4 +1,4 @@
-"""The sensor's thread: the newest sample wins, lost sensors are reopened, hung ones abandoned."""
+"""Tests that the sensor's thread prefers the newest sample, reopens lost sensors and abandons hung ones."""
 
 from __future__ import annotations
 

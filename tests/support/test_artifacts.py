@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all: what cannot be written is one line, and nothing new is left."""
+"""Tests that files are written as a whole or not at all."""
 
 from __future__ import annotations
 

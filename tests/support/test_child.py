@@ -1,4 +1,4 @@
-"""Work in a separate process: its arrays, texts and refusals are returned, and its crash ends nothing else."""
+"""Tests that a separate process returns arrays, texts and refusals, and that its crash is harmless."""
 
 from __future__ import annotations
 

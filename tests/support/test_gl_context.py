@@ -1,4 +1,4 @@
-"""The context without a screen, where it can't be had."""
+"""Tests errors of the offscreen context where OpenGL is missing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Logging never delays its caller, reports lost lines, and can't be made to forge lines."""
+"""Tests that logging never delays its caller, reports lost lines and cannot be made to forge lines."""
 
 from __future__ import annotations
 

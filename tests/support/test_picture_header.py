@@ -1,4 +1,4 @@
-"""Picture sizes read from the header, before decoding."""
+"""Tests picture sizes read from the header before decoding."""
 
 from __future__ import annotations
 

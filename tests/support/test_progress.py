@@ -1,4 +1,4 @@
-"""Long work reports its progress on terminals, and on nothing else."""
+"""Tests that long work reports its progress on terminals only."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The one place where paths, files, JSON and numbers from outside are read."""
+"""Tests the module through which all untrusted paths, files, JSON and numbers are read."""
 
 from __future__ import annotations
 

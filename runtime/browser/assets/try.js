@@ -1,10 +1,10 @@
-// Live display: this page's pointer is the head that the daemon's sensor sees, and this page shows the panels.
+// Live display: the pointer acts as the head that the daemon's sensor sees, and the page shows the panels.
 import { Look } from "/look.js";
 import { ask, token } from "/session.js";
 
 const AGAIN_MS = 500, STATUS_MS = 500, RETRY_MS = 1000, KEPT = 600; // AGAIN_MS: a resting head is sent again; KEPT: latencies in the statistics
 const PLACE_M = [0.6, 0, 0];
-const PEAK_M_S2 = 12, LEAST_S = 0.1, STEP_MS = 12; // a quick head's acceleration, its shortest movement, and the time between its samples
+const PEAK_M_S2 = 12, LEAST_S = 0.1, STEP_MS = 12; // acceleration of a quick head, its shortest movement, and the time between samples
 const CONTROLS = `
 <dl class="figures"></dl>
 <form><label>Scene <input type="text" name="scene" list="scenes" autocomplete="off"></label><datalist id="scenes"></datalist>
@@ -299,7 +299,7 @@ async function report() {
     if (starting && now.reason) starting.textContent = `Starting: ${now.reason}. The first start on a machine takes about ten seconds longer.`;
     if (look && now.ok) figures(now, asked_ms);
   } catch {
-    // the closed connection reports it
+    // the closed connection reports this
   }
   setTimeout(report, document.hidden ? 4 * STATUS_MS : STATUS_MS);
 }

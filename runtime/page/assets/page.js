@@ -4,7 +4,7 @@ import { ask, keep, token } from "/session.js";
 
 const $ = (id) => document.getElementById(id);
 const SVG = "http://www.w3.org/2000/svg";
-const KEPT = 240; // points of a plot: two minutes
+const KEPT = 240; // number of points in a plot: two minutes
 const STATUS_MS = 500, PICTURES_MS = 400, LOG_MS = 1000, ABOUT_MS = 5000, RETRY_MS = 1000;
 const ZOOMED_SIGMAS = 20; // two standard deviations, ten times as large
 
@@ -246,7 +246,7 @@ $("place-reset").addEventListener("click", () => tell($("place-reset"), "place",
 
 // Polling.
 
-let loggedIn = Promise.resolve(); // once the token is right
+let loggedIn = Promise.resolve(); // resolved once the token is right
 
 function logIn() {
   if ($("login").open) return;
@@ -285,7 +285,7 @@ function gone(why, hangs = false) {
 }
 
 function show(status) {
-  if (!running) { // errors about a missing daemon are over
+  if (!running) { // clear errors about a missing daemon
     for (const told of document.querySelectorAll('[data-kind="bad"]')) setText(told, "");
   }
   running = true;
@@ -296,7 +296,7 @@ function show(status) {
   const reason = status.reason ?? "", late = /solutions take|has not answered for/.test(reason);
   setText($("state"), hangs ? "hangs" : late ? "late" : status.state ?? "starting");
   $("state").dataset.state = hangs ? "gone" : late ? "holding" : (status.state ?? "starting").split(":")[0];
-  setText($("reason"), late ? `${reason}: use the model "fast", or fewer pixels; the panels still follow the eyes` : reason);
+  setText($("reason"), late ? `${reason}: use the model "fast" or fewer pixels (the panels still follow the eyes)` : reason);
   if (status.state === undefined) return; // before the first refresh
   document.querySelector('[data-command="pause"]').setAttribute("aria-pressed", String(status.paused));
   document.querySelector('[data-command="flat"]').setAttribute("aria-pressed", String(status.flat_asked));
@@ -319,7 +319,7 @@ async function every(ms, work) {
     try {
       await work();
     } catch {
-      gone("The page's server does not answer either: it has stopped, or the network is down.");
+      gone("The page's server does not answer either. It has stopped, or the network is down.");
       pause = RETRY_MS;
     }
     await new Promise((done) => setTimeout(done, pause));

@@ -1,4 +1,4 @@
-// The browser keeps the token for this address and port, and gives it to no other server.
+// The browser stores the token for this address and port only, so no other server gets it.
 const key = new URL(location.href).searchParams.get("token");
 if (key) {
   localStorage.setItem("token", key);
