@@ -333,7 +333,7 @@ def _checked(
             matrices, places_m = as_cameras(cameras)
             eyes = _eyes(places_m, stack)
             if eyes_m is not None and np.abs(_eyes(eyes_m, stack) - eyes).max() > SAME_PLACE_M:
-                raise ValueError(f"stand at {np.round(eyes, 4).tolist()}, but eyes_m are elsewhere: omit eyes_m")
+                raise ValueError(f"stand at {np.round(eyes, 4).tolist()}, but eyes_m are elsewhere; omit eyes_m")
             pictures, fov_deg = looking_at_origin(pictures, matrices, eyes, stack)
         except ValueError as error:
             raise ValueError(f"cameras: {error}") from None

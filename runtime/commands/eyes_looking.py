@@ -1,4 +1,4 @@
-"""Implementation of `phasestack eyes`: finds pupils in pictures, and draws overlays."""
+"""Implementation of `phasestack eyes`, which finds pupils in pictures and draws overlays."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Row = dict[str, Any]
 
 
 class Watcher:
-    """An eye finder that returns one row for every frame."""
+    """Eye finder that returns one row for every frame."""
 
     def __init__(self, settings: Settings) -> None:
         cv2.setNumThreads(1)  # as in the display's loop
@@ -68,7 +68,7 @@ class Watcher:
 def look_at_files(
     files: list[Path], settings: Settings, *, sequence: bool, rate_hz: float, out: Path | None
 ) -> list[Row]:
-    """Return a row for each frame of each file, in order. Raises InputError, leaving `out` unchanged."""
+    """Return a row for each frame of each file, in order. Raises InputError and leaves `out` unchanged."""
     watcher, rows, follows = Watcher(settings), [], False
     with OutputFolder(out) if out is not None else nullcontext() as folder:
         for place, path in enumerate(files):
@@ -119,7 +119,7 @@ def _filmed(path: Path, rate_hz: float) -> Iterator[SensorFrame]:
 
 
 class _Overlays:
-    """Writes a file's overlays as a private picture or film; does nothing without a target."""
+    """Writer of overlays as a private picture or film. Does nothing without a target."""
 
     def __init__(self, target: Path | None, is_still: bool, rate_hz: float) -> None:
         self._target, self._is_still, self._rate_hz = target, is_still, rate_hz
@@ -149,7 +149,7 @@ class _Overlays:
 
 
 def drawn(picture: U8, pupils: Pupils | None, row: Row) -> U8:
-    """Return the picture with the pupils, the face and their figures drawn on it."""
+    """Draw the pupils, the face and their figures on a picture."""
     scale = max(1.0, OVERLAY_MIN_PX / max(picture.shape[:2]))
     canvas = np.asarray(cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC), np.uint8)
     bits = 4  # fractional bits of a coordinate
@@ -177,7 +177,7 @@ def drawn(picture: U8, pupils: Pupils | None, row: Row) -> U8:
 def look_at_sensor(
     settings: Settings, report: Callable[[Row], None], *, out: Path | None, seconds: float = np.inf
 ) -> None:
-    """Report every frame of the configured sensor until the time is up, its recording ends, or Ctrl-C.
+    """Report every frame of the sensor until the time is up, its recording ends or Ctrl-C is pressed.
 
     `out` keeps only the newest overlay. Raises InputError, SensorLost.
     """

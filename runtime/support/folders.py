@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def state_folder() -> Path:
-    """Return the systemd service's state folder or, outside the service, the user's."""
+    """Return the state folder of the systemd service or, outside it, that of the user."""
     if service := os.environ.get("STATE_DIRECTORY", ""):
         return Path(service.split(":")[0])
     xdg, home = os.environ.get("XDG_STATE_HOME", ""), os.environ.get("HOME", "")

@@ -1,4 +1,4 @@
-"""Headers of picture files, read and checked against the limits before decoding."""
+"""Headers of picture files, which are read and checked against the limits before decoding."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from runtime.support.untrusted_input import LIMITS
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 PNG_DEPTH = slice(24, 25)  # position of a PNG's bit depth
 CHUNK_BYTES = 12  # overhead of a PNG chunk: length, kind, checksum
-SIDE_MAX_PX = 1 << 16  # largest side that a header may declare
+SIDE_MAX_PX = 1 << 16  # maximum side that a header may declare
 # Pillow's names. EPS is excluded, because Pillow would start Ghostscript. Pillow identifies an MPO as JPEG.
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "PPM", "TGA", "AVIF")
 ANIMATED = ("GIF", "PNG", "WEBP", "AVIF")
@@ -32,12 +32,12 @@ DISPARITY, UNDEFINED = "Multi-Frame Image: (Disparity)", "Undefined"
 JPS, JPS_BYTES = b"_JPSJPS_", 14  # marker of a stereo header, and offset of its layout field
 JPS_LAYOUTS = {2: "side-by-side", 3: "top-bottom", 4: "anaglyph"}
 JPS_HALF_HEIGHT, JPS_HALF_WIDTH, JPS_LEFT_FIRST = 1, 2, 4
-GAIN_MAP = (b"hdrgm", b"21496-1")  # markers of a gain map, a second picture that only holds brightness
-HEAD_BYTES = 512  # read to identify a file
+GAIN_MAP = (b"hdrgm", b"21496-1")  # markers of a gain map, a second picture that contains only brightness
+HEAD_BYTES = 512  # number of bytes read to identify a file
 UNDECODED = "is not an image that can be decoded"
 ANOTHER = "save it as PNG, JPEG or AVIF"
 CAMERA_SET = "such a scene is trained first; its splats (.ply) are drawn, and its folder of pictures as a slideshow"
-RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")  # most are TIFFs too
+RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")  # most are also TIFFs
 RAW_KIND = "a camera's raw picture", "develop it and save it as JPEG"
 OTHER_KINDS = (  # unsupported formats: offset and value of the marker, name, remedy
     (0, b"\xff\x0a", "JPEG XL", f"{ANOTHER} (djxl in.jxl out.png)"),
@@ -65,7 +65,7 @@ OTHER_KINDS = (  # unsupported formats: offset and value of the marker, name, re
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """Properties of a picture file, without decoding its pixels."""
+    """Properties of a picture file that are known without decoding it."""
 
     kind: str  # Pillow's name for the format
     width_px: int
@@ -73,7 +73,7 @@ class Header:
     views: tuple[int, ...]  # indices of the frames: the one to show, or the left and the right eye's
     is_animated: bool
     is_around: bool = False  # True if its XMP declares a sphere of 360 by 180 degrees
-    warning: str = ""  # for example, that the second view is missing
+    warning: str = ""  # such as a missing second view
     layout: str = ""  # arrangement of the views in one picture, from its stereo header
     other: slice | None = None  # bytes of a Leia picture's other view
 
@@ -99,7 +99,7 @@ def opened(coded: bytes | IO[bytes]) -> Iterator[Any]:
 
 @cache
 def _formats() -> tuple[str, ...]:
-    """Names of the supported Pillow formats, with HEIC if the extra `heic` is installed."""
+    """Return the names of supported Pillow formats, with HEIC if the extra `heic` is installed."""
     if importlib.util.find_spec("pillow_heif") is None:
         return FORMATS
     import pillow_heif
@@ -141,7 +141,7 @@ def _beginning(coded: bytes | IO[bytes], most_bytes: int) -> bytes:
 
 
 def _views(image: Any, *, is_named_so: bool) -> tuple[tuple[int, ...], str]:
-    """Return the indices of the left and right eyes' frames, or of the one to show, and a warning.
+    """Return the indices of the frames for the left and right eye, or of the only one, and a warning.
 
     A second picture is an eye's view only if the file declares it as one and if it is as large as the first.
     """
@@ -179,7 +179,7 @@ def _leia_view(coded: bytes | IO[bytes], size: tuple[int, int]) -> tuple[slice, 
 
 
 def _jps_layout(image: Any) -> str:
-    """Layout declared by a JPEG's stereo header (JPS), in the syntax of `content.layout`; empty without a header."""
+    """Return the layout in a JPEG's stereo header (JPS), as in `content.layout`, or an empty string."""
     for name, data in getattr(image, "applist", ()):
         if name == "APP3" and data[:8] == JPS and len(data) >= JPS_BYTES:
             flags, kind, is_stereo = data[11], JPS_LAYOUTS.get(data[12], ""), data[13] == 1
@@ -204,7 +204,7 @@ def _size_of(image: Any, frame: int) -> tuple[int, int]:
 
 
 def _viewpoint(image: Any) -> int | None:
-    """Number of a frame's viewpoint in an MPO, where 1 is the leftmost; None if unknown."""
+    """Return the number of a frame's viewpoint in an MPO, where 1 is leftmost, or None if unknown."""
     from PIL import TiffImagePlugin
 
     with suppress(Exception):  # a malformed table has no number
@@ -217,7 +217,7 @@ def _viewpoint(image: Any) -> int | None:
 
 
 def picture_size(coded: bytes) -> tuple[int, int]:
-    """Width and height of a coded picture as stored. Raises ValueError with the problem."""
+    """Return the stored width and height of an encoded picture. Raises ValueError."""
     try:
         with opened(coded) as image:
             width, height = image.size
@@ -227,7 +227,7 @@ def picture_size(coded: bytes) -> tuple[int, int]:
 
 
 def undecodable(data: bytes, error: Exception | None = None) -> str:
-    """Reason why a picture can't be decoded: an unsupported format, with a remedy, or a damaged file."""
+    """Return why a picture cannot be decoded: an unsupported format, with a remedy, or a damaged file."""
     from PIL import UnidentifiedImageError
 
     if not data:
@@ -262,7 +262,7 @@ def _promises_more(data: bytes) -> bool:
 
 
 def is_cut_off(coded: bytes) -> bool:
-    """Return True if a PNG's chunks exceed the file or its end is missing; False for other formats.
+    """Return True if the chunks of a PNG exceed the file or its end is missing. False for other formats.
 
     OpenCV allocates the declared size before reading, up to 2 GiB for a file of any size.
     """
@@ -323,7 +323,7 @@ def decoded_picture(coded: bytes, *, source: str | Path, field: str, name: str) 
 
 
 def camera_set_in(folder: Path) -> str:
-    """Why a folder with cameras of pictures is not drawn; empty without such a file."""
+    """Return why a folder with a camera set cannot be drawn, or an empty string if it has none."""
     sets = sorted(folder.glob("transforms*.json"))
     return f"holds a camera set, as of a NeRF ({sets[0].name}): {CAMERA_SET}" if sets else ""
 
@@ -337,6 +337,6 @@ def read_coded(path: Path) -> tuple[bytes, Header]:
 
 
 def header_of_file(path: Path) -> Header:
-    """Return a picture file's header. Raises InputError, also for more pixels than the limit."""
+    """Return the header of a picture file. Raises InputError, also for more pixels than the limit."""
     with untrusted_input.open_regular(path, most_bytes=LIMITS.file_bytes) as file:
         return _header_of(path, file)
