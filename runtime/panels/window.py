@@ -136,7 +136,7 @@ class WindowPanels(PanelSink):
         context.finish()
         if fault := _reset_status() or _error(context):
             self._context_lost = True
-            raise PanelLost(f"the GL context of panel {panel} was lost: {fault}")
+            raise PanelLost(f"the GL context of panel {panel}: {fault}")
 
     def _swap(self, window: Window) -> int:
         window.make_current()
