@@ -75,11 +75,8 @@ def drawn_job(
         raster = window.box.cut(raster)
     views = raster_views(eyes_m, raster, reduction=reduction)
     content.expect(views, time_ns=time_ns)
-    reads_textures = content.draws_in is not None and predictor.reads_textures_of(content.draws_in)
-    drawn = [_picture(content, view, time_ns=time_ns, in_texture=reads_textures) for view in views]
+    pictures = [_picture(predictor, content, view, time_ns=time_ns) for view in views]
     relief = _relief(content, views, stack, window) if in_depth else None
-    # Read back last: the renderer draws one picture while the next is prepared.
-    pictures = drawn if reads_textures else [p.pixels() if isinstance(p, DrawnPicture) else p for p in drawn]
     job = Job(Targets(stack, eyes_m, drawn_views(pictures, stack, window)), window=window, relief=relief)
     return trim(job, before) if trimmed else job
 
@@ -110,20 +107,18 @@ def _relief(
     return relief_of((left, right), distance_m=[float(view.eye_m[0]) - middle_m for view in views])
 
 
-def _picture(content: ContentSource, view: View, *, time_ns: int, in_texture: bool) -> U8 | DrawnPicture:
-    """A view's picture: in a texture where the content draws one, else an array.
+def _picture(predictor: Predictor, content: ContentSource, view: View, *, time_ns: int) -> U8 | DrawnPicture:
+    """A view's picture: in a texture where the content draws one that the model reads, else an array.
 
-    in_texture: the model reads the texture. Raises ContentFailure, and ContextLost if `in_texture`.
+    Raises ContentFailure, ContextLost.
     """
-    if content.draws_in is None:
+    if content.draws_in is None or not predictor.reads_textures_of(content.draws_in):
         return content.render(view, time_ns=time_ns)
     try:
         picture = content.draw(view, time_ns=time_ns)
     except PhasestackError:
         raise
     except Exception as error:  # moderngl raises various exceptions for a lost context
-        if not in_texture:
-            raise
         raise ContextLost(f"OpenGL: {error}") from error
     if picture is None:
         return content.render(view, time_ns=time_ns)
