@@ -24,10 +24,13 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64
 
 CELLS_STEP = 8  # chains' lengths are rounded up to this, so that a moving viewer meets few shapes
-ROWS_STEP = 64
+ROWS_STEP = 32  # the same for rows, if the eyes are not level
+ROWS_SHARE = (
+    1.5  # most rows, relative to level eyes; beyond, they are higher: 0.1 dB less, the network up to twice as fast
+)
 CELLS_MAX = 1024
 BLOCK_ROWS = 8  # that the network transforms together: the raster has whole blocks
-ROWS_MAX = (1 << 15) - BLOCK_ROWS  # OpenCV samples no taller rasters
+ROWS_MAX = 1 << 15  # rows that eyes would need at full height; beyond, they are implausible
 NEAREST_F = 0.8  # the raster's half width by F's distance from its middle: nearer to F it is not laid
 FARTHEST_F = 0.01  # and beyond, s changes by less than a hundredth of itself: columns may as well be even
 
@@ -130,12 +133,15 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int)
     # In the raster's middle, the extent to be seen at either end of its rows.
     ends = columns.homography_from_column(np.array([0.0, 2.0 * middle_column])) - middle_column
     reached_m = [z * (1 - bend * end) + bend_z_m * end for z in (window.bottom_m, window.top_m) for end in ends]
-    row_m = window.height_m / (stack.height_px / reduction)
-    rise_rows = (max(reached_m) - min(reached_m) - window.height_m) / row_m
-    step = ROWS_STEP if rise_rows > 0.01 else BLOCK_ROWS
-    rows = step * ceil((stack.height_px / reduction + rise_rows) / step)
-    if rows > ROWS_MAX:
-        raise ValueError(f"implausible eye positions: their raster would need {rows} rows")
+    height_m, level_rows = max(reached_m) - min(reached_m), stack.height_px / reduction
+    share = height_m / window.height_m
+    if level_rows * share > ROWS_MAX:
+        raise ValueError(f"implausible eye positions: their raster would be {share:.0f} times as high as the panels")
+    row_m = max(window.height_m, height_m / ROWS_SHARE) / level_rows
+    if height_m - window.height_m > 0.01 * row_m:
+        rows = ROWS_STEP * ceil(height_m / row_m / ROWS_STEP)
+    else:
+        rows = BLOCK_ROWS * ceil(level_rows / BLOCK_ROWS)
     middle_y_m = window.middle_m[0] - window.half_width_m * line.nearness / (1 + sqrt(1 - line.nearness**2))
     middle_z_m = (min(reached_m) + max(reached_m)) / 2
     plane_from_raster = np.array([

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from runtime.model.chain import BLOCK_ROWS, ROWS_STEP, ColumnLaw, chain_frame, chain_modes
+from runtime.model.chain import BLOCK_ROWS, ROWS_SHARE, ROWS_STEP, ColumnLaw, chain_frame, chain_modes
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import relative_scale_shift
 from runtime.report.pairs import eyes_at
@@ -197,6 +197,17 @@ def test_rows_are_panel_rows_and_cover_the_centre_panel(pair: np.ndarray, reduct
         assert frame.rows % ROWS_STEP == 0 and frame.rows > high
 
 
+def test_rows_of_oblique_eyes_grow_higher_instead_of_many() -> None:
+    """Far eyes in a row with the display's edge need four times the rows at the near end, if all stay as high."""
+    level = chain_frame(UPRIGHT, STACK, cell_px=4, reduction=2)
+    steep = np.array([[0.5, -0.031, -0.031], [0.5, 0.031, 0.031]])
+    frame = chain_frame(steep, STACK, cell_px=4, reduction=2)
+    assert level.rows * ROWS_SHARE <= frame.rows < level.rows * ROWS_SHARE + 2 * ROWS_STEP
+    from_panel = frame.frame_from_plane(x_m=0.0)
+    corners = [from_panel @ [y, z, 1.0] for y in (-STACK.width_m / 2, STACK.width_m / 2) for z in (-0.01, 0.01)]
+    assert all(0 <= v / w <= frame.rows for _, v, w in corners)
+
+
 def test_where_the_origin_lies_along_x_changes_nothing() -> None:
     aside = np.array([0.2, 0.0, 0.0])
     moved = replace(STACK, x_m=tuple(x_m + 0.2 for x_m in STACK.x_m))
@@ -209,7 +220,7 @@ def test_where_the_origin_lies_along_x_changes_nothing() -> None:
     )
 
 
-def test_a_raster_that_opencv_can_not_sample_is_refused() -> None:
+def test_eyes_whose_raster_would_be_far_higher_than_the_panels_are_refused() -> None:
     pair = np.array([[50.0, 50.0, 50.0], [0.07, -50.0, -50.0]])
-    with pytest.raises(ValueError, match="rows"):
+    with pytest.raises(ValueError, match="times as high"):
         chain_frame(pair, STACK, cell_px=4, reduction=2)
