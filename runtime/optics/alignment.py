@@ -8,8 +8,8 @@ the old middle's: both are a scale and a shift, so that q = p·s + t with (o: th
     s = 1 + d_x·(r - a) / ((D + d_x)·(o_x - r)),    t = (a - r) / (o_x - r) · (o·d_x - d·D) / (D + d_x).
 
 In this form s = 1 and t = 0 without rounding error if the middle has not moved or the panel is the reference plane. The
-middle's rays are carried exactly, and so are both eyes' rays if the head faces the panels and moved parallel to them. A
-head that came nearer or moved away keeps its old disparity, which no shift can change.
+middle's rays map exactly, and so do both eyes' rays if the head faces the panels and has moved parallel to them. After
+the head comes nearer or moves away, the disparity is still the old one; no shift can change that.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ FARTHEST_M = 1e6  # coordinates beyond this count as not finite
 NEAREST_M = 0.01  # least distance of an eye from the front panel
 MOST_SHIFT = 0.5  # largest shift of a panel's middle, in panel widths or heights
 MOST_SCALE = 2.0  # largest enlargement or reduction of a panel
-ROWS = 32  # rows resampled together, so that their float32 pixels fit in a core's cache
+ROWS = 32  # rows per resampled strip; a strip's float32 pixels fit in a core's cache
 
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Maps with which each panel is drawn for the current eyes."""
+    """Maps that draw each panel for the current eyes."""
 
-    solved_from_shown: tuple[F64, ...]  # per panel (3, 3), a scale and a shift: pixels of the solved layer from shown
-    limited: str = ""  # reason if it is at its limit, because the eyes have moved too far; otherwise empty
-    parallax: Parallax | None = None  # motion of content off the middle panel; None: the eyes are those solved for
+    solved_from_shown: tuple[F64, ...]  # per panel (3, 3), scale and shift from shown pixels to the solved layer's
+    limited: str = ""  # why the alignment stopped short of the current eyes; empty if it did not
+    parallax: Parallax | None = None  # motion of content off the middle panel; None: the eyes have not moved
 
 
 def reference_x_m(stack: PanelStack) -> float:
-    """x of the reference plane: the centre panel, or halfway between the two middle ones."""
+    """Return x of the reference plane: the centre panel, or halfway between the two middle ones."""
     half = stack.count // 2
     return stack.x_m[half] if stack.count % 2 else (stack.x_m[half - 1] + stack.x_m[half]) / 2
 
@@ -51,17 +51,17 @@ def reference_x_m(stack: PanelStack) -> float:
 def align(stack: PanelStack, *, solved_for_m: F64, eyes_m: F64) -> Alignment:
     """Align layers solved for eyes (2, 3) to eyes (2, 3) at another position, both in frame `stack`.
 
-    It ends where an eye comes within `NEAREST_M` of the front panel, where a panel's middle would move by more than
-    `MOST_SHIFT` of its size, or where a panel would be drawn `MOST_SCALE` times larger or smaller. Beyond that limit it
-    is the alignment at the farthest allowed point on the straight line from the old eyes to the new ones, so that it is
-    continuous. Eyes that are not finite leave the layers as they are. Never raises.
+    The limits: each eye stays at least `NEAREST_M` in front of the front panel, no panel's middle moves by more than
+    `MOST_SHIFT` of its size, and no panel is drawn `MOST_SCALE` times larger or smaller. Beyond a limit, the result is
+    the alignment at the farthest allowed point on the straight line from the old eyes to the new ones, so it stays
+    continuous. Eyes that are not finite leave the layers unchanged. Never raises.
     """
     if not (np.abs(solved_for_m).max() <= FARTHEST_M and np.abs(eyes_m).max() <= FARTHEST_M):  # nor NaN
         return Alignment(_as_they_are(stack), "the eyes' positions are not finite")
     old, new = _middle(solved_for_m), _middle(eyes_m)
     share, limited = 1.0, ""
     for most, least, why in _limits(stack, solved_for_m, eyes_m, old=old, new=new):
-        # Every limit has the form share · most <= least, where share is the part of the movement that is allowed.
+        # Every limit has the form share · most <= least, where `share` is the allowed part of the movement.
         reach = 0.0 if least < 0.0 else 1.0 if most <= least else least / most
         if reach < share:
             share, limited = reach, why
@@ -73,7 +73,7 @@ def align(stack: PanelStack, *, solved_for_m: F64, eyes_m: F64) -> Alignment:
 
 
 def scale_and_shift(matrix: F64) -> tuple[float, float, float, float]:
-    """Return (scale_u, scale_v, shift_u, shift_v) of a 3x3. Raises ValueError for any other matrix."""
+    """Return (scale_u, scale_v, shift_u, shift_v). Raises ValueError if the matrix does more."""
     (su, a, tu), (b, sv, tv), last = matrix.tolist()
     if a or b or last != [0.0, 0.0, 1.0]:
         raise ValueError("an alignment must be a scale and a shift")
@@ -81,17 +81,17 @@ def scale_and_shift(matrix: F64) -> tuple[float, float, float, float]:
 
 
 def is_identity(matrix: F64) -> bool:
-    """Return True if the solved pixels are shown unchanged, without resampling."""
+    """Return True if the solved pixels are shown without resampling."""
     return scale_and_shift(matrix) == (1.0, 1.0, 0.0, 0.0)
 
 
 def shown_layers(frame: PanelFrame) -> U8:
-    """Return (N, h, w, 4) exactly as shown, before each panel's curve, rotation and mirroring.
+    """Return the (N, h, w, 4) layers exactly as shown, before each panel's curve, rotation and mirroring.
 
-    This is the reference for the presentation shader: bilinear with exact weights (for moved eyes bicubic was never
-    better by more than 0.05 dB: docs/mathematics.md), a coarse solution enlarged in the same pass, panels at rest
-    outside the solution, mixed with the flat picture before rounding. If there is nothing to do, the result is the
-    frame's array itself. Raises ValueError for a frame that has nothing to show.
+    This is the reference for the presentation shader. It samples bilinearly with exact weights (for moved eyes, bicubic
+    sampling was never better by more than 0.05 dB: docs/mathematics.md), enlarges a coarse solution in the same pass,
+    fills the outside with the rest code, and mixes in the flat picture before rounding. A frame that needs none of this
+    is returned as its own array. Raises ValueError for a frame that has nothing to show.
     """
     flatness = 1.0 if frame.solved is None else frame.flatness
     if flatness > 0.0 and frame.flat is None:
@@ -141,7 +141,7 @@ def _solved_from_shown(stack: PanelStack, index: int, *, old: F64, step: F64) ->
     shift_m = (raster.x_m - reference_m) / height_m * (old[1:] * step[0] - step[1:] * distance_m) / now_m
     matrix = np.eye(3)
     matrix[0, 0] = matrix[1, 1] = 1.0 + magnified
-    # The pixels' origin is the top left corner, not the middle.
+    # The pixels' origin is the top left corner, not the centre.
     matrix[0, 2] = (raster.left_m * magnified + shift_m[0]) / raster.pitch_u_m
     matrix[1, 2] = -(raster.top_m * magnified + shift_m[1]) / raster.pitch_v_m
     matrix += 0.0  # avoids negative zeros
@@ -151,7 +151,7 @@ def _solved_from_shown(stack: PanelStack, index: int, *, old: F64, step: F64) ->
 def _limits(
     stack: PanelStack, solved_for_m: F64, eyes_m: F64, *, old: F64, new: F64
 ) -> Iterator[tuple[float, float, str]]:
-    """Return (most, least, why): the share of the movement that is allowed obeys share · most <= least."""
+    """Yield (most, least, why). A movement scaled by `share` is allowed if share · most <= least."""
     front_m = stack.x_m[-1]
     for name, before, after in zip(("left", "right"), solved_for_m, eyes_m, strict=True):
         room_m = before[0] - front_m - NEAREST_M
@@ -175,15 +175,17 @@ def _limits(
 
 
 def _places(count: int, shown: int, *, scale: float, shift: float) -> tuple[NDArray[np.intp], F32]:
-    """Return the padded source pixel before each of `shown` pixels (0: the resting border) and the distance past it."""
+    """Return the padded source pixel (0: border) before each of `shown` pixels, and the distance past it."""
     place = np.clip((np.arange(shown) + 0.5) * scale + shift - 0.5, -1.0, count)
     first = np.minimum(np.floor(place), count - 1.0)
     return first.astype(np.intp) + 1, (place - first).astype(np.float32)
 
 
 def _resampled(layer: U8, matrix: F64, rest: int, *, size: tuple[int, int]) -> Iterator[tuple[slice, F32]]:
-    """Strips of rows of the shown layer (height, width) and their codes (rows, w, 4), not yet rounded; overwritten by
-    the next. A coarse layer's edge is extended by a pixel, so that it does not fade where the panel ends."""
+    """Yield strips of rows of the shown layer (height, width) with their unrounded codes (rows, w, 4).
+
+    The next strip overwrites the codes. A coarse layer is extended by a pixel, so that it does not fade at its edge.
+    """
     su, sv, tu, tv = scale_and_shift(matrix)
     height, width = layer.shape[:2]
     if (height, width) != size:
@@ -215,11 +217,11 @@ def _resampled(layer: U8, matrix: F64, rest: int, *, size: tuple[int, int]) -> I
 def _displaced(
     displacement: Displacement, layer: U8, matrix: F64, rest: int, *, size: tuple[int, int]
 ) -> Iterator[tuple[slice, F32]]:
-    """`_resampled` with every pixel's own displacement."""
+    """Yield the same strips as `_resampled`, with a separate displacement for every pixel."""
     su, sv, tu, tv = scale_and_shift(matrix)
     height, width = layer.shape[:2]
     by_u, by_v, extended = width / size[1], height / size[0], int((height, width) != size)
-    # Outside is the rest code. A coarse layer is first extended by one pixel of its edge.
+    # The rest code surrounds the layer. A coarse layer is first extended by one pixel of its edge.
     padded = np.pad(layer, ((extended, extended), (extended, extended), (0, 0)), mode="edge")
     padded = np.pad(padded, ((1, 1), (1, 1), (0, 0)), constant_values=rest).astype(np.float32)
     padded[..., 3] = 255.0
@@ -243,7 +245,7 @@ def _displaced(
 
 
 def _between(low: F32, high: F32, weight: F32) -> F32:
-    """Compute low · (1 - weight) + high · weight in `low`."""
+    """Return low · (1 - weight) + high · weight, computed in `low`; `high` is overwritten."""
     high -= low
     high *= weight
     low += high

@@ -1,4 +1,4 @@
-"""Resampling of pictures from arbitrary cameras, as seen by eyes that look at the stack's origin."""
+"""Resample pictures from arbitrary cameras to views of eyes that look at the stack's origin."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import stack_from_eye
 from runtime.records import F32, F64, U8
 
-OUTSIDE_MOST = 1 / 3  # largest share of a picture outside the panels before a warning
-LEAST_PX = 16  # side of a resampled picture
+OUTSIDE_MOST = 1 / 3  # warn if a larger share of a picture is outside the panels
+LEAST_PX = 16  # smallest side of a resampled picture
 EXACT = 1e-6  # cameras that differ by less, relative to the focal length, count as equal
-DIGITS = 9  # decimals of metres and degrees, which recover the values that a camera matrix was built from
+DIGITS = 9  # decimals of metres and degrees; rounding to them recovers the values a camera matrix was built from
 NAMES = ("left", "right")
 Picture = U8 | F32  # (h, w, 3)
 
 
 def as_cameras(matrices: Any) -> tuple[F64, F64]:
-    """Return (2, 3, 4) right-handed projections from `stack` to pixels, and (2, 3) camera positions.
+    """Return right-handed projections (2, 3, 4) from `stack` to pixels, and positions (2, 3) in metres.
 
     Raises ValueError for anything but two invertible 3x4 matrices.
     """
@@ -47,9 +47,9 @@ def looking_at_origin(
 ) -> tuple[list[Picture], float]:
     """Resample the pictures of `cameras` (2, 3, 4) as if the eyes (2, 3) looked at the stack's origin.
 
-    Returns the (h, w, 3) pictures and their horizontal field of view in degrees. They extend over the panels as far as
-    both originals do. Sampling is bicubic; pictures that look at the origin already are returned unchanged. Raises
-    ValueError if a picture does not show the stack's middle.
+    Returns the (h, w, 3) pictures and their horizontal field of view in degrees. The pictures cover as much of the
+    panels as both originals do. Sampling is bicubic; pictures that already look at the origin are returned unchanged.
+    Raises ValueError if a picture does not show the stack's centre.
     """
     height, width = pictures[0].shape[:2]
     turns = [np.diag([1.0, -1.0, -1.0]) @ stack_from_eye(eye_m)[:3, :3].T for eye_m in eyes_m]
@@ -94,7 +94,7 @@ def looking_at_origin(
 
 
 def _within(matrix: F64, half: F64, width: int, height: int) -> bool:
-    """Return True if a picture shows directions up to `half` on every side."""
+    """Return True if a picture contains all directions up to `half` (2,) on every side of its centre."""
     corners = np.array([(x * half[0], y * half[1], 1.0) for x in (-1, 1) for y in (-1, 1)]) @ matrix.T
     if not (corners[:, 2] > 0).all():
         return False
@@ -114,12 +114,12 @@ def _most(holds: Any, least: float = 0.0) -> float:
 
 
 def _slope(matrix: F64) -> F64:
-    """(2, 2) derivative of pixels by direction, straight ahead."""
+    """Return the (2, 2) derivative of pixels with respect to direction, straight ahead."""
     return np.asarray(matrix[:2, :2] - np.outer(matrix[:2, 2], matrix[2, :2]))
 
 
 def doubts(eyes_m: ArrayLike, stack: PanelStack, *, fov_deg: float, size: tuple[int, int]) -> list[str]:
-    """List probable mistakes in eyes and picture sizes (width, height), a line each, naming the argument."""
+    """Return a line per probable mistake in the eyes or picture size (width, height)."""
     eyes, warnings = np.asarray(eyes_m, np.float64), []
     if fov_deg <= math.pi:
         warnings.append(f"fov_deg: {fov_deg:g} degrees looks like radians ({math.degrees(fov_deg):.1f} degrees)")

@@ -1,9 +1,9 @@
 """Carried, expected and light quality, at eyes other than those solved for (docs/contracts.md).
 
 The picture that the layers were solved for is treated as painted on the centre panel: each pixel's ray is replaced by
-the ray from the true eye through the same point of that panel. Ghosts and colour fringes count as errors.
-The parallax between nominal and true eye, which no shift of the layers can add, does not count. A stale view is
-not counted here; live quality counts it (`evaluation.refresh_quality`).
+the ray from the true eye through the same point of that panel. Ghosts and colour fringes count as errors. The parallax
+between nominal and true eye does not count, because no shift of the layers can add it. Neither does the age of the
+view, which live quality measures (`evaluation.refresh_quality`).
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ def carried_db(
 ) -> float:
     """Return the PSNR, with one ray per pixel, at eyes (2, 3) of layers solved for other eyes (2, 3).
 
-    layers: (N, H, W, 3 or 4) code values, exactly as displayed; drawn: an (h, w, 3) picture for each eye of
-    `solved_for_m`, as retina pictures of horizontal field of view `fov_deg`, code values or float in [0, 1].
-    Raises ValueError for an eye behind a panel, and where the eyes see no part of the panels.
+    layers: (N, H, W, 3 or 4) code values, exactly as displayed; drawn: an (h, w, 3) retina picture for each eye of
+    `solved_for_m`, `fov_deg` wide, as code values or float in [0, 1].
+    Raises ValueError for an eye behind a panel, or if the eyes see no part of the panels.
     """
     targets = [intensities(picture) for picture in drawn]
     solved_for, eyes = np.asarray(solved_for_m, np.float64), np.asarray(eyes_m, np.float64)
@@ -48,12 +48,12 @@ def carried_db(
 
 
 class AtEyes(TypedDict):
-    """Eyes at which an expected quality is measured."""
+    """Eyes, pictures' width and tracking errors for an expected quality."""
 
     eyes_m: ArrayLike  # (2, 3) eyes that the layers were solved for
-    fov_deg: float  # field of view of the pictures
-    sigmas_mm: Sequence[float]  # tracking errors
-    seen_from_m: NotRequired[ArrayLike | None]  # (2, 3) true positions of the eyes; by default the same
+    fov_deg: float  # horizontal field of view of the pictures
+    sigmas_mm: Sequence[float]  # standard deviations of the tracking error
+    seen_from_m: NotRequired[ArrayLike | None]  # (2, 3) true positions of the eyes; by default `eyes_m`
 
 
 def expected_errors(
@@ -64,14 +64,16 @@ def expected_errors(
     sampling: Sampling | None = None,
     **at: Unpack[AtEyes],
 ) -> dict[float, F64]:
-    """Expected carried squared error over normal tracking errors, for all rows, then for groups.
+    """Return expected carried squared errors for normal tracking errors, keyed by standard deviation.
 
-    For each standard deviation, to the right and up, it is evaluated at five points: no error with weight 1/2, and two
-    standard deviations to either side with weight 1/8 each. This is exact for second moments. drawn: an (h, w, 3)
-    picture for each of the eyes (2, 3) that the layers were solved for. sampling: None: light, the figure to quote,
-    with four times as many rays a pixel in a picture of fewer values than `PLENTY`. Moved eyes get a quarter of the
-    rays, which is exact to 0.02 dB: in a picture of `PLENTY` every second pixel of every second row, otherwise, for
-    light, two rays instead of four. Other arguments and errors as for `carried_db`.
+    Each value is an array: the error of all rows, then of each group of rows. The expectation is a sum over five
+    points, which is exact for second moments: no tracking error with weight 1/2, and two standard deviations left,
+    right, up and down with weight 1/8 each.
+
+    drawn: an (h, w, 3) picture for each of the eyes (2, 3) that the layers were solved for. sampling: by default light,
+    the figure to quote, with four times as many rays per pixel in pictures of at most `PLENTY` values. Moved eyes get a
+    quarter of the rays, which costs less than 0.02 dB: every second pixel of every second row in larger pictures, two
+    rays instead of four in others. Other arguments and errors as for `carried_db`.
     """
     chosen = sampling or (LIGHT if drawn[0].size > PLENTY else LIGHT._replace(rays=2 * LIGHT.rays))
     seen_from_m = at.get("seen_from_m")
@@ -106,20 +108,20 @@ def expected_psnrs_db(
     sampling: Sampling | None = None,
     **at: Unpack[AtEyes],
 ) -> dict[float, float]:
-    """PSNR of `expected_errors`, by tracking error."""
+    """Return the PSNRs of `expected_errors` in dB, keyed by the tracking error's standard deviation."""
     errors = expected_errors(layers, drawn, stack, sampling=sampling, **at)
     return {sigma_mm: psnr_db(error[0]) for sigma_mm, error in errors.items()}
 
 
 def standard_error_db(errors: F64) -> float:
-    """Standard error of a PSNR; errors: (1 + groups,) mean squared error of all rows, and of each group."""
+    """Return a PSNR's standard error; errors: (1 + groups,) of all rows, then of each group."""
     groups = errors[1:]
     relative = float(np.std(groups, ddof=1)) / len(groups) ** 0.5 / max(float(errors[0]), 1e-12)
     return float(10 / math.log(10) * relative)
 
 
 def intensities(picture: U8 | F32) -> F32:
-    """(h, w, 3) float32 intensities in [0, 1] of a picture: code values, or intensities already."""
+    """Return a picture's (h, w, 3) float32 intensities in [0, 1], from code values or intensities."""
     part = picture[..., :3].astype(np.float32)
     if picture.dtype == np.uint8:
         part /= np.float32(255)

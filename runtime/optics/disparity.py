@@ -15,20 +15,18 @@ from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import image_from_stack
 from runtime.records import F32, F64, U8
 
-WIDTH_PX = 256  # width of the raster on the middle panel that pictures are compared on
+WIDTH_PX = 256  # width of the middle panel's raster on which the pictures are compared
 REACH_PX = WIDTH_PX // 4  # largest disparity searched, in either direction
-# Largest ghosts that are not reported: root mean square, in shares of full scale. The example pair has as much error of
-# other kinds (37 dB of light), so that larger ghosts cost more than 3 dB.
+# Largest ghosts that are not reported: root mean square, relative to full scale. The example pair has about as large an
+# error of other kinds (37 dB of light), so larger ghosts would cost more than 3 dB.
 GHOSTS_MOST = 0.015
-BEYOND_LEAST = (
-    0.1  # share of the matches that must be outside the stack; between the panels, disparity causes no ghosts
-)
-LARGER, MOST_LARGER = 1.1, 20.0  # factor between gaps that are tried, and between the largest of them and the stack's
+BEYOND_LEAST = 0.1  # share of the matches that must be outside the stack; disparity within it causes no ghosts
+LARGER, MOST_LARGER = 1.1, 20.0  # factor between the gaps that are tried; largest one, relative to the stack's
 ROLLED, TURNED = 0.05, 0.2  # largest slopes of the line between the eyes for which picture rows correspond
 LEAST_MATCHED = 0.1  # share of the panel that must be matched
-LEAST_ONCE = 1 / 3  # share of the matches that must be the only ones at their place; else the picture repeats
-WINDOW_PX, APART_PX = 21, 4  # of two matches at one place
-NO_WORSE = 1.3, 1.0  # factor and codes: errors up to which the second match is as good
+LEAST_ONCE = 1 / 3  # share of the matches that must be unambiguous; otherwise the picture is repetitive
+WINDOW_PX, APART_PX = 21, 4  # cost window, and least distance between two matches of a pixel
+NO_WORSE = 1.3, 1.0  # factor and codes: the second match is ambiguous up to this multiple of the first's error
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,12 +38,12 @@ class _Compared:
     panel: PlaneRaster
 
     def ghosts(self, unit_m: float) -> float:
-        """Root mean square of the light, 0 to 1, that reaches the wrong eye, as the outer panels' range ends.
+        """Return the root mean square of the light, 0 to 1, that reaches the wrong eye for lack of range.
 
-        Two eyes see a point of the front panel `unit_m` apart on the middle panel, and of the rear panel as far apart
-        in the other direction. The difference between their pictures, in panel values, is therefore the slope of
-        (front - rear) times `unit_m`, and front - rear stays between -1 and 1. Each row is followed from left to right.
-        Where that range ends, the difference is lost, and both eyes see the mean.
+        The two eyes see a point of the front panel `unit_m` apart on the middle panel, and a point of the rear
+        panel as far apart in the other direction. The difference between their pictures, in panel values, is
+        therefore the slope of (front - rear) times `unit_m`, and front - rear stays between -1 and 1. Each row
+        is integrated from left to right. Beyond that range the difference is lost, and both eyes see the mean.
         """
         light = np.stack(self.grey) / 255.0
         value = np.arcsin(np.sqrt(light)) / (np.pi / 2)
@@ -61,10 +59,10 @@ class _Compared:
         return float(np.sqrt(np.mean((share * (light[0] - light[1]) / 2)[both] ** 2))) if both.any() else 0.0
 
     def disparities_m(self) -> F64:
-        """(n,) disparities, metres on the middle panel, of points that match only once.
+        """Return the (n,) disparities, in metres on the middle panel, of the unambiguously matched points.
 
-        Positive for points in front of that panel, which are farther right for the left eye. Empty if most of the
-        pictures repeats, or if too little of them matches.
+        They are positive in front of that panel, where points appear farther right to the left eye. The result
+        is empty if most of the picture is repetitive, or if too little of it matches.
         """
         sides = 0, 0, REACH_PX, REACH_PX
         framed: list[Any] = [
@@ -84,56 +82,56 @@ class _Compared:
 
 
 def _compared(pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, *, fov_deg: float) -> _Compared:
-    """Pictures are `fov_deg` wide and look at the stack's origin."""
+    """Compare pictures that are `fov_deg` wide and look at the stack's origin."""
     small = replace(stack, width_px=WIDTH_PX, height_px=max(16, round(WIDTH_PX * stack.height_m / stack.width_m)))
     panel, size = small.panel(stack.count // 2), (WIDTH_PX, small.height_px)
-    found: list[Any] = []
+    framed: list[Any] = []
     for picture, eye_m in zip(pictures, eyes_m, strict=True):
         codes: Any = picture[..., :3] if picture.dtype == np.uint8 else np.rint(255 * picture[..., :3])
         grey = cv2.cvtColor(np.ascontiguousarray(codes, np.uint8), cv2.COLOR_RGB2GRAY)
-        # Sampled as they are, fine textures would differ between the eyes at random.
+        # Without shrinking first, fine textures would differ between the eyes at random.
         shrunk = min(1.0, WIDTH_PX / stack.width_m * _width_m(eye_m, fov_deg) / grey.shape[1])
         grey = cv2.resize(grey, None, fx=shrunk, fy=shrunk, interpolation=cv2.INTER_AREA)
         height, width = grey.shape
         matrix = panel_from_image(image_from_stack(eye_m, width_px=width, height_px=height, fov_deg=fov_deg), panel)
-        found += [cv2.warpPerspective(one, matrix, size) for one in (grey, np.full_like(grey, 255))]
-    return _Compared((found[0], found[2]), (found[1], found[3]), panel)
+        framed += [cv2.warpPerspective(one, matrix, size) for one in (grey, np.full_like(grey, 255))]
+    return _Compared((framed[0], framed[2]), (framed[1], framed[3]), panel)
 
 
 def _width_m(eye_m: F64, fov_deg: float) -> float:
-    """Width of an eye's picture at the stack's origin."""
+    """Return the width in metres of an eye's picture at the stack's origin."""
     return float(2 * np.linalg.norm(eye_m) * np.tan(np.radians(fov_deg / 2)))
 
 
 def _is_ambiguous(left: U8, right: U8, matched: F64) -> NDArray[np.bool_]:
-    """Mask of places where another disparity matches as well, as in a texture that repeats.
+    """Return a mask of pixels that match at another disparity as well, as in a repetitive texture.
 
-    The matcher's own test compares ratios, and so misses matches without any error.
+    The matcher's own uniqueness test compares ratios of errors, so it misses matches with an error of 0.
     """
     there = right.astype(np.float32)
     halves = (there + np.roll(there, 1, 1)) / 2, (there + np.roll(there, -1, 1)) / 2
     least, most = np.minimum(there, np.minimum(*halves)), np.maximum(there, np.maximum(*halves))
-    found, other = np.full((2, *left.shape), np.inf, np.float32)
+    best, other = np.full((2, *left.shape), np.inf, np.float32)
     for shift_px in range(-REACH_PX, REACH_PX + 1):
         low, high = np.roll(least, shift_px, 1), np.roll(most, shift_px, 1)
         error = np.maximum(0.0, np.maximum(left - high, low - left))  # Birchfield and Tomasi: half a pixel is free
         cost = cv2.blur(error, (WINDOW_PX, WINDOW_PX))
         away_px = np.abs(matched - shift_px)
-        np.minimum(found, cost, out=found, where=away_px <= 1)
+        np.minimum(best, cost, out=best, where=away_px <= 1)
         np.minimum(other, cost, out=other, where=away_px > APART_PX)
-    return np.asarray(other <= NO_WORSE[0] * found + NO_WORSE[1])
+    return np.asarray(other <= NO_WORSE[0] * best + NO_WORSE[1])
 
 
 def disparity_doubts(
     pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, *, fov_deg: float, parallel: bool = True
 ) -> list[str]:
-    """Explain in one line why eyes (2, 3) will see ghosts of these pictures; empty if no reason is found.
+    """Explain in one line why eyes (2, 3) will see ghosts of these pictures; empty if they will not.
 
     parallel: the pictures may be a rectified pair from parallel cameras, passed by mistake as the eyes' own views.
     """
     line = eyes_m[1] - eyes_m[0]
     if line[1] <= 0 or abs(line[2]) > ROLLED * line[1] or abs(line[0]) > TURNED * line[1]:
-        return []  # a point is not in the same row of both pictures
+        return []  # points are in different rows of the two pictures
     compared = _compared(pictures, eyes_m, stack, fov_deg=fov_deg)
     apart_m, away_m = float(line[1]), float(eyes_m[:, 0].mean())
     centre_m = stack.x_m[stack.count // 2]
@@ -153,13 +151,13 @@ def disparity_doubts(
         return f"{abs(depth_mm):.0f} mm {'before' if depth_mm > 0 else 'behind'}"
 
     low_m, middle_m, high_m = (float(value) for value in np.percentile(found_m, (10, 50, 90)))
-    told = "pictures: have more disparity than these gaps can show without ghosts, which are estimated at "
-    told += f"{ghosts:.0%} of full scale. Things stand {place(low_m)} to {place(high_m)} the middle panel"
+    warning = "pictures: have more disparity than these gaps can show without ghosts, which are estimated at "
+    warning += f"{ghosts:.0%} of full scale. Things stand {place(low_m)} to {place(high_m)} the middle panel"
     factors = LARGER ** np.arange(1, 1 + np.log(MOST_LARGER) / np.log(LARGER))
     if larger := next((float(one) for one in factors if compared.ghosts(one * unit_m) <= GHOSTS_MOST), None):
-        told += f"; {larger:.1f} times the gaps, or as many times less disparity, would show them"
+        warning += f"; {larger:.1f} times the gaps, or as many times less disparity, would show them"
     if parallel and low_m > 0:
         shift_px = middle_m / _width_m(eyes_m.mean(axis=0), fov_deg) * pictures[0].shape[1] / 2
-        told += ". All of it is before that panel, as in a rectified pair (parallel cameras): give the cameras, or "
-        told += f"move the left picture {shift_px:.0f} pixels to the left and the right one as far to the right"
-    return [told]
+        warning += ". All of it is before that panel, as in a rectified pair (parallel cameras): give the cameras, or "
+        warning += f"move the left picture {shift_px:.0f} pixels to the left and the right one as far to the right"
+    return [warning]

@@ -1,10 +1,10 @@
 """Mean squared error that displayed layers cause at the eyes (docs/contracts.md, Error).
 
-For *light*, the figure to quote, a panel's pixel is a square of one colour, and a pixel of the eye's picture gets the
-mean intensity over that pixel and over the pupil, which is focused on the centre panel. Two independent sets of random
-rays estimate it. The mean of the product of both sets' errors is an unbiased estimate of the squared error; the mean of
-one set's squares would include the variance of its rays. *One ray*, as in published evaluations: through the centres of
-pixel and pupil, with panels sampled bilinearly.
+*Light* is the figure to quote. Each panel pixel is a square of one colour. Each pixel of the eye's picture receives the
+mean intensity over that pixel's area and over the pupil, which is focused on the centre panel. Two independent sets of
+random rays estimate this mean. The mean product of their errors is an unbiased estimate of the squared error, whereas
+the mean square of one set's errors would include the variance of its rays. *One ray*, as in published evaluations, goes
+through the centres of pixel and pupil and samples the panels bilinearly.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ RINGS = 9  # rings of points on the pupil, one point for each ray: 271 points ar
 class Sampling(NamedTuple):
     """The rays along which the squared error is measured."""
 
-    rays: int = 2  # rays across and down a pixel, in each of the two sets; 0: one ray, bilinear
-    pupil_mm: float = PUPIL_MM  # diameter; 0: a point
+    rays: int = 2  # rays across and down a pixel, in each of the two sets; 0: a single ray, sampled bilinearly
+    pupil_mm: float = PUPIL_MM  # pupil diameter; 0: a pinhole
     step: int = 1  # every `step`-th pixel of every `step`-th row
     groups: int = 0  # groups of rows, for the standard error
 
@@ -48,9 +48,9 @@ class LightView(NamedTuple):
 
     target: F32  # (h, w, 3) intensities
     centre_from_image: F64  # (3, 3) from the image's pixels to the centre panel's
-    panels_from_centre: F64  # (points of the pupil, N, 3, 3) from the centre panel's pixels to the panels'
-    toward: F64  # (3,) dot (u, v, 1) is negative for a ray towards the panels
-    first_ray: int  # number of its first ray
+    panels_from_centre: F64  # (pupil points, N, 3, 3) from the centre panel's pixels to each panel's
+    toward: F64  # (3,) its dot product with (u, v, 1) is negative for rays towards the panels
+    first_ray: int  # number of the view's first ray, which seeds its random positions
 
 
 def squared_errors(
@@ -63,12 +63,12 @@ def squared_errors(
     fov_deg: float,
     sampling: Sampling,
 ) -> F64:
-    """(1 + groups,) mean squared errors at eyes (2, 3) against carried pictures of the eyes solved for.
+    """Return the (1 + groups,) mean squared errors of layers at eyes (2, 3), against carried pictures.
 
-    layers: (N, H, W, 3 or 4) code values, rear to front; targets: (h, w, 3) intensities for each eye solved for, of
-    pictures `fov_deg` wide. The first is of all rows, the others are of interleaved groups of them, whose scatter gives
-    its standard error. A pixel counts if all its rays cross every panel half a pixel inside. For nearly perfect light
-    the result can be below 0, by the rays' noise.
+    layers: (N, H, W, 3 or 4) code values, rear to front; targets: (h, w, 3) intensities, `fov_deg` wide, for each eye
+    solved for. The first error is over all rows. The others are over interleaved groups of rows; their scatter gives
+    the standard error of the first. A pixel counts if all its rays cross every panel at least half a pixel inside its
+    edge. For nearly perfect light the result can be negative, because of the rays' noise.
     Raises ValueError for an eye behind a panel, or where no pixel counts.
     """
     cores, step = len(os.sched_getaffinity(0)), sampling.step
@@ -87,7 +87,7 @@ def squared_errors(
         return _squared_error(codes, view, table, sampling, first, last)
 
     with ThreadPoolExecutor(cores) as pool:
-        sums = np.array(list(pool.map(error, calls)), np.float64)  # of the squared errors, and numbers of terms
+        sums = np.array(list(pool.map(error, calls)), np.float64)  # (calls, 2): sum of squared errors, number of terms
     if not sums[:, 1].any():
         raise ValueError("no ray from these eyes crosses every panel")
     if sampling.groups:  # one part per row
@@ -100,7 +100,7 @@ def squared_errors(
 def _squared_error(
     codes: U8, view: LightView, table: F32, sampling: Sampling, first: int, last: int
 ) -> tuple[float, int]:
-    """Sum of the squared error over some rows of one eye's picture, and the number of terms."""
+    """Return the sum of squared errors over some rows of one eye's picture, and the number of terms."""
     count, height, width, components = codes.shape
     target, table = np.ascontiguousarray(view.target, np.float32), np.ascontiguousarray(table, np.float32)
     matrices = [
@@ -121,7 +121,7 @@ def _squared_error(
 def view_of(
     side: int, nominal_m: F64, true_m: F64, target: F32, stack: PanelStack, *, fov_deg: float, pupil_mm: float
 ) -> LightView:
-    """Return the rays of one eye. Raises ValueError for an eye behind a panel."""
+    """Return the picture and rays of one eye. Raises ValueError for an eye behind a panel."""
     height, width = target.shape[:2]
     rays = Rays.of_eye(checked_eye(nominal_m, stack), width_px=width, height_px=height, fov_deg=fov_deg)
     centre = panel_from_image(rays.from_stack, stack.panel(stack.count // 2))
@@ -131,7 +131,7 @@ def view_of(
 
 
 def first_ray(side: int) -> int:
-    """Return the number of an eye's first ray. The two eyes' ray numbers are disjoint."""
+    """Return the number of an eye's first ray; the two eyes' ray numbers never overlap."""
     return side << 40
 
 

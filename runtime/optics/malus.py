@@ -10,30 +10,30 @@ from numpy.typing import NDArray
 HALF_PI = np.pi / 2
 Branch = Literal[1, 2]
 T = TypeVar("T", bound=np.floating[Any])
-# Panel values at rest, before any solving. Their sum is in the middle of one of the slopes of sin².
+# Panel values at rest, before any solving. Their sum is halfway up one of the slopes of sin².
 REST = {2: 0.75, 3: 0.5, 4: 0.375, 5: 0.5}
 
 
 def rest_value(panels: int) -> float:
-    """Value in [0, 1] that each panel of a stack of `panels` panels shows at rest."""
+    """Return the value in [0, 1] that each of `panels` panels shows at rest."""
     return REST.get(panels, 1.5 / panels)
 
 
 def rest_code(panels: int) -> int:
-    """`rest_value` as an 8-bit code."""
+    """Return `rest_value` as an 8-bit code."""
     return int(rest_value(panels) * 255 + 0.5)
 
 
 def intensity_from_phase(phase: NDArray[T]) -> NDArray[T]:
-    """Intensity sin²(π/2·phase) for the sum of a ray's panel values (equation (7)); keeps the dtype."""
+    """Return the intensity sin²(π/2·phase) for summed panel values (equation (7)); keeps the dtype."""
     result: NDArray[T] = np.sin(phase * HALF_PI) ** 2
     return result
 
 
 def phase_from_intensity(intensity: NDArray[T], branch: Branch = 2) -> NDArray[T]:
-    """(...) phase sum (units of pi/2) whose sin² is `intensity`, clipped to [0, 1].
+    """Return the phase sums (...), in units of π/2, whose sin² is `intensity` clipped to [0, 1].
 
-    Branch 1 is in [0, 1], branch 2 in [1, 2]; with three panels branch 2 keeps the outer ones far from their limits.
+    Branch 1 is in [0, 1], branch 2 in [1, 2]. With three panels, branch 2 keeps the outer two far from their limits.
     """
     root = np.arcsin(np.sqrt(np.clip(intensity, 0.0, 1.0))) / HALF_PI
     result: NDArray[T] = root if branch == 1 else 2 - root

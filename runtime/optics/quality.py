@@ -11,25 +11,25 @@ import numpy as np
 from runtime.optics.retina import Mask, strips
 from runtime.records import F32
 
-HALF_WINDOW = 5  # half width of SSIM's window, pixels
+HALF_WINDOW = 5  # half the width of SSIM's window, in pixels
 
 
 @dataclass(frozen=True, slots=True)
 class Quality:
     """PSNR and SSIM of both eyes together, and PSNR of each."""
 
-    psnr_db: float  # from the mean squared error over all counted pixels, channels and eyes
+    psnr_db: float  # computed from the mean squared error over all counted pixels, channels and eyes
     ssim: float  # mean over eyes
     eye_psnr_db: tuple[float, ...]
 
 
 def psnr_db(mean_squared_error: float) -> float:
-    """Peak signal-to-noise ratio for intensities in [0, 1], limited to 120 dB."""
+    """Return the peak signal-to-noise ratio in dB for intensities in [0, 1], at most 120."""
     return float(-10 * np.log10(max(mean_squared_error, 1e-12)))
 
 
 def ssim(a: F32, b: F32, mask: Mask) -> float:
-    """Mean structural similarity over a mask: 11x11 Gaussian window of sigma 1.5 (Wang et al. 2004)."""
+    """Return the mean SSIM over a mask: 11x11 Gaussian window of sigma 1.5 (Wang et al. 2004)."""
 
     def blur(x: F32) -> F32:
         return np.asarray(cv2.GaussianBlur(x, (11, 11), 1.5), dtype=np.float32)[inside]
@@ -39,7 +39,7 @@ def ssim(a: F32, b: F32, mask: Mask) -> float:
     for rows in strips(len(mask)):
         if not mask[rows].any():
             continue
-        # Half a window more at both ends completes every row's window. Outside, the image is mirrored.
+        # Half a window more at both ends completes every row's window. The image is mirrored at its border.
         first = max(rows.start - HALF_WINDOW, 0)
         around, inside = slice(first, rows.stop + HALF_WINDOW), slice(rows.start - first, rows.stop - first)
         x, y = a[around], b[around]
@@ -54,7 +54,7 @@ def ssim(a: F32, b: F32, mask: Mask) -> float:
 
 
 def squared_error(image: F32, target: F32, mask: Mask) -> tuple[float, int]:
-    """Sum the squared differences over the counted rays and channels. Also returns the number of terms."""
+    """Return the sum of squared differences over the masked pixels, and the number of terms."""
     total, counted = 0.0, 0
     for rows in strips(len(mask)):
         difference = (image[rows] - target[rows])[mask[rows]].astype(np.float64).ravel()
@@ -63,9 +63,9 @@ def squared_error(image: F32, target: F32, mask: Mask) -> tuple[float, int]:
 
 
 def quality(seen: Sequence[F32], targets: Sequence[F32], masks: Sequence[Mask], *, similarity: bool = True) -> Quality:
-    """Displayed quality pooled over the eyes. Raises ValueError if no ray of an eye crosses every panel.
+    """Return the displayed quality pooled over the eyes; its SSIM is NaN without `similarity`.
 
-    similarity: compute SSIM; otherwise it is NaN.
+    Raises ValueError if no ray of an eye crosses every panel.
     """
     errors, weights, per_eye, similarities = 0.0, 0, [], []
     for image, target, mask in zip(seen, targets, masks, strict=True):

@@ -35,7 +35,7 @@ class PixelRect:
         return slice(self.v0, self.v1), slice(self.u0, self.u1)
 
     def beside(self, *, width_px: int, height_px: int) -> list[PixelRect]:
-        """Return all other pixels of a raster, as up to four boxes."""
+        """Return the raster's other pixels as up to four boxes."""
         if not self.width_px or not self.height_px:
             return [PixelRect(0, 0, width_px, height_px)]
         boxes = (
@@ -62,7 +62,7 @@ class PixelRect:
 
 
 def union(boxes: Sequence[PixelRect]) -> PixelRect:
-    """Smallest box around all non-empty boxes; empty if there are none."""
+    """Return the smallest box around all non-empty boxes; empty if there are none."""
     filled = [box for box in boxes if box.width_px and box.height_px]
     if not filled:
         return PixelRect(0, 0, 0, 0)

@@ -1,4 +1,4 @@
-"""Depth of the content, and how its picture on the panels moves with the eyes.
+"""Depth of the content (its relief), and the motion on the panels that it causes when the eyes move.
 
 Let o be the point midway between the eyes. From o, a content point at depth x is seen through a point c on the middle
 panel's plane (x = r). Measure c from the plane's origin. Let b = (x - r) / (o_x - x) be the relief, n the new midpoint
@@ -24,21 +24,21 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, Parallax
 
 WIDEST_PX = 480  # columns of a relief; more of them do not give finer outlines
-RIM_PX = 2  # relief pixels by which nearer content is extended over its surroundings, so that its outline moves with it
+RIM_PX = 2  # relief pixels by which nearer content is dilated, so that its outline moves with it
 
 Pixels = NDArray[np.floating[Any]]
 
 
 def block_px(width_px: int) -> int:
-    """Side length, in pixels of a raster `width_px` wide, of the block that one relief pixel covers."""
+    """Return the side in pixels, on a raster `width_px` wide, of the block that one relief pixel covers."""
     return -(-width_px // WIDEST_PX)
 
 
 def relief_of(nearness: Sequence[F32], *, distance_m: Sequence[float]) -> F32:
-    """Combine both eyes' depth into one (h, w) relief.
+    """Combine both eyes' depth into one (h, w) relief, using at each pixel the one farther from 0.
 
-    nearness: per eye (h, w), 1/m, the inverse distance along x, 0: the background alone, which has no relief;
-    distance_m: per eye, from the middle panel. Of both eyes' reliefs, the one farther from 0 counts.
+    nearness: (h, w) per eye, inverse distance along x in 1/m, with 0 for the background, which has no relief.
+    distance_m: distance of each eye from the middle panel.
     """
     rim = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
     reliefs = []
@@ -50,7 +50,7 @@ def relief_of(nearness: Sequence[F32], *, distance_m: Sequence[float]) -> F32:
 
 
 def parallax(stack: PanelStack, *, old_m: F64, new_m: F64) -> Parallax | None:
-    """Return the motion of content on the panels when the eyes' midpoint (3,) moves; frame `stack`.
+    """Return the content's motion on the panels when the eyes' midpoint (3,) moves, in frame `stack`.
 
     Returns None if there is no middle panel (an even number of panels) or no movement.
     """
@@ -63,7 +63,7 @@ def parallax(stack: PanelStack, *, old_m: F64, new_m: F64) -> Parallax | None:
     places, weights = [], []
     for n in range(stack.count):
         raster = stack.panel(n)
-        # Along the new middle's ray, from the panel to the middle one.
+        # Project from the panel to the middle one along the new midpoint's rays.
         scale = (new_m[0] - middle.x_m) / (new_m[0] - raster.x_m)
         matrix = np.diag([scale * raster.pitch_u_m / middle.pitch_u_m, scale * raster.pitch_v_m / middle.pitch_v_m, 1])
         y_m, z_m = new_m[1:] + (np.array([raster.left_m, raster.top_m]) - new_m[1:]) * scale
@@ -88,7 +88,7 @@ class Displacement:
     weight: float
 
     def at(self, columns: Pixels, rows: Pixels, *, size_px: tuple[int, int]) -> tuple[F32, F32]:
-        """Return two (rows, columns) arrays of panel pixels, right and down, for every pixel's centre."""
+        """Return the pixel centres' displacements, right and down: (rows, columns) in panel pixels."""
         scale_u, scale_v = self.middle_from_shown[0, 0], self.middle_from_shown[1, 1]
         u = columns * scale_u + self.middle_from_shown[0, 2]
         v = rows * scale_v + self.middle_from_shown[1, 2]
@@ -106,7 +106,7 @@ class Displacement:
 
 
 def displacement(relief: F32 | None, parallax: Parallax | None, panel: int) -> Displacement | None:
-    """Return a panel's displacement, or None without a relief or a movement."""
+    """Return a panel's displacement, or None if there is no relief or no movement."""
     if relief is None or parallax is None:
         return None
     return Displacement(
@@ -115,7 +115,7 @@ def displacement(relief: F32 | None, parallax: Parallax | None, panel: int) -> D
 
 
 def _between_centres(place: Pixels, count: int) -> tuple[NDArray[np.intp], F32]:
-    """Return the pixel whose centre is before each place, and the distance past it, clamped to the edge."""
+    """Return the last pixel whose centre precedes each place, and the distance past it (clamped)."""
     inside = np.clip(place - 0.5, 0.0, count - 1.0)
     low = np.floor(inside)
     return low.astype(np.intp), (inside - low).astype(np.float32)

@@ -30,12 +30,12 @@ class Retina:
     mask: Mask  # (h, w)
 
     def codes(self) -> U8:
-        """(h, w, 3) 8-bit code values; black where a ray misses a panel."""
+        """Return (h, w, 3) 8-bit code values; black where a ray misses a panel."""
         return np.asarray(as_codes(self.image) * self.mask[..., None], np.uint8)
 
 
 def strips(rows: int) -> Iterator[slice]:
-    """Strips of an image's rows, small enough to stay in the cache between two operations."""
+    """Return slices of an image's rows, small enough to stay in the cache between two operations."""
     return (slice(start, min(start + STRIP_ROWS, rows)) for start in range(0, rows, STRIP_ROWS))
 
 
@@ -44,7 +44,7 @@ def _planes(layer: NDArray[np.uint8] | F32) -> list[F32]:
 
 
 class _Samples:
-    """Bilinear weights and indices of positions (h, w), shared by all channels."""
+    """Bilinear weights and indices of positions (h, w), computed once for all channels."""
 
     def __init__(self, u: F32, v: F32, shape: tuple[int, ...]) -> None:
         height, width = shape[:2]
@@ -58,7 +58,7 @@ class _Samples:
         self._right, self._below = slice(min(1, width - 1), None), slice(min(1, height - 1), None)
 
     def of(self, plane: F32) -> F32:
-        """(h, w) samples of (H, W)."""
+        """Return the (h, w) samples of a plane (H, W)."""
         right, below = self._right, self._below
         no_second_map: Any = None  # None is valid, but missing from OpenCV's stubs
         top, top_right, bottom, bottom_right = (
@@ -88,7 +88,7 @@ class Rays:
 
     @classmethod
     def of_eye(cls, eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg: float) -> Rays:
-        """Create the rays of an eye (3,), frame `stack`, for an image of this size and field of view."""
+        """Create the rays of an eye (3,), in frame `stack`, for an image of this size and field of view."""
         return cls(
             image_from_stack(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg),
             np.arange(width_px, dtype=np.float64) + 0.5,
@@ -100,7 +100,7 @@ class Rays:
         return len(self.v), len(self.u)
 
     def on(self, raster: PlaneRaster, rows: slice = slice(None), *, moved: F64 | None = None) -> tuple[F64, F64]:
-        """(h, w) positions in a raster's pixels where some rows' rays cross its plane (M_RPU).
+        """Return the (h, w) pixels u and v at which some rows of rays cross a raster (M_RPU).
 
         moved: (3, 3) map applied to those pixels afterwards.
         """
@@ -113,13 +113,13 @@ class Rays:
             return (h[0, 0] * u + h[0, 1] * v + h[0, 2]) / weight, (h[1, 0] * u + h[1, 1] * v + h[1, 2]) / weight
 
     def toward_panels(self) -> Mask:
-        """Return (h, w), True where the ray goes towards the panels and not backwards."""
+        """Return an (h, w) mask of the rays that go towards the panels rather than away from them."""
         toward = self.toward()
         result: Mask = toward[0] * self.u + toward[1] * self.v + toward[2] < 0.0
         return result
 
     def toward(self) -> F64:
-        """(3,) coefficients of a ray's x component for (u, v, 1): negative towards the panels."""
+        """Return a ray's x component as coefficients (3,) of (u, v, 1); negative towards the panels."""
         # A ray's direction is the inverse of the projection's left part times (u, v, 1).
         return np.asarray(np.linalg.inv(self.from_stack[:, :3])[0])
 
@@ -135,9 +135,8 @@ def seen_by(
 ) -> Retina:
     """Compute a pinhole eye's image: sin² of the values summed along each ray (supplement, (6), (7)).
 
-    layers: (N, H, W, 3 or 4), rear to front, uint8 code values or float in [0, 1]; a fourth channel is ignored.
-    The image has the layers' size by default.
-    Raises ValueError for an eye behind a panel.
+    layers: (N, H, W, 3 or 4), rear to front, uint8 code values or float in [0, 1]; a fourth channel is ignored. By
+    default the image has the layers' size. Raises ValueError for an eye behind a panel.
     """
     eye = checked_eye(eye_m, stack)
     width, height = width_px or layers.shape[2], height_px or layers.shape[1]
@@ -149,14 +148,14 @@ def seen_by(
 
 
 def _moved(stack: PanelStack, index: int, eye_m: F64) -> F64 | None:
-    """(3, 3) map from the ideal panel's pixels to a layer's, as an eye sees them; None: identity."""
+    """Return the 3x3 map from the ideal panel's pixels to a layer's for one eye; None: identity."""
     if stack.tilt is None:
         return None
     return layer_pixels_from_seen(stack.panel(index), layer_from_seen(stack, index, eye_m))
 
 
 def checked_eye(eye_m: ArrayLike, stack: PanelStack) -> F64:
-    """(3,) eye as float64. Raises ValueError unless it is in front of every panel."""
+    """Return an eye (3,) as float64. Raises ValueError unless it is in front of every panel."""
     eye = np.asarray(eye_m, dtype=np.float64)
     if not np.isfinite(eye).all() or eye[0] <= max(stack.x_m):
         raise ValueError("the eye must be in front of every panel")
@@ -168,8 +167,8 @@ def through_layers(
 ) -> Retina:
     """Compute an image along rays whose positions on each panel are given.
 
-    positions: returns (h, w) u and v on every panel, rear to front, for some rows of the image; mask: (h, w) rays that
-    may count. Of these, the ones that cross every panel half a pixel inside its edge do count.
+    positions: function that returns (h, w) u and v on every panel, rear to front, for a slice of rows. mask: (h, w)
+    rays that may count; of these, the result's mask keeps those that cross every panel half a pixel inside its edge.
     """
     image, counted = np.empty((*mask.shape, 3), np.float32), mask.copy()
     planes = [_planes(layer[..., :3]) for layer in layers]
@@ -187,12 +186,12 @@ def through_layers(
 
 
 def as_codes(image: F32) -> U8:
-    """(...) 8-bit code values from intensities, clipped to [0, 1]."""
+    """Return intensities (...), clipped to [0, 1], as 8-bit code values."""
     return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def pupil_points(diameter_m: float, rings: int = 2) -> F64:
-    """(K, 2) sample points (right, up) in metres that cover a round pupil evenly; the centre first."""
+    """Return (K, 2) points (right, up) in metres that cover a round pupil evenly, the centre first."""
     points = [(0.0, 0.0)]
     for ring in range(1, rings + 1):
         radius = diameter_m / 2 * ring / (rings + 0.5)
@@ -202,7 +201,7 @@ def pupil_points(diameter_m: float, rings: int = 2) -> F64:
 
 
 def average(images: Iterable[F32]) -> F32:
-    """(h, w, C) mean of images, as seen by a finite pupil (section 1.4)."""
+    """Return the mean (h, w, C) of images, as a finite pupil sees. Raises ValueError without any."""
     total: F32 | None = None
     count = 0
     for image in images:

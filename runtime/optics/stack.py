@@ -27,15 +27,15 @@ class PlaneRaster:
     height_px: int
 
     def stack_from_raster(self) -> F64:
-        """3x3: homogeneous `stack` coordinates (x, y, z) of a homogeneous pixel (u, v, 1)."""
+        """Return the 3x3 map to homogeneous `stack` coordinates (x, y, z) from a homogeneous pixel (u, v, 1)."""
         return np.array([[0.0, 0.0, self.x_m], [self.pitch_u_m, 0.0, self.left_m], [0.0, -self.pitch_v_m, self.top_m]])
 
     def plane_from_raster(self) -> F64:
-        """3x3: homogeneous (y, z, 1) on the plane from homogeneous (u, v, 1)."""
+        """Return the 3x3 map to homogeneous (y, z, 1) on the plane from homogeneous (u, v, 1)."""
         return np.array([[self.pitch_u_m, 0.0, self.left_m], [0.0, -self.pitch_v_m, self.top_m], [0.0, 0.0, 1.0]])
 
     def raster_from_plane(self) -> F64:
-        """3x3: homogeneous (u, v, 1) from homogeneous (y, z, 1) on the plane; inverse in closed form."""
+        """Return the 3x3 map to homogeneous (u, v, 1) from (y, z, 1) on the plane, in closed form."""
         return np.array(
             [
                 [1.0 / self.pitch_u_m, 0.0, -self.left_m / self.pitch_u_m],
@@ -47,9 +47,9 @@ class PlaneRaster:
 
 @dataclass(frozen=True, slots=True)
 class Tilt:
-    """Slopes of panels that are not quite parallel, and the eye position for which they are registered."""
+    """Slopes of panels that are not quite parallel, and the position from which they were registered."""
 
-    depth: tuple[tuple[float, float, float], ...]  # per panel (d, r, u): d + r·y + u·z metres before its x_m
+    depth: tuple[tuple[float, float, float], ...]  # per panel (d, r, u): the point (y, z) is d + r·y + u·z past its x_m
     seen_from_m: tuple[float, float, float]  # frame `stack`
 
 
@@ -75,7 +75,7 @@ class PanelStack:
         return bool(gaps.size == 0 or np.ptp(gaps) <= UNEVEN_MOST * gaps.mean())
 
     def reduced(self, reduction: int) -> PanelStack:
-        """Return the stack with rows and columns divided by `reduction`, but at least one of each."""
+        """Return the stack with its rows and columns divided by `reduction`; at least one of each remains."""
         if reduction == 1:
             return self
         width_px, height_px = (max(1, round(px / reduction)) for px in (self.width_px, self.height_px))
@@ -90,7 +90,7 @@ class PanelStack:
         return PanelStack(self.height_m, self.width_m, self.x_m, self.height_px, self.width_px, tilt)
 
     def panel(self, index: int) -> PlaneRaster:
-        """The pixel grid of panel `index`."""
+        """Return the pixel grid of panel `index`."""
         return PlaneRaster(
             x_m=self.x_m[index],
             left_m=-self.width_m / 2,

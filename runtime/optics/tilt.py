@@ -1,10 +1,10 @@
 """Tilted panels: homographies from the ideal panel's points to those of a layer, for one eye.
 
-Registration by photographs places every pixel of a layer where an eye at `seen_from_m` sees it on the ideal panel
-(parallel, at its x_m). From any other position, the second eye's included, a tilted panel's pixels appear displaced.
-The eye's ray meets the tilted plane in a point; the line from `seen_from_m` through that point meets the ideal plane
-at the layer's pixel. Both are projections between planes, so their composition is a homography. It is affine for eyes
-at the distance of `seen_from_m`.
+Registration by photographs places every pixel of a layer where an eye at `seen_from_m` sees it on the ideal panel,
+which is parallel and at the nominal x_m. From any other position, including the second eye's, a tilted panel's pixels
+appear displaced. The eye's ray meets the tilted plane at a point; the line from `seen_from_m` through that point meets
+the ideal plane at the layer's pixel. Both are projections between planes, so their composition is a homography. It is
+affine for eyes at the distance of `seen_from_m`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ UNSEEN_PX = 0.05  # displacements below this, in panel pixels, are ignored
 
 
 def layer_from_seen(stack: PanelStack, index: int, eye_m: F64) -> F64:
-    """3x3 from (y, z, 1) on the ideal panel to the layer's, as seen by an eye (3,)."""
+    """Return the 3x3 map from (y, z, 1) on the ideal panel to the layer's, as an eye (3,) sees them."""
     if stack.tilt is None or not any(stack.tilt.depth[index]):
         return np.eye(3)
     return _projected(stack.tilt.depth[index], stack.tilt.seen_from_m, _triple(eye_m), stack.x_m[index])
@@ -33,7 +33,7 @@ def layer_pixels_from_seen(raster: PlaneRaster, layer_from_seen_m: F64) -> F64:
 
 
 def coarse_layer_from_seen(stack: PanelStack, index: int, eye_m: F64) -> F64:
-    """Simplest approximation of `layer_from_seen` within `UNSEEN_PX` at the panel's corners.
+    """Return the simplest approximation of `layer_from_seen` within `UNSEEN_PX` at the panel's corners.
 
     Tried in order: identity, scale and shift (fast to resample), affine, homography.
     """
@@ -60,7 +60,7 @@ def _projected(
     eye: tuple[float, float, float],
     x_m: float,
 ) -> F64:
-    """Project the ideal plane to the tilted one along the eye's rays, and back along those of `seen_from`."""
+    """Project the ideal plane to the tilted one along the eye's rays, and back from `seen_from`."""
     offset_m, right, up = depth
     normal, far = np.array([1.0, -right, -up]), x_m + offset_m
     origin, place = np.array(seen_from), np.array(eye)

@@ -12,10 +12,10 @@ from runtime.records import F64
 
 
 def stack_from_eye(eye_m: ArrayLike) -> F64:
-    """4x4 pose of an eye that looks at the stack's origin (EyeReal supplement, (10)-(14)).
+    """Return the 4x4 pose of an eye that looks at the stack's origin (EyeReal supplement, (10)-(14)).
 
-    Axes: x right and parallel to the ground, y up, z from the scene towards the eye. On the vertical
-    axis, where the limits differ, use the limit from +x: r_x = +y.
+    Axes: x right and parallel to the ground, y up, z from the scene towards the eye. On the vertical axis, where the
+    limit depends on the direction of approach, it is the limit from +x: r_x = +y.
 
     Raises ValueError if the eye is at the origin or not finite.
     """
@@ -23,10 +23,10 @@ def stack_from_eye(eye_m: ArrayLike) -> F64:
     scale = float(np.abs(eye).max())
     if not np.isfinite(scale) or scale == 0.0:
         raise ValueError(f"an eye at {eye.tolist()} has no direction of gaze")
-    # Scaled first: squares of 1e-200 or 1e200 would leave float64.
+    # Scale first: the squares of 1e-200 or 1e200 would leave float64's range.
     back = eye / scale
     back = back / math.hypot(*back)
-    # From the unscaled eye: near the vertical axis its x and y may be too small to survive the scaling.
+    # Use the unscaled eye: near the vertical axis its x and y may be too small to survive the scaling.
     off_axis = float(np.abs(eye[:2]).max())
     along = eye[:2] / off_axis if off_axis > 0.0 else np.array([1.0, 0.0])
     along = along / math.hypot(*along)
@@ -37,13 +37,13 @@ def stack_from_eye(eye_m: ArrayLike) -> F64:
 
 
 def image_from_camera(*, width_px: int, height_px: int, fov_deg: float) -> F64:
-    """3x3 intrinsic matrix: square pixels, centred principal point, horizontal fov (equation (36))."""
+    """Return the 3x3 intrinsic matrix for a horizontal field of view and square pixels (equation (36))."""
     focal_px = width_px / 2 / math.tan(math.radians(fov_deg) / 2)
     return np.array([[focal_px, 0.0, width_px / 2], [0.0, focal_px, height_px / 2], [0.0, 0.0, 1.0]])
 
 
 def image_from_stack(eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg: float) -> F64:
-    """3x4 projection of `stack` points to an eye's image: K·diag(1, -1, -1)·R_e^T·[I | -e] ((31)-(39)).
+    """Return the 3x4 projection K·diag(1, -1, -1)·R_e^T·[I | -e] of `stack` to an image ((31)-(39)).
 
     The third homogeneous coordinate is the distance along the gaze in metres, positive in front of the eye.
     """
@@ -55,7 +55,7 @@ def image_from_stack(eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg
 
 
 def raster_from_stack(eye_m: ArrayLike, raster: PlaneRaster) -> F64:
-    """3x4 projection of `stack` points, seen from an eye, onto a plane's pixels.
+    """Return the 3x4 projection of `stack` points, seen from an eye, onto a plane's pixels.
 
     Equals M_RPU · `image_from_stack` for any image of the eye. The third coordinate is the eye's distance from the
     point along x, in metres.
@@ -75,15 +75,15 @@ def raster_from_stack(eye_m: ArrayLike, raster: PlaneRaster) -> F64:
 
 
 def image_from_raster(image_from_stack: F64, raster: PlaneRaster) -> F64:
-    """3x3 plane-induced homography from a plane's pixels to an eye's image pixels (H of (40)-(42))."""
+    """Return the 3x3 homography from a plane's pixels to an eye's image pixels (H of (40)-(42))."""
     return image_from_stack[:, :3] @ raster.stack_from_raster() + np.outer(image_from_stack[:, 3], [0.0, 0.0, 1.0])
 
 
 def relative_scale_shift(eye_m: ArrayLike, *, from_x_m: float, to_x_m: float) -> tuple[float, F64]:
-    """Scale and (2,) shift (y, z), metres, that project one plane to a parallel one from an eye.
+    """Return the scale and shift (2,) in metres that project a plane onto a parallel one from an eye.
 
-    The ray through a point p crosses the other plane at p·scale + shift.
-    Raises ValueError for an eye in the first plane.
+    The ray through a point p crosses the other plane at p·scale + shift. Raises ValueError for an eye in the first
+    plane.
     """
     eye = np.asarray(eye_m, dtype=np.float64)
     distance_m = eye[0] - from_x_m
