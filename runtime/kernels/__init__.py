@@ -1,7 +1,7 @@
-"""The compiled C++ loops, called by `ctypes`, which lets other threads run meanwhile.
+"""The compiled C++ loops, called through `ctypes`, which releases the GIL meanwhile.
 
-The structures below are those of the C++ files, field by field (`KernelImage` is `Image` there, `KernelView` is `View`,
-`ErrorSum` is `Result`); `library` compares their sizes and the limit of ray sets.
+The structures below mirror those of the C++ files field by field; `KernelImage` is `Image` there, `KernelView` is
+`View` and `ErrorSum` is `Result`. `library` compares their sizes and the limit on ray sets.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from typing import Any
 from numpy.typing import NDArray
 
 MAX_PANELS = 5
-MAX_SETS = 4  # of rays: left and right eye's, at two places
-MARGIN = 64  # elements after an image's rows that loops may touch
+MAX_SETS = 4  # sets of rays: both eyes at two head positions
+MARGIN = 64  # elements after an image's rows that the loops may touch
 SUBCODE = 16  # fixed point: sixteenths of an 8-bit panel code
-FULL = 255 * SUBCODE  # one panel's whole range, a quarter turn
+FULL = 255 * SUBCODE  # a panel's whole range, a quarter turn
 EDGE_PX = 4  # pixels outside an image that may be sampled
 EDGE_CLAMP_PX = 2  # pixels outside a picture to which its border ray bundles are extended (clamp to edge)
-TABLE_STEPS = 16  # entries for a code value in the table of intensities, for bilinear rays
+TABLE_STEPS = 16  # table entries per code value, for the intensities of bilinear rays
 _AGAIN = "install phasestack again (it needs g++)"
 _pointer, _int, _long, _float, _double = (
     ctypes.c_void_p, ctypes.c_int32, ctypes.c_int64, ctypes.c_float, ctypes.c_double
@@ -29,24 +29,24 @@ _pointer, _int, _long, _float, _double = (
 
 
 class KernelImage(ctypes.Structure):
-    """Rows of 16-bit elements, interleaved channels."""
+    """Rows of 16-bit elements with interleaved channels."""
 
     _fields_ = (("data", _pointer), ("stride", _long), ("rows", _int), ("width", _int), ("ring", _int))
 
     @classmethod
     def of(cls, array: NDArray[Any], *, rows: int, width: int) -> KernelImage:
-        """The first rows and pixels of an int16 array (rows, elements), which must live as long."""
+        """Return part of an int16 array (rows, elements), which the caller must keep alive."""
         return cls(array.ctypes.data, array.strides[0] // array.itemsize, rows, width, len(array))
 
 
 class Panel(ctypes.Structure):
-    """One panel between steps."""
+    """Images of one panel, from one step to the next."""
 
     _fields_ = tuple((name, KernelImage) for name in ("ahead", "moved", "before", "last"))
 
 
 class Problem(ctypes.Structure):
-    """Arguments of a step."""
+    """Arguments of `step` and `close_middle`."""
 
     _fields_ = (
         ("panels", _int), ("sets", _int), ("channels", _int), ("height", _int), ("width", _int),
@@ -57,7 +57,7 @@ class Problem(ctypes.Structure):
 
 
 class Warp(ctypes.Structure):
-    """Map from a raster to an image, and the distance up to which its edge is clamped (less than `EDGE_PX`)."""
+    """Map from a raster to an image, and how far (below `EDGE_PX`) its edge is clamped."""
 
     _fields_ = (
         ("image_from_raster", _double * 9), ("image_bend", _double), ("image_middle", _double),
@@ -66,7 +66,7 @@ class Warp(ctypes.Structure):
 
 
 class KernelView(ctypes.Structure):
-    """One eye's view of displayed layers."""
+    """One eye's view of the displayed layers."""
 
     _fields_ = (
         ("layers", _pointer), ("panels", _int), ("height", _int), ("width", _int), ("components", _int),
@@ -77,7 +77,7 @@ class KernelView(ctypes.Structure):
 
 
 class ErrorSum(ctypes.Structure):
-    """Sum of a squared error, and the number of its terms."""
+    """Sum of squared errors, and the number of its terms."""
 
     _fields_ = (("total", _double), ("counted", _long))
 
@@ -90,12 +90,12 @@ COMPILED = {
 
 @cache
 def library() -> Any:
-    """The loops. Raises ImportError where the package was not built for this machine, or from other sources."""
-    built = Path(__file__).with_name("compiled" + EXTENSION_SUFFIXES[0])  # another Python's may be a stale one
+    """Return the compiled library. Raises ImportError if it is missing, or was built from other sources."""
+    built = Path(__file__).with_name("compiled" + EXTENSION_SUFFIXES[0])  # a file built for another Python may be stale
     if not built.exists():
         raise ImportError(f"runtime.kernels is not compiled for this Python: {_AGAIN}")
     loops = ctypes.CDLL(str(built))
-    other = ImportError(f"{built} is of another version: {_AGAIN}")
+    other = ImportError(f"{built} was built from another version: {_AGAIN}")
     for name, arguments in {
         "step": (_pointer, _int, _int),
         "close_middle": (_pointer, _int, _int),

@@ -1,11 +1,11 @@
-// What one eye sees of displayed layers, ray by ray: the squared error of some rows (runtime/optics/light.py).
+// Squared error of some rows of one eye's view of the displayed layers, ray by ray (runtime/optics/light.py).
 #include <cstdint>
 
 #include "sampling.hpp"
 
 namespace {
 
-constexpr int TABLE_STEPS = 16;  // entries a code value, of the table that sums along bilinear rays are looked up in
+constexpr int TABLE_STEPS = 16;  // table entries per code value, for the sums of bilinear rays
 
 struct View {
   const uint8_t *layers;  // (panels, height, width, components)
@@ -14,10 +14,10 @@ struct View {
   int32_t rows, columns;
   const double *centre_from_image;   // (3, 3)
   const double *panels_from_centre;  // (points, panels, 3, 3)
-  const double *toward;              // (3) times (u, v, 1): negative for a ray that goes towards the panels
-  const float *table;                // intensities of summed codes, half of an entry added before it is cut off
-  int64_t first_ray;                 // its number
-  int32_t points, rays, step;        // of the pupil; a side of a pixel in each set, 0: one, bilinear; every such pixel
+  const double *toward;              // (3) its product with (u, v, 1) is negative for rays towards the panels
+  const float *table;                // intensities by sum of codes; indices are rounded by adding 0.5 first
+  int64_t first_ray;                 // number of the first ray
+  int32_t points, rays, step;        // pupil points; rays along a pixel's side per set, 0: one, bilinear; row step
 };
 
 struct Result {
@@ -25,7 +25,7 @@ struct Result {
   int64_t counted;
 };
 
-// Of a ray, by its number (splitmix64): 24 bits for its place along the pixel, 24 down, 16 for the pupil's point.
+// Random bits of a ray from its number (splitmix64): 24 for its place along the pixel, 24 down, 16 for its pupil point.
 INLINE uint64_t random_bits(uint64_t ray) {
   uint64_t bits = ray * 0x9E3779B97F4A7C15u;
   bits = (bits ^ (bits >> 30)) * 0xBF58476D1CE4E5B9u;
@@ -33,7 +33,7 @@ INLINE uint64_t random_bits(uint64_t ray) {
   return bits ^ (bits >> 31);
 }
 
-// Adds what one ray sees, by colours; false where it misses a panel.
+// Add the intensities along one ray, by colour; return false if it misses a panel.
 INLINE bool see(const View &view, double u, double v, int point, float *seen) {
   if (!(view.toward[0] * u + view.toward[1] * v + view.toward[2] < 0)) return false;
   const double *c = view.centre_from_image, weight = 1 / (c[6] * u + c[7] * v + c[8]);
@@ -66,7 +66,7 @@ INLINE bool see(const View &view, double u, double v, int point, float *seen) {
 
 }  // namespace
 
-// Of every step-th row from first to end: the sum of both sets' errors' products, and how many numbers it is of.
+// Sum, over every step-th row from first to end, of the products of both sets' errors, and the number of terms.
 FOR_EVERY_CPU void squared_error(const View *given, int first, int end, Result *result) {
   const View &view = *given;
   const int in_set = std::max(view.rays * view.rays, 1), sets = view.rays ? 2 : 1, side = std::max(view.rays, 1);

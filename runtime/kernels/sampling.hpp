@@ -1,4 +1,4 @@
-// Bilinear samples of images along the rows of a raster, through a homography: the one sampler of all kernels.
+// The sampler of all kernels: bilinear samples of images along the rows of a raster, through a homography.
 #pragma once
 
 #include <algorithm>
@@ -6,7 +6,7 @@
 #include <cstdint>
 #include <cstring>
 
-// Exported functions are compiled for each of three processors, together with the functions that they inline.
+// Exported functions are compiled for three processor levels, together with the functions that they inline.
 #if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
 #define FOR_EVERY_CPU extern "C" __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
 #else
@@ -15,25 +15,25 @@
 #define INLINE static inline __attribute__((always_inline))
 #define VECTORISED _Pragma("GCC ivdep")
 
-constexpr int LANES = 32;     // elements of a vector in the loops; the compiler splits it for the processor
-constexpr int TILE_PX = 256;  // pixels of a row that are sampled together: their data fits the first-level cache
-constexpr int EDGE_PX = 4;    // outside an image, that may be sampled
+constexpr int LANES = 32;     // elements per vector in the loops; the compiler splits it for the processor
+constexpr int TILE_PX = 256;  // pixels of a row that are sampled together; their data fits the first-level cache
+constexpr int EDGE_PX = 4;    // pixels outside an image that may be sampled
 constexpr int MAX_PANELS = 5;
 constexpr int MAX_CHANNELS = 3;
-constexpr int TILE = TILE_PX * MAX_CHANNELS + 2 * LANES;  // elements; those after the last one may be overwritten
+constexpr int TILE = TILE_PX * MAX_CHANNELS + 2 * LANES;  // elements, with those that may be overwritten at the end
 constexpr int SOURCE = 2 * TILE + MAX_CHANNELS * LANES;
-constexpr int FIELDS = 2;  // sampled together, at most
+constexpr int FIELDS = 2;  // most images sampled together
 constexpr float WEIGHT_UNIT = 16384;
 
 // An image of 16-bit elements with interleaved channels. Whole vectors are read past the end of a row.
 struct Image {
   int16_t *data;
   int64_t stride;  // elements
-  int32_t rows, width, ring;  // row r is the (r % ring)th in memory
+  int32_t rows, width, ring;  // row r is stored at index r % ring
   const int16_t *row(int r) const { return data + int64_t(r % ring) * stride; }
 };
 
-struct Ramp {  // the pixel that an element belongs to
+struct Ramp {  // pixel index of each element
   int16_t one_channel[LANES + MAX_CHANNELS] = {}, three_channels[LANES + MAX_CHANNELS] = {};
   constexpr Ramp() {
     for (int e = 0; e < LANES + MAX_CHANNELS; ++e) one_channel[e] = int16_t(e), three_channels[e] = int16_t(e / 3);
@@ -41,7 +41,7 @@ struct Ramp {  // the pixel that an element belongs to
 };
 constexpr Ramp RAMP;
 
-// A row of a raster through a homography: position of its pixel u in an image with pixel centres at integers.
+// A raster's row mapped by a homography: positions of its pixels u in an image with pixel centres at integers.
 struct Line {
   double x0, xu, y0, yu, w0, wu;
   Line() = default;
@@ -56,7 +56,7 @@ struct Line {
 };
 
 struct Span {
-  int first, last;  // pixels, and beyond the last
+  int first, last;  // pixels [first, last)
 };
 
 INLINE Span common(Span a, Span b) {
@@ -72,7 +72,7 @@ INLINE void at_least_zero(double slope, double offset, double &low, double &high
 
 // Pixels of a row of `count` whose positions are at least `near` pixels inside the image's edges.
 INLINE Span inside(const Line &line, int count, const Image &image, double near) {
-  constexpr double rounded = 1e-6;  // a position on an edge is inside, with any rounding error
+  constexpr double rounded = 1e-6;  // counts a position on an edge as inside, despite rounding
   const double right = image.width - near, below = image.rows - near;
   double low = 0, high = count - 1;
   at_least_zero(line.wu, line.w0 - 1e-9, low, high);
@@ -89,10 +89,10 @@ INLINE int64_t whole_vectors(int64_t elements) { return (elements + LANES - 1) /
 
 INLINE int16_t rounded(float x) { return int16_t(int(std::nearbyintf(x))); }
 
-// a·b/32768, rounded: one instruction of most processors.
+// a·b/32768, rounded: a single instruction on most processors.
 INLINE int16_t product(int16_t a, int16_t b) { return int16_t((((int32_t(a) * int32_t(b)) >> 14) + 1) >> 1); }
 
-// From a to b by a share in WEIGHT_UNIT. Both are 8191 at most, either way, so that twice their difference fits.
+// Share, in WEIGHT_UNIT, of the way from a to b. Both are within ±8191, so that twice their difference fits.
 INLINE int16_t part_of(int16_t a, int16_t b, int16_t share) { return product(int16_t(2 * (b - a)), share); }
 INLINE int16_t mixed(int16_t a, int16_t b, int16_t share) { return int16_t(a + part_of(a, b, share)); }
 
@@ -102,12 +102,12 @@ struct alignas(2 * LANES) Work {
   int16_t sum[TILE];
 };
 
-// Pixels first to last of a line in an image, and the image's pixels that they lie between.
+// Pixels [first, last) of a line in an image, and the image's pixels that surround them.
 struct Stretch {
   double xs, xe, ys, ye;  // positions of the first and the last pixel
-  int first, steps;       // steps from pixel to pixel
-  bool on_pixels;         // every pixel lies on a column of the image, one column after the other
-  int s0, elements;       // first pixel that is read, and the number of elements from there
+  int first, steps;       // first pixel, number of steps to the last
+  bool on_pixels;         // the pixels coincide with consecutive columns of the image
+  int s0, elements;       // first pixel to read, number of elements from there
 };
 
 template <int C, typename AnyLine>
@@ -122,7 +122,7 @@ INLINE Stretch stretch_of(const Image &image, const AnyLine &line, int first, in
   return {xs, xe, line.y(first), line.y(last - 1), first, steps, on_pixels, s0, std::min((s1 - s0 + 1) * C, SOURCE - 4 * LANES)};
 }
 
-// Mix the two rows of the images between which a stretch runs, into to[f]: run by run, with weights that grow evenly.
+// Mix the two rows around a stretch for each image, into to[f], in runs with linearly growing weights.
 template <int F, int C>
 INLINE void mix_rows(const Image *images, const Stretch &along, int16_t *const (&to)[F]) {
   const Image &image = images[0];
@@ -155,7 +155,7 @@ INLINE void mix_rows(const Image *images, const Stretch &along, int16_t *const (
   }
 }
 
-// Repeat the first and the last pixel of mixed rows outside them (clamp to edge).
+// Repeat the first and the last pixel of mixed rows beyond their ends (clamp to edge).
 template <int C>
 INLINE void clamp_ends(int16_t *source, int elements) {
   for (int beyond = 1; beyond <= EDGE_PX; ++beyond)
@@ -165,10 +165,10 @@ INLINE void clamp_ends(int16_t *source, int elements) {
     }
 }
 
-// Position along a stretch, in pixels after the first that is read: a parabola, in 2^-32 pixels. Pixel k's is k further.
+// Parabola in 2^-32 pixels: k plus its value at k is pixel k's position, from the first pixel that is read.
 struct Parabola {
   int64_t begin, drift, turn;
-  int at_once;  // elements of a vector
+  int at_once;  // elements per vector
 };
 
 template <int C, typename AnyLine>
@@ -177,8 +177,8 @@ INLINE Parabola parabola_of(const AnyLine &line, const Stretch &along) {
   const double half = 0.5 * steps, middle = steps > 1 ? line.x(along.first + half) : 0.5 * (along.xs + along.xe);
   const double bend = steps > 1 ? (along.xs + along.xe - 2 * middle) / (half * half) * 0.5 : 0;
   const double scale = steps > 0 ? (along.xe - along.xs) / steps - bend * steps : 1;  // at the first pixel
-  // As many elements per vector as keep the source's gain below three pixels (two with one channel: over 32 pixels the
-  // rounding of a weight's growth adds up) and a chord close to the parabola.
+  // Use as many elements per vector as keep the source's gain below three pixels and a chord close to the parabola.
+  // With one channel the limit is two, because the rounding of a weight's growth adds up over 32 pixels.
   constexpr double gains = C == 1 ? 1.9 : 2.9;
   const double most = std::max(std::abs(scale - 1), std::abs(scale - 1 + 2 * bend * steps));
   int at_once = LANES;
@@ -187,14 +187,14 @@ INLINE Parabola parabola_of(const AnyLine &line, const Stretch &along) {
   return {int64_t((along.xs - along.s0) * one), int64_t((scale - 1) * one), int64_t(bend * one), at_once};
 }
 
-// Mix neighbours in mixed rows, a vector at a time: the source's pixels advance by a little more or less than the
-// line's, so that a vector needs two neighbours, or up to three more.
+// Mix neighbours in mixed rows, one vector at a time. The source advances a little faster or slower than the line, so a
+// vector needs two to five neighbours.
 template <int F, int C>
 INLINE void mix_neighbours(const Parabola &by, int elements, const int16_t *const (&sources)[F], int16_t *const (&to)[F]) {
   const int16_t *ramp = C == 1 ? RAMP.one_channel : RAMP.three_channels;
   for (int e = 0; e < elements; e += by.at_once) {
     const int k = e / C, phase = e - k * C, px = (by.at_once - 1 + phase) / C;
-    const int first_at = int((by.begin + k * (by.drift + by.turn * k)) >> 18);  // in WEIGHT_UNIT from here on, as weights are
+    const int first_at = int((by.begin + k * (by.drift + by.turn * k)) >> 18);  // now in WEIGHT_UNIT, like weights
     const int each = int((by.drift + by.turn * (2 * k + px) + (1 << 17)) >> 18), last_at = first_at + each * px;
     const int offset = std::min(first_at, last_at) >> 14, further = (std::max(first_at, last_at) >> 14) - offset;  // pixels
     const uint16_t share = uint16_t(first_at - offset * int(WEIGHT_UNIT));
@@ -220,12 +220,12 @@ INLINE void mix_neighbours(const Parabola &by, int elements, const int16_t *cons
   }
 }
 
-// F images of one shape at pixels first to last of a line (TILE_PX at most, all of them `inside`), into out[f], from
-// element `begin_at` on; a vector and two pixels after the last may be overwritten, nothing before the first.
+// Sample F images of equal shape at pixels [first, last) of a line (at most TILE_PX, all `inside`) into out[f], from
+// element `begin_at` on. Up to a vector and two pixels after the last may be overwritten, nothing before the first.
 template <int F, int C, typename AnyLine>
 INLINE void sample(const Image *images, const AnyLine &line, int first, int last, Work &work, int16_t (*out)[TILE], int begin_at = 0) {
   const Stretch along = stretch_of<C>(images[0], line, first, last);
-  int16_t *mixes[F], *to[F];  // straight to the output where pixels lie on pixels
+  int16_t *mixes[F], *to[F];  // mix directly into the output if pixels coincide
   for (int f = 0; f < F; ++f) to[f] = out[f] + begin_at, mixes[f] = along.on_pixels ? to[f] : work.source[f] + LANES;
   mix_rows<F, C>(images, along, mixes);
   if (along.on_pixels) return;
@@ -233,7 +233,7 @@ INLINE void sample(const Image *images, const AnyLine &line, int first, int last
   mix_neighbours<F, C>(parabola_of<C>(line, along), (along.steps + 1) * C, mixes, to);
 }
 
-// Length of a tile of a line: short enough that a parabola is a hundredth of a pixel off, with room for its source.
+// Length of a tile of a line: short enough for a parabola with an error of 0.01 pixel, and for the source's buffer.
 INLINE int tile_px(const Line &line, Span span) {
   const double nearest = std::min(std::abs(line.w0 + line.wu * span.first), std::abs(line.w0 + line.wu * span.last));
   const double turn = std::max(std::abs(line.wu) / nearest, 1e-9);

@@ -1,7 +1,7 @@
 // The solver's steps on the processor (docs/mathematics.md, L1 to L5; model_export/light.py is the reference).
 //
 // Rays are processed row by row. Residuals go to a ring buffer of rows; a panel row is updated once every ray that
-// crosses it has been processed. Phasors are kept in a ring buffer too, from a row's first ray to its last: only the
+// crosses it has been processed. Phasors are kept in a ring buffer too, from a row's first ray to its last, so only the
 // panels themselves are read from and written to memory.
 #include <vector>
 
@@ -9,31 +9,31 @@
 
 namespace {
 
-constexpr int FULL = 255 * 16;   // of a panel that shows 1: sixteenths of a code
-constexpr float UNIT = 8100;     // of 1 in phasors: rounding takes no product of theirs beyond 8191
+constexpr int FULL = 255 * 16;   // panel value 1, in sixteenths of a code
+constexpr float UNIT = 8100;     // value of 1 in phasors, small enough that rounded products stay within 8191
 constexpr float PI = 3.14159265f;
-constexpr double NEAR_PX = 0.5;  // rays count that cross every panel at least this far inside its edges
+constexpr double NEAR_PX = 0.5;  // rays count if they cross every panel at least this far inside its edges
 constexpr double EDGE_CLAMP_PX = 2;  // border ray bundles are extended this many pixels beyond the picture (clamp to edge)
-constexpr int MAX_SETS = 4;      // of rays, whose sums of squared slopes, 7830 each, fit 16 bits
-static_assert(FIELDS * MAX_SETS <= 2 * MAX_PANELS, "tiles of work that all sets are gathered in");
+constexpr int MAX_SETS = 4;      // sets of rays; their sum of squared slopes, up to 7830 each, fits 16 bits
+static_assert(FIELDS * MAX_SETS <= 2 * MAX_PANELS, "work has too few tiles to gather all sets");
 
 struct Panel {
-  Image ahead;   // read by the rays: with momentum
-  Image moved;   // the same after the step
+  Image ahead;   // read by the rays: includes momentum
+  Image moved;   // its successor after the step
   Image before;  // without momentum
-  Image last;    // the same after the step: the same image, except in the first step, where `before` is `ahead`
+  Image last;    // its successor: the same image, except in the first step, where `before` is `ahead`
 };
 
 struct Problem {
-  int32_t panels, sets, channels;  // sets of rays: left and right eye in turn, for each place that they may be at
-  int32_t height, width;           // of a set's rays: places take turns, from row to row of a picture
+  int32_t panels, sets, channels;  // sets of rays: left and right eye alternately, for each head position
+  int32_t height, width;           // of a set's rays; head positions alternate from row to row of a picture
   const double *panels_from_rays;  // (sets, panels, 3, 3)
   const double *rays_from_panels;  // their inverses
-  const uint8_t *targets[2];       // left and right eye's, (rows of all places, width, channels)
+  const uint8_t *targets[2];       // left and right eye: (rows of all positions, width, channels)
   const int16_t *column_taper;     // (width, channels) weights of the rays' errors, 32767 for 1
-  const int16_t *row_taper;        // (rows of all places)
-  const int32_t *table;            // (256,) of a target's code, the sum of all panels that shows it, and 65536 times its weight
-  float rest, missing;             // closing: value outside a panel; weight of a ray that misses one
+  const int16_t *row_taper;        // (rows of all positions)
+  const int32_t *table;            // (256,) by target code: the panels' sum that shows it, plus 65536 times its weight
+  float rest, missing;             // for close_middle: value outside a panel; weight of rays that miss a panel
   Panel panel[MAX_PANELS];
   float size, momentum, floor;
 
@@ -43,14 +43,14 @@ struct Problem {
   }
 };
 
-// One thread's partition: rows of rays, and the panel rows that are complete after them.
+// One thread's partition: rows of rays, and the panel rows that these complete.
 struct Share {
   int first, end;
   std::vector<int> since[MAX_PANELS], until[MAX_PANELS];  // first and last row of rays that see each row of a panel
   int panel_first[MAX_PANELS], panel_end[MAX_PANELS];
   int16_t *ring;
-  int64_t stride, plane;  // of a row, of one field
-  int rows;               // of a ring
+  int64_t stride, plane;  // elements per row, per field
+  int rows;               // rows of the rays' ring buffer
   Image cosine[MAX_PANELS], sine[MAX_PANELS];  // of pi times `ahead`
 
   int16_t *field(int set, int f) const { return ring + (int64_t(set) * FIELDS + f) * plane; }
@@ -64,7 +64,7 @@ struct Range {
   double low, high;
 };
 
-// Rows of rays, of any set, that see row q of a panel.
+// Range of ray rows, over all sets, that cross row q of a panel.
 Range rays_through(const Problem &problem, int n, int q) {
   const double right = problem.panel[n].ahead.width - 0.5;
   Range rays{1e9, -1e9};
@@ -78,7 +78,7 @@ Range rays_through(const Problem &problem, int n, int q) {
   return rays;
 }
 
-// Set `since` and `until` of each row of a panel. Neither decreases from row to row.
+// Set `since` and `until` for each row of a panel. Both are non-decreasing.
 void find_dependencies(const Problem &problem, int n, Share &share) {
   const int rows = problem.panel[n].ahead.rows;
   const double last = problem.height - 1.0;
@@ -97,8 +97,8 @@ int first_until(const std::vector<int> &until, int r) {
   return int(std::lower_bound(until.begin(), until.end(), r) - until.begin());
 }
 
-// Divide the rays' rows evenly: a partition updates the panel rows whose last ray is in its share. It also processes
-// the rays before its share that see those rows.
+// Divide the ray rows evenly. A partition updates the panel rows whose last ray is in its share, and also processes the
+// rays before its share that cross those rows.
 void assign_rows(const Problem &problem, int part, int parts, Share &share) {
   const int first = int(int64_t(problem.height) * part / parts);
   share.first = first, share.end = int(int64_t(problem.height) * (part + 1) / parts);
@@ -110,15 +110,15 @@ void assign_rows(const Problem &problem, int part, int parts, Share &share) {
   }
 }
 
-// Rows of rays that a panel row may have to wait for, with two more.
+// Number of ray rows, plus two, that a panel row may have to wait for.
 int ray_rows(const std::vector<int> &since, const std::vector<int> &until) {
   int rows = 1;
   for (size_t q = 0; q < since.size(); ++q) rows = std::max(rows, until[q] - since[q] + 2);
   return rows;
 }
 
-// Rows of a panel whose phasors are in use together. Rays between two rows see both: a row's phasors are needed from the
-// row before's first ray to the next one's last.
+// Number of a panel's phasor rows in use at the same time. Rays between two rows read both, so a row's phasors are
+// needed from the previous row's first ray to the next row's last.
 int phasor_rows(const std::vector<int> &since, const std::vector<int> &until) {
   int rows = 2;
   for (int q = 0, oldest = 0; q < int(since.size()); ++q) {
@@ -130,7 +130,7 @@ int phasor_rows(const std::vector<int> &since, const std::vector<int> &until) {
 
 int64_t stride_of(const Problem &problem, int width) { return whole_vectors(int64_t(width) * problem.channels + LANES); }
 
-// Place the ring buffers in memory that the thread keeps from call to call.
+// Place the ring buffers in memory that the thread keeps between calls.
 void lay_out(const Problem &problem, bool phasors, Share &share) {
   static thread_local std::vector<int16_t> memory;
   share.rows = 1;
@@ -160,23 +160,23 @@ Share share_of(const Problem &problem, int part, int parts, bool phasors) {
   return share;
 }
 
-// Coefficients of x, x^3, x^5 and x^7 in sin(pi/2 x), and UNIT, for 16384; 32768 / FULL - 8, for 32768.
+// sin(pi/2 x) as a polynomial: coefficients of x, x^3, x^5, x^7, and UNIT (16384 is 1); 32768 / FULL - 8 (32768 is 1).
 struct Factors {
   int16_t first = 25736, third = -10583, fifth = 1302, seventh = -71, unit = int16_t(UNIT * 2), beyond_eight = 1028;
 };
 
 // UNIT times the cosine of an angle; 32768 is half a turn.
 INLINE int16_t cosine_of(int16_t angle, const Factors &by) {
-  const int16_t within = int16_t(16384 - (angle < 0 ? -angle : angle));     // sine's, a quarter turn to either side
-  const int16_t x = int16_t(2 * within - (within >> 14)), y = product(x, x);  // one less where 16 bits don't hold it
+  const int16_t within = int16_t(16384 - (angle < 0 ? -angle : angle));     // the sine's argument, up to a quarter turn
+  const int16_t x = int16_t(2 * within - (within >> 14)), y = product(x, x);  // subtracting 1 avoids 32768
   const int16_t series = int16_t(by.third + product(y, int16_t(by.fifth + product(y, by.seventh))));
   return product(product(x, int16_t(by.first + product(y, series))), by.unit);
 }
 
-// Cosine and sine of pi times row q of a panel.
+// Write cosine and sine of pi times row q of a panel.
 INLINE void to_phasors(const Problem &problem, const Share &share, int n, int q) {
   Factors by;
-  asm("" : "+m"(by));  // products with numbers that a compiler knows are taken apart, which takes four times as long
+  asm("" : "+m"(by));  // hides the constants: GCC would expand products with them, which takes four times as long
   const int16_t *row = problem.panel[n].ahead.row(q);
   int16_t *cosine = const_cast<int16_t *>(share.cosine[n].row(q)), *sine = const_cast<int16_t *>(share.sine[n].row(q));
   const int count = problem.panel[n].ahead.width * problem.channels;
@@ -202,7 +202,7 @@ INLINE float unit_of(int panels) {
   return unit;
 }
 
-// Row r of a set of rays: the squared slope, and the error times the slope.
+// Compute the squared slope, and the error times the slope, for row r of a set of rays.
 template <int C, int N>
 INLINE void compare(const Problem &problem, const Share &share, int set, int r, Work &work) {
   Line lines[N];
@@ -240,7 +240,7 @@ INLINE void compare(const Problem &problem, const Share &share, int set, int r, 
   clear_outside(problem, share, set, r, span);
 }
 
-// Lines of all sets' rays through a panel's row.
+// Lines of all sets' rays through a row of a panel.
 struct Back {
   Line line[MAX_SETS];
   Span span[MAX_SETS];
@@ -252,7 +252,7 @@ struct Back {
   }
 };
 
-// Sum the first F fields of all sets at pixels of a panel's row, into work.tile[0] to [F - 1].
+// Sum the first F fields of all sets at the pixels of a panel's row, into work.tile[0] to [F - 1].
 template <int F, int C>
 INLINE void gather(const Problem &problem, const Share &share, const Back &back, Span tile, Work &work) {
   const int count = (tile.last - tile.first) * C;
@@ -299,7 +299,7 @@ INLINE void move(const Problem &problem, const Share &share, int n, int q, Work 
   }
 }
 
-// Row r of a set of rays: the target's weight, and its product with the middle panel's residual.
+// Compute the targets' weights, and their products with the middle panel's residuals, for row r of a set of rays.
 template <int C>
 INLINE void residual(const Problem &problem, const Share &share, int set, int r, Work &work) {
   const int middle = problem.panels / 2;
@@ -342,7 +342,7 @@ INLINE void residual(const Problem &problem, const Share &share, int set, int r,
   clear_outside(problem, share, set, r, span);
 }
 
-// Row q of the middle panel: the mean of all rays' residuals there; it rests where there are none.
+// Set row q of the middle panel to the mean of all rays' residuals there, or to rest without rays.
 template <int C>
 INLINE void fill(const Problem &problem, const Share &share, int q, Work &work) {
   const Image &image = problem.panel[problem.panels / 2].last;
@@ -361,7 +361,7 @@ INLINE void fill(const Problem &problem, const Share &share, int q, Work &work) 
 template <int C, int N>
 INLINE void step_rows(const Problem &problem, const Share &share) {
   Work work{};
-  int at[N], ready[N];  // the next row of a panel that moves, and that becomes phasors
+  int at[N], ready[N];  // next row of each panel to update, and to convert to phasors
   std::copy(share.panel_first, share.panel_first + N, at);
   for (int n = 0; n < N; ++n)
     ready[n] = std::max(0, first_until(share.until[n], share.first) - 1);
@@ -410,7 +410,7 @@ FOR_EVERY_CPU void close_middle(const Problem *problem, int part, int parts) {
   else close_rows<1>(*problem, share);
 }
 
-// Rows of a panel in 8-bit codes, opaque, into (rows, width) RGBA pixels.
+// Convert rows of a panel to opaque 8-bit codes in (rows, width) RGBA pixels.
 FOR_EVERY_CPU void show(const Image *panel, int channels, uint32_t *pixels, int64_t stride, int first, int end) {
   for (int r = first; r < end; ++r) {
     const int16_t *row = panel->row(r);

@@ -1,13 +1,13 @@
-// An image on another raster, through a homography between what laws of columns make of both (model/chain.py).
+// Resample an image to another raster, through a homography between columns after both column laws (model/chain.py).
 #include "sampling.hpp"
 
 namespace {
 
-constexpr int BENT_TILE_PX = 64;   // a parabola approximates a law's curve
-constexpr int SOURCE_PX = 480;     // that a tile's source has room for; near a law's end columns are wide
-constexpr double BEYOND = 1e-9;    // where a law has no column
+constexpr int BENT_TILE_PX = 64;   // short enough for a parabola to approximate a law's curve
+constexpr int SOURCE_PX = 480;     // capacity for a tile's source; near a law's end columns are wide
+constexpr double BEYOND = 1e-9;    // smallest argument of the logarithm, where a law has no column
 
-struct Columns {  // column u of a raster is t = middle + (1 - exp(-bend (u - middle))) / bend to a homography
+struct Columns {  // column u corresponds to t = middle + (1 - exp(-bend (u - middle))) / bend in the homography
   double bend, middle;
   double to(double u) const { return bend == 0 ? u : middle - std::expm1(-bend * (u - middle)) / bend; }
   double from(double t) const { return bend == 0 ? t : middle - std::log(std::max(1 - bend * (t - middle), BEYOND)) / bend; }
@@ -16,18 +16,18 @@ struct Columns {  // column u of a raster is t = middle + (1 - exp(-bend (u - mi
 struct Warp {
   double image_from_raster[9];
   Columns image, raster;
-  double reach_px;  // outside the image, up to which it is clamped to its edge: less than EDGE_PX
+  double reach_px;  // distance outside the image, below EDGE_PX, up to which it is clamped to its edge
 };
 
 struct WarpedLine {
-  Line line;  // between the columns by both laws
+  Line line;  // maps columns after both laws
   Columns image, raster;
   double t(double u) const { return raster.to(u + 0.5) - 0.5; }
   double x(double u) const { return image.from(line.x(t(u)) + 0.5) - 0.5; }
   double y(double u) const { return line.y(t(u)); }
 };
 
-// Pixels of a line inside an image or at most reach_px outside, where it is clamped to its edge.
+// Pixels of a line inside an image, or at most reach_px outside, where the image is clamped to its edge.
 INLINE Span reaches(const WarpedLine &at, int count, const Image &image, double reach_px) {
   const Line &line = at.line;
   const double left = at.image.to(-reach_px), right = at.image.to(image.width + reach_px), below = image.rows + reach_px;
@@ -67,7 +67,7 @@ INLINE void warp_rows(const Image &image, const Image &result, const Warp &warp,
 
 }  // namespace
 
-// Rows of a result: bilinear samples of an image with elements within +-8191; `outside` where it has none.
+// Sample rows of the result bilinearly from an image with elements within ±8191; `outside` where it has none.
 FOR_EVERY_CPU void warp(const Image *image, const Image *result, const Warp *by, int channels, int outside, int first, int end) {
   if (channels == 3) warp_rows<3>(*image, *result, *by, outside, first, end);
   else warp_rows<1>(*image, *result, *by, outside, first, end);

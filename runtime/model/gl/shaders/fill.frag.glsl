@@ -1,5 +1,5 @@
 #version 330 core
-// The middle panel: the mean of the residuals of all rays through its pixels.
+// Set the middle panel to the mean of the residuals of all rays through its pixels.
 uniform vec2 origin;
 #include "places.glsl"
 uniform sampler2D last, weight0, residual0, weight1, residual1;

@@ -1,5 +1,5 @@
 #version 330 core
-// A panel, updated by the errors of all rays through its pixels (L5).
+// Gradient step with momentum for one panel (L5).
 uniform vec2 origin;
 #include "places.glsl"
 uniform sampler2D ahead, last, curvature0, gradient0, curvature1, gradient1;

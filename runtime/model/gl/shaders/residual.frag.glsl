@@ -1,5 +1,5 @@
 #version 330 core
-// One eye's rays: the weight of their targets, and its product with the middle panel's residual.
+// Targets' weights for one eye's rays, and their products with the middle panel's residuals.
 uniform vec2 origin;
 #include "places.glsl"
 uniform sampler2D last0, last2, targets, table;

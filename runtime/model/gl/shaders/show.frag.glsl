@@ -1,5 +1,5 @@
 #version 330 core
-// A panel in 8-bit codes, in its place among the whole panel's.
+// Convert a panel to 8-bit codes, at the box's place within the whole panel.
 uniform vec2 origin;
 #include "places.glsl"
 uniform sampler2D last;
