@@ -1,1 +1,1 @@
-"""Predictors: values of every panel from the target pictures of two eyes."""
+"""Predictors, which compute the values of every panel from the target pictures of two eyes."""

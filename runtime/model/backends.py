@@ -23,34 +23,34 @@ if TYPE_CHECKING:
 log = logging.getLogger("phasestack.model")
 
 EYES_M = ((0.6, -0.031, 0.0), (0.6, 0.031, 0.0))
-FIRST_SHARE = 4  # the first comparison is at panels with this many times fewer columns and rows
-CLEAR = 2.5  # times as fast there: no second look is needed
-RUNS = 3  # timed, of which the fastest counts
+FIRST_SHARE = 4  # the first comparison uses panels with this many times fewer columns and rows
+CLEAR = 2.5  # a backend that is this many times as fast there wins without a second comparison
+RUNS = 3  # timed runs; the fastest one counts
 
 Wanted = Literal["auto", "cpu", "gl"]
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """A backend, and why."""
+    """A backend and the reason for choosing it."""
 
     backend: SolverBackend
     why: str  # one line, with the measurement
 
 
 def choose(wanted: Wanted, predictor: Predictor, context: Callable[[], Any]) -> Choice:
-    """The backend for a loaded model, logged with the reason.
+    """Return the backend for a loaded model, and log the reason.
 
     context: returns an OpenGL context that is current on this thread, or raises MissingPart; called only if needed.
-    auto: the one that is faster on this machine; the processor if OpenGL can't be used.
-    Raises MissingPart (gl without OpenGL), InputError (a panel too large for the driver), ModelFailure.
+    For `auto`, both backends are timed; the processor is used if OpenGL is unavailable.
+    Raises MissingPart (`gl` without OpenGL), InputError (a panel too large for the driver) and ModelFailure.
     """
     if predictor.on_panels(predictor.stack) is None:
-        choice = Choice(_cpu(), f"{predictor.name} has no other")
+        choice = Choice(_cpu(), f"the only one for {predictor.name}")
     elif wanted == "cpu":
-        choice = Choice(_cpu(), "as asked for")
+        choice = Choice(_cpu(), "as configured")
     elif wanted == "gl":
-        choice = Choice(_gl(context(), predictor.stack), "as asked for")
+        choice = Choice(_gl(context(), predictor.stack), "as configured")
     else:
         choice = _faster(predictor, lambda: _gl(context(), predictor.stack))
     log.info("backend: %s (%s)", choice.backend.name, choice.why)
@@ -77,23 +77,23 @@ def _faster(predictor: Predictor, made: Callable[[], GlBackend]) -> Choice:
             width_px, height_px = (max(64, px // share) for px in (predictor.stack.width_px, predictor.stack.height_px))
             stack = replace(predictor.stack, width_px=width_px, height_px=height_px)
             cpu_ms, gl_ms = (solution_ms(predictor, stack, backend, runs=runs) for backend in (cpu, gl))
-            found = f"{stack.width_px}x{stack.height_px}: cpu {cpu_ms:.1f} ms, gl {gl_ms:.1f} ms"
+            times = f"{stack.width_px}x{stack.height_px}: cpu {cpu_ms:.1f} ms, gl {gl_ms:.1f} ms"
             if max(cpu_ms, gl_ms) > CLEAR * min(cpu_ms, gl_ms):
                 break
         if gl_ms < cpu_ms:
-            return Choice(gl, f"measured at {found}")
+            return Choice(gl, f"measured at {times}")
     except PhasestackError as error:
         return Choice(cpu, f"OpenGL can't be used: {error}")
     gl.close()
-    return Choice(cpu, f"measured at {found}")
+    return Choice(cpu, f"measured at {times}")
 
 
 def solution_ms(predictor: Predictor, stack: PanelStack, backend: SolverBackend, *, runs: int) -> float:
-    """Milliseconds of one solution: the fastest of a few, after one that compiles and allocates."""
+    """Return the fastest of `runs` solutions in ms, after one that compiles and allocates."""
     solver = predictor.on_panels(stack)
     assert solver is not None
     solver.set_backend(backend)
-    # With eyes known exactly: a tracking error costs the same on every backend.
+    # Assume exactly known eyes: allowing for a tracking error costs the same on every backend.
     job = replace(drawn_job([_noise(stack, seed) for seed in (0, 1)], np.array(EYES_M), stack), eye_sigma_m=0.0)
     try:
         solver.solve(job)
@@ -108,7 +108,7 @@ def solution_ms(predictor: Predictor, stack: PanelStack, backend: SolverBackend,
 
 
 def _noise(stack: PanelStack, seed: int) -> U8:
-    """(h, w, 4) in colour, so that no part of it is skipped."""
+    """Return an (h, w, 4) picture of coloured noise, which leaves the solver nothing to skip."""
     noise = np.random.default_rng(seed).integers(0, 256, (stack.height_px, stack.width_px, 4), np.uint8)
     noise[..., 3] = 255
     return noise

@@ -1,4 +1,4 @@
-"""Interface of every model: a job in, layers out."""
+"""Interface of every model: it turns a job into layers."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ if TYPE_CHECKING:
     from runtime.model.device import SolverBackend
 
 
-STAGES = ("prepare", "inference", "finish", "step")  # inference: the network alone; step: all updates of panels
+STAGES = ("prepare", "inference", "finish", "step")  # inference: the network alone; step: all updates of the panels
 
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """The layers of a job, and their cost."""
+    """The layers of a job, and the work spent on them."""
 
     layers: U8  # (N, height_px, width_px, 4) RGBA, rear to front, of the job's stack; read-only
-    stage_ms: dict[str, float] = field(default_factory=dict)  # by STAGES
+    stage_ms: dict[str, float] = field(default_factory=dict)  # time of each of STAGES
     savings: Savings = field(default_factory=Savings)
-    steps: int = 0  # updates of all panels, of this and of the solutions that it continues
-    continued_from: int | None = None  # those of them that the solution before had; None: it was not continued
+    steps: int = 0  # updates of all panels, including those of the solutions that it continues
+    continued_from: int | None = None  # how many of `steps` an earlier solution had already done; None: not continued
 
 
 class Predictor(ABC):
-    """A job in, N layers out. One thread uses it."""
+    """A model that solves jobs for N layers. Only one thread uses it."""
 
     name: str
     provider: str
     parameters: int
-    precision: str = "fp32"  # the network's weights and arithmetic
-    stack: PanelStack  # the display's
+    precision: str = "fp32"  # precision of the network's weights and arithmetic
+    stack: PanelStack  # the display's geometry
     backend: str = "cpu"  # device for everything except the network
-    trims: bool = False  # whether it solves a window of the panels, or one channel (`trim`)
-    reductions: tuple[int, ...] = (1,)  # rasters it solves on: this many times fewer rows and columns than the display
-    steps: int = 0  # updates of all panels that a solution has
-    refined_steps: int = 0  # up to which a solution can be continued
+    trims: bool = False  # can solve a window of the panels, or a single channel (`trim`)
+    reductions: tuple[int, ...] = (1,)  # rasters it solves on, as divisors of the display's rows and columns
+    steps: int = 0  # updates of all panels in a solution
+    refined_steps: int = 0  # number of updates up to which a solution can be continued
     warmed_ms: Mapping[int, Mapping[str, float]] = MappingProxyType({1: {}})  # stage times of `warm_up`, by reduction
 
     def reads_textures_of(self, context: object) -> bool:
@@ -51,7 +51,7 @@ class Predictor(ABC):
         return False
 
     def on_panels(self, stack: PanelStack) -> Predictor | None:
-        """Copy of the model for other panels of its kind, to time backends; None: it has one backend."""
+        """Return a copy for panels of another size, to time backends; None if it has only one."""
         return None
 
     def set_backend(self, backend: SolverBackend) -> None:  # noqa: B027 - most have one
@@ -59,19 +59,19 @@ class Predictor(ABC):
 
     @abstractmethod
     def solve(self, job: Job, watch: Stopwatch | None = None) -> Prediction:
-        """Compute the layers of a job. watch: its stages are added to.
+        """Compute the layers of a job. watch: the stages' times are added to it.
 
-        Raises ModelFailure where inference fails or yields numbers that are not finite; of these EyesNotServed where
-        the model has no picture for two eyes like these.
+        Raises ModelFailure if inference fails or returns numbers that are not finite, and its subclass
+        EyesNotServed if the model does not support eyes at these positions.
         """
 
     def warm_up(self, eyes_m: F64) -> None:
-        """Solve grey pictures with one step on every raster, so that the first frame does not pay for allocation."""
+        """Solve grey pictures with one step on every raster, so that the first frame need not allocate."""
         measured = {}
         for reduction in self.reductions:
             job = replace(grey_job(eyes_m, self.stack.reduced(reduction)), steps=1)
             self.solve(job)
-            runs = [self.solve(job).stage_ms for _ in range(min(reduction, 3))]  # other work delays some of them
+            runs = [self.solve(job).stage_ms for _ in range(min(reduction, 3))]  # other work may delay a run
             measured[reduction] = {stage: min(run[stage] for run in runs) for stage in runs[0]}
         self.warmed_ms = measured
 

@@ -1,4 +1,4 @@
-"""A pool of layer buffers: a solution is written in place and never copied."""
+"""A pool of layer buffers, so that solutions are written in place and never copied."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from runtime.records import U8
 
 @dataclass(eq=False)
 class LayerBuffer:
-    """Memory for one solution's layers."""
+    """Memory for the layers of one solution."""
 
     pixels: U8  # (N, h, w, 4) RGBA, opaque
     outside: object = None  # key of the pixels outside the solved boxes; None: unknown
     holder: Callable[[], U8 | None] = field(default=lambda: None)
 
     def handed_over(self) -> U8:
-        """Return a read-only view; the buffer is free again once the view is gone."""
-        # Not `pixels.view()`: a slice of that would keep the buffer alive, but not the view that is watched.
+        """Return a read-only view of the layers. The buffer is free again once that view is collected."""
+        # `pixels.view()` will not do, because a slice of it keeps the buffer alive but not the view that is watched.
         view: U8 = np.asarray(self.pixels.data.toreadonly())
         self.holder = weakref.ref(view)
         return view
 
 
 class LayerPool:
-    """Buffers for the solutions alive together: the one being written, the newest, the one on the panels."""
+    """Buffers for the solutions that coexist: one being written, the newest, and the one on the panels."""
 
     def __init__(self, stack: PanelStack) -> None:
         self._shape = stack.count, stack.height_px, stack.width_px, 4
         self._buffers: list[LayerBuffer] = []
 
     def take(self) -> LayerBuffer:
-        """Return a free buffer with its last contents, else a new one."""
+        """Return a free buffer with its old contents, or a new one if all are in use."""
         for buffer in self._buffers:
             if buffer.holder() is None:
                 return buffer

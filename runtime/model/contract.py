@@ -1,4 +1,4 @@
-"""The contract in a model file (docs/contracts.md), checked at load."""
+"""The contract stored in a model file (docs/contracts.md), which is checked when the model is loaded."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ Places = Literal["middle", "rising", "falling"]
 
 
 class Step(Section):
-    """One step of all panels (docs/mathematics.md, L5)."""
+    """One update of all panels (docs/mathematics.md, L5)."""
 
     size: Annotated[float, Field(gt=0, le=3)] = 1.0
     momentum: Annotated[float, Field(ge=0, lt=1)] = Field(
         0.7, description="momentum: fraction of a step's update carried into the next step"
     )
     floor: Annotated[float, Field(gt=0, le=1)] = Field(
-        0.1, description="the squared slope of what an eye sees counts for so much at least"
+        0.1, description="lower limit of the squared slope of an eye's intensity"
     )
     places: Places = Field(
         "middle",
-        description="where unsure eyes are taken to be: where they are, or a standard deviation to either side, "
-        "the right one higher or lower, in turn from row to row of a picture",
+        description="assumed head position: the estimate, or one standard deviation to either side of it, "
+        "alternating from row to row of a picture; the right one is higher (rising) or lower (falling)",
     )
 
 
-Steps = Annotated[tuple[Step, ...], Field(max_length=64, description="of all panels, after the network")]
+Steps = Annotated[tuple[Step, ...], Field(max_length=64, description="updates of all panels after the network")]
 
 
 class TrainedFor(Section):
-    """The range of poses that the model was trained on."""
+    """Range of eye positions and panel gaps that the model was trained on."""
 
     distance_m: tuple[float, float]
     off_axis_deg: tuple[float, float]
@@ -56,7 +56,7 @@ class Port(Section):
 
 
 class Contract(Section):
-    """The metadata entry `phasestack.contract`."""
+    """The model's metadata entry `phasestack.contract`."""
 
     version: Literal[2]
     arch: str
@@ -70,19 +70,19 @@ class Contract(Section):
     output: Literal["panels", "outer"]
     branch: Literal[1, 2]
     value_range: tuple[float, float]
-    trained_for: TrainedFor | None = Field(description="null: not known, or not trained")
+    trained_for: TrainedFor | None = Field(description="null: unknown or untrained")
     recipe_sha256: str
     width_px: Annotated[int, Field(ge=0, le=16384)] = Field(0, description="fixed input width; 0: any")
     height_px: Annotated[int, Field(ge=0, le=16384)] = Field(0, description="fixed input height; 0: any")
     inputs: Annotated[tuple[Port, ...], Field(min_length=1, max_length=32)]
     outputs: Annotated[tuple[Port, ...], Field(min_length=1, max_length=32)]
-    graph_sha256: str = Field("", description="of the file without its metadata; empty: not stated")
+    graph_sha256: str = Field("", description="SHA-256 of the file without its metadata; empty: not stated")
     precision: Literal["fp32", "fp16", "int8"] = "fp32"
     parameters: Annotated[int, Field(ge=0)] = 0
     cell_px: Annotated[int, Field(ge=1, le=64)] = Field(
-        4, description="chain: parallax of the outer panels in columns of the network's raster"
+        4, description="chain: the outer panels' parallax in columns of the network's raster"
     )
-    reduction: Literal[1, 2, 4] = Field(2, description="chain: the network's raster is so much coarser than a panel")
+    reduction: Literal[1, 2, 4] = Field(2, description="chain: divisor from a panel's raster to the network's")
     picture_fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
         0.0, description="horizontal view of the pictures it was trained on, black outside them; 0: unlimited"
     )
@@ -90,10 +90,10 @@ class Contract(Section):
 
 
 def parse_contract(metadata: dict[str, str], *, source: str | Path) -> Contract:
-    """The contract in an ONNX file's metadata. Raises InputError: missing, unknown, or not fitting."""
+    """Return the contract in an ONNX file's metadata. Raises InputError if missing or unsuitable."""
     text = metadata.get(METADATA_KEY)
     if text is None:
-        raise InputError(source, METADATA_KEY, "the model carries no contract: it is not one of phasestack's")
+        raise InputError(source, METADATA_KEY, "the model has no contract, so it was not made for phasestack")
     try:
         table: Any = json.loads(text)
     except RecursionError:

@@ -1,4 +1,4 @@
-"""The solver's panels on the processor: 16-bit integers, moved by `runtime.kernels`."""
+"""The solver on the processor: panels are 16-bit integers, updated by `runtime.kernels`."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F64, I16
 from runtime.support.threads import on_rows, parallel_map
 
-WEIGHT, TAPER = 8191, 32767  # of 1 in targets' weights, and in tapers
-SAFE = 4 * MARGIN  # elements around rows of panels that whole vectors touch
+WEIGHT, TAPER = 8191, 32767  # fixed-point values of 1 in the targets' weights and in tapers
+SAFE = 4 * MARGIN  # elements around the panels' rows that whole vectors may touch
 
 
 class CpuBackend:
-    """Runs everywhere."""
+    """Backend on the processor, available everywhere."""
 
     name = "cpu"
     context: object = None
@@ -34,16 +34,16 @@ class CpuBackend:
         return CpuState(stack, threads=threads)
 
     def close(self) -> None:
-        """It holds nothing."""
+        """Do nothing: this backend holds no resources."""
 
 
 class CpuState:
-    """A `SolverState`."""
+    """`SolverState` on the processor."""
 
     def __init__(self, stack: PanelStack, *, threads: int) -> None:
         self._stack, self._threads = stack, max(1, threads)
         self._rest = rest_of(stack.count)
-        self._buffers: dict[int, _Buffers] = {}  # by channels
+        self._buffers: dict[int, _Buffers] = {}  # by number of channels
 
     def begin(self, job: Job, geometry: Geometry, *, resumed: bool = False) -> AbstractContextManager[None]:
         self._geometry, self._channels, self._sigma_m = geometry, job.channels, job.eye_sigma_m
@@ -63,7 +63,7 @@ class CpuState:
         self._resting.discard(panel)
 
     def close_middle(self) -> None:
-        self._resting.discard(self._geometry.middle)  # all of it is written
+        self._resting.discard(self._geometry.middle)  # every pixel is written below
         self._rest_others()
         held = self._held
         problem, _keep = self._problem(self._geometry.panels_from_rays("middle", 0.0), ahead=held.ahead, last=held.last)
@@ -75,7 +75,7 @@ class CpuState:
 
     def step(self, step: Step) -> None:
         held = self._held
-        # Rays read rows that have been updated long ago: the first step, whose rays read `last`, writes elsewhere.
+        # Rays read rows after their update. In the first step they read `last`, so the update is written elsewhere.
         ahead, last = (held.last, held.ahead) if self._starts else (held.ahead, held.last)
         panels_from_rays = self._geometry.panels_from_rays(step.places, self._sigma_m)
         problem, _keep = self._problem(panels_from_rays, ahead=ahead, last=last)
@@ -110,7 +110,7 @@ class CpuState:
         self._buffers = {}
 
     def _rest_others(self) -> None:
-        """Set all panels to rest that have not been set."""
+        """Set every panel to rest that has not been set yet."""
         for n in self._resting:
             box = self._geometry.boxes[n]
             self._held.last[n, : box.height_px, : box.width_px * self._channels] = self._rest
@@ -120,11 +120,11 @@ class CpuState:
         parallel_map(lambda part: work(byref(problem), part, self._threads), range(self._threads))
 
     def _problem(self, panels_from_rays: F64, *, ahead: I16, last: I16) -> tuple[Problem, object]:
-        """Arguments of the compiled loops, and the arrays that must outlive the call."""
+        """Return the arguments of the compiled loops, and the arrays that must outlive the call."""
         geometry, held, channels = self._geometry, self._held, self._channels
         seen, back = np.ascontiguousarray(panels_from_rays), np.ascontiguousarray(inverse(panels_from_rays))
         if len(seen) > MAX_SETS:
-            raise ValueError(f"{len(seen)} sets of rays; {MAX_SETS} at most")
+            raise ValueError(f"{len(seen)} sets of rays; the maximum is {MAX_SETS}")
         table = _packed_table(self._stack.count)
         problem = Problem(
             panels=self._stack.count, sets=len(seen), channels=channels,
@@ -144,13 +144,13 @@ class CpuState:
 
 @lru_cache(maxsize=8)
 def _packed_table(panels: int) -> NDArray[np.int32]:
-    """(256,) of `target_table`: sums in the lower 16 bits, weights above."""
+    """Return `target_table` as (256,) integers: sums in the lower 16 bits, weights in the upper ones."""
     sums, weights = np.rint(target_table(panels) * np.array((1, WEIGHT), np.float32)).astype(np.int32).T
     return np.asarray(sums + (weights << 16), np.int32)
 
 
 class _Buffers:
-    """Panels between steps, for one number of channels; a box begins at the first row and element."""
+    """Panels between steps, for one number of channels. A box starts at the first row and element."""
 
     def __init__(self, stack: PanelStack, channels: int) -> None:
         shape = (stack.count, stack.height_px + 1, stack.width_px * channels + SAFE)

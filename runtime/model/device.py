@@ -1,4 +1,4 @@
-"""Interface of a device (`cpu`, `gl`): the solver's single operations. Their order is the solver's business."""
+"""Interface of a device (`cpu`, `gl`), with the operations that make up a solution."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from runtime.records import I16
 
 
 class SolverState(Protocol):
-    """The panels of one stack on one device, kept from frame to frame. One thread uses it."""
+    """The panels of one stack on one device, kept between frames. Only one thread uses it."""
 
     def begin(self, job: Job, geometry: Geometry, *, resumed: bool = False) -> AbstractContextManager[None]:
-        """Load the targets; everything else is called within the returned context.
+        """Load the targets; call everything else within the returned context.
 
-        Panels rest in their boxes until they are set. resumed: they and their momentum are those of the solution
-        before, whose geometry was the same.
+        Panels rest in their boxes until they are set. resumed: keep the panels and momentum of the previous
+        solution, which must have had the same geometry.
         """
 
     def set_panel(self, panel: int, codes: I16) -> None:
-        """Set a panel's box: (rows, columns[, 3]), sixteenths of a code."""
+        """Set a panel's box to codes (rows, columns[, 3]), in sixteenths of an 8-bit code."""
 
     def close_middle(self) -> None:
-        """Solve the middle panel for both eyes, with the other panels fixed."""
+        """Solve the middle panel for both eyes while the other panels are fixed."""
 
     def start(self) -> None:
-        """Begin steps from the panels as they are, without momentum."""
+        """Prepare for steps from the panels' present values, without momentum."""
 
     def step(self, step: Step) -> None:
         """Update all panels."""
@@ -38,7 +38,8 @@ class SolverState(Protocol):
     def write(self, buffer: LayerBuffer, outside: int | tuple[int, ...] | None) -> None:
         """Write all panels as 8-bit codes.
 
-        Outside the boxes panels rest, and the middle one has a code or a colour; with None they keep the buffer's.
+        Outside the boxes, the outer panels get the rest code, and the middle one gets `outside`, a code or a
+        colour. With None, the outside keeps the buffer's contents.
         """
 
     def close(self) -> None:
@@ -46,13 +47,13 @@ class SolverState(Protocol):
 
 
 class SolverBackend(Protocol):
-    """A device that does the steps."""
+    """A device that runs the solver's steps."""
 
-    name: str  # as `model.backend` calls it
-    context: object  # of OpenGL, whose textures it reads; None: it reads arrays
+    name: str  # value of `model.backend` that selects it
+    context: object  # OpenGL context whose textures it reads; None: it reads arrays
 
     def state(self, stack: PanelStack, *, threads: int) -> SolverState:
-        """For a stack. Raises InputError where that does not fit."""
+        """Return a new state for a stack. Raises InputError if the device does not support its size."""
 
     def close(self) -> None:
-        """Release what its states shared, once they are closed. May be called twice."""
+        """Release what its states shared, after they are closed. May be called twice."""

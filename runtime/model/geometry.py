@@ -1,7 +1,7 @@
 """The rays of a solution: targets, the panels' windows, and homographies from rays to panel pixels.
 
-A ray belongs to a pixel of a picture. Only that homography distinguishes content that was
-drawn on the middle panel's raster, in a window of it or on a coarser one, and captured photographs.
+Each ray belongs to one pixel of a picture. Drawn content (on the middle panel's raster, a window of it or a coarser
+one) and captured photographs differ only in the homography from picture to panel.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from runtime.optics.views import relative_scale_shift, stack_from_eye
 from runtime.records import F32, F64, U8
 from runtime.support.gl import DrawnPicture
 
-PAD_PX = 2  # around the visible pixels
-ALIGN_PX = 8  # boxes begin and end at multiples of this, so that the network's raster (a half, a quarter) is whole
+PAD_PX = 2  # margin around the visible pixels
+ALIGN_PX = 8  # boxes begin and end at multiples of this, so that rasters of a half or a quarter have whole pixels
 LEAST_PX = 32
-MIN_WEIGHT = 0.05  # least homogeneous weight of a window's corner relative to its middle: below, it has no image
-SNAPPED = 1e-6  # pixels by which a homography may miss whole pixels and still count as a translation by them
-MISSING_WEIGHT = 1 / 8  # 2 dB in two pairs of twelve: the other eye's ray through such a pixel may cross all panels
-KNOWN_PX = 1 / 8  # eye errors that move an outer panel's picture by less than this are ignored
-TAPERED_SHARE = 1 / 6  # share of a window's taper over which its rays fade: they correct the error of its edge
-PLACES: dict[Places, tuple[tuple[float, float], ...]] = {  # right and up, standard deviations of the eyes' place
+MIN_WEIGHT = 0.05  # least homogeneous weight of a window's corner, relative to its middle, that gives a usable image
+SNAPPED = 1e-6  # a homography within this many pixels of a whole-pixel translation counts as one
+MISSING_WEIGHT = 1 / 8  # 2 dB in two of 12 pairs: the other eye's ray through the pixel may cross all panels
+KNOWN_PX = 1 / 8  # tracking errors that move an outer panel's picture by less than this are ignored
+TAPERED_SHARE = 1 / 6  # share of a window's taper over which its rays fade in; these rays correct the error at its edge
+PLACES: dict[Places, tuple[tuple[float, float], ...]] = {  # head positions: right, up, in sigmas
     "middle": ((0.0, 0.0),),
     "rising": ((1.0, 1.0), (-1.0, -1.0)),
     "falling": ((1.0, -1.0), (-1.0, 1.0)),
@@ -38,28 +38,28 @@ PLACES: dict[Places, tuple[tuple[float, float], ...]] = {  # right and up, stand
 
 @dataclass(frozen=True, slots=True)
 class TargetView:
-    """The picture that one eye should see, and where its pixels' rays cross the middle panel's plane."""
+    """The picture that one eye should see, and where its rays cross the middle panel's plane."""
 
     picture: U8 | DrawnPicture  # (h, w, 3 or 4) RGB or RGBA
-    plane_from_picture: F64  # 3x3: (y, z, 1) on the plane, metres, from the picture's pixels (u, v, 1)
+    plane_from_picture: F64  # 3x3, (y, z, 1) on the plane in metres from the picture's pixels (u, v, 1)
 
     @property
     def pixels(self) -> U8:
-        """The picture as an array, read back where it was left in a texture."""
+        """The picture as an array, read back if it is in a texture."""
         return self.picture.pixels() if isinstance(self.picture, DrawnPicture) else self.picture
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """Panels' boxes and the raster of rays of one solution."""
+    """The panels' boxes and the raster of rays of one solution."""
 
     stack: PanelStack
     eyes_m: F64  # (2, 3) left and right, frame `stack`
     boxes: tuple[PixelRect, ...]  # solved pixels of each panel
-    kept: PixelRect  # pixels of the middle panel's box that rays look through
-    rays: PixelRect  # pixels of the views' pictures that look through `kept`
-    middle_from_rays: F64  # (2, 3, 3) for each eye: the middle panel's pixels (0: its box's first) from rays (0: first)
-    taper_px: tuple[float, float] = (0.0, 0.0)  # pixels of the middle panel, right and down, over which rays fade
+    kept: PixelRect  # pixels of the middle panel's box through which rays pass
+    rays: PixelRect  # pixels of the views' pictures whose rays pass through `kept`
+    middle_from_rays: F64  # (2, 3, 3) per eye, pixels of the middle panel's box from those of `rays`
+    taper_px: tuple[float, float] = (0.0, 0.0)  # middle-panel pixels, right and down, over which rays fade
 
     @property
     def middle(self) -> int:
@@ -67,11 +67,11 @@ class Geometry:
 
     @property
     def missing_weight(self) -> float:
-        """Weight of a ray that misses a box in solving the middle panel; 1 with a window, outside which panels rest."""
+        """Weight of rays that miss a box when the middle panel is solved; 1 with a window."""
         return 1.0 if any(self.taper_px) else MISSING_WEIGHT
 
     def is_like(self, other: Geometry) -> bool:
-        """True where rays and boxes are the same: panels solved for one are where steps for the other may begin."""
+        """Return True if rays and boxes are equal, so that steps may continue from the other's panels."""
         return (
             (self.stack, self.boxes, self.kept, self.rays, self.taper_px)
             == (other.stack, other.boxes, other.kept, other.rays, other.taper_px)
@@ -81,20 +81,21 @@ class Geometry:
 
     @cached_property
     def rasters(self) -> tuple[PlaneRaster, ...]:
-        """The panels' pixels within their boxes."""
+        """The panels' pixel grids, cropped to their boxes."""
         return tuple(box.cut(self.stack.panel(n)) for n, box in enumerate(self.boxes))
 
     def panels_from_rays(self, places: Places, eye_sigma_m: float) -> F64:
-        """(2P, N, 3, 3) panel pixels (from the box's first), P positions of the head, left and right eye alternately.
+        """Return (2P, N, 3, 3) homographies from rays to pixels of the panels' boxes.
 
-        Positions alternate from row to row of a picture: row k of position p's rays is the picture's row P·k + p.
+        They are listed for P positions of the head, left and right eye alternately. Positions alternate between
+        the rows of a picture: row k of position p's rays is row P·k + p of the picture.
         """
         right, up = stack_from_eye(self.eyes_m.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
         sure = self.rays.height_px == 1 or self._moved_px(eye_sigma_m) < KNOWN_PX
-        taken = PLACES["middle" if sure else places]
-        turns, found = len(taken), []
+        positions = PLACES["middle" if sure else places]
+        turns, homographies = len(positions), []
         centre = np.array([self.rays.width_px / 2, self.rays.height_px / turns / 2, 1.0])
-        for turn, (across, down) in enumerate(taken):
+        for turn, (across, down) in enumerate(positions):
             rows = np.array([[1.0, 0.0, 0.0], [0.0, turns, turn + (1 - turns) / 2], [0.0, 0.0, 1.0]])
             moved_m = eye_sigma_m * (across * right + down * up)
             for eye_m, from_rays in zip(self.eyes_m + moved_m, self.middle_from_rays, strict=True):
@@ -103,17 +104,17 @@ class Geometry:
                     for n in range(self.stack.count)
                 ]
                 seen = np.stack(between) @ from_rays @ rows
-                found.append(seen / (seen[:, 2] @ centre)[:, None, None])
-        return np.array(found)
+                homographies.append(seen / (seen[:, 2] @ centre)[:, None, None])
+        return np.array(homographies)
 
     def _moved_px(self, eye_sigma_m: float) -> float:
-        """Largest displacement of a panel's picture against the middle one, for one sigma of the eyes."""
+        """Return how far one sigma of the eyes moves a panel's picture relative to the middle one, at most."""
         pitch_m, middle_x_m = self.stack.panel(self.middle).pitch_u_m, self.stack.x_m[self.middle]
         shares = [abs((x_m - middle_x_m) / (self.eyes_m[:, 0].mean() - middle_x_m)) for x_m in self.stack.x_m]
         return float(eye_sigma_m * max(shares) / pitch_m)
 
     def tapers(self) -> tuple[F32, F32]:
-        """(width,) and (height,) what rays' errors are multiplied with: 0 at a window's edges to 1 inside."""
+        """Return (width,) and (height,) weights of the rays' errors, from 0 at a window's edges to 1 inside."""
         box, kept, matrix = self.boxes[self.middle], self.kept, self.middle_from_rays.mean(axis=0)
         width_px, height_px = self.rays.width_px, self.rays.height_px
         u = np.stack([np.arange(width_px) + 0.5, np.full(width_px, height_px / 2), np.ones(width_px)])
@@ -126,7 +127,7 @@ class Geometry:
 
 
 def inverse(homographies: F64) -> F64:
-    """(..., 3, 3) the way back, of the same sign before the eye, last entries 1."""
+    """Return the inverses (..., 3, 3) with last entries of 1, which keeps the sign in front of the eye."""
     back = np.linalg.inv(homographies)
     return np.asarray(back / np.abs(back[..., 2:, 2:]), np.float64)
 
@@ -140,7 +141,7 @@ def geometry_of(
     kept: PixelRect | None = None,
     taper_px: tuple[float, float] = (0.0, 0.0),
 ) -> Geometry:
-    """Rays of both views' pixels through `kept` of the middle panel (None: its whole box); `boxes` of each panel."""
+    """Return the rays of both views through `kept` (by default the whole box) of the middle panel."""
     box = boxes[stack.count // 2]
     kept = kept or box
     middle_from_plane = stack.panel(stack.count // 2).raster_from_plane()
@@ -153,14 +154,14 @@ def geometry_of(
 
 
 def _snapped(homography: F64) -> F64:
-    """Exact where it takes pixels to pixels: sampling is then a copy."""
+    """Return the homography, made exact if it maps pixels to pixels, so that sampling is a copy."""
     normalised = np.asarray(homography / homography[2, 2], np.float64)
     whole = np.rint(normalised)
     return whole if np.abs(normalised - whole).max() < SNAPPED else normalised
 
 
 def _looked_through(pictures_from_middle: F64, box: PixelRect, shape: tuple[int, ...]) -> PixelRect:
-    """Pixels of either picture (h, w, ...) that look through a box of the middle panel."""
+    """Return the pixels of either picture (h, w, ...) whose rays pass through a box of the middle panel."""
     height, width = shape[:2]
     corners = np.array([[box.u0, box.u1, box.u0, box.u1], [box.v0, box.v0, box.v1, box.v1], [1.0] * 4])
     centre = np.array([(box.u0 + box.u1) / 2, (box.v0 + box.v1) / 2, 1.0])
@@ -176,9 +177,9 @@ def _looked_through(pictures_from_middle: F64, box: PixelRect, shape: tuple[int,
 
 
 def panel_from_middle(stack: PanelStack, rasters: Sequence[PlaneRaster], eye_m: F64, n: int) -> F64:
-    """3x3, last entry 1: panel n's pixels from the middle one's, as an eye (3,) sees them in line.
+    """Return the 3x3 map, last entry 1, to panel n's pixels from the middle panel's for an eye (3,).
 
-    A scale and a shift, but where panels are tilted (`optics.tilt`).
+    It is a scale and a shift, unless panels are tilted (`optics.tilt`).
     """
     source, target = rasters[stack.count // 2], rasters[n]
     scale, shift_m = relative_scale_shift(eye_m, from_x_m=source.x_m, to_x_m=target.x_m)
@@ -190,9 +191,9 @@ def panel_from_middle(stack: PanelStack, rasters: Sequence[PlaneRaster], eye_m: 
 
 
 def visible_boxes(eyes_m: F64, stack: PanelStack) -> tuple[PixelRect, ...]:
-    """For each panel the pixels on rays of either eye (2, 3) that cross every panel, a little padded.
+    """Return for each panel the padded box of pixels on rays of either eye (2, 3) that cross every panel.
 
-    Where an eye sees nothing through all panels, a small box in the middle: there is nothing to solve.
+    If an eye sees nothing through all panels, the result is a small box in the middle, as there is nothing to solve.
     """
     middle_x_m, half = stack.x_m[stack.count // 2], np.array([stack.width_m, stack.height_m]) / 2
     lows, highs = [], []
@@ -223,7 +224,7 @@ def _span(low: float, high: float, size: int) -> tuple[int, int]:
 
 
 def taper(at_px: F64, first: int, last: int, size: int, over_px: float) -> F32:
-    """Ramp from 0 at pixels `first` and `last` to 1 `over_px` inside, except at the edges of a panel of `size`."""
+    """Return a ramp from 0 at `first` and `last` to 1 `over_px` inside; the panel's own edges have none."""
     weights = np.ones(len(at_px))
     if over_px > 0 and first > 0:
         weights = np.minimum(weights, (at_px - first) / over_px)

@@ -1,4 +1,4 @@
-"""The input of one solution: targets, their rays, and the part of the panels that is solved."""
+"""The input of one solution: targets, their rays, and the part of the panels to solve."""
 
 from __future__ import annotations
 
@@ -23,47 +23,47 @@ NOWHERE = PixelRect(0, 0, 0, 0)
 
 @dataclass(frozen=True, slots=True)
 class SolveWindow:
-    """Window of every panel that is solved.
+    """The window of every panel that is solved.
 
-    Outside it the outer panels stay at mid-range, where the solver starts, and the middle panel carries the picture
-    that both eyes see.
+    Outside it, the outer panels stay at mid-range, where the solver starts, and the middle panel carries the
+    picture that both eyes see.
     """
 
-    box: PixelRect  # panel pixels; empty: no pixel is solved
+    box: PixelRect  # panel pixels; empty: nothing is solved
     kept: PixelRect  # middle-panel pixels inside `box` that are written; outside, the flat fill owns them
-    taper_px: tuple[float, float]  # right and down: width over which the outer panels' drive is tapered to zero
-    colour: tuple[int, ...] | None = None  # 8-bit codes of the background outside; None: the views show it
+    taper_px: tuple[float, float]  # (right, down) width over which the outer panels' drive is tapered to zero
+    colour: tuple[int, ...] | None = None  # 8-bit codes of the background outside; None: use the views' picture
 
 
 @dataclass(frozen=True)
 class Targets:
-    """Targets of both eyes, and the rays of their pixels through a stack of a given raster."""
+    """Targets of both eyes, and the rays of their pixels through the panels."""
 
-    stack: PanelStack  # the panels' pixels as they are solved: the display's own, or coarser ones
+    stack: PanelStack  # the panels at the solved raster: the display's own or a coarser one
     eyes_m: F64  # (2, 3) left and right, frame `stack`
     views: tuple[TargetView, TargetView]  # left and right
 
     @cached_property
     def visible(self) -> Geometry:
-        """Rays of all that the eyes see through every panel."""
+        """Rays of everything that the eyes see through every panel."""
         return geometry_of(self.stack, self.eyes_m, self.views, boxes=visible_boxes(self.eyes_m, self.stack))
 
     @cached_property
     def every_pixel(self) -> Geometry:
-        """Rays through every pixel of every panel, whether an eye sees it or not."""
+        """Rays through every pixel of every panel, visible or not."""
         whole = PixelRect(0, 0, self.stack.width_px, self.stack.height_px)
         return geometry_of(self.stack, self.eyes_m, self.views, boxes=(whole,) * self.stack.count)
 
     def within(self, window: SolveWindow) -> Geometry:
-        """Rays through a window."""
+        """Return the rays through a window."""
         boxes = (window.box,) * self.stack.count
         return geometry_of(self.stack, self.eyes_m, self.views, boxes=boxes, kept=window.kept, taper_px=window.taper_px)
 
     def reduced(self, reduction: int) -> tuple[TargetView, TargetView]:
-        """Return the views averaged down by `reduction` (`reduced_view`). Computed once for each value."""
+        """Return the views averaged down by `reduction` (`reduced_view`), computed once per value."""
         if reduction not in self._reduced:
             middle = self.stack.panel(self.stack.count // 2)
-            # A texture is read back on the thread of its context only, which is this one.
+            # A texture can only be read back on its context's thread, which is this one.
             views = [TargetView(view.pixels, view.plane_from_picture) for view in self.views]
             left, right = parallel_map(lambda view: reduced_view(view, middle, reduction), views)
             self._reduced[reduction] = left, right
@@ -78,37 +78,37 @@ class Targets:
 class Savings:
     """Work that a job saves."""
 
-    solved_share: float = 1.0  # of the panels' pixels
+    solved_share: float = 1.0  # share of the panels' pixels that is solved
     channels: int = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One solution's task; a cheaper solution differs in a field (`runtime.model.trim`)."""
+    """The task of one solution. Cheaper solutions differ in a few fields (`runtime.model.trim`)."""
 
     targets: Targets
-    # Standard deviation of the tracker's error, an axis, common to both eyes, right and up; 0: they are known.
+    # Standard deviation of the tracking error per axis, right and up, common to both eyes; 0: exactly known eyes.
     eye_sigma_m: float = TRACKING_SIGMA_M
-    window: SolveWindow | None = None  # None: all that the eyes see
-    channels: int = 3  # 1: the pictures are grey, and one channel is solved for all three
-    steps: int | None = None  # at most; None: the model's
-    continued: bool = False  # begin from the panels of the solution before, where its rays were the same
-    deadline_ns: int | None = None  # of `time.perf_counter_ns`: no further step begins after it; None: none
-    relief: F32 | None = None  # (h, w) of the content over the middle panel (`optics.relief`): for the panels, not here
+    window: SolveWindow | None = None  # None: everything that the eyes see
+    channels: int = 3  # 1: the pictures are grey, so one channel is solved for all three
+    steps: int | None = None  # most updates of all panels; None: the model's number
+    continued: bool = False  # start from the previous solution's panels if its rays were the same
+    deadline_ns: int | None = None  # no step begins after this time of `time.perf_counter_ns`; None: no limit
+    relief: F32 | None = None  # (h, w) the content's relief on the middle panel, for the presenter (`optics.relief`)
 
     @property
     def views(self) -> tuple[TargetView, TargetView]:
-        """Left and right eye's."""
+        """Views of the left and right eye."""
         return self.targets.views
 
     @property
     def stack(self) -> PanelStack:
-        """The panels' pixels as they are solved."""
+        """The panels at the solved raster."""
         return self.targets.stack
 
     @property
     def eyes_m(self) -> F64:
-        """(2, 3) left and right, frame `stack`."""
+        """(2, 3) left and right eye, frame `stack`."""
         return self.targets.eyes_m
 
     @property
@@ -122,7 +122,7 @@ class Job:
 def drawn_views(
     pictures: Sequence[U8 | DrawnPicture], stack: PanelStack, window: SolveWindow | None = None
 ) -> tuple[TargetView, TargetView]:
-    """Left and right eye's views of pictures (h, w, 3 or 4) on the pixels of the middle panel, or of its window."""
+    """Return left and right views of pictures (h, w, 3 or 4) on the middle panel or its window."""
     raster = stack.panel(stack.count // 2)
     if window is not None:
         raster = window.box.cut(raster)
@@ -131,11 +131,11 @@ def drawn_views(
 
 
 def drawn_job(pictures: Sequence[U8 | DrawnPicture], eyes_m: F64, stack: PanelStack) -> Job:
-    """The task of solving a whole stack for pictures (h, w, 3 or 4) on the middle panel's pixels; eyes (2, 3)."""
+    """Return the job of a whole stack for pictures (h, w, 3 or 4) on the middle panel; eyes (2, 3)."""
     return Job(Targets(stack, eyes_m, drawn_views(pictures, stack)))
 
 
 def grey_job(eyes_m: F64, stack: PanelStack) -> Job:
-    """A task of grey pictures, to warm up with."""
+    """Return a job with grey pictures, to warm up with."""
     grey = np.full((stack.height_px, stack.width_px, 4), 128, np.uint8)
     return drawn_job((grey, grey), eyes_m, stack)

@@ -1,4 +1,4 @@
-"""Whole-picture networks as proposals: eye pictures on panel rasters to panel values."""
+"""Networks that map whole eye pictures to panel values, as proposals for the solver."""
 
 from __future__ import annotations
 
@@ -21,16 +21,17 @@ from runtime.records import I16, U8
 
 
 class PictureProposal:
-    """Models of `input_frame` panel (one picture per eye and panel) or centre (one per eye), layout NCHW.
+    """Models whose `input_frame` is panel (a picture per eye and panel) or centre (one per eye).
 
-    Channels are panel-major, then eye, then RGB. Each eye's picture is warped to the pixels of every panel that the
-    network reads (EyeReal supplement, (47)); outside the contract's field of view it is black, as in training.
+    The layout is NCHW; channels are ordered by panel, then eye, then RGB. Each eye's picture is warped to the
+    pixels of every panel that the network reads (EyeReal supplement, (47)). Outside the contract's field of view it
+    is black, as in training.
     """
 
-    any_raster = False  # it proposes whole panels of one size
+    any_raster = False  # it proposes whole panels of one size only
 
     def __init__(self, session: ModelSession, stack: PanelStack, *, source: Path) -> None:
-        """Raises InputError where the model's fixed size is not the panels', or its ports do not fit."""
+        """Raises InputError if the model's fixed size differs from the panels', or its ports do not fit."""
         contract = session.contract
         self.session, self._stack = session, stack
         for given, wanted, name in (
@@ -38,7 +39,7 @@ class PictureProposal:
             (contract.height_px, stack.height_px, "height_px"),
         ):
             if given and given != wanted:
-                raise InputError(source, f"contract.{name}", f"made for {given}, the panels have {wanted}")
+                raise InputError(source, f"contract.{name}", f"is {given}, but the panels have {wanted}")
         if contract.layout != "NCHW":
             raise InputError(source, "contract.layout", f"{contract.layout} does not fit {contract.input_frame}")
         self._panels = range(stack.count) if contract.input_frame == "panel" else (stack.count // 2,)
@@ -63,7 +64,7 @@ class PictureProposal:
         name, answered, shape = contract.outputs[0].name, self._answered, self._answer
         answer = self.session.run({contract.inputs[0].name: self._input}, {name: shape})[name]
         if not np.isfinite(answer.sum()):
-            raise ModelFailure("the network answered with numbers that are not finite")
+            raise ModelFailure("the network's output is not finite")
         watch.lap("inference")
         values = np.rint(np.clip(answer[0].reshape(len(answered), 3, *shape[2:]), 0, 1) * FULL).astype(np.int16)
         return {
@@ -72,7 +73,7 @@ class PictureProposal:
         }
 
     def _seen(self, job: Job, n: int, side: int) -> U8:
-        """(h, w, 3 or 4) an eye's picture on panel n's pixels, black outside the contract's field of view."""
+        """Return an eye's picture (h, w, 3 or 4) on panel n, black outside the contract's field of view."""
         stack, eye_m, view, middle = self._stack, job.eyes_m[side], job.views[side], self._stack.count // 2
         rasters, size = [stack.panel(n) for n in range(stack.count)], (stack.height_px, stack.width_px)
         panel_from_mid = panel_from_middle(stack, rasters, eye_m, n) if n != middle else np.eye(3)
@@ -82,7 +83,7 @@ class PictureProposal:
         picture = picture_on(view, rasters[middle], middle_from_result=mid_from_panel, edge=edge, size=size)
         if not fov_deg:
             return picture
-        # A white picture of that view, bilinear: its edge fades over one pixel as it did in training.
+        # Warp a white picture of that view bilinearly: its edge fades over one pixel, as it did in training.
         projection = image_from_stack(eye_m, width_px=size[1], height_px=size[0], fov_deg=fov_deg)
         cover = resample(np.full(size, 255, np.uint8), image_from_raster(projection, rasters[n]), size=size)
         return np.asarray(cv2.min(picture, cv2.merge([cover] * picture.shape[2])), np.uint8)

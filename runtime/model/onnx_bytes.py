@@ -1,6 +1,6 @@
-"""Facts of an ONNX file from its bytes alone: its producer, and references to other files.
+"""Read facts from an ONNX file's bytes without loading it: its digest and references to other files.
 
-Protocol buffers are rows of (tag, value); field numbers are those of onnx.proto.
+A protocol buffer is a sequence of tags and values. Field numbers are those of onnx.proto.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import hashlib
 from collections.abc import Iterator
 
 MODEL_METADATA = 14
-# Messages in which a tensor may be, and the numbers of their fields that hold such messages.
+# Messages that may contain a tensor, and the numbers of their fields that hold such messages.
 PARTS: dict[str, dict[int, str]] = {
     "model": {7: "graph", 25: "function"},
     "graph": {1: "node", 5: "tensor", 15: "sparse tensor"},
@@ -20,13 +20,13 @@ PARTS: dict[str, dict[int, str]] = {
 }
 TENSOR_EXTERNAL, TENSOR_LOCATION = 13, 14
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
-DEEPEST = 32  # graphs within attributes of graphs
+DEEPEST = 32  # deepest nesting of graphs within attributes of graphs
 
 
 def fields(data: memoryview) -> Iterator[tuple[int, memoryview, memoryview]]:
-    """(number, value, the whole field) of a message, in order; a number's value is empty if it is 0.
+    """Yield (number, value, whole field) for each field of a message; a 0 has an empty value.
 
-    Raises ValueError for other bytes.
+    Raises ValueError if the bytes are not a message.
     """
     at = 0
     while at < len(data):
@@ -52,16 +52,16 @@ def fields(data: memoryview) -> Iterator[tuple[int, memoryview, memoryview]]:
 
 
 def digest(data: bytes) -> str:
-    """SHA-256 of a model without its metadata, which holds the digest. Raises ValueError."""
-    found = hashlib.sha256()
+    """Return the SHA-256 of a model without its metadata. Raises ValueError if malformed."""
+    digester = hashlib.sha256()
     for number, _, whole in fields(memoryview(data)):
         if number != MODEL_METADATA:
-            found.update(whole)
-    return found.hexdigest()
+            digester.update(whole)
+    return digester.hexdigest()
 
 
 def has_external_data(data: bytes) -> bool:
-    """Return True if a tensor of the model is stored in another file. Raises ValueError."""
+    """Return True if a tensor of the model is stored in another file. Raises ValueError if malformed."""
     return _refers_to_a_file("model", memoryview(data), DEEPEST)
 
 

@@ -1,4 +1,4 @@
-"""Find and load a model by name; the interface is in `base`."""
+"""Find and load a model by its name. The interface of models is in `base`."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from runtime.support.memory import keep_freed_memory
 __all__ = ["SHIPPED", "Prediction", "Predictor", "load_predictor", "model_path"]
 
 SHIPPED = ("fast", "balanced", "best")
-SUMS = "SHA256SUMS"  # of the files next to it, in the format of sha256sum
+SUMS = "SHA256SUMS"  # digests of the shipped models, in the format of sha256sum
 
 
 def model_path(name: str) -> Path | None:
-    """The file of a shipped model or of a path; None for `sart`. Raises InputError for an unknown name."""
+    """Return the file of a model; None for `sart`. Raises InputError for an unknown name."""
     if name == "sart":
         return None
     if name in SHIPPED:
@@ -32,7 +32,7 @@ def model_path(name: str) -> Path | None:
 
 
 def shipped_sha256(name: str) -> str:
-    """The SHA-256 that a shipped model's file must have; empty for others. Raises InputError."""
+    """Return a shipped model's SHA-256; empty for others. Raises InputError if it is not listed."""
     if name not in SHIPPED:
         return ""
     table = Path(str(resources.files("runtime.model") / "data" / SUMS))
@@ -44,17 +44,17 @@ def shipped_sha256(name: str) -> str:
 
 
 def steps_from_even(steps: int) -> tuple[Step, ...]:
-    """Steps from panels at rest that replace `steps` steps from a network's proposal."""
+    """Return steps from panels at rest that replace `steps` steps from a network's proposal."""
     in_turn: tuple[Places, ...] = ("rising", "middle", "falling", "middle")
     sizes = (1.2,) * (4 * steps) + (0.8,) * (3 * steps // 2)
     return tuple(Step(size=size, places=in_turn[n % 4]) for n, size in enumerate(sizes))
 
 
 def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None = None) -> Predictor:
-    """The model `name` (shipped name, `sart` or an ONNX file) for a stack.
+    """Return the model `name` (a shipped name, `sart` or an ONNX file) for a stack.
 
-    A stack that a shipped network was not made for (not three panels, or none that are evenly spaced, to `UNEVEN_MOST`)
-    is served by its steps alone, from even panels; `Predictor.name` says so. Raises InputError, MissingPart.
+    A shipped network needs three panels whose gaps are equal within `UNEVEN_MOST`. For other stacks only its steps
+    run, from panels at rest, and `Predictor.name` says so. Raises InputError and MissingPart.
     """
     keep_freed_memory()
     try:
@@ -73,7 +73,7 @@ def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None 
     from runtime.model.solver import StepPredictor
 
     if stack.count > MAX_PANELS:
-        raise InputError("model", "name", f"{name} serves up to {MAX_PANELS} panels; use the model sart")
+        raise InputError("model", "name", f"{name} supports up to {MAX_PANELS} panels; use the model sart")
     session = ModelSession(path, provider=settings.provider, threads=settings.threads, sha256=shipped_sha256(name))
     contract = session.contract
     if name in SHIPPED and not (stack.count == 3 and stack.is_evenly_spaced):

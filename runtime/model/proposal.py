@@ -1,7 +1,7 @@
-"""Initial outer panels, proposed by a network along the eyes' baseline.
+"""Initial outer panels, proposed by a network along the line through the eyes.
 
-The network gets the difference of both eyes' pictures on a separate raster (`chain`), on which an eye's parallax is a
-whole number of columns, and returns both outer panels there.
+The network receives the difference of both eyes' pictures on a separate raster (`chain`), where an eye's parallax is a
+whole number of columns. It returns both outer panels on that raster.
 """
 
 from __future__ import annotations
@@ -27,44 +27,45 @@ from runtime.optics.tilt import coarse_layer_from_seen
 from runtime.records import F32, F64, I16
 from runtime.support.threads import parallel_map
 
-HALF_BASELINE_M = 0.031  # for a single eye that replaces both: any value does
-EDGE_SHARE = 1 / 40  # of a picture's size: most pixels by which its edge is extended
-UNSEEN = -1  # targets are positive
-SHARPENED = 0.2  # of the difference, on either side: what two interpolations blur
+HALF_BASELINE_M = 0.031  # for a single eye that stands in for both; any value works
+EDGE_SHARE = 1 / 40  # largest extension of a picture's edge (clamp to edge), as a share of its size
+UNSEEN = -1  # marks unseen pixels; targets are positive
+SHARPENED = 0.2  # gain by which the difference is sharpened on either side, against the blur of two interpolations
 SHARPENING = np.array([-SHARPENED, 1 + 2 * SHARPENED, -SHARPENED])
-EVEN = rest_of(3)  # of an outer panel, sixteenths of a code
+EVEN = rest_of(3)  # an outer panel at rest, sixteenths of a code
 _SWAPPED = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # (y, z, 1) from (-z, -y, 1), and back
 
 
 class Proposal(Protocol):
-    """A network that proposes panels from which the steps begin."""
+    """A network that proposes the panels from which the steps begin."""
 
-    any_raster: bool  # whether it serves stacks of every raster, and windows of them
+    any_raster: bool  # serves stacks of every raster, and windows of them
     session: ModelSession
 
     def panels(self, job: Job, geometry: Geometry, watch: Stopwatch) -> dict[int, I16]:
-        """Boxes of the proposed panels, (rows, columns[, 3]), in sixteenths of a code; the others rest.
+        """Return boxes (rows, columns[, 3]) of the proposed panels in sixteenths of a code; others rest.
 
-        Raises ModelFailure, and of these EyesNotServed."""
+        Raises ModelFailure, or its subclass EyesNotServed.
+        """
 
 
 @dataclass(frozen=True, slots=True)
 class _Local:
-    """A window of the panels as a separate stack, turned so that the eyes are level."""
+    """A window of the panels as a separate stack, rotated so that the eyes are level."""
 
     stack: PanelStack
-    eyes_m: F64  # (2, 3), the first is the left one there
-    order: tuple[int, int]  # which eyes these are
-    plane_from_local: F64  # 3x3, (y, z, 1) of frame `stack`
+    eyes_m: F64  # (2, 3), left eye of this stack first
+    order: tuple[int, int]  # indices of these eyes in the whole stack
+    plane_from_local: F64  # 3x3, (y, z, 1) of frame `stack` from this stack's
 
     def in_stack(self, point_m: F64) -> F64:
-        """(3,) in frame `stack`, of a point (3,) here."""
+        """Convert a point (3,) of this stack to frame `stack`."""
         y_m, z_m, _ = self.plane_from_local @ (point_m[1], point_m[2], 1.0)
         return np.array([point_m[0], y_m, z_m])
 
 
 class ChainProposal:
-    """Networks of `input_frame` chain: three panels, evenly spaced or nearly so, any pose."""
+    """Networks whose `input_frame` is chain: three (nearly) evenly spaced panels and any eye positions."""
 
     any_raster = True
 
@@ -86,7 +87,7 @@ class ChainProposal:
         )
 
         def residual(side: int) -> I16:
-            """Half the difference of an eye's targets along its rays from the other one's in the same places."""
+            """Return half the difference between an eye's targets and the other eye's along its rays."""
             to_plane = local.plane_from_local @ frame.plane_from_frame(local.eyes_m[side], x_m=middle_x_m)
             own, other = (
                 warp(
@@ -97,7 +98,7 @@ class ChainProposal:
             )  # fmt: skip
             return _residual(own, other)
 
-        # A thread for each eye's whole way: handing over single steps costs more than small ones take.
+        # One thread does all work for an eye: handing over single steps would cost more than small ones take.
         left, right = parallel_map(residual, (0, 1))
         waves, shifted_waves, spectrum, modes_in = chain_modes(frame.cells)
         feeds: dict[str, NDArray[Any]] = {
@@ -113,19 +114,19 @@ class ChainProposal:
         watch.lap("prepare")
         answer = self.session.run(feeds, {"rear": shape, "front": shape, "check": (1,)})
         if not np.isfinite(answer["check"]).all():
-            raise ModelFailure("the network answered with numbers that are not finite")
+            raise ModelFailure("the network's output is not finite")
         watch.lap("inference")
         outer = {n: answer[name].reshape(frame.rows, -1, *left.shape[2:]) for n, name in ((0, "rear"), (2, "front"))}
         panels = parallel_map(lambda item: self._on_panel(*item, geometry, local, frame), list(outer.items()))
         return dict(zip(outer, panels, strict=True))
 
     def _target_codes(self, view: TargetView, channels: int) -> tuple[I16, F64]:
-        """Target sum of all panels for each pixel, sixteenths of a code up to a constant; its picture_from_plane."""
+        """Return each pixel's target sum (sixteenths of a code, up to a constant), and picture_from_plane."""
         codes = cv2.LUT(without_alpha(view.pixels, channels), self._codes)
         return np.asarray(codes, np.int16), np.asarray(np.linalg.inv(view.plane_from_picture), np.float64)
 
     def _on_panel(self, n: int, answer: I16, geometry: Geometry, local: _Local, frame: ChainFrame) -> I16:
-        """The network's answer for an outer panel, within its box."""
+        """Resample the network's answer to an outer panel's box."""
         raster = geometry.rasters[n]
         middle_m = local.in_stack(frame.middle_m)
         seen_from_layer = np.linalg.inv(coarse_layer_from_seen(geometry.stack, n, middle_m))
@@ -144,7 +145,7 @@ class ChainProposal:
 
 
 def _residual(own: I16, other: I16) -> I16:
-    """Half the difference between an eye's target and the other one's."""
+    """Return half the difference between an eye's target and the other eye's."""
     half = np.asarray(cv2.subtract(own, other), np.int16) >> 1
     # Rays outside one eye's picture have no residual.
     np.copyto(half, 0, where=cv2.min(own, other) < 0)
@@ -163,17 +164,17 @@ def _local(geometry: Geometry, *, whole: bool) -> _Local:
         eyes_m = eyes_m - np.array([0.0, y_m, z_m])
         plane_from_local = np.array([[1.0, 0.0, y_m], [0.0, 1.0, z_m], [0.0, 0.0, 1.0]])
     apart_m = np.abs(eyes_m[1] - eyes_m[0])
-    if apart_m[2] > apart_m[1]:  # eyes above each other: down (-z) becomes right (+y)
+    if apart_m[2] > apart_m[1]:  # if one eye is above the other, down (-z) becomes right (+y)
         eyes_m = np.stack([eyes_m[:, 0], -eyes_m[:, 2], -eyes_m[:, 1]], axis=1)
         stack, plane_from_local = replace(stack, tilt=None).transposed(), plane_from_local @ _SWAPPED
-    elif not apart_m.any():  # a single eye for both has no difference: any line does
+    elif not apart_m.any():  # a single eye that stands in for both has no difference, so any line will do
         eyes_m = eyes_m + HALF_BASELINE_M * np.array([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
     order = (0, 1) if eyes_m[1, 1] >= eyes_m[0, 1] else (1, 0)
     return _Local(stack, eyes_m[list(order)], order, plane_from_local)
 
 
 def _wave_taper(geometry: Geometry, raster: PlaneRaster, middle_m: F64) -> F32:
-    """(rows, columns): 0 at a window's edges to 1 inside, for an outer panel as it is seen from between the eyes."""
+    """Return an outer panel's taper (rows, columns): 0 at the window's edges, 1 inside."""
     stack, kept = geometry.stack, geometry.kept
     centre = stack.panel(stack.count // 2)
     share = (centre.x_m - raster.x_m) / (middle_m[0] - raster.x_m)

@@ -1,4 +1,4 @@
-"""An onnxruntime session whose buffers are bound once."""
+"""Run a model in onnxruntime with buffers that are bound once."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from runtime.support.onnx_runtime import onnxruntime
 from runtime.support.untrusted_input import LIMITS
 
 FILE_BYTES_MAX = 1 << 30
-MEMORY_MAX = 1 << 30  # bytes, of a process that loads an untrusted file
+MEMORY_MAX = 1 << 30  # bytes of memory for a process that loads an untrusted file
 
 log = logging.getLogger("phasestack.model")
 
@@ -37,7 +37,7 @@ TYPES = {"tensor(float)": np.float32, "tensor(int16)": np.int16}
 NEWER_OPSET = re.compile(r"(Opset) (\d+) is under development.*till opset (\d+)")
 NEWER_IR = re.compile(r"(IR version): (\d+), max supported IR version: (\d+)")
 ERROR_KIND = re.compile(r"^\[ONNXRuntimeError\] : \d+ : \w+ : ")
-SOURCE_PLACE = re.compile(r"/\S+\.(cc|h|cpp):\d+ .*\) ")  # of onnxruntime's own, with the function's name
+SOURCE_PLACE = re.compile(r"/\S+\.(cc|h|cpp):\d+ .*\) ")  # source line and function in onnxruntime
 Shape = tuple[int, ...]
 
 
@@ -45,9 +45,9 @@ class ModelSession:
     """One loaded model. `run` binds a set of buffers for each input shape once and reuses it."""
 
     def __init__(self, path: Path, *, provider: str = "cpu", threads: int = 2, sha256: str = "") -> None:
-        """sha256: of the whole file; empty: not known.
+        """sha256: digest of the whole file; empty: unknown.
 
-        Raises InputError (no ONNX, other bytes than promised, no contract), MissingPart (provider not installed).
+        Raises InputError (not ONNX, wrong digest, no contract) or MissingPart (provider not installed).
         """
         ort = onnxruntime()
         name, package = PROVIDERS[provider]
@@ -55,7 +55,7 @@ class ModelSession:
             raise MissingPart(f"model.provider: {provider} is not installed: pip install {package}")
         options = ort.SessionOptions()
         options.intra_op_num_threads = threads
-        # A spinning pool eats the cores that the camera and the renderer need.
+        # A spinning thread pool takes cores from the camera and the renderer.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.log_severity_level = 3
         options.add_session_config_entry(RECORD_NODES, "1")
@@ -66,9 +66,10 @@ class ModelSession:
         try:
             metadata = self._session.get_modelmeta().custom_metadata_map
         except UnicodeDecodeError:
-            raise InputError(path, "metadata", "is no UTF-8 text") from None
-        if name not in self._session.get_providers():  # onnxruntime continues without it, with a line on stderr only
-            raise MissingPart(f"model.provider: {provider} is installed and does not start here: {package}, its driver")
+            raise InputError(path, "metadata", "is not UTF-8 text") from None
+        if name not in self._session.get_providers():  # onnxruntime continues without it, and only says so on stderr
+            problem = f"is installed but does not start: check {package} and its driver"
+            raise MissingPart(f"model.provider: {provider} {problem}")
         self.provider: str = provider
         self.fell_back = nodes_elsewhere(self._session, name)  # nodes of the graph that another provider runs
         if count := len(self.fell_back):
@@ -76,22 +77,22 @@ class ModelSession:
             log.warning("provider %s leaves %d node%s to another: %s", provider, count, "s" * (count != 1), names)
         self.contract: Contract = parse_contract(metadata, source=path)
         if self.contract.graph_sha256 and self.contract.graph_sha256 != digest(data):
-            raise InputError(path, "contract.graph_sha256", "does not fit: the file was changed after its export")
+            raise InputError(path, "contract.graph_sha256", "does not match: the file was changed after its export")
         self.input_shapes = {item.name: item.shape for item in self._session.get_inputs()}
         self._types = {item.name: TYPES.get(item.type, np.float32) for item in self._session.get_outputs()}
         self._check_ports(path)
         self._bound: dict[tuple[Any, ...], tuple[Any, dict[str, Any], dict[str, Any]]] = {}
 
     def run(self, feeds: Mapping[str, NDArray[Any]], shapes: Mapping[str, Shape]) -> dict[str, NDArray[Any]]:
-        """Outputs by name, of the given shapes, from inputs by name.
+        """Run the model on inputs by name, and return the outputs by name, with the given shapes.
 
-        They are the session's own buffers: they hold until the next run of the same shapes. Raises ModelFailure where
-        onnxruntime fails.
+        The outputs are the session's own buffers, valid until the next run with the same shapes. Raises
+        ModelFailure if onnxruntime fails.
         """
         key = (*((name, array.shape) for name, array in feeds.items()), *shapes.items())
         try:
             if key not in self._bound:
-                if len(self._bound) > 8:  # a viewer who walks about meets a few shapes, not hundreds
+                if len(self._bound) > 8:  # a viewer who walks about causes a few shapes, not hundreds
                     self._bound.clear()
                 self._bound[key] = self._bind(feeds, shapes)
             binding, values, results = self._bound[key]
@@ -116,15 +117,15 @@ class ModelSession:
         return binding, values, results
 
     def _check_ports(self, path: Path) -> None:
-        """The graph has the inputs and outputs that its contract declares."""
+        """Raise InputError unless the graph has the inputs and outputs that its contract declares."""
         for field, ports, items in (
             ("inputs", self.contract.inputs, self._session.get_inputs()),
             ("outputs", self.contract.outputs, self._session.get_outputs()),
         ):
             declared = {port.name: len(port.axes) for port in ports}
-            found = {item.name: len(item.shape) for item in items}
-            if declared != found:
-                raise InputError(path, f"contract.{field}", f"declares {_named(declared)}, the graph {_named(found)}")
+            actual = {item.name: len(item.shape) for item in items}
+            if declared != actual:
+                raise InputError(path, f"contract.{field}", f"declares {_named(declared)}, the graph {_named(actual)}")
             for item in items:
                 if item.type not in TYPES:
                     kind = item.type.removeprefix("tensor(").removesuffix(")")
@@ -132,9 +133,9 @@ class ModelSession:
                     raise InputError(path, f"{field}.{item.name}", problem)
 
     def check_fits(self, source: Path, feeds: Mapping[str, Shape], answers: Mapping[str, Shape]) -> None:
-        """Raise InputError, naming the port, if the graph's inputs and outputs do not have these names and shapes.
+        """Raise InputError, naming the port, unless the graph's ports have these names and shapes.
 
-        If its declared shapes leave sizes open, it is run once.
+        If the declared shapes leave sizes open, the model is run once.
         """
         is_open = False
         for field, items, shapes in (
@@ -142,7 +143,7 @@ class ModelSession:
             ("outputs", self._session.get_outputs(), answers),
         ):
             if len(items) != len(shapes):
-                raise InputError(source, field, f"are {_list(item.name for item in items)}, not {_list(shapes)} alone")
+                raise InputError(source, field, f"are {_list(item.name for item in items)}, must be {_list(shapes)}")
             for item in items:
                 sizes, expected = item.shape, shapes[item.name]
                 fits = [size == want for size, want in zip(sizes, expected, strict=False) if isinstance(size, int)]
@@ -153,19 +154,19 @@ class ModelSession:
             return
         try:
             zeros = {name: np.zeros(shape, np.float32) for name, shape in feeds.items()}
-            made = dict(zip(answers, self._session.run(list(answers), zeros), strict=True))
+            got = dict(zip(answers, self._session.run(list(answers), zeros), strict=True))
         except Exception as error:  # onnxruntime's own hierarchy
             name, shape = next(iter(feeds.items()))
             raise InputError(source, f"inputs.{name}", f"of {_sizes(shape)} fails ({_first_line(error)})") from None
         for name, shape in answers.items():
-            if made[name].shape != shape:
-                raise InputError(source, f"outputs.{name}", f"is {_sizes(made[name].shape)}, expected {_sizes(shape)}")
+            if got[name].shape != shape:
+                raise InputError(source, f"outputs.{name}", f"is {_sizes(got[name].shape)}, expected {_sizes(shape)}")
 
 
 def nodes_elsewhere(session: Any, provider: str) -> tuple[str, ...]:
-    """Names (or kinds) of the graph's nodes that run on another provider than the requested one.
+    """Return names (or kinds) of the graph's nodes that run on another provider than the requested one.
 
-    session: made with RECORD_NODES. As onnxruntime assigned them after its basic optimizations.
+    session: created with RECORD_NODES. The assignment follows onnxruntime's basic optimizations.
     """
     return tuple(
         node.name or node.op_type
@@ -184,8 +185,8 @@ def _checked(path: Path, sha256: str) -> bytes:
     except ValueError as error:
         raise InputError(path, "", f"is not an ONNX model ({error})") from None
     if external:
-        way_out = "onnx.save(onnx.load(NAME), OTHER_NAME) makes one of both"
-        raise InputError(path, "external_data", f"is refused: a model is one file, with its weights in it; {way_out}")
+        way_out = "onnx.save(onnx.load(NAME), OTHER_NAME) combines both"
+        raise InputError(path, "external_data", f"is not supported: the weights must be in the model file; {way_out}")
     return data
 
 
@@ -198,17 +199,19 @@ def _opened(path: Path, data: bytes, options: Any, provider: str) -> Any:
         raise InputError(path, "", _why_not_loaded(error)) from None
 
 
-_tried_out: set[bytes] = set()  # digests of files that onnxruntime loads within its limits
+_tried_out: set[bytes] = set()  # digests of files that are known to load within the limits
 
 
 def _try_out(path: Path, data: bytes) -> None:
-    """Load it in a child process with limited memory and time: constants of a few bytes can expand to all
-    memory when a model is loaded. Raises InputError."""
-    found = hashlib.sha256(data).digest()
-    if found not in _tried_out:
+    """Load the file in a child process with limited memory and time. Raises InputError if that fails.
+
+    A few bytes of constants can expand to fill all memory when a model is loaded.
+    """
+    checksum = hashlib.sha256(data).digest()
+    if checksum not in _tried_out:
         memory_bytes = MEMORY_MAX + 8 * len(data)
         in_child(_tried_here, path, data, source=path, seconds=LIMITS.load_s, memory_bytes=memory_bytes)
-        _tried_out.add(found)
+        _tried_out.add(checksum)
 
 
 def _tried_here(path: Path, data: bytes) -> None:
@@ -218,7 +221,7 @@ def _tried_here(path: Path, data: bytes) -> None:
 
 
 def _why_not_loaded(error: Exception) -> str:
-    """Describe why onnxruntime cannot load a model, with both versions where the model is newer."""
+    """Explain why onnxruntime cannot load a model, with both versions if the model is too new."""
     text = str(error)
     for found in (NEWER_OPSET.search(text), NEWER_IR.search(text)):
         if found:
@@ -228,7 +231,7 @@ def _why_not_loaded(error: Exception) -> str:
             return f"has {what.replace('Opset', 'opset')} {version}; {runtime} takes up to {most}: {remedy}"
     if found := re.search(r"No Op registered for (\S+)", text):
         return f"has an operator that onnxruntime does not know: {found[1]}"
-    return f"is no model that onnxruntime can load ({_first_line(error)})"
+    return f"is not a model that onnxruntime can load ({_first_line(error)})"
 
 
 def _list(names: Iterable[str]) -> str:

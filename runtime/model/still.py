@@ -1,4 +1,4 @@
-"""One still stereo pair to layers: what `solve`, the report and the calibration charts drive."""
+"""Solve a still stereo pair; used by `solve`, the report and the calibration charts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_raster, image_from_stack
 from runtime.records import F64, U8
 
-RAYS_PX = 0.6, 1.6  # pixels of a picture, along a side, for one of a panel: others are resized to one for one
+RAYS_PX = 0.6, 1.6  # picture pixels per panel pixel, each way; outside this range pictures are resized to 1
 
 
 def solve_still(
@@ -31,10 +31,10 @@ def solve_still(
     eye_sigma_mm: float = TRACKING_SIGMA_MM,
     trimmed: bool = False,
 ) -> Prediction:
-    """Layers for pictures (h, w, 3 or 4) of a left and a right eye (2, 3), frame `stack`.
+    """Return layers for pictures (h, w, 3 or 4) of a left and a right eye (2, 3), frame `stack`.
 
-    The pictures' horizontal field of view is `fov_deg`; each eye looks at the stack's origin. The solver looks along
-    their pixels' own rays. trimmed: skip work that the pictures do not need, if the model can (`trim`).
+    The pictures are `fov_deg` wide, and each eye looks at the stack's origin. The solver follows the rays of
+    their pixels. trimmed: skip work that the pictures do not need, if the model can (`trim`).
     """
     watch = Stopwatch(*STAGES)
     pictures = [np.ascontiguousarray(picture[..., :3]) for picture in (left, right)]
@@ -49,7 +49,7 @@ def solve_still(
 def captured_views(
     pictures: Sequence[U8], eyes_m: F64, stack: PanelStack, *, fov_deg: float
 ) -> tuple[TargetView, TargetView]:
-    """Views of a left and a right picture (h, w, 3), resized where they have many more or fewer pixels than panels."""
+    """Return views of left and right pictures (h, w, 3), resized to about the panels' resolution."""
     height, width = pictures[0].shape[:2]
     middle = stack.panel(stack.count // 2)
     at = [image_from_stack(eye_m, width_px=width, height_px=height, fov_deg=fov_deg) for eye_m in eyes_m]

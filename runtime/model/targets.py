@@ -13,24 +13,24 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F32, I16, U8
 
 SLOPE_FLOOR = 0.25  # least weight of a ray, relative to the steepest slope of sin²
-COARSE_STEP = 16  # pixels between samples of the quick look that recognises most coloured pictures
+COARSE_STEP = 16  # spacing in pixels of the quick test, which recognises most coloured pictures
 
 
 def rest_of(panels: int) -> int:
-    """Value of a panel at rest, in sixteenths of a code."""
+    """Return the value of a panel at rest, in sixteenths of a code."""
     return round(rest_value(panels) * FULL)
 
 
 def slope_of(panels: int) -> int:
-    """Slope of sin² that sums are on: 1 falls from 1 to 2, 2 rises from there."""
+    """Return which slope of sin² the sums are on: 1 (falling, sums 1 to 2) or 2 (rising, sums 2 to 3)."""
     return int(rest_value(panels) * panels)
 
 
 @lru_cache(maxsize=8)
 def target_table(panels: int) -> F32:
-    """(256, 2) target sum of the panels, in sixteenths of a code, and its weight, for each code.
+    """Return (256, 2): for each code, the panels' target sum in sixteenths of a code, and its weight.
 
-    The sum is the one nearest to rest; the weight is the slope of sin² there, 1 at its steepest.
+    The sum is the solution nearest to the rest state. The weight is the slope of sin² there, 1 where it is steepest.
     """
     intensities = np.arange(256) / 255.0
     slope = slope_of(panels)
@@ -42,13 +42,13 @@ def target_table(panels: int) -> F32:
 
 @lru_cache(maxsize=8)
 def middle_codes(panels: int) -> U8:
-    """(256,) the middle panel's code for each code that an eye should see, while the others rest."""
+    """Return (256,) codes of the middle panel that show an eye each code while the other panels rest."""
     codes = (target_table(panels)[:, 0] - (panels - 1) * rest_of(panels)) / SUBCODE
     return np.clip(np.rint(codes), 0, 255).astype(np.uint8)
 
 
 def outside_codes(panels: int, n: int, outside: int | tuple[int, ...]) -> list[int]:
-    """RGB code of panel n outside the window: at rest; the middle one a code, or a colour."""
+    """Return panel n's RGB code outside the window: at rest, or `outside` for the middle panel."""
     if n != panels // 2:
         return [rest_code(panels)] * 3
     return middle_codes(panels)[list(outside)].tolist() if isinstance(outside, tuple) else [outside] * 3
@@ -56,13 +56,13 @@ def outside_codes(panels: int, n: int, outside: int | tuple[int, ...]) -> list[i
 
 @lru_cache(maxsize=4)
 def phase_codes(branch: Branch = 2) -> I16:
-    """(256,) phase sum, in sixteenths of a panel code, for each 8-bit code value an eye should see."""
+    """Return (256,) phase sums, in sixteenths of a panel code, by 8-bit code that an eye should see."""
     codes = np.arange(256) / 255.0
     return np.rint(phase_from_intensity(codes, branch) * FULL).astype(np.int16)
 
 
 def is_grey(picture: U8) -> bool:
-    """True if red, green and blue are equal in every pixel of an (h, w, 3 or 4) picture."""
+    """Return True if red, green and blue are equal in every pixel of an (h, w, 3 or 4) picture."""
     coarse = picture[::COARSE_STEP, ::COARSE_STEP]
     if (coarse[..., 0] != coarse[..., 1]).any() or (coarse[..., 1] != coarse[..., 2]).any():
         return False
@@ -71,7 +71,7 @@ def is_grey(picture: U8) -> bool:
 
 
 def without_alpha(picture: U8, channels: int) -> U8:
-    """The picture as contiguous (h, w, 3), or (h, w) where it is grey and one channel suffices."""
+    """Return a contiguous picture (h, w, 3), or (h, w) if it is grey and one channel suffices."""
     if channels == 1:
         return np.asarray(cv2.extractChannel(picture, 0), np.uint8)
     if picture.shape[2] == 3:
@@ -80,10 +80,10 @@ def without_alpha(picture: U8, channels: int) -> U8:
 
 
 def flat_layers(image: U8, stack: PanelStack) -> U8:
-    """(N, h, w, 4) layers that show every eye a picture (h, w, 4) on the middle panel's raster."""
+    """Return (N, h, w, 4) layers that show every eye a picture (h, w, 4) on the middle panel's raster."""
     middle = stack.count // 2
     layers = np.full((stack.count, stack.height_px, stack.width_px, 4), 255, np.uint8)
-    # The sum is at least the slope's beginning: the other panels share that, and the middle one carries the picture.
+    # The sum is at least the start of the slope. The other panels share that part; the middle one adds the picture.
     even = slope_of(stack.count) * 255 // (stack.count - 1)
     layers[..., :3] = even
     sums = np.rint(target_table(stack.count)[:, 0] / SUBCODE)

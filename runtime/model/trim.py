@@ -1,6 +1,6 @@
-"""Reduces a job to the window where the eyes' pictures differ, and to one channel if grey.
+"""Reduce a job to the window where the eyes' pictures differ, and to one channel if they are grey.
 
-Panels that are cut to a window and moved to its centre are a smaller stack, seen by eyes moved the same way. Where the
+A window of the panels, moved to their centre, is a smaller stack seen by eyes that are moved the same way. Where the
 eyes agree, the outer panels rest at mid-range, and the centre panel carries the picture. The outer panels' drive is
 tapered towards the window's edge (`Geometry.tapers`), which avoids a seam.
 """
@@ -23,13 +23,13 @@ from runtime.support.gl import DrawnPicture
 from runtime.support.threads import PIECE_ROWS, parallel_map
 
 TOLERANCE_CODES = 2  # pictures within 2 codes count as equal; the error is a tenth of 8-bit quantisation's at 40 dB
-COARSE_STEP = 16  # pixels between samples of the quick look that decides whether a close one is worth its time
-MAX_SHARE = 0.6  # of the panel: a larger window is not worth cutting out
-MAX_SLACK = 1.3  # area of a window that is kept from the solution before, relative to the one needed
-WINDOW_SHARES = 16  # windows are whole sixteenths of the panel, so that few shapes occur
+COARSE_STEP = 16  # spacing in pixels of the quick comparison that decides whether an exact one is worthwhile
+MAX_SHARE = 0.6  # share of the panel above which a window is not worth cutting out
+MAX_SLACK = 1.3  # a window of the previous solution may be this many times as large as the one needed
+WINDOW_SHARES = 16  # windows are whole sixteenths of the panel, so that only a few shapes occur
 # Measured with the shipped models: tapering the outer panels over 14 parallaxes around a differing region costs 0.06 dB
-# on a mid-grey background, where sin² is steepest, and over 6 up to 0.4 dB; on white or black, where it is level, 6
-# cost 0.02 dB. A window must also hold each panel's part of the rays through another.
+# on a mid-grey background, where sin² is steepest; over 6 parallaxes it costs up to 0.4 dB there, but only 0.02 dB on
+# white or black, where sin² is level. A window must also contain the other panels' ends of its rays.
 TAPER_PARALLAXES = (6.0, 14.0)
 PANEL_CROSSINGS = 2.0
 MARGIN_PX = 16
@@ -38,9 +38,9 @@ COMPARED = 2  # captured pictures are compared on a raster this many times coars
 
 
 def trim(job: Job, before: SolveWindow | None = None) -> Job:
-    """The job with less work: a window, unless it has one already, and one channel where nothing in it has a colour.
+    """Return the job with a window, unless it has one, and with one channel if nothing is coloured.
 
-    before: the window of the solution before, kept where it still fits.
+    before: the previous solution's window, which is kept if it still fits.
     """
     window = job.window or differing_window(job, before)
     grey = (window is None or window.box.width_px > 0) and all(_is_grey(view, job, window) for view in job.views)
@@ -50,9 +50,9 @@ def trim(job: Job, before: SolveWindow | None = None) -> Job:
 def extent_window(
     extent: PixelRect, colour: tuple[int, ...], eyes_m: F64, stack: PanelStack, before: SolveWindow | None = None
 ) -> SolveWindow | None:
-    """The window of content that both eyes see within `extent` of the middle panel, on a background of 8-bit `colour`.
+    """Return the window of content within `extent` of the middle panel, on an 8-bit background `colour`.
 
-    Found before the content is drawn. None: the whole panel is as fast.
+    It is computed before the content is drawn. None: solving the whole panel is as fast.
     """
     if not extent.width_px:
         return None
@@ -62,9 +62,9 @@ def extent_window(
 
 
 def differing_window(job: Job, before: SolveWindow | None = None) -> SolveWindow | None:
-    """The window in which the eyes' pictures differ; empty where they agree.
+    """Return the window in which the eyes' pictures differ; empty if they agree.
 
-    None where the whole panel is as fast, or the pictures were left in textures.
+    None: solving the whole panel is as fast, or the pictures are in textures.
     """
     if any(isinstance(view.picture, DrawnPicture) for view in job.views):
         return None
@@ -80,7 +80,7 @@ def differing_window(job: Job, before: SolveWindow | None = None) -> SolveWindow
         grown = PixelRect(*(first + scale * at for first, at in zip(origin * 2, box.corners)))
         return _window_around(grown, job.eyes_m, stack, before, steep=steepness_beside(left, box))
 
-    # A quick look recognises windows that would be too large; only the others are worth a close one.
+    # A quick comparison recognises windows that would be too large, so only the others need an exact one.
     box, window = coarse_box(left, right), None
     if box.width_px:
         window = window_of(box)
@@ -91,14 +91,14 @@ def differing_window(job: Job, before: SolveWindow | None = None) -> SolveWindow
 
 
 def _on_middle_panel(view: TargetView, stack: PanelStack) -> bool:
-    """True where a view's pixels are the middle panel's."""
+    """Return True if a view's pixels are the middle panel's."""
     middle = stack.panel(stack.count // 2)
     same_size = view.picture.shape[:2] == (stack.height_px, stack.width_px)
     return same_size and np.allclose(view.plane_from_picture, middle.plane_from_raster(), rtol=0, atol=1e-9)
 
 
 def _compared(job: Job) -> tuple[U8, U8, tuple[int, int]]:
-    """Both pictures on one coarse raster of the visible part of the middle panel, and its first panel pixel."""
+    """Return both pictures on a coarse raster of the middle panel's visible part, and its first pixel."""
     visible = job.targets.visible
     box, middle = visible.boxes[visible.middle], job.stack.panel(visible.middle)
     size = max(1, box.height_px // COMPARED), max(1, box.width_px // COMPARED)
@@ -117,19 +117,19 @@ def _compared(job: Job) -> tuple[U8, U8, tuple[int, int]]:
 def _window_around(
     box: PixelRect, eyes_m: F64, stack: PanelStack, before: SolveWindow | None, *, steep: float
 ) -> SolveWindow | None:
-    """Window for a box in which the eyes' pictures differ; None if the whole panel is as fast."""
+    """Return the window for a box in which the eyes' pictures differ; None if the whole panel is as fast."""
     parallaxes = taper_parallaxes(steep)
     window = window_around(box, eyes_m, stack, parallaxes=parallaxes)
     if window is None:
         return None
     if before is not None and still_fits(before.box, window):
         window = before.box
-    # Near the window's edge the centre panel can't know what rays meet that leave the window.
+    # Near the window's edge, rays leave the window on another panel, so the centre panel has no valid target there.
     return SolveWindow(window, whole_rays(window, eyes_m, stack), taper_px(eyes_m, stack, parallaxes=parallaxes))
 
 
 def _is_grey(view: TargetView, job: Job, window: SolveWindow | None) -> bool:
-    """True if nothing that is solved has a colour; as far as it is known, where a picture was left in a texture."""
+    """Return True if everything solved is grey; a texture counts as grey only if marked so."""
     if isinstance(view.picture, DrawnPicture):
         return view.picture.grey
     if window is not None and _on_middle_panel(view, job.stack):
@@ -138,24 +138,24 @@ def _is_grey(view: TargetView, job: Job, window: SolveWindow | None) -> bool:
 
 
 def differing_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES, known: PixelRect = NOWHERE) -> PixelRect:
-    """The smallest box in which two (h, w, 3 or 4) pictures differ; empty where they agree.
+    """Return the smallest box in which two (h, w, 3 or 4) pictures differ; empty if they agree.
 
-    known: a box within it, as `coarse_box` finds one: only the rest is compared.
+    known: a box inside the result, such as that of `coarse_box`; only the rest is compared.
     """
     height, width = left.shape[:2]
 
     def look(part: PixelRect) -> PixelRect:
-        found = _box(left[part.slices], right[part.slices], tolerance)
-        return PixelRect(found.u0 + part.u0, found.v0 + part.v0, found.u1 + part.u0, found.v1 + part.v0)
+        box = _box(left[part.slices], right[part.slices], tolerance)
+        return PixelRect(box.u0 + part.u0, box.v0 + part.v0, box.u1 + part.u0, box.v1 + part.v0)
 
     parts = known.beside(width_px=width, height_px=height)
     return union([known, *parallel_map(look, [piece for part in parts for piece in part.in_rows(PIECE_ROWS)])])
 
 
 def coarse_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES) -> PixelRect:
-    """A box within `differing_box` from a few pixels, at a hundredth of the time.
+    """Return a box within `differing_box` from a few pixels, in a hundredth of the time.
 
-    It decides whether the window would be too much of the panel to be worth cutting out.
+    It decides whether the window would be too large to be worth cutting out.
     """
     few = [np.ascontiguousarray(picture[::COARSE_STEP, ::COARSE_STEP]) for picture in (left, right)]
     u0, v0, u1, v1 = (COARSE_STEP * corner for corner in _box(few[0], few[1], tolerance).corners)
@@ -170,47 +170,47 @@ def _box(left: U8, right: U8, tolerance: int) -> PixelRect:
 
 
 def parallax_margin_px(eyes_m: F64, stack: PanelStack) -> F64:
-    """(2, N, 2) stray on each panel of rays through a centre-panel pixel: columns right, rows down.
+    """Return the stray (2, N, 2) on each panel of rays through a centre-panel pixel: right, down.
 
-    To first order, as at the window's centre. eyes_m: (2, 3) left, right; frame `stack`.
+    To first order, at the window's centre. eyes_m: (2, 3) left, right; frame `stack`.
     """
     return np.asarray(_eyes_px(eyes_m, stack)[:, None] * _weights(eyes_m, stack)[..., None], np.float64)
 
 
 def steepness(codes: U8) -> float:
-    """Visibility of a phase error before these 8-bit codes: 0 at black or white, 1 at mid-grey.
+    """Return how visible a phase error is on these 8-bit codes: 0 at black or white, 1 at mid-grey.
 
-    The slope of sin² in its own terms, 2·sqrt(I·(1 - I)), root mean square.
+    It is the root mean square of the slope of sin², 2·sqrt(I·(1 - I)).
     """
     intensities = codes.astype(np.float64) / 255
     return float(np.sqrt((4 * intensities * (1 - intensities)).mean())) if codes.size else 0.0
 
 
 def steepness_beside(picture: U8, box: PixelRect) -> float:
-    """`steepness` of an (h, w, 3 or 4) picture right and left of a box, where the outer panels' drive is tapered."""
+    """Return `steepness` right and left of a box in a picture (h, w, 3 or 4), where drive is tapered."""
     rows = slice(box.v0, box.v1, COARSE_STEP)
     beside = (picture[rows, : box.u0 : COARSE_STEP, :3], picture[rows, box.u1 :: COARSE_STEP, :3])
     return max(steepness(side) for side in beside)
 
 
 def taper_parallaxes(steep: float) -> float:
-    """Parallaxes over which the outer panels' drive is tapered around a difference, by the background's steepness."""
+    """Return the taper's width in parallaxes around a difference, given the background's steepness."""
     least, most = TAPER_PARALLAXES
     return least + (most - least) * steep
 
 
 def taper_px(eyes_m: F64, stack: PanelStack, *, parallaxes: float) -> tuple[float, float]:
-    """Width of that taper in pixels, right and down. eyes_m: (2, 3), frame `stack`."""
+    """Return the taper's width in pixels, right and down. eyes_m: (2, 3), frame `stack`."""
     left, right = parallax_margin_px(eyes_m, stack)
     across, down = np.abs(left - right).max(axis=0) * parallaxes
     return float(across), float(down)
 
 
 def whole_rays(box: PixelRect, eyes_m: F64, stack: PanelStack) -> PixelRect:
-    """The part of a window in which no eye's ray leaves it on another panel; up to the panels' own edges.
+    """Return the part of a window whose rays stay inside it on every panel, or end at the panels' edges.
 
-    A ray through p on the centre panel meets a panel of weight t at p(1 - t) + e·t. eyes_m: (2, 3), frame
-    `stack`, not moved to the window.
+    A ray through p on the centre panel meets a panel of weight t at p(1 - t) + e·t. eyes_m: (2, 3) in frame
+    `stack`, not relative to the window.
     """
     weights = _weights(eyes_m, stack)
     limits = []
@@ -226,25 +226,25 @@ def whole_rays(box: PixelRect, eyes_m: F64, stack: PanelStack) -> PixelRect:
 
 
 def _weights(eyes_m: F64, stack: PanelStack) -> F64:
-    """(2, N) each panel's position along an eye's ray, from 0 at the centre panel to 1 at the eye."""
+    """Return the panels' positions (2, N) along each eye's ray: 0 at the centre panel, 1 at the eye."""
     middle_m = stack.x_m[stack.count // 2]
     return np.asarray((np.array(stack.x_m) - middle_m) / (eyes_m[:, :1] - middle_m), np.float64)
 
 
 def _eyes_px(eyes_m: F64, stack: PanelStack) -> F64:
-    """(2, 2) the eyes' positions in panel pixels from the panel's centre, columns and rows."""
+    """Return the eyes' positions (2, 2) in panel pixels from the panel's centre, columns and rows."""
     return np.asarray(eyes_m[:, 1:] * (stack.width_px / stack.width_m, -stack.height_px / stack.height_m), np.float64)
 
 
 def window_around(box: PixelRect, eyes_m: F64, stack: PanelStack, *, parallaxes: float) -> PixelRect | None:
-    """The window of a difference: grown by its margins, rounded up to sixteenths of the panel.
+    """Return a difference's window, with its margins, rounded up to sixteenths of the panel.
 
-    parallaxes: see `taper_parallaxes`. None where it would be most of the panel: then the whole is as fast.
+    parallaxes: see `taper_parallaxes`. None: the window would be most of the panel, so the whole panel is as fast.
     """
     parallax, weights, eyes_px = parallax_margin_px(eyes_m, stack), _weights(eyes_m, stack), _eyes_px(eyes_m, stack)
     spans: list[tuple[int, int]] = []
     for axis, (start, end, whole) in enumerate(((box.u0, box.u1, stack.width_px), (box.v0, box.v1, stack.height_px))):
-        eyes = eyes_px[:, axis, None]  # from the panel's centre, as both ends of the difference here
+        eyes = eyes_px[:, axis, None]  # relative to the panel's centre, like both ends of the difference
         before, after = (weights * (start - whole / 2 - eyes)).max(), (weights * (eyes - (end - whole / 2))).max()
         room = parallaxes * float(np.abs(parallax[0, :, axis] - parallax[1, :, axis]).max()) + MARGIN_PX
         low = max(start - (PANEL_CROSSINGS * max(float(before), 0.0) + room), 0.0)
@@ -259,6 +259,6 @@ def window_around(box: PixelRect, eyes_m: F64, stack: PanelStack, *, parallaxes:
 
 
 def still_fits(held: PixelRect, new: PixelRect) -> bool:
-    """True where a window in use holds a new one and isn't much larger: nothing need be allocated again."""
+    """Return True if the current window contains a new one and is not much larger, so it can be kept."""
     inside = held.u0 <= new.u0 and held.v0 <= new.v0 and held.u1 >= new.u1 and held.v1 >= new.v1
     return inside and held.width_px * held.height_px <= MAX_SLACK * new.width_px * new.height_px

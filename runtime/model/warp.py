@@ -1,4 +1,4 @@
-"""Pictures and panels on other rasters."""
+"""Resample pictures and panels to other rasters."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from runtime.optics.stack import PlaneRaster
 from runtime.records import F64, I16, U8
 from runtime.support.threads import on_rows
 
-LEAST_PX, MIN_SCALE = 16, 0.25  # of a picture: smaller ones and finer rasters add no information
-REACH_PX = EDGE_PX - 1.0  # most pixels by which an image's edge is extended
-LARGEST = 8191  # of an element that the compiled loop samples, either way
+LEAST_PX, MIN_SCALE = 16, 0.25  # least side and scale of a picture; smaller ones add no information
+REACH_PX = EDGE_PX - 1.0  # largest extension of an image's edge
+LARGEST = 8191  # largest absolute value that the compiled loop can sample
 _TRANSPOSED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def source_px(image_from_raster: F64, size: tuple[int, int]) -> tuple[float, float]:
-    """Pixels of an image, along and down, for one of a raster (width, height) along and down, in its middle."""
+    """Return an image's pixels per pixel of a raster, along and down, at the raster's middle."""
     a = image_from_raster
     x, y, w = a @ (size[0] / 2, size[1] / 2, 1.0)
     across, down = np.linalg.norm((a[:2, :2] - np.outer((x / w, y / w), a[2, :2])) / w, axis=0)
@@ -32,12 +32,12 @@ def source_px(image_from_raster: F64, size: tuple[int, int]) -> tuple[float, flo
 
 
 def resized_px(pixels: int, scale: float) -> int:
-    """Number of pixels that replace `pixels`, with `scale` of them in one."""
+    """Return the number of pixels that replace `pixels` if each of them covers `scale` old ones."""
     return max(min(pixels, LEAST_PX), round(pixels / max(scale, MIN_SCALE)))
 
 
 def reduced_view(view: TargetView, middle: PlaneRaster, reduction: int) -> TargetView:
-    """Average a view down to one pixel for about `reduction` x `reduction` pixels of the middle panel."""
+    """Average a view down to a pixel per about `reduction` x `reduction` middle-panel pixels."""
     picture = view.pixels
     picture_from_middle = np.linalg.inv(view.plane_from_picture) @ middle.plane_from_raster()
     scales = source_px(picture_from_middle, (middle.width_px, middle.height_px))
@@ -47,7 +47,7 @@ def reduced_view(view: TargetView, middle: PlaneRaster, reduction: int) -> Targe
     )
     if (by_u, by_v) == (1, 1):
         return TargetView(picture, view.plane_from_picture)
-    # Whole multiples, which OpenCV shrinks ten times as fast.
+    # OpenCV shrinks by whole factors ten times as fast.
     cropped = picture[: height // by_v * by_v, : width // by_u * by_u]
     small = cv2.resize(cropped, (width // by_u, height // by_v), interpolation=cv2.INTER_AREA)
     return TargetView(np.asarray(small, np.uint8), view.plane_from_picture @ np.diag([by_u, by_v, 1.0]))
@@ -56,8 +56,10 @@ def reduced_view(view: TargetView, middle: PlaneRaster, reduction: int) -> Targe
 def picture_on(
     view: TargetView, middle: PlaneRaster, *, middle_from_result: F64, edge: int, size: tuple[int, int]
 ) -> U8:
-    """(rows, columns, 3 or 4) a view's picture on a raster of (rows, columns) that a homography takes to the middle
-    panel's pixels; the picture itself if it is there already. edge: OpenCV's border mode."""
+    """Return a view's picture (rows, columns, 3 or 4) on a raster mapped to the middle panel.
+
+    A picture on that raster is returned unchanged. edge: OpenCV's border mode.
+    """
     picture_from_result = np.linalg.inv(view.plane_from_picture) @ middle.plane_from_raster() @ middle_from_result
     picture_from_result = picture_from_result / picture_from_result[2, 2]
     if view.picture.shape[:2] == size and np.abs(picture_from_result - np.eye(3)).max() < SNAPPED:
@@ -68,8 +70,10 @@ def picture_on(
 def resample(
     image: NDArray[Any], image_from_result: F64, *, size: tuple[int, int], edge: int = cv2.BORDER_CONSTANT
 ) -> NDArray[Any]:
-    """Bilinear samples of an image (h, w[, C]) on a raster of (rows, columns); pixel centres at half-integers.
-    edge: OpenCV's border mode."""
+    """Return bilinear samples of an image (h, w[, C]) on a raster of (rows, columns).
+
+    Pixel centres are at half-integers. edge: OpenCV's border mode.
+    """
     to_corners = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
     at_centres = np.linalg.inv(to_corners) @ image_from_result @ to_corners
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -87,15 +91,15 @@ def warp(
     result_columns: ColumnLaw = EVEN_COLUMNS,
     threads: int | None = None,
 ) -> I16:
-    """`resample` of an image (h, w[, 3]) of LARGEST at most either way, several times as fast, through a homography
-    between the columns by both laws. One of them is even.
+    """Resample an int16 image (h, w[, 3]) like `resample`, several times as fast.
 
-    outside: value more than reach_px (REACH_PX at most) outside the image; nearer, it is clamped to its edge. threads:
-    OpenCV's number, unless given.
+    Its values must be within ±LARGEST. The homography connects columns after both column laws, one of which is
+    even. outside: value more than reach_px (at most REACH_PX) outside the image; nearer, it is clamped to its edge.
+    threads: OpenCV's number by default.
     """
     x, y, w = image_from_result @ (result_columns.middle or size[1] / 2, size[0] / 2, 1.0)
     right, down = image_from_result[:2, 0] - np.array([x, y]) / w * image_from_result[2, 0]
-    turned = abs(down) > abs(right)  # the loop wants a result's rows along the image's
+    turned = abs(down) > abs(right)  # the loop needs the result's rows to run along the image's
     if turned and result_columns.bend:
         image, image_from_result, turned = np.swapaxes(image, 0, 1), _TRANSPOSED @ image_from_result, False
     elif turned:

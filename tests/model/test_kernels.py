@@ -33,7 +33,7 @@ NEEDS = {
 def test_kernels_of_another_layout_or_limit_are_refused(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(kernels.COMPILED, name, kernels.COMPILED[name] + 1)
     kernels.library.cache_clear()
-    with pytest.raises(MissingPart, match="is of another version"):
+    with pytest.raises(MissingPart, match="was built from another version"):
         load_predictor("sart", STACK)
     monkeypatch.undo()
     kernels.library()

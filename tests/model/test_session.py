@@ -49,7 +49,7 @@ def test_weights_in_another_file_are_refused_wherever_they_are_asked_for(tmp_pat
     model = shipped()
     assert not has_external_data(model.SerializeToString())
     model.graph.initializer.append(outside("elsewhere"))
-    with pytest.raises(InputError, match="external_data: is refused"):
+    with pytest.raises(InputError, match="external_data: is not supported"):
         ModelSession(saved(model, tmp_path))
     branch = helper.make_graph([helper.make_node("Constant", [], ["y"], value=outside("deep"))], "b", [], [])
     nested = helper.make_graph(
@@ -152,7 +152,7 @@ def test_a_provider_that_is_installed_and_does_not_start_is_refused(monkeypatch:
 
     Module.InferenceSession = staticmethod(on_the_processor)
     monkeypatch.setattr(session, "onnxruntime", lambda: Module)
-    with pytest.raises(MissingPart, match=r"model\.provider: cuda is installed and does not start here"):
+    with pytest.raises(MissingPart, match=r"model\.provider: cuda is installed but does not start"):
         ModelSession(path, provider="cuda")
 
 

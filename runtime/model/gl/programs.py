@@ -1,4 +1,4 @@
-"""Fragment shaders that draw from images into images."""
+"""Compile fragment shaders and draw with them from images into images."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CONSTANTS = f"FULL {FULL:.1f}", f"EDGE_CLAMP_PX {EDGE_CLAMP_PX:.1f}"
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """The part of a texture that is in use, from its first row and column on."""
+    """The part of a texture that is in use, starting at its first row and column."""
 
     texture: Any  # moderngl.Texture
     width_px: int
@@ -34,7 +34,7 @@ class Image:
 
 
 def source(name: str, *, defines: Sequence[str] = ()) -> str:
-    """Return a shader with its includes. defines: names for its `#ifdef`s."""
+    """Return a shader's text with its includes. defines: names that its `#ifdef`s test."""
 
     def read(file: str) -> str:
         return (resources.files(SHADERS) / "shaders" / file).read_text(encoding="ascii")
@@ -44,7 +44,7 @@ def source(name: str, *, defines: Sequence[str] = ()) -> str:
 
 
 class Passes:
-    """The programs of one context. Every one is compiled when it is first used."""
+    """The programs of one context, each compiled on its first use."""
 
     def __init__(self, context: moderngl.Context) -> None:
         self.context = context
@@ -76,9 +76,10 @@ class Passes:
         defines: tuple[str, ...] = (),
         at: tuple[int, int, int, int] | None = None,
     ) -> None:
-        """Draw a pass into all its outputs at the first one's size; unused inputs are ignored.
+        """Draw a pass into all outputs, at the first one's size.
 
-        Inputs and uniforms are named as in the shader. defines: of the shader; at: first column and row, width, height.
+        Inputs and uniforms are named as in the shader; unused inputs are ignored. defines: of the shader; at:
+        first column and row, width, height.
         """
         raise_if_abandoned()
         program, array, held = self._program(name, defines)
@@ -94,21 +95,21 @@ class Passes:
         array.render(moderngl.TRIANGLES, vertices=3)
 
     def target(self, outputs: Sequence[Image]) -> Any:
-        """The framebuffer of some images."""
+        """Return the framebuffer of some images."""
         key = tuple(output.texture.glo for output in outputs)
         if key not in self._targets:
             self._targets[key] = self.context.framebuffer([output.texture for output in outputs])
         return self._targets[key]
 
     def forget(self, texture: Any) -> None:
-        """Release a texture and the framebuffers that it is in."""
-        self.context.detect_framebuffer(0).use()  # moderngl binds the last one again: it must not be one that is gone
+        """Release a texture and its framebuffers."""
+        self.context.detect_framebuffer(0).use()  # moderngl binds the last one again, which must still exist
         for key in [key for key in self._targets if texture.glo in key]:
             self._targets.pop(key).release()
         texture.release()
 
     def release(self) -> None:
-        """Programs and framebuffers; textures are their owners'."""
+        """Release programs and framebuffers. Textures belong to their owners."""
         self.context.detect_framebuffer(0).use()
         for target in self._targets.values():
             target.release()

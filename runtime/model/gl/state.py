@@ -1,7 +1,8 @@
-"""The solver's panels in textures, and its steps as passes of fragment shaders.
+"""The solver on OpenGL: panels are textures, and steps are passes of fragment shaders.
 
-Everything between steps is 16 bits from 0 to 1 (`shaders/places.glsl` says of what), which every driver filters and
-draws into: one component where there is one channel, else four, of which one is unused (three can't be drawn into).
+All data between steps are 16-bit values from 0 to 1 (see `shaders/places.glsl` for their meaning), which every driver
+can filter and draw into. Textures have one component for one channel and otherwise four, of which one is unused,
+because three components cannot be drawn into.
 """
 
 from __future__ import annotations
@@ -30,12 +31,12 @@ PANELS, MIDDLE = 3, 1
 
 
 class GlBackend:
-    """OpenGL as a backend: one context, whose programs all models on it share. Used on the thread of that context."""
+    """OpenGL backend of one context, whose programs its models share. Used on that context's thread."""
 
     name = "gl"
 
     def __init__(self, context: Any, stack: PanelStack) -> None:
-        """context: released by its maker. Raises InputError where a panel is too large for the driver."""
+        """context: the caller releases it. Raises InputError if a panel is too large for the driver."""
         check_size(context, stack)
         self.context, self.passes = context, Passes(context)
 
@@ -48,14 +49,14 @@ class GlBackend:
 
 
 class GlState:
-    """A `SolverState` of three panels, on the thread of its context."""
+    """`SolverState` of three panels, used only on its context's thread."""
 
     def __init__(self, passes: Passes, stack: PanelStack) -> None:
-        """passes: of a context that others may use too. Raises InputError where a panel is too large for the driver."""
+        """passes: of a shared context. Raises InputError if a panel is too large for the driver."""
         check_size(passes.context, stack)
         self._passes, self._stack = passes, stack
         self._textures: dict[tuple[Any, ...], Any] = {}
-        self._names: dict[str, str] = {}  # which of two images is which
+        self._names: dict[str, str] = {}  # which of two images plays which role
         self._closed = False
 
     @contextmanager
@@ -65,18 +66,18 @@ class GlState:
             self._targets = [self._loaded(view, side) for side, view in enumerate(job.views)]
             for name, taper in zip(("column_taper", "row_taper"), geometry.tapers(), strict=True):
                 self._texture(name, (self._longest, 1), 1, dtype="f4").write(taper, viewport=(0, 0, len(taper), 1))
-            held = (rest_of(PANELS) / FULL + 1) / 3
+            rest = (rest_of(PANELS) / FULL + 1) / 3
             for n in range(0 if resumed else PANELS):
-                self._passes.target((self._panel("last", n),)).clear(held, held, held, held)
+                self._passes.target((self._panel("last", n),)).clear(rest, rest, rest, rest)
             yield
 
     def set_panel(self, panel: int, codes: I16) -> None:
         box = self._geometry.boxes[panel]
         unit = 65535 / (3 * FULL)
-        held = np.asarray(cv2.addWeighted(codes, unit, codes, 0.0, FULL * unit, dtype=cv2.CV_16U))
-        if held.ndim == 3:
-            held = np.dstack([held, held[..., :1]])
-        self._panel("last", panel).texture.write(held, viewport=(0, 0, box.width_px, box.height_px), alignment=1)
+        stored = np.asarray(cv2.addWeighted(codes, unit, codes, 0.0, FULL * unit, dtype=cv2.CV_16U))
+        if stored.ndim == 3:
+            stored = np.dstack([stored, stored[..., :1]])
+        self._panel("last", panel).texture.write(stored, viewport=(0, 0, box.width_px, box.height_px), alignment=1)
 
     def close_middle(self) -> None:
         seen = self._geometry.panels_from_rays("middle", 0.0)
@@ -146,7 +147,7 @@ class GlState:
             self._textures = {}
 
     def _loaded(self, view: TargetView, side: int) -> tuple[Image, tuple[int, int]]:
-        """An eye's target, where it was drawn or uploaded, and its column and row that belong to the first ray."""
+        """Return an eye's target, drawn or uploaded, and the column and row of its first ray."""
         rays = self._geometry.rays
         if isinstance(view.picture, DrawnPicture):
             texture = view.picture.texture
@@ -177,7 +178,7 @@ class GlState:
         return max(self._stack.width_px, self._stack.height_px, rays.width_px, rays.height_px)
 
     def _panel(self, name: str, n: int) -> Image:
-        """The box's part of an image as large as a whole panel: boxes follow the viewer, textures don't."""
+        """Return a panel's box in an image as large as the panel, whose texture stays as the box moves."""
         box, key = self._geometry.boxes[n], (self._names.get(f"{name} {n}", name), n)
         size = self._stack.width_px, self._stack.height_px
         return Image(self._texture(key, size, self._components, dtype="nu2"), box.width_px, box.height_px)
@@ -187,7 +188,7 @@ class GlState:
         self._names[a], self._names[b] = self._names.get(b, other), self._names.get(a, one)
 
     def _rays(self, name: str, places: int = 1) -> Image:
-        """An image of one field of a set's rays."""
+        """Return an image for one field of a ray set."""
         image = self._ray_image(name, self._components, "nu2")
         return Image(image.texture, image.width_px, image.height_px // places)
 
@@ -195,27 +196,27 @@ class GlState:
         return Image(self._texture(name, (self._longest, 1), 1, dtype="f4"), self._longest, 1)
 
     def _ray_image(self, name: str, components: int, dtype: str) -> Image:
-        """An image of all rays. Their number follows pictures and viewer; its texture only grows."""
+        """Return an image for all rays. Their number varies, but the texture only grows."""
         width_px, height_px = self._geometry.rays.width_px, self._geometry.rays.height_px
         size = width_px, height_px
-        held = self._textures.get(key := (name, components, dtype))
-        if held is not None and (held.width < width_px or held.height < height_px):
-            size = max(width_px, held.width), max(height_px, held.height)
+        texture = self._textures.get(key := (name, components, dtype))
+        if texture is not None and (texture.width < width_px or texture.height < height_px):
+            size = max(width_px, texture.width), max(height_px, texture.height)
             self._passes.forget(self._textures.pop(key))
         return Image(self._texture(name, size, components, dtype=dtype), width_px, height_px)
 
     def _texture(self, name: Any, size: tuple[int, int], components: int, *, dtype: str, data: Any = None) -> Any:
         key = (name, components, dtype)
         if key not in self._textures:
-            made = self._passes.context.texture(size, components, data, dtype=dtype, alignment=1)
+            texture = self._passes.context.texture(size, components, data, dtype=dtype, alignment=1)
             smooth = moderngl.LINEAR if dtype == "nu2" else moderngl.NEAREST
-            made.filter, made.repeat_x, made.repeat_y = (smooth, smooth), False, False
-            self._textures[key] = made
+            texture.filter, texture.repeat_x, texture.repeat_y = (smooth, smooth), False, False
+            self._textures[key] = texture
         return self._textures[key]
 
 
 def check_size(context: moderngl.Context, stack: PanelStack) -> None:
-    """Raises InputError where a panel is wider or higher than the driver allows."""
+    """Raise InputError if a panel is wider or higher than the driver allows."""
     most = int(context.info["GL_MAX_TEXTURE_SIZE"])
     most_wide, most_high = (min(most, int(value)) for value in context.info["GL_MAX_VIEWPORT_DIMS"])
     for name, value, limit in (("width_px", stack.width_px, most_wide), ("height_px", stack.height_px, most_high)):
@@ -224,5 +225,5 @@ def check_size(context: moderngl.Context, stack: PanelStack) -> None:
 
 
 def _mat3(matrix: F64) -> tuple[float, ...]:
-    """Column-major values, for OpenGL."""
+    """Return a matrix's values in column-major order, for OpenGL."""
     return tuple(matrix.T.ravel().tolist())
