@@ -1,1 +1,1 @@
-"""Content sources: the picture of a scene for one eye, in a given raster."""
+"""Content sources, which draw the picture of a scene for one eye in a given raster."""

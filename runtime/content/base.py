@@ -1,7 +1,7 @@
-"""The interface of content sources: the picture of a scene for one eye, in a given raster.
+"""The interface of content sources, which draw the picture of a scene for one eye in a given raster.
 
-`ContentSource` is also the base of user-defined scenes: `scene = "mypackage.tunnel:Tunnel"`. Of its methods only
-`render` must be written; the others are optimisations, whose defaults are right for any scene.
+`ContentSource` is also the base of user-defined scenes: `scene = "mypackage.tunnel:Tunnel"`. Only `render` must be
+implemented; the other methods are optimisations, whose defaults are correct for any scene.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ WHITE: Colour = (1.0, 1.0, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One eye and the raster that it should be drawn for."""
+    """One eye, and the raster to draw for it."""
 
     eye_m: F64  # (3,) frame `stack`
     side: int  # 0: left, 1: right
-    pixels_from_stack: F64  # (3, 4) projection; third coordinate: positive before the eye, metres
+    pixels_from_stack: F64  # (3, 4) projection; third coordinate in metres, positive in front of the eye
     width_px: int
     height_px: int
-    reduction: int = 1  # of the display's rows and columns on this raster: outlines keep the width they have there
-    display_from_view: F64 | None = None  # 3x3 turn out of a frame that was placed: the lamp is fixed to the display
+    reduction: int = 1  # divisor of the display's rows and columns; outlines keep their width there
+    display_from_view: F64 | None = None  # 3x3 rotation from the placed scene's frame; the lamp is fixed to the display
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,22 +45,22 @@ class ContentInfo:
     name: str
     moving: bool = False
     grey: bool = False
-    background: Colour | None = WHITE  # uniform, behind it; None: none
-    flat_x_m: float | None = None  # plane of `stack` that contains all of it; both eyes see the same picture
-    left_out: tuple[str, ...] = ()  # content of the file that is not drawn
+    background: Colour | None = WHITE  # uniform colour behind the scene; None: there is none
+    flat_x_m: float | None = None  # x of the plane that contains the whole scene: both eyes see the same picture
+    left_out: tuple[str, ...] = ()  # parts of the file that are not drawn
 
 
 class ContentSource(ABC):
-    """A scene. One thread, the one with its GL context, makes, uses and closes it."""
+    """A scene. The thread that owns its GL context creates, uses and closes it."""
 
-    Options: ClassVar[type[BaseModel]] = Section  # of a class of the user's own: what [content.options] may hold
+    Options: ClassVar[type[BaseModel]] = Section  # options that [content.options] may contain, for user-defined scenes
     info: ContentInfo
-    draws_in: object = None  # the GL context that its textures are in; None: it has arrays
+    draws_in: object = None  # GL context of its textures; None: it returns arrays
 
     def __init__(self, options: Any, *, stack: Any, context: Any) -> None:
         """Construct a user-defined scene. Raises InputError if it cannot be shown.
 
-        options: an instance of `Options`; stack: the panels (`PanelStack`); context: moderngl's, current.
+        options: an instance of `Options`; stack: the panels (`PanelStack`); context: the current moderngl context.
         """
         self.info = ContentInfo(type(self).__name__, moving=True, background=None)
 
@@ -68,52 +68,51 @@ class ContentSource(ABC):
     def render(self, view: View, *, time_ns: int) -> U8:
         """Return the eye's picture in the view's raster: (height_px, width_px, 4) RGBA, row 0 at the top.
 
-        Colour is already composed over the background; alpha is the content's coverage: 0 only where nothing
-        but the background shows. The array is the source's own: it holds until the next `render` of the same
-        side, and the other side's call leaves it alone. `time_ns` is the run's clock, for content that moves.
-        Raises ContentFailure: the last picture stays.
+        Colour is already blended with the background. Alpha is the content's coverage, 0 only where nothing but the
+        background shows. The array belongs to the source and stays valid until the next `render` for the same side.
+        `time_ns` is the run's clock, for moving content. Raises ContentFailure, after which the last picture stays.
         """
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture | None:
-        """The picture in a texture, valid until the side's next; None: use `render`. Raises ContentFailure."""
+        """Return a texture, valid until the side's next picture; None: use `render`. Raises ContentFailure."""
         return None
 
     def nearness(self, view: View, *, every: int, first: tuple[int, int]) -> F32 | None:
-        """(h, w) 1/m: the inverse distance of the nearest point in each block of a view's picture.
+        """Return (h, w) inverse distances, 1/m, of the nearest points in blocks of the side's newest picture.
 
-        The distance is the view's third coordinate; the picture is the side's newest, of the same raster; 0: only the
-        background shows there. None: unknown, and content is aligned to a new eye as if on the middle panel. every:
-        pixels of a block, right and down; first: pixels, fewer than those, by which the first block is cut.
+        The distance is the view's third coordinate. A value of 0 means that only the background shows. None:
+        unknown, so content is aligned to new eyes as if it were on the middle panel. every: size of a block in
+        pixels; first: number of pixels (right, down), less than `every`, that are cut off the first block.
         """
         return None
 
     def expect(self, views: Sequence[View], *, time_ns: int) -> None:  # noqa: B027 - most have nothing to prepare
-        """Announce the two eyes' views that will be rendered next. Raises ContentFailure."""
+        """Prepare for the two eyes' views that will be rendered next. Raises ContentFailure."""
 
     @property
     def program(self) -> dict[str, Any] | None:
-        """`address` and recent `frame_ms` of a scene that another program draws, else None."""
+        """Return `address` and recent `frame_ms` of a scene that another program draws, otherwise None."""
         return None
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect | None:
-        """A box of the view's pixels outside which only the background shows; None: unknown."""
+        """Return a box of the view's pixels outside which only the background shows; None: unknown."""
         return None
 
     def revision(self, *, time_ns: int) -> int:
-        """A number that changes whenever `render` may draw the same view differently."""
+        """Return a number that changes whenever `render` may draw the same view differently."""
         return time_ns if self.info.moving else 0
 
     def describe(self, *, time_ns: int) -> dict[str, Any] | None:
-        """Entries of a playlist, the one that is shown and its remaining time; None for any other source."""
+        """Return a playlist's entries, the current one and its remaining time; None for other sources."""
         return None
 
     def skip(self, *, time_ns: int) -> bool:
-        """Go to the next one of a playlist; False: there is no other."""
+        """Go to a playlist's next entry; return False if there is no other."""
         return False
 
     @property
     def problem(self) -> str:
-        """The current fault while the last good picture stays, in one line; empty without one."""
+        """The current fault in one line, while the last good picture stays; empty without one."""
         return ""
 
     def close(self) -> None:  # noqa: B027 - most sources hold nothing
@@ -121,14 +120,14 @@ class ContentSource(ABC):
 
 
 class ForwardingSource(ContentSource):
-    """A source that shows another one."""
+    """A source that shows another source."""
 
-    source: ContentSource  # that is shown at present
-    _drew: tuple[ContentSource | None, ContentSource | None] = (None, None)  # each side's newest picture
+    source: ContentSource  # the source that is currently shown
+    _drew: tuple[ContentSource | None, ContentSource | None] = (None, None)  # source of each side's newest picture
 
     @abstractmethod
     def forwarded(self, view: View, time_ns: int) -> tuple[ContentSource, View, int]:
-        """The source, view and time that a request is forwarded to."""
+        """Return the source, view and time to which a request is forwarded."""
 
     @property
     def problem(self) -> str:
@@ -159,10 +158,10 @@ class ForwardingSource(ContentSource):
         return None if source is None else source.nearness(view, every=every, first=first)
 
     def _forwarded(self, view: View, time_ns: int) -> tuple[ContentSource, View, int]:
-        found = self.forwarded(view, time_ns)
+        forwarded = self.forwarded(view, time_ns)
         left, right = self._drew
-        self._drew = (left, found[0]) if view.side else (found[0], right)
-        return found
+        self._drew = (left, forwarded[0]) if view.side else (forwarded[0], right)
+        return forwarded
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect | None:
         source, view, time_ns = self.forwarded(view, time_ns)

@@ -1,4 +1,4 @@
-"""A view's 3x4 projection as a rasteriser's camera, and where boxes land in it: pure functions."""
+"""Pure functions that turn a view's 3x4 projection into a rasteriser's camera and project boxes."""
 
 from __future__ import annotations
 
@@ -9,16 +9,14 @@ from runtime.content.base import View
 from runtime.optics.rect import PixelRect
 from runtime.records import F64
 
-NEAREST_M = 1e-3  # before the eye: the near plane
+NEAREST_M = 1e-3  # distance of the near plane from the eye
 
 
 def clip_from_stack(view: View, corners_m: F64) -> F64:
-    """4x4 OpenGL clip matrix of a view, with near and far planes around (8n, 3) corners.
+    """Return a view's 4x4 OpenGL clip matrix, with near and far planes around (8n, 3) corners.
 
-    Row 0 of the raster is row 0 of what GL reads back.
-
-    GL's first row in memory is its lowest, so the raster's v runs along GL's +y and nothing need be flipped.
-    Raises ValueError if none of the corners is before the eye.
+    GL's first row in memory is its lowest. The raster's v therefore runs along GL's +y, so that row 0 of the raster is
+    row 0 of what GL reads back and nothing need be flipped. Raises ValueError if no corner is in front of the eye.
     """
     near_m, far_m = depth_bounds(view, corners_m)
     if not 0.0 < near_m < far_m:
@@ -30,20 +28,20 @@ def clip_from_stack(view: View, corners_m: F64) -> F64:
 
 
 def box_corners(low_m: ArrayLike, high_m: ArrayLike) -> F64:
-    """(8, 3) corners of an axis-aligned box."""
+    """Return the (8, 3) corners of an axis-aligned box."""
     bounds = np.array([low_m, high_m], dtype=np.float64)
     return np.array([[bounds[i, 0], bounds[j, 1], bounds[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 
 
 def project(pixels_from_stack: F64, points_m: F64) -> tuple[F64, F64]:
-    """(n, 2) pixels and (n,) depths in metres of (n, 3) `stack` points; behind the eye undefined."""
+    """Return (n, 2) pixels and (n,) depths in metres of (n, 3) `stack` points; undefined behind the eye."""
     homogeneous = points_m @ pixels_from_stack[:, :3].T + pixels_from_stack[:, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
         return homogeneous[:, :2] / homogeneous[:, 2:], homogeneous[:, 2]
 
 
 def covered_box(view: View, corners_m: F64, *, align_px: int = 32) -> PixelRect:
-    """The pixels that a convex hull of corners may cover, grown to `align_px`; empty behind the eye."""
+    """Return the pixels that a hull of corners may cover, in steps of `align_px`; empty behind the eye."""
     pixels, depths = project(view.pixels_from_stack, corners_m)
     if depth_bounds(view, corners_m)[1] <= 2 * NEAREST_M:
         return PixelRect(0, 0, 0, 0)
@@ -58,7 +56,7 @@ def covered_box(view: View, corners_m: F64, *, align_px: int = 32) -> PixelRect:
 
 
 def depth_bounds(view: View, corners_m: F64) -> tuple[float, float]:
-    """Near and far, metres, with a margin, that hold all of `corners_m` before the eye."""
+    """Return near and far distances, in metres, around all corners in front of the eye, with a margin."""
     depths = project(view.pixels_from_stack, corners_m)[1]
     far = float(depths.max()) * 1.001 + NEAREST_M
     return max(float(depths.min()) * 0.999 - NEAREST_M, min(NEAREST_M, far / 2)), far

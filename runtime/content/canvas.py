@@ -1,4 +1,4 @@
-"""Offscreen targets for sources, kept per size, with smoothed edges, RGBA8."""
+"""Offscreen RGBA8 framebuffers with smoothed edges, kept per size, for sources that draw with OpenGL."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ OVER = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl
 
 @dataclass(slots=True)
 class _Target:
-    smooth: Any  # framebuffer with several samples or half floats; None where neither is needed
-    plain: list[Any]  # one a side
-    pictures: list[U8]  # one (h, w, 4) array a side, reused
+    smooth: Any  # multisampled or half-float framebuffer; None if neither is needed
+    plain: list[Any]  # one per side
+    pictures: list[U8]  # (h, w, 4) arrays, one per side, reused
 
 
 class _Reducer:
-    """Reads depth back as its nearest value in blocks of pixels: a whole raster's floats would hold Python's lock."""
+    """Reduces depth to the nearest value per block; reading back all of it would hold Python's lock."""
 
     def __init__(self, context: Any) -> None:
         self._context = context
@@ -66,7 +66,10 @@ class _Reducer:
         at_near: float,
         at_far: float,
     ) -> F32:
-        """(rows, columns), `size` the other way round: at_near at depth 0 to at_far at 1; 0 where it is 1."""
+        """Return (rows, columns) values: at_near at depth 0, at_far at depth 1, 0 where nothing was drawn.
+
+        size: (columns, rows).
+        """
         if size not in self._targets:
             if len(self._targets) >= SIZES_KEPT:
                 self._drop(next(iter(self._targets)))
@@ -97,17 +100,17 @@ class _Reducer:
 
 
 class CanvasSource(ContentSource):
-    """A source that draws with OpenGL into a framebuffer per view size, read back on request.
+    """A source that draws with OpenGL into one framebuffer per view size, read back on request.
 
-    Only the box that the content may touch is cleared, drawn and resolved with several samples a pixel: on a
-    software rasteriser resolving is the most expensive step.
+    Only the box that the content may cover is cleared, drawn and resolved from its samples, because resolving is
+    the most expensive step on a software rasteriser.
     """
 
     def __init__(self, context: Any, *, info: ContentInfo, samples: int = 0, deep: bool = False) -> None:
-        """samples: a pixel; deep: draw in half floats, for sums of many layers, some brighter than white."""
+        """samples: per pixel; deep: draw in half floats, for sums of many layers, some brighter than white."""
         self.info, self.context = info, context
         self.draws_in = context
-        self.held: list[Any] = []  # GL objects that are released with it
+        self.held: list[Any] = []  # GL objects to release with the source
         self._deep = deep
         self._samples = min(samples, context.max_samples)
         self._clear_colour = (*(info.background or WHITE), 0.0)
@@ -122,7 +125,7 @@ class CanvasSource(ContentSource):
         return self.draw(view, time_ns=time_ns).pixels()
 
     def drawn(self, view: View, box: PixelRect, paint: Callable[[], None]) -> DrawnPicture:
-        """Clear, let `paint` draw inside `box`; the picture of the view's side, valid until its next one."""
+        """Clear `box`, let `paint` draw inside it, and return the picture, valid until the side's next one."""
         raise_if_abandoned()
         self._bounds[view.side] = None
         target = self._target(view.width_px, view.height_px)
@@ -155,7 +158,7 @@ class CanvasSource(ContentSource):
             self._reducer = _Reducer(self.context)
         size = -(-(view.width_px + first[0]) // every), -(-(view.height_px + first[1]) // every)
         depth = target.plain[view.side].depth_attachment
-        # Between the near and the far plane, depth is linear in the inverse of the distance.
+        # Between the near and the far plane, depth is linear in the inverse distance.
         return self._reducer.reduced(
             depth, size, every=every, first=first, at_near=1 / near_m, at_far=1 / far_m
         )  # fmt: skip
@@ -171,7 +174,7 @@ class CanvasSource(ContentSource):
 
     def _forget_oldest(self) -> None:
         target = self._targets.pop(next(iter(self._targets)))
-        # moderngl binds the last framebuffer again on later calls: a released one must not be current.
+        # moderngl binds the last framebuffer again in later calls, so a released one must not be current.
         self.context.detect_framebuffer(0).use()
         for framebuffer in (*target.plain, *([target.smooth] if target.smooth else [])):
             for attachment in (*framebuffer.color_attachments, framebuffer.depth_attachment):
@@ -196,5 +199,5 @@ class CanvasSource(ContentSource):
         return self._targets[size]
 
     def _framebuffer(self, size: tuple[int, int], colour: Any, *, samples: int = 0) -> Any:
-        # Depth in a texture: Mesa never frees a renderbuffer's where another context of the group releases it.
+        # Depth is a texture because Mesa never frees a renderbuffer's memory if a context that shares it releases it.
         return self.context.framebuffer([colour], self.context.depth_texture(size, samples=samples))

@@ -1,4 +1,4 @@
-"""Splats compressed as SPZ (versions 1 to 4) and SOG (version 2, as one file or a folder)."""
+"""Read splats compressed as SPZ (versions 1 to 4) or SOG (version 2, as one file or a folder)."""
 
 from __future__ import annotations
 
@@ -21,35 +21,35 @@ from runtime.support import untrusted_input
 from runtime.support.picture_header import decoded_picture
 from runtime.support.untrusted_input import LIMITS
 
-SPZ_HEADER = struct.Struct("<4sIIBBBBI12x")  # mark, version, count, degree, position bits, flags, streams, their table
-SPZ_SHORT = 16  # bytes of it before version 4
-SPZ_COLOUR = 0.15  # units of a flat harmonic in the range of a colour's byte
-SOG_PARTS = {"means": 2, "scales": 1, "quats": 1, "sh0": 1}  # number of pictures
-FIRST_TAG = 252  # in a turn's alpha, where the first number is the largest
-WIDE = 64  # palette entries in a row of `shN_centroids`
-MOST = max(COEFFICIENTS) // 3  # coefficients of a channel that are drawn: those of degree 4 are left out
+SPZ_HEADER = struct.Struct("<4sIIBBBBI12x")  # magic, version, count, degree, position bits, flags, streams, table
+SPZ_SHORT = 16  # bytes of the header before version 4
+SPZ_COLOUR = 0.15  # units of a flat harmonic over the range of a colour's byte
+SOG_PARTS = {"means": 2, "scales": 1, "quats": 1, "sh0": 1}  # number of pictures per property
+FIRST_TAG = 252  # lowest alpha of a rotation; the difference from it is the index of the largest component
+WIDE = 64  # palette entries per row of `shN_centroids`
+MOST = max(COEFFICIENTS) // 3  # coefficients per channel that are drawn; those of degree 4 are not
 U32 = NDArray[np.uint32]
 
 
 def is_sog_folder(folder: Path) -> bool:
-    """Return True if a folder holds the files of a SOG."""
+    """Return True if a folder contains the files of a SOG."""
     return (folder / "meta.json").is_file() and (folder / "means_l.webp").is_file()
 
 
 def load_compressed_splats(path: Path) -> Gaussians:
-    """Read an SPZ or SOG file, or a folder that holds SOG's pictures. Raises InputError."""
+    """Read an SPZ or SOG file, or a folder with SOG's pictures. Raises InputError."""
     try:
         with np.errstate(all="ignore"):
             return _spz(path) if path.suffix.lower() == ".spz" else _sog(path)
     except (InputError, ImportError, MemoryError):
         raise
-    except Exception:  # zlib, zipfile, zstandard and JSON of another shape raise their own
+    except Exception:  # zlib, zipfile, zstandard and malformed JSON raise various errors
         kind = "an SPZ" if path.suffix.lower() == ".spz" else "a SOG"
         raise InputError(path, "", f"is damaged, or not {kind} file") from None
 
 
 def _spz(path: Path) -> Gaussians:
-    """Read bytes of all splats' places, then of opacities, colours, scales, turns and harmonics."""
+    """Read all splats' positions, then their opacities, colours, scales, rotations and harmonics."""
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
     zipped = zlib.decompressobj(31) if data[:2] == b"\x1f\x8b" else None
     head = zipped.decompress(data, SPZ_SHORT) if zipped else data[: SPZ_HEADER.size]
@@ -80,7 +80,7 @@ def _spz(path: Path) -> Gaussians:
 
 
 def _zstd_blocks(data: bytes, table: int, sizes: list[int]) -> list[bytes]:
-    """The streams of version 4, each unpacked to at most its size. Those without a byte may be missing."""
+    """Return the streams of version 4, decompressed to at most their sizes. Empty streams may be missing."""
     import zstandard
 
     names = [size for size in sizes if size]
@@ -94,26 +94,29 @@ def _zstd_blocks(data: bytes, table: int, sizes: list[int]) -> list[bytes]:
 
 
 def _fixed(places: U8, bits: int) -> F32:
-    """(n, 3) of signed numbers of 24 bits, `bits` of them behind the point."""
+    """Return (n, 3) signed 24-bit fixed-point numbers with `bits` fractional bits."""
     low, middle, high = places.reshape(-1, 3, 3).astype(np.int32).transpose(2, 0, 1)
     return np.asarray(((high << 24 | middle << 16 | low << 8) >> 8) * 2.0**-bits, np.float32)
 
 
 def _three_bytes(turns: U8) -> F32:
-    """(n, 4) w, x, y, z of x, y and z."""
+    """Return (n, 4) quaternions w, x, y, z from bytes of x, y and z."""
     xyz = turns / np.float32(127.5) - 1
     return np.column_stack([np.sqrt(np.maximum(1 - (xyz**2).sum(1), 0)), xyz]).astype(np.float32)
 
 
 def _four_bytes(turns: U32) -> F32:
-    """(n, 4) w, x, y, z of words: the largest's number among x, y, z, w, and a sign and 9 bits of each other."""
+    """Return (n, 4) quaternions w, x, y, z from packed words.
+
+    A word contains the index (in x, y, z, w) of the largest component, then a sign and 9 bits of each other one.
+    """
     share = fields_of(turns, (1, 9, 1, 9, 1, 9))
     three = (1 - 2 * share[:, ::2]) * share[:, 1::2] * np.float32(np.sqrt(0.5))
     return np.roll(with_largest(three, turns >> 30), 1, axis=1)
 
 
 def _sog(path: Path) -> Gaussians:
-    """Read pictures with a pixel for each splat, whose bytes lie between bounds or name an entry of a codebook."""
+    """Read pictures with one pixel per splat; their bytes are values between bounds or codebook indices."""
     with _SogFiles(path) as files:
         meta = untrusted_input.parsed_json(files.read("meta.json"), source=path)
         if meta.get("version") != 2:
@@ -149,7 +152,7 @@ def _sog(path: Path) -> Gaussians:
 
 
 class _SogFiles:
-    """The files of a SOG: in a folder, or a ZIP."""
+    """The files of a SOG in a folder or a ZIP archive."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -173,13 +176,13 @@ class _SogFiles:
         return self._zip.read(name)
 
     def picture(self, name: str) -> U8:
-        """(h, w, 4) RGBA. Raises InputError."""
+        """Return a picture (h, w, 4) RGBA. Raises InputError."""
         image = decoded_picture(self.read(name), source=self._path, field=untrusted_input.shown(name), name="")
         return np.asarray(image.convert("RGBA"))
 
     def pixels(self, name: str, count: int) -> U8:
-        """(count, 4) RGBA of the first pixels. Raises InputError where there are fewer."""
-        found = self.picture(name).reshape(-1, 4)[:count]
-        if len(found) < count:
-            raise InputError(self._path, untrusted_input.shown(name), f"has {len(found)} of {count} pixels")
-        return found
+        """Return the first `count` pixels (count, 4) of an RGBA picture. Raises InputError if it has fewer."""
+        pixels = self.picture(name).reshape(-1, 4)[:count]
+        if len(pixels) < count:
+            raise InputError(self._path, untrusted_input.shown(name), f"has {len(pixels)} of {count} pixels")
+        return pixels

@@ -1,4 +1,4 @@
-"""A folder of the EyeReal data set: picture pairs that carry their eyes in their names."""
+"""A folder of the EyeReal data set: picture pairs whose names contain the positions of the eyes."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from runtime.support.picture_file import read_image
 
 NUMBER = r"(-?(?:\d+\.?\d*|\.\d+))"
 NAME = re.compile(rf"pair(\d+)_x{NUMBER}_y{NUMBER}_z{NUMBER}_([01]|left|right)\.(?:jpg|jpeg|png)$", re.IGNORECASE)
-KEPT = 4  # pairs in memory
+KEPT = 4  # pairs kept in memory
 
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """Two files of one pair, the viewer's left first."""
+    """The two files of a pair, the viewer's left one first."""
 
     number: int
     paths: tuple[Path, Path]
     eyes_m: F64  # (2, 3) left, right; frame `stack`
-    looks_at_m: F64  # (3,) the scene's origin, at which both look; the display may be before or behind it
+    looks_at_m: F64  # (3,) the scene's origin, at which both eyes look; it may be in front of or behind the display
 
     def image_from_stack(self, side: int, *, width_px: int, height_px: int, fov_deg: float) -> F64:
-        """(3, 4) the projection of one of its pictures."""
+        """Return the (3, 4) projection of one of its pictures."""
         around_origin = np.eye(4)
         around_origin[:3, 3] = -self.looks_at_m
         eye = self.eyes_m[side] - self.looks_at_m
@@ -42,18 +42,19 @@ class Pair:
 
 
 def is_data_set(folder: Path) -> bool:
-    """True if the folder contains pictures that follow the data set's naming scheme."""
+    """Return True if the folder contains pictures that follow the data set's naming scheme."""
     return folder.is_dir() and any(NAME.match(path.name) for path in folder.iterdir())
 
 
 def read_folder(folder: Path, preset: str) -> tuple[Pair, ...]:
-    """Every pair, by number. Raises InputError: no pair, half a pair, coordinates behind the display.
+    """Return all pairs, ordered by number.
 
-    Names hold the eyes in the scene's digital units. Which of `_0` and `_1` is left follows from their positions;
-    `_left` and `_right`, of the set's newer data, must agree with them. preset: the scene's name.
+    Raises InputError if there is no pair, half a pair, or an eye behind the display. File names contain the eyes in
+    the scene's digital units. Which of `_0` and `_1` is left follows from these positions. `_left` and `_right`,
+    used by newer data, must agree with them. preset: the scene's name.
     """
     stack_from_scene: F64 = np.linalg.inv(drawn_scene_from_stack(preset)).astype(np.float64)
-    found: dict[int, list[tuple[str, Path, F64]]] = {}
+    files: dict[int, list[tuple[str, Path, F64]]] = {}
     for path in sorted(folder.iterdir()):
         match = NAME.match(path.name)
         if not match:
@@ -62,11 +63,11 @@ def read_folder(folder: Path, preset: str) -> tuple[Pair, ...]:
         if eye[0] <= 0:
             problem = f"its eye is behind the display (x = {eye[0]:.3f} m) with preset {preset}"
             raise InputError(path, "name", problem)
-        found.setdefault(int(match[1]), []).append((match[5].lower(), path, eye))
-    if not found:
-        raise InputError(folder, "", "holds no pair0_x.._y.._z.._0.jpg")
+        files.setdefault(int(match[1]), []).append((match[5].lower(), path, eye))
+    if not files:
+        raise InputError(folder, "", "contains no pair0_x.._y.._z.._0.jpg")
     pairs = []
-    for number, halves in sorted(found.items()):
+    for number, halves in sorted(files.items()):
         names = [half for half, _, _ in halves]
         if sorted(names) not in (["0", "1"], ["left", "right"]):
             problem = f"has {', '.join(f'_{half}' for half in names)}; _0 and _1, or _left and _right are needed"
@@ -81,7 +82,7 @@ def read_folder(folder: Path, preset: str) -> tuple[Pair, ...]:
 
 
 def prepare(file: SceneFile) -> Callable[..., ContentSource]:
-    """Read a folder as the preset that was chosen, or that its name holds. Raises InputError."""
+    """Read a folder with the chosen preset, or with the preset in its name. Raises InputError."""
     path, settings = file.path, file.settings
     name = file.preset or next((name for name in preset_names() if name in path.resolve().name), "")
     if not name:
@@ -89,12 +90,12 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
     pairs = read_folder(path, name)
     background = settings.background or WHITE
     make = partial(EyeRealSource, pairs, fov_deg=settings.fov_deg, background=background, name=name)
-    make()  # refuses a picture that can't be read
+    make()  # refuses an unreadable picture now
     return make
 
 
 class EyeRealSource(ContentSource):
-    """The pair taken nearest to the viewer, warped to the view through the display's centre plane."""
+    """Shows the pair taken nearest to the viewer, warped to the view through the display's centre plane."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""View arrangement stated by a film: `st3d`, `sv3d` or spherical XML in MP4, StereoMode in Matroska."""
+"""Read a film's arrangement of views: `st3d`, `sv3d` or spherical XML in MP4, StereoMode in Matroska."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from typing import IO
 
 from runtime.support import untrusted_input
 
-MOVIE_BYTES, HEAD_BYTES = 32 << 20, 1 << 20  # read at most: of an MP4's `moov`; of a Matroska file, up to its clusters
-BOXES_MAX = 10_000  # at the top of an MP4
+MOVIE_BYTES, HEAD_BYTES = 32 << 20, 1 << 20  # most bytes read: of an MP4's `moov`, of a Matroska's head
+BOXES_MAX = 10_000  # most top-level boxes of an MP4
 ST3D = re.compile(rb"\0\0\0\x0dst3d.{4}([\1\2])", re.DOTALL)
-EQUI = re.compile(rb"\0\0\0\x1cequi.{12}(.{4})(.{4})", re.DOTALL)  # what is cut off left and right
+EQUI = re.compile(rb"\0\0\0\x1cequi.{12}(.{4})(.{4})", re.DOTALL)  # crop on the left and right
 XML_STEREO = re.compile(rb"GSpherical:StereoMode>\s*(left-right|top-bottom)")
 XML_AROUND = re.compile(rb"GSpherical:Spherical>\s*true")
-MULTIVIEW = b"vexu"  # of a film of headsets and phones
+MULTIVIEW = b"vexu"  # box in films from headsets and phones
 SEGMENT, TRACKS, TRACK, VIDEO, STEREO_MODE = 0x18538067, 0x1654AE6B, 0xAE, 0xE0, 0x53B8
 MODES = {1: "side-by-side", 3: "top-bottom", 10: "anaglyph", 11: "cross-eyed"}
 
 
 @dataclass(frozen=True, slots=True)
 class FilmHeader:
-    """Empty and 0 where the film states nothing."""
+    """The arrangement that a film states; fields that it does not state are empty or 0."""
 
-    layout: str = ""  # in the syntax of `content.layout`
+    layout: str = ""  # same syntax as `content.layout`
     span_deg: int = 0  # longitude covered by equirectangular views
-    left_out: str = ""  # stated, but not shown
+    left_out: str = ""  # stated, but not supported
 
 
 def film_header(path: Path) -> FilmHeader:
-    """The header of a film. Raises InputError if it cannot be read."""
+    """Return the header of a film. Raises InputError if it cannot be read."""
     with untrusted_input.open_regular(path) as file:
         if file.read(4) == b"\x1a\x45\xdf\xa3":
             return _matroska(file)
@@ -76,7 +76,7 @@ def _matroska(file: IO[bytes]) -> FilmHeader:
 
 
 def _elements(data: bytes, within: slice) -> Iterator[tuple[int, slice]]:
-    """Numbers and contents of the elements within another one, as far as they are there."""
+    """Yield the numbers and contents of the elements within another element, as far as they were read."""
     place, end = within.start, min(within.stop, len(data))
     while place < end:
         number_bytes = 9 - data[place].bit_length()

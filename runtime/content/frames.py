@@ -1,4 +1,4 @@
-"""Pictures in time: a still, an animation, a folder, a film; with the layout of each."""
+"""Sequences of pictures (a still, an animation, a folder, a film) with the layout of each."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ PICTURES = (
     ".png", ".jpg", ".jpeg", ".jfif", ".mpo", ".jps", ".pns", ".bmp", ".tif", ".tiff", ".webp", ".gif", ".apng",
     ".avif", ".heic", ".heif", ".hif", ".ppm", ".pgm", ".tga",
 )  # fmt: skip
-NOT_READ = (*RAW, ".jxl", ".exr", ".hdr", ".psd", ".svg", ".jp2", *VIDEOS)  # of a folder: skipped, and logged
+NOT_READ = (*RAW, ".jxl", ".exr", ".hdr", ".psd", ".svg", ".jp2", *VIDEOS)  # skipped and logged in a folder
 TOLD = 3  # skipped files of a folder that the log names
-TELL_EVERY = 64  # pictures between two reports of progress
-VIDEO_FRAMES_MAX = 1e8  # that a header may claim: five weeks at 30 a second
+TELL_EVERY = 64  # pictures between two progress reports
+VIDEO_FRAMES_MAX = 1e8  # most frames that a header may claim: five weeks at 30 per second
 VIDEO_PROPERTIES = (
     cv2.CAP_PROP_FRAME_COUNT,
     cv2.CAP_PROP_FPS,
@@ -44,15 +44,15 @@ VIDEO_PROPERTIES = (
 
 
 class Frames(ABC):
-    """Pictures in time. Constructors raise InputError; later failures are ContentFailure."""
+    """A sequence of pictures. Constructors raise InputError; later failures raise ContentFailure."""
 
     count: int
     rate_hz: float
-    layouts: Sequence[Layout]  # of each picture; of a single one, of all
+    layouts: Sequence[Layout]  # one per picture, or a single one for all
 
     @abstractmethod
     def frame(self, index: int) -> U8:
-        """(h, w, 3) RGB, with the views of its layout. Raises ContentFailure."""
+        """Return an (h, w, 3) RGB picture that contains the views of its layout. Raises ContentFailure."""
 
     def layout(self, index: int) -> Layout:
         return self.layouts[min(index, len(self.layouts) - 1)]
@@ -66,13 +66,13 @@ class Frames(ABC):
 
 
 class PictureFiles(Frames):
-    """One still picture, or a folder's in the order of their names.
+    """One still picture, or those of a folder in the order of their names.
 
-    Two views of one file are returned side by side.
+    A file that contains two views is returned with the views side by side.
     """
 
     def __init__(self, paths: Sequence[Path], settings: ContentSettings, *, folder: Path | None = None) -> None:
-        """folder: their folder, if any; its undecodable files are skipped and logged."""
+        """folder: the pictures' folder, if any; its undecodable files are skipped and logged."""
         self._background = settings.background or DARK
         self.layouts, self._paths, refused = [], [], []
         for number, path in enumerate(paths):
@@ -80,8 +80,8 @@ class PictureFiles(Frames):
                 progress.tell(f"{path.parent.name}: pictures", number, len(paths))
             try:
                 if folder is not None and path.suffix.lower() in VIDEOS:
-                    raise InputError(path, "", "is a film, which is shown by its own name")
-                header = header_of_file(path)  # by its header alone: a long sequence opens quickly
+                    raise InputError(path, "", "is a film: set content.scene to the film itself")
+                header = header_of_file(path)  # the header alone, so that a long sequence opens quickly
             except InputError as error:
                 refused.append(error)
                 continue
@@ -113,7 +113,7 @@ class PictureFiles(Frames):
 
 
 class Animation(Frames):
-    """An animated picture, decoded whole."""
+    """An animated picture, decoded as a whole."""
 
     def __init__(self, path: Path, settings: ContentSettings) -> None:
         self.layouts = [layout_of(path, settings)]
@@ -130,7 +130,7 @@ class Animation(Frames):
 
 
 class Video(Frames):
-    """A video file, read by OpenCV as it goes."""
+    """A video file, decoded by OpenCV while it plays."""
 
     def __init__(self, path: Path, layout: Layout) -> None:
         self._path, self.layouts = path, [layout]
@@ -162,8 +162,8 @@ class Video(Frames):
         done, bgr = self._capture.read()
         if not done:
             if self._next == 0:
-                raise InputError(self._path, "frames", "the first one cannot be decoded")
-            self.count = self._next  # containers count more frames than they hold
+                raise InputError(self._path, "frames", "the first frame cannot be decoded")
+            self.count = self._next  # containers may claim more frames than they contain
             raise ContentFailure(f"{self._path}: frame {index} cannot be decoded")
         self._next = index + 1
         self._last = np.ascontiguousarray(bgr[..., ::-1], np.uint8)
@@ -177,7 +177,7 @@ class Video(Frames):
 
 
 def layout_in(header: Header, path: Path, settings: ContentSettings, folder: Path | None = None) -> Layout:
-    """Return a picture's layout: from the file if it holds two views, else from its or its folder's name."""
+    """Return a picture's layout, from the file if it contains two views, otherwise from the names."""
     layout = layout_of(path, settings, stated=header.layout)
     if header.is_around:
         layout = replace(layout, span_deg=360)
@@ -189,7 +189,7 @@ def layout_in(header: Header, path: Path, settings: ContentSettings, folder: Pat
 
 
 def open_frames(path: Path, settings: ContentSettings) -> Frames:
-    """A picture, an animation, a video, or a folder of pictures. Raises InputError."""
+    """Open a picture, an animation, a video or a folder of pictures. Raises InputError."""
     if not path.is_dir():
         if path.suffix.lower() in VIDEOS:
             return _open_film(path, settings)
@@ -201,11 +201,11 @@ def open_frames(path: Path, settings: ContentSettings) -> Frames:
 
 
 def _suggest(path: Path, picture: U8) -> None:
-    """Log the layout that a picture shown flat may have."""
+    """Log a hint if a picture that is shown flat probably has several views."""
     if "quilt" in path.stem.lower():
-        log.warning("%s: a quilt? then --layout qs8x6a0.75: columns, rows, and width over height of a view", path)
+        log.warning("%s: if it is a quilt, pass --layout qs8x6a0.75 (columns, rows, aspect ratio of a view)", path)
     elif found := hint(picture):
-        log.warning("%s: its halves nearly agree: two views? then --layout %s (content.layout)", path, found)
+        log.warning("%s: its halves nearly agree; if they are two views, pass --layout %s", path, found)
 
 
 def _open_film(path: Path, settings: ContentSettings) -> Video:
@@ -221,20 +221,20 @@ def _open_film(path: Path, settings: ContentSettings) -> Video:
 
 
 def _why_none(folder: Path) -> str:
-    """Describe a folder without pictures, for an error message."""
+    """Return an error message for a folder without pictures."""
     if problem := camera_set_in(folder):
         return problem
-    told = "the folder holds no pictures"
+    message = "the folder holds no pictures"
     for inner in sorted(item for item in folder.iterdir() if item.is_dir()):
         if any(item.suffix.lower() in PICTURES for item in inner.iterdir()):
-            return f"{told}; those in {inner.name} are shown by its own name"
-    return told
+            return f"{message}; those in {inner.name} are shown by its own name"
+    return message
 
 
 def read_pair(path: Path, settings: ContentSettings) -> list[U8]:
-    """The left and the right eye's view of one file, of square pixels, over white.
+    """Return the left and right eye's views from one file, with square pixels, over white.
 
-    Raises InputError if it holds one, or a quilt's many.
+    Raises InputError if the file contains a single view or a quilt.
     """
     views = read_views(path)
     if len(views) == 2:

@@ -1,7 +1,7 @@
-"""Smooth outlines without multisampling: a ramp one pixel wide outside each silhouette edge.
+"""Smooth outlines without multisampling, by a ramp one pixel wide outside each silhouette edge.
 
-A software rasteriser pays four times for four samples; outlines are a few hundred edges. The object grows by
-half a pixel on average.
+Four samples per pixel take a software rasteriser four times as long, while outlines are a few hundred edges. The ramps
+enlarge the object by half a pixel on average.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ CORNER_ENDS = (0, 0, 1, 1, 0, 1)
 
 @dataclass(frozen=True, slots=True)
 class Edges:
-    """Every edge of a triangle mesh with the one or two faces that meet there."""
+    """All edges of a triangle mesh, each with its one or two faces."""
 
-    faces: I32  # (e, 2) faces; the second is -1 on a border
-    ends: I32  # (e, 2, 2) per face: the vertices of the edge, in one order for both
-    apex: I32  # (e, 2) per face: its third vertex
-    normals: F64  # (t, 3) of faces, not normalised
-    heights: F64  # (t,) of faces' planes along their normals: an eye whose product with the normal is larger sees them
-    border: NDArray[np.bool_]  # (e,) edges of one face
+    faces: I32  # (e, 2) faces; the second is -1 at a border
+    ends: I32  # (e, 2, 2) the edge's vertices for each face, in the same order for both
+    apex: I32  # (e, 2) third vertex of each face
+    normals: F64  # (t, 3) normals of the faces, not normalised
+    heights: F64  # (t,) plane offsets: a face is visible to eyes whose product with its normal is larger
+    border: NDArray[np.bool_]  # (e,) True for edges with one face
 
 
 def edges_of(shape: Shape) -> Edges:
-    """The edges of a shape. Vertices at the same place count as one, with any normals and textures."""
+    """Return the edges of a shape. Vertices at the same position count as one."""
     positions = shape.positions_m.astype(np.float64)
     extent = max(float(np.ptp(positions, axis=0).max()), 1e-9)
     welded = np.unique(np.rint(positions / extent * 1e6).astype(np.int64), axis=0, return_inverse=True)[1].reshape(-1)
@@ -44,7 +44,7 @@ def edges_of(shape: Shape) -> Edges:
     vertices[swapped] = vertices[swapped][:, ::-1]
     key = welded[vertices[:, 0]] * (int(welded.max()) + 1) + welded[vertices[:, 1]]
     places = np.sort(welded[triangles], axis=1)
-    real = np.tile((np.diff(places, axis=1) > 0).all(1), 3)  # a sphere's poles have triangles without area
+    real = np.tile((np.diff(places, axis=1) > 0).all(1), 3)  # the poles of a sphere have triangles without area
     order = np.flatnonzero(real)[np.argsort(key[real], kind="stable")]
     first = np.flatnonzero(np.r_[True, np.diff(key[order]) != 0]) if order.size else np.empty(0, np.int64)
     second = np.minimum(first + 1, max(order.size - 1, 0))
@@ -65,10 +65,10 @@ def edges_of(shape: Shape) -> Edges:
 
 
 class Outlines:
-    """Edges of several parts, searched together for the outlines that an eye sees."""
+    """Edges of several parts, from which the outlines that an eye sees are selected together."""
 
     def __init__(self, each: Sequence[Edges], *, vertices: Sequence[int]) -> None:
-        """each: the parts' edges; vertices: how many each part has. Results count vertices over all parts."""
+        """each: the parts' edges; vertices: their numbers of vertices. Results count over all parts."""
         faces_before = np.cumsum([0, *(len(edges.normals) for edges in each)])
         self.vertices_before = np.cumsum([0, *vertices])
         self._faces = list(pairwise(faces_before.tolist()))
@@ -83,10 +83,10 @@ class Outlines:
         self._part = np.repeat(np.arange(len(each)), [len(edges.faces) for edges in each])
 
     def seen(self, eyes: Sequence[F64 | None]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return (k, 3) vertices of the edges on the outlines, and (k,) their parts.
+        """Return (k, 3) vertices of the edges on the outlines, and (k,) the parts to which they belong.
 
-        The vertices are both ends and the apex of the visible face. eyes: (3,) in each part's own frame; None leaves
-        the part out. Normals must point outwards.
+        The vertices are both ends and the apex of the visible face. eyes: (3,) in each part's own frame; None
+        excludes the part. Normals must point outwards.
         """
         edges = self._edges
         facing = np.zeros(len(edges.normals), bool)
@@ -101,11 +101,11 @@ class Outlines:
 
 
 def ramps(points: F64, *, width_px: int, height_px: int, ramp_px: float = 1.0) -> tuple[F32, NDArray[np.intp]]:
-    """Two triangles along each outline edge: coverage 1 at the edge, 0 `ramp_px` pixels outside.
+    """Return two triangles along each outline edge, with coverage 1 at the edge and 0 `ramp_px` outside.
 
-    points: (k, 3, 4) clip coordinates of edges' ends and apexes.
-    Returns (m, 6, 5) clip coordinates and coverage of the edges that lie wholly before the eye and are long enough to
-    have a direction, and which of the k they are; the corners have the colours of the ends in `CORNER_ENDS`.
+    points: (k, 3, 4) clip coordinates of the edges' ends and apexes. Returns (m, 6, 5) clip coordinates and
+    coverage, and the indices among the k edges. Edges partly behind the eye, or too short to have a direction, are
+    left out. The corners have the colours of the ends in `CORNER_ENDS`.
     """
     scale = np.array([width_px / 2, height_px / 2])
     kept = np.flatnonzero((points[..., 3] > 1e-6).all(1))

@@ -1,4 +1,4 @@
-"""3D Gaussian splats (Kerbl et al. 2023) as arrays: read from a .ply, projected, coloured."""
+"""3D Gaussian splats (Kerbl et al. 2023) as arrays: reading from .ply, projection and colours."""
 
 from __future__ import annotations
 
@@ -21,42 +21,42 @@ from runtime.records import F32, F64
 
 log = logging.getLogger("phasestack.content")
 
-LOW_PASS_PX2 = 0.3  # added to each splat's covariance: none falls between the pixels
-ALPHA_MIN = 1 / 255  # of a splat at a pixel: less changes no code value
-LARGEST_COORDINATE = 1e15  # products of two or three still fit in float32's range
-LARGEST_RELATIVE_SCALE = 100.0  # of a splat, in units of the scene's extent
-STRAY = 1.0  # percent of the splats at either end of an axis that do not decide the scale
-FAINT = 0.1  # opacity of a splat that decides nothing
-REACH = 2.0  # standard deviations of a splat that are to be seen
-AT_ONCE = 1 << 17  # splats that are worked on, and drawn, together: bounds the memory
-SAMPLED = 10_000  # points whose neighbours are looked for
-DOTS, MOST_DOTS = 500, 200_000  # of a line, and of all lines together
+LOW_PASS_PX2 = 0.3  # added to each splat's covariance, so that no splat falls between pixels
+ALPHA_MIN = 1 / 255  # least alpha of a splat at a pixel; less changes no code value
+LARGEST_COORDINATE = 1e15  # products of two or three such coordinates still fit in float32
+LARGEST_RELATIVE_SCALE = 100.0  # largest scale of a splat, in units of the scene's extent
+STRAY = 1.0  # percentage of the splats at each end of an axis that the scale ignores
+FAINT = 0.1  # splats of less opacity are ignored for scale and bounds
+REACH = 2.0  # standard deviations of a splat that must be visible
+AT_ONCE = 1 << 17  # splats processed and drawn together, which bounds the memory
+SAMPLED = 10_000  # points whose neighbours are searched
+DOTS, MOST_DOTS = 500, 200_000  # most dots of a line, and of all lines together
 FINEST_POINT, LARGEST_POINT = 5e-4, 0.01  # standard deviation of a point, in units of the scene's extent
-FLAT_HARMONIC = 0.28209479177387814  # of degree 0
-COEFFICIENTS = (0, 9, 24, 45)  # f_rest properties: of harmonics to degree 0, 1, 2, 3
-SOLID = 0.3  # alpha from which a splat counts as a surface: two such hide half
-SQUARE = 0.89  # half the side of a square with a disc's area, in units of the disc's radius
+FLAT_HARMONIC = 0.28209479177387814  # harmonic of degree 0
+COEFFICIENTS = (0, 9, 24, 45)  # number of f_rest properties for harmonics up to degree 0, 1, 2, 3
+SOLID = 0.3  # alpha from which a splat counts as a surface; two such splats hide half of the background
+SQUARE = 0.89  # half the side of a square with the area of a disc of radius 1
 LARGEST_STEP = 7  # half sides of squares in blocks: 0, 1, 2, 4 to 64
-PACKED = [0, 1, 2, 4, 5, 8]  # of a 3x3 matrix, row by row
+PACKED = [0, 1, 2, 4, 5, 8]  # elements of a 3x3 matrix, row by row
 
 I64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
 class Gaussians:
-    """A scene of n splats in one frame."""
+    """A scene of n splats in a common frame."""
 
     centres: F32  # (n, 3)
     covariances: F32  # (n, 6): xx, xy, xz, yy, yz, zz
     opacities: F32  # (n,) in [0, 1]
-    harmonics: F32  # (n, k, 3), k = 1, 4, 9 or 16; directions in the file's own frame
+    harmonics: F32  # (n, k, 3), k = 1, 4, 9 or 16; directions in the file's frame
 
 
 @dataclass(frozen=True, slots=True)
 class Splats:
-    """Their projections for one eye: ellipses in pixels, farthest first."""
+    """Projections of splats for one eye: ellipses in pixels, farthest first."""
 
-    index: I64  # (m,) which gaussian
+    index: I64  # (m,) indices of the gaussians
     centres_px: F32  # (m, 2)
     major_px: F32  # (m, 2) one standard deviation along the longer axis
     minor_px: F32  # (m, 2)
@@ -66,20 +66,20 @@ class Splats:
 
 
 def load_gaussians(header: PlyHeader) -> Gaussians:
-    """The splats of a file as the reference implementation writes it, without unusable ones.
+    """Return the usable splats of a file in the reference implementation's format.
 
-    Raises InputError: a property missing, none that can be drawn.
+    Raises InputError if a property is missing or no splat can be drawn.
     """
     path, table = header.path, read_elements(header)["vertex"]
     if not len(table):
-        raise InputError(path, "vertex", "there are none")
+        raise InputError(path, "vertex", "the file has none")
     names = set(table.dtype.names or ())
     rest = sum(name.startswith("f_rest_") for name in names)
     if rest not in COEFFICIENTS:
         raise InputError(path, "f_rest", f"{rest} properties; 0, 9, 24 or 45 are needed")
 
     def columns(*wanted: str) -> F32:
-        """(n, len(wanted)) numbers."""
+        """Return an (n, len(wanted)) array of these properties."""
         if missing := [name for name in wanted if name not in names]:
             raise InputError(path, missing[0], "the property is missing: not a 3D Gaussian splat file")
         with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite
@@ -101,9 +101,9 @@ def load_gaussians(header: PlyHeader) -> Gaussians:
 
 
 def drawable(path: Path, *, centres: F32, log_scales: F32, quaternions: F32, logits: F32, harmonics: F32) -> Gaussians:
-    """The splats that can be drawn: not those without numbers or turn, or far larger than the scene.
+    """Return the splats that can be drawn: finite, with a rotation, and not much larger than the scene.
 
-    quaternions: (n, 4) w, x, y, z of any length; logits: (n,) of opacities. Raises InputError if none is left.
+    quaternions: (n, 4) w, x, y, z of any length; logits: (n,) of the opacities. Raises InputError if none is left.
     """
     with np.errstate(invalid="ignore"):  # NaN compares as false
         usable = (np.abs(centres) < LARGEST_COORDINATE).all(1) & (quaternions != 0).any(1) & ~np.isnan(logits)
@@ -111,7 +111,7 @@ def drawable(path: Path, *, centres: F32, log_scales: F32, quaternions: F32, log
             usable &= np.isfinite(values).all(1)
         some = centres[usable]
         extent = _extent(some) if len(some) else 0.0
-        # Minus infinity is a disc, as trainers write it.
+        # Trainers write minus infinity for the thickness of a disc.
         usable &= (log_scales < np.log(LARGEST_RELATIVE_SCALE * (extent or 1.0))).all(1)
     if not usable.all():
         log.warning("%s: is drawn without %d of its %d splats, which are unusable", path, (~usable).sum(), len(usable))
@@ -124,26 +124,26 @@ def drawable(path: Path, *, centres: F32, log_scales: F32, quaternions: F32, log
 
 
 def _extent(places: F32) -> float:
-    """The longest side of the box around 98 percent of the places along each axis."""
+    """Return the longest side of the box around the middle 98 percent of the positions along each axis."""
     return float(np.ptp(np.percentile(places, [1, 99], axis=0), axis=0).max())
 
 
 def flat_harmonics(colours: F32) -> F32:
-    """(n, 1, 3) harmonics of degree 0 that show (n, 3) colours from everywhere."""
+    """Return (n, 1, 3) harmonics of degree 0 that show (n, 3) colours from all directions."""
     return np.asarray((colours - np.float32(0.5)) / np.float32(FLAT_HARMONIC), np.float32)[:, None]
 
 
 def with_higher(flat: F32, higher: NDArray[Any], *, zero: float = 0.0, unit: float = 1.0) -> F32:
-    """(n, k, 3) harmonics: flat (n, 1, 3) and (higher - zero) * unit (n, k - 1, 3), in little memory."""
-    found = np.empty((len(flat), 1 + higher.shape[1], 3), np.float32)
-    found[:, :1], found[:, 1:] = flat, higher
-    found[:, 1:] -= np.float32(zero)
-    found[:, 1:] *= np.float32(unit)
-    return found
+    """Join harmonics to (n, k, 3): flat (n, 1, 3) and (higher - zero) * unit (n, k - 1, 3)."""
+    harmonics = np.empty((len(flat), 1 + higher.shape[1], 3), np.float32)
+    harmonics[:, :1], harmonics[:, 1:] = flat, higher
+    harmonics[:, 1:] -= np.float32(zero)
+    harmonics[:, 1:] *= np.float32(unit)
+    return harmonics
 
 
 def dotted(ends: F32, colours: F32) -> tuple[F32, F32]:
-    """Lines (n, 2, 3) as points (m, 3) along them; colours of ends (n, 2, 3) interpolated."""
+    """Convert lines (n, 2, 3) to points (m, 3), interpolating the colours (n, 2, 3) of their ends."""
     lengths = np.nan_to_num(np.linalg.norm(np.diff(ends.astype(np.float64), axis=1)[:, 0], axis=1))
     share = np.minimum(lengths / max(float(lengths.sum()), 1e-30), 1.0)
     counts = 2 + (share * min(DOTS * len(ends), MOST_DOTS)).astype(np.int64)
@@ -155,9 +155,9 @@ def dotted(ends: F32, colours: F32) -> tuple[F32, F32]:
 
 
 def of_points(places: F32, colours: F32) -> Gaussians:
-    """Points as small round splats, about the size of their spacing.
+    """Return points as small round splats, about as large as the spacing of the points.
 
-    colours: (n, 3), 0-1; NaN: by position, since a single colour would show only an outline.
+    colours: (n, 3), 0-1. NaN: colour by position, because a single colour would show only an outline.
     """
     low, high = np.percentile(places, [1, 99], axis=0)
     by_place = 0.25 + 0.7 * np.clip((places - low) / np.maximum(high - low, 1e-30), 0, 1)
@@ -173,7 +173,7 @@ def of_points(places: F32, colours: F32) -> Gaussians:
 
 
 def bounds(gaussians: Gaussians) -> tuple[F64, F64]:
-    """(3,) corners of a box around the visible splats, to two standard deviations, without outliers."""
+    """Return the corners (3,) of a box around visible splats, to two sigma, without outliers."""
     seen = gaussians.opacities > FAINT
     seen = seen if seen.any() else np.ones_like(seen)
     centres = gaussians.centres[seen].astype(np.float64)
@@ -184,7 +184,7 @@ def bounds(gaussians: Gaussians) -> tuple[F64, F64]:
 
 
 def covariances_of(scales: F32, quaternions: F32) -> F32:
-    """(n, 6) R diag(s²) R^T of (n, 3) standard deviations and (n, 4) quaternions w, x, y, z."""
+    """Return (n, 6) R diag(s²) R^T from (n, 3) standard deviations and (n, 4) quaternions w, x, y, z."""
     packed = np.empty((len(scales), 6), np.float32)
     for first in range(0, len(scales), AT_ONCE):
         rows = slice(first, first + AT_ONCE)
@@ -195,7 +195,7 @@ def covariances_of(scales: F32, quaternions: F32) -> F32:
 
 
 def moved(gaussians: Gaussians, target_from_source: F64) -> Gaussians:
-    """The splats in another frame (4x4 similarity); harmonics stay in the file's directions."""
+    """Move splats to another frame by a 4x4 similarity; harmonics keep the file's directions."""
     linear = target_from_source[:3, :3]
     centres = gaussians.centres @ linear.T + target_from_source[:3, 3]
     packed = np.empty_like(gaussians.covariances)
@@ -207,10 +207,10 @@ def moved(gaussians: Gaussians, target_from_source: F64) -> Gaussians:
 
 
 def seen_splats(gaussians: Gaussians, view: View, *, nearest_m: float = 1e-3) -> Splats:
-    """Visible splats, sorted, projected to first order about each centre (EWA, Zwicker et al. 2001).
+    """Return visible splats, sorted and projected to first order (EWA, Zwicker et al. 2001).
 
-    A 3x4 projection of any kind will do: the Jacobian is (P_i - u_i P_3)/w, so a panel's own pixels are as good
-    as an eye's image.
+    Any 3x4 projection will do, because the Jacobian is (P_i - u_i P_3)/w: a panel's pixels are as good as an eye's
+    image.
     """
     projection = view.pixels_from_stack.astype(np.float32)
     homogeneous = gaussians.centres @ projection[:, :3].T + projection[:, 3]
@@ -236,7 +236,7 @@ def seen_splats(gaussians: Gaussians, view: View, *, nearest_m: float = 1e-3) ->
     keep = np.flatnonzero(inside)
     keep = keep[np.argsort(-w[shown[keep]], kind="stable")]
     a, b, c = a[keep], b[keep], c[keep]
-    # Eigenvectors of [[a, b], [b, c]] by the half-angle, which is exact where b = 0 too.
+    # The half-angle gives the eigenvectors of [[a, b], [b, c]], and is exact for b = 0.
     mean, swing = (a + c) / 2, np.hypot((a - c) / 2, b)
     angle = np.arctan2(b, (a - c) / 2) / 2
     cosine, sine = np.cos(angle), np.sin(angle)
@@ -253,9 +253,9 @@ def seen_splats(gaussians: Gaussians, view: View, *, nearest_m: float = 1e-3) ->
 
 
 def nearest_blocks(splats: Splats, view: View, *, every: int, first: tuple[int, int]) -> F32:
-    """(h, w) 1/m as of `ContentSource.nearness`: of the nearest splat whose alpha there is over `SOLID`.
+    """Return `ContentSource.nearness`, (h, w) in 1/m, of the nearest splat with alpha over `SOLID`.
 
-    Each is taken as a square of that area, or up to half as wide, at its centre's distance.
+    Each splat is treated as a square with its area, or as little as half as wide, at the distance of its centre.
     """
     shape = -(-(view.height_px + first[1]) // every), -(-(view.width_px + first[0]) // every)
     solid = np.flatnonzero(splats.opacities > SOLID)  # farthest first
@@ -263,20 +263,20 @@ def nearest_blocks(splats: Splats, view: View, *, every: int, first: tuple[int, 
     half_px = SQUARE * np.sqrt(abs(a * d - b * c) * 2 * np.log(splats.opacities[solid] / np.float32(SOLID)))
     step = np.clip(np.log2(half_px / np.float32(every)) + 1, 0, LARGEST_STEP).astype(np.int8)
     column, row = np.floor((splats.centres_px[solid] + np.array(first, np.float32)).T / np.float32(every))
-    found = np.zeros(shape, np.float32)
+    nearness = np.zeros(shape, np.float32)
     for number in np.flatnonzero(np.bincount(step)):
         some, reach = np.flatnonzero(step == number), (1 << number) >> 1
         u, v = np.clip(column[some], 0, shape[1] - 1), np.clip(row[some], 0, shape[0] - 1)
         near = (abs(u - column[some]) <= reach) & (abs(v - row[some]) <= reach)
         u, v, some = u[near].astype(np.intp), v[near].astype(np.intp), some[near]
         layer = np.zeros(shape, np.float32)
-        layer[v, u] = splats.nearness[solid[some]]  # of several at a place the last, the nearest
-        np.maximum(found, cv2.dilate(layer, np.ones((2 * reach + 1,) * 2, np.uint8)), out=found)
-    return found
+        layer[v, u] = splats.nearness[solid[some]]  # the last of several splats in a block is the nearest
+        np.maximum(nearness, cv2.dilate(layer, np.ones((2 * reach + 1,) * 2, np.uint8)), out=nearness)
+    return nearness
 
 
 def harmonic_basis(directions: F32, count: int) -> F32:
-    """(n, count) real spherical harmonics, order and signs as in the reference implementation."""
+    """Return (n, count) real spherical harmonics, in the reference implementation's order and signs."""
     x, y, z = directions.T
     basis = [np.full_like(x, FLAT_HARMONIC)]
     if count > 1:
@@ -301,7 +301,7 @@ def harmonic_basis(directions: F32, count: int) -> F32:
 
 
 def colours_towards(harmonics: F32, directions: F32) -> F32:
-    """(n, 3) colours >= 0 of (n, k, 3) coefficients along (n, 3) unit directions from the eye."""
+    """Return (n, 3) colours >= 0 of coefficients (n, k, 3) along unit directions (n, 3) from the eye."""
     if harmonics.shape[1] == 1:
         return np.asarray(np.maximum(harmonics[:, 0] * np.float32(FLAT_HARMONIC) + np.float32(0.5), 0))
     basis = harmonic_basis(directions, harmonics.shape[1])

@@ -1,4 +1,4 @@
-"""The scene of a glTF 2.0 file as parts to draw: nodes, primitives and materials, at rest."""
+"""Convert a glTF 2.0 file's scene to parts to draw: its nodes, primitives and materials at rest."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from runtime.records import F32, F64
 from runtime.support import progress, untrusted_input
 from runtime.support.untrusted_input import LIMITS
 
-POINTS, LINES, LOOP, LINE_STRIP, TRIANGLES, STRIP, FAN = range(7)  # of primitives' modes
+POINTS, LINES, LOOP, LINE_STRIP, TRIANGLES, STRIP, FAN = range(7)  # modes of primitives
 WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 NEAREST = 9728
-PLACES = {"TRANSLATION": "translation", "ROTATION": "rotation", "SCALE": "scale"}  # of instances
-OWN_PROBLEMS = ("an accessor", "bufferViews[", "a primitive", "a data URI")  # how errors raised here begin
+PLACES = {"TRANSLATION": "translation", "ROTATION": "rotation", "SCALE": "scale"}  # attributes of instances
+OWN_PROBLEMS = ("an accessor", "bufferViews[", "a primitive", "a data URI")  # how our own messages begin
 DRACO = "KHR_draco_mesh_compression"
 INSTANCES = "EXT_mesh_gpu_instancing"
 GLOSSY = "KHR_materials_pbrSpecularGlossiness"
@@ -32,7 +32,7 @@ DRAWN = {
     "KHR_mesh_quantization", "EXT_texture_webp", "EXT_texture_avif", INSTANCES,
 }  # fmt: skip
 UNSEEN = {"KHR_materials_ior", "KHR_materials_specular", "KHR_materials_variants", "KHR_xmp_json_ld"}
-# A file that requires these is drawn without them.
+# A file that requires one of these is drawn without it.
 WITHOUT = UNSEEN | {
     "KHR_lights_punctual", "KHR_materials_clearcoat", "KHR_materials_sheen", "KHR_materials_transmission",
     "KHR_materials_volume", "KHR_materials_anisotropy", "KHR_materials_iridescence", "KHR_materials_dispersion",
@@ -41,13 +41,13 @@ WITHOUT = UNSEEN | {
 
 
 class GltfScene:
-    """The parts of a file's scene, and what of it is not drawn."""
+    """The parts of a file's scene, and descriptions of what is not drawn."""
 
     def __init__(self, path: Path, data: bytes, read: Read) -> None:
-        """Raises InputError: no glTF 2.0, damaged, over a limit, an extension that it requires is not read."""
+        """Raises InputError if the file is not glTF 2.0, is damaged or over a limit, or needs an extension."""
         self.path = path
         self.parts: list[Part] = []
-        self.points: list[tuple[F32, F32]] = []  # (n, 3) places and (n, 3) colours, codes of 0-1
+        self.points: list[tuple[F32, F32]] = []  # (n, 3) positions and (n, 3) sRGB colours, 0-1
         self.left_out: set[str] = set()
         try:
             self.file = GltfFile(path, data, read)
@@ -60,9 +60,9 @@ class GltfScene:
         file, path = self.file, self.path
         for name in file.table.get("extensionsRequired", []):
             if name in COMPRESSED and name != DRACO:
-                raise InputError(path, "extensionsRequired", f"{name}: {COMPRESSED[name]} is not read; {WAY_OUT}")
+                raise InputError(path, "extensionsRequired", f"{name}: {COMPRESSED[name]} is not supported; {WAY_OUT}")
             if name not in DRAWN | WITHOUT:
-                raise InputError(path, "extensionsRequired", f"{untrusted_input.shown(name)} is not understood")
+                raise InputError(path, "extensionsRequired", f"{untrusted_input.shown(name)} is not supported")
         meshes = [node["mesh"] for node in file.all("nodes") if "mesh" in node for _ in range(self._instances(node))]
         untrusted_input.within(len(meshes), LIMITS.instances, source=path, field="nodes")
         triangles = [sum(map(self._triangles, mesh["primitives"])) for mesh in file.all("meshes")]
@@ -75,18 +75,18 @@ class GltfScene:
         return corners // 3 if primitive.get("mode", TRIANGLES) <= TRIANGLES else corners
 
     def _instances(self, node: Table) -> int:
-        """The number of instances of a node's mesh (EXT_mesh_gpu_instancing)."""
+        """Return the number of instances of a node's mesh (EXT_mesh_gpu_instancing)."""
         own = node.get("extensions", {}).get(INSTANCES, {}).get("attributes", {})
         return min((self.file.count(index) for name, index in own.items() if name in PLACES), default=1)
 
     def _instanced(self, node: Table, matrix: F64) -> list[F64]:
-        """4x4 scene_from_mesh of each instance."""
+        """Return each instance's 4x4 scene_from_mesh."""
         own = node.get("extensions", {}).get(INSTANCES, {}).get("attributes", {})
         read = {PLACES[name]: self.file.accessor(index) for name, index in own.items() if name in PLACES}
         return [matrix @ _local({name: rows[k] for name, rows in read.items()}) for k in range(self._instances(node))]
 
     def _textures(self) -> Iterator[Table]:
-        """The texture references of materials that are drawn: not normal maps and the like."""
+        """Yield the texture references of the drawn material properties, so not of normal maps, for example."""
         for material in self.file.all("materials"):
             glossy = material.get("extensions", {}).get(GLOSSY, {})
             base = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
@@ -107,26 +107,26 @@ class GltfScene:
         self.left_out |= {str(name) for name in file.table.get("extensionsUsed", [])} - DRAWN - UNSEEN - {*COMPRESSED}
 
     def _world(self) -> dict[int, tuple[Table, F64]]:
-        """The nodes of the scene, by number, and 4x4 scene_from_node. Raises InputError: nested too deep."""
+        """Return nodes and 4x4 scene_from_node by number. Raises InputError if nested too deep."""
         nodes, scenes = self.file.all("nodes"), self.file.all("scenes")
         children = {child for node in nodes for child in node.get("children", [])}
         roots = [number for number in range(len(nodes)) if number not in children]
         if scenes:
             roots = self.file.item("scenes", self.file.table.get("scene", 0)).get("nodes", [])
-        found: dict[int, tuple[Table, F64]] = {}
+        placed_nodes: dict[int, tuple[Table, F64]] = {}
         queue = [(root, np.eye(4), 1) for root in reversed(roots)]
         while queue:
             number, parent, depth = queue.pop()
             if depth > LIMITS.depth:
                 raise InputError(self.path, "nodes", f"are nested deeper than {LIMITS.depth}")
-            if number not in found:
+            if number not in placed_nodes:
                 node = self.file.item("nodes", number)
-                found[number] = node, parent @ _local(node)
-                queue += [(child, found[number][1], depth + 1) for child in reversed(node.get("children", []))]
-        return found
+                placed_nodes[number] = node, parent @ _local(node)
+                queue += [(child, placed_nodes[number][1], depth + 1) for child in reversed(node.get("children", []))]
+        return placed_nodes
 
     def _joints(self, node: Table, world: dict[int, tuple[Table, F64]]) -> F64:
-        """(j, 4, 4) scene_from_mesh by each of a skin's joints, with its nodes at rest (section 3.7.3)."""
+        """Return (j, 4, 4) scene_from_mesh for each joint of a skin, with its nodes at rest (section 3.7.3)."""
         skin = self.file.item("skins", node["skin"])
         stand = np.array([world[joint][1] if joint in world else np.eye(4) for joint in skin["joints"]])
         if "inverseBindMatrices" not in skin:
@@ -150,8 +150,8 @@ class GltfScene:
         faces = _faces(corners, mode)
         has_normals = "NORMAL" in primitive["attributes"] and mode >= TRIANGLES
         if has_normals or mode < TRIANGLES:
-            rows, faces = np.unique(faces, return_inverse=True)  # those of other primitives are left alone
-        else:  # flat: triangles share no corners (section 3.7.2.1)
+            rows, faces = np.unique(faces, return_inverse=True)  # vertices of other primitives are dropped
+        else:  # flat shading: triangles share no vertices (section 3.7.2.1)
             rows, faces = faces.reshape(-1), np.arange(faces.size).reshape(-1, 3)
 
         def attribute(name: str) -> F32 | None:
@@ -159,11 +159,11 @@ class GltfScene:
                 return np.asarray(values[name][rows], np.float32)
             if name not in primitive["attributes"]:
                 return None
-            found = file.accessor(primitive["attributes"][name], rows=rows)
+            elements = file.accessor(primitive["attributes"][name], rows=rows)
             for target, weight in zip(primitive.get("targets", []), weights):
                 if name in target and weight:
-                    found = np.asarray(found + weight * file.accessor(target[name], rows=rows), np.float32)
-            return found
+                    elements = np.asarray(elements + weight * file.accessor(target[name], rows=rows), np.float32)
+            return elements
 
         positions, normals, colours = attribute("POSITION"), attribute("NORMAL"), attribute("COLOR_0")
         assert positions is not None
@@ -191,7 +191,7 @@ class GltfScene:
         self.parts.append(Part(shape, vertex_colours=colours, is_linear=not is_plain, **look))
 
     def _skinned(self, joints: F64, attribute: Any) -> F64:
-        """(v, 4, 4) of each vertex: the mean of its joints' matrices by its weights."""
+        """Return (v, 4, 4): for each vertex, the weighted mean of its joints' matrices."""
         names, weights = attribute("JOINTS_0"), attribute("WEIGHTS_0")
         for number in range(1, 4):
             if (more := attribute(f"JOINTS_{number}")) is not None:
@@ -204,7 +204,7 @@ class GltfScene:
         return total
 
     def _draco(self, primitive: Table) -> tuple[dict[str, Array], Array | None]:
-        """The attributes and corners of a primitive that Draco has compressed; nothing of others."""
+        """Return a Draco-compressed primitive's attributes and vertex indices; nothing for others."""
         own = primitive.get("extensions", {}).get(DRACO)
         if own is None:
             return {}, None
@@ -212,25 +212,25 @@ class GltfScene:
             import DracoPy
         except ImportError:
             accessors = [self.file.item("accessors", index) for index in primitive["attributes"].values()]
-            if all("bufferView" in accessor for accessor in accessors):  # the same, uncompressed
+            if all("bufferView" in accessor for accessor in accessors):  # the file has the same data uncompressed
                 return {}, None
             problem = f"Draco needs `pip install 'phasestack[draco]'`; or {WAY_OUT}"
             raise InputError(self.path, DRACO, problem) from None
         try:
-            found = DracoPy.decode(bytes(self.file.view(own["bufferView"])[0]))
+            decoded = DracoPy.decode(bytes(self.file.view(own["bufferView"])[0]))
         except InputError as error:
             raise InputError(self.path, DRACO, error.problem) from None
         except DracoPy.FileTypeException:
             raise InputError(self.path, DRACO, "is damaged: its bytes cannot be decoded") from None
-        arrays = {attribute["unique_id"]: attribute["data"] for attribute in found.attributes}
+        arrays = {attribute["unique_id"]: attribute["data"] for attribute in decoded.attributes}
         values = {}
         for name, number in own["attributes"].items():
             accessor = self.file.item("accessors", primitive["attributes"][name])
             values[name] = fractions(arrays[number].reshape(len(arrays[number]), -1), accessor)
-        return values, np.asarray(found.faces).reshape(-1)
+        return values, np.asarray(decoded.faces).reshape(-1)
 
     def _look(self, index: int | None) -> tuple[dict[str, Any], Table]:
-        """Fields of a part of a material, with linear colours; and how its texture is used."""
+        """Return the `Part` fields of a material, with linear colours, and how its texture is applied."""
         file, material = self.file, {} if index is None else self.file.item("materials", index)
         own = material.get("extensions", {})
         base, prefix = material.get("pbrMetallicRoughness", {}), "baseColor"
@@ -265,7 +265,7 @@ class GltfScene:
 
 
 def _problem(error: Exception) -> str:
-    """The fault of a file, from the error that reading it raised."""
+    """Return the fault of a file, in words, from the error that reading it raised."""
     if isinstance(error, KeyError):
         return f"{untrusted_input.shown(str(error))} is missing"
     if isinstance(error, IndexError):
@@ -275,7 +275,7 @@ def _problem(error: Exception) -> str:
 
 
 def _local(node: Table) -> F64:
-    """4x4 parent_from_node."""
+    """Return a node's 4x4 parent_from_node."""
     if "matrix" in node:
         return np.asarray(np.array(node["matrix"], np.float64).reshape(4, 4).T)
     x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))
@@ -288,7 +288,10 @@ def _local(node: Table) -> F64:
 
 
 def _faces(corners: Array, mode: int) -> Array:
-    """Rows of attributes: (t, 3) triangles, (n, 2) lines, (n,) points (3.7.2.1). Raises ValueError: no such mode."""
+    """Return rows of attributes: (t, 3) triangles, (n, 2) lines or (n,) points (3.7.2.1).
+
+    Raises ValueError for an unknown mode.
+    """
     corners = np.asarray(corners).astype(np.int64)
     if mode == POINTS:
         return corners
@@ -313,7 +316,7 @@ def _coordinates(use: Table) -> tuple[int, Table]:
 
 
 def _transformed(uv: F32, use: Table) -> F32:
-    """Texture coordinates by KHR_texture_transform: scaled, turned, moved."""
+    """Apply KHR_texture_transform to texture coordinates: scale, rotate, shift."""
     own = _coordinates(use)[1]
     if not own:
         return uv

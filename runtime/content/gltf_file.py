@@ -1,7 +1,7 @@
-"""The container of a glTF 2.0 file: its table, buffers, accessors and pictures.
+"""The container of a glTF 2.0 file: its JSON, buffers, accessors and pictures.
 
-Own code: trimesh drops samplers, sparse accessors and normalized integers, pygltflib does not decode accessors, and
-assimp-py does not return embedded pictures.
+This is own code because trimesh drops samplers, sparse accessors and normalized integers, pygltflib does not decode
+accessors, and assimp-py does not return embedded pictures.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from runtime.support.untrusted_input import LIMITS
 
 Table = dict[str, Any]
 Array = NDArray[Any]
-Read = Callable[[str], bytes]  # a file in its folder, by its URI or name
+Read = Callable[[str], bytes]  # reads a file in the same folder, given its URI or name
 
-ELEMENTS_PER_TRIANGLE = 10  # all accessors together, for the limit on triangles
+ELEMENTS_PER_TRIANGLE = 10  # for all accessors together, to derive their limit from that on triangles
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 SHAPES = {"SCALAR": (1,), "VEC2": (2,), "VEC3": (3,), "VEC4": (4,), "MAT2": (2, 2), "MAT3": (3, 3), "MAT4": (4, 4)}
-PICTURE_EXTENSIONS = ("EXT_texture_webp", "EXT_texture_avif")  # the others' pictures, such as KTX2, are not decoded
+PICTURE_EXTENSIONS = ("EXT_texture_webp", "EXT_texture_avif")  # others, such as KTX2, are not decoded
 COMPRESSED = {
     "KHR_draco_mesh_compression": "Draco",
     "EXT_meshopt_compression": "meshopt",
@@ -43,7 +43,7 @@ WAY_OUT = "save it without that compression, in Blender or with `gltf-transform`
 
 
 class GltfFile:
-    """One file. Raises LookupError, TypeError or ValueError if it is malformed, else InputError."""
+    """One file. Raises LookupError, TypeError or ValueError if malformed, otherwise InputError."""
 
     def __init__(self, path: Path, data: bytes, read: Read) -> None:
         text, self._binary = (data, b"") if data[:4] != b"glTF" else _chunks(path, data)
@@ -60,12 +60,12 @@ class GltfFile:
             untrusted_input.within(elements, most, source=path, field=f"accessors[{number}].count")
 
     def all(self, kind: str) -> list[Table]:
-        """The objects of a kind, such as `meshes`; empty if the file has none."""
-        found: list[Table] = self.table.get(kind, [])
-        return found
+        """Return the objects of a kind, such as `meshes`; empty if the file has none."""
+        objects: list[Table] = self.table.get(kind, [])
+        return objects
 
     def item(self, kind: str, index: int) -> Table:
-        """Raises IndexError for a missing object, negative indices included."""
+        """Return one object of a kind. Raises IndexError if it is missing or the index is negative."""
         items = self.all(kind)
         return items[range(len(items))[index]]
 
@@ -73,9 +73,9 @@ class GltfFile:
         return _count(self.item("accessors", accessor))
 
     def accessor(self, index: int, *, rows: Array | None = None, as_float: bool = True) -> Array:
-        """(n, ...) the elements of an accessor, or chosen rows of them.
+        """Return an accessor's elements (n, ...), or chosen rows of them.
 
-        as_float: float32 by `fractions`; else the numbers as they are stored.
+        as_float: convert to float32 with `fractions`; otherwise the numbers are returned as stored.
         """
         accessor = self.item("accessors", index)
         values = self._stored(accessor)
@@ -89,11 +89,11 @@ class GltfFile:
         return fractions(values, accessor) if as_float else values
 
     def _stored(self, accessor: Table) -> Array:
-        """A view of an accessor's bytes, strided as its buffer view says; without one, zeros."""
+        """Return a strided view of an accessor's bytes; zeros if it has no buffer view."""
         count, shape = _count(accessor), SHAPES[accessor["type"]]
         dtype = np.dtype(COMPONENTS[accessor["componentType"]])
         column = shape[0] * dtype.itemsize
-        # Columns of matrices begin at multiples of four bytes.
+        # Columns of matrices start at multiples of four bytes.
         steps = (column,) if len(shape) == 1 else (-(-column // 4) * 4, dtype.itemsize)
         size = column if len(shape) == 1 else steps[0] * shape[1]
         strides = (dtype.itemsize,) if len(shape) == 1 else steps
@@ -108,7 +108,7 @@ class GltfFile:
         return np.ndarray((count, *shape), dtype, data, first, (stride, *strides))
 
     def view(self, index: int) -> tuple[memoryview, int]:
-        """A buffer view's bytes, and its stride; 0: its elements are contiguous."""
+        """Return a buffer view's bytes and stride; a stride of 0 means contiguous elements."""
         view = self.item("bufferViews", index)
         number, first, size = view["buffer"], view.get("byteOffset", 0), view["byteLength"]
         buffer = self._buffer(number)
@@ -130,7 +130,7 @@ class GltfFile:
     def _without_data(self, number: int, buffer: Table) -> bytes:
         if any(name in buffer.get("extensions", {}) for name in COMPRESSED):
             raise InputError(self.path, f"buffers[{number}]", f"is compressed with meshopt; {WAY_OUT}")
-        raise InputError(self.path, f"buffers[{number}].uri", "is missing: the file is cut off, or not whole")
+        raise InputError(self.path, f"buffers[{number}].uri", "is missing: the file is incomplete")
 
     def _of_uri(self, uri: str) -> bytes:
         if not uri.startswith("data:"):
@@ -144,7 +144,7 @@ class GltfFile:
             raise ValueError(f"a data URI that is not base64: {error}") from None
 
     def picture(self, texture: Table) -> U8:
-        """(h, w, 4) RGBA of a texture, whose pictures were checked. Raises InputError."""
+        """Return a texture's picture (h, w, 4) RGBA; its header has been checked. Raises InputError."""
         number = self._image_of(texture)
         if number not in self._pictures:
             image = decoded_picture(self._coded(number), source=self.path, field="texture", name=f"images[{number}]")
@@ -152,7 +152,7 @@ class GltfFile:
         return self._pictures[number]
 
     def check_pictures(self, textures: list[Table]) -> None:
-        """By their headers, before one is decoded. Raises InputError."""
+        """Check all pictures' headers before any is decoded. Raises InputError."""
         pixels = 0
         for number in sorted({self._image_of(texture) for texture in textures}):
             coded = self._coded(number)
@@ -163,39 +163,39 @@ class GltfFile:
             untrusted_input.within(pixels, LIMITS.texture_pixels, source=self.path, field="textures' pixels")
 
     def _image_of(self, texture: Table) -> int:
-        """The number of a texture's image; of several that its extensions offer, one that is decoded."""
+        """Return the number of a texture's image: if its extensions offer several, one that can be decoded."""
         own: Table = texture.get("extensions", {})
         for offered in (*(own[name] for name in PICTURE_EXTENSIONS if name in own), texture):
             if offered.get("source") is not None:
                 number: int = range(len(self.all("images")))[offered["source"]]
                 return number
         known = [f"{COMPRESSED[name]} pictures; {WAY_OUT}" for name in own if name in COMPRESSED]
-        problem = "hold " + "".join(known[:1] or ["a picture in a format that is not understood"])
+        problem = "hold " + "".join(known[:1] or ["a picture in an unsupported format"])
         raise InputError(self.path, "textures", problem)
 
     def _coded(self, number: int) -> bytes:
-        """An image's undecoded bytes."""
+        """Return an image's encoded bytes."""
         image = self.item("images", number)
         return self._of_uri(image["uri"]) if "uri" in image else bytes(self.view(image["bufferView"])[0])
 
 
 def fractions(values: Array, accessor: Table) -> F32:
-    """An accessor's numbers as floats: normalized integers are fractions of their largest (3.6.2.2)."""
-    found = np.asarray(values, np.float32)
+    """Return an accessor's numbers as floats; normalized integers become fractions (3.6.2.2)."""
+    floats = np.asarray(values, np.float32)
     if accessor.get("normalized", False) and values.dtype.kind in "iu":
-        found = np.maximum(found / np.float32(np.iinfo(values.dtype).max), np.float32(-1.0))
-    return found
+        floats = np.maximum(floats / np.float32(np.iinfo(values.dtype).max), np.float32(-1.0))
+    return floats
 
 
 def _count(accessor: Table) -> int:
     count = accessor["count"]
     if not isinstance(count, int) or count < 0:
-        raise ValueError("an accessor's count is no whole number")
+        raise ValueError("an accessor's count is not a whole number")
     return count
 
 
 def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
-    """The JSON and the buffer of a GLB."""
+    """Return the JSON and the buffer of a GLB."""
     if int.from_bytes(data[4:8], "little") == 1:
         raise InputError(path, "asset.version", VERSION_1)
     size = int.from_bytes(data[12:16], "little")

@@ -1,4 +1,4 @@
-"""Pictures with a known projection, warped into the raster of a view."""
+"""Warp pictures with a known projection into the raster of a view."""
 
 from __future__ import annotations
 
@@ -11,30 +11,30 @@ from runtime.optics.stack import PlaneRaster
 from runtime.optics.views import image_from_raster
 from runtime.records import F64, U8
 
-# Pixel centres are half-integers here and integers in OpenCV.
+# Pixel centres are half-integers here, but integers in OpenCV.
 _HALF = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
 _MINUS_HALF = np.array([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5], [0.0, 0.0, 1.0]])
 
 
 def rgba_from_rgb(rgb: U8) -> U8:
-    """(h, w, 4) opaque RGBA of an (h, w, 3) RGB picture; RGBA warps in half the time."""
+    """Return an (h, w, 3) RGB picture as opaque (h, w, 4) RGBA, which warps in half the time."""
     return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA))
 
 
 def image_from_view(image_from_stack: F64, pixels_from_stack: F64, *, x_m: float) -> F64 | None:
-    """3x3 picture pixels from view pixels through the plane x = x_m; None: the eye is in it.
+    """Return the 3x3 map to picture pixels from view pixels through x = x_m; None for an eye there.
 
-    Where picture and view are of the same eye, every plane gives the same matrix; otherwise the plane is where
-    the picture hangs.
+    If picture and view belong to the same eye, every plane gives the same matrix; otherwise the picture hangs in
+    this plane.
     """
-    # Its `pixels` are metres: u is y, v is -z.
+    # The pixels of this raster are metres: u is y, v is -z.
     plane = PlaneRaster(x_m=x_m, left_m=0.0, top_m=0.0, pitch_u_m=1.0, pitch_v_m=1.0, width_px=1, height_px=1)
     plane_from_view = plane_from_pixels(pixels_from_stack, plane)
     return None if plane_from_view is None else image_from_raster(image_from_stack, plane) @ plane_from_view
 
 
 def plane_from_pixels(pixels_from_stack: F64, plane: PlaneRaster) -> F64 | None:
-    """3x3 a plane's pixels from a view's; None for an eye in the plane: it sees the picture edge-on."""
+    """Return the 3x3 map to a plane's pixels from a view's; None for an eye in the plane."""
     try:
         return panel_from_image(pixels_from_stack, plane)
     except ValueError:
@@ -42,7 +42,7 @@ def plane_from_pixels(pixels_from_stack: F64, plane: PlaneRaster) -> F64 | None:
 
 
 def reduction(picture_from_view: F64, view: View) -> int:
-    """Number of halvings before a warp, so that a sample covers about 1.5 pixels at most."""
+    """Return the number of halvings before a warp, so that a sample covers at most about 1.5 pixels."""
     middle = np.array([view.width_px, view.height_px]) / 2 + np.array([[0, 0], [1, 0], [0, 1]])
     mapped = cv2.perspectiveTransform(middle[None], picture_from_view)[0]
     steps = np.linalg.norm(mapped[1:] - mapped[0], axis=1)
@@ -50,7 +50,7 @@ def reduction(picture_from_view: F64, view: View) -> int:
 
 
 class WarpedPicture:
-    """One RGBA picture, its smaller copies, and the warp into a view's raster."""
+    """An RGBA picture with its reduced copies, which can be warped into a view's raster."""
 
     def __init__(self, rgba: U8, *, background: tuple[float, float, float]) -> None:
         self._levels = [np.ascontiguousarray(rgba)]
@@ -58,9 +58,9 @@ class WarpedPicture:
         self._out: dict[tuple[int, int, int], U8] = {}
 
     def warped(self, picture_from_view: F64 | None, view: View) -> U8:
-        """(h, w, 4) the picture at each pixel of the view, and the background with alpha 0 outside it.
+        """Return the picture (h, w, 4) at the view's pixels; outside it, the background with alpha 0.
 
-        The array is kept and written again by the next call of the same size and side.
+        The next call with the same size and side overwrites the array.
         """
         key = (view.width_px, view.height_px, view.side)
         if key not in self._out:

@@ -1,4 +1,4 @@
-"""Arrangement of views in a picture, by setting, file name or similarity of its halves."""
+"""Arrangement of a picture's views, from a setting, its name or the similarity of its halves."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from runtime.records import U8
 
 QUILT = re.compile(r"(?<![a-z0-9])qs([0-9]{1,6})x([0-9]{1,6})(?:a([0-9]*\.?[0-9]+))?(?![0-9])")
 ASPECT_MIN, ASPECT_MAX = 0.05, 20.0  # width over height of one view
-RIGHT_FIRST = (".jps", ".pns")  # by custom, side by side and cross-eyed
-MARKS = {  # words anywhere in a name, such as the middle of a film's
+RIGHT_FIRST = (".jps", ".pns")  # these formats are side by side and cross-eyed by convention
+MARKS = {  # words that may be anywhere in a name, for example in the middle of a film's
     "half-side-by-side": "(half|h) ?(sbs|side by side|lr|left right)|sbs h(alf)?",
     "half-top-bottom": "(half|h) ?(tb|tab|over under|top bottom)|(half|h|3d) (ou|hou)|halfou|(ou|tb|tab) half",
     "cross-eyed": "cross ?eyed?|crossview|sbs rl",
@@ -33,8 +33,8 @@ LAST_MARKS = {  # ambiguous words: accepted only at the end, before words with d
     "top-bottom": "ou|tb|tab|top bottom|1x2",
 }
 COPY = re.compile(r"( copy)?( ?\([0-9]+\))?$")  # suffix added by a browser or desktop to a second download
-NARROW, LOW = 2.5, 1.28  # width over height below and above which a film of two views has squeezed ones
-FULL = re.compile(r"(^|[^a-z])(full|fsbs|ftb|fou)")  # in the name of a film whose views are not
+NARROW, LOW = 2.5, 1.28  # below NARROW or above LOW (width over height), a film's two views are squeezed
+FULL = re.compile(r"(^|[^a-z])(full|fsbs|ftb|fou)")  # in a film's name: its views are not squeezed
 ALIKE = 0.8  # correlation above which halves may be two views
 SMALL_PX = (64, 48)  # size of halves for comparison
 SHIFT_PX = 6  # largest shift between views, in these pixels
@@ -45,40 +45,40 @@ ROUGH = 6.0  # standard deviation, codes; smoother halves always agree
 class Layout:
     """Arrangement of the views in a picture."""
 
-    kind: str  # mono, rgbd, quilt, side-by-side, top-bottom, anaglyph
+    kind: str  # mono, rgbd, quilt, side-by-side, top-bottom or anaglyph
     columns: int = 1
     rows: int = 1
-    half: bool = False  # its views are squeezed to half their width or height
+    half: bool = False  # the views are squeezed to half their width or height
     right_first: bool = False  # the right eye's view comes first
     span_deg: int = 0  # longitude covered by equirectangular views; 0: flat views
-    view_aspect: float = 0.0  # of a quilt's views, width over height; 0: as their pixels have it
+    view_aspect: float = 0.0  # width over height of a quilt's views; 0: as given by their pixels
 
     def views(self, picture: U8) -> list[U8]:
-        """Return the views, with equirectangular ones cropped ahead. Raises ValueError as `parts` does."""
+        """Return the views, cropped straight ahead if equirectangular. Raises ValueError as `parts` does."""
         parts = self.parts(picture)
         height, width = parts[0].shape[:2]
-        squeezed = (1.0, 0.5, 2.0) if len(parts) == 2 else (1.0,)  # with or without such a word in the name
+        squeezed = (1.0, 0.5, 2.0) if len(parts) == 2 else (1.0,)  # whether or not the name states it
         if not self.span_deg or not any(is_around(width * by, height, self.span_deg) for by in squeezed):
             return parts
         return [ahead(part, self.span_deg) for part in parts]
 
     def parts(self, picture: U8) -> list[U8]:
-        """[left, right], [one], or a quilt's from the leftmost camera to the rightmost.
+        """Return [left, right], a single view, or a quilt's views from the leftmost camera to the rightmost.
 
-        Raises ValueError for a picture that is smaller than one pixel a view.
+        Raises ValueError if the picture is smaller than one pixel per view.
         """
         height, width = picture.shape[:2]
         if not 0 < self.columns <= width or not 0 < self.rows <= height:
             raise ValueError(f"{width} x {height} pixels cannot hold {self.columns} x {self.rows} views")
-        if self.kind == "anaglyph":  # red for the left eye, cyan for the right one
+        if self.kind == "anaglyph":  # red is the left eye's, cyan the right eye's
             cyan = cv2.addWeighted(picture[..., 1], 0.8, picture[..., 2], 0.2, 0)
             return [np.repeat(np.asarray(part)[..., None], 3, axis=2) for part in (picture[..., 0], cyan)]
         wide, high = width // self.columns, height // self.rows
-        if self.kind != "quilt":  # an odd pixel in the middle is of neither view
+        if self.kind != "quilt":  # an odd pixel in the middle belongs to neither view
             rows, columns = (0, height - high)[: self.rows], (0, width - wide)[: self.columns]
             views = [picture[v : v + high, u : u + wide] for v in rows for u in columns]
             return views[::-1] if self.right_first else views
-        # The first view is at the bottom left, then rightwards, then upwards.
+        # The first view is at the bottom left; the views continue rightwards, then upwards.
         return [
             picture[height - (row + 1) * high : height - row * high, column * wide : (column + 1) * wide]
             for row in range(self.rows)
@@ -86,26 +86,26 @@ class Layout:
         ]
 
     def pixel_aspect(self, *, width_px: int, height_px: int) -> float:
-        """Width over height of a pixel of a view of that size."""
+        """Return the width of a view's pixel over its height, for a view of this size."""
         if self.half:
             return float(self.columns) if self.columns > 1 else 1 / self.rows
         return self.view_aspect * height_px / width_px if self.view_aspect else 1.0
 
 
-MONO, PAIR = Layout("mono"), Layout("side-by-side", columns=2)  # one view; two, as a file of two pictures is read
+MONO, PAIR = Layout("mono"), Layout("side-by-side", columns=2)  # PAIR: two pictures in one file
 
 
 def layout_of(path: Path, settings: ContentSettings, *, stated: str = "") -> Layout:
-    """Arrangement of a file's views: as set, as the file states it, or by its name. Raises InputError."""
+    """Return a file's layout: as set, as the file states it, or by its name. Raises InputError."""
     named = settings.layout
     if named == "auto":
         named = stated or _named(path)
     if found := QUILT.search(named):
         columns, rows, aspect = int(found[1]), int(found[2]), float(found[3] or 0)
         if not columns or not rows:
-            raise InputError(path, "layout", f"a quilt of {columns} x {rows} views")
+            raise InputError(path, "layout", f"a quilt cannot have {columns} x {rows} views")
         if aspect and not ASPECT_MIN <= aspect <= ASPECT_MAX:
-            problem = f"an aspect of {aspect:g}; must be {ASPECT_MIN:g} to {ASPECT_MAX:g}"
+            problem = f"the aspect ratio is {aspect:g}; it must be {ASPECT_MIN:g} to {ASPECT_MAX:g}"
             raise InputError(path, "layout", problem)
         return Layout("quilt", columns, rows, view_aspect=aspect)
     kind = named.removeprefix("half-").replace("cross-eyed", "side-by-side")
@@ -116,7 +116,7 @@ def layout_of(path: Path, settings: ContentSettings, *, stated: str = "") -> Lay
 
 
 def of_film(layout: Layout, path: Path, *, width_px: int, height_px: int) -> Layout:
-    """The layout of a film by its name: squeezed views if the whole has one view's shape."""
+    """Return a film's layout by its name; views are squeezed if the picture has the shape of one."""
     aspect = width_px / height_px
     squeezed = {"side-by-side": aspect < NARROW, "top-bottom": aspect > LOW}.get(layout.kind, False)
     is_half = squeezed and not layout.span_deg and not FULL.search(path.stem.lower())
@@ -147,7 +147,7 @@ def _span_deg(path: Path) -> int:
 
 
 def hint(picture: U8) -> str:
-    """Return the layout suggested by halves that nearly agree, else an empty string."""
+    """Return the layout suggested by halves that nearly agree, otherwise an empty string."""
     for layout in ("side-by-side", "top-bottom"):
         columns = 2 if layout == "side-by-side" else 1
         if min(picture.shape[0] * columns, picture.shape[1] * (3 - columns)) < 4 * SMALL_PX[0]:
@@ -163,6 +163,6 @@ def hint(picture: U8) -> str:
 
 
 def _detail(view: U8) -> U8:
-    """Return a view, small, grey and high-pass filtered: any two skies are alike."""
+    """Return a view reduced, grey and high-pass filtered, because any two skies are alike."""
     small = cv2.cvtColor(cv2.resize(view, SMALL_PX, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
     return np.asarray(small.astype(np.float32) - cv2.GaussianBlur(small, (0, 0), 8).astype(np.float32), np.float32)

@@ -1,4 +1,4 @@
-"""Meshes drawn with one lamp: glTF/GLB, OBJ, OFF, PLY and STL."""
+"""Read meshes (glTF/GLB, OBJ, OFF, PLY and STL), which are drawn with one lamp."""
 
 from __future__ import annotations
 
@@ -28,25 +28,25 @@ from runtime.support.untrusted_input import LIMITS
 
 log = logging.getLogger("phasestack.content")
 
-STL_HEAD, STL_FACET = 84, 50  # bytes of a binary file's head and of each of its triangles
+STL_HEAD, STL_FACET = 84, 50  # bytes of a binary file's header and of each triangle
 UNREAD = ("tristrips", "edge")  # elements of a PLY that are not drawn
 OFF_COUNTS = re.compile(rb"^\s*[A-Z4n]*OFF\s+(?:#.*\s+)*(\d{1,18})\s+(\d{1,18})")
 
 
 @dataclass(frozen=True, slots=True)
 class MeshData:
-    """A loaded file, in its own coordinates."""
+    """A loaded mesh, in the file's coordinates."""
 
     parts: tuple[Part, ...]
-    points: tuple[tuple[F32, F32], ...]  # (n, 3) positions and colours, drawn without parts only
-    low: F64  # (3,) corner of the box that holds it
+    points: tuple[tuple[F32, F32], ...]  # (n, 3) positions and colours, drawn only if there are no parts
+    low: F64  # (3,) lowest corner of its bounding box
     high: F64
-    facing: F64  # (3,) the mean normal of its triangles, by area: length at most 1; 0 if closed
-    left_out: tuple[str, ...] = ()  # what of it is not drawn
+    facing: F64  # (3,) area-weighted mean normal: length at most 1; 0 for a closed surface
+    left_out: tuple[str, ...] = ()  # descriptions of what is not drawn
 
 
 def prepare(file: SceneFile) -> Callable[..., ContentSource]:
-    """Read the file and find its outlines; the result uploads them to GL. Raises InputError."""
+    """Read the file and find its outlines; the returned function uploads them to GL. Raises InputError."""
     data = load_mesh(file.path)
     if data.left_out:
         log.warning("%s: is drawn without %s", file.path, ", ".join(data.left_out))
@@ -65,14 +65,14 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
 
 
 def load_mesh(path: Path) -> MeshData:
-    """Read a mesh. Raises InputError: unreadable, over a limit, nothing to draw, NaN."""
+    """Read a mesh. Raises InputError if it is unreadable, over a limit, not finite or empty."""
     progress.tell(f"reading {path.name}", 0)
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
     _check_counts(path, data)
     parts: list[Part] = []
     points: list[tuple[F32, F32]] = []
     left_out: set[str] = set()
-    with np.errstate(all="ignore"):  # coordinates beyond any scene overflow; they are refused below
+    with np.errstate(all="ignore"):  # coordinates that overflow are refused below
         if path.suffix.lower() == ".ply":
             left_out = {name for name, count in read_header(path).counts.items() if count and name in UNREAD}
         elif path.suffix.lower() == ".off" and data.lstrip().startswith(b"COFF"):
@@ -100,27 +100,27 @@ def load_mesh(path: Path) -> MeshData:
             normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
             total, area = total + normal.sum(0), area + float(np.linalg.norm(normal, axis=1).sum())
     if parts and not area:
-        raise InputError(path, "faces", "none has an area")
+        raise InputError(path, "faces", "all have zero area")
     low, high = (np.asarray(end([end(place, 0) for place in places], 0), np.float64) for end in (np.min, np.max))
     said = tuple(untrusted_input.shown(name) for name in sorted(left_out))
     return MeshData(tuple(parts), tuple(points), low, high, total / (area or 1.0), said)
 
 
 def folder_reader(path: Path, field: str) -> Callable[[str], bytes]:
-    """Reads a file that a mesh names by its URI or path. Raises InputError."""
-    held: dict[str, bytes] = {}
+    """Return a function that reads the files that a mesh refers to by URI or path, or raises InputError."""
+    read_files: dict[str, bytes] = {}
 
     def read(name: str) -> bytes:
-        if name not in held:
+        if name not in read_files:
             place = _file_of(name, source=path, field=field)
-            held[name] = untrusted_input.read_bytes(place, most_bytes=LIMITS.file_bytes, source=path, field=field)
-        return held[name]
+            read_files[name] = untrusted_input.read_bytes(place, most_bytes=LIMITS.file_bytes, source=path, field=field)
+        return read_files[name]
 
     return read
 
 
 def _file_of(uri: str, *, source: Path, field: str) -> Path:
-    """Path of the file that a URI names in the folder of `source`. Raises InputError."""
+    """Return the path of the file in the folder of `source` to which a URI refers. Raises InputError."""
     shown = untrusted_input.shown(uri, most=200)
     if "://" in uri or uri.startswith("data:"):
         raise InputError(source, field, f"{shown}: only files next to this one are read")
@@ -133,10 +133,10 @@ def _file_of(uri: str, *, source: Path, field: str) -> Path:
 
 
 def _check(path: Path, parts: Sequence[Part], places: Sequence[F32], left_out: set[str]) -> None:
-    """Raises InputError if nothing could be seen, or not drawn."""
+    """Raise InputError if nothing would be visible, or if some coordinates cannot be drawn."""
     if not any(len(place) for place in places):
         alone = f", and {' and '.join(sorted(left_out))} are not drawn" if left_out else ""
-        raise InputError(path, "faces", f"there are none{alone}")
+        raise InputError(path, "faces", f"the file has none{alone}")
     for points in places:
         broken = int((~(np.abs(points) <= LARGEST_COORDINATE).all(1)).sum())  # NaN too
         if broken:
@@ -148,7 +148,7 @@ def _check(path: Path, parts: Sequence[Part], places: Sequence[F32], left_out: s
 
 
 def _check_counts(path: Path, data: bytes) -> None:
-    """Compare the counts that a file states with the limits, before its loader allocates. Raises InputError."""
+    """Check a file's stated counts against the limits before its loader allocates, or raise InputError."""
     suffix, promised = path.suffix.lower(), 0
     if suffix == ".ply":
         read_header(path)
@@ -168,7 +168,7 @@ def _is_binary_stl(path: Path, data: bytes) -> bool:
 
 
 def _binary_stl(data: bytes) -> Part:
-    """Without trimesh, which takes ten times the memory of the largest files."""
+    """Read binary STL without trimesh, which needs ten times the memory for the largest files."""
     facets = np.frombuffer(data, [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")], offset=STL_HEAD)
     corners = np.ascontiguousarray(facets["corners"])
     triangles = np.arange(3 * len(facets), dtype=np.int32).reshape(-1, 3)

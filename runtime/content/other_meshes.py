@@ -1,4 +1,4 @@
-"""OBJ, OFF, PLY and STL as parts to draw, read by trimesh."""
+"""Read OBJ, OFF, PLY and STL with trimesh, as parts to draw."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from runtime.support.untrusted_input import LIMITS
 log = logging.getLogger("phasestack.content")
 
 BOMS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-# Before a texture's name in an MTL: `-s 1 1 1`, `-blendu off`, `-imfchan r`.
+# Options before a texture's name in an MTL file: `-s 1 1 1`, `-blendu off`, `-imfchan r`.
 OPTIONS = re.compile(r"(?:-[a-zA-Z]+(?:\s+(?:on|off|[rgbmlz]|[-+.\d]+(?:[eE][-+]?\d+)?))*\s+)+")
-DRIVE = re.compile(r"[A-Za-z]:.*/")  # a path of somebody else's Windows: the name alone is looked for
+DRIVE = re.compile(r"[A-Za-z]:.*/")  # path on the author's Windows machine; only its file name is used
 
 
 class FolderResolver(trimesh.resolvers.FilePathResolver):
-    """Reads files in the mesh's folder, and keeps the reason of a refusal, which loaders would skip."""
+    """Reads files in the mesh's folder, and keeps the reason of a refusal, which loaders would discard."""
 
     def __init__(self, path: Path, read: Read, *, has_materials: bool) -> None:
         super().__init__(str(path))
@@ -45,14 +45,14 @@ class FolderResolver(trimesh.resolvers.FilePathResolver):
     def get(self, name: str) -> bytes:
         is_material = name.lower().endswith(".mtl")
         try:
-            found = self._named(name)
-            if found is None:
+            file_name = self._named(name)
+            if file_name is None:
                 what = "materials" if is_material else "texture"
                 why = f"{untrusted_input.shown(name)} does not exist"
                 log.warning("%s: is drawn grey without its %s (%s)", self._path, what, why)
                 self.has_materials = self.has_materials and not is_material
                 return b"" if is_material else _grey()
-            data = self._read(found)
+            data = self._read(file_name)
             if not is_material:
                 image = decoded_picture(data, source=self._path, field="texture", name=untrusted_input.shown(name))
                 self._pixels += image.width * image.height
@@ -64,7 +64,7 @@ class FolderResolver(trimesh.resolvers.FilePathResolver):
         return data
 
     def _named(self, name: str) -> str | None:
-        """The name of the file in the folder: without options and backslashes, in its own letter case."""
+        """Return the file's name in the folder, without options and backslashes, in its actual case."""
         name = DRIVE.sub("", OPTIONS.sub("", name, count=1).strip().replace("\\", "/"))
         untrusted_input.checked_path(name, source=self._path, field="texture")
         if Path(name).is_absolute() or (self._path.parent / name).exists():
@@ -77,7 +77,7 @@ class FolderResolver(trimesh.resolvers.FilePathResolver):
 
 
 def read_mesh(path: Path, data: bytes, read: Read) -> tuple[list[Part], list[tuple[F32, F32]]]:
-    """The file's parts, or points (n, 3) with their colours if it has no faces. Raises InputError."""
+    """Return the file's parts, or points (n, 3) with their colours if it has no faces. Raises InputError."""
     kind = path.suffix.lower().removeprefix(".")
     progress.tell(f"{path.name}: triangles", 0)
     mark = {"obj": b"mtllib", "ply": b"TextureFile"}.get(kind, b"")
@@ -87,10 +87,10 @@ def read_mesh(path: Path, data: bytes, read: Read) -> tuple[list[Part], list[tup
     file = io.StringIO(_text(data)) if kind == "obj" else io.BytesIO(data)
     try:
         scene = trimesh.load_scene(file, file_type=kind, resolver=resolver, process=False)
-        found = [(scene.geometry[name], matrix) for matrix, name in map(scene.graph.get, scene.graph.nodes_geometry)]
-        has_faces = any(len(getattr(mesh, "faces", ())) for mesh, _ in found)
+        meshes = [(scene.geometry[name], matrix) for matrix, name in map(scene.graph.get, scene.graph.nodes_geometry)]
+        has_faces = any(len(getattr(mesh, "faces", ())) for mesh, _ in meshes)
         wires = _wires(file) if isinstance(file, io.StringIO) and not has_faces else None
-    except Exception as error:  # loaders raise any error of their parsers
+    except Exception as error:  # trimesh's loaders raise the errors of their parsers
         if resolver.refused is not None:
             raise resolver.refused from None
         why = (
@@ -103,23 +103,23 @@ def read_mesh(path: Path, data: bytes, read: Read) -> tuple[list[Part], list[tup
         raise resolver.refused
     pictures: dict[int, U8] = {}
     parts, points = [], []
-    for mesh, matrix in found:
+    for mesh, matrix in meshes:
         if not len(getattr(mesh, "faces", ())):
             points += _points(mesh)
             continue
-        if mesh.visual.kind == "texture" and not resolver.has_materials:  # without the loader's own grey
+        if mesh.visual.kind == "texture" and not resolver.has_materials:  # drop the loader's own grey
             mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=mesh.visual.vertex_attributes.get("color"))
         parts.append(_part(mesh, matrix, path, pictures))
     return parts, points if wires is None else [dotted(wires, np.full_like(wires, np.nan))]
 
 
 def _text(data: bytes) -> str:
-    """The text of an OBJ. Only names and comments can be non-ASCII, and exporters encode them differently."""
+    """Decode an OBJ file. Only names and comments can be non-ASCII; their encodings vary."""
     return data.decode("utf-16" if data[:2] in BOMS else "utf-8", errors="replace")
 
 
 def _wires(file: io.StringIO) -> F32 | None:
-    """(n, 2, 3) the lines of an OBJ; None if it has none."""
+    """Return (n, 2, 3) ends of an OBJ's lines; None if it has none."""
     places: list[list[str]] = []
     ends: list[tuple[int, int]] = []
     for kind, *words in filter(None, map(str.split, file.getvalue().splitlines())):
@@ -147,7 +147,7 @@ def _points(cloud: Any) -> list[tuple[F32, F32]]:
 
 
 def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8]) -> Part:
-    """A trimesh as a part: its material, or the colours of its faces or vertices; grey without any."""
+    """Return a trimesh as a part, with its material or face or vertex colours; otherwise grey."""
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(path, "faces", "are not triangles of existing vertices")
@@ -156,7 +156,7 @@ def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8]) -> Part:
     if kind == "texture":
         picture, colour, opacity = _material(visual.material, pictures)
         colours = visual.vertex_attributes.get("color")
-        if path.suffix.lower() == ".ply":  # which has no materials: the loader's own has a colour
+        if path.suffix.lower() == ".ply":  # PLY has no materials, but trimesh adds a coloured one
             colour = WHITE
     elif kind == "vertex":
         colours, colour = visual.vertex_colors, WHITE
@@ -180,16 +180,16 @@ def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8]) -> Part:
 
 
 def _unit(colours: Any) -> F32:
-    """(n, 3 or 4) colours, integers or fractions, as floats in [0, 1]."""
+    """Return colours (n, 3 or 4), given as integers or fractions, as floats in [0, 1]."""
     numbers = np.asarray(colours)
     scale = np.float32(np.iinfo(numbers.dtype).max if numbers.dtype.kind == "u" else 1.0)
     return np.asarray(np.clip(numbers.astype(np.float32) / scale, 0.0, 1.0), dtype=np.float32)
 
 
 def _material(material: Any, pictures: dict[int, U8]) -> tuple[U8 | None, Colour, float]:
-    """Texture (RGBA), the colour that multiplies it, and the opacity, of a trimesh material.
+    """Return a trimesh material's texture (RGBA), the colour that multiplies it, and the opacity.
 
-    A black colour with a texture counts as white: some exporters write it for the texture alone.
+    Black with a texture counts as white, because some exporters write black for materials that only have a texture.
     """
     image, diffuse = getattr(material, "image", None), getattr(material, "diffuse", None)
     red, green, blue = _unit(np.ones(3) if diffuse is None else diffuse)[:3].tolist()
@@ -202,7 +202,7 @@ def _material(material: Any, pictures: dict[int, U8]) -> tuple[U8 | None, Colour
 
 
 def _opacity(fields: dict[str, Any]) -> float:
-    """The opacity in an MTL: `d`, or 1 - `Tr`; 1 if that is not a number, or nothing could be seen."""
+    """Return the opacity in an MTL file (`d` or 1 - `Tr`), or 1 if it is invalid or hides everything."""
     for name, sign, start in (("d", 1.0, 0.0), ("tr", -1.0, 1.0)):
         try:
             value = start + sign * float(fields[name][-1])

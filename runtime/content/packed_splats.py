@@ -1,4 +1,4 @@
-"""Splats as others pack them: SuperSplat's compressed .ply, and .splat, 32 bytes each."""
+"""Read packed splats: SuperSplat's compressed .ply, and .splat with 32 bytes per splat."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from runtime.records import F32
 from runtime.support import untrusted_input
 from runtime.support.untrusted_input import LIMITS
 
-CHUNK = 256  # splats that share their bounds
+CHUNK = 256  # number of splats with common bounds
 SPLAT = np.dtype([("place", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("turn", "u1", 4)])
 U32 = NDArray[np.uint32]
 
@@ -25,18 +25,18 @@ U32 = NDArray[np.uint32]
 def load_compressed(header: PlyHeader) -> Gaussians:
     """Read SuperSplat's compressed form: numbers of 8 to 11 bits between the bounds of their chunk.
 
-    Raises InputError: no bounds for all splats, none that can be drawn.
+    Raises InputError if a splat has no bounds or none can be drawn.
     """
     elements = read_elements(header)
     splats, bounds = elements["vertex"], elements.get("chunk")
     names = {*(splats.dtype.names or ())}
     kinds = ("position", "rotation", "scale", "color")
     if bounds is None or len(bounds) * CHUNK < len(splats) or not {f"packed_{kind}" for kind in kinds} <= names:
-        raise InputError(header.path, "chunk", "is missing, or holds no bounds of all splats")
+        raise InputError(header.path, "chunk", "is missing, or lacks bounds for some splats")
     place, turn, scale, colour = (splats[f"packed_{kind}"].astype(np.uint32) for kind in kinds)
 
     def bounds_of(name: str, axes: str) -> list[F32]:
-        """Two (n, 3): the least and the largest that a splat's chunk holds."""
+        """Return two (n, 3) arrays: lower and upper bounds of each splat's chunk."""
         columns = [[f"{end}_{name}{axis}" for axis in axes] for end in ("min", "max")]
         if missing := {*columns[0], *columns[1]} - {*(bounds.dtype.names or ())}:
             raise InputError(header.path, "chunk", f"has no {min(missing)}")
@@ -65,7 +65,7 @@ def load_compressed(header: PlyHeader) -> Gaussians:
 
 @np.errstate(all="ignore")
 def load_splat(path: Path) -> Gaussians:
-    """Read a .splat: position, scale, RGBA, rotation. Raises InputError: wrong length, over a limit."""
+    """Read a .splat: position, scale, RGBA, rotation. Raises InputError for a wrong length."""
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
     if not data or len(data) % SPLAT.itemsize:
         problem = f"is cut off, or not a .splat: it has {len(data)} bytes, not a multiple of {SPLAT.itemsize}"
@@ -84,7 +84,7 @@ def load_splat(path: Path) -> Gaussians:
 
 
 def fields_of(packed: U32, bits: tuple[int, ...]) -> F32:
-    """(n, len(bits)) fields of a word as fractions of their largest value, the first in the highest bits."""
+    """Return (n, len(bits)) fields of words as fractions of their maximum, highest bits first."""
     parts = []
     for width in reversed(bits):
         most = (1 << width) - 1
@@ -98,15 +98,15 @@ def _between(share: F32, low: F32, high: F32) -> F32:
 
 
 def _turns(packed: U32) -> F32:
-    """(n, 4) quaternions w, x, y, z: the largest, whose number is in two bits, follows from the three others."""
+    """Return (n, 4) quaternions w, x, y, z; two bits index the largest component, which is implied."""
     return with_largest((fields_of(packed, (10, 10, 10)) - np.float32(0.5)) * np.float32(np.sqrt(2)), packed >> 30)
 
 
 def with_largest(three: NDArray[np.floating[Any]], number: NDArray[np.integer[Any]]) -> F32:
-    """(n, 4) unit quaternions from three components and the largest one's index; zeros if above 3."""
+    """Return (n, 4) unit quaternions from three components and the largest one's index; zeros if above 3."""
     largest = np.sqrt(np.maximum(1 - (three**2).sum(1), 0))
-    found = np.zeros((len(three), 4), np.float32)
+    quaternions = np.zeros((len(three), 4), np.float32)
     for place in range(4):
         rows = number == place
-        found[rows] = np.insert(three[rows], place, largest[rows], axis=1)
-    return found
+        quaternions[rows] = np.insert(three[rows], place, largest[rows], axis=1)
+    return quaternions

@@ -1,4 +1,4 @@
-"""Straight-ahead crops of equirectangular pictures of 360 or 180 degrees."""
+"""Crop equirectangular pictures of 360 or 180 degrees straight ahead."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 
 from runtime.records import F32, U8
 
-AHEAD_DEG = 75.0  # horizontal field of view of the crop: a display's and some margin
-SHAPE = 16 / 9  # of it, width over height
-ASPECT_OFF = 0.02  # that a view's aspect may be off
+AHEAD_DEG = 75.0  # horizontal field of view of the crop: a display's, with some margin
+SHAPE = 16 / 9  # width over height of the crop
+ASPECT_OFF = 0.02  # tolerance for a view's aspect ratio
 
 
 def is_around(width: float, height: float, span_deg: int) -> bool:
-    """Return True if a view of square pixels has the aspect of span_deg by 180 degrees."""
+    """Return True if a view of square pixels has the aspect ratio of span_deg by 180 degrees."""
     return abs(width / height * 180 / span_deg - 1) < ASPECT_OFF
 
 

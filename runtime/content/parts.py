@@ -1,4 +1,4 @@
-"""Parts: triangles with one material; merging of parts with equal materials."""
+"""Parts, which are triangles with one material, and the merging of parts with equal materials."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from runtime.content.shapes import Shape, join
 from runtime.records import F32, U8
 
 BLACK: Colour = (0.0, 0.0, 0.0)
-UNCOLOURED: Colour = (0.70, 0.74, 0.80)  # of a file without colours
+UNCOLOURED: Colour = (0.70, 0.74, 0.80)  # colour for files without colours
 OPAQUE_FROM = 0.99  # alpha from which a pixel counts as opaque
 LARGEST_TEXTURE_PX = 4096
-OUTLINED_MAX = 200_000  # triangles of a part, and of a file; beyond, finding outlines costs more than drawing
+OUTLINED_MAX = 200_000  # triangles of a part and of a file; beyond it, finding outlines costs more than drawing
 Wrap = Literal["repeat", "clamp", "mirror"]
 
 
 @dataclass(frozen=True, slots=True)
 class Sampler:
-    """A texture's wrap modes (across and down), and whether it is magnified without interpolation."""
+    """Wrap modes of a texture (across, down), and whether it is magnified without interpolation."""
 
     wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
     nearest: bool = False
@@ -31,27 +31,27 @@ class Sampler:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """Triangles of one material, in their own frame."""
+    """Triangles with one material, in their own frame."""
 
     shape: Shape
     picture: U8 | None = None  # (h, w, 4) RGBA, row 0 at uv 0; parts may share one array
-    colour: Colour = WHITE  # multiplies everything, 0-1
+    colour: Colour = WHITE  # factor of all colours, 0-1
     vertex_colours: F32 | None = None  # (v, 3 or 4), 0-1: RGB or RGBA
     lit: bool = True
     grey: bool = False
-    turning: bool = False  # its placement changes: it is boxed for every orientation
+    turning: bool = False  # its placement changes, so its box covers every orientation
     sampler: Sampler = Sampler()
     opacity: float = 1.0
     alpha: Literal["opaque", "mask", "blend"] = "mask"
-    cutoff: float = 0.5  # of a mask: pixels with less alpha are discarded
-    two_sided: bool = True  # else back faces of a translucent part are culled
-    is_linear: bool = False  # colours (not pictures) are linear light; products and sums are of linear light
-    glow: Colour = BLACK  # its own light, linear, multiplied by its picture
+    cutoff: float = 0.5  # for a mask: pixels with less alpha are discarded
+    two_sided: bool = True  # False: back faces of a translucent part are culled
+    is_linear: bool = False  # colours (not pictures) are linear light; the shader computes in linear light
+    glow: Colour = BLACK  # emitted light, linear, multiplied by `glow_picture`
     glow_picture: U8 | None = None
 
     @property
     def features(self) -> tuple[str, ...]:
-        """The shader switches that it needs."""
+        """Shader switches that the part needs."""
         least = self.opacity
         if self.picture is not None:
             least *= float(self.picture[..., 3].min()) / 255
@@ -74,23 +74,23 @@ class Part:
 
 
 def texture_of(image: Any) -> U8:
-    """(h, w, 4) RGBA of Pillow's image, scaled down to the largest texture that is kept."""
-    if image.mode not in ("L", "RGB", "RGBA") or "transparency" in image.info:  # such as a palette: it has no means
+    """Return Pillow's image as (h, w, 4) RGBA, reduced to the largest supported texture."""
+    if image.mode not in ("L", "RGB", "RGBA") or "transparency" in image.info:  # a palette cannot be averaged
         image = image.convert("RGBA")
     image.thumbnail((LARGEST_TEXTURE_PX, LARGEST_TEXTURE_PX))
     return np.array(image.convert("RGBA"))
 
 
 def coded(light: ArrayLike) -> F32:
-    """sRGB codes in 0-1 of linear light in 0-1."""
+    """Return sRGB codes in 0-1 for linear light in 0-1."""
     linear = np.clip(np.asarray(light, np.float32), 0.0, 1.0)
     return np.where(linear <= 0.0031308, linear * np.float32(12.92), 1.055 * linear ** np.float32(1 / 2.4) - 0.055)
 
 
 def merged(parts: Sequence[Part]) -> list[Part]:
-    """The triangles in fewer parts: one for each material, up to the size whose outlines are drawn.
+    """Merge triangles into one part per material, up to the size whose outlines are drawn.
 
-    Colours do not separate parts: they become vertex colours.
+    Colours do not separate parts, because they become vertex colours.
     """
     alike: dict[tuple[object, ...], list[list[Part]]] = {}
     for part in parts:
@@ -109,7 +109,7 @@ def merged(parts: Sequence[Part]) -> list[Part]:
 
 
 def _coloured(part: Part) -> F32:
-    """(v, 4) the colours of a part's vertices, with its own colour and opacity."""
+    """Return the vertex colours (v, 4) of a part, multiplied by its colour and opacity."""
     colours = np.ones((len(part.shape.positions_m), 4), np.float32)
     if part.vertex_colours is not None:
         colours[:, : part.vertex_colours.shape[1]] = part.vertex_colours
@@ -120,6 +120,6 @@ def _coloured(part: Part) -> F32:
 def _one(group: list[Part]) -> Part:
     if len(group) == 1:
         return group[0]
-    held = [part.vertex_colours for part in group if part.vertex_colours is not None]
-    colours = np.concatenate(held) if held else None
+    given_colours = [part.vertex_colours for part in group if part.vertex_colours is not None]
+    colours = np.concatenate(given_colours) if given_colours else None
     return replace(group[0], shape=join([part.shape for part in group]), vertex_colours=colours)

@@ -1,4 +1,4 @@
-"""Pictures, picture folders and videos on the screen's plane, each eye with its view."""
+"""Show pictures, picture folders and videos on the centre panel's plane, with a view for each eye."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from runtime.records import U8
 
 
 def screen(stack: PanelStack, *, width_px: int, height_px: int, pixel_aspect: float = 1.0) -> PlaneRaster:
-    """A picture's pixel grid on the stack's centre plane, as large as the display allows.
+    """Return a picture's pixel grid on the stack's centre plane, as large as the display allows.
 
     pixel_aspect: width of a pixel over its height.
     """
@@ -37,12 +37,12 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
     """Open a picture, a video or a folder of pictures. Raises InputError."""
     frames = open_frames(file.path, file.settings)
     make = partial(PicturesSource, frames, file=file)
-    make()  # refuses a picture too small for its layout
+    make()  # refuses now a picture that is too small for its layout
     return make
 
 
 class PicturesSource(ContentSource):
-    """Views of pictures or films that hang in the plane of the display's centre."""
+    """Shows the views of pictures or films on the centre panel's plane."""
 
     def __init__(self, frames: Frames, *, file: SceneFile, context: object = None) -> None:
         """Raises InputError if the picture is too small for its layout."""
@@ -75,14 +75,14 @@ class PicturesSource(ContentSource):
         return self._shown[which].warped(matrix, view)
 
     def _take(self, number: int, picture: U8) -> None:
-        """Raises ValueError if it is too small."""
+        """Use a picture from now on. Raises ValueError if it is too small."""
         layout = self._frames.layout(number)
         views = layout.views(picture)
         height, width = views[0].shape[:2]
         aspect = layout.pixel_aspect(width_px=width, height_px=height)
         self._screen = screen(self._file.stack, width_px=width, height_px=height, pixel_aspect=aspect)
         self._shown: dict[int, WarpedPicture] = {}
-        self._views, self._at = views, number  # of the picture of this number
+        self._views, self._at = views, number  # views of the picture with this number
 
     def _view_for(self, view: View) -> int:
         """Return the index of an eye's view: its side, or a quilt's nearest in angle about the vertical."""

@@ -1,7 +1,7 @@
-"""A scene moved, turned, scaled or on a turntable, by any source: the eye is moved the other way.
+"""Place any source's scene (shift, rotation, scale, turntable) by moving the eye the opposite way.
 
-A source never learns of it: a view's projection times the placing is another projection, and the eye seen from the
-scene is another eye.
+The source needs no support for it: the view's projection times the placement is another projection, for the eye as seen
+in the scene's frame.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from runtime.content.base import ContentInfo, ContentSource, ForwardingSource, V
 from runtime.content.presets import rotation_matrix
 from runtime.records import F64
 
-FIELDS = ("scale", "offset_m", "rotation_deg", "turntable_per_min")  # of ContentSettings
+FIELDS = ("scale", "offset_m", "rotation_deg", "turntable_per_min")  # fields of ContentSettings
 NS_PER_MIN = 60 * NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
 class Placing:
-    """Placement of a scene: p_stack = offset + scale · R · p, R the turntable's turn after the rotation."""
+    """Placement of a scene: p_stack = offset + scale · R · p, R the rotation, then the turntable's."""
 
     scale: float = 1.0
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # frame `stack`
@@ -31,14 +31,14 @@ class Placing:
     turntable_per_min: float = 0.0  # about the vertical
 
     def rotation(self, time_ns: int) -> F64:
-        """3x3 stack_from_scene turn."""
-        # Whole turns are removed first: a clock that has run for months keeps its fractions.
+        """Return the 3x3 rotation stack_from_scene."""
+        # Remove whole turns first, to keep precision on a clock that has run for months.
         period_ns = NS_PER_MIN / self.turntable_per_min if self.turntable_per_min else np.inf
         turntable = rotation_matrix((0.0, 0.0, 360.0 * (time_ns % period_ns) / period_ns), "xyz")
         return turntable @ rotation_matrix(self.rotation_deg, "xyz")
 
     def stack_from_scene(self, time_ns: int) -> F64:
-        """4x4 similarity."""
+        """Return the 4x4 similarity stack_from_scene."""
         matrix = np.eye(4)
         matrix[:3, :3] = self.scale * self.rotation(time_ns)
         matrix[:3, 3] = self.offset_m
@@ -46,27 +46,27 @@ class Placing:
 
 
 def placing_of(settings: ContentSettings) -> Placing:
-    """The placing that the settings describe."""
+    """Return the placement that the settings describe."""
     return Placing(settings.scale, settings.offset_m, settings.rotation_deg, settings.turntable_per_min)
 
 
 def placed_source(source: ContentSource, placing: Placing) -> ContentSource:
-    """The source at its place; one that was placed before is placed again."""
+    """Return the source with this placement, which replaces an earlier one."""
     if isinstance(source, PlacedSource):
         source = source.source
     return source if placing == Placing() else PlacedSource(source, placing)
 
 
 class PlacedSource(ForwardingSource):
-    """A source at another place."""
+    """A source with a placement."""
 
     def __init__(self, source: ContentSource, placing: Placing) -> None:
-        """source: closed with this one."""
+        """source: closed together with this one."""
         self.source, self.placing = source, placing
 
     @property
     def info(self) -> ContentInfo:  # type: ignore[override]
-        """The source's own, as far as it still holds here."""
+        """The source's own info, except for properties that the placement invalidates."""
         return _moved(self.source.info, self.placing)
 
     def forwarded(self, view: View, time_ns: int) -> tuple[ContentSource, View, int]:
@@ -94,6 +94,6 @@ class PlacedSource(ForwardingSource):
 
 def _moved(info: ContentInfo, placing: Placing) -> ContentInfo:
     still = not placing.turntable_per_min
-    # Only if its plane stays in the middle panel's.
+    # It stays flat only if its plane remains the middle panel's.
     is_flat = still and placing.rotation_deg[1:] == (0.0, 0.0) and placing.offset_m[0] == 0.0
     return replace(info, moving=info.moving or not still, flat_x_m=info.flat_x_m if is_flat else None)

@@ -1,4 +1,4 @@
-"""A scene file and the placement of its coordinates in the stack frame: a preset's, or fitted."""
+"""A scene file, and the placement of its coordinates in the stack frame, from a preset or by fitting."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from runtime.records import F64
 
 log = logging.getLogger("phasestack.content")
 
-FILL = 0.75  # of the display's width and height that a fitted scene takes: its front is seen larger
-DEEPER = 2.0  # times `depth_m`, that a fitted scene may be
-BACK = 0.5  # component of a flat mesh's mean normal away from the viewer that turns it around
-FLAT = 0.1  # a mesh thinner than this fraction of its other sides faces the viewer
-STANDS = 0.2  # of its height: a range that begins higher by this fraction along one axis makes that axis up
+FILL = 0.75  # share of the display's width and height for a fitted scene, whose front appears larger
+DEEPER = 2.0  # a fitted scene may be this many times as deep as `depth_m`
+BACK = 0.5  # a flat mesh is turned around if its mean normal points away from the viewer by this much
+FLAT = 0.1  # a mesh thinner than this fraction of its other sides is flat, and turned to face the viewer
+STANDS = 0.2  # an axis is up if its range begins higher than the other's by this fraction of the height
 GLTF = (".glb", ".gltf")
-CUSTOMS = {".glb": ("+y", "+z"), ".gltf": ("+y", "+z"), ".obj": ("+y", "+z"), ".stl": ("+z", "-y")}  # up, and forwards
-DARK = (0.12, 0.12, 0.12)  # behind all but the built-in scenes: ghosts are seen on it, brighter and darker ones
+CUSTOMS = {".glb": ("+y", "+z"), ".gltf": ("+y", "+z"), ".obj": ("+y", "+z"), ".stl": ("+z", "-y")}  # up, to viewer
+DARK = (0.12, 0.12, 0.12)  # background of all but the built-in scenes, on which brighter and darker ghosts are visible
 
 
 @dataclass(frozen=True, slots=True)
 class SceneFile:
-    """A file, the settings that it is shown with, and the display."""
+    """A file, the settings to show it with, and the display."""
 
     path: Path
     settings: ContentSettings
     stack: PanelStack
-    preset: str = ""  # that the file is of
+    preset: str = ""  # name of the file's preset
 
     @property
     def background(self) -> tuple[float, float, float]:
-        """Background colour."""
+        """Background colour of the scene."""
         return self.settings.background or DARK
 
     def placed(self, low: F64, high: F64, *, custom: tuple[str, str] | None = None, facing: F64 | None = None) -> F64:
@@ -55,7 +55,7 @@ class SceneFile:
         return matrix
 
     def _axes(self, low: F64, high: F64, custom: tuple[str, str] | None, facing: F64 | None) -> F64:
-        """3x3 scene_from_stack rotation: as set, else the format's custom or the display's own, else guessed."""
+        """Return the 3x3 scene_from_stack rotation: as set, by the format's or display's custom, or guessed."""
         if self.settings.axes != "auto":
             up, out = self.settings.axes.split()
         elif not self.settings.fit and self.path.suffix.lower() not in GLTF:
@@ -64,25 +64,26 @@ class SceneFile:
             up, out = custom or guessed_axes(low, high)
             if self.settings.fit and facing is not None:
                 up, out = turned_to_viewer(up, out, size=high - low, facing=facing)
-            log.info("%s: taken to have %s up and %s towards the viewer (content.axes)", self.path.name, up, out)
+            log.info("%s: assuming that %s is up and %s points to the viewer (content.axes)", self.path.name, up, out)
         return axes_matrix(out=out, up=up)
 
 
 def guessed_axes(low: F64, high: F64) -> tuple[str, str]:
-    """The up axis and the one towards the viewer, guessed from an extent: +y and +z, or +z and -y.
+    """Guess the axes (up, towards the viewer) from an extent: (+y, +z) or (+z, -y).
 
-    The up axis is the one whose range begins near 0 or above; if both or neither do, the longer one.
+    If exactly one range begins near 0 or above, its axis is up; otherwise the longer axis is.
     """
     size = np.maximum(high - low, 1e-30)
-    y, z = np.maximum(low / size + 0.5, 0.0)[1:]  # 0: centred on the origin; 0.5: begins there
+    y, z = np.maximum(low / size + 0.5, 0.0)[1:]  # 0: centred on the origin; 0.5: begins at the origin
     z_is_up = z > y if abs(z - y) > STANDS else size[2] > size[1]
     return ("+z", "-y") if z_is_up else ("+y", "+z")
 
 
 def turned_to_viewer(up: str, out: str, *, size: F64, facing: F64) -> tuple[str, str]:
-    """The axes up and to the viewer, changed for a flat mesh so that its front faces the viewer.
+    """Return the axes (up, to the viewer), changed for a flat mesh so that its front faces the viewer.
 
-    size: (3,) of its bounding box. A mesh flat along the up axis is seen from above, its near edge at the bottom.
+    size: (3,) of its bounding box. A mesh that is flat along the up axis is seen from above, its near edge at the
+    bottom.
     """
     thinnest = int(size.argmin())
     axis = "xyz"[thinnest]
@@ -101,10 +102,10 @@ def _opposite(axis: str) -> str:
 
 
 def fitted(low: F64, high: F64, *, axes: F64, stack: PanelStack, depth_m: tuple[float, float]) -> F64:
-    """4x4 stack_from_scene that centres a box and scales it to the display's size and depth.
+    """Return the 4x4 stack_from_scene that centres a box and scales it to the display's size and depth.
 
-    A scene deeper than `depth_m` (rear, front) begins at the front and extends past the rear, where most is hidden.
-    low, high: (3,) corners in the scene's coordinates; axes: 3x3 scene_from_stack rotation.
+    A scene deeper than `depth_m` (rear, front) begins at the front and extends beyond the rear, where most of it is
+    hidden. low, high: (3,) corners in the scene's coordinates; axes: 3x3 scene_from_stack rotation.
     """
     size = np.abs(axes.T @ (high - low))
     room = np.array([DEEPER * (depth_m[1] - depth_m[0]), stack.width_m * FILL, stack.height_m * FILL])

@@ -1,4 +1,4 @@
-"""A playlist: scenes one after another, each with its time and settings.
+"""A playlist shows scenes one after another, each with its own duration and settings.
 
 All scenes are loaded before the first is shown, so missing files are refused at the start and changes take no time.
 """
@@ -22,33 +22,33 @@ from runtime.support.picture_header import CAMERA_SET
 from runtime.support.plausible import within
 from runtime.support.plugins import located
 
-ENTRIES_MAX = 64  # of a playlist: all of them are kept in memory
+ENTRIES_MAX = 64  # most entries, because all are kept in memory
 
 
 class PlaylistFile(Section):
-    """The file: TOML (or JSON) with a table `[[show]]` for each scene."""
+    """A playlist file in TOML (or JSON), with a table `[[show]]` for each scene."""
 
-    repeat: bool = Field(True, description="begin again after the last one; else it stays")
-    show: list[dict[str, Any]] = Field(min_length=1, max_length=ENTRIES_MAX, description="the scenes, in this order")
+    repeat: bool = Field(True, description="restart after the last scene; false: keep showing it")
+    show: list[dict[str, Any]] = Field(min_length=1, max_length=ENTRIES_MAX, description="the scenes, in order")
 
 
 class Entry(ContentSettings):
-    """One scene of a playlist, with its own placing."""
+    """One scene of a playlist, with its own placement."""
 
-    scene: str = Field(min_length=1, description="as content.scene, seen from the list's folder")
-    seconds: Annotated[float, within(0.5, 86_400.0, "s")] = Field(description="for how long it is shown")
+    scene: str = Field(min_length=1, description="like content.scene; paths are relative to the playlist's folder")
+    seconds: Annotated[float, within(0.5, 86_400.0, "s")] = Field(description="how long it is shown")
 
     @field_validator("scene")
     @classmethod
     def _no_list(cls, value: str) -> str:
         if Path(value).suffix.lower() in (".toml", ".json"):
-            raise ValueError("another list is no scene of a playlist")
+            raise ValueError("a playlist cannot contain another one")
         return value
 
 
 @dataclass(frozen=True, slots=True)
 class Playlist:
-    """A parsed playlist file; its scenes are not opened yet."""
+    """A parsed playlist file, whose scenes have not been opened yet."""
 
     path: Path
     repeat: bool
@@ -56,15 +56,15 @@ class Playlist:
 
 
 def read_playlist(path: Path, settings: ContentSettings) -> Playlist:
-    """Raises InputError, naming file, entry and field.
+    """Read a playlist. Raises InputError, naming file, entry and field.
 
-    settings: defaults of every entry, except for the placing, which is the whole list's.
+    settings: defaults for every entry, except for the placement, which applies to the whole list.
     """
     table = read_table(path)
     if "frames" in table and "show" not in table:
-        raise InputError(path, "", f"is a camera set, as of a NeRF: {CAMERA_SET}")
+        raise InputError(path, "", f"is a camera set, as used for a NeRF: {CAMERA_SET}")
     if path.suffix.lower() == ".json" and "show" not in table:
-        raise InputError(path, "show", "is missing: a JSON file as scene is a playlist, with its scenes there")
+        raise InputError(path, "show", "is missing: a JSON file is shown as a playlist, and must list its scenes here")
     file = validated(PlaylistFile, table, source=path)
     common = settings.model_dump(exclude={"scene", "file", *FIELDS})
     entries = []
@@ -82,14 +82,14 @@ def read_playlist(path: Path, settings: ContentSettings) -> Playlist:
 
 
 class PlaylistSource(ForwardingSource):
-    """Plays a list of scenes one after another. The clock starts at the first request."""
+    """Plays a list of scenes one after another. Time counts from the first request."""
 
     def __init__(self, playlist: Playlist, openers: list[Callable[..., ContentSource]], *, context: Any) -> None:
         """Prepare every entry. Raises InputError if one can't be shown."""
         self._list = playlist
         self._ends_ns = list(accumulate(round(entry.seconds * NS_PER_S) for entry in playlist.entries))
         self._begin_ns: int | None = None
-        self._number = 0  # of the entry at present, counted over all rounds
+        self._number = 0  # number of the current entry, counted over all rounds
         self._sources: list[ContentSource] = []
         try:
             for number, opener in enumerate(openers):
@@ -113,7 +113,7 @@ class PlaylistSource(ForwardingSource):
         return self._sources[self._number % len(self._sources)]
 
     def describe(self, *, time_ns: int) -> dict[str, Any]:
-        """For the status: the scenes and their seconds, which one is shown, and for how long still."""
+        """Return the status entry: the scenes and their durations, the current one and its remaining time."""
         entries = [{"scene": entry.scene, "seconds": entry.seconds} for entry in self._list.entries]
         index, since_ns = self._at(time_ns)
         left_s = self._list.entries[index % len(entries)].seconds - since_ns / NS_PER_S
@@ -141,7 +141,7 @@ class PlaylistSource(ForwardingSource):
             source.close()
 
     def _turn_to(self, time_ns: int) -> int:
-        """Show the entry due now; returns the time it has been shown."""
+        """Switch to the entry that is due, and return how long it has been shown."""
         if self._begin_ns is None:
             self._begin_ns = time_ns
         self._number, since_ns = self._at(time_ns)

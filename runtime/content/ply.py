@@ -1,6 +1,6 @@
-"""The elements of a PLY file as tables, for splats; what its header promises, for meshes too.
+"""Read the header of a PLY file, and its elements as tables.
 
-Ours, because plyfile's licence is the GPL, and trimesh gives out no properties but its own.
+This is own code because plyfile is licensed under the GPL, and trimesh returns only properties that it knows.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ TYPES = {
     "double": "f8", "float64": "f8",
 }  # fmt: skip
 ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
-PACKED = "packed_position"  # a property of splats in SuperSplat's compressed form
+PACKED = "packed_position"  # property of splats in SuperSplat's compressed form
 SPLAT_MARKS = {"f_dc_0", "scale_0", "rot_0", PACKED}
 
 
@@ -35,14 +35,14 @@ class PlyHeader:
 
     path: Path
     order: str  # a key of ORDERS
-    counts: dict[str, int]  # of elements, in the file's order
-    properties: dict[str, list[tuple[str, str]]]  # of each element: name and type; `list` is one, too
-    starts_at: int  # bytes before the first element
-    size: int  # bytes of the file
+    counts: dict[str, int]  # number of each element, in the file's order
+    properties: dict[str, list[tuple[str, str]]]  # per element: names and types; `list` is one of the types
+    starts_at: int  # offset of the first element in bytes
+    size: int  # size of the file in bytes
 
     @property
     def kind(self) -> str:
-        """Kind of content, which decides the file's limits: `splats` or `triangles`."""
+        """Kind of content, which determines the file's limits: `splats` or `triangles`."""
         return "splats" if SPLAT_MARKS & {name for name, _ in self.properties["vertex"]} else "triangles"
 
     @property
@@ -52,7 +52,7 @@ class PlyHeader:
 
 
 def read_header(path: Path) -> PlyHeader:
-    """Raises InputError: no header, or counts that are over a limit or more than the file has bytes."""
+    """Read a file's header. Raises InputError if it is missing, or counts exceed a limit."""
     with untrusted_input.open_regular(path, most_bytes=LIMITS.file_bytes) as file:
         head = file.read(LONGEST_HEADER)
         size = file.seek(0, 2)
@@ -83,15 +83,15 @@ def read_header(path: Path) -> PlyHeader:
         field, kind = f"element {untrusted_input.shown(name)}", header.kind
         most = getattr(LIMITS, kind) * (3 if kind == "triangles" and name == "vertex" else 1)
         untrusted_input.within(count, most, source=path, field=field)
-        if count > size:  # the shortest has a byte
+        if count > size:  # every element has at least one byte
             raise InputError(path, field, f"the file is cut off: {count:,} are declared in {size:,} bytes")
     return header
 
 
 def read_elements(header: PlyHeader) -> dict[str, Table]:
-    """The elements up to the first with a list, each as a structured array, the vertices among them.
+    """Return structured arrays, by name, of the elements before the first one with a list.
 
-    Raises InputError: truncated, text, or a list before the vertices are over.
+    The vertices are among them. Raises InputError if the file is truncated, text, or has a list before their end.
     """
     path, place, found = header.path, header.starts_at, dict[str, Table]()
     if header.order == "ascii":
@@ -101,9 +101,9 @@ def read_elements(header: PlyHeader) -> dict[str, Table]:
             if "list" in {kind for _, kind in header.properties[name]}:
                 break
             dtype = np.dtype([(field, ORDERS[header.order] + kind) for field, kind in header.properties[name]])
-            held = (header.size - place) // max(dtype.itemsize, 1)
-            if held < count:
-                problem = f"the file is cut off: {count} are declared, {max(held, 0)} present"
+            present = (header.size - place) // max(dtype.itemsize, 1)
+            if present < count:
+                problem = f"the file is cut off: {count} are declared, {max(present, 0)} present"
                 raise InputError(path, untrusted_input.shown(name), problem)
             file.seek(place)
             found[name] = np.frombuffer(file.read(count * dtype.itemsize), dtype)

@@ -20,17 +20,17 @@ Triple = tuple[float, float, float]
 
 @cache
 def preset_file() -> dict[str, Any]:
-    """The data file; its comments explain its keys."""
+    """Return the data file's contents; its comments explain the keys."""
     return tomllib.loads(FILE.read_text(encoding="utf-8"))
 
 
 def preset_names() -> tuple[str, ...]:
-    """Every preset's name."""
+    """Return the names of all presets."""
     return tuple(preset_file()["scene"])
 
 
 def stack_from_preset(name: str) -> F64:
-    """4x4 stack metres from scene units as the supplement prints it: R·scene/(100 r_p2d) + t."""
+    """Return the supplement's 4x4 map from scene units to `stack` metres: R·scene/(100 r_p2d) + t."""
     table, matrix = preset_file()["scene"][name], np.eye(4)
     rotation = rotation_matrix(table["rotation_deg"], preset_file()["rotation_order"])
     matrix[:3, :3] = rotation / (table["scale_per_cm"] / CM)
@@ -39,14 +39,14 @@ def stack_from_preset(name: str) -> F64:
 
 
 def drawn_scene_from_stack(name: str) -> F64:
-    """4x4 scene units from stack metres, as the published code drew the data set.
+    """Return the 4x4 map from metres in `stack` to scene units, as the published code drew the data set.
 
-    It uses its own scale, the scene's axes, and the panels where that code evaluates.
+    That code has its own scale, uses the scene's axes, and places the panels differently for evaluation.
     """
     code, matrix = preset_file()["scene"][name]["published"], np.eye(4)
     axes = axes_matrix(out=code["out"], up=code["up"])
     gap = code["thickness_cm"] * code["scale_per_cm"]
-    # The middle panel is half a gap beyond that code's ground, along `out`; the ground may be in gaps.
+    # That code's ground is half a gap behind the middle panel, along `out`, and may be specified in gaps.
     middle = gap / 2 + code.get("ground", gap * code.get("ground_coefficient", 0.0))
     matrix[:3, :3] = axes * (code["scale_per_cm"] / CM)
     matrix[:3, 3] = np.array(code.get("shift", (0.0, 0.0, 0.0))) + axes[:, 0] * middle
@@ -54,13 +54,13 @@ def drawn_scene_from_stack(name: str) -> F64:
 
 
 def rotation_matrix(angles_deg: Triple, order: str) -> F64:
-    """3x3 rotation by three angles about x, y, z in `order` (lower case: fixed axes, else moving ones)."""
+    """Return the 3x3 rotation about x, y, z in `order` (lower case: fixed axes, else moving)."""
     angles = [angles_deg["xyz".index(letter)] for letter in order.lower()]
     return np.asarray(Rotation.from_euler(order, angles, degrees=True).as_matrix())
 
 
 def axes_matrix(*, out: str, up: str) -> F64:
-    """3x3 scene_from_stack rotation: its columns point out of the screen, right and up, in scene axes."""
+    """Return the 3x3 scene_from_stack rotation; its columns point out of the screen, right and up."""
     columns = []
     for axis in (out, up):
         column = np.zeros(3)

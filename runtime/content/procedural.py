@@ -1,4 +1,4 @@
-"""The built-in scenes, drawn straight into the pixels that a view asks for."""
+"""Draw the built-in scenes directly at the pixels of a view."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from runtime.content.triangles import DrawnPart, TriangleSource
 from runtime.optics.stack import PanelStack
 from runtime.records import F64
 
-MODELLED_HEIGHT_M = 0.2916  # the display for which the scenes' lengths are written
+MODELLED_HEIGHT_M = 0.2916  # height of the display for which the scenes' lengths are given
 
 
 def parts_of(built_in: Scene) -> list[DrawnPart]:
-    """A scene's shapes and pictures, a part a thing: the slow half of opening it, which needs no GL."""
+    """Return a scene's parts, one per thing. This slow half of opening a scene needs no GL."""
     pictures = {name: textures.texture(name) for name in {thing.texture for thing in built_in.things}}
     return [
         DrawnPart(
@@ -69,7 +69,7 @@ class ProceduralSource(TriangleSource):
         return [self._placed(thing, time_ns / NS_PER_S) for thing in self._scene.things]
 
     def _placed(self, thing: Thing, time_s: float) -> F64:
-        """4x4 stack_from_thing at a time."""
+        """Return a thing's 4x4 stack_from_thing at a time."""
         turn = np.eye(3) if thing.rotation is None else thing.rotation
         if self._scene.moving and thing.turns_per_s:
             turn = shapes.rotation_about(2, 2 * np.pi * thing.turns_per_s * time_s) @ turn

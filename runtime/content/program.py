@@ -1,6 +1,6 @@
-"""Scenes drawn by another program (renderer, game, web page) that answers requests for pictures.
+"""Show pictures from another program (renderer, game, web page) that answers requests for them.
 
-The protocol is in docs/programs.md. A late or missing answer leaves the last pictures in place.
+The protocol is in docs/programs.md. After a late or missing answer the last pictures stay.
 """
 
 from __future__ import annotations
@@ -35,23 +35,23 @@ from runtime.support.background import begin
 log = logging.getLogger("phasestack.content")
 
 HOST = "127.0.0.1"
-ANSWERED_S = 0.4  # both pictures; later they are late
+ANSWERED_S = 0.4  # time limit for both pictures
 GIVEN_UP_S = 2.0  # a late frame is abandoned after this, and another may be requested
-IN_FLIGHT_MAX = 2  # frames that were asked for and are not answered
-HELLO_S = 5.0  # time limit of a program's greeting
+IN_FLIGHT_MAX = 2  # most frames that are requested and not yet answered
+HELLO_S = 5.0  # time limit for a program's greeting
 NEAR_M, FAR_M = 0.05, 100.0
-HEAD = struct.Struct("<II")  # of an answer: the frame, and whose picture (0 left, 1 right)
+HEAD = struct.Struct("<II")  # of an answer: frame number and side (0 left, 1 right)
 SIDES = ("left", "right")
 
 
 class ProgramOptions(Section):
-    """Settings of [content.options] for it."""
+    """Options for the scene `program` in [content.options]."""
 
-    port: int = Field(0, ge=0, le=65535, description="of the address; 0: any that is free")
+    port: int = Field(0, ge=0, le=65535, description="TCP port to listen on; 0: any free port")
 
 
 def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
-    """Listens from now on. Raises InputError if the port is in use."""
+    """Start listening for programs. Raises InputError if the port is in use."""
     options = validated(ProgramOptions, file.settings.options, source="content.options")
     size_px = file.stack.width_px * file.stack.height_px
     source = ProgramSource(Programs(options.port, most_bytes=8 * size_px + HEAD.size), background=file.background)
@@ -59,7 +59,7 @@ def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
 
 
 def camera_of(view: View) -> dict[str, Any]:
-    """View and projection matrices of a view for OpenGL: column-major, depth -1 to 1, metres."""
+    """Return a view's OpenGL view and projection matrices: column-major, depth -1 to 1, metres."""
     pixels = view.pixels_from_stack
     forward = pixels[2, :3] / np.linalg.norm(pixels[2, :3])
     right, down = (row[:3] - (row[:3] @ forward) * forward for row in pixels[:2])
@@ -80,7 +80,7 @@ def camera_of(view: View) -> dict[str, Any]:
 
 @dataclass(slots=True)
 class _Frame:
-    """One request to a program."""
+    """One request to a program for a frame."""
 
     views: Sequence[View]
     asked_s: float
@@ -93,18 +93,18 @@ class _Frame:
 
 
 class Programs:
-    """Connections of drawing programs, and their answers. Thread-safe."""
+    """Connections to drawing programs, and their answers. Thread-safe."""
 
     def __init__(self, port: int, *, most_bytes: int) -> None:
         """Raises InputError if the port is in use."""
         self._token = secrets.token_urlsafe(24)
         self._changed = threading.Condition()
-        self._drawing: ServerConnection | None = None  # the newest
+        self._drawing: ServerConnection | None = None  # the newest connection that draws
         self._listening: set[ServerConnection] = set()
-        self._frames: dict[int, _Frame] = {}  # that are not answered, by number
+        self._frames: dict[int, _Frame] = {}  # unanswered frames by number
         self._count, self._bottom_up = 0, False
         self.problem = ""
-        self.frame_ms: float | None = None  # from asking to the last picture, lately
+        self.frame_ms: float | None = None  # recent time from a request to its last picture
         try:
             self._server = serve(
                 self._connected, HOST, port, process_request=self._refused, max_size=most_bytes, compression=None
@@ -124,8 +124,8 @@ class Programs:
             self._count += 1
             number, program = self._count, self._drawing
             self._frames = {n: frame for n, frame in self._frames.items() if now_s - frame.asked_s < GIVEN_UP_S}
-            told = {"frame": number, "time_s": time_ns / NS_PER_S, "width": view.width_px, "height": view.height_px}
-            message = json.dumps(told | {"eyes": [camera_of(one) for one in views]})
+            request = {"frame": number, "time_s": time_ns / NS_PER_S, "width": view.width_px, "height": view.height_px}
+            message = json.dumps(request | {"eyes": [camera_of(one) for one in views]})
             if program is not None and len(self._frames) < IN_FLIGHT_MAX:
                 self._frames[number] = _Frame(views, now_s)
             others = tuple(self._listening)
@@ -136,11 +136,11 @@ class Programs:
             why = f" ({self.problem})" if self.problem else ""
             raise ContentFailure(f"no program is connected{why}: its address is in the status (program)")
         if number not in self._frames:
-            raise ContentFailure(f"the program is late: {IN_FLIGHT_MAX} frames are not answered")
+            raise ContentFailure(f"the program is late: {IN_FLIGHT_MAX} requests are unanswered")
         return number
 
     def answer(self, number: int, side: int) -> U8:
-        """One picture of a frame; waits for it. Raises ContentFailure."""
+        """Wait for one picture of a frame, and return it. Raises ContentFailure."""
         with self._changed:
             frame = self._frames.get(number)
             if frame is not None:
@@ -151,7 +151,7 @@ class Programs:
         raise ContentFailure(self.problem or f"the program has not answered within {1e3 * ANSWERED_S:.0f} ms")
 
     def done(self, number: int) -> None:
-        """Stop waiting for a frame; it counts as in flight until it is answered."""
+        """Stop waiting for a frame. It still counts as in flight until it is answered."""
         with self._changed:
             frame = self._frames.get(number)
             if frame is not None:
@@ -164,18 +164,18 @@ class Programs:
         begin("programs", self._server.shutdown)
 
     def _refused(self, connection: ServerConnection, request: Any) -> Any:
-        given = parse_qs(urlsplit(request.path).query).get("token", [""])[0]
-        if not hmac.compare_digest(given.encode(), self._token.encode()):
+        token = parse_qs(urlsplit(request.path).query).get("token", [""])[0]
+        if not hmac.compare_digest(token.encode(), self._token.encode()):
             return connection.respond(403, "the token of the address is wrong\n")
         return None
 
     def _connected(self, connection: ServerConnection) -> None:
-        """One connection's thread; its first message says whether it draws or listens."""
-        why = "it is gone"
+        """Serve a connection on its thread. Its first message states whether it draws or listens."""
+        why = "it closed the connection"
         try:
             hello = json.loads(connection.recv(timeout=HELLO_S))
             if not isinstance(hello, dict):
-                raise ValueError("begins with no JSON object")
+                raise ValueError("does not begin with a JSON object")
             self._welcome(connection, hello)
             for message in connection:
                 self._take(connection, message)
@@ -202,14 +202,14 @@ class Programs:
             self._bottom_up, self.problem = hello.get("rows") == "bottom-up", ""
             self._frames.clear()
             self._changed.notify_all()
-        log.info("a program draws: %s", one_line(str(hello.get("name", "without a name")), most=80))
+        log.info("drawing program connected: %s", one_line(str(hello.get("name", "unnamed")), most=80))
         if before is not None:
-            before.close(1001, "another program draws")
+            before.close(1001, "another program has replaced it")
 
     def _take(self, connection: ServerConnection, message: str | bytes) -> None:
-        """One picture. Raises ValueError for anything else."""
+        """Accept one picture. Raises ValueError for any other message."""
         if not isinstance(message, bytes) or len(message) < HEAD.size:
-            raise ValueError("it answered with something that is no picture")
+            raise ValueError("its answer is not a picture")
         number, side = HEAD.unpack_from(message)
         with self._changed:
             frame = self._frames.get(number)
@@ -217,8 +217,8 @@ class Programs:
                 return  # it was abandoned
             height, width = frame.views[0].height_px, frame.views[0].width_px
             if len(message) - HEAD.size != 4 * width * height:
-                found = len(message) - HEAD.size
-                raise ValueError(f"it answered with {found} bytes for {width}x{height} RGBA pixels")
+                size = len(message) - HEAD.size
+                raise ValueError(f"it answered with {size} bytes for {width}x{height} RGBA pixels")
             picture = np.frombuffer(message, np.uint8, offset=HEAD.size).reshape(height, width, 4)
             frame.pictures[side] = np.ascontiguousarray(picture[::-1]) if self._bottom_up else picture
             if frame.complete:
@@ -229,12 +229,12 @@ class Programs:
 
 
 class ProgramSource(ContentSource):
-    """Pictures of the connected program, for exactly the eyes that are solved for."""
+    """Shows pictures of the connected program, drawn for exactly the eyes that are solved for."""
 
     def __init__(self, programs: Programs, *, background: Any) -> None:
         self._programs = programs
         self.info = ContentInfo("program", moving=True, background=background)
-        self._expected: tuple[int, list[View]] | None = None  # the frame that was asked for, of these views
+        self._expected: tuple[int, list[View]] | None = None  # the requested frame and its views
         weakref.finalize(self, programs.close)
 
     @property

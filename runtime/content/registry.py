@@ -1,4 +1,4 @@
-"""Content sources by `content.scene`. Loaders are imported when they are needed."""
+"""Open the content source that `content.scene` names. Loaders are imported on demand."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from runtime.support.untrusted_input import LIMITS
 MESHES = (".glb", ".gltf", ".obj", ".off", ".stl")
 SPLATS = (".ply", ".splat", ".spz", ".sog")  # a .ply may be a mesh
 PLAYLISTS = (".toml", ".json")
-HARMLESS = {".png": PNG, ".jpg": JPEG, ".jpeg": JPEG}  # small stills of these first bytes are read here
+HARMLESS = {".png": PNG, ".jpg": JPEG, ".jpeg": JPEG}  # small stills with these first bytes are read in this process
 HARMLESS_PX = 4096 * 4096
 TO_GLTF, TO_PLY = "export it as glTF (.glb), as Blender does", "save it as PLY, as CloudCompare does"
 TO_SPLATS = "convert it: `npx @playcanvas/splat-transform in{} out.ply`"
 FILMS = (".wmv", ".flv", ".mpg", ".mpeg", ".ts", ".m2ts", ".mts", ".3gp", ".ogv", ".vob")
-OTHER_FILES = {  # by their names: format and the way out
+OTHER_FILES = {  # by suffix: kind of file, and the way out
     **dict.fromkeys((".fbx", ".dae", ".blend", ".3ds", ".x3d", ".wrl", ".abc"), ("a 3D scene", TO_GLTF)),
     **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), ("a USD scene", TO_GLTF)),
     **dict.fromkeys(
@@ -46,12 +46,12 @@ OTHER_FILES = {  # by their names: format and the way out
     **dict.fromkeys((".ksplat", ".lcc"), ("compressed splats", TO_SPLATS)),
 }
 LFS = b"version https://git-lfs"
-TRIED_PX = (32, 18)  # a picture that a class is asked for before it is shown
-Opener = Callable[..., ContentSource]  # of `context`
+TRIED_PX = (32, 18)  # size of the trial picture of a user-defined scene
+Opener = Callable[..., ContentSource]  # called with `context`
 
 
 def open_content(settings: ContentSettings, stack: PanelStack, context: Any) -> ContentSource:
-    """The source of `settings.scene`: a built-in scene, a preset, a class, a file or a folder.
+    """Open `settings.scene`: a built-in scene, a preset, a class, a file or a folder.
 
     context: the moderngl context of the thread that will call `render`. Raises InputError, naming file and field.
     """
@@ -59,10 +59,10 @@ def open_content(settings: ContentSettings, stack: PanelStack, context: Any) -> 
 
 
 def prepare_content(settings: ContentSettings, stack: PanelStack) -> Opener:
-    """Read and check `settings.scene`; the result makes the source on the thread with the context.
+    """Read and check `settings.scene`; the returned function creates the source on the context's thread.
 
-    This is the slow part and needs no GL: it may run on any thread, and files are read in a child process. How
-    far it is goes to `support.progress`. Raises InputError, naming file and field.
+    This slow part needs no GL and may run on any thread. Files are read in a child process, and `support.progress`
+    receives the progress. Raises InputError, naming file and field.
     """
     file = SceneFile(Path(settings.scene), settings, stack)
     too_slow = InputError(settings.scene, "", f"takes longer to load than {LIMITS.load_s:g} s")
@@ -81,14 +81,14 @@ def _prepared(file: SceneFile) -> Opener:
         return _built_in(name, file)
     if name in preset_names():
         if not settings.file:
-            raise InputError("content", "file", f"is needed: {name}'s .ply, .glb or data-set folder (not shipped)")
+            raise InputError("content", "file", f"is missing: {name}'s .ply, .glb or data-set folder (not shipped)")
         return _from_path(replace(file, path=Path(settings.file), preset=name))
     if name == "program":
         from runtime.content import program
 
         return program.prepare(file)
     if "://" in name or name.startswith("/dev/video"):
-        problem = "live pictures come from a class of yours (module:Class) or a program (docs/content.md)"
+        problem = "live pictures need a class of your own (module:Class) or a program (docs/content.md)"
         raise InputError("content", "scene", f"{untrusted_input.shown(without_secrets(name))}: {problem}")
     if is_plugin(name):
         return _plugin(name, file)
@@ -135,7 +135,7 @@ def _is_harmless(file: SceneFile) -> bool:
 
 
 def _read(file: SceneFile) -> Opener:
-    """Read a path by its name and first bytes; the result can be pickled."""
+    """Read a path, choosing the reader by its name and first bytes. The result can be pickled."""
     path = file.path
     suffix = path.suffix.lower()
     if path.is_dir():
@@ -188,7 +188,7 @@ def _playlist(file: SceneFile) -> Opener:
 
 
 def _plugin(name: str, file: SceneFile) -> Opener:
-    """A class of the user's own: imported and its options checked here, made and tried once with the context."""
+    """Import a user's class and check its options; the returned function creates and tries it."""
     plugin = plugin_class(name, ContentSource, field="content.scene")
     options = validated(strict(plugin.Options), file.settings.options, source="content.options")
 
@@ -204,7 +204,7 @@ def _plugin(name: str, file: SceneFile) -> Opener:
             raise InputError(name, "", written(error)) from error
         if getattr(picture, "shape", None) != (*TRIED_PX[::-1], 4) or picture.dtype != np.uint8:
             source.close()
-            raise InputError(name, "render", "must answer (height_px, width_px, 4) RGBA, uint8")
+            raise InputError(name, "render", "must return (height_px, width_px, 4) RGBA, uint8")
         return source
 
     return make

@@ -29,22 +29,22 @@ from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8
 
-COLUMNS = 320  # of the surface where it is smooth: as fine as depth cameras see, and quick without a graphics card
-FINEST_COLUMNS = 1600  # of the surface at an edge
-NOMINAL_DISTANCE_M = 0.6  # from here the surface looks like the picture
-TORN_RELATIVE = 0.12  # of the depth range: a larger step between neighbours is an edge, not a slope
-BLURRED_PX = 5  # so wide an edge of the depth map still is one
-MIXED_PX = 2  # to either side of an edge colours are of both sides
-REACH_PX = 10  # farthest that a colour is taken from
-BEHIND_SHARE = 0.1  # of the picture's width: how far behind an edge the background is filled in
-SET_BACK = 0.004  # of the depth range: offset of the made-up surface behind the true one
-SAMPLES = 4  # a pixel: the split edges are its outlines
+COLUMNS = 320  # resolution of the smooth surface: as fine as depth cameras, and fast without a GPU
+FINEST_COLUMNS = 1600  # resolution at edges
+NOMINAL_DISTANCE_M = 0.6  # distance from which the surface looks exactly like the picture
+TORN_RELATIVE = 0.12  # share of the depth range; a larger step between neighbours is an edge rather than a slope
+BLURRED_PX = 5  # an edge of the depth map may be blurred over this width
+MIXED_PX = 2  # this near to an edge, colours are mixed from both sides
+REACH_PX = 10  # largest distance from which a colour is taken
+BEHIND_SHARE = 0.1  # how far behind an edge the background is filled in, as a share of the picture's width
+SET_BACK = 0.004  # offset of the invented surface behind the true one, as a share of the depth range
+SAMPLES = 4  # per pixel, because the split edges are its outlines
 
 Mask = NDArray[np.bool_]
 
 
 def split_rgbd(rgb: U8, path: Path) -> tuple[U8, F32]:
-    """(h, w, 3) colour and (h, w) depth in [0, 1], 1 nearest, of the two halves. Raises InputError."""
+    """Return the halves as colour (h, w, 3) and depth (h, w) in [0, 1], 1 nearest. Raises InputError."""
     width = rgb.shape[1] // 2
     if width < 2 or rgb.shape[0] < 2:
         raise InputError(path, "layout", "the picture is too small for colour and depth side by side")
@@ -55,7 +55,7 @@ def split_rgbd(rgb: U8, path: Path) -> tuple[U8, F32]:
 
 
 def surfaces(colour: U8, depth: F32, *, stack: PanelStack, depth_m: tuple[float, float]) -> list[Part]:
-    """The picture as triangles, each point on its ray at its depth: front surface, and background.
+    """Return front surface and background as triangles, with each point on its ray at its depth.
 
     colour: (h, w, 3); depth: (h, w), 1 nearest.
     """
@@ -81,7 +81,7 @@ def surfaces(colour: U8, depth: F32, *, stack: PanelStack, depth_m: tuple[float,
 
 
 def sharpened(depth: F32) -> F32:
-    """(h, w) depth with blurred edges sharpened to one step: pixels between go to the nearer side."""
+    """Return the depth (h, w) with blurred edges sharpened; their pixels go to the nearer side."""
     kernel = np.ones((BLURRED_PX, BLURRED_PX), np.uint8)
     high, low = cv2.dilate(depth, kernel), cv2.erode(depth, kernel)
     snapped = np.where(high - depth < depth - low, high, low)
@@ -89,7 +89,7 @@ def sharpened(depth: F32) -> F32:
 
 
 def unmixed(colour: U8, depth: F32) -> U8:
-    """(h, w, 3) colours whose pixels next to a depth edge are replaced from farther inside their side."""
+    """Return the colours (h, w, 3), those next to a depth edge replaced from farther inside."""
     side = 2 * MIXED_PX + 1
     kernel = np.ones((side, side), np.uint8)
     mixed = cv2.dilate(depth, kernel) - cv2.erode(depth, kernel) > TORN_RELATIVE
@@ -97,21 +97,21 @@ def unmixed(colour: U8, depth: F32) -> U8:
     if not beside.any():
         return colour
     there, wanted = np.argwhere(beside), np.argwhere(mixed)
-    far_apart = 4 * side / TORN_RELATIVE  # pixels that a unit of depth counts for: the other side is farther off
+    far_apart = 4 * side / TORN_RELATIVE  # pixels per unit of depth, so that the other side is never the nearest
     away, nearest = cKDTree(np.column_stack([there, depth[beside] * far_apart])).query(
         np.column_stack([wanted, depth[mixed] * far_apart]), distance_upper_bound=REACH_PX
     )
-    near = np.isfinite(away)  # what is too thin to have an inside keeps its own colours
+    near = np.isfinite(away)  # a part too thin to have an inside keeps its own colours
     result = colour.copy()
     result[tuple(wanted[near].T)] = colour[beside][nearest[near]]
     return result
 
 
 def background(depth: F32, colour: U8) -> tuple[F32, U8, Mask]:
-    """(h, w) depth and (h, w, 3) colour of the background behind edges, and the mask of invented pixels.
+    """Return the background behind edges: depth (h, w), colour (h, w, 3) and a mask of invented pixels.
 
-    Under the near side it is as the far one is at the nearest edge; a ring of the far side itself belongs to it, so
-    that it has no gap there.
+    Behind the near side, they continue those of the far side at the nearest edge. A ring of the far side itself is
+    included, so that no gap remains there.
     """
     far_side = depth < cv2.dilate(depth, np.ones((5, 5), np.uint8)) - TORN_RELATIVE
     if not far_side.any():
@@ -123,7 +123,7 @@ def background(depth: F32, colour: U8) -> tuple[F32, U8, Mask]:
 
 
 def _quads(depth: F32) -> I32:
-    """(n, 4) corners, as indices into the depth map: large where it is smooth, single pixels at edges."""
+    """Return quads (n, 4) as depth map indices: large on smooth areas, single pixels at edges."""
     rows, columns = depth.shape
     step = -(-columns // COLUMNS)
     down = np.unique(np.r_[np.arange(0, rows - 1, step), rows - 1])
@@ -153,7 +153,7 @@ def _corners(row: Any, column: Any, columns: int) -> I32:
 
 
 def _placed(depth: F32, quads: I32, picture: U8, *, stack: PanelStack, depth_m: tuple[float, float]) -> Part:
-    """Quads of a depth map as triangles in the stack's frame."""
+    """Return the quads of a depth map as triangles in the stack's frame."""
     rows, columns = depth.shape
     used, corners = np.unique(quads, return_inverse=True)
     corners = corners.reshape(-1, 4)
@@ -171,17 +171,17 @@ def _placed(depth: F32, quads: I32, picture: U8, *, stack: PanelStack, depth_m: 
 
 
 def _edge_to_edge(index: Any, count: int) -> F64:
-    """Return pixel centres, with the outermost at the picture's edge."""
+    """Return pixel centres, stretched so that the outermost are at the picture's edge."""
     place = index + 0.5
     return np.where(index == 0, 0.0, np.where(index == count - 1, float(count), place))
 
 
 def prepare(file: SceneFile) -> Callable[..., TriangleSource]:
-    """Read the file; the result uploads it to GL. Raises InputError if it holds no depth."""
+    """Read the file; the returned function uploads it to GL. Raises InputError if the file has no depth."""
     colour, depth = split_rgbd(open_frames(file.path, file.settings).frame(0), file.path)
-    # Outlines of a torn surface run through its inside: samples there, no ramps.
-    found = surfaces(colour, depth, stack=file.stack, depth_m=file.settings.depth_m)
-    parts = [DrawnPart(part, outlined=False) for part in found]
+    # The outlines of a torn surface run through its inside, so they need samples instead of ramps.
+    surface_parts = surfaces(colour, depth, stack=file.stack, depth_m=file.settings.depth_m)
+    parts = [DrawnPart(part, outlined=False) for part in surface_parts]
     info = ContentInfo(file.path.stem, background=file.background)
     places = [np.eye(4)] * len(parts)
     return partial(TriangleSource, parts, places, info=info, samples=SAMPLES)

@@ -1,4 +1,4 @@
-"""The built-in scenes, in fractions of the display, so that every stack shows all of them."""
+"""The built-in scenes. Their lengths scale with the display, so that every stack shows all of them."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from runtime.records import F64
 
 @dataclass(frozen=True, slots=True)
 class Thing:
-    """One object: lengths in metres of a display 0.2916 m high, frame `stack` after `centre_m`."""
+    """One object. Lengths are in metres for a display 0.2916 m high, in frame `stack` after `centre_m`."""
 
-    shape: Shape  # around its own origin
+    shape: Shape  # centred on its own origin
     texture: str
     centre_m: tuple[float, float, float]
     colour: Colour = WHITE  # multiplies the texture
     rotation: F64 | None = None  # 3x3 stack_from_thing
-    turns_per_s: float = 0.0  # about the vertical, where the scene moves
+    turns_per_s: float = 0.0  # about the vertical, in a moving scene
     lit: bool = True
 
 
@@ -35,7 +35,7 @@ class Scene:
     background: Colour = WHITE
     moving: bool = False
     grey: bool = False
-    flat: bool = False  # everything in the middle panel's plane
+    flat: bool = False  # everything is in the middle panel's plane
 
 
 def _turned(yaw_deg: float, pitch_deg: float = 0.0) -> F64:
@@ -84,7 +84,7 @@ def _demo(turns_per_s: float = 0.0) -> tuple[Thing, ...]:
 
 
 def _room() -> tuple[Thing, ...]:
-    """A dim room behind the display, wider than it, and objects in front of it: nearest is the globe."""
+    """Return a dim room, wider than the display and behind it, with objects; the nearest is a globe."""
     wide, high, back = 0.56, 0.34, -0.14
     deep = 0.02 - back
     middle, down = (0.02 + back) / 2, shapes.rotation_about(1, -np.pi / 2)
@@ -125,7 +125,7 @@ def _sparse() -> tuple[Thing, ...]:
 
 
 def _texture() -> tuple[Thing, ...]:
-    """A wall that fills the picture from everywhere before the display, with things before it."""
+    """Return a wall that fills the picture from any position, and things in front of it."""
     wall = shapes.card(3.2, 2.4, repeat=(12.0, 9.0))
     return (Thing(wall, "mosaic", (-0.10, 0.0, 0.0), lit=False), *_demo()[3:])
 

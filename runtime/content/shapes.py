@@ -1,4 +1,4 @@
-"""Shapes as triangle lists in their own coordinates: pure functions of numpy. Normals point outwards."""
+"""Shapes as triangle lists in their own coordinates. Their normals point outwards."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from runtime.records import F32, F64
 
 I32 = NDArray[np.int32]
 
-AT_ONCE = 1 << 17  # vertices or faces that are worked on together: bounds the memory
+AT_ONCE = 1 << 17  # vertices or faces processed together, which bounds the memory
 
-# 5x7 letters, a row a string; only those that the built-in scene spells.
+# 5x7 letters, one string per row; only those that the built-in scenes need.
 GLYPHS = {
     "3": ("####.", "....#", "....#", ".###.", "....#", "....#", "####."),
     "D": ("####.", "#...#", "#...#", "#...#", "#...#", "#...#", "####."),
@@ -45,7 +45,7 @@ class Shape:
 
 
 def join(shapes: Sequence[Shape]) -> Shape:
-    """Several shapes as one."""
+    """Join several shapes into one."""
     starts = np.cumsum([0, *(len(shape.positions_m) for shape in shapes)])
     return Shape(
         np.concatenate([shape.positions_m for shape in shapes]),
@@ -58,7 +58,7 @@ def join(shapes: Sequence[Shape]) -> Shape:
 
 
 def flat_normals(corners: ArrayLike) -> F32:
-    """(t, 3) unit normals of triangles' corners (t, 3, 3); zero for triangles without area."""
+    """Return (t, 3) unit normals of triangles with corners (t, 3, 3); zero for triangles without area."""
     corners = np.asarray(corners)
     normals = np.empty((len(corners), 3), np.float32)
     for first in range(0, len(corners), AT_ONCE):
@@ -69,17 +69,17 @@ def flat_normals(corners: ArrayLike) -> F32:
 
 
 def placed(positions: ArrayLike, normals: ArrayLike | None, matrices: F64) -> tuple[F32, F32 | None]:
-    """(v, 3) places and unit normals, moved by one 4x4 matrix, or by one a vertex (v, 4, 4)."""
+    """Return (v, 3) positions and unit normals, moved by one 4x4 matrix or by one per vertex (v, 4, 4)."""
     positions = np.asarray(positions)
     moved = np.empty(positions.shape, np.float32)
     turned = None if normals is None else np.empty(positions.shape, np.float32)
-    for first in range(0, len(positions), AT_ONCE):  # in double precision
+    for first in range(0, len(positions), AT_ONCE):  # chunks, because this needs double precision
         rows = slice(first, first + AT_ONCE)
         matrix = matrices[rows] if matrices.ndim == 3 else matrices
         linear = matrix[..., :3, :3]
         moved[rows] = _times(linear, positions[rows]) + matrix[..., :3, 3]
         if normals is not None and turned is not None:
-            # Joints turn and scale evenly, nodes as they like.
+            # Joints rotate and scale uniformly; nodes may transform in any linear way.
             turn = linear if matrices.ndim == 3 else np.linalg.pinv(linear).T
             normal = _times(turn, np.asarray(normals)[rows])
             turned[rows] = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
@@ -87,12 +87,12 @@ def placed(positions: ArrayLike, normals: ArrayLike | None, matrices: F64) -> tu
 
 
 def _times(matrix: NDArray[Any], vectors: NDArray[Any]) -> NDArray[Any]:
-    """(v, 3) vectors by a 3x3 matrix, or each by its own."""
+    """Multiply vectors (v, 3) by one 3x3 matrix, or each by its own."""
     return np.asarray(vectors @ matrix.T if matrix.ndim == 2 else np.einsum("nij,nj->ni", matrix, vectors))
 
 
 def rotation_about(axis: int, angle_rad: float) -> F64:
-    """3x3 right-handed rotation about x (0), y (1) or z (2)."""
+    """Return the 3x3 right-handed rotation about x (0), y (1) or z (2)."""
     cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
     i, j = (axis + 1) % 3, (axis + 2) % 3
     matrix = np.eye(3)
@@ -101,7 +101,7 @@ def rotation_about(axis: int, angle_rad: float) -> F64:
 
 
 def _grid(u: F64, v: F64) -> tuple[F64, F64, I32]:
-    """Parameters and triangles of a (len(v), len(u)) grid of vertices."""
+    """Return parameters and triangles of a (len(v), len(u)) grid of vertices."""
     columns, rows = len(u), len(v)
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1)
     first = np.column_stack([corner, corner + 1, corner + columns])
@@ -115,7 +115,7 @@ def _shape(positions: F64, normals: F64, uv: F64, triangles: I32) -> Shape:
 
 
 def card(width_m: float, height_m: float, *, repeat: tuple[float, float] = (1.0, 1.0)) -> Shape:
-    """A rectangle in the plane x = 0 that faces +x, its picture upright and unmirrored for an eye at +x."""
+    """Return a rectangle in the plane x = 0, its picture upright and unmirrored for an eye at +x."""
     s, t, triangles = _grid(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
     positions = np.column_stack([0 * s, (s - 0.5) * width_m, (0.5 - t) * height_m])
     return _shape(
@@ -124,7 +124,7 @@ def card(width_m: float, height_m: float, *, repeat: tuple[float, float] = (1.0,
 
 
 def box(size_m: Sequence[float]) -> Shape:
-    """A box around the origin, each face with the whole texture."""
+    """Return a box around the origin, each face with the whole texture."""
     sx, sy, sz = size_m
     turns = [
         (np.eye(3), (sy, sz), sx),
@@ -138,7 +138,7 @@ def box(size_m: Sequence[float]) -> Shape:
 
 
 def sphere(radius_m: float, *, columns: int = 48, rows: int = 24) -> Shape:
-    """A globe with its poles on the z axis."""
+    """Return a sphere with its poles on the z axis."""
     s, t, triangles = _grid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1))
     longitude, polar = s * 2 * np.pi, t * np.pi
     normal = np.column_stack([np.cos(longitude) * np.sin(polar), np.sin(longitude) * np.sin(polar), np.cos(polar)])
@@ -146,7 +146,7 @@ def sphere(radius_m: float, *, columns: int = 48, rows: int = 24) -> Shape:
 
 
 def torus(radius_m: float, tube_m: float, *, columns: int = 64, rows: int = 24) -> Shape:
-    """A ring around the x axis."""
+    """Return a torus around the x axis."""
     s, t, triangles = _grid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1))
     around, across = s * 2 * np.pi, t * 2 * np.pi
     normal = np.column_stack([np.sin(across), np.cos(around) * np.cos(across), np.sin(around) * np.cos(across)])
@@ -155,12 +155,12 @@ def torus(radius_m: float, tube_m: float, *, columns: int = 64, rows: int = 24) 
 
 
 def _runs(marks: str) -> list[tuple[int, int]]:
-    """Start and length of each unbroken run of `#`."""
+    """Return the start and length of each unbroken run of `#`."""
     return [(match.start(), match.end() - match.start()) for match in re.finditer("#+", marks)]
 
 
 def lettering(text: str, *, cell_m: float, depth_m: float) -> Shape:
-    """Letters of square bars, 5 x 7 cells each with a gap of one, centred on the origin, read from +x."""
+    """Return letters of square bars (5 x 7 cells, gaps of one) around the origin, read from +x."""
     left = -(len(text) * 6 - 1) / 2
     bars = []
     for index, letter in enumerate(text):
@@ -175,7 +175,7 @@ def lettering(text: str, *, cell_m: float, depth_m: float) -> Shape:
 
 
 def fence(width_m: float, height_m: float, *, bars: int, bar_m: float) -> Shape:
-    """Upright thin bars with two rails, in the plane x = 0."""
+    """Return thin upright bars with two rails, in the plane x = 0."""
     upright = [
         box((bar_m, bar_m, height_m)).moved(offset_m=(0.0, y, 0.0))
         for y in np.linspace(-width_m / 2, width_m / 2, bars)

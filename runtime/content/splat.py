@@ -1,4 +1,4 @@
-"""3D Gaussian splats, sorted and blended straight into the pixels that a view asks for."""
+"""Draw 3D Gaussian splats, sorted and blended, directly at the pixels of a view."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from runtime.support.background import raise_if_abandoned
 from runtime.support.gl import DrawnPicture
 
 CUSTOM, CUSTOM_SPZ = ("-y", "-z"), ("+y", "+z")  # up, and to the viewer: trainers use OpenCV's camera axes
-FLOATS = 8  # a corner: place in clip space (2), place in standard deviations (2), colour and opacity (4)
+FLOATS = 8  # per corner: clip position (2), position in standard deviations (2), colour and opacity (4)
 VERTEX = """
 #version 330
 in vec2 in_place;
@@ -59,7 +59,7 @@ void main() {
 
 
 def prepare(file: SceneFile) -> Callable[..., SplatSource]:
-    """Read the file; the result uploads it to GL. Raises InputError."""
+    """Read the file; the returned function uploads it to GL. Raises InputError."""
     suffix = file.path.suffix.lower()
     if suffix == ".ply":
         header = read_header(file.path)
@@ -72,12 +72,12 @@ def prepare(file: SceneFile) -> Callable[..., SplatSource]:
 
 
 class SplatSource(CanvasSource):
-    """A scene of splats at its place in the stack frame."""
+    """A scene of splats, placed in the stack frame."""
 
     def __init__(self, gaussians: Gaussians, *, stack_from_scene: F64, context: Any, info: ContentInfo) -> None:
         super().__init__(context, info=info, deep=True)
         self._gaussians = moved(gaussians, stack_from_scene)
-        self._seen: list[Splats | None] = [None] * SIDES  # of each side's newest picture
+        self._seen: list[Splats | None] = [None] * SIDES  # for each side's newest picture
         linear = stack_from_scene[:3, :3]
         self._scene_from_stack_rotation = (np.linalg.inv(linear) * np.cbrt(np.linalg.det(linear))).astype(np.float32)
         self._program = context.program(vertex_shader=VERTEX, fragment_shader=FRAGMENT)
@@ -94,7 +94,7 @@ class SplatSource(CanvasSource):
         self.held += [self._program, self._buffer, indices, self._vertices]
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
-        """Every splat that the eye can see, farthest first."""
+        """Draw all splats that the eye can see, farthest first."""
         splats = self._seen[view.side] = seen_splats(self._gaussians, view)
         count = len(splats.index)
 
@@ -104,7 +104,7 @@ class SplatSource(CanvasSource):
             for first in range(0, count, AT_ONCE):
                 raise_if_abandoned()
                 if first:
-                    self._buffer.orphan()  # its storage may still be drawn from
+                    self._buffer.orphan()  # the GPU may still read its storage
                 self._vertices.render(vertices=6 * self._prepare(view, splats, slice(first, first + AT_ONCE)))
 
         whole = PixelRect(0, 0, view.width_px, view.height_px if count else 0)
@@ -115,7 +115,7 @@ class SplatSource(CanvasSource):
         return None if splats is None else nearest_blocks(splats, view, every=every, first=first)
 
     def _prepare(self, view: View, splats: Splats, some: slice) -> int:
-        """Fill the vertex buffer with some splats of a view; returns how many."""
+        """Fill the vertex buffer with some splats of a view, and return their number."""
         index, reach = splats.index[some], splats.reach[some]
         count = len(index)
         directions = self._gaussians.centres[index] - view.eye_m.astype(np.float32)

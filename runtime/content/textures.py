@@ -16,14 +16,14 @@ def _coordinates() -> tuple[F64, F64]:
 
 
 def _mixed(weight: F64, first: tuple[int, int, int], second: tuple[int, int, int]) -> U8:
-    """A picture between two colours; weight 1 is the first."""
+    """Return a picture that mixes two colours; weight 1 is the first."""
     rgb = weight[..., None] * np.array(first) + (1 - weight[..., None]) * np.array(second)
     alpha = np.full((*weight.shape, 1), 255.0)
     return np.concatenate([np.clip(np.rint(rgb), 0, 255), alpha], axis=2).astype(np.uint8)
 
 
 def _noise(seed: int, octaves: int = 4) -> F64:
-    """Smooth periodic noise in [0, 1]: random waves, so that it tiles."""
+    """Return smooth noise in [0, 1], a sum of random waves that tiles."""
     u, v = _coordinates()
     random = np.random.default_rng(seed)
     total = np.zeros_like(u)
@@ -31,12 +31,12 @@ def _noise(seed: int, octaves: int = 4) -> F64:
         for _ in range(6):
             a, b = random.integers(-(2**octave) - 1, 2**octave + 2, 2)
             total += np.sin(2 * np.pi * (a * u + b * v + random.random())) / 2**octave
-    found: F64 = (total - total.min()) / np.ptp(total)
-    return found
+    noise: F64 = (total - total.min()) / np.ptp(total)
+    return noise
 
 
 def checker() -> U8:
-    """Squares, 8 x 8, with fine lines between them."""
+    """Return 8 x 8 squares with fine lines between them."""
     u, v = _coordinates()
     squares = (np.floor(u * 8) + np.floor(v * 8)) % 2
     lines = np.minimum(np.abs(u * 8 - np.rint(u * 8)), np.abs(v * 8 - np.rint(v * 8))) < 0.04
@@ -44,7 +44,7 @@ def checker() -> U8:
 
 
 def crate() -> U8:
-    """Planks with grain, a frame and a diagonal."""
+    """Return planks with grain, a frame and a diagonal."""
     u, v = _coordinates()
     grain = 0.5 + 0.5 * np.sin(2 * np.pi * (18 * v + 1.5 * np.sin(2 * np.pi * (u + 2 * _noise(3, 2)))))
     frame = np.minimum(np.minimum(u, 1 - u), np.minimum(v, 1 - v)) < 0.11
@@ -55,7 +55,7 @@ def crate() -> U8:
 
 
 def globe() -> U8:
-    """Seas and lands with a graticule."""
+    """Return seas and lands with a graticule."""
     u, v = _coordinates()
     lines = (np.abs(u * 12 - np.rint(u * 12)) < 0.05) | (np.abs(v * 12 - np.rint(v * 12)) < 0.05)
     land = np.clip((_noise(11) - 0.52) * 20, 0, 1)
@@ -65,13 +65,13 @@ def globe() -> U8:
 
 
 def stripes() -> U8:
-    """Slanted stripes in two colours."""
+    """Return slanted stripes in two colours."""
     u, v = _coordinates()
     return _mixed((np.floor((u + v) * 4) % 2), (226, 44, 78), (255, 214, 226))
 
 
 def picture() -> U8:
-    """A poster: rings, a gradient and dots, with detail at all scales."""
+    """Return a poster of rings, a gradient and dots, with detail at all scales."""
     u, v = _coordinates()
     radius = np.hypot(u - 0.5, v - 0.5)
     rings = 0.5 + 0.5 * np.sin(2 * np.pi * 40 * radius**1.5)
@@ -82,7 +82,7 @@ def picture() -> U8:
 
 
 def mosaic() -> U8:
-    """Coloured tiles with grout and grain; repeats without a seam."""
+    """Return coloured tiles with grout and grain, which repeat without a seam."""
     u, v = _coordinates()
     column, row = (np.floor(u * 12)).astype(int), (np.floor(v * 12)).astype(int)
     colours = np.random.default_rng(23).uniform(0.25, 1.0, (12, 12, 3))[row, column]
@@ -102,5 +102,5 @@ TEXTURES = {
 
 
 def texture(name: str) -> U8 | None:
-    """A texture by name, (256, 256, 4); None for `plain`: the object's own colour shows."""
+    """Return a texture (256, 256, 4) by name; None for `plain`, where the object's own colour shows."""
     return None if name == "plain" else TEXTURES[name]()

@@ -1,6 +1,6 @@
-"""Triangles with colours, pictures and one lamp, drawn straight into the pixels that a view asks for.
+"""Draw triangles with colours, pictures and one lamp directly at the pixels of a view.
 
-A part without lamp, picture, vertex colours or holes has a shader without them.
+Parts without lamp, picture, vertex colours or holes use shaders without them.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from runtime.records import F32, F64, U8
 from runtime.support.background import raise_if_abandoned
 from runtime.support.gl import DrawnPicture
 
-PROJECTED_MAX = 5000  # vertices of a part that are projected to find its extent; beyond, its box is
-DRAWN_AT_ONCE = 20_000  # triangles
-UPLOADED_AT_ONCE = 8 << 20  # bytes
+PROJECTED_MAX = 5000  # most vertices of a part to project for its extent; beyond, its box is projected
+DRAWN_AT_ONCE = 20_000  # number of triangles
+UPLOADED_AT_ONCE = 8 << 20  # number of bytes
 ATTRIBUTES = ("in_normal", "in_uv", "in_colour")
-OUTLINE_FLOATS = 5 + 9  # a corner: clip coordinates and coverage, then the attributes
+OUTLINE_FLOATS = 5 + 9  # per corner: clip coordinates and coverage, then the attributes
 
-ANY_ALPHA = 2.0  # beyond every alpha
+ANY_ALPHA = 2.0  # above every alpha
 VERTEX = """
 #ifdef OUTLINE
 in vec4 in_clip;
@@ -78,7 +78,7 @@ out vec4 pixel;
 uniform sampler2D picture;
 uniform sampler2D glow_picture;
 uniform vec3 glow;
-uniform vec2 kept;  // alpha from and below which it is drawn
+uniform vec2 kept;  // drawn from kept.x to below kept.y
 float mirrored(float place) { return abs(mod(place + 1.0, 2.0) - 1.0); }
 vec3 linear(vec3 code) { return mix(code / 12.92, pow((code + 0.055) / 1.055, vec3(2.4)), step(0.04045, code)); }
 vec3 coded(vec3 light) {
@@ -128,10 +128,10 @@ void main() {
 
 
 class DrawnPart:
-    """A part with its prepared buffers: made on any thread without GL, then uploaded by its source."""
+    """A part with its buffers, prepared on any thread without GL and uploaded later by its source."""
 
     def __init__(self, part: Part, *, outlined: bool = True) -> None:
-        """outlined: with what ramps along its outline need."""
+        """outlined: also prepare the ramps along its outline."""
         mesh = part.shape
         self.features, self.sampler = part.features, part.sampler
         self.pictures, self.glow, self.two_sided = (part.picture, part.glow_picture), part.glow, part.two_sided
@@ -150,25 +150,25 @@ class DrawnPart:
         if part.turning:
             reach = float(np.linalg.norm(mesh.positions_m, axis=1).max())
             low, high = np.full(3, -reach), np.full(3, reach)
-        self.corners_m = camera.box_corners(low, high)  # (8, 3) of the box that holds it; frame of the part
+        self.corners_m = camera.box_corners(low, high)  # (8, 3) corners of its box, in the part's frame
         self.textures: list[Any] = []
 
     @property
     def positions(self) -> F32:
-        """(v, 3) at present."""
+        """Current positions (v, 3)."""
         return self.vertices[:, :3]
 
     def upload(self, context: Any, surface_program: Any, outline: Any, textures: list[Any]) -> None:
-        """Make its GL objects; program, outline (a vertex array) and textures are the source's, and shared."""
+        """Create its GL objects. The source owns and shares program, outline (a vertex array) and textures."""
         self.surface_program, self.outline, self.textures = surface_program, outline, textures
         self._buffer, self._triangles = (_uploaded(context, array) for array in (self.vertices, self.triangles))
-        if self.edges is None and not self.is_projected:  # hundreds of MiB that are no longer read
+        if self.edges is None and not self.is_projected:  # may free hundreds of MiB
             self.vertices, self.triangles = self.vertices[:0].copy(), self.triangles[:0].copy()
         layout = _layout(surface_program, self._buffer, ("in_position", *ATTRIBUTES), (3, 3, 2, 4))
         self.surface = context.vertex_array(surface_program, [layout], index_buffer=self._triangles)
 
     def draw_surface(self) -> None:
-        """In pieces: a software rasteriser holds Python's lock for as long as a call takes."""
+        """Draw in several calls, because a software rasteriser holds Python's lock during each."""
         for first in range(0, self.corner_count, 3 * DRAWN_AT_ONCE):
             raise_if_abandoned()
             self.surface.render(first=first, vertices=min(3 * DRAWN_AT_ONCE, self.corner_count - first))
@@ -180,22 +180,22 @@ class DrawnPart:
 
 
 class _Place:
-    """A part's place in a scene, with the matrices that do not depend on the view."""
+    """A part's position in a scene, with the matrices that do not depend on the view."""
 
     def __init__(self, stack_from_part: F64) -> None:
         linear = stack_from_part[:3, :3]
         volume = float(np.linalg.det(linear))
         self.stack_from_part = stack_from_part
-        self.part_from_stack = np.linalg.inv(stack_from_part) if volume else None  # None: squashed flat
+        self.part_from_stack = np.linalg.inv(stack_from_part) if volume else None  # None: flattened to no volume
         self.normals = np.linalg.pinv(linear).T * np.cbrt(abs(volume))
 
 
 class _Look:
-    """The matrices of a place in a view."""
+    """The matrices of a part's position in a view."""
 
     def __init__(self, place: _Place, clip_from_stack: F64, view: View) -> None:
         inverse = place.part_from_stack
-        self.eye = None if inverse is None else inverse[:3, :3] @ view.eye_m + inverse[:3, 3]  # None: has no inside
+        self.eye = None if inverse is None else inverse[:3, :3] @ view.eye_m + inverse[:3, 3]  # None: no volume
         turned = place.normals if view.display_from_view is None else view.display_from_view @ place.normals
         self.clip_from_part = clip_from_stack @ place.stack_from_part
         self._clip, self._normals = _gl(self.clip_from_part), _gl(turned)
@@ -212,16 +212,16 @@ class _Look:
 
 @dataclass(frozen=True, slots=True)
 class _Arrangement:
-    """Places of all parts at one time."""
+    """Positions of all parts at one time."""
 
-    places: list[_Place]  # of each part; parts of one place share it
-    points_m: F64  # (n, 3) around all parts, frame `stack`
-    corners_m: F64  # (p, 8, 3) of each part's box, frame `stack`
+    places: list[_Place]  # one per part; parts at the same position share it
+    points_m: F64  # (n, 3) points around all parts, frame `stack`
+    corners_m: F64  # (p, 8, 3) corners of each part's box, frame `stack`
     nearest_first: NDArray[np.intp]  # (p,)
 
 
 class TriangleSource(CanvasSource):
-    """Parts at their places, over a background."""
+    """A source of placed parts over a background."""
 
     def __init__(
         self,
@@ -232,14 +232,14 @@ class TriangleSource(CanvasSource):
         info: ContentInfo,
         samples: int = 0,
     ) -> None:
-        """stack_from_parts: 4x4 similarities; samples: per pixel for outlines; 0: ramps along the outlines.
+        """stack_from_parts: 4x4 similarities; samples: per pixel for outlines; 0: draw ramps instead.
 
-        A software rasteriser draws ramps faster.
+        Ramps are faster on a software rasteriser.
         """
         super().__init__(context, info=info, samples=samples)
         self.parts, self.stack_from_parts = list(parts), list(stack_from_parts)
         self._with_ramps = samples == 0
-        self._still: _Arrangement | None = None  # of a scene that does not move
+        self._still: _Arrangement | None = None  # arrangement of a scene that does not move
         self._programs: dict[tuple[str, ...], Any] = {}
         self._textures: dict[tuple[int, Sampler], Any] = {}
         self._outlined = [(n, part, part.edges) for n, part in enumerate(self.parts) if part.edges is not None]
@@ -249,7 +249,7 @@ class TriangleSource(CanvasSource):
             self._edges = Outlines([edges for _, _, edges in self._outlined], vertices=counts)
             self._corners = np.concatenate([part.vertices for _, part, _ in self._outlined])
             for (begin, end), (_, part, _) in zip(pairwise(self._edges.vertices_before), self._outlined, strict=True):
-                part.vertices = self._corners[begin:end]  # not kept twice
+                part.vertices = self._corners[begin:end]  # avoids a second copy
         self._outline_buffer = context.buffer(reserve=max(edges, 1) * 6 * OUTLINE_FLOATS * 4, dynamic=True)
         self._outlines: dict[tuple[str, ...], Any] = {}
         for part in self.parts:
@@ -260,7 +260,7 @@ class TriangleSource(CanvasSource):
         self.held += [*self._textures.values(), *self._programs.values()]
 
     def places(self, time_ns: int) -> Sequence[F64]:
-        """4x4 stack_from_part of every part; moving scenes compute it for each time."""
+        """Return each part's 4x4 stack_from_part; moving scenes compute it for each time."""
         return self.stack_from_parts
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect:
@@ -277,7 +277,7 @@ class TriangleSource(CanvasSource):
             corners.append(part.corners_m @ matrix[:3, :3].T + matrix[:3, 3])
             is_few = part.is_projected
             points.append(part.positions @ matrix[:3, :3].T + matrix[:3, 3] if is_few else corners[-1])
-        # Nearest first: hidden pixels need not be shaded.
+        # Nearest first, so that hidden pixels need not be shaded.
         order = np.argsort([-box[:, 0].mean() for box in corners], kind="stable")
         found = _Arrangement([shared[id(m)] for m in matrices], np.concatenate(points), np.stack(corners), order)
         if is_still:
@@ -337,7 +337,7 @@ class TriangleSource(CanvasSource):
         return self._programs[features]
 
     def _outline(self, features: tuple[str, ...]) -> Any:
-        """The vertex array of outlines of parts with these features."""
+        """Return the vertex array for outlines of parts with these features."""
         if features not in self._outlines:
             program = self._program((*features, "OUTLINE"))
             names = ("in_clip", "in_coverage", *ATTRIBUTES)
@@ -386,14 +386,14 @@ class TriangleSource(CanvasSource):
 
 
 def _set_uniforms(program: Any, **values: Any) -> None:
-    """Those that the compiler has kept."""
+    """Set the uniforms that the compiler has kept."""
     for name, value in values.items():
-        if (uniform := program.get(name, None)) is not None:  # `in` would try one name after another
+        if (uniform := program.get(name, None)) is not None:  # `in` would try all names in turn
             uniform.value = value
 
 
 def _uploaded(context: Any, array: Any) -> Any:
-    """A buffer, in pieces: uploading holds Python's lock."""
+    """Upload a buffer in pieces, because uploading holds Python's lock."""
     data = memoryview(array).cast("B")
     buffer = context.buffer(reserve=data.nbytes)
     for first in range(0, data.nbytes, UPLOADED_AT_ONCE):
@@ -402,12 +402,12 @@ def _uploaded(context: Any, array: Any) -> Any:
 
 
 def _gl(matrix: F64) -> F32:
-    """Column by column, as GL reads a matrix."""
+    """Return a matrix in column-major order, for OpenGL."""
     return np.ascontiguousarray(matrix.T, np.float32)
 
 
 def _layout(program: Any, buffer: Any, names: tuple[str, ...], sizes: tuple[int, ...]) -> tuple[Any, ...]:
-    """A buffer's description for a program, without attributes that the compiler removed."""
+    """Return a buffer's description for a program, without attributes that the compiler removed."""
     used = [name for name in names if name in program]
     formats = [f"{size}f" if name in used else f"{size * 4}x" for name, size in zip(names, sizes, strict=True)]
     return (buffer, " ".join(formats), *used)

@@ -241,7 +241,7 @@ def undecodable(data: bytes, error: Exception | None = None) -> str:
     if data[:5] == b"<?xml" and b"<svg" in data[:HEAD_BYTES]:
         return f"is SVG, which is not supported: {ANOTHER}"
     if data.lstrip()[:1] == b"{" and b'"frames"' in data:
-        return f"is a camera set, as of a NeRF: {CAMERA_SET}"
+        return f"is a camera set, as used for a NeRF: {CAMERA_SET}"
     told = str(error).lower()
     if is_cut_off(data) or _promises_more(data) or "truncated" in told or "end of file" in told:
         return f"{UNDECODED} (it is cut off)"
@@ -325,7 +325,7 @@ def decoded_picture(coded: bytes, *, source: str | Path, field: str, name: str) 
 def camera_set_in(folder: Path) -> str:
     """Return why a folder with a camera set cannot be drawn, or an empty string if it has none."""
     sets = sorted(folder.glob("transforms*.json"))
-    return f"holds a camera set, as of a NeRF ({sets[0].name}): {CAMERA_SET}" if sets else ""
+    return f"holds a camera set, as used for a NeRF ({sets[0].name}): {CAMERA_SET}" if sets else ""
 
 
 def read_coded(path: Path) -> tuple[bytes, Header]:

@@ -119,7 +119,7 @@ def test_newer_data_name_the_eyes_left_and_right(tmp_path: Path, context: Any, s
 
 
 def test_a_folder_without_pairs_and_a_truncated_picture_are_told(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="holds no pair0"):
+    with pytest.raises(InputError, match="contains no pair0"):
         read_folder(tmp_path, LEGO)
     for half, y in ((0, 0.2), (1, -0.2)):
         (tmp_path / f"pair0_x6.0_y{y}_z2.0_{half}.jpg").write_bytes(b"\xff\xd8\xff broken")

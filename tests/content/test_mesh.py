@@ -335,12 +335,12 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
         ("a.obj", "v 0 0 0\nv 1 0 1e300\nv 0 1 0\nf 1 2 3\n", "vertices: 1 of 3 are not finite, or beyond 1e+15"),
         ("a.obj", "v 0 0 0\nv 1 0 fish\nv 0 1 0\nf 1 2 3\n", "cannot be read as a mesh"),
         ("a.obj", TRIANGLE + "f 1 2 9\n", "cannot be read as a mesh"),
-        ("a.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "faces: none has an area"),
-        ("a.stl", "\0" * 80 + "\7\0\0\0" + "\0" * 60, "faces: there are none"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "faces: all have zero area"),
+        ("a.stl", "\0" * 80 + "\7\0\0\0" + "\0" * 60, "faces: the file has none"),
         ("a.stl", "solid x\n" + "facet normal 0 0 1\n" * 50, "faces: 50 exceeds the limit of 20"),
-        ("a.stl", "", "faces: there are none"),
-        ("a.ply", CLOUD, "faces: there are none"),
-        ("a.stl", "\0" * 84, "faces: there are none"),
+        ("a.stl", "", "faces: the file has none"),
+        ("a.ply", CLOUD, "faces: the file has none"),
+        ("a.stl", "\0" * 84, "faces: the file has none"),
         *(
             (f"a{suffix}", data, "")
             for suffix in (".glb", ".gltf", ".ply", ".obj")

@@ -204,7 +204,7 @@ def test_a_picture_called_a_quilt_without_its_numbers_gets_a_hint(tmp_path: Path
     for name in ("my-Quilt.png", "quilt_qs2x2.png"):
         write_png(tmp_path / name, solid(RED))
         open_frames(tmp_path / name, AUTO)
-    assert caplog.text.count("a quilt? then --layout qs8x6a0.75") == 1 and "my-Quilt.png" in caplog.text
+    assert caplog.text.count("if it is a quilt, pass --layout qs8x6a0.75") == 1 and "my-Quilt.png" in caplog.text
 
 
 # All around
@@ -263,7 +263,7 @@ def test_a_camera_set_is_called_so_as_file_and_folder(tmp_path: Path, context: A
         told = set()
         # As `run`, `solve` and `eyes` read it.
         for read in (lambda p: opened(p, context, stack), lambda p: read_pair(p, ContentSettings()), read_image):
-            with pytest.raises(InputError, match="camera set, as of a NeRF") as error:
+            with pytest.raises(InputError, match="camera set, as used for a NeRF") as error:
                 read(path)
             told.add(str(error.value))
         assert len(told) == 1
@@ -272,7 +272,7 @@ def test_a_camera_set_is_called_so_as_file_and_folder(tmp_path: Path, context: A
     with pytest.raises(InputError, match="holds no pictures; those in train are shown by its own name"):
         opened(tmp_path, context, stack)
     (tmp_path / "a.json").write_text('{"name": "something"}')
-    with pytest.raises(InputError, match=r"a\.json: show: is missing: a JSON file as scene is a playlist"):
+    with pytest.raises(InputError, match=r"a\.json: show: is missing: a JSON file is shown as a playlist"):
         opened(tmp_path / "a.json", context, stack)
 
 
@@ -352,7 +352,7 @@ def test_what_a_folder_holds_besides_is_left_out_and_named(tmp_path: Path, caplo
     (tmp_path / "e.mov").write_bytes(b"\0\0\0\x14ftypqt  ")
     assert open_frames(tmp_path, AUTO).count == 2
     assert "3 of 5 pictures are skipped: a.jxl is JPEG XL" in caplog.text and "b.png is not an image" in caplog.text
-    assert "e.mov is a film, which is shown by its own name" in caplog.text
+    assert "e.mov is a film: set content.scene to the film itself" in caplog.text
 
 
 @pytest.mark.parametrize(("kind", "first_ms"), [("GIF", 200), ("WEBP", 200), ("PNG", 200), ("AVIF", 200)])

@@ -137,7 +137,7 @@ def test_a_silent_program_is_late_and_gets_at_most_two_requests(source: Any) -> 
     for _ in range(2):
         with pytest.raises(ContentFailure, match="not answered within 400 ms"):
             drawn(source)
-    with pytest.raises(ContentFailure, match="late: 2 frames"):
+    with pytest.raises(ContentFailure, match="late: 2 requests"):
         drawn(source)
     assert len(program.asked) == 2
     time.sleep(2.1)
@@ -172,7 +172,7 @@ def test_a_program_with_the_wrong_size_is_told_why_and_may_return(source: Any) -
     again = Program(source)
     assert drawn(source)[0].shape == (36, 64, 3) and source.problem == ""
     again.end()
-    assert eventually(lambda: source.problem == "it is gone")
+    assert eventually(lambda: source.problem == "it closed the connection")
 
 
 def test_the_newest_program_draws(source: Any) -> None:

@@ -293,7 +293,7 @@ def edited(folder: Path, old: bytes, new: bytes, cut: int = 0) -> Path:
         (b"", b"", 100, "vertex: the file is cut off: 20 are declared, 19 present"),
         (b"vertex 20", b"vertex 2999999", 0, "element vertex: the file is cut off"),
         (b"vertex 20", b"vertex 3000001", 0, "element vertex: 3,000,001 exceeds the limit of 3,000,000"),
-        (b"vertex 20", b"vertex 0", 0, "vertex: there are none"),
+        (b"vertex 20", b"vertex 0", 0, "vertex: the file has none"),
         (b"element vertex", b"element corner", 0, "vertex: the header has no format, no vertices"),
         (
             b"property float x",

@@ -284,7 +284,7 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
         gltf(buffers=[{"uri": "gone.bin", "byteLength": 9}]),
         "uri: gone.bin does not exist",
     ),
-    "nothing": (gltf(meshes=[], nodes=[], scenes=[{"nodes": []}]), "faces: there are none"),
+    "nothing": (gltf(meshes=[], nodes=[], scenes=[{"nodes": []}]), "faces: the file has none"),
     "a URI with NUL": (gltf(buffers=[{"byteLength": 48, "uri": "a%00b.bin"}]), "uri: the path contains a NUL"),
     "a long name": (
         gltf(buffers=[{"byteLength": 48, "uri": "a" * 300}]),
@@ -308,9 +308,9 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "a compression": (
         gltf(extensionsRequired=["EXT_meshopt_compression"]),
-        "extensionsRequired: EXT_meshopt_compression: meshopt is not read; save it without that compression",
+        "extensionsRequired: EXT_meshopt_compression: meshopt is not supported; save it without that compression",
     ),
-    "an extension": (gltf(extensionsRequired=["ADOBE_x"]), "extensionsRequired: ADOBE_x is not understood"),
+    "an extension": (gltf(extensionsRequired=["ADOBE_x"]), "extensionsRequired: ADOBE_x is not supported"),
     "an older version": (gltf(asset={"version": "1.0"}), "asset.version: is 1.0, which is not supported; convert it"),
     "an accessor beyond its view": (
         gltf(accessors=[{"bufferView": 0, "componentType": 5126, "count": 99, "type": "VEC3"}] * 2),

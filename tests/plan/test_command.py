@@ -68,7 +68,7 @@ def test_what_reuse_costs_agrees_with_what_is_shown_after_the_drift() -> None:
     [
         ("--scene", "textures", "plan: --scene: `textures` is neither .* did you mean texture"),
         ("--scene", "nosuch", "17 presets, such as lego_bulldozer"),
-        ("--scene", "street", "content: file: is needed: street's .ply, .glb or data-set folder"),
+        ("--scene", "street", "content: file: is missing: street's .ply, .glb or data-set folder"),
         ("--model", "nosuch", "plan: --model: 'nosuch'"),
     ],
 )
