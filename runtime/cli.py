@@ -1,7 +1,7 @@
 """Entry point of the script `phasestack`, imported first so that Ctrl-C exits silently with 130.
 
-While commands are imported, no file is open, so an interrupt can simply exit. As an exception it would print a
-traceback, or be lost where Python ignores it. Then `commands.guard` takes over.
+While commands are imported, no file is open, so an interrupt can simply exit the process. An exception would print a
+traceback, or be lost where Python ignores it. Later, `commands.guard` takes over.
 """
 
 # These modules are already loaded; importing `signal` would delay the handler by milliseconds.

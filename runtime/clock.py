@@ -13,10 +13,10 @@ class Clock(Protocol):
     """The only source of time in the runtime."""
 
     def now_ns(self) -> int:
-        """Return the time in nanoseconds on a monotonic clock whose zero has no meaning."""
+        """Return the time in nanoseconds on a monotonic clock with an arbitrary zero."""
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Sleep until the deadline; return at once if it has passed."""
+        """Sleep until the deadline, or return immediately if it has passed."""
 
 
 class MonotonicClock:
@@ -51,10 +51,10 @@ class SimulatedClock:
 
 
 class Stopwatch:
-    """Measures the milliseconds of named stages, each from the end of the previous one, in real time."""
+    """Measures named stages in milliseconds of real time; each starts at the end of the previous one."""
 
     def __init__(self, *stages: str) -> None:
-        """stages: names to list even if they never occur."""
+        """stages: names that are listed even if they never occur."""
         self.stage_ms = dict.fromkeys(stages, 0.0)
         self._last_ns = time.perf_counter_ns()
 

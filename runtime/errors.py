@@ -1,4 +1,4 @@
-"""Error classes: transient (hold, degrade, retry) or fatal (refuse to start, exit 2)."""
+"""Error classes. Transient errors hold, degrade and retry; fatal ones refuse to start (exit code 2)."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-PART_CHARACTERS_MAX = (
-    300  # limit for one part of a message: untrusted names must not fill the screen or forge log lines
-)
+PART_CHARACTERS_MAX = 300  # limit per part of a message: untrusted names must not fill the screen or forge log lines
 PROBLEM_CHARACTERS_MAX = 1500  # limit for all problems of a file together
 _USER_OF_ADDRESS = re.compile(r"""(:/{1,2})[^/\s'"]*@""")  # normalised paths have one slash
-# Lack of resources, or a temporary hardware failure.
+# System errors for a lack of resources or a temporary hardware failure.
 PASSING = frozenset(
     (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.ENOBUFS, errno.EINTR)
 )
@@ -46,14 +44,11 @@ class PhasestackError(Exception):
 
 
 class FatalError(PhasestackError):
-    """A failure that retrying cannot fix, so the start is refused.
-
-    The CLI prints one line and exits with 2.
-    """
+    """A failure that retrying cannot fix; the CLI prints one line and exits with 2."""
 
 
 class InputError(FatalError):
-    """Wrong input from a user. Its text names the file (or option) and the field.
+    """Wrong input from a user. The message names the file (or option) and the field.
 
     >>> str(InputError("panels.toml", "x_m", "must ascend"))
     'panels.toml: x_m: must ascend'
@@ -73,11 +68,11 @@ class MissingPart(FatalError):
 
 
 class TransientError(PhasestackError):
-    """A failure that may pass: hold the last good frame, degrade, retry. Never ends the daemon."""
+    """A failure that may pass. The daemon holds the last good frame, degrades and retries."""
 
 
 class SensorLost(TransientError):
-    """The sensor is gone, hangs or delivers invalid data: close it and reopen it with back-off."""
+    """The sensor is gone, hangs or delivers invalid data. It is closed, and reopened with back-off."""
 
 
 class SensorTimeout(TransientError):
@@ -93,18 +88,18 @@ class ContentFailure(TransientError):
 
 
 class ModelFailure(TransientError):
-    """Inference failed or returned something other than a picture. The last good layers stay."""
+    """Inference failed or returned invalid layers. The last good layers stay."""
 
 
 class EyesNotServed(ModelFailure):
     """The model does not support these eye positions.
 
-    A viewer may move; eyes given as an option are refused.
+    Positions of a moving viewer may become valid again; positions given as an option are refused.
     """
 
 
 class ContextLost(TransientError):
-    """The solver's GL context is lost. The solver must be rebuilt from the settings."""
+    """The solver's GL context is lost, so the solver must be rebuilt from the settings."""
 
 
 class PanelLost(TransientError):
@@ -112,12 +107,12 @@ class PanelLost(TransientError):
 
 
 class Stopped(PhasestackError):
-    """Raised when the daemon is asked to stop during its start."""
+    """The daemon was asked to stop while it was starting."""
 
 
 @contextmanager
 def retry_advised() -> Iterator[None]:
-    """Turn an error that may be temporary into a TransientError: exit 75, since another start may help."""
+    """Convert errors that may be temporary to TransientError (exit code 75): another start may help."""
     try:
         yield
     except Exception as error:
@@ -129,7 +124,7 @@ def retry_advised() -> Iterator[None]:
 def is_retryable(error: BaseException | None) -> bool:
     """Return True if an exception, or its context, is a temporary failure of the machine, not bad input.
 
-    Readers turn a system error into an InputError that names the file; the system error is still its context.
+    Readers convert a system error to an InputError that names the file; the system error remains its context.
     """
     while error is not None:
         if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno in PASSING):

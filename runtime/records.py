@@ -1,4 +1,4 @@
-"""Frozen records passed between stages; their arrays are never modified after construction."""
+"""Frozen records passed between stages. Their arrays are never modified after construction."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Inference = Literal["ran", "reused", "skipped"]
 
 
 class State(StrEnum):
-    """State of the daemon; the reason of DEGRADED names the missing parts."""
+    """State of the daemon. The reason of DEGRADED names the missing parts."""
 
     STARTING = "starting"
     TRACKING = "tracking"
@@ -34,7 +34,7 @@ class State(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Intrinsics:
-    """A pinhole camera's intrinsic matrix, pixel centres at half-integers."""
+    """A pinhole camera's intrinsic matrix; pixel centres are at half-integers."""
 
     width_px: int
     height_px: int
@@ -45,16 +45,16 @@ class Intrinsics:
 
     @classmethod
     def centred(cls, width_px: int, height_px: int, *, fov_rad: float) -> Intrinsics:
-        """Intrinsics with square pixels and a centred principal point. fov_rad: horizontal field of view."""
+        """Return intrinsics with square pixels, centred; fov_rad: horizontal field of view."""
         focal_px = width_px / 2 / math.tan(fov_rad / 2)
         return cls(width_px, height_px, focal_px, focal_px, width_px / 2, height_px / 2)
 
 
 @dataclass(frozen=True, slots=True)
 class EyePoints:
-    """Two eyes at one instant, measured by a sensor or a finder."""
+    """Two eyes at one instant, measured by a sensor or an eye finder."""
 
-    eyes_m: F64  # (2, 3) the viewer's left and right eye in metres; the context states the frame, `sensor` or `stack`
+    eyes_m: F64  # (2, 3) left and right eye in metres, frame `sensor` or `stack` according to context
     confidence: F64  # (2,) in [0, 1], left, right
     completed: Literal["", "left", "right"] = ""  # the hidden eye, filled in from the head's pose
     covariance_m2: F64 | None = None  # (3, 3) covariance of the midpoint of the eyes, same frame; None: unknown
@@ -62,9 +62,9 @@ class EyePoints:
 
 @dataclass(frozen=True, slots=True)
 class SensorFrame:
-    """A driver's sample: one instant of the sensor's streams."""
+    """A sensor's sample, with all its streams at one instant."""
 
-    sequence: int  # the device's frame number; gaps mean lost frames
+    sequence: int  # the device's frame number; gaps are lost frames
     capture_ns: int  # time of exposure, on the monotonic clock
     eyes: EyePoints | None = None  # frame `sensor`; None: no face, or the sensor does not find eyes
     colour: U8 | None = None  # (h, w, 3) RGB
@@ -75,10 +75,10 @@ class SensorFrame:
 
 @dataclass(frozen=True, slots=True)
 class EyesEstimate:
-    """Estimated eyes at one instant, with a label for their origin."""
+    """Eyes estimated for one instant, with a label for their origin."""
 
     time_ns: int  # instant of the estimate
-    capture_ns: int  # newest sample used; 0 with label none
+    capture_ns: int  # capture time of the newest sample used; 0 with label none
     eyes_m: F64 | None  # (2, 3) left, right; frame `stack`; None with label none
     label: EyesLabel
     sigma_m: float = 0.0  # standard deviation, per axis, of the midpoint of the eyes at that instant
@@ -86,38 +86,37 @@ class EyesEstimate:
 
 @dataclass(frozen=True, slots=True)
 class Parallax:
-    """Motion of content on the panels from the eyes solved for to the present ones (`optics.relief`).
+    """Motion of content on the panels when the eyes move away from those solved for (`optics.relief`).
 
-    Content of relief b that is seen through pixel p of the middle panel was seen through p + b·(drift_px + growth·p).
+    Content of relief b that is now seen through pixel p of the middle panel was seen through p + b·(drift_px +
+    growth·p).
     """
 
     drift_px: tuple[float, float]  # right and down
     growth: float  # scaling as the head comes nearer or moves away
-    middle_from_shown: tuple[F64, ...]  # per panel (3, 3), a scale and a shift along rays from the present midpoint
+    middle_from_shown: tuple[F64, ...]  # per panel (3, 3), scale and shift along rays from the present midpoint
     weights: tuple[float, ...]  # per panel: its pixels per pixel of the middle panel, along rays from the old midpoint
 
 
 @dataclass(frozen=True, slots=True)
 class PanelFrame:
-    """Layers of all panels at one refresh: an aligned solution, the flat picture, or a mix."""
+    """Layers of all panels at one refresh: an aligned solution, the flat picture or a mix of both."""
 
     number: int  # number of the refresh, the same on all panels
-    solved: (
-        U8 | None
-    )  # (N, h, w, 4) RGBA, rear to front, on any raster: the layers solved for two eyes; None: not solved yet
+    solved: U8 | None  # (N, h, w, 4) RGBA layers solved for two eyes, rear to front, on any raster; None: not yet
     solved_version: int  # changes whenever `solved` changes
     solved_from_shown: tuple[F64, ...] = ()  # per panel (3, 3), both in the panels' pixels; (): layers as solved
     flat: U8 | None = None  # (N, height_px, width_px, 4): the flat picture, which is never aligned
     flat_version: int = 0
-    flatness: float = 0.0  # weight of `flat` in the linear mix of codes: 0: `solved` alone, 1: `flat` alone
+    flatness: float = 0.0  # weight of `flat` in a linear mix of codes; 0: `solved` alone, 1: `flat` alone
     size_px: tuple[int, int] | None = None  # columns and rows of the panels; None: as `solved`
     relief: F32 | None = None  # (h, w) relief of the solution's content, on the middle panel; None: unknown
-    parallax: Parallax | None = None  # None: content stays where it is on the middle panel
+    parallax: Parallax | None = None  # None: content does not move on the middle panel
 
 
 @dataclass(frozen=True, slots=True)
 class PresentReport:
-    """Outcome of presenting a PanelFrame."""
+    """Result of presenting a PanelFrame."""
 
     number: int
     present_ns: int  # estimated time at which the last panel was lit
@@ -127,7 +126,7 @@ class PresentReport:
 
 @dataclass(frozen=True, slots=True)
 class PlanItem:
-    """A saving: the omitted work, the reason, the time saved and the quality lost."""
+    """A saving, with the omitted work, the reason, the time saved and the quality lost."""
 
     what: str
     why: str
@@ -147,7 +146,7 @@ class FrameTiming:
 
 @dataclass(frozen=True, slots=True)
 class SolveRequest:
-    """Request from the presenter to the solver. It replaces an older request that has not started."""
+    """Request from the presenter to the solver, which replaces an older one that has not started."""
 
     time_ns: int  # instant to solve for: middle of the solution's expected display time
     eyes_m: F64 | None  # (2, 3) left, right; frame `stack`; predicted for `time_ns`; None: no viewer
@@ -155,53 +154,44 @@ class SolveRequest:
     sigma_m: float  # standard deviation of these eyes per axis
     flat_wanted: bool  # the flat picture is shown or will be needed
     paused: bool = False  # no new solutions
-    effort: Effort | None = None  # effort for a solution; None: full
-    refined_to: Effort | None = (
-        None  # effort to which the newest solution is continued if eyes and pictures are unchanged
-    )
+    effort: Effort | None = None  # effort for a new solution; None: full
+    refined_to: Effort | None = None  # to continue the newest solution, if eyes and pictures are unchanged
 
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """Work spent on a solution: its raster and its updates of all panels."""
+    """Work spent on a solution, as a raster and a number of updates of all panels."""
 
     reduction: int = 1  # divisor for the panels' rows and columns
     steps: int = 0
-    continued_from: int | None = (
-        None  # steps already done by the solution that is continued; None: starts from a proposal
-    )
+    continued_from: int | None = None  # steps that the continued solution had already done; None: a new one
 
     @property
     def name(self) -> str:
-        """`1/2+1`: half the rows and columns, one step."""
+        """Short name such as `1/2+1`, for half the rows and columns and one step."""
         return f"1/{self.reduction}+{self.steps}"
 
 
 @dataclass(frozen=True, slots=True)
 class Measures:
-    """Measurements of a solution: squared errors of intensities in 0..1; None: not measured."""
+    """Measurements of a solution, as squared errors of intensities in 0..1; None: not measured."""
 
     residual: float | None = None  # error of sampled rays against the solution's targets
     detail: Mapping[int, float] = field(default_factory=dict)  # error of the pictures on coarser rasters, by reduction
-    contrast: float | None = None  # error between unrelated pictures: half the variance
-    change: tuple[float, float, float] | None = (
-        None  # error against the previous pictures; distance moved in metres; time in seconds
-    )
+    contrast: float | None = None  # half the variance, the error between unrelated pictures
+    change: tuple[float, float, float] | None = None  # against the previous pictures: error, metres moved, seconds
 
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """Immutable layers for one pair of eyes, or the flat picture."""
+    """Immutable layers for one pair of eyes, or of the flat picture."""
 
-    number: int  # from 1; flat pictures and solutions share one count
+    number: int  # counts from 1, solutions and flat pictures together
     layers: U8  # (N, h, w, 4) RGBA, rear to front; in the panels' pixels, or fewer (`effort.reduction`)
     solved_for_m: F64 | None  # (2, 3) left, right; frame `stack`; None: a flat picture
     solved_for_ns: int  # instant for which its eyes and content were predicted
-    seeing: tuple[bool, bool] = (
-        True,
-        True,
-    )  # left, right: False for an eye outside the viewing range, which the other one replaces
-    eye_sigma_m: float | None = None  # tracking error that it allows for
+    seeing: tuple[bool, bool] = (True, True)  # left, right: False for an eye out of range, replaced by the other
+    eye_sigma_m: float | None = None  # tracking error that the solution allows for
     stage_ms: dict[str, float] = field(default_factory=dict)  # time of each of `SOLVING_STAGES`, on the run's clock
     effort: Effort | None = None  # None: flat
     measures: Measures | None = None
@@ -210,7 +200,7 @@ class Solution:
 
 @dataclass(frozen=True, slots=True)
 class RefreshAccount:
-    """Record of one refresh: a line of frames.jsonl (docs/contracts.md)."""
+    """Record of one refresh, written as a line of frames.jsonl (docs/contracts.md)."""
 
     frame: int
     capture_ns: int  # capture time of the newest sample used; 0: none
@@ -223,7 +213,7 @@ class RefreshAccount:
     solution: int | None  # number of the solution that is shown; None: the flat picture alone
     solved_for_m: F64 | None  # (2, 3)
     solution_age_ms: float | None  # display time minus the solution's instant
-    inference: Inference  # ran: first to show its solution; reused: a later one; skipped: no solution is shown
+    inference: Inference  # ran: first to show its solution; reused: a later one; skipped: shows no solution
     presented: bool
     skew_ms: float
     photon_ns: int = 0  # display time, computed from the actual present time

@@ -1,1 +1,1 @@
-"""Record of a run for debugging: the last minutes in memory, and a journal on disk."""
+"""Record a run for debugging: the last minutes in memory, and a journal on disk."""

@@ -1,10 +1,10 @@
-"""Black box: keeps a run's last minutes, and writes them to MCAP on request or after a fault.
+"""Black box, which keeps a run's last minutes and writes them to MCAP on request or after a fault.
 
-Every few seconds new messages go to a journal on the disk, which an orderly end of the run deletes. After a power cut
-or a kill the next run finds it and renames it to a file of the kind `cut`.
+Every few seconds, new messages are appended to a journal on disk, which is deleted when the run ends normally. After a
+power cut or a kill, the next run finds the journal and renames it to a file of the kind `cut`.
 
-The file is also a recording: `run --replay` plays its samples through the same code. Messages are serialised when they
-arrive, so that the garbage collector never visits them; a background job writes the files.
+The file is also a recording, whose samples `run --replay` plays through the same code. Messages are serialised when
+they arrive, so that the garbage collector never visits them. A background job writes the files.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ from runtime.support.version import version
 
 log = logging.getLogger("phasestack.blackbox")
 
-Saved = Callable[[str, Path | None], None]  # arguments: the problem (empty: none) and the file
+Saved = Callable[[str, Path | None], None]  # arguments: the problem (empty without one) and the file
 
-BYTES_MAX = 32 << 20  # limit for messages in memory
-OVERHEAD_BYTES = 150  # memory that a message takes in addition to its data
+BYTES_MAX = 32 << 20  # limit for the messages in memory
+OVERHEAD_BYTES = 150  # memory that a message needs in addition to its data
 AFTER_FAULT_NS = 5 * NS_PER_S  # time recorded after a fault before its file is written
-FAULTS_APART_NS = 60 * NS_PER_S  # least time between files of one kind, so that a repeated fault does not fill the disk
+FAULTS_APART_NS = 60 * NS_PER_S  # shortest time between files of one kind, so that repeated faults do not fill the disk
 STATE_EVERY_NS = NS_PER_S
 WRITTEN_WITHIN_S = 5.0  # the end of a run waits this long for a file to be written
-JOURNAL_EVERY_NS = 3 * NS_PER_S  # at most this long, plus one chunk, is lost in a power cut
+JOURNAL_EVERY_NS = 3 * NS_PER_S  # a power cut loses at most this much, plus one chunk
 CHUNK_BYTES = 16384  # chunk size of the journal
 CUT = "cut"
 LINES_KEPT, STATES_KEPT = 200, 50  # kept for the operator's page
@@ -61,7 +61,7 @@ JOURNAL = "journal"
 PART = ".part"
 
 LOG, REFRESH, STATE = "/log", "/refresh", "/state"
-# Viewers plot any number. Only topics that they display specially need a schema with field names.
+# Viewers can plot any number. Only the topics that they display in a special way need a schema with field names.
 SCHEMAS: dict[str, dict[str, Any]] = {
     **fmt.SCHEMAS,
     LOG: {
@@ -131,7 +131,7 @@ class Recorder(logging.Handler):
     """
 
     def __init__(self, folder: Path, *, minutes: float) -> None:
-        """folder: for the files; minutes: kept in memory; 0: keep and write nothing."""
+        """folder: where files are written; minutes: time kept in memory; 0: neither keep nor write anything."""
         super().__init__()
         self._folder, self._most_ns = folder, round(60 * minutes * NS_PER_S)
         self._kept_lock = threading.Lock()
@@ -146,9 +146,9 @@ class Recorder(logging.Handler):
         self._lines: deque[dict[str, Any]] = deque(maxlen=LINES_KEPT)
         self._passed: deque[dict[str, Any]] = deque(maxlen=STATES_KEPT)
         self._waiting_lock, self._is_writing = threading.Lock(), False
-        self._waiting: dict[str, list[Saved]] = {}  # requests for files that the writer has not started, by kind
+        self._waiting: dict[str, list[Saved]] = {}  # requests for files that the writer has not started yet, by kind
         self._writer: BackgroundJob[None] | None = None
-        self._fresh = 0  # number of newest messages that are not in the journal yet
+        self._fresh = 0  # number of newest messages that are not yet in the journal
         self._journal, self._journaled_ns = _Journal(folder), 0
         self._journaling: BackgroundJob[None] | None = None
         if self._most_ns:
@@ -159,7 +159,7 @@ class Recorder(logging.Handler):
         _sweep(folder)
 
     def watches(self, presenter: Presenter, *, in_stack_frame: bool) -> None:
-        """Begin recording. in_stack_frame: points arrive in frame `stack`, but are written in `sensor`."""
+        """Start recording. in_stack_frame: points arrive in frame `stack` and are converted to `sensor`."""
         self._presenter = presenter
         if in_stack_frame:
             self._sensor_from_stack = np.asarray(np.linalg.inv(presenter.run_cell.state.calibration.stack_from_sensor))
@@ -190,7 +190,7 @@ class Recorder(logging.Handler):
                 fresh = list(islice(reversed(self._kept), self._fresh))[::-1]
                 self._fresh = 0
             work = partial(self._journal.add, fresh, *_head(self._presenter), most_ns=self._most_ns)
-            self._journaling = BackgroundJob("black box's journal", work)  # so that no refresh waits for a disk
+            self._journaling = BackgroundJob("black box's journal", work)  # no refresh waits for the disk
         if self._fault is not None and at_ns - self._fault[0] >= AFTER_FAULT_NS:
             kind, self._fault = self._fault[1], None
             self.save(kind)
@@ -283,7 +283,7 @@ class Recorder(logging.Handler):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close; after an unexpected error, write the kept messages."""
+        """Close the recorder. After an unexpected error, write the kept messages to a file."""
         if isinstance(error, Exception) and not isinstance(error, Stopped | InputError) and self._presenter is not None:
             log.error("%s", one_line(f"{type(error).__name__}: {error}"))
             self._fault = (0, "error")
@@ -306,17 +306,17 @@ class Recorder(logging.Handler):
 
 
 def _head(presenter: Presenter) -> tuple[RecordingHeader, str]:
-    """Return the header and the settings written before the messages of a file."""
+    """Return the header and the settings that precede a file's messages."""
     settings = presenter.run_cell.state.settings
     header = RecordingHeader(settings.sensor.driver, presenter.samples.serial)
     return header, without_secrets(settings.model_dump_json())
 
 
 def write_file(folder: Path, kind: str, kept: list[BlackBoxMessage], header: RecordingHeader, settings: str) -> Path:
-    """Write a new file atomically, readable only by its owner because it shows viewers' movements.
+    """Write a new file atomically and return its path. Raises OSError.
 
-    Raises OSError.
-    Its number is higher than all others in the folder, because the wall clock may be set back.
+    Only the owner can read it, because it shows viewers' movements. Its number is higher than all others in the folder,
+    because the wall clock may be set back.
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = _next_name(folder, kind, datetime.now(UTC))
@@ -370,7 +370,7 @@ class _Written:
 
 
 class _Journal:
-    """Recent messages on the disk: two alternating files, each with at most half the kept time and bytes."""
+    """Recent messages on disk, in two alternating files with at most half the kept time and bytes each."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._current, self._begun_ns = folder, 0, 0
@@ -378,7 +378,7 @@ class _Journal:
         self._written: _Written | None = None
 
     def add(self, fresh: list[BlackBoxMessage], header: RecordingHeader, settings: str, *, most_ns: int) -> None:
-        """Write messages to the disk at once. If that fails, the journal ends and the run continues."""
+        """Write messages to the disk immediately. If that fails, the journal ends and the run continues."""
         now_ns = time.monotonic_ns()
         try:
             if self._file is None or now_ns - self._begun_ns > most_ns // 2 or self._file.tell() > BYTES_MAX // 2:
@@ -402,7 +402,7 @@ class _Journal:
         return self._folder / f".{PREFIX}{JOURNAL}{self._current}{PART}"
 
     def close(self, *, in_use: bool = False) -> None:
-        """Delete the journal after an orderly end. in_use: another thread is still writing."""
+        """Delete the journal after a normal end. in_use: another thread is still writing."""
         if self._file is not None and not in_use:
             with suppress(OSError):
                 self._file.close()
@@ -413,7 +413,7 @@ class _Journal:
 
 
 def _find_cut(folder: Path) -> None:
-    """Rename the journals of a killed run to separate files."""
+    """Rename the journals of a killed run to permanent files."""
     for journal in sorted(folder.glob(f".{PREFIX}{JOURNAL}*{PART}"), key=lambda path: path.stat().st_mtime):
         with suppress(OSError), journal.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

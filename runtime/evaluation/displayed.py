@@ -1,4 +1,4 @@
-"""Displayed quality of layers against target pictures (docs/contracts.md)."""
+"""Measure the displayed quality of layers against target pictures (docs/contracts.md)."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from runtime.records import F32, F64, U8
 from runtime.support.artifacts import write_png
 
 Picture = U8 | F32  # (h, w, 3): code values, or intensities in [0, 1]
-SIGMAS_MM = (0.0, 1.0, 2.0)  # tracking errors: none, a good tracker's, twice that
+SIGMAS_MM = (0.0, 1.0, 2.0)  # standard deviations: none, a good tracker's, twice that
 
 
 @dataclass(frozen=True, slots=True)
 class EyeViews:
-    """Retina images of both eyes, seen through some layers, and their targets."""
+    """Retina images of both eyes, seen through the layers, and their targets."""
 
     seen: tuple[Retina, ...]
     wanted: tuple[Picture, ...]
@@ -50,13 +50,12 @@ class EyeViews:
 def displayed(
     layers: U8, wanted: Sequence[Picture], stack: PanelStack, *, eyes_m: F64, fov_deg: float, similarity: bool = True
 ) -> EyeViews:
-    """Compute retina images of eyes (2, 3), frame `stack`, through layers, with a target for each eye.
+    """Compute retina images of eyes (2, 3), frame `stack`, through layers, and compare with targets.
 
-    layers: (N, H, W, 3 or 4), rear to front. Targets are `fov_deg` wide. If their aspect ratio is that of the panels,
-    they are compared at the panels' resolution, otherwise at their own resolution, but with at most as many pixels as a
-    panel has.
-    similarity: compute SSIM; otherwise it is NaN.
-    Raises ValueError for eyes behind a panel, or that see no part of the panels.
+    layers: (N, H, W, 3 or 4), rear to front. Targets are `fov_deg` wide, one per eye. If their aspect ratio equals the
+    panels', they are compared at the panels' resolution, otherwise at their own, but with at most as many pixels as a
+    panel. similarity: compute SSIM; otherwise it is NaN. Raises ValueError for eyes behind a panel, or that see no part
+    of the panels.
     """
     wanted = [on_panels_raster(picture, stack) for picture in wanted]
     seen = tuple(
@@ -72,7 +71,7 @@ class Expected(NamedTuple):
     """Expected PSNR (docs/contracts.md, Error) by tracking error in millimetres: "0", "1", "2"."""
 
     db: dict[str, float]  # NaN if such an error moves an eye so far that it sees no part of the panels
-    standard_error_db: dict[str, float]  # from groups of rows; empty without groups
+    standard_error_db: dict[str, float]  # computed from groups of rows; empty without groups
 
 
 def expected_quality(
@@ -80,7 +79,7 @@ def expected_quality(
 ) -> Expected:
     """Measure expected quality for several tracking errors.
 
-    sampling: None: light, sampled as in `expected_errors`.
+    sampling: by default light, sampled as in `expected_errors`.
     """
     groups = sampling.groups if sampling else 0
     errors = dict.fromkeys(sigmas_mm, np.full(1 + groups, np.nan))

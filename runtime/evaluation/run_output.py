@@ -176,7 +176,7 @@ class RunOutput:
             return
         self.problem = why
         log.warning("output abandoned; nothing new was written to %s: %s", self._target, why, exc_info=trace)
-        self._folder.discard()  # at once, because these files may be filling the disk
+        self._folder.discard()  # now, because these files may be filling the disk
 
     def _line(self, line: Mapping[str, Any]) -> None:
         assert self._lines is not None

@@ -1,4 +1,4 @@
-"""Solved still pair: retina images of its layers, their quality, and the files of a result."""
+"""Evaluate a solved still pair: retina images of its layers, their quality, and result files."""
 
 from __future__ import annotations
 
@@ -18,22 +18,23 @@ from runtime.support.artifacts import write_png, write_text
 
 BySigma = Mapping[str, float]
 GROUPS = 10  # groups of rows, for the standard error of sampled light
-WHOLE_PX = 1920 * 1200  # largest picture whose light is measured at every pixel
+WHOLE_PX = 1920 * 1200  # size of the largest picture whose light is measured at every pixel
 
 
 @dataclass(frozen=True, slots=True)
 class PairQuality:
     """Quality at the eyes (docs/contracts.md, Error), by tracking error: "0", "1", "2" mm.
 
-    NaN if not requested, or if such an error moves an eye so far that it sees no part of the panels.
+    A value is NaN if it was not requested, or if its tracking error moves an eye so far that it sees no part of the
+    panels.
     """
 
-    light_db: BySigma  # with square pixels and a finite pupil; quote "1", the error of a good tracker
-    expected_db: BySigma  # one ray a pixel
-    psnr_db: float  # one ray a pixel, at exactly known eyes
+    light_db: BySigma  # square pixels and a finite pupil; quote "1", the error of a good tracker
+    expected_db: BySigma  # one ray per pixel
+    psnr_db: float  # one ray per pixel, at exactly known eyes
     ssim: float
     eye_psnr_db: tuple[float, ...]  # left, right
-    standard_error_db: BySigma = field(default_factory=dict)  # of `light_db`, if sampled
+    standard_error_db: BySigma = field(default_factory=dict)  # for a sampled `light_db`; otherwise empty
 
     def table(self) -> dict[str, Any]:
         """Return the entries for solve.json."""
@@ -48,7 +49,7 @@ class PairQuality:
 
 @dataclass(frozen=True)
 class SolvedPair:
-    """Layers, retina images and quality, the latter two computed on first access.
+    """Layers with their retina images and quality, which are computed on first access.
 
     Access raises ValueError if an eye sees no part of the display.
     """
@@ -66,13 +67,13 @@ class SolvedPair:
 
     @cached_property
     def quality(self) -> PairQuality:
-        """Measured quality. Above `WHOLE_PX`, light is sampled, and has a standard error."""
+        """Measured quality. Above `WHOLE_PX`, light is sampled and has a standard error."""
         height_px, width_px = self.eye_views.wanted[0].shape[:2]
         every = 1 if height_px * width_px <= WHOLE_PX else 4 * math.ceil(height_px / 2160)
         return self._measured(self.eye_views, sigmas_mm=SIGMAS_MM, every=every)
 
     def sampled(self, *, sigmas_mm: Sequence[float], every: int) -> PairQuality:
-        """Measure light from every `every`-th pixel each way, with its standard error, and no SSIM."""
+        """Measure light at every `every`-th pixel each way, with its standard error and without SSIM."""
         views = displayed(
             self.layers, self.pictures, self.stack, eyes_m=self.eyes_m, fov_deg=self.fov_deg, similarity=False
         )
@@ -88,7 +89,7 @@ class SolvedPair:
 
     @property
     def seen(self) -> tuple[U8, ...]:
-        """(h, w, 3) retina image of each eye; black where a ray misses a panel."""
+        """Retina image (h, w, 3) of each eye; black where a ray misses a panel."""
         return tuple(retina.codes() for retina in self.eye_views.seen)
 
     def viewer(self, lines: Sequence[str]) -> str:
@@ -96,7 +97,7 @@ class SolvedPair:
         return self.eye_views.viewer(self.layers, [headline(self.quality.light_db["1"]), *lines])
 
     def write(self, folder: Path, *, lines: Sequence[str]) -> None:
-        """Write layers, eye views, contact sheet and viewer, with `lines` below their headline."""
+        """Write layers, eye views, contact sheet and viewer page, with `lines` below the headline."""
         for n, layer in enumerate(self.layers):
             write_png(folder / f"layer-{n}.png", layer)
         self.eye_views.write(folder)

@@ -1,4 +1,4 @@
-"""Timing of repeated trials: warm-up, repetition, alternation and median."""
+"""Time repeated trials, with warm-up, repetition, alternation and median."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Timed(Generic[T]):
-    """Times of a call, run by run, and its last result."""
+    """The times of a call's runs, and its last result."""
 
     answer: T
     times_ms: tuple[float, ...]
@@ -30,9 +30,9 @@ class Timed(Generic[T]):
 def timed(
     call: Callable[[], T], *, runs: int, most: int | None = None, enough_s: float = 0.0, slow_s: float = float("inf")
 ) -> Timed[T]:
-    """Time a warm function: at least `runs` times, then until `enough_s` or `most` runs.
+    """Time a warm function, at least `runs` times, then until `enough_s` or `most` runs.
 
-    slow_s: if the first run takes longer than this, it counts and is the only one.
+    slow_s: a first run that takes longer than this counts and is the only one.
     """
     answer, took_ms = _timed(call)
     if took_ms >= slow_s * 1e3:
@@ -45,9 +45,9 @@ def timed(
 
 
 def timed_in_turn(ways: Mapping[str, Callable[[], U8]], *, runs: int) -> dict[str, Timed[U8]]:
-    """Time several calls alternately, so that other load on the machine slows all of them.
+    """Time several calls alternately, so that other load on the machine affects all of them.
 
-    The first run of each is discarded. Answers are copies, as a call may reuse its buffer.
+    Each call's first run is discarded. Results are copied, because a call may reuse its buffer.
     """
     times: dict[str, list[float]] = {name: [] for name in ways}
     answers: dict[str, U8] = {}

@@ -1,4 +1,4 @@
-"""Solver requests: the effort, and the eyes predicted for the middle of a solution's display time."""
+"""Build solver requests: choose the effort, and predict the eyes for a solution's display time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from runtime.records import F64, Effort, EyesEstimate, EyesLabel, FrameTiming, S
 HORIZON_NS = NS_PER_S // 8  # longest prediction after this refresh's display time
 SPEED_NS = NS_PER_S // 2  # time constant of the running mean of a head's squared speed
 REQUESTS_KEPT = 256
-CALM_M_S = 0.02  # a seated head sways more slowly than this; a deliberate movement is faster
+CALM_M_S = 0.02  # a seated head sways more slowly than this, and moves faster on purpose
 WORTH = 0.995  # refine only if the expected error falls below this share of the current one
 
 
@@ -24,12 +24,12 @@ class Aim:
     """Builds the solver requests of one run. Single-threaded; never reads a clock."""
 
     def __init__(self, viewer: Viewer, solver: SolverHost, *, period_ns: int, fixed: Effort | None = None) -> None:
-        """fixed: effort of every solution if `model.effort` is `full`; None: full raster, all steps."""
+        """fixed: effort of every solution if `model.effort` is `full`; None: choose it."""
         self._viewer, self._solver, self._period_ns, self._fixed = viewer, solver, period_ns, fixed
         self._chooser = EffortChooser()
         self._calm_ns: int | None = None  # time since which the head has been slower than CALM_M_S
         self._expected: dict[int, float] = {}  # expected squared distance of the true eyes, m², by requested instant
-        self._speed2 = 0.0  # (m/s)², running mean
+        self._speed2 = 0.0  # running mean, in (m/s)²
         self._learned: int | None = None  # number of the newest solution whose measures have been used
 
     def request(
@@ -42,7 +42,7 @@ class Aim:
         flat_wanted: bool,
         paused: bool,
     ) -> SolveRequest:
-        """Return the next request. eyes: at the display time of this refresh; shown: the newest solution."""
+        """Return the next request. eyes: at this refresh's display time; shown: the newest solution."""
         self._learn(shown, eyes)
         predictor, refined, costs = state.predictor, None, self._solver.costs
         whole = self._fixed or Effort(1, predictor.steps)
@@ -67,11 +67,11 @@ class Aim:
         self._expected[then_ns] = expected_m2
         while len(self._expected) > REQUESTS_KEPT:
             self._expected.pop(next(iter(self._expected)))
-        # When shown, a solution is aligned to newer eyes, so only the uncertainty of the current eyes matters.
+        # The solution is aligned to newer eyes when it is shown, so only the current eyes' uncertainty matters.
         return SolveRequest(then_ns, then_m, label, eyes.sigma_m, flat_wanted, paused, effort, refined)
 
     def _learn(self, shown: Solution | None, eyes: EyesEstimate) -> None:
-        """Learn from the newest solution's measures and from the distance between its eyes and the present ones."""
+        """Learn from the newest solution's measures, and from how far the eyes have moved since."""
         if shown is None or shown.solved_for_m is None:
             return
         expected_m2 = self._expected.get(shown.solved_for_ns, 0.0)
@@ -83,14 +83,14 @@ class Aim:
             self._chooser.pictures.learn(shown.measures, shown.effort)
 
     def _middle_ns(self, timing: FrameTiming, cost_ns: int) -> int:
-        """Return the middle of the time for which a solution started now will be shown.
+        """Return the middle of the display time of a solution that starts now.
 
         It is complete after its cost, appears half a period later on average, and is shown until the next one appears.
         """
         return timing.photon_ns + cost_ns + (self._period_ns + max(cost_ns, self._period_ns)) // 2
 
     def _eyes_then(self, timing: FrameTiming, eyes: EyesEstimate, *, cost_ns: int) -> tuple[int, F64 | None, EyesLabel]:
-        """Return the instant to solve for and its predicted eyes, no farther ahead than the tracker is reliable."""
+        """Return the instant to solve for, within the tracker's reliable range, and its predicted eyes."""
         middle_ns = self._middle_ns(timing, cost_ns)
         reach_ns = min(middle_ns, timing.photon_ns + HORIZON_NS)
         then = self._viewer.ahead(reach_ns) if eyes.eyes_m is not None else eyes
@@ -118,7 +118,7 @@ class Aim:
         return outlook
 
     def _horizon_s(self, timing: FrameTiming, *, speed_m_s: float) -> float:
-        """Return how long the current motion is assumed to continue: for a calm head, as long as it has been calm."""
+        """Return for how long the motion should continue: a calm head's for as long as it has been calm."""
         if speed_m_s > CALM_M_S:
             self._calm_ns = None
             return HORIZON_S
@@ -145,7 +145,7 @@ class Aim:
     def _refined(
         self, shown: Solution, most: int, costs: Costs, *, shown_error: float, horizon_s: float
     ) -> Effort | None:
-        """Choose how to refine a solution for a resting head: finer raster or more steps. None: good enough."""
+        """Return how to refine a resting head's solution (raster or steps), or None if it is good enough."""
         done, pictures = shown.effort, self._chooser.pictures
         if done is None:
             return None

@@ -1,19 +1,20 @@
-"""Choice of each solution's effort: the raster and step count with the least expected error.
+"""Choose the raster and the number of steps that give each solution the least expected error.
 
-A solution that takes c seconds stays on the panels for T = max(c, refresh period) and is computed for the eyes at the
-middle of that interval. Averaged over that time, its squared error of light at the true eyes is the error for a viewer
-who keeps still plus that of a stale view (docs/mathematics.md, "Effort"):
+A solution that takes c seconds stays on the panels for T = max(c, refresh period), and is computed for the eyes at the
+middle of that interval. Averaged over it, the squared error of light at the true eyes is the error for a still viewer
+plus the error of a stale view (docs/mathematics.md, "Effort"):
 
     J = Q(raster, steps) + D(sqrt(2·sigma² + v²·T²/12 + l²), T/sqrt(12)),
     D(d, t) = y / (1 + y/D_max),    y = a·d²/(d + d0) + b·t²
 
-sigma: the tracker's error per axis at that instant; v: the head's speed; l: the distance moved beyond the tracker's
-horizon. One factor scales all three, so that predicted displacements match observed ones. a, b: rates at which the
-picture changes with the head's position and time; D_max: half its variance. All are measured on successive targets.
+Here sigma is the tracker's error per axis at that instant, v the head's speed, and l the distance moved beyond the
+tracker's horizon. A common factor scales these three, so that predicted displacements match observed ones. The rates a
+and b describe how the picture changes with the head's position and with time; D_max is half its variance. All are
+measured on successive targets.
 
 Until a solution is complete, the panels show the previous one, with error E, and do not respond to a head that starts
-moving: over a horizon H the mean is (c·E + (H - c)·J) / H + D_max·(c/H)²/2. The effort with the least mean is chosen,
-with a preference for the present one and for faster ones.
+moving. Over a horizon H the mean error is (c·E + (H - c)·J) / H + D_max·(c/H)²/2. The effort with the least mean is
+chosen, with a preference for the present effort and for faster ones.
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ from dataclasses import dataclass, field
 from runtime.records import Effort, Measures
 
 SOLVING_STAGES = ("render", "prepare", "inference", "finish", "step")
-HORIZON_S = 1.0  # time for which head and content are assumed to continue as they are
+HORIZON_S = 1.0  # time for which head and content are assumed to continue unchanged
 EQUAL = 1.03  # among efforts whose expected errors differ by less, choose the fastest
 PREFERRED = 0.93  # switch effort only if its expected error is below this share of the current one's
 GAIN = 0.2  # weight of the newest measurement in a running mean
-KEPT_SOLUTIONS = 100  # forget a raster's times after this many solutions on others, since the load may have changed
-# Squared error in light after k steps, relative to no steps: solver `best`, mean of the scenes demo and texture at
-# 960x540, with a tracking error of 2 mm.
+KEPT_SOLUTIONS = 100  # a raster's times are forgotten after this many solutions on others, as the load may have changed
+# Squared error of light after k steps, relative to no steps: solver `best`, mean over the scenes demo and texture at
+# 960x540, tracking error 2 mm.
 STEP_SHARES = (1.0, 0.77, 0.61, 0.58, 0.53, 0.53, 0.51, 0.51, 0.51)
 FIRST_RESIDUAL = 1e-3  # squared error of a solution without steps; initial value
 FIRST_DETAIL = {
@@ -68,7 +69,7 @@ def simulated_costs(stage_ms: Mapping[str, float], reductions: Iterable[int]) ->
 
 
 class CostBook:
-    """Running means of stage times by raster. Those of rasters that have long been unused are forgotten."""
+    """Running means of stage times by raster. A raster's times are forgotten if it is unused for long."""
 
     def __init__(self, first: Mapping[int, Mapping[str, float]]) -> None:
         """first: times by reduction and stage, measured with full pictures before the first refresh."""
@@ -93,9 +94,9 @@ class CostBook:
     def costs(self) -> Costs:
         """Return the current costs.
 
-        Costs of rasters without measurements are scaled like those of the measured ones. They are at most those of the
-        next finer raster divided by the ratio of the widths, so that a first time which other work delayed does not
-        exclude them.
+        Costs of unmeasured rasters are scaled from measured ones. A raster's cost is at most that of the next finer
+        raster divided by the ratio of the widths, so that a first measurement delayed by other work does not exclude
+        it.
         """
         measured_ms = sum(sum(stages.values()) for stages in self._measured.values())
         first_ms = sum(self.first.get(by, {}).get(s, 0.0) for by, stages in self._measured.items() for s in stages)
@@ -114,7 +115,7 @@ class CostBook:
 
 @dataclass(frozen=True, slots=True)
 class Outlook:
-    """The tracker's forecast for one effort: the eyes in the middle of the solution's display time."""
+    """Forecast for one effort: the tracker's, for the eyes in the middle of the solution's display time."""
 
     sigma_m: float = 0.0  # standard deviation per axis of the point midway between the eyes
     speed_m_s: float = 0.0
@@ -127,7 +128,7 @@ class Outlook:
 
 @dataclass(slots=True)
 class Foresight:
-    """Ratio of observed to expected squared distance between solutions' eyes and the true ones."""
+    """Ratio of observed to expected squared distances between solutions' eyes and the true ones."""
 
     scale: float = 1.0
     _expected: float = 0.0
@@ -143,7 +144,7 @@ class Foresight:
 
 @dataclass(slots=True)
 class PictureStatistics:
-    """Running means of solutions' measures: their errors, and the rate at which their pictures change."""
+    """Running means of the solutions' errors, and of the rates at which their pictures change."""
 
     residual: float = FIRST_RESIDUAL  # squared error of a solution without steps, on the raster solved on
     detail: dict[int, float] = field(default_factory=lambda: dict(FIRST_DETAIL))  # by reduction
@@ -167,7 +168,7 @@ class PictureStatistics:
             self._learn_change(*measures.change)
 
     def stale(self, distance_m: float, elapsed_s: float) -> float:
-        """Return D, the squared error of a picture drawn for an earlier, different head position."""
+        """Return D, the squared error of a picture drawn for an earlier time and another head position."""
         y = self.rate_m * _outlines_off_m(distance_m) + self.rate_s2 * elapsed_s**2
         return y / (1 + y / self.contrast) + TAIL * y
 
@@ -234,9 +235,9 @@ class EffortChooser:
         return best
 
     def mean_error(self, error: float, cost_ms: float, *, shown_error: float, horizon_s: float) -> float:
-        """Average the displayed picture's error until completion and the solution's error afterwards.
+        """Return the mean of the displayed error until completion and the solution's error afterwards.
 
-        If the head starts to move meanwhile, the view is stale until completion: with probability c/H, for c/2 on
+        If the head starts to move before completion, the view is stale until then: with probability c/H, for c/2 on
         average.
         """
         waited = min(cost_ms / 1e3 / horizon_s, 0.9)

@@ -1,4 +1,4 @@
-"""Kept light (`--keep-light`): layers of every N-th refresh, with target pictures for comparison."""
+"""Keep the layers of every N-th refresh (`--keep-light`), with target pictures for comparison."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ WRITTEN_WITHIN_S = 10.0  # timeout for writing the last refresh's layers
 
 
 class Output(Protocol):
-    """Destination for a run's files."""
+    """Receives the files of a run."""
 
     def refresh(self, line: dict[str, Any]) -> None:
         """Add a line to frames.jsonl."""
@@ -44,7 +44,7 @@ class _Kept:
 
 
 class KeptLight:
-    """Keeps the layers of every `every`-th refresh; 0 keeps none."""
+    """Keeps the layers of every `every`-th refresh, or none if it is 0."""
 
     def __init__(self, every: int, output: Output, drawer: TargetDrawer, truth: TrueEyes, *, simulated: bool) -> None:
         self._every, self._output, self._drawer, self._truth = every, output, drawer, truth
@@ -71,7 +71,7 @@ class KeptLight:
         kept = _Kept(account, solved_for_ns, self._drawer.shown_content())
         if self._truth.is_recorded:
             self._kept.append(kept)
-        else:  # a live run ends with a signal, so there is no time to draw afterwards
+        else:  # a live run ends with a signal, and leaves no time to draw afterwards
             self._draw(kept, lambda: None)
 
     def finish(self, stopped: Callable[[], bool]) -> None:

@@ -1,4 +1,4 @@
-"""Sampled measurements of solutions on the solver's thread: error, lost detail and rate of change."""
+"""Measure solutions by samples, on the solver's thread: error, lost detail and rate of change."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from runtime.optics.relief import displacement, parallax
 from runtime.records import F32, F64, U8, Effort, Measures
 from runtime.support.gl import DrawnPicture
 
-RAYS = 1024  # per eye
+RAYS = 1024  # rays per eye
 SAMPLED = 54, 96  # rows and columns of the grid for comparing successive pictures
 BAND_ROWS = 64  # height of each of the two bands in which detail is measured
-EVERY = 4  # residual and detail are measured for one in this many solutions of an effort
+EVERY = 4  # residual and detail are measured for every 4th solution of an effort
 
 
 class SolutionMeter:
-    """Measures solutions, and compares each with samples of the previous pictures."""
+    """Measures solutions, and compares each one's pictures with samples of the previous ones."""
 
     def __init__(self) -> None:
         self._before: tuple[tuple[int, ...], list[U8], Job, int] | None = None  # raster and window, pictures, job, time
@@ -31,7 +31,7 @@ class SolutionMeter:
         self._places = np.random.default_rng(1).random((2, RAYS, 2))
 
     def measure(self, job: Job, layers: U8, effort: Effort, *, time_ns: int) -> Measures | None:
-        """Measure one solution. Returns None if its pictures exist only as textures."""
+        """Measure one solution. Return None if its pictures exist only as textures."""
         if any(isinstance(view.picture, DrawnPicture) for view in job.views):
             return None
         key = Effort(effort.reduction, effort.steps)
@@ -76,7 +76,7 @@ def sampled_light(layers: U8, job: Job, places: F64, *, boxes: bool) -> float | 
         column, row = (places[0] * (width, height)).astype(int).T
         target = view.pixels[row, column, :3] / np.float32(255)
         errors, counts = [], np.ones(len(row), bool)
-        for offset in places % (1 / 64) * 64:  # position within the pixel, independent of the pixel chosen
+        for offset in places % (1 / 64) * 64:  # position within the pixel, independent of the chosen pixel
             at = middle_from_picture @ np.stack([column + offset[:, 0], row + offset[:, 1], np.ones(len(row))])
             total = np.zeros((len(row), 3), np.float32)
             for n in range(stack.count):
@@ -140,8 +140,8 @@ def _moved_grid(pictures: Sequence[U8], job: Job, eyes_m: F64) -> list[F32]:
     size_px = job.stack.width_px, job.stack.height_px
     right, down = moved.at(2 * columns + (u0 + 1.0), 2 * rows + (v0 + 1.0), size_px=size_px)
     u, v = (columns + right / 2).astype(np.float32), (rows[:, None] + down / 2).astype(np.float32)
-    found = [cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for picture in pictures]
-    return [np.asarray(picture[..., :3] / np.float32(255), np.float32) for picture in found]
+    warped = [cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for picture in pictures]
+    return [np.asarray(picture[..., :3] / np.float32(255), np.float32) for picture in warped]
 
 
 def _sampled(layer: U8, x: F64, y: F64, *, boxes: bool) -> tuple[F32, NDArray[np.bool_]]:

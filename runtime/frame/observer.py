@@ -1,4 +1,4 @@
-"""Observer of refreshes: passes each to the line writer, quality sampler and light keeper."""
+"""Pass each refresh on to the line writer, the quality sampler and the light keeper."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from runtime.records import RefreshAccount, SensorFrame
 
 
 class RunObserver:
-    """Observer of one run: called with every sample and refresh, then with `finish`."""
+    """Observer of one run. It receives every sample and refresh, and finally a call of `finish`."""
 
     def __init__(
         self,
@@ -76,7 +76,7 @@ class RunObserver:
         self._sampler.advance()
 
     def finish(self, stopped: Callable[[], bool] = lambda: False) -> None:
-        """Write and measure everything queued, draw the kept refreshes' pictures, measure the last refresh.
+        """Write and measure what is queued, draw the kept refreshes' pictures, and measure the last refresh.
 
         In real time the last refresh is measured only if no other was. stopped: returns True after a stop request.
         """

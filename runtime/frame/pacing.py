@@ -1,7 +1,7 @@
-"""Pacing: wake, present and display times of refreshes, predicted from vertical blanks.
+"""Predict the wake, present and display times of refreshes from vertical blanks.
 
-It reads no clock: callers pass in times and events. The scheme follows Monado's compositor pacing:
-predict, report events, learn the phase of the blanks and the time a refresh needs before one.
+Callers pass in times and events; this module reads no clock. The scheme follows Monado's compositor pacing: it predicts
+a refresh, receives its events, and learns the phase of the blanks and the time that a refresh needs before one.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from runtime.clock import NS_PER_MS
 from runtime.records import FrameTiming
 
-PHASE_GAIN = 0.1  # gain of the newest blank's error in the predicted phase
+PHASE_GAIN = 0.1  # share of the newest blank's error that corrects the predicted phase
 WORK_GAIN = 0.05  # decay of the work-time estimate (increases use gain 0.5)
 LATE_SHARE = 0.5  # share of a period; a refresh that is later than this moves to the next slot
 MARGIN_GROWTH = 1.5  # factor on the margin after a missed blank
@@ -78,7 +78,7 @@ class Pacer:
         return round(self._work_ns + (self._margin_ns if self._has_blanks else 0.0))
 
     def _learn_work(self, work_ns: int) -> None:
-        # Increases count half, so that one long refresh does not make all later ones wake early.
+        # Increases have gain 0.5, so that a single long refresh does not make all later ones wake early.
         gain = 0.5 if work_ns > self._work_ns else WORK_GAIN
         bounded = min(work_ns, self.period_ns // 2)
         self._work_ns += gain * (bounded - self._work_ns)

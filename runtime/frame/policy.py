@@ -1,7 +1,7 @@
-"""Decisions on what to solve and show (flat, solved, reuse): pure functions without clock or I/O.
+"""Decide what to solve and show (flat, solved, reused), by pure functions without clock or I/O.
 
 Only the rest watch on the sensor's samples (`eyes.rest`) decides whether a head is still. Eyes labelled `rested` are
-solved for once. Any other change of position gets a new solution.
+solved for once; any other change of position requires a new solution.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Kind = Literal["solve", "refine", "flat", "nothing"]
 
 @dataclass(frozen=True, slots=True)
 class SolutionKey:
-    """Inputs of the newest solution or flat picture."""
+    """Inputs of the newest solution or flat picture, to detect when it is outdated."""
 
     state_version: int
     revision: int  # the content's revision
@@ -90,7 +90,7 @@ class FramePolicy:
 
 
 def _is_more(effort: Effort | None, done: Effort | None) -> bool:
-    """Return True if an effort goes beyond the one already spent: a finer raster or more steps."""
+    """Return True if an effort exceeds the effort already spent, by a finer raster or more steps."""
     if effort is None or done is None:
         return False
     return (-effort.reduction, effort.steps) > (-done.reduction, done.steps)

@@ -1,7 +1,8 @@
-"""Presenter's loop: receive, map, predict, align, present, account. It waits only for its slot.
+"""The presenter's loop, which aligns the newest solution to the eyes at every refresh.
 
-The solver (`solver_host`) runs in parallel and hands over complete solutions. Every refresh shows the newest one,
-aligned to the eyes predicted for its display time.
+A refresh receives samples, predicts the eyes, aligns, presents and accounts for the result. The loop waits only for its
+slot. The solver (`solver_host`) runs in parallel and delivers complete solutions. The newest one is aligned to the eyes
+predicted for the refresh's display time.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ class Refresh:
 
 
 class Observer(Protocol):
-    """Observer of refreshes (files, sampled quality); must return quickly."""
+    """Observer of refreshes, which must return quickly."""
 
     def sampled(self, sample: SensorFrame) -> None:
         """Handle a sample that has arrived."""
@@ -82,7 +83,7 @@ class Observer(Protocol):
 
 
 class RefreshTimes:
-    """Stage times of a refresh; on a simulated clock each stage takes its configured time."""
+    """Stage times of a refresh. On a simulated clock each stage takes its configured time."""
 
     def __init__(self, clock: Clock, simulated_ms: Mapping[str, float]) -> None:
         self._simulated = clock if isinstance(clock, SimulatedClock) else None
@@ -113,10 +114,7 @@ class RefreshTimes:
 
 
 class Presenter:
-    """Presents one run. The caller owns the parts that it passes in.
-
-    The presenter owns only its counters.
-    """
+    """Presents one run. It owns only its counters; the caller owns the parts that it passes in."""
 
     def __init__(
         self,
@@ -155,7 +153,7 @@ class Presenter:
         self._aligned: tuple[int, bytes, Alignment] | None = None  # solution number, eyes, and their alignment
 
     def run(self, *, frames: int | None = None) -> str:
-        """Refresh until the recording ends, `frames` are done or a stop is requested. Returns the reason."""
+        """Refresh until the recording ends, `frames` are done or a stop is requested, and return the reason."""
         reason = ""
         while not reason:
             try:
@@ -169,7 +167,7 @@ class Presenter:
         return reason
 
     def refresh(self) -> RefreshAccount:
-        """Do one refresh. Raises EndOfRecording, FatalError."""
+        """Do one refresh and return its account. Raises EndOfRecording and FatalError."""
         times = RefreshTimes(self.clock, self._stage_ms)
         timing = self.pacer.predict(self.clock.now_ns())
         self.clock.sleep_until_ns(timing.wake_ns)
@@ -246,7 +244,7 @@ class Presenter:
         return frame, alignment.limited
 
     def _alignment(self, eyes: EyesEstimate, solution: Solution | None) -> Alignment:
-        """Return the alignment to the eyes; without eyes, the last one; without matrices, if none is needed."""
+        """Return the alignment to the eyes, or the last one without eyes. It may need no matrices."""
         plan = self.run_cell.state.settings.plan
         if solution is None or solution.solved_for_m is None or not plan.align:
             return Alignment(())
@@ -256,12 +254,12 @@ class Presenter:
         eyes_m = selected_eyes(eyes.eyes_m, solution.seeing)
         key = eyes_m.tobytes()
         if last is None or last[:2] != (solution.number, key):
-            found = align(self.stack, solved_for_m=solution.solved_for_m, eyes_m=eyes_m)
-            self._aligned = last = solution.number, key, found
+            alignment = align(self.stack, solved_for_m=solution.solved_for_m, eyes_m=eyes_m)
+            self._aligned = last = solution.number, key, alignment
         return last[2]
 
     def _present(self, frame: PanelFrame) -> tuple[PresentReport | None, str]:
-        """Present a frame. Returns (None, reason) if a panel is lost, (None, "") before the first picture."""
+        """Present a frame. Return (None, reason) if a panel is lost, (None, "") before the first picture."""
         if frame.solved is None and frame.flat is None:
             return None, ""
         unchanged = self.last is not None and self.last.account.presented and _same(frame, self.last.frame)

@@ -1,4 +1,4 @@
-"""Lines of frames.jsonl, and the view error. Both wait for the true eyes at the display time."""
+"""Write frames.jsonl and measure the view error, once the true eyes at the display time are known."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from runtime.frame.stats import Quantiles
 from runtime.frame.truth import TrueEyes
 from runtime.records import RefreshAccount, State
 
-WAITING_MAX = 2048  # refreshes that wait for their true eyes; beyond this the oldest is written without them
+WAITING_MAX = 2048  # refreshes that may wait for their true eyes; beyond this, the oldest is written without them
 LINE = (
     "frame", "capture_ns", "predicted_for_ns", "present_ns", "eyes_m", "eyes_label", "eye_sigma_mm", "state",
     "solution", "effort", "solved_for_m", "solution_age_ms", "true_eyes_m", "inference", "presented", "stage_ms",
@@ -21,12 +21,12 @@ LINE = (
 
 
 class RefreshLines:
-    """Writes refreshes in order, each as soon as its true eyes are known, or known to be missing."""
+    """Writes refreshes in order, each as soon as its true eyes are known or known to be missing."""
 
     def __init__(self, truth: TrueEyes, write: Callable[[dict[str, Any]], None] | None) -> None:
         self._truth, self._write = truth, write
         self._waiting: deque[RefreshAccount] = deque()
-        self.view_error_mm = Quantiles()  # of refreshes that show a solution and whose true eyes are known
+        self.view_error_mm = Quantiles()  # over refreshes that show a solution and have known true eyes
 
     def add(self, account: RefreshAccount) -> None:
         """Queue a refresh."""

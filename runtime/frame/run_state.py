@@ -1,4 +1,4 @@
-"""Immutable state of a run at one moment, which a reconfiguration replaces as a whole."""
+"""Immutable state of a run. A reconfiguration replaces it as a whole."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LEFT_BEHIND = "content or model took too long to load, so the solver was restart
 class RunState:
     """Settings, calibration, content and model that belong together; the solver owns the last two."""
 
-    version: int  # different for each state
+    version: int  # a different number for each state
     settings: Settings
     calibration: Calibration
     content: ContentSource
@@ -50,7 +50,7 @@ class RunCell:
             return self.generation
 
     def replace(self, generation: int | None = None, **changes: Any) -> RunState:
-        """Replace fields of the state. Returns the previous state, whose parts the caller must close.
+        """Replace fields and return the previous state, whose replaced parts the caller must close.
 
         generation: the calling solver's. Raises Stopped and changes nothing if a newer one has begun.
         """

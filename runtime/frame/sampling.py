@@ -1,9 +1,9 @@
-"""Quality of sampled refreshes, measured once their true eyes are known.
+"""Measure the quality of sampled refreshes once their true eyes are known.
 
-Targets are drawn on the solver's thread. In real time they are compared with the layers on a background thread, one
-refresh at a time, newest first, and only for a small share of the time: measuring must not slow down the solutions
-that it measures. A few of the samples that arrive meanwhile are queued and measured at the end; the rest are dropped.
-On a simulated clock every sample is measured, in order.
+Targets are drawn on the solver's thread. In real time, a background thread compares them with the layers, one refresh
+at a time, newest first, and only for a small share of the time, because measuring must not slow down the solutions that
+it measures. A few samples that arrive meanwhile are queued and measured at the end; the others are dropped. On a
+simulated clock every sample is measured, in order.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from runtime.records import F64, State
 from runtime.support.background import MEASURING_NICENESS, BackgroundJob
 
 HELD_MAX = 5  # samples queued in real time, with their layers
-HELD_BYTES = 200 << 20  # of their layers, at most: 25 MB each at 1080p on the full raster
-MEASURING_SHARE = 0.1  # of a real-time run, spent on measuring
+HELD_BYTES = 200 << 20  # limit for their layers: 25 MB each at 1080p on the full raster
+MEASURING_SHARE = 0.1  # share of a real-time run spent on measuring
 MEASURED_WITHIN_S = 60.0  # timeout for measuring the queued samples after the run
 LOOK_S = 0.02  # interval between checks for completion
 DRAWN_WITHIN_S = 10.0  # timeout for drawing the last refresh's targets
@@ -65,7 +65,7 @@ class QualitySampler:
         self._job_frame = self._moment_frame = -1
         self._samples = 0
         self._drawing = False
-        self._began_s = self._resumes_s = 0.0  # of the newest measurement; earliest begin of the next, in real time
+        self._began_s = self._resumes_s = 0.0  # start of the newest measurement; earliest start of the next
 
     def refreshed(self, refresh: Refresh) -> None:
         """Queue a refresh if it is due. In real time it may replace a queued one."""
@@ -86,7 +86,7 @@ class QualitySampler:
         return bool(self._waiting) or self._drawing or self._job is not None
 
     def drain(self, stopped: Callable[[], bool]) -> None:
-        """Measure the queued samples after the run, until `stopped` returns True; then begin no more."""
+        """Measure the queued samples after the run. Start no more once `stopped` returns True."""
         ends_s = time.monotonic() + MEASURED_WITHIN_S
         self._collect()
         while self._is_busy and not stopped() and time.monotonic() < ends_s:
@@ -95,9 +95,9 @@ class QualitySampler:
                 time.sleep(LOOK_S)
 
     def advance(self, *, at_once: bool = False) -> None:
-        """Collect a finished measurement and start those whose true eyes are now known.
+        """Collect a finished measurement, and start those whose true eyes are now known.
 
-        at_once: begin the next one now; otherwise, in real time, keep to MEASURING_SHARE.
+        at_once: start the next one now; otherwise, in real time, respect MEASURING_SHARE.
         """
         self._collect()
         now_s = time.monotonic()
@@ -190,7 +190,7 @@ class QualitySampler:
 
     @property
     def live_db(self) -> float | None:
-        """Live quality (docs/contracts.md, Error) over the refreshes measured so far."""
+        """Live quality (docs/contracts.md, Error) over the refreshes measured so far, in dB."""
         return round(psnr_db(float(np.mean(list(self.live.values())))), 3) if self.live else None
 
     def summary(self) -> dict[str, Any]:

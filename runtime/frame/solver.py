@@ -1,4 +1,4 @@
-"""The solver: draws content and computes layers for the predicted eyes, on its GL context's thread."""
+"""The solver draws content and computes layers for the predicted eyes, on its GL context's thread."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ FLAT_EYE_M = (0.7, 0.0, 0.0)  # viewpoint of the flat picture before any viewer 
 
 @dataclass(frozen=True, slots=True)
 class SolverUpdate:
-    """Results of one request or, in the news, the newest results so far."""
+    """Results of one request. In `news`, the newest results so far."""
 
     solution: Solution | None = None  # new solution for two eyes
     flat: Solution | None = None  # a new flat picture
@@ -53,7 +53,7 @@ class Solver:
         self._solved: SolutionKey | None = None
         self._flat: SolutionKey | None = None
         self._windows: dict[int, SolveWindow | None] = {}  # windows that the newest solutions covered, by reduction
-        self._kept: Job | None = None  # the last job, with copies of its pictures; None: pictures must be drawn
+        self._kept: Job | None = None  # the last job with copies of its pictures; None: pictures must be drawn
         self._meter = SolutionMeter()
         self._middle_m: F64 = np.array(FLAT_EYE_M)
         self._missing: dict[str, str] = {}
@@ -82,7 +82,7 @@ class Solver:
             return self._draw_flat(state, revision=revision, time_ns=time_ns)
         if job.eyes_m is not None:
             wanted = request.refined_to if job.kind == "refine" else request.effort
-            if wanted is None or wanted.reduction not in state.predictor.reductions:  # chosen for the model before
+            if wanted is None or wanted.reduction not in state.predictor.reductions:  # chosen for the previous model
                 wanted = Effort(1, state.predictor.steps)
             return self._solve(state, request, job.eyes_m, wanted, revision=revision)
         if request.eyes_m is not None and not request.paused:
@@ -103,7 +103,7 @@ class Solver:
                 job = self._kept
             else:
                 job = self._drawn(state, request, eyes_m, effort.reduction)
-        except ContextLost:  # content and model live in the context: the owner starts another solver
+        except ContextLost:  # content and model live in the context, so the owner starts another solver
             raise
         except (Exception, SystemExit) as error:
             return SolverUpdate(missing=self._failed("content", error, expected=ContentFailure))
@@ -136,7 +136,7 @@ class Solver:
         return SolverUpdate(solution=solution)
 
     def _drawn(self, state: RunState, request: SolveRequest, eyes_m: F64, reduction: int) -> Job:
-        """Draw the targets, and keep those of a resting head, so that its solution can be refined."""
+        """Draw the targets. A resting head's are kept, so that its solution can be refined."""
         job = drawn_job(
             state.predictor,
             state.content,

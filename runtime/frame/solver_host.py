@@ -33,11 +33,11 @@ class SolverParts(Protocol):
         """Release everything that no newer solver uses, on the thread that created it."""
 
 
-Task = Callable[[SolverParts], bool]  # called on the solver's thread between steps until it returns True
+Task = Callable[[SolverParts], bool]  # called between steps on the solver's thread until it returns True
 
 
 class SolverHost(ABC):
-    """Interface to a solver: the presenter posts requests and reads `news`, without waiting."""
+    """Interface to a solver. The presenter posts requests and reads `news`, and never waits."""
 
     @property
     @abstractmethod

@@ -1,4 +1,4 @@
-"""Solver thread, which publishes complete solutions, and is abandoned and replaced if a call hangs."""
+"""Run a solver on a thread, which is abandoned and replaced if a call hangs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ABANDON_S = 10.0  # a step that takes longer is abandoned and a new solver start
 IDLE_S = 0.02  # interval between checks for tasks while requests are absent
 USUAL_S = 0.2  # when stopping, a running step gets this long to finish
 LATE_STEPS = 3  # this many consecutive late steps raise a fault, this many on time clear it
-ANSWER_STEP_MS = 500  # resolution of the reported time without an answer
+ANSWER_STEP_MS = 500  # resolution of the reported time without a response
 ABANDONED_MAX = 4  # hung threads; with more, no new solver is started
 
 
@@ -104,7 +104,7 @@ class SolverThread(SolverHost):
         self._tasks.put(task)
 
     def close(self, timeout_s: float = 1.0) -> None:
-        """Stop without waiting for a solver still starting: the process ends without it (`commands.guard`)."""
+        """Stop, but do not wait for a solver that is still starting (`commands.guard` ends the process)."""
         self._closing.set()
         with self._lock:
             self._lock.notify_all()
@@ -118,7 +118,7 @@ class SolverThread(SolverHost):
             thread.join(patience_s(timeout_s))
 
     def _late_reason(self) -> str:
-        """Return why the solver is unavailable or late (empty: it is fine); abandon and replace a hung thread."""
+        """Return why the solver is unavailable or late, or "" if it is fine. Replace a hung thread."""
         attempt = self._attempt
         busy_ns = self._clock.now_ns() - attempt.busy_since_ns if attempt.busy_since_ns else 0
         if attempt.error is not None:

@@ -1,4 +1,4 @@
-"""Daemon states as a pure function of the conditions, and detection of late refreshes."""
+"""Determine the daemon's state from observed conditions, and detect late refreshes."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ PARTS: tuple[Part, ...] = ("sensor", "content", "model", "panel")
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """Conditions that are observed in one turn of the loop."""
+    """Conditions observed in one turn of the loop."""
 
     eyes: EyesLabel
     missing: dict[Part, str]  # failed parts, with a short reason
     presented: bool  # True once any frame has been on the panels
     flat_wanted: bool = False  # the operator asked for the 2D picture
     stopping: str = ""  # reason for stopping; empty: not stopping
-    limited: str = ""  # reason the alignment to the eyes is at its limit; empty: it is not
-    late: str = ""  # message if there are too few refreshes for the display's rate, otherwise empty
+    limited: str = ""  # why the alignment to the eyes is at its limit; empty: it is not
+    late: str = ""  # message if there are fewer refreshes than the display's rate requires; otherwise empty
     paused: bool = False  # the operator froze the picture; it is still aligned to the eyes
 
 
@@ -52,7 +52,7 @@ def judge(conditions: Conditions) -> tuple[State, str]:
 
 
 class StateMachine:
-    """Current state of the daemon, and the time spent in each state."""
+    """The daemon's current state, and the time spent in each state."""
 
     def __init__(self, *, now_ns: int) -> None:
         self.state = State.STARTING
@@ -63,7 +63,7 @@ class StateMachine:
 
     @property
     def name(self) -> str:
-        """Return the state as people read it: `tracking`, `degraded: sensor, panel`."""
+        """The state as people read it: `tracking`, `degraded: sensor, panel`."""
         return f"{self.state}: {', '.join(self.missing)}" if self.state is State.DEGRADED else str(self.state)
 
     def update(self, conditions: Conditions, *, now_ns: int) -> bool:
@@ -80,9 +80,9 @@ class StateMachine:
 
     def seconds(self, *, now_ns: int) -> dict[str, float]:
         """Return the seconds spent so far in each state that was ever entered."""
-        held = dict(self._held_ns)
-        held[self.state] += now_ns - self._counted_ns
-        return {str(state): held_ns / NS_PER_S for state, held_ns in held.items() if held_ns > 0}
+        durations_ns = dict(self._held_ns)
+        durations_ns[self.state] += now_ns - self._counted_ns
+        return {str(state): held_ns / NS_PER_S for state, held_ns in durations_ns.items() if held_ns > 0}
 
 
 WINDOW_NS = NS_PER_S
@@ -92,7 +92,7 @@ REFRESHES_MAX = 1024  # most refreshes counted in the window
 
 
 class Lateness:
-    """Detects lateness: a full second with too few refreshes in the window. Updated once per refresh."""
+    """Detects a full second in which the window has too few refreshes. Updated once per refresh."""
 
     def __init__(self, period_ns: int) -> None:
         self._wanted = WINDOW_NS / period_ns

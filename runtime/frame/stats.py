@@ -21,7 +21,7 @@ OVERHEAD_STAGES = ("sensor", "track")
 
 
 class Quantiles:
-    """Quantiles over a whole run. Beyond `size` values every other one is dropped; the maximum is exact."""
+    """Quantiles over a run. Beyond `size` values, every second one is dropped; the maximum is exact."""
 
     def __init__(self, size: int = WINDOW) -> None:
         self._values = np.zeros(size)
@@ -40,11 +40,11 @@ class Quantiles:
 
     def of(self, *names: str) -> dict[str, float] | None:
         """Return the named quantiles (`p50`, `p95`, `p99`, `max`, ...), or None before the first value."""
-        held = self._values[: -(-self._count // self._every)]
-        if held.size == 0:
+        values = self._values[: -(-self._count // self._every)]
+        if values.size == 0:
             return None
-        found = {name: float(np.quantile(held, float(name[1:]) / 100)) for name in names if name != "max"}
-        return {name: round(found.get(name, self._largest), 4) for name in names}
+        quantiles = {name: float(np.quantile(values, float(name[1:]) / 100)) for name in names if name != "max"}
+        return {name: round(quantiles.get(name, self._largest), 4) for name in names}
 
 
 class RunStats:
@@ -64,7 +64,7 @@ class RunStats:
         self._recent: deque[tuple[int, bool, bool]] = deque(maxlen=NOW_KEPT)  # time, presented, shows a new solution
 
     def add(self, account: RefreshAccount, *, overhead_ms: float, missed_blanks: int = 0) -> None:
-        """Count a refresh. overhead_ms: its duration on the machine's clock, without presenting and waiting."""
+        """Count a refresh. overhead_ms: its time on the machine's clock, without presenting and waiting."""
         now_ns, ran = account.present_ns, account.inference == "ran"
         self._first_ns = now_ns if self._first_ns < 0 else self._first_ns
         if self._effort is not None:

@@ -1,4 +1,4 @@
-"""Target pictures for the eyes, drawn on the solver's thread in its GL context."""
+"""Draw target pictures for given eyes on the solver's thread, in its GL context."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ class TrueEyes:
         self._ended = True
 
     def may_come(self, time_ns: int) -> bool:
-        """Return True while an instant's truth is unknown but may follow from later samples."""
+        """Return True while the true eyes at an instant are unknown but later samples may determine them."""
         return bool(self._known) and time_ns > self._known[-1][0] and not self._ended
 
     def at(self, time_ns: int) -> F64 | None:

@@ -1,4 +1,4 @@
-"""The viewer's eyes at any instant, from sensor samples: calibration, tracking and detection of rest."""
+"""The viewer's eyes at any instant, from samples by calibration, tracking and rest detection."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Viewer:
 
     @property
     def warning(self) -> str:
-        """Return the reason if most recent samples are implausible (eyes swapped, millimetres, ...), else ""."""
+        """Why most recent samples are implausible (eyes swapped, millimetres, ...); empty if they are not."""
         return self._refusals.warning
 
     @property
@@ -92,7 +92,7 @@ class Viewer:
         return self._served(self._tracker.ahead(time_ns))
 
     def _served(self, eyes: EyesEstimate) -> EyesEstimate:
-        """Return a resting head's fixed position, no eyes if they are predicted inside the panels, else `eyes`."""
+        """Return a resting head's fixed position, no eyes if they are inside the panels, else `eyes`."""
         if eyes.eyes_m is None:
             return eyes
         if self._rest is not None and self._rest.place is not None:
@@ -104,5 +104,5 @@ class Viewer:
 
 
 def _rest_watch(settings: Settings) -> RestWatch | None:
-    """Create the rest watch, or return None if the plan may not reuse a picture for nearly unchanged eyes."""
+    """Create the rest watch, or return None if pictures must not be reused for nearly unchanged eyes."""
     return RestWatch(max_drift_m=MAX_REST_DRIFT_M) if settings.plan.enabled else None

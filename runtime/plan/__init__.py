@@ -1,1 +1,1 @@
-"""Savings and their measurement; and drawing, where content, views and models meet."""
+"""Savings and their measurement, and the drawing of targets, where content, views and models meet."""

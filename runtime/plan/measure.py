@@ -33,22 +33,22 @@ from runtime.support.progress import tell
 MIDDLE_M = (0.6, 0.0, 0.05)
 HALF_IPD_M = 0.031
 REPEATS = 5
-MAX_DRIFT_M = 0.001  # of a resting head, before its picture is renewed (`eyes.rest`)
+MAX_DRIFT_M = 0.001  # a resting head may drift this far before its picture is renewed (`eyes.rest`)
 
 
 class TrialResult(NamedTuple):
-    """One way of making the layers: time of the median frame, drawing included, and quality."""
+    """Median time per frame, drawing included, and quality, of one way to compute the layers."""
 
     frame_ms: float
     psnr_db: float
 
     def saving_over(self, other: TrialResult) -> Saving:
-        """Compare with a way that saves less."""
+        """Return the saving relative to another way, which saves less."""
         return Saving(other.frame_ms - self.frame_ms, other.psnr_db - self.psnr_db)
 
 
 class Measurement(NamedTuple):
-    """A scene with the plan and without, alternately."""
+    """Measurements of a scene with and without the plan, taken alternately."""
 
     numbers: Measured
     with_plan: TrialResult
@@ -56,7 +56,7 @@ class Measurement(NamedTuple):
 
 
 def measure(predictor: Predictor, content: ContentSource, eyes_m: F64, *, fov_deg: float) -> Measurement:
-    """Each saving with and without, for eyes (2, 3)."""
+    """Measure each saving with and without it, for eyes (2, 3) and pictures `fov_deg` wide."""
     stack = predictor.stack
 
     def psnr_db(layers: U8, at_m: F64) -> float:
@@ -97,7 +97,7 @@ def measure(predictor: Predictor, content: ContentSource, eyes_m: F64, *, fov_de
 
 
 def plan_for(config: Path | None, *, scene: str | None, model: str | None, scale: float) -> dict[str, Any]:
-    """Measure and plan one scene; everything that `phasestack plan` prints. Raises PhasestackError."""
+    """Measure and plan one scene, and return what `phasestack plan` prints. Raises PhasestackError."""
     settings = with_options(load_settings(config), scene=scene, model=model)
     cv2.setNumThreads(settings.model.threads or -1)
     stack = settings.stack.stack()
@@ -115,7 +115,7 @@ def plan_for(config: Path | None, *, scene: str | None, model: str | None, scale
         predictor = load_predictor(settings.model.name, stack, settings.model)
         backend = choose(settings.model.backend, predictor, lambda: context).backend
         cleanup.callback(backend.close)
-        cleanup.callback(predictor.close)  # before its backend
+        cleanup.callback(predictor.close)  # must be closed before its backend
         predictor.set_backend(backend)
         measured = measure(predictor, content, eyes_m, fov_deg=settings.content.fov_deg)
         numbers = measured.numbers
@@ -141,7 +141,7 @@ def plan_for(config: Path | None, *, scene: str | None, model: str | None, scale
 
 
 def _check_viewer(eyes_m: F64, stack: PanelStack, *, fov_deg: float) -> None:
-    """Raise InputError for eyes (2, 3) from which no part of the display is visible."""
+    """Raise InputError for eyes (2, 3) that see no part of the display."""
     nearest_m = float(eyes_m[:, 0].min())
     if nearest_m <= max(stack.x_m):
         raise InputError(
