@@ -19,6 +19,7 @@ from runtime.optics.retina import Retina, as_codes, seen_by
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8
 from runtime.support.artifacts import write_png
+from runtime.support.threads import parallel_map
 
 Picture = U8 | F32  # (h, w, 3): code values, or intensities in [0, 1]
 SIGMAS_MM = (0.0, 1.0, 2.0)  # standard deviations: none, a good tracker's, twice that
@@ -42,9 +43,13 @@ class EyeViews:
 
     def write(self, folder: Path) -> None:
         """Write seen-*.png and wanted-*.png."""
-        for eye, retina, target in zip(("left", "right"), self.seen, self.wanted, strict=True):
-            write_png(folder / f"seen-{eye}.png", retina.codes())
-            write_png(folder / f"wanted-{eye}.png", as_codes(intensities(target)))
+
+        def write(side: int) -> None:
+            eye = ("left", "right")[side]
+            write_png(folder / f"seen-{eye}.png", self.seen[side].codes())
+            write_png(folder / f"wanted-{eye}.png", as_codes(intensities(self.wanted[side])))
+
+        parallel_map(write, range(2))
 
 
 def displayed(
