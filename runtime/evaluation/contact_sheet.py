@@ -32,7 +32,7 @@ class Moment:
     layers: U8  # (N, h, w, 3 or 4), as the panels showed them: aligned
     eye_views: EyeViews
     light_db: float  # for a tracking error of 1 mm
-    lines: tuple[str, ...]  # position of the eyes and its uncertainty
+    lines: tuple[str, ...]  # which refresh it is, and how far the eyes had moved
     solution: U8  # (N, h, w, 3 or 4), before alignment
     solved_for_m: F64  # (2, 3) eyes, frame `stack`
     asked_for: tuple[U8, ...]  # (h, w, 3) their targets

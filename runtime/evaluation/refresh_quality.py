@@ -12,7 +12,6 @@ from runtime.evaluation.displayed import displayed
 from runtime.optics.carried import PLENTY, carried_db, expected_psnrs_db, intensities
 from runtime.optics.light import Sampling, squared_errors
 from runtime.optics.pupil import TRACKING_SIGMA_MM
-from runtime.optics.quality import psnr_db
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8, RefreshAccount
 
@@ -78,7 +77,7 @@ def measure_refresh(
         except ValueError as why:
             log.info("live quality: not measured here (%s)", why)
     try:
-        moment, figures = _at_aligned_eyes(account, layers, carried, targets, stack, error)
+        moment, figures = _at_aligned_eyes(account, layers, carried, targets, stack)
     except ValueError as why:
         log.info("quality: not measured here (%s)", why)
         return RefreshQuality(live_error=error)
@@ -91,7 +90,6 @@ def _at_aligned_eyes(
     carried: tuple[U8, U8] | None,
     targets: RefreshTargets,
     stack: PanelStack,
-    error: float | None,
 ) -> tuple[Moment | None, dict[str, float]]:
     eyes_m, solved_for_m, true_m = account.eyes_m, account.solved_for_m, account.true_eyes_m
     fov_deg = targets.fov_deg
@@ -120,20 +118,15 @@ def _at_aligned_eyes(
     if targets.true is not None and true_m is not None:
         values.append(one_ray_db(layers, targets.true, drawn_for_m=true_m, seen_from_m=true_m))
         values.append(one_ray_db(aligned, targets.solved, drawn_for_m=solved_for_m, seen_from_m=true_m))
-    moment = Moment(layers, views, light_db, _lines(account, error), unaligned, solved_for_m, targets.solved)
+    moment = Moment(layers, views, light_db, (_line(account),), unaligned, solved_for_m, targets.solved)
     return moment, dict(zip(FIGURES, values, strict=False))
 
 
-def _lines(account: RefreshAccount, error: float | None) -> tuple[str, ...]:
-    """Lines for the sheet: position of the eyes, its uncertainty, and live quality."""
+def _line(account: RefreshAccount) -> str:
+    """Return which refresh it is, and how far the eyes had moved, for the sheet."""
     assert account.eyes_m is not None and account.solved_for_m is not None
-    sigma = "" if account.eye_sigma_mm is None else f", standard deviation {account.eye_sigma_mm:.1f} mm"
     moved_mm = view_error_mm(account.eyes_m, account.solved_for_m)
-    first = f"Refresh {account.frame}; eyes {account.eyes_label}{sigma}, {moved_mm:.0f} mm from where the layers"
-    lines = [f"{first} were solved for; the outer panels were shifted accordingly"]
-    if error is not None and account.true_eyes_m is not None:
-        stale_mm = view_error_mm(account.true_eyes_m, account.solved_for_m)
-        lines.append(
-            f"Live, at the true eyes: {psnr_db(error):.1f} dB; the layers were solved for eyes {stale_mm:.1f} mm away"
-        )
-    return tuple(lines)
+    return (
+        f"Refresh {account.frame}; the eyes were {moved_mm:.0f} mm from where the layers were solved for; "
+        "the outer panels were shifted accordingly"
+    )

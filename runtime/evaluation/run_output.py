@@ -184,12 +184,8 @@ class RunOutput:
 
 
 def in_one_line(summary: dict[str, Any]) -> str:
-    """Return a run's summary in one line, for its contact sheet."""
+    """Return a run in one line, with the one figure for its motion, for its contact sheet."""
     line = f"The run: {summary['presented']} of {summary['frames']} refreshes presented, model {summary['model']}"
     if summary.get("live_db") is not None:
-        line += f"; live {summary['live_db']:.1f} dB at the true eyes, over {summary['live_frames']} refreshes"
-    if (error := summary.get("view_error_mm")) is not None:
-        line += f"; view error {error['p50']:.1f} mm, 95th percentile {error['p95']:.1f}"
-    if summary.get("light_db") is not None:
-        line += f"; light {summary['light_db']:.1f} dB, mean of {summary['quality_frames']} refreshes"
+        line += f"; while the head moved, PSNR {summary['live_db']:.1f} dB at the true eyes (live), delays included"
     return line

@@ -58,6 +58,7 @@ def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
         axes.use_sticky_edges = False  # which bars have
         axes.margins(x=0.1, y=0.15)
         axes.set_title("Light against run time: up and to the left is better")
+        axes.xaxis.get_major_locator().set_params(subs=(1.0, 2.0, 5.0))
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter("")
         axes.legend()
