@@ -134,7 +134,7 @@ def test_added_models_stand_beside_the_curves_and_every_pair_is_a_dot(monkeypatc
     assert sum(len(dots.get_offsets()) for dots in axes.collections) == 8
 
 
-def test_times_are_read_off_an_axis_with_ticks_at_one_two_and_five(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_axis_of_times_has_ticks_at_one_two_and_five(monkeypatch: pytest.MonkeyPatch) -> None:
     figures: list[Any] = []
     monkeypatch.setattr(sections, "png", lambda figure: (figure.canvas.draw(), figures.append(figure), b"")[2])
     sections.frontier_plot([method("fast", "network", 59, 36), method("best", "network", 310, 42)], name="test")
