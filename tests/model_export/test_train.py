@@ -170,7 +170,7 @@ def test_a_killed_training_continues_as_if_uninterrupted(tmp_path: Path) -> None
     assert curve(cut) == curve(whole)
     ends = [load_checkpoint(out / "checkpoint.pth")["model"] for out in (whole, cut)]
     assert all(torch.equal(value, ends[1][key]) for key, value in ends[0].items())
-    with pytest.raises(InputError, match=r"checkpoint\.pth: seed: was 1, now 2"):
+    with pytest.raises(InputError, match=r"checkpoint\.pth: seed: must be 1"):
         run_training(cut, Training(**SHORT | {"seed": 2}), resume=True)
 
 
