@@ -81,8 +81,8 @@ class StackGeometry(Section):
         if abs(aspect / self.pixel_aspect - 1) > PIXEL_ASPECT_TOLERANCE:
             square_m = self.width_m / self.width_px * self.height_px / self.pixel_aspect
             raise ValueError(
-                f"stack.height_m: {self.width_m:g} x {self.height_m:g} m by {self.width_px} x {self.height_px} pixels "
-                f"make pixels {aspect:.3g} times as wide as high, not {self.pixel_aspect:g}; did you mean "
+                f"stack.height_m: {self.width_px} x {self.height_px} pixels on {self.width_m:g} x {self.height_m:g} m "
+                f"are {aspect:.3g} times as wide as high, not {self.pixel_aspect:g}; did you mean "
                 f"height_m = {square_m:.4g}? (or set stack.pixel_aspect)"
             )
 
@@ -190,8 +190,8 @@ class ContentSettings(Section):
     file: PathText = Field("", description="data of a preset: a .ply file, a .glb file or the folder of a data set")
     layout: Annotated[str, Field(pattern=LAYOUT)] = Field(
         "auto",
-        description="arrangement of the views: mono, side-by-side, top-bottom, cross-eyed (right view on the left), "
-        "each but the first also with half- in front, anaglyph, rgbd, or a quilt (qs8x6a0.75); auto: by file name",
+        description="arrangement of the views: mono, [half-]side-by-side, [half-]top-bottom, [half-]cross-eyed (right "
+        "view on the left), anaglyph, rgbd or a quilt such as qs8x6a0.75; auto: by file name",
     )
     cone_deg: Annotated[float, Field(gt=0, lt=180)] = Field(40.0, description="angle between a quilt's outermost views")
     depth_m: tuple[Annotated[float, within(-10.0, 10.0, "m")], Annotated[float, within(-10.0, 10.0, "m")]] = Field(
