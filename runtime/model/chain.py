@@ -1,13 +1,13 @@
-"""The common raster in which the eyes' difference splits into chains (one small linear system each).
+"""Raster on which the difference between the eyes splits into chains, each a small linear system.
 
-With +g on the front and -g on the rear panel, the difference between the eyes' phases is
-D(p) = 2·[g(p + s) - g(p - s)]. On a raster whose columns make s a whole number K, columns 2K apart form chains
-that don't interact: D = A·g along each, with one bidiagonal A for all of them.
+With +g on the front panel and -g on the rear panel, the difference between the eyes' phases is D(p) = 2·[g(p + s) - g(p
+- s)]. If the columns of a raster make s a whole number K, columns that are 2K apart form chains that do not interact: D
+= A·g along each chain, with the same bidiagonal A for all.
 
-Where one eye is nearer to the panels than the other, s varies: seen through a plane parallel to the panels,
-an outer panel is scaled about the point F where the line through the eyes meets that plane, by as much for one eye as
-the other way for the other. On columns that are spaced by the logarithm of the distance from F, and rows that run
-towards it, the scale is a shift again.
+If one eye is nearer to the panels than the other, s varies. Seen through a plane parallel to the panels, an outer panel
+is scaled about the point F, where the line through the eyes meets that plane; the scales for the two eyes are
+reciprocal. If the columns are spaced by the logarithm of the distance from F, and the rows run towards F, this scaling
+is again a shift.
 """
 
 from __future__ import annotations
@@ -23,16 +23,14 @@ from numpy.typing import NDArray
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64
 
-CELLS_STEP = 8  # chains' lengths are rounded up to this, so that a moving viewer meets few shapes
-ROWS_STEP = 32  # the same for rows, if the eyes are not level
-ROWS_SHARE = (
-    1.5  # most rows, relative to level eyes; beyond, they are higher: 0.1 dB less, the network up to twice as fast
-)
+CELLS_STEP = 8  # chain lengths are rounded up to a multiple of this, so that a moving viewer causes few shapes
+ROWS_STEP = 32  # likewise for rows, if the eyes are not level
+ROWS_SHARE = 1.5  # most rows, relative to level eyes; then they get higher, for 0.1 dB less and up to twice the speed
 CELLS_MAX = 1024
-BLOCK_ROWS = 8  # that the network transforms together: the raster has whole blocks
+BLOCK_ROWS = 8  # rows that the network transforms together; the raster has whole blocks
 ROWS_MAX = 1 << 15  # rows that eyes would need at full height; beyond, they are implausible
-NEAREST_F = 0.8  # the raster's half width by F's distance from its middle: nearer to F it is not laid
-FARTHEST_F = 0.01  # and beyond, s changes by less than a hundredth of itself: columns may as well be even
+NEAREST_F = 0.8  # largest ratio of the raster's half width to its middle's distance from F: the raster stays clear of F
+FARTHEST_F = 0.01  # below this ratio s varies by less than a hundredth, so the columns are evenly spaced
 
 Columns = NDArray[np.floating[Any]]
 
@@ -41,20 +39,20 @@ Columns = NDArray[np.floating[Any]]
 class ColumnLaw:
     """Spacing of a raster's columns: t = middle + (1 - exp(-bend·(u - middle)))/bend.
 
-    t is the homography's coordinate for u; bend 0: even columns.
+    u is the column, t the coordinate to which the homography applies. A bend of 0 stands for even columns.
     """
 
     bend: float = 0.0  # per column
-    middle: float = 0.0  # column where both are the same
+    middle: float = 0.0  # column where t = u
 
     def homography_from_column(self, u: Columns) -> Columns:
-        """t for columns u, of any shape."""
+        """Return t for columns u, of any shape."""
         if not self.bend:
             return u
         return np.asarray(self.middle - np.expm1(-self.bend * (u - self.middle)) / self.bend)
 
     def column_from_homography(self, t: Columns) -> Columns:
-        """u for t, of any shape; far outside beyond F."""
+        """Return u for t, of any shape; beyond F, a value far outside the raster."""
         if not self.bend:
             return t
         return np.asarray(self.middle - np.log(np.maximum(1 - self.bend * (t - self.middle), BEYOND_F)) / self.bend)
@@ -66,40 +64,41 @@ BEYOND_F = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class ChainFrame:
-    """The raster on the plane where both outer panels have the same parallax, seen from between the eyes."""
+    """Raster on the plane of equal parallax of both outer panels, seen from between the eyes."""
 
-    x_m: float  # of the plane: a²/ex
-    plane_from_raster: F64  # 3x3, (y, z, 1) from (t, v, 1); t by `columns` from u, along the line of the eyes
+    x_m: float  # x of that plane: a²/ex
+    plane_from_raster: F64  # 3x3, (y, z, 1) from (t, v, 1); `columns` maps u to t, along the eyes' line
     columns: ColumnLaw
-    cells: int  # chain cells a row; the raster has cells·2K columns
+    cells: int  # chain cells per row; the raster has cells·2K columns
     cell_px: int  # K
     rows: int
-    middle_m: F64  # (3,) between the eyes, frame `stack`: where their parallaxes are opposite
+    middle_m: F64  # (3,) point between the eyes, frame `stack`, from which their parallaxes are opposite
 
     @property
     def width_px(self) -> int:
         return self.cells * 2 * self.cell_px
 
     def plane_from_frame(self, eye_m: F64, *, x_m: float) -> F64:
-        """3x3: (y, z, 1) on a parallel plane hit by an eye's rays through this raster's (t, v, 1)."""
+        """Return the 3x3 map from (t, v, 1) to (y, z, 1) where an eye's rays hit a parallel plane."""
         t = (x_m - self.x_m) / (eye_m[0] - self.x_m)
         across = np.array([[1 - t, 0.0, eye_m[1] * t], [0.0, 1 - t, eye_m[2] * t], [0.0, 0.0, 1.0]])
         return across @ self.plane_from_raster
 
     def frame_from_plane(self, *, x_m: float) -> F64:
-        """3x3 this raster's (t, v, 1) from (y, z, 1) on a parallel plane, rectified between the eyes."""
-        found = np.linalg.inv(self.plane_from_frame(self.middle_m, x_m=x_m))
-        return np.asarray(found / found[2, 2], np.float64)
+        """Return the 3x3 map to (t, v, 1) from (y, z, 1) on a parallel plane, rectified between the eyes."""
+        inverse = np.linalg.inv(self.plane_from_frame(self.middle_m, x_m=x_m))
+        return np.asarray(inverse / inverse[2, 2], np.float64)
 
     def eye_sigma_px(self, stack: PanelStack, *, eye_sigma_m: float) -> F32:
-        """(3,) movement of the outer panels' pictures, columns and rows, for one sigma of the eyes.
+        """Return the (3,) movements in pixels that one sigma of the eyes causes.
 
-        The third is the centre panel's own parallax against this raster's plane, in columns.
+        The first two are those of the outer panels' pictures, in columns and rows. The third is the centre
+        panel's own parallax relative to the raster's plane, in columns.
         """
         reach = (stack.x_m[-1] - self.x_m) / (self.middle_m[0] - stack.x_m[-1])
         centre = (self.x_m - stack.x_m[1]) / (self.middle_m[0] - stack.x_m[1])
         moved_m = eye_sigma_m * reach
-        # Metres to the right and up for a column, and up for a row, in the raster's middle.
+        # Metres to the right and up per column, and up per row, at the raster's middle.
         raster = self.plane_from_raster
         at = raster @ (self.columns.middle, self.rows / 2, 1.0)
         (across_m, along_m), (_, down_m) = ((raster[:2, k] - at[:2] / at[2] * raster[2, k]) / at[2] for k in (0, 1))
@@ -109,11 +108,11 @@ class ChainFrame:
 
 
 def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int) -> ChainFrame:
-    """The raster for two eyes (2, 3), left and right, frame `stack`.
+    """Return the raster for a left and a right eye (2, 3) in frame `stack`.
 
-    Columns are scaled so that the outer panels' parallax is `cell_px` columns; rows are `reduction` panel
-    rows high and sheared along the line of the eyes. It covers the part of all panels that both see, and a margin.
-    Raises ValueError where the eyes have no horizontal separation, or the raster would be too tall.
+    The columns are scaled so that the outer panels' parallax is `cell_px` columns. The rows are `reduction` panel
+    rows high and sheared along the line of the eyes. The raster covers the part of all panels that both eyes see,
+    and a margin. Raises ValueError if the eyes have no horizontal separation, or if the raster would be too tall.
     """
     between_m, half_m = eyes_m.mean(axis=0), (eyes_m[1] - eyes_m[0]) / 2
     plane_m = _equal_parallax_m(stack, between_m[0])
@@ -122,15 +121,15 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int)
     window = _window_of(middle_m, stack, plane_m=plane_m)
     line = _line_of_eyes(between_m, half_m, plane_m=plane_m, window=window)
     per_column = (stack.x_m[-1] - plane_m) / (middle_m[0] - stack.x_m[-1]) / (cell_px * ahead_m)
-    column_m = abs(line.from_f_m2[0] * per_column)  # in the window's middle
+    column_m = abs(line.from_f_m2[0] * per_column)  # at the window's middle
     if column_m < 1e-12:
-        raise ValueError("the eyes are not next to each other: one is behind or above the other, or in its place")
+        raise ValueError("the eyes have no horizontal separation: one is behind, above or at the other")
     half_columns = window.half_width_m / column_m * (atanh(line.nearness) / line.nearness if line.nearness else 1.0)
     cells = min(CELLS_MAX, CELLS_STEP * ceil((ceil(half_columns / cell_px) + 1) / CELLS_STEP))
     middle_column = cells * cell_px
     bend, (bend_y_m, bend_z_m) = line.nearer_m * per_column, line.towards_f_m2 * per_column
     columns = ColumnLaw(float(bend), float(middle_column))
-    # In the raster's middle, the extent to be seen at either end of its rows.
+    # Extent to cover at either end of the rows, measured at the raster's middle.
     ends = columns.homography_from_column(np.array([0.0, 2.0 * middle_column])) - middle_column
     reached_m = [z * (1 - bend * end) + bend_z_m * end for z in (window.bottom_m, window.top_m) for end in ends]
     height_m, level_rows = max(reached_m) - min(reached_m), stack.height_px / reduction
@@ -154,7 +153,7 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int)
 
 @dataclass(frozen=True, slots=True)
 class _Window:
-    """Extent of a raster on its plane, metres; frame `stack`."""
+    """Extent of a raster on its plane, in metres; frame `stack`."""
 
     low_m: float  # along y
     high_m: float
@@ -171,45 +170,45 @@ class _Window:
 
     @property
     def middle_m(self) -> F64:
-        """(2,) y, z."""
+        """Centre (2,) of the window: y, z."""
         return np.array([self.low_m + self.high_m, self.bottom_m + self.top_m]) / 2
 
 
 @dataclass(frozen=True, slots=True)
 class _LineOfEyes:
-    """Intersection of the eyes' line with the plane: F = towards_f_m2 / nearer_m, up to infinity."""
+    """Point F = towards_f_m2 / nearer_m, possibly infinite, where the eyes' line meets the plane."""
 
-    nearer_m: float  # half the difference of the eyes' distances from it, right minus left; 0: F counts as infinite
-    towards_f_m2: F64  # (2,) y, z
-    from_f_m2: F64  # (2,) from F to the window's middle, by nearer_m
-    nearness: float  # the window's half width by its middle's distance from F; 0 where F counts as infinite
+    nearer_m: float  # half of the right eye's distance from the plane minus the left eye's; 0: F counts as infinite
+    towards_f_m2: F64  # (2,) y, z of F, times nearer_m
+    from_f_m2: F64  # (2,) vector from F to the window's middle, times nearer_m
+    nearness: float  # the window's half width over its middle's distance from F; 0: F counts as infinite
 
 
 def _line_of_eyes(between_m: F64, half_m: F64, *, plane_m: float, window: _Window) -> _LineOfEyes:
-    """For eyes at between_m -+ half_m (3,). F counts as infinite where it is within the window or close, or far off."""
+    """Return the line of eyes at between_m ± half_m (3,); F near the window or far away is infinite."""
     nearer_m, ahead_m = float(half_m[0]), between_m[0] - plane_m
     towards = nearer_m * between_m[1:] - ahead_m * half_m[1:]
     from_f = nearer_m * window.middle_m - towards
     nearness = window.half_width_m * nearer_m / from_f[0] if from_f[0] else inf
     if abs(nearness) > NEAREST_F:
         return _LineOfEyes(0.0, -from_f, from_f, 0.0)
-    if abs(nearness) < FARTHEST_F:  # level eyes keep level rows, which are sampled better
+    if abs(nearness) < FARTHEST_F:  # level eyes keep level rows, which can be sampled more accurately
         level = -ahead_m * half_m[1:]
         return _LineOfEyes(0.0, level, -level, 0.0)
     return _LineOfEyes(nearer_m, towards, from_f, float(nearness))
 
 
 def _equal_parallax_m(stack: PanelStack, eye_x_m: float) -> float:
-    """x of the plane on which both outer panels have the same parallax: a²/ex before the centre of even gaps a."""
+    """Return x of the plane where both outer panels have the same parallax (a²/ex behind the centre)."""
     rear_m, front_m, far_m = stack.x_m[1] - stack.x_m[0], stack.x_m[2] - stack.x_m[1], eye_x_m - stack.x_m[1]
     ahead = 2 * rear_m * front_m + far_m * (front_m - rear_m)
     return float(stack.x_m[1] + ahead / (2 * far_m + (rear_m - front_m)))
 
 
 def _window_of(middle: F64, stack: PanelStack, *, plane_m: float) -> _Window:
-    """The part of the plane that rays from `middle` through all panels reach across, and the centre panel's height.
+    """Return the window that rays from `middle` through all panels cover, as high as the centre panel.
 
-    At least 10 % of the panels' width.
+    It is at least 10 % of the panels' width wide.
     """
 
     def extent(x_m: float, size_m: float, axis: int) -> tuple[float, float]:
@@ -226,11 +225,12 @@ def _window_of(middle: F64, stack: PanelStack, *, plane_m: float) -> _Window:
 
 @lru_cache(maxsize=8)
 def chain_modes(cells: int) -> tuple[F32, F32, F32, F32]:
-    """Modes of the chain operators, in closed form, for `cells` equations.
+    """Return the modes of the chain operators for `cells` equations, in closed form.
 
-    The difference A (cells, cells + 1), rows [.. -2 2 ..], is U·diag(s)·V^T; the mean B, rows [.. 1/2 1/2 ..], is
-    U·diag(cos)·Ũ^T with cos = sqrt(1 - s²/16): sines and cosines of the same frequencies. Returns V and Ũ
-    (cells + 1, cells + 1), s (cells + 1,) and U^T (cells + 1, cells), float32; A maps the first mode of V to 0.
+    The difference operator A (cells, cells + 1), with rows [.. -2 2 ..], is U·diag(s)·V^T. The mean operator B,
+    with rows [.. 1/2 1/2 ..], is U·diag(cos)·Ũ^T with cos = sqrt(1 - s²/16). The modes are sines and cosines of the
+    same frequencies. Returns V and Ũ (cells + 1, cells + 1), s (cells + 1,) and U^T (cells + 1, cells) as float32;
+    A maps the first mode of V to 0.
     """
     angle = np.pi * np.arange(cells + 1) / (cells + 1)
     size = np.sqrt(2 / (cells + 1))

@@ -1,4 +1,4 @@
-"""Draws the targets of a solution: the one place where content, views and models meet."""
+"""Draw the targets of a solution. Only this module knows content, views and models."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ from runtime.support.gl import DrawnPicture
 
 
 def raster_views(eyes_m: F64, raster: PlaneRaster, *, reduction: int = 1) -> tuple[View, View]:
-    """Left and right eye's views of one raster, of a reduction of the panels'; eyes (2, 3), frame `stack`."""
+    """Return the left and right eye's views of a raster; eyes (2, 3), frame `stack`.
+
+    reduction: divisor from the panels' rows and columns to the raster's.
+    """
     left, right = (
         View(eye, side, raster_from_stack(eye, raster), raster.width_px, raster.height_px, reduction)
         for side, eye in enumerate(eyes_m)
@@ -29,7 +32,7 @@ def raster_views(eyes_m: F64, raster: PlaneRaster, *, reduction: int = 1) -> tup
 
 
 def retina_view(eye_m: F64, side: int, *, width_px: int, height_px: int, fov_deg: float) -> View:
-    """The view of an eye's own image, looking at the stack's origin."""
+    """Return the view of an eye's own image; the eye looks at the stack's origin."""
     projection = image_from_stack(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
     return View(eye_m, side, projection, width_px, height_px)
 
@@ -37,7 +40,7 @@ def retina_view(eye_m: F64, side: int, *, width_px: int, height_px: int, fov_deg
 def retina_pictures(
     content: ContentSource, eyes_m: F64, stack: PanelStack, *, fov_deg: float, time_ns: int
 ) -> tuple[U8, U8]:
-    """Draw retina pictures (h, w, 3), panel size, of content for eyes (2, 3), frame `stack`."""
+    """Draw retina pictures (h, w, 3) of content, as large as a panel, for eyes (2, 3) in frame `stack`."""
     size = {"width_px": stack.width_px, "height_px": stack.height_px}
     views = [retina_view(eye, side, **size, fov_deg=fov_deg) for side, eye in enumerate(eyes_m)]
     content.expect(views, time_ns=time_ns)
@@ -56,12 +59,12 @@ def drawn_job(
     before: SolveWindow | None = None,
     in_depth: bool = False,
 ) -> Job:
-    """The job of solving for eyes (2, 3), frame `stack`: content drawn for them on the middle panel's pixels.
+    """Return the job for eyes (2, 3), frame `stack`, with content drawn on the middle panel's pixels.
 
-    Pictures stay in textures where the model reads those; else they are the source's own arrays. reduction: of the
-    panels' rows and columns. trimmed: skip work that the scene does not need (`trim`), drawing included, where the
-    content knows its extent. before: the window of the solution before, on the same raster. in_depth: with the
-    content's relief, where the source knows it.
+    Pictures stay in textures if the model can read them; otherwise they are the source's own arrays. reduction: divisor
+    of the panels' rows and columns. trimmed: skip work that the scene does not need (`trim`), including drawing if the
+    content knows its extent. before: the previous solution's window, on the same raster. in_depth: include the
+    content's relief, if the source knows it.
     """
     stack, trimmed = predictor.stack.reduced(reduction), trimmed and predictor.trims
     window: SolveWindow | None = None
@@ -82,7 +85,7 @@ def drawn_job(
 
 
 def _extent(content: ContentSource, eyes_m: F64, middle: PlaneRaster, *, time_ns: int) -> PixelRect | None:
-    """Pixels of the middle panel outside which both eyes see the background alone; None: the content doesn't know."""
+    """Return the middle panel's pixels outside which both eyes see only the background; None: unknown."""
     views = raster_views(eyes_m, middle)
     boxes = [content.extent(view, time_ns=time_ns) for view in views]
     known = [box for box in boxes if box is not None]
@@ -92,7 +95,7 @@ def _extent(content: ContentSource, eyes_m: F64, middle: PlaneRaster, *, time_ns
 def _relief(
     content: ContentSource, views: tuple[View, View], stack: PanelStack, window: SolveWindow | None
 ) -> F32 | None:
-    """The relief of the content that was drawn for both views, over the middle panel; None: the source has no depth."""
+    """Return the relief, on the middle panel, of the content drawn for both views; None without depth."""
     every = block_px(stack.width_px)
     u0, v0 = (0, 0) if window is None else (window.box.u0, window.box.v0)
     left, right = (content.nearness(view, every=every, first=(u0 % every, v0 % every)) for view in views)
@@ -108,9 +111,9 @@ def _relief(
 
 
 def _picture(predictor: Predictor, content: ContentSource, view: View, *, time_ns: int) -> U8 | DrawnPicture:
-    """A view's picture: in a texture where the content draws one that the model reads, else an array.
+    """Return a view's picture: a texture if the model reads the content's textures, otherwise an array.
 
-    Raises ContentFailure, ContextLost.
+    Raises ContentFailure and ContextLost.
     """
     if content.draws_in is None or not predictor.reads_textures_of(content.draws_in):
         return content.render(view, time_ns=time_ns)

@@ -145,7 +145,7 @@ def test_the_raster_covers_what_is_seen_of_all_panels() -> None:
 
 def test_eyes_above_each_other_have_no_row_to_solve_along() -> None:
     upright = np.array([[0.6, 0.0, -0.03], [0.6, 0.0, 0.03]])
-    with pytest.raises(ValueError, match="not next to each other"):
+    with pytest.raises(ValueError, match="no horizontal separation"):
         chain_frame(upright, STACK, cell_px=4, reduction=2)
 
 

@@ -130,7 +130,7 @@ def test_a_head_that_lies_down_and_sits_up_again_leaves_nothing_behind() -> None
 def test_eyes_behind_each_other_are_a_passing_model_failure() -> None:
     predictor = load_predictor("fast", STACK)
     grey = np.full((270, 480, 4), 128, np.uint8)
-    with pytest.raises(EyesNotServed, match="not next to each other") as caught:
+    with pytest.raises(EyesNotServed, match="no horizontal separation") as caught:
         predictor.solve(drawn_job([grey, grey], np.array([[0.6, 0.0, 0.0], [0.66, 0.0, 0.0]]), STACK))
     assert isinstance(caught.value, ModelFailure)
 
