@@ -1,4 +1,4 @@
-"""Contact sheet of a run: its layers and, for each eye, target, retina image and error."""
+"""Draw the contact sheet of a run: its layers and, for each eye, target, retina image and error."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ PAPER = 246
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """One refresh of a run, for the contact sheet, and its unaligned solution, for the viewer."""
+    """One refresh of a run for the contact sheet, and its unaligned solution for the viewer page."""
 
     layers: U8  # (N, h, w, 3 or 4), as the panels showed them: aligned
     eye_views: EyeViews
-    light_db: float  # for a tracking error of 1 mm
-    lines: tuple[str, ...]  # which refresh it is, and how far the eyes had moved
+    light_db: float  # light PSNR for a tracking error of 1 mm
+    lines: tuple[str, ...]  # state the refresh, and how far the eyes had moved
     solution: U8  # (N, h, w, 3 or 4), before alignment
     solved_for_m: F64  # (2, 3) eyes, frame `stack`
-    asked_for: tuple[U8, ...]  # (h, w, 3) their targets
+    asked_for: tuple[U8, ...]  # (h, w, 3) targets of the solution
     relief: F32 | None = None  # (h, w) of the solution's content (`optics.relief`)
 
 
@@ -79,7 +79,7 @@ def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, line
 
 
 def headline(light_db: float | None) -> str:
-    """Return the sentence with the figure to quote."""
+    """Return the sentence that states the figure to quote."""
     if light_db is None or math.isnan(light_db):
         return "light PSNR at these eyes was not measured"
     conditions = f"pixels as squares, pupil {PUPIL_MM:g} mm, tracking error {TRACKING_SIGMA_MM:g} mm"

@@ -1,4 +1,4 @@
-"""Quality of one sampled refresh at the eyes that it was aligned to and (*live*) at the true eyes."""
+"""Measure one sampled refresh at the eyes to which it was aligned, and (*live*) at the true eyes."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from runtime.records import F64, U8, RefreshAccount
 
 log = logging.getLogger("phasestack.quality")
 
-# Sampling of light. Errors of a displaced view are at edges: sampling a quarter of a small picture is off by 0.6 dB.
+# Sampling of light. A displaced view's errors are at edges: a quarter of a small picture's pixels is off by 0.6 dB.
 ALIGNED, LIVE = Sampling(step=2), Sampling(rays=4)
-ALIGNED_LARGE, LIVE_LARGE = Sampling(step=4), Sampling(step=2)  # for pictures with `PLENTY` values
+ALIGNED_LARGE, LIVE_LARGE = Sampling(step=4), Sampling(step=2)  # for pictures with more values than `PLENTY`
 FIGURES = ("light_db", "psnr_db", "ssim", "carried_db", "psnr_db_true_eyes", "carried_db_true_eyes")
 Pictures = tuple[U8, U8]  # (h, w, 3) retina pictures of the left and right eye, panel size
 
 
 @dataclass(frozen=True, slots=True)
 class RefreshTargets:
-    """Target pictures for a refresh; None if not drawn."""
+    """Target pictures of a refresh; None if they were not drawn."""
 
     fov_deg: float  # horizontal, of every picture
     solved: Pictures | None = None  # for the eyes and the instant of the solution
@@ -38,18 +38,18 @@ class RefreshTargets:
 class RefreshQuality:
     """Measurements of one refresh."""
 
-    figures: dict[str, float] = field(default_factory=dict)  # of FIGURES
+    figures: dict[str, float] = field(default_factory=dict)  # by name in FIGURES
     live_error: float | None = None  # mean squared error of light at the true eyes
     moment: Moment | None = None  # for stills, sheet and viewer
 
 
 def view_error_mm(eyes_m: F64, solved_for_m: F64) -> float:
-    """Distance in millimetres between the midpoints of two pairs of eyes (2, 3)."""
+    """Return the distance in millimetres between the midpoints of two pairs of eyes (2, 3)."""
     return 1000 * float(np.linalg.norm((eyes_m - solved_for_m).mean(axis=0)))
 
 
 def live_error(layers: U8, targets: Pictures, stack: PanelStack, *, eyes_m: F64, fov_deg: float) -> float:
-    """Mean squared error of the light at eyes (2, 3) against the target pictures for these eyes.
+    """Return the mean squared error of light at eyes (2, 3) against the target pictures for these eyes.
 
     layers: (N, H, W, 3 or 4), as the panels show them. Raises ValueError if the eyes see no part of them.
     """
@@ -66,9 +66,9 @@ def measure_refresh(
 ) -> RefreshQuality:
     """Measure a refresh as far as its targets were drawn, skipping eyes that see no part of the panels.
 
-    account: includes the true eyes if known; layers: (N, h, w, 4), as the panels showed them; carried: the layers
-    aligned as if all content were on the middle panel, and before alignment; None unless the panels show only a
-    solution.
+    account: includes the true eyes, if known. layers: (N, h, w, 4), as the panels showed them. carried: the layers
+    aligned as if all content were on the middle panel, and the layers before alignment; None unless the panels show
+    only a solution.
     """
     error = None
     if targets.true is not None and account.true_eyes_m is not None:
@@ -123,7 +123,7 @@ def _at_aligned_eyes(
 
 
 def _line(account: RefreshAccount) -> str:
-    """Return which refresh it is, and how far the eyes had moved, for the sheet."""
+    """Return the sheet's line, which states the refresh and how far the eyes had moved."""
     assert account.eyes_m is not None and account.solved_for_m is not None
     moved_mm = view_error_mm(account.eyes_m, account.solved_for_m)
     return (
