@@ -26,7 +26,7 @@ Options = Annotated[
     typer.Option(
         "--option",
         metavar="NAME=VALUE",
-        help="option NAME=VALUE of the network, or steps=N solver steps after it; may be repeated",
+        help="network option as NAME=VALUE, or steps=N for the solver steps after the network; may be repeated",
     ),
 ]
 

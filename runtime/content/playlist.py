@@ -103,7 +103,7 @@ class PlaylistSource(ForwardingSource):
 
     @property
     def info(self) -> ContentInfo:  # type: ignore[override]
-        """Return the current entry's info, named after the list."""
+        """Return the current entry's info, with the playlist's name."""
         index, inner = self._number % len(self._sources), self.source.info
         name = f"{self._list.path.stem}: {inner.name} ({index + 1} of {len(self._sources)})"
         return replace(inner, name=name, moving=True)

@@ -266,7 +266,7 @@ def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[
                 yield record
             # mcap skips unknown records
             if end in indexed and os.pread(file.fileno(), len(CHUNK), end) != CHUNK:
-                raise ValueError(f"the chunk at byte {end} is not marked as one")
+                raise ValueError(f"the chunk at byte {end} has no chunk marker")
     except InputError:
         raise
     except Exception:  # the errors of mcap, lz4 and zstandard

@@ -172,7 +172,7 @@ def test_a_chunk_whose_kind_is_damaged_ends_the_recording_with_a_line(
             continue
         recording = Recording(path)
         assert [eyes_message(frame) for frame in recording.samples()] == DEMO[:before]
-        assert not recording.is_whole and f"the chunk at byte {start} is not marked as one" in caplog.text
+        assert not recording.is_whole and f"the chunk at byte {start} has no chunk marker" in caplog.text
 
 
 def test_another_program_s_or_version_s_recording_is_called_so(tmp_path: Path) -> None:
