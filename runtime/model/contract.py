@@ -82,9 +82,9 @@ class Contract(Section):
     cell_px: Annotated[int, Field(ge=1, le=64)] = Field(
         4, description="chain: the outer panels' parallax in columns of the network's raster"
     )
-    reduction: Literal[1, 2, 4] = Field(2, description="chain: factor by which the panel's raster is divided for the network")
+    reduction: Literal[1, 2, 4] = Field(2, description="chain: factor by which a panel's raster is divided")
     picture_fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
-        0.0, description="horizontal field of view of the training pictures in degrees, which are black outside; 0: unlimited"
+        0.0, description="horizontal field of view of the training pictures, black outside; 0: unlimited"
     )
     steps: Steps = ()
 
