@@ -153,7 +153,7 @@ def capture(
 @app.command()
 def solve(
     pairs: Annotated[
-        Path, typer.Option(help="CSV or JSON file of point pairs (sensor_x, ... and stack_x, ...) in metres")
+        Path, typer.Option(help="CSV or JSON file of point pairs (sensor_x, stack_x, ...) in metres")
     ],
     out: Annotated[Path, typer.Option(help="calibration file to write (TOML); a previous one is kept")],
     method: Annotated[
