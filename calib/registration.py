@@ -1,9 +1,9 @@
 """Registration of the panels from photographs of their test patterns: poses and standard errors.
 
 The stack frame is that of the reference (middle) panel, whose picture is not resampled. Every other panel gets its
-actual distance and a homography that maps each pixel to where it would appear on a panel parallel to the reference. For a
-parallel panel this is exact at every eye position. For a tilted one it is exact only at the viewing position, and the
-models correct the tilt at other positions.
+actual distance and a homography that maps each pixel to where it would appear on a panel parallel to the reference.
+For a parallel panel this is exact at every eye position. For a tilted one it is exact only at the viewing position, and
+the models correct the tilt at other positions.
 """
 
 from __future__ import annotations
