@@ -152,9 +152,7 @@ def capture(
 
 @app.command()
 def solve(
-    pairs: Annotated[
-        Path, typer.Option(help="CSV or JSON file of point pairs (sensor_x, stack_x, ...) in metres")
-    ],
+    pairs: Annotated[Path, typer.Option(help="CSV or JSON file of point pairs (sensor_x, stack_x, ...) in metres")],
     out: Annotated[Path, typer.Option(help="calibration file to write (TOML); a previous one is kept")],
     method: Annotated[
         str, typer.Option(help="seed, least-squares, inverse, robust or fixed-scale; default: the best for these pairs")

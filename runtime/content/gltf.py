@@ -137,7 +137,7 @@ class GltfScene:
     def _add(self, primitive: Table, *, weights: list[float], matrices: F64) -> None:
         """Add the triangles, lines or points of a primitive.
 
-        matrices: 4x4 scene_from_mesh, or one for each joint of its skin.
+        matrices: one 4x4 scene_from_mesh or, for a skinned mesh, one per joint.
         """
         file, mode = self.file, primitive.get("mode", TRIANGLES)
         if "POSITION" not in primitive["attributes"]:

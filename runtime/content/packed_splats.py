@@ -50,7 +50,7 @@ def load_compressed(header: PlyHeader) -> Gaussians:
     if fields := elements["sh"].dtype.names if "sh" in elements else ():
         rest = np.column_stack([elements["sh"][name] for name in fields])
         if rest.shape[1] not in COEFFICIENTS or len(rest) != len(splats):
-            raise InputError(header.path, "sh", "holds no harmonics of degree 1 to 3 for every splat")
+            raise InputError(header.path, "sh", "does not hold harmonics of degrees 1 to 3 for every splat")
         higher = rest.reshape(len(rest), 3, -1).transpose(0, 2, 1)
         harmonics = with_higher(harmonics, higher, zero=127.5, unit=8 / 255)
     return drawable(

@@ -23,7 +23,7 @@ from runtime.records import F64, EyePoints
 DEMO_FILE = Path(__file__).parent / "data" / "demo-calibration.toml"
 SIMILARITY_TOLERANCE = 1e-3  # relative; accepts matrices with four digits, but not sheared ones
 PLAUSIBLE_SCALE = (0.8, 1.25)  # scale between two frames in metres
-SCALE = (5e-4, 2e3)  # allows for millimetres on one side; anything outside is an error
+SCALE = (5e-4, 2e3)  # allows for millimetres in one of the two point sets; anything outside is an error
 NEAR_M, MAX_DISTANCE_M = 5.0, 20.0  # distance from sensor to display above which to warn or to refuse
 
 Number = Annotated[float, Field(strict=True, ge=-MOST, le=MOST)]  # refuses "1.0" and true

@@ -68,7 +68,7 @@ class FaceFlow:
 
 
 def _flow(before: Any, after: Any, start: Any, guess: Any) -> tuple[Any, Any]:
-    """Return the positions (n, 2) in `after` of points in `before`, and a mask (n, 1) of those found.
+    """Find points of `before` in `after`: return their positions (n, 2) and a mask (n, 1) of those found.
 
     Overwrites `guess`.
     """

@@ -80,7 +80,7 @@ def without_alpha(picture: U8, channels: int) -> U8:
 
 
 def flat_layers(image: U8, stack: PanelStack) -> U8:
-    """Return (N, h, w, 4) layers that show every eye a picture (h, w, 4) on the middle panel's raster."""
+    """Return (N, h, w, 4) layers that show every eye the same picture (h, w, 4)."""
     middle = stack.count // 2
     layers = np.full((stack.count, stack.height_px, stack.width_px, 4), 255, np.uint8)
     # The sum is at least the start of the slope. The other panels share that part; the middle one adds the picture.

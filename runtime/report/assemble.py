@@ -71,7 +71,7 @@ def whole_report(
     command: str = "phasestack report",
     progress: Progress = lambda name: None,
 ) -> dict[str, Any]:
-    """Measure everything into a folder and return report.json. quick: quarter size, fewer references.
+    """Run all measurements, write them to a folder and return the contents of report.json. quick: quarter size, fewer references.
 
     Raises InputError for invalid case files and models before the first measurement.
     """

@@ -1,1 +1,1 @@
-"""Drivers for depth cameras and eye trackers, recordings, and the thread that reads a driver."""
+"""Depth-camera and eye-tracker drivers, recordings, and the thread that polls a driver."""
