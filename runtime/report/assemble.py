@@ -71,9 +71,9 @@ def whole_report(
     command: str = "phasestack report",
     progress: Progress = lambda name: None,
 ) -> dict[str, Any]:
-    """Run all measurements, write them to a folder and return the contents of report.json. quick: quarter size, fewer references.
+    """Run all measurements, write them to a folder and return the contents of report.json.
 
-    Raises InputError for invalid case files and models before the first measurement.
+    quick: at a quarter of the size, with fewer references. Raises InputError for invalid case files and models before the first measurement.
     """
     cases = read_pairs(pairs) if pairs is not None else []
     stack = StackGeometry().stack()
