@@ -73,8 +73,8 @@ def whole_report(
 ) -> dict[str, Any]:
     """Run all measurements, write them to a folder and return the contents of report.json.
 
-    quick: at a quarter of the size, with fewer references. Raises InputError for invalid case files and models before the
-    first measurement.
+    quick: at a quarter of the size, with fewer references. Raises InputError for invalid case files and models, before
+    measuring.
     """
     cases = read_pairs(pairs) if pairs is not None else []
     stack = StackGeometry().stack()
