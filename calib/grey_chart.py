@@ -55,7 +55,7 @@ class Patch:
 
 @lru_cache(maxsize=8)
 def patches(stack: PanelStack, panel: int) -> tuple[Patch, ...]:
-    """Return the patches between the marks of the board, with the kinds of patch shuffled reproducibly."""
+    """Return the patches between the board's marks, their kinds shuffled reproducibly."""
     pitch = stack.width_px // PATCHES_ACROSS
     side = pitch * 5 // 6 // 8 * 8  # so that the measured half contains whole periods of the mixing pattern
     free = [

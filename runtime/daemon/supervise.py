@@ -98,7 +98,7 @@ class Daemon(Host):
             self._server.lookups |= {"log": self.recorder.look_at_log} if self.recorder is not None else {}
 
     def wait_for_panel(self, why: str) -> bool:
-        """If a panel is missing: report it and wait a second (as a service), or refuse to start (by hand)."""
+        """Without a panel, report it and wait a second (as a service) or refuse to start."""
         if not self._notifier.supervised or self._signals.stop:
             return False
         if why != self._waits_for:

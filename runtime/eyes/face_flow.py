@@ -68,7 +68,7 @@ class FaceFlow:
 
 
 def _flow(before: Any, after: Any, start: Any, guess: Any) -> tuple[Any, Any]:
-    """Find points of `before` in `after`: return their positions (n, 2) and a mask (n, 1) of those found.
+    """Return positions (n, 2) in `after` of points of `before`, and a mask (n, 1) of those found.
 
     Overwrites `guess`.
     """

@@ -296,7 +296,7 @@ class Tracker:
 
 
 def sideways_sigma_m(error_m2: F64, eye_m: F64, *, panel_m: tuple[float, float]) -> float:
-    """Return the sideways standard deviation that affects the picture as much as a position covariance (3, 3).
+    """Return the sideways standard deviation with the effect of a position covariance (3, 3).
 
     If an eye is nearer than its estimated distance x by d, a display point is affected as by a sideways displacement of
     d·u/x, where u is the distance from that point to the foot of the eye's perpendicular. The result is the root mean
