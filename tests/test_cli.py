@@ -77,7 +77,7 @@ def solve_arguments(folder: Path, **changes: object) -> list[str]:
         ({"left_eye": (0.6, 1e30, 0)}, "--left-eye: 1e+30 m is beyond 50 m"),
         (
             {"left_eye": (0.6, 0, 0), "right_eye": (0.66, 0, 0), "model": "fast"},
-            "--right-eye: the eyes are not next to",
+            "--right-eye: the eyes have no horizontal separation",
         ),
         ({"left_eye": (50, 50, 50), "right_eye": (0.07, -50, -50), "model": "fast"}, "--right-eye: implausible"),
         ({"fov": 180}, "--fov"),
