@@ -116,7 +116,7 @@ class BrowserLink:
         return next((page_ms for ns, page_ms in reversed(tuple(self._captures)) if ns <= capture_ns), None)
 
     def refreshed(self, account: dict[str, Any]) -> None:
-        """Publish a refresh. frame: what the panels show. account: the figures known so far."""
+        """Publish a refresh of the newest frame. account: the status that pages show."""
         self.shown = self.frame, account
         self._notify()
 

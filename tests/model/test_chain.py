@@ -198,7 +198,7 @@ def test_rows_are_panel_rows_and_cover_the_centre_panel(pair: np.ndarray, reduct
 
 
 def test_rows_of_oblique_eyes_grow_higher_instead_of_many() -> None:
-    """Far eyes in a row with the display's edge need four times the rows at the near end, if all stay as high."""
+    """With rows as high as those of level eyes, this pair would need many more than `ROWS_SHARE` allows."""
     level = chain_frame(UPRIGHT, STACK, cell_px=4, reduction=2)
     steep = np.array([[0.5, -0.031, -0.031], [0.5, 0.031, 0.031]])
     frame = chain_frame(steep, STACK, cell_px=4, reduction=2)
