@@ -58,15 +58,18 @@ PICTURES = {  # in docs/images: results of the commands, and of this script
     "focal-slices.jpg": "report/focal-slices.png",
 }
 MOVING = f"""\
-The daemon's own loop runs for {SECONDS:g} s on the simulated clock, with panels of 960x540 and {NOISE_MM} mm of
-sensor noise. The costs are those of a slow processor (ms on the full raster: render 44, prepare 40, inference 31,
-finish 38, a step 85). *Film* is moving content for a resting head. *Full* uses the whole model for every solution.
-*Auto*, the default, [chooses](mathematics.md#effort) an effort, such as half the raster without steps (`1/2+0`). The
-table gives [live quality](contracts.md#error) in dB, the view error in mm (median and 95th percentile) and the share
-of time of each effort. Between solutions, the picture is [reprojected](mathematics.md#reprojection) by its depth.
+The daemon's own loop ran for {SECONDS:g} s on the simulated clock, with 960x540 panels and {NOISE_MM} mm of sensor
+noise. The simulated costs are those of a slow processor (in ms on the full raster: render 44, prepare
+40, inference 31, finish 38, each step 85). In the row *film*, the content moves and the head rests.
+
+An [effort](mathematics.md#effort) is a raster and a number of steps; `1/2+0` means half the raster
+without steps. *Full* runs the whole model for every solution. *Auto*, the default, chooses an effort
+for each solution. The table gives [live quality](contracts.md#error) in dB, the view error in mm
+(median and 95th percentile) and each effort's share of the time. Between solutions, the picture is
+[reprojected](mathematics.md#reprojection) by its depth.
 """
 LEANING = """\
-This is the left eye's view while a head leans at 0.6 m, at every fourth refresh: with `model.effort = "full"`
+The film shows every fourth refresh of the left eye's view while a head leans at 0.6 m: with `model.effort = "full"`
 ("before"), with `"auto"` ("now"), and the true view.
 """
 HEAD = """\
@@ -74,20 +77,20 @@ HEAD = """\
 
 # Performance: light against run time
 
-    phasestack report --out report            # the page appears within a minute and is then completed
-    phasestack report --pairs DIR --focal     # also with your own pairs and focal parallax
+    phasestack report --out report            # the first version of the page appears within a minute
+    phasestack report --pairs DIR --focal     # adds your own pairs and focal parallax
     phasestack bench --out new.json           # figures for regression tests
     phasestack bench compare old.json new.json
 
 **Quote [light](contracts.md#error) at a tracking error of 1 mm** (`light_db`, `"1"`). *One ray* is `psnr_db`. The time
-of a solution runs from two decoded pictures to 8-bit layers; memory is the peak of the method's own process. Run times
+of a solution runs from two decoded pictures to 8-bit layers. Memory is the peak of the method's own process. Run times
 depend on the machine and its load, so compare ratios.
 
-`bench compare` divides times by a reference measured in the same run and skips them if the machine was busy. It exits
-with 1 if a model became slower by more than the noise, lost 0.1 dB or took 15% more memory.
+`bench compare` divides all times by a reference time from the same run. It does not compare times if the machine was
+busy. It exits with 1 if a model became slower by more than the noise, lost 0.1 dB or took 15% more memory.
 
-`report --pairs` reads every [case file](contracts.md#cases-pairs-calibration) in DIR. The optional `off` lists pictures
-that should be seen `mm` away from an eye:
+`report --pairs` reads every [case file](contracts.md#cases-pairs-calibration) in DIR. The optional field `off` lists
+pictures that should be seen from a point `mm` away from an eye:
 
     {"panels": {"width_m": 0.5184, "height_m": 0.2916, "x_m": [-0.06, 0.0, 0.06]},
      "eyes": [[0.78, -0.03, 0.24], [0.78, 0.03, 0.24]], "images": ["left.png", "right.png"], "fov": 40.0,
@@ -96,6 +99,9 @@ that should be seen `mm` away from an eye:
 ![result of the demo: layers, and for each eye the target, the view and their difference](images/contact-sheet.jpg)
 
 """
+
+
+HEADINGS = ["method", "time, × fastest", "ms", "memory, MiB", "light 0 mm, dB", "**1 mm**", "2 mm", "one ray, dB"]
 
 
 def page(report: dict[str, Any]) -> str:
@@ -116,8 +122,9 @@ def page(report: dict[str, Any]) -> str:
         [
             HEAD,
             "## Error against run time\n",
-            f"Measured on built-in scenes and panels of {size} by `{report['command']}`; {facts}.\n",
-            _table(["method", "× fastest", "ms", "MiB", "light 0 mm, dB", "**1 mm**", "2 mm", "one ray"], rows),
+            f"`{report['command']}` measured these figures on built-in scenes with {size} panels ({facts}). "
+            "SART-n is `sart` after n iterations.\n",
+            _table(HEADINGS, rows),
             "![light against run time](images/frontier.png)\n",
             "## What a moving viewer sees\n",
             moving_text([Moving(**one) for one in report["moving"]]),
@@ -125,10 +132,9 @@ def page(report: dict[str, Any]) -> str:
             "![a leaning head, before, now, and what it should see](images/leaning.webp)\n",
             LEANING,
             "## Focal parallax\n",
-            "Three cards are seen through a pupil of 4 mm. The table gives the distance at which the eyes converge on "
-            "each card,\nat which its picture through the layers is sharpest, and at which the card itself is "
-            "sharpest.\n",
-            _table(["card at, mm", "sharpest through the layers", "sharpest in truth"], cards),
+            "Three cards are seen through a pupil of 4 mm. The table gives the distance of each card, and the "
+            "distances at which its\npicture through the layers and the card itself look sharpest.\n",
+            _table(["card, mm", "sharpest through the layers, mm", "sharpest without the display, mm"], cards),
             "![focused behind, on and in front of the panels](images/focal-slices.jpg)",
             "",
         ]
@@ -177,11 +183,12 @@ def moving_text(found: Sequence[Moving]) -> str:
         rows.append([motion, *_live(before), f"{best.live_db:.1f} ({best.effort})", *_live(now), most_used(now)])
         if now.live_db < best.live_db - 0.5:
             worse.append(f"{motion} ({best.live_db - now.live_db:.1f} dB below {best.effort})")
-    headings = ["motion", "full, dB", "view, mm", "95%", "best fixed, dB", "auto, dB", "view, mm", "95%", "efforts"]
+    view = "view error, mm", "95%"
+    headings = ["motion", "full, dB", *view, "best fixed effort, dB", "auto, dB", *view, "efforts of auto"]
     verdict = "never more than 0.5 dB below the best fixed effort"
     if worse:
         verdict = f"more than 0.5 dB below the best fixed effort for {', '.join(worse)}"
-    return f"{MOVING}\n{_table(headings, rows)}\n`auto` is {verdict}.\n"
+    return f"{MOVING}\n{_table(headings, rows)}\n*Auto* is {verdict}.\n"
 
 
 def _live(one: Moving) -> list[str]:
