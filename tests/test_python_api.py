@@ -354,7 +354,7 @@ def test_a_pair_with_too_much_disparity_is_explained_wherever_its_figure_is(tmp_
     eyes = ((0.6, -0.0315, 0.0), (0.6, 0.0315, 0.0))
     good, bad = (phasestack.solve(*rectified(px), eyes_m=eyes, stack=STACK, model="fast") for px in (6, 60))
     assert good.notes == ()
-    with pytest.warns(UserWarning, match=r"rectified pair .* move the left picture 3\d pixels to the left"):
+    with pytest.warns(UserWarning, match=r"rectified pair .* shift the left picture 3\d pixels left"):
         assert bad.measure(sigmas_mm=(1,)).light_db["1"] < good.measure(sigmas_mm=(1,)).light_db["1"] - 6
     with pytest.warns(UserWarning, match="more disparity than these gaps"):
         assert bad.quality.light_db["1"] < good.quality.light_db["1"] - 6

@@ -1,4 +1,4 @@
-"""Choose the solver's device: the configured one or, for `auto`, the faster on this machine."""
+"""Choose the solver's device: the configured one or, for `auto`, the faster one on this machine."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 log = logging.getLogger("phasestack.model")
 
 EYES_M = ((0.6, -0.031, 0.0), (0.6, 0.031, 0.0))
-FIRST_SHARE = 4  # the first comparison uses panels with this many times fewer columns and rows
-CLEAR = 2.5  # a backend that is this many times as fast there wins without a second comparison
+FIRST_SHARE = 4  # in the first comparison, the panels' columns and rows are divided by this
+CLEAR = 2.5  # a backend that is this many times as fast in the first comparison wins without a second one
 RUNS = 3  # timed runs; the fastest one counts
 
 Wanted = Literal["auto", "cpu", "gl"]
@@ -39,10 +39,10 @@ class Choice:
 
 
 def choose(wanted: Wanted, predictor: Predictor, context: Callable[[], Any]) -> Choice:
-    """Return the backend for a loaded model, and log the reason.
+    """Choose the backend for a loaded model, and log the reason.
 
-    context: returns an OpenGL context that is current on this thread, or raises MissingPart; called only if needed.
-    For `auto`, both backends are timed; the processor is used if OpenGL is unavailable.
+    wanted: for `auto`, both backends are timed, and the processor is used if OpenGL is unavailable. context: function,
+    called only if needed, that returns an OpenGL context that is current on this thread, or raises MissingPart.
     Raises MissingPart (`gl` without OpenGL), InputError (a panel too large for the driver) and ModelFailure.
     """
     if predictor.on_panels(predictor.stack) is None:
@@ -81,15 +81,15 @@ def _faster(predictor: Predictor, made: Callable[[], GlBackend]) -> Choice:
             if max(cpu_ms, gl_ms) > CLEAR * min(cpu_ms, gl_ms):
                 break
         if gl_ms < cpu_ms:
-            return Choice(gl, f"measured at {times}")
+            return Choice(gl, f"the faster at {times}")
     except PhasestackError as error:
-        return Choice(cpu, f"OpenGL can't be used: {error}")
+        return Choice(cpu, f"OpenGL cannot be used: {error}")
     gl.close()
-    return Choice(cpu, f"measured at {times}")
+    return Choice(cpu, f"the faster at {times}")
 
 
 def solution_ms(predictor: Predictor, stack: PanelStack, backend: SolverBackend, *, runs: int) -> float:
-    """Return the fastest of `runs` solutions in ms, after one that compiles and allocates."""
+    """Return the time in ms of the fastest of `runs` solutions, after one that compiles and allocates."""
     solver = predictor.on_panels(stack)
     assert solver is not None
     solver.set_backend(backend)

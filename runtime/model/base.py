@@ -22,9 +22,9 @@ STAGES = ("prepare", "inference", "finish", "step")  # inference: the network al
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """The layers of a job, and the work spent on them."""
+    """Layers computed for a job, and the work spent on them."""
 
-    layers: U8  # (N, height_px, width_px, 4) RGBA, rear to front, of the job's stack; read-only
+    layers: U8  # (N, height_px, width_px, 4) RGBA, rear to front, as large as the job's stack; read-only
     stage_ms: dict[str, float] = field(default_factory=dict)  # time of each of STAGES
     savings: Savings = field(default_factory=Savings)
     steps: int = 0  # updates of all panels, including those of the solutions that it continues
@@ -32,7 +32,7 @@ class Prediction:
 
 
 class Predictor(ABC):
-    """A model that solves jobs for N layers. Only one thread uses it."""
+    """A model that computes the N layers of a job. Only one thread uses it."""
 
     name: str
     provider: str
@@ -47,11 +47,11 @@ class Predictor(ABC):
     warmed_ms: Mapping[int, Mapping[str, float]] = MappingProxyType({1: {}})  # stage times of `warm_up`, by reduction
 
     def reads_textures_of(self, context: object) -> bool:
-        """Return True if `solve` reads pictures in textures of a GL context (`DrawnPicture`)."""
+        """Return True if `solve` can read pictures in textures of this GL context (`DrawnPicture`)."""
         return False
 
     def on_panels(self, stack: PanelStack) -> Predictor | None:
-        """Return a copy for panels of another size, to time backends; None if it has only one."""
+        """Return a copy for panels of another size, to time backends; None if there is only one backend."""
         return None
 
     def set_backend(self, backend: SolverBackend) -> None:  # noqa: B027 - most have one
@@ -59,19 +59,20 @@ class Predictor(ABC):
 
     @abstractmethod
     def solve(self, job: Job, watch: Stopwatch | None = None) -> Prediction:
-        """Compute the layers of a job. watch: the stages' times are added to it.
+        """Compute the layers of a job.
 
+        watch: stopwatch to which the stages' times are added.
         Raises ModelFailure if inference fails or returns numbers that are not finite, and its subclass
         EyesNotServed if the model does not support eyes at these positions.
         """
 
     def warm_up(self, eyes_m: F64) -> None:
-        """Solve grey pictures with one step on every raster, so that the first frame need not allocate."""
+        """Solve grey pictures in one step on every raster, so that the first frame allocates nothing."""
         measured = {}
         for reduction in self.reductions:
             job = replace(grey_job(eyes_m, self.stack.reduced(reduction)), steps=1)
             self.solve(job)
-            runs = [self.solve(job).stage_ms for _ in range(min(reduction, 3))]  # other work may delay a run
+            runs = [self.solve(job).stage_ms for _ in range(min(reduction, 3))]  # other work may delay one run
             measured[reduction] = {stage: min(run[stage] for run in runs) for stage in runs[0]}
         self.warmed_ms = measured
 

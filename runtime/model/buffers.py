@@ -29,14 +29,14 @@ class LayerBuffer:
 
 
 class LayerPool:
-    """Buffers for the solutions that coexist: one being written, the newest, and the one on the panels."""
+    """Buffers for solutions in use at once: one being written, the newest, and the one on the panels."""
 
     def __init__(self, stack: PanelStack) -> None:
         self._shape = stack.count, stack.height_px, stack.width_px, 4
         self._buffers: list[LayerBuffer] = []
 
     def take(self) -> LayerBuffer:
-        """Return a free buffer with its old contents, or a new one if all are in use."""
+        """Return a free buffer, which keeps its old contents, or a new one if all are in use."""
         for buffer in self._buffers:
             if buffer.holder() is None:
                 return buffer

@@ -1,6 +1,6 @@
 """Raster on which the difference between the eyes splits into chains, each a small linear system.
 
-With +g on the front panel and -g on the rear panel, the difference between the eyes' phases is
+With +g on the front panel and -g on the rear panel, and a parallax of s, the difference between the eyes' phases is
 
     D(p) = 2·[g(p + s) - g(p - s)].
 
@@ -8,9 +8,9 @@ If the columns of a raster make s a whole number K, columns that are 2K apart fo
 each chain D = A·g, with the same bidiagonal A for all.
 
 If one eye is nearer to the panels than the other, s varies. Seen through a plane parallel to the panels, an outer panel
-is scaled about the point F, where the line through the eyes meets that plane; the scales for the two eyes are
+is scaled about the point F where the line through the eyes meets that plane. The scales for the two eyes are
 reciprocal. If the columns are spaced by the logarithm of the distance from F, and the rows run towards F, this scaling
-is again a shift.
+becomes a shift again.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64
 
 CELLS_STEP = 8  # chain lengths are rounded up to a multiple of this, so that a moving viewer causes few shapes
-ROWS_STEP = 32  # likewise for rows, if the eyes are not level
+ROWS_STEP = 32  # the same for the number of rows, if the eyes are not level
 ROWS_SHARE = 1.75  # most rows, relative to level eyes; saves a quarter of the network's time for a walking viewer
 CELLS_MAX = 1024
 BLOCK_ROWS = 8  # rows that the network transforms together; the raster has whole blocks
 ROWS_MAX = 1 << 15  # rows that eyes would need at full height; beyond, they are implausible
-NEAREST_F = 0.8  # largest ratio of the raster's half width to its middle's distance from F: the raster stays clear of F
+NEAREST_F = 0.8  # largest ratio of the raster's half width to its middle's distance from F, which keeps it clear of F
 FARTHEST_F = 0.01  # below this ratio s varies by less than a hundredth, so the columns are evenly spaced
 
 Columns = NDArray[np.floating[Any]]
@@ -42,20 +42,20 @@ Columns = NDArray[np.floating[Any]]
 class ColumnLaw:
     """Spacing of a raster's columns: t = middle + (1 - exp(-bend·(u - middle)))/bend.
 
-    u is the column, t the coordinate to which the homography applies. A bend of 0 stands for even columns.
+    u is the column, and t is the coordinate to which the homography applies. With a bend of 0, columns are even.
     """
 
     bend: float = 0.0  # per column
     middle: float = 0.0  # column where t = u
 
     def homography_from_column(self, u: Columns) -> Columns:
-        """Return t for columns u, of any shape."""
+        """Return t for an array of columns u."""
         if not self.bend:
             return u
         return np.asarray(self.middle - np.expm1(-self.bend * (u - self.middle)) / self.bend)
 
     def column_from_homography(self, t: Columns) -> Columns:
-        """Return u for t, of any shape; beyond F, a value far outside the raster."""
+        """Return u for an array of coordinates t; beyond F, a value far outside the raster."""
         if not self.bend:
             return t
         return np.asarray(self.middle - np.log(np.maximum(1 - self.bend * (t - self.middle), BEYOND_F)) / self.bend)
@@ -70,33 +70,33 @@ class ChainFrame:
     """Raster on the plane of equal parallax of both outer panels, seen from between the eyes."""
 
     x_m: float  # x of that plane: a²/ex
-    plane_from_raster: F64  # 3x3, (y, z, 1) from (t, v, 1); `columns` maps u to t, along the eyes' line
+    plane_from_raster: F64  # 3x3, (y, z, 1) from (t, v, 1); t runs along the eyes' line, and `columns` maps u to t
     columns: ColumnLaw
     cells: int  # chain cells per row; the raster has cells·2K columns
     cell_px: int  # K
     rows: int
-    middle_m: F64  # (3,) point between the eyes, frame `stack`, from which their parallaxes are opposite
+    middle_m: F64  # (3,) point between the eyes, frame `stack`, relative to which their parallaxes are opposite
 
     @property
     def width_px(self) -> int:
         return self.cells * 2 * self.cell_px
 
     def plane_from_frame(self, eye_m: F64, *, x_m: float) -> F64:
-        """Return the 3x3 map from (t, v, 1) to (y, z, 1) where an eye's rays hit a parallel plane."""
+        """Return the 3x3 map, along an eye's rays, from (t, v, 1) to (y, z, 1) on the plane at `x_m`."""
         t = (x_m - self.x_m) / (eye_m[0] - self.x_m)
         across = np.array([[1 - t, 0.0, eye_m[1] * t], [0.0, 1 - t, eye_m[2] * t], [0.0, 0.0, 1.0]])
         return across @ self.plane_from_raster
 
     def frame_from_plane(self, *, x_m: float) -> F64:
-        """Return the 3x3 map to (t, v, 1) from (y, z, 1) on a parallel plane, rectified between the eyes."""
+        """Return the 3x3 map, along rays from `middle_m`, to (t, v, 1) from (y, z, 1) on the plane at `x_m`."""
         inverse = np.linalg.inv(self.plane_from_frame(self.middle_m, x_m=x_m))
         return np.asarray(inverse / inverse[2, 2], np.float64)
 
     def eye_sigma_px(self, stack: PanelStack, *, eye_sigma_m: float) -> F32:
-        """Return the (3,) movements in pixels that one sigma of the eyes causes.
+        """Return (3,) lengths in pixels of this raster for the network.
 
-        The first two are those of the outer panels' pictures, in columns and rows. The third is the centre
-        panel's own parallax relative to the raster's plane, in columns.
+        The first two say how far one sigma of the eyes moves the outer panels' pictures, in columns and rows. The
+        third is the centre panel's own parallax relative to the raster's plane, in columns.
         """
         reach = (stack.x_m[-1] - self.x_m) / (self.middle_m[0] - stack.x_m[-1])
         centre = (self.x_m - stack.x_m[1]) / (self.middle_m[0] - stack.x_m[1])
@@ -113,9 +113,9 @@ class ChainFrame:
 def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int) -> ChainFrame:
     """Return the raster for a left and a right eye (2, 3) in frame `stack`.
 
-    The columns are scaled so that the outer panels' parallax is `cell_px` columns. The rows are `reduction` panel
-    rows high and sheared along the line of the eyes. The raster covers the part of all panels that both eyes see,
-    and a margin. Raises ValueError if the eyes have no horizontal separation, or if the raster would be too tall.
+    The columns are scaled so that the outer panels' parallax is `cell_px` columns. Each row is as high as `reduction`
+    panel rows and sheared along the line of the eyes. The raster covers the part of all panels that both eyes see,
+    plus a margin. Raises ValueError if the eyes have no horizontal separation, or if the raster would be too tall.
     """
     between_m, half_m = eyes_m.mean(axis=0), (eyes_m[1] - eyes_m[0]) / 2
     plane_m = _equal_parallax_m(stack, between_m[0])
@@ -179,7 +179,7 @@ class _Window:
 
 @dataclass(frozen=True, slots=True)
 class _LineOfEyes:
-    """Point F = towards_f_m2 / nearer_m, possibly infinite, where the eyes' line meets the plane."""
+    """Point F = towards_f_m2 / nearer_m, possibly infinite, in which the eyes' line meets the plane."""
 
     nearer_m: float  # half of the right eye's distance from the plane minus the left eye's; 0: F counts as infinite
     towards_f_m2: F64  # (2,) y, z of F, times nearer_m
@@ -188,7 +188,7 @@ class _LineOfEyes:
 
 
 def _line_of_eyes(between_m: F64, half_m: F64, *, plane_m: float, window: _Window) -> _LineOfEyes:
-    """Return the line of eyes at between_m ± half_m (3,); F near the window or far away is infinite."""
+    """Return the line of eyes at between_m ± half_m (3,). F counts as infinite if too near or too far."""
     nearer_m, ahead_m = float(half_m[0]), between_m[0] - plane_m
     towards = nearer_m * between_m[1:] - ahead_m * half_m[1:]
     from_f = nearer_m * window.middle_m - towards
@@ -209,9 +209,9 @@ def _equal_parallax_m(stack: PanelStack, eye_x_m: float) -> float:
 
 
 def _window_of(middle: F64, stack: PanelStack, *, plane_m: float) -> _Window:
-    """Return the window that rays from `middle` through all panels cover, as high as the centre panel.
+    """Return the part of the plane that rays from `middle` through all panels cross.
 
-    It is at least 10 % of the panels' width wide.
+    It is as high as the centre panel and at least 10 % as wide as the panels.
     """
 
     def extent(x_m: float, size_m: float, axis: int) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""The contract stored in a model file (docs/contracts.md), which is checked when the model is loaded."""
+"""Contract in a model file (docs/contracts.md), checked when the model is loaded."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class Contract(Section):
 
 
 def parse_contract(metadata: dict[str, str], *, source: str | Path) -> Contract:
-    """Return the contract in an ONNX file's metadata. Raises InputError if missing or unsuitable."""
+    """Return the contract in an ONNX file's metadata. Raises InputError if it is missing or unsuitable."""
     text = metadata.get(METADATA_KEY)
     if text is None:
         raise InputError(source, METADATA_KEY, "the model has no contract, so it was not made for phasestack")

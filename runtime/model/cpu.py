@@ -1,4 +1,4 @@
-"""The solver on the processor: panels are 16-bit integers, updated by `runtime.kernels`."""
+"""Solver on the processor: `runtime.kernels` updates panels of 16-bit integers."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F64, I16
 from runtime.support.threads import on_rows, parallel_map
 
-WEIGHT, TAPER = 8191, 32767  # fixed-point values of 1 in the targets' weights and in tapers
-SAFE = 4 * MARGIN  # elements around the panels' rows that whole vectors may touch
+WEIGHT, TAPER = 8191, 32767  # fixed-point values that stand for 1 in the targets' weights and in tapers
+SAFE = 4 * MARGIN  # elements allocated around the panels' rows, because whole vectors may read past their ends
 
 
 class CpuBackend:
@@ -110,7 +110,7 @@ class CpuState:
         self._buffers = {}
 
     def _rest_others(self) -> None:
-        """Set every panel to rest that has not been set yet."""
+        """Set every panel that has not been set yet to rest."""
         for n in self._resting:
             box = self._geometry.boxes[n]
             self._held.last[n, : box.height_px, : box.width_px * self._channels] = self._rest
@@ -124,7 +124,7 @@ class CpuState:
         geometry, held, channels = self._geometry, self._held, self._channels
         seen, back = np.ascontiguousarray(panels_from_rays), np.ascontiguousarray(inverse(panels_from_rays))
         if len(seen) > MAX_SETS:
-            raise ValueError(f"{len(seen)} sets of rays; the maximum is {MAX_SETS}")
+            raise ValueError(f"there are {len(seen)} sets of rays, but the kernels accept at most {MAX_SETS}")
         table = _packed_table(self._stack.count)
         problem = Problem(
             panels=self._stack.count, sets=len(seen), channels=channels,

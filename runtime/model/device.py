@@ -1,4 +1,4 @@
-"""Interface of a device (`cpu`, `gl`), with the operations that make up a solution."""
+"""Interface of a device (`cpu` or `gl`): the operations that make up a solution."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class SolverState(Protocol):
     """The panels of one stack on one device, kept between frames. Only one thread uses it."""
 
     def begin(self, job: Job, geometry: Geometry, *, resumed: bool = False) -> AbstractContextManager[None]:
-        """Load the targets; call everything else within the returned context.
+        """Load the targets. All other methods must be called within the returned context.
 
-        Panels rest in their boxes until they are set. resumed: keep the panels and momentum of the previous
+        Panels are at rest in their boxes until they are set. resumed: keep the panels and momentum of the previous
         solution, which must have had the same geometry.
         """
 
@@ -27,19 +27,19 @@ class SolverState(Protocol):
         """Set a panel's box to codes (rows, columns[, 3]), in sixteenths of an 8-bit code."""
 
     def close_middle(self) -> None:
-        """Solve the middle panel for both eyes while the other panels are fixed."""
+        """Solve the middle panel for both eyes and leave the other panels as they are."""
 
     def start(self) -> None:
         """Prepare for steps from the panels' present values, without momentum."""
 
     def step(self, step: Step) -> None:
-        """Update all panels."""
+        """Update all panels once."""
 
     def write(self, buffer: LayerBuffer, outside: int | tuple[int, ...] | None) -> None:
-        """Write all panels as 8-bit codes.
+        """Write all panels to a buffer as 8-bit codes.
 
-        Outside the boxes, the outer panels get the rest code, and the middle one gets `outside`, a code or a
-        colour. With None, the outside keeps the buffer's contents.
+        outside: code or colour of the middle panel outside its box; the outer panels get the rest code there. With
+        None, the buffer's contents outside the boxes are kept.
         """
 
     def close(self) -> None:
@@ -53,7 +53,7 @@ class SolverBackend(Protocol):
     context: object  # OpenGL context whose textures it reads; None: it reads arrays
 
     def state(self, stack: PanelStack, *, threads: int) -> SolverState:
-        """Return a new state for a stack. Raises InputError if the device does not support its size."""
+        """Create the state for a stack. Raises InputError if the device does not support its size."""
 
     def close(self) -> None:
-        """Release what its states shared, after they are closed. May be called twice."""
+        """Release what the states share, after all of them are closed. May be called twice."""

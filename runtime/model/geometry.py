@@ -1,7 +1,7 @@
-"""The rays of a solution: targets, the panels' windows, and homographies from rays to panel pixels.
+"""Geometry of a solution: the panels' windows, and homographies from rays to panel pixels.
 
 Each ray belongs to one pixel of a picture. Drawn content (on the middle panel's raster, a window of it or a coarser
-one) and captured photographs differ only in the homography from picture to panel.
+raster) and captured photographs differ only in the homography from picture to panel.
 """
 
 from __future__ import annotations
@@ -26,10 +26,11 @@ ALIGN_PX = 8  # boxes begin and end at multiples of this, so that rasters of a h
 LEAST_PX = 32
 MIN_WEIGHT = 0.05  # least homogeneous weight of a window's corner, relative to its middle, that gives a usable image
 SNAPPED = 1e-6  # a homography within this many pixels of a whole-pixel translation counts as one
-MISSING_WEIGHT = 1 / 8  # 2 dB in two of 12 pairs: the other eye's ray through the pixel may cross all panels
+# Weight of rays that miss a panel, worth 2 dB in two of 12 pairs: the other eye's ray through the pixel may cross all.
+MISSING_WEIGHT = 1 / 8
 KNOWN_PX = 1 / 8  # tracking errors that move an outer panel's picture by less than this are ignored
 TAPERED_SHARE = 1 / 6  # share of a window's taper over which its rays fade in; these rays correct the error at its edge
-PLACES: dict[Places, tuple[tuple[float, float], ...]] = {  # head positions: right, up, in sigmas
+PLACES: dict[Places, tuple[tuple[float, float], ...]] = {  # head positions (right, up) in sigmas
     "middle": ((0.0, 0.0),),
     "rising": ((1.0, 1.0), (-1.0, -1.0)),
     "falling": ((1.0, -1.0), (-1.0, 1.0)),
@@ -45,20 +46,20 @@ class TargetView:
 
     @property
     def pixels(self) -> U8:
-        """The picture as an array, read back if it is in a texture."""
+        """Picture as an array, read back if it is in a texture."""
         return self.picture.pixels() if isinstance(self.picture, DrawnPicture) else self.picture
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """The panels' boxes and the raster of rays of one solution."""
+    """Boxes of the panels and raster of rays for one solution."""
 
     stack: PanelStack
     eyes_m: F64  # (2, 3) left and right, frame `stack`
     boxes: tuple[PixelRect, ...]  # solved pixels of each panel
     kept: PixelRect  # pixels of the middle panel's box through which rays pass
-    rays: PixelRect  # pixels of the views' pictures whose rays pass through `kept`
-    middle_from_rays: F64  # (2, 3, 3) per eye, pixels of the middle panel's box from those of `rays`
+    rays: PixelRect  # box of the pictures' pixels whose rays pass through `kept`
+    middle_from_rays: F64  # (2, 3, 3) for each eye, pixels of the middle panel's box from pixels of `rays`
     taper_px: tuple[float, float] = (0.0, 0.0)  # middle-panel pixels, right and down, over which rays fade
 
     @property
@@ -67,11 +68,11 @@ class Geometry:
 
     @property
     def missing_weight(self) -> float:
-        """Weight of rays that miss a box when the middle panel is solved; 1 with a window."""
+        """Weight of rays that miss another panel's box, for solving the middle panel; 1 with a window."""
         return 1.0 if any(self.taper_px) else MISSING_WEIGHT
 
     def is_like(self, other: Geometry) -> bool:
-        """Return True if rays and boxes are equal, so that steps may continue from the other's panels."""
+        """Return True if rays and boxes are equal, so that steps may continue from the other's solution."""
         return (
             (self.stack, self.boxes, self.kept, self.rays, self.taper_px)
             == (other.stack, other.boxes, other.kept, other.rays, other.taper_px)
@@ -81,14 +82,14 @@ class Geometry:
 
     @cached_property
     def rasters(self) -> tuple[PlaneRaster, ...]:
-        """The panels' pixel grids, cropped to their boxes."""
+        """Pixel grids of the panels, cropped to their boxes."""
         return tuple(box.cut(self.stack.panel(n)) for n, box in enumerate(self.boxes))
 
     def panels_from_rays(self, places: Places, eye_sigma_m: float) -> F64:
         """Return (2P, N, 3, 3) homographies from rays to pixels of the panels' boxes.
 
-        They are listed for P positions of the head, left and right eye alternately. Positions alternate between
-        the rows of a picture: row k of position p's rays is row P·k + p of the picture.
+        The first axis lists, for each of P head positions, the left and the right eye. The positions take turns at
+        the rows of a picture: row k of the rays for position p is row P·k + p of the picture.
         """
         right, up = stack_from_eye(self.eyes_m.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
         sure = self.rays.height_px == 1 or self._moved_px(eye_sigma_m) < KNOWN_PX
@@ -108,13 +109,13 @@ class Geometry:
         return np.array(homographies)
 
     def _moved_px(self, eye_sigma_m: float) -> float:
-        """Return how far one sigma of the eyes moves a panel's picture relative to the middle one, at most."""
+        """Return the largest shift in pixels, over all panels, that one sigma of the eyes causes."""
         pitch_m, middle_x_m = self.stack.panel(self.middle).pitch_u_m, self.stack.x_m[self.middle]
         shares = [abs((x_m - middle_x_m) / (self.eyes_m[:, 0].mean() - middle_x_m)) for x_m in self.stack.x_m]
         return float(eye_sigma_m * max(shares) / pitch_m)
 
     def tapers(self) -> tuple[F32, F32]:
-        """Return (width,) and (height,) weights of the rays' errors, from 0 at a window's edges to 1 inside."""
+        """Return weights of the rays by column (width,) and row (height,): 0 at a window's edges, 1 inside."""
         box, kept, matrix = self.boxes[self.middle], self.kept, self.middle_from_rays.mean(axis=0)
         width_px, height_px = self.rays.width_px, self.rays.height_px
         u = np.stack([np.arange(width_px) + 0.5, np.full(width_px, height_px / 2), np.ones(width_px)])
@@ -127,7 +128,7 @@ class Geometry:
 
 
 def inverse(homographies: F64) -> F64:
-    """Return the inverses (..., 3, 3) with last entries of 1, which keeps the sign in front of the eye."""
+    """Return the inverses (..., 3, 3) divided by the magnitude of their last entry, which keeps its sign."""
     back = np.linalg.inv(homographies)
     return np.asarray(back / np.abs(back[..., 2:, 2:]), np.float64)
 
@@ -141,7 +142,7 @@ def geometry_of(
     kept: PixelRect | None = None,
     taper_px: tuple[float, float] = (0.0, 0.0),
 ) -> Geometry:
-    """Return the rays of both views through `kept` (by default the whole box) of the middle panel."""
+    """Return the geometry of both views' rays through `kept` of the middle panel (default: its box)."""
     box = boxes[stack.count // 2]
     kept = kept or box
     middle_from_plane = stack.panel(stack.count // 2).raster_from_plane()
@@ -154,14 +155,17 @@ def geometry_of(
 
 
 def _snapped(homography: F64) -> F64:
-    """Return the homography, made exact if it maps pixels to pixels, so that sampling is a copy."""
+    """Round a homography that is almost a whole-pixel translation, so that sampling becomes a copy."""
     normalised = np.asarray(homography / homography[2, 2], np.float64)
     whole = np.rint(normalised)
     return whole if np.abs(normalised - whole).max() < SNAPPED else normalised
 
 
 def _looked_through(pictures_from_middle: F64, box: PixelRect, shape: tuple[int, ...]) -> PixelRect:
-    """Return the pixels of either picture (h, w, ...) whose rays pass through a box of the middle panel."""
+    """Return the box of pixels, in pictures of a shape (h, w, ...), whose rays pass through `box`.
+
+    box: of the middle panel. A pixel counts if its ray in either eye passes.
+    """
     height, width = shape[:2]
     corners = np.array([[box.u0, box.u1, box.u0, box.u1], [box.v0, box.v0, box.v1, box.v1], [1.0] * 4])
     centre = np.array([(box.u0 + box.u1) / 2, (box.v0 + box.v1) / 2, 1.0])
@@ -177,9 +181,9 @@ def _looked_through(pictures_from_middle: F64, box: PixelRect, shape: tuple[int,
 
 
 def panel_from_middle(stack: PanelStack, rasters: Sequence[PlaneRaster], eye_m: F64, n: int) -> F64:
-    """Return the 3x3 map, last entry 1, to panel n's pixels from the middle panel's for an eye (3,).
+    """Return the 3x3 map, for an eye (3,), from the middle panel's pixels to those of panel `n`.
 
-    It is a scale and a shift, unless panels are tilted (`optics.tilt`).
+    Its last entry is 1. It is a scale and a shift unless panels are tilted (`optics.tilt`).
     """
     source, target = rasters[stack.count // 2], rasters[n]
     scale, shift_m = relative_scale_shift(eye_m, from_x_m=source.x_m, to_x_m=target.x_m)
@@ -191,7 +195,7 @@ def panel_from_middle(stack: PanelStack, rasters: Sequence[PlaneRaster], eye_m: 
 
 
 def visible_boxes(eyes_m: F64, stack: PanelStack) -> tuple[PixelRect, ...]:
-    """Return for each panel the padded box of pixels on rays of either eye (2, 3) that cross every panel.
+    """Return, for each panel, the padded box of pixels that the eyes (2, 3) see through every panel.
 
     If an eye sees nothing through all panels, the result is a small box in the middle, as there is nothing to solve.
     """
@@ -224,7 +228,10 @@ def _span(low: float, high: float, size: int) -> tuple[int, int]:
 
 
 def taper(at_px: F64, first: int, last: int, size: int, over_px: float) -> F32:
-    """Return a ramp from 0 at `first` and `last` to 1 `over_px` inside; the panel's own edges have none."""
+    """Return weights that rise from 0 at `first` and `last` to 1 at `over_px` inside them.
+
+    A limit at the edge of the panel (0 or `size`) has no ramp. at_px: positions of the weights.
+    """
     weights = np.ones(len(at_px))
     if over_px > 0 and first > 0:
         weights = np.minimum(weights, (at_px - first) / over_px)

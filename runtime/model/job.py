@@ -1,4 +1,4 @@
-"""The input of one solution: targets, their rays, and the part of the panels to solve."""
+"""Job: the input of one solution, with targets, their rays, and the part of the panels to solve."""
 
 from __future__ import annotations
 
@@ -23,44 +23,44 @@ NOWHERE = PixelRect(0, 0, 0, 0)
 
 @dataclass(frozen=True, slots=True)
 class SolveWindow:
-    """The window of every panel that is solved.
+    """Window in which every panel is solved.
 
-    Outside it, the outer panels stay at mid-range, where the solver starts, and the middle panel carries the
+    Outside the window, the outer panels stay at mid-range, where the solver starts, and the middle panel carries the
     picture that both eyes see.
     """
 
     box: PixelRect  # panel pixels; empty: nothing is solved
-    kept: PixelRect  # middle-panel pixels inside `box` that are written; outside, the flat fill owns them
+    kept: PixelRect  # middle-panel pixels inside `box` that the solution writes; the others get the flat fill
     taper_px: tuple[float, float]  # (right, down) width over which the outer panels' drive is tapered to zero
-    colour: tuple[int, ...] | None = None  # 8-bit codes of the background outside; None: use the views' picture
+    colour: tuple[int, ...] | None = None  # 8-bit codes of the background outside; None: taken from the pictures
 
 
 @dataclass(frozen=True)
 class Targets:
-    """Targets of both eyes, and the rays of their pixels through the panels."""
+    """Target pictures of both eyes, and their pixels' rays through the panels."""
 
-    stack: PanelStack  # the panels at the solved raster: the display's own or a coarser one
+    stack: PanelStack  # panels with the raster that is solved: the display's own or a coarser one
     eyes_m: F64  # (2, 3) left and right, frame `stack`
     views: tuple[TargetView, TargetView]  # left and right
 
     @cached_property
     def visible(self) -> Geometry:
-        """Rays of everything that the eyes see through every panel."""
+        """Geometry of all rays on which the eyes see through every panel."""
         return geometry_of(self.stack, self.eyes_m, self.views, boxes=visible_boxes(self.eyes_m, self.stack))
 
     @cached_property
     def every_pixel(self) -> Geometry:
-        """Rays through every pixel of every panel, visible or not."""
+        """Geometry of the rays through every pixel of every panel, visible or not."""
         whole = PixelRect(0, 0, self.stack.width_px, self.stack.height_px)
         return geometry_of(self.stack, self.eyes_m, self.views, boxes=(whole,) * self.stack.count)
 
     def within(self, window: SolveWindow) -> Geometry:
-        """Return the rays through a window."""
+        """Return the geometry of the rays through a window."""
         boxes = (window.box,) * self.stack.count
         return geometry_of(self.stack, self.eyes_m, self.views, boxes=boxes, kept=window.kept, taper_px=window.taper_px)
 
     def reduced(self, reduction: int) -> tuple[TargetView, TargetView]:
-        """Return the views averaged down by `reduction` (`reduced_view`), computed once per value."""
+        """Return the views averaged down by `reduction` (`reduced_view`); each is computed only once."""
         if reduction not in self._reduced:
             middle = self.stack.panel(self.stack.count // 2)
             # A texture can only be read back on its context's thread, which is this one.
@@ -84,16 +84,16 @@ class Savings:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """The task of one solution. Cheaper solutions differ in a few fields (`runtime.model.trim`)."""
+    """Input of one solution. For a cheaper solution, `runtime.model.trim` changes a few fields."""
 
     targets: Targets
     # Standard deviation of the tracking error per axis, right and up, common to both eyes; 0: exactly known eyes.
     eye_sigma_m: float = TRACKING_SIGMA_M
     window: SolveWindow | None = None  # None: everything that the eyes see
     channels: int = 3  # 1: the pictures are grey, so one channel is solved for all three
-    steps: int | None = None  # most updates of all panels; None: the model's number
+    steps: int | None = None  # largest number of updates of all panels; None: the model's
     continued: bool = False  # start from the previous solution's panels if its rays were the same
-    deadline_ns: int | None = None  # no step begins after this time of `time.perf_counter_ns`; None: no limit
+    deadline_ns: int | None = None  # no step begins after this time (`time.perf_counter_ns`); None: no limit
     relief: F32 | None = None  # (h, w) the content's relief on the middle panel, for the presenter (`optics.relief`)
 
     @property
@@ -103,12 +103,12 @@ class Job:
 
     @property
     def stack(self) -> PanelStack:
-        """The panels at the solved raster."""
+        """Panels with the raster that is solved."""
         return self.targets.stack
 
     @property
     def eyes_m(self) -> F64:
-        """(2, 3) left and right eye, frame `stack`."""
+        """Positions (2, 3) of the left and right eye, frame `stack`."""
         return self.targets.eyes_m
 
     @property
@@ -131,7 +131,7 @@ def drawn_views(
 
 
 def drawn_job(pictures: Sequence[U8 | DrawnPicture], eyes_m: F64, stack: PanelStack) -> Job:
-    """Return the job of a whole stack for pictures (h, w, 3 or 4) on the middle panel; eyes (2, 3)."""
+    """Return the job of a whole stack for eyes (2, 3) and pictures (h, w, 3 or 4) on the middle panel."""
     return Job(Targets(stack, eyes_m, drawn_views(pictures, stack)))
 
 

@@ -21,17 +21,17 @@ from runtime.records import I16, U8
 
 
 class PictureProposal:
-    """Models whose `input_frame` is panel (a picture per eye and panel) or centre (one per eye).
+    """Proposals by a model whose `input_frame` is `panel` or `centre`.
 
-    The layout is NCHW; channels are ordered by panel, then eye, then RGB. Each eye's picture is warped to the
-    pixels of every panel that the network reads (EyeReal supplement, (47)). Outside the contract's field of view it
-    is black, as in training.
+    Such a network reads one picture per eye for every panel, or for the centre panel only. The layout is NCHW;
+    channels are ordered by panel, then eye, then RGB. Each eye's picture is warped to the pixels of every panel that
+    the network reads (EyeReal supplement, (47)). It is black outside the contract's field of view, as in training.
     """
 
-    any_raster = False  # it proposes whole panels of one size only
+    any_raster = False  # the network proposes only whole panels of one size
 
     def __init__(self, session: ModelSession, stack: PanelStack, *, source: Path) -> None:
-        """Raises InputError if the model's fixed size differs from the panels', or its ports do not fit."""
+        """Raise InputError if the model's fixed size differs from the panels' or its ports do not fit."""
         contract = session.contract
         self.session, self._stack = session, stack
         for given, wanted, name in (
@@ -83,7 +83,7 @@ class PictureProposal:
         picture = picture_on(view, rasters[middle], middle_from_result=mid_from_panel, edge=edge, size=size)
         if not fov_deg:
             return picture
-        # Warp a white picture of that view bilinearly: its edge fades over one pixel, as it did in training.
+        # Warp a white picture with that field of view bilinearly: its edge fades over one pixel, as in training.
         projection = image_from_stack(eye_m, width_px=size[1], height_px=size[0], fov_deg=fov_deg)
         cover = resample(np.full(size, 255, np.uint8), image_from_raster(projection, rasters[n]), size=size)
         return np.asarray(cv2.min(picture, cv2.merge([cover] * picture.shape[2])), np.uint8)

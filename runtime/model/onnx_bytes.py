@@ -1,6 +1,6 @@
-"""Read facts from an ONNX file's bytes without loading it: its digest and references to other files.
+"""Read an ONNX file's digest and its references to other files without loading the model.
 
-A protocol buffer is a sequence of tags and values. Field numbers are those of onnx.proto.
+The file is a protocol buffer, a sequence of tags and values. Field numbers are those of onnx.proto.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ DEEPEST = 32  # deepest nesting of graphs within attributes of graphs
 
 
 def fields(data: memoryview) -> Iterator[tuple[int, memoryview, memoryview]]:
-    """Yield (number, value, whole field) for each field of a message; a 0 has an empty value.
+    """Yield (number, value, whole field) for each field of a message.
 
-    Raises ValueError if the bytes are not a message.
+    The value of a field that holds the number 0 is empty. Raises ValueError if the bytes are not a message.
     """
     at = 0
     while at < len(data):
@@ -52,7 +52,7 @@ def fields(data: memoryview) -> Iterator[tuple[int, memoryview, memoryview]]:
 
 
 def digest(data: bytes) -> str:
-    """Return the SHA-256 of a model without its metadata. Raises ValueError if malformed."""
+    """Return the SHA-256 of a model without its metadata. Raises ValueError if it is malformed."""
     digester = hashlib.sha256()
     for number, _, whole in fields(memoryview(data)):
         if number != MODEL_METADATA:
@@ -61,7 +61,10 @@ def digest(data: bytes) -> str:
 
 
 def has_external_data(data: bytes) -> bool:
-    """Return True if a tensor of the model is stored in another file. Raises ValueError if malformed."""
+    """Return True if a tensor of a model is stored in another file.
+
+    Raises ValueError if the model is malformed.
+    """
     return _refers_to_a_file("model", memoryview(data), DEEPEST)
 
 

@@ -1,4 +1,4 @@
-"""Find and load a model by its name. The interface of models is in `base`."""
+"""Find and load a model by its name. Its interface is `runtime.model.base.Predictor`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SUMS = "SHA256SUMS"  # digests of the shipped models, in the format of sha256sum
 
 
 def model_path(name: str) -> Path | None:
-    """Return the file of a model; None for `sart`. Raises InputError for an unknown name."""
+    """Return a model's file, or None for `sart`. Raises InputError if the name is unknown."""
     if name == "sart":
         return None
     if name in SHIPPED:
@@ -32,7 +32,10 @@ def model_path(name: str) -> Path | None:
 
 
 def shipped_sha256(name: str) -> str:
-    """Return a shipped model's SHA-256; empty for others. Raises InputError if it is not listed."""
+    """Return the SHA-256 of a shipped model's file, or "" for other models.
+
+    Raises InputError if a shipped model is missing from the list.
+    """
     if name not in SHIPPED:
         return ""
     table = Path(str(resources.files("runtime.model") / "data" / SUMS))
@@ -44,17 +47,17 @@ def shipped_sha256(name: str) -> str:
 
 
 def steps_from_even(steps: int) -> tuple[Step, ...]:
-    """Return steps from panels at rest that replace `steps` steps from a network's proposal."""
+    """Return the steps from panels at rest that replace `steps` steps from a network's proposal."""
     in_turn: tuple[Places, ...] = ("rising", "middle", "falling", "middle")
     sizes = (1.2,) * (4 * steps) + (0.8,) * (3 * steps // 2)
     return tuple(Step(size=size, places=in_turn[n % 4]) for n, size in enumerate(sizes))
 
 
 def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None = None) -> Predictor:
-    """Return the model `name` (a shipped name, `sart` or an ONNX file) for a stack.
+    """Load the model `name` (a shipped name, `sart` or an ONNX file) for a stack.
 
-    A shipped network needs three panels whose gaps are equal within `UNEVEN_MOST`. For other stacks only its steps
-    run, from panels at rest, and `Predictor.name` says so. Raises InputError and MissingPart.
+    A shipped network needs three panels whose gaps are equal within `UNEVEN_MOST`. For other stacks, only steps run,
+    from panels at rest, and `Predictor.name` says so. Raises InputError and MissingPart.
     """
     keep_freed_memory()
     try:

@@ -1,7 +1,7 @@
-"""Initial outer panels, proposed by a network along the line through the eyes.
+"""Proposals by a network for the outer panels, from which the steps begin.
 
-The network receives the difference of both eyes' pictures on a separate raster (`chain`), where an eye's parallax is a
-whole number of columns. It returns both outer panels on that raster.
+The network receives the difference of both eyes' pictures on a separate raster (`chain`) along the line through the
+eyes, where an eye's parallax is a whole number of columns. It returns both outer panels on that raster.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from runtime.optics.tilt import coarse_layer_from_seen
 from runtime.records import F32, F64, I16
 from runtime.support.threads import parallel_map
 
-HALF_BASELINE_M = 0.031  # for a single eye that stands in for both; any value works
-EDGE_SHARE = 1 / 40  # largest extension of a picture's edge (clamp to edge), as a share of its size
-UNSEEN = -1  # marks unseen pixels; targets are positive
+HALF_BASELINE_M = 0.031  # assumed if a single eye stands in for both; any value works
+EDGE_SHARE = 1 / 40  # a picture's edge pixels are repeated outwards by at most this share of its size
+UNSEEN = -1  # marks pixels that an eye does not see; targets are positive
 SHARPENED = 0.2  # gain by which the difference is sharpened on either side, against the blur of two interpolations
 SHARPENING = np.array([-SHARPENED, 1 + 2 * SHARPENED, -SHARPENED])
 EVEN = rest_of(3)  # an outer panel at rest, sixteenths of a code
@@ -39,22 +39,22 @@ _SWAPPED = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # (y
 class Proposal(Protocol):
     """A network that proposes the panels from which the steps begin."""
 
-    any_raster: bool  # serves stacks of every raster, and windows of them
+    any_raster: bool  # can propose panels of any size, and windows of them
     session: ModelSession
 
     def panels(self, job: Job, geometry: Geometry, watch: Stopwatch) -> dict[int, I16]:
-        """Return boxes (rows, columns[, 3]) of the proposed panels in sixteenths of a code; others rest.
+        """Return the box (rows, columns[, 3]) of each proposed panel, in sixteenths of a code, by panel.
 
-        Raises ModelFailure, or its subclass EyesNotServed.
+        Panels that are missing stay at rest. Raises ModelFailure or its subclass EyesNotServed.
         """
 
 
 @dataclass(frozen=True, slots=True)
 class _Local:
-    """A window of the panels as a separate stack, rotated so that the eyes are level."""
+    """A window of the panels as a separate stack, rotated so that the eyes are roughly level."""
 
     stack: PanelStack
-    eyes_m: F64  # (2, 3), left eye of this stack first
+    eyes_m: F64  # (2, 3), the eye on the left of this stack first
     order: tuple[int, int]  # indices of these eyes in the whole stack
     plane_from_local: F64  # 3x3, (y, z, 1) of frame `stack` from this stack's
 
@@ -65,7 +65,7 @@ class _Local:
 
 
 class ChainProposal:
-    """Networks whose `input_frame` is chain: three (nearly) evenly spaced panels and any eye positions."""
+    """Proposals by a network whose `input_frame` is `chain`, for three (nearly) evenly spaced panels."""
 
     any_raster = True
 
@@ -87,7 +87,7 @@ class ChainProposal:
         )
 
         def residual(side: int) -> I16:
-            """Return half the difference between an eye's targets and the other eye's along its rays."""
+            """Return half of an eye's targets minus the other eye's, on the first eye's rays."""
             to_plane = local.plane_from_local @ frame.plane_from_frame(local.eyes_m[side], x_m=middle_x_m)
             own, other = (
                 warp(
@@ -98,7 +98,7 @@ class ChainProposal:
             )  # fmt: skip
             return _residual(own, other)
 
-        # One thread does all work for an eye: handing over single steps would cost more than small ones take.
+        # One thread does all the work for an eye: handing over single operations would take longer than small ones do.
         left, right = parallel_map(residual, (0, 1))
         waves, shifted_waves, spectrum, modes_in = chain_modes(frame.cells)
         feeds: dict[str, NDArray[Any]] = {
@@ -121,17 +121,20 @@ class ChainProposal:
         return dict(zip(outer, panels, strict=True))
 
     def _target_codes(self, view: TargetView, channels: int) -> tuple[I16, F64]:
-        """Return each pixel's target sum (sixteenths of a code, up to a constant), and picture_from_plane."""
+        """Return each pixel's target sum and the view's 3x3 map to pixels from the middle panel's plane.
+
+        Sums are in sixteenths of a code, up to a constant.
+        """
         codes = cv2.LUT(without_alpha(view.pixels, channels), self._codes)
         return np.asarray(codes, np.int16), np.asarray(np.linalg.inv(view.plane_from_picture), np.float64)
 
     def _on_panel(self, n: int, answer: I16, geometry: Geometry, local: _Local, frame: ChainFrame) -> I16:
-        """Resample the network's answer to an outer panel's box."""
+        """Resample the network's output to the box of outer panel `n`."""
         raster = geometry.rasters[n]
         middle_m = local.in_stack(frame.middle_m)
         seen_from_layer = np.linalg.inv(coarse_layer_from_seen(geometry.stack, n, middle_m))
         to_frame = frame.frame_from_plane(x_m=raster.x_m) @ np.linalg.inv(local.plane_from_local)
-        # The answer begins one parallax before the first column.
+        # The output begins one parallax before the raster's first column.
         begin = np.array([[1.0, 0.0, frame.cell_px], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
         columns = ColumnLaw(frame.columns.bend, frame.columns.middle + frame.cell_px)
         matrix = begin @ to_frame @ seen_from_layer @ raster.plane_from_raster()
@@ -145,7 +148,7 @@ class ChainProposal:
 
 
 def _residual(own: I16, other: I16) -> I16:
-    """Return half the difference between an eye's target and the other eye's."""
+    """Return half of an eye's target minus the other eye's, sharpened."""
     half = np.asarray(cv2.subtract(own, other), np.int16) >> 1
     # Rays outside one eye's picture have no residual.
     np.copyto(half, 0, where=cv2.min(own, other) < 0)
@@ -167,14 +170,14 @@ def _local(geometry: Geometry, *, whole: bool) -> _Local:
     if apart_m[2] > apart_m[1]:  # if one eye is above the other, down (-z) becomes right (+y)
         eyes_m = np.stack([eyes_m[:, 0], -eyes_m[:, 2], -eyes_m[:, 1]], axis=1)
         stack, plane_from_local = replace(stack, tilt=None).transposed(), plane_from_local @ _SWAPPED
-    elif not apart_m.any():  # a single eye that stands in for both has no difference, so any line will do
+    elif not apart_m.any():  # if a single eye stands in for both there is no difference, so any line will do
         eyes_m = eyes_m + HALF_BASELINE_M * np.array([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
     order = (0, 1) if eyes_m[1, 1] >= eyes_m[0, 1] else (1, 0)
     return _Local(stack, eyes_m[list(order)], order, plane_from_local)
 
 
 def _wave_taper(geometry: Geometry, raster: PlaneRaster, middle_m: F64) -> F32:
-    """Return an outer panel's taper (rows, columns): 0 at the window's edges, 1 inside."""
+    """Return the taper (rows, columns) of an outer panel: 0 at the window's edges, 1 inside."""
     stack, kept = geometry.stack, geometry.kept
     centre = stack.panel(stack.count // 2)
     share = (centre.x_m - raster.x_m) / (middle_m[0] - raster.x_m)

@@ -1,7 +1,7 @@
-"""SART on one branch of Malus' law, the solver of the literature, for comparison.
+"""SART on one branch of Malus' law: the published solver, for comparison.
 
-It supports 2 to 8 panels. Each iteration corrects all panels together, by equal shares of both eyes' residual phases
-(Andersen and Kak 1984; for polarization fields Lanman et al. 2011). The relaxation is the best one found by trial.
+It supports 2 to 8 panels. Each iteration corrects all panels at once, by equal shares of both eyes' residual phases
+(Andersen and Kak 1984; for polarization fields, Lanman et al. 2011). The relaxation is the best one found by trial.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64
 
 ITERATIONS = 10
-RELAXATION = 1.7  # factor of both eyes' mean residual, found by trial; diverges from 2 on
+RELAXATION = 1.7  # factor of both eyes' mean residual, found by trial; from 2 on, the iteration diverges
 
 
 class SartPredictor(Predictor):
-    """The model `sart`, available for any stack. It computes in float32 and rounds at the end."""
+    """Model `sart`, available for any stack. It computes in float32 and rounds at the end."""
 
     name = "sart"
     provider = "numpy"
@@ -72,7 +72,10 @@ class SartPredictor(Predictor):
         return Prediction(layers, watch.stage_ms, job.savings, self.iterations)
 
     def _panel_from_middle(self, eye_m: F64, index: int) -> F64:
-        """Return the 3x3 map to a layer's pixels from the middle panel's for an eye (OpenCV's centres)."""
+        """Return the 3x3 map, for an eye (3,), from the middle panel's pixels to those of a layer.
+
+        Pixel centres are at integers, as in OpenCV.
+        """
         rasters = [self.stack.panel(n) for n in range(self.stack.count)]
         matrix = panel_from_middle(self.stack, rasters, eye_m, index)
         to_corners = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])

@@ -21,7 +21,7 @@ from runtime.support.onnx_runtime import onnxruntime
 from runtime.support.untrusted_input import LIMITS
 
 FILE_BYTES_MAX = 1 << 30
-MEMORY_MAX = 1 << 30  # bytes of memory for a process that loads an untrusted file
+MEMORY_MAX = 1 << 30  # bytes that a process which loads an untrusted file may use, in addition to 8 times the file
 
 log = logging.getLogger("phasestack.model")
 
@@ -42,12 +42,12 @@ Shape = tuple[int, ...]
 
 
 class ModelSession:
-    """One loaded model. `run` binds a set of buffers for each input shape once and reuses it."""
+    """One loaded model. `run` binds a set of buffers once for each input shape, and reuses it."""
 
     def __init__(self, path: Path, *, provider: str = "cpu", threads: int = 2, sha256: str = "") -> None:
-        """sha256: digest of the whole file; empty: unknown.
+        """Load a model. Raises InputError (not ONNX, wrong digest, no contract) or MissingPart.
 
-        Raises InputError (not ONNX, wrong digest, no contract) or MissingPart (provider not installed).
+        provider: MissingPart is raised if it is not installed. sha256: digest of the whole file; empty: unknown.
         """
         ort = onnxruntime()
         name, package = PROVIDERS[provider]
@@ -66,15 +66,15 @@ class ModelSession:
         try:
             metadata = self._session.get_modelmeta().custom_metadata_map
         except UnicodeDecodeError:
-            raise InputError(path, "metadata", "is not UTF-8 text") from None
-        if name not in self._session.get_providers():  # onnxruntime continues without it, and only says so on stderr
+            raise InputError(path, "metadata", "is not valid UTF-8") from None
+        if name not in self._session.get_providers():  # onnxruntime continues without it, with only a message on stderr
             problem = f"is installed but does not start: check {package} and its driver"
             raise MissingPart(f"model.provider: {provider} {problem}")
         self.provider: str = provider
         self.fell_back = nodes_elsewhere(self._session, name)  # nodes of the graph that another provider runs
         if count := len(self.fell_back):
             names = ", ".join((*self.fell_back[:NODES_LOGGED], *(["..."] if count > NODES_LOGGED else [])))
-            log.warning("provider %s leaves %d node%s to another: %s", provider, count, "s" * (count != 1), names)
+            log.warning("%s leaves %d node%s to another provider: %s", provider, count, "s" * (count != 1), names)
         self.contract: Contract = parse_contract(metadata, source=path)
         if self.contract.graph_sha256 and self.contract.graph_sha256 != digest(data):
             raise InputError(path, "contract.graph_sha256", "does not match: the file was changed after its export")
@@ -84,15 +84,15 @@ class ModelSession:
         self._bound: dict[tuple[Any, ...], tuple[Any, dict[str, Any], dict[str, Any]]] = {}
 
     def run(self, feeds: Mapping[str, NDArray[Any]], shapes: Mapping[str, Shape]) -> dict[str, NDArray[Any]]:
-        """Run the model on inputs by name, and return the outputs by name, with the given shapes.
+        """Run the model on `feeds` (inputs by name) and return its outputs by name.
 
-        The outputs are the session's own buffers, valid until the next run with the same shapes. Raises
-        ModelFailure if onnxruntime fails.
+        shapes: of the outputs, by name. The outputs are the session's own buffers, valid until the next run with the
+        same shapes. Raises ModelFailure if onnxruntime fails.
         """
         key = (*((name, array.shape) for name, array in feeds.items()), *shapes.items())
         try:
             if key not in self._bound:
-                if len(self._bound) > 8:  # a viewer who walks about causes a few shapes, not hundreds
+                if len(self._bound) > 8:  # a viewer who walks about causes only a few shapes
                     self._bound.clear()
                 self._bound[key] = self._bind(feeds, shapes)
             binding, values, results = self._bound[key]
@@ -117,7 +117,7 @@ class ModelSession:
         return binding, values, results
 
     def _check_ports(self, path: Path) -> None:
-        """Raise InputError unless the graph has the inputs and outputs that its contract declares."""
+        """Raise InputError unless the graph has the inputs and outputs that the contract declares."""
         for field, ports, items in (
             ("inputs", self.contract.inputs, self._session.get_inputs()),
             ("outputs", self.contract.outputs, self._session.get_outputs()),
@@ -129,13 +129,14 @@ class ModelSession:
             for item in items:
                 if item.type not in TYPES:
                     kind = item.type.removeprefix("tensor(").removesuffix(")")
-                    problem = f"is of {kind}, expected float32: only tensors within the graph may be narrower"
+                    problem = f"is {kind}, expected float32: only tensors inside the graph may have a lower precision"
                     raise InputError(path, f"{field}.{item.name}", problem)
 
     def check_fits(self, source: Path, feeds: Mapping[str, Shape], answers: Mapping[str, Shape]) -> None:
-        """Raise InputError, naming the port, unless the graph's ports have these names and shapes.
+        """Raise InputError, which names the port, unless the graph's ports have these names and shapes.
 
-        If the declared shapes leave sizes open, the model is run once.
+        feeds: shapes of the inputs by name; answers: of the outputs. If the graph leaves sizes open, the model is run
+        once.
         """
         is_open = False
         for field, items, shapes in (
@@ -164,9 +165,9 @@ class ModelSession:
 
 
 def nodes_elsewhere(session: Any, provider: str) -> tuple[str, ...]:
-    """Return names (or kinds) of the graph's nodes that run on another provider than the requested one.
+    """Return the names (or kinds) of the graph's nodes that do not run on the requested provider.
 
-    session: created with RECORD_NODES. The assignment follows onnxruntime's basic optimizations.
+    session: created with RECORD_NODES. Nodes are those after onnxruntime's basic optimizations.
     """
     return tuple(
         node.name or node.op_type
@@ -185,7 +186,7 @@ def _checked(path: Path, sha256: str) -> bytes:
     except ValueError as error:
         raise InputError(path, "", f"is not an ONNX model ({error})") from None
     if external:
-        way_out = "onnx.save(onnx.load(NAME), OTHER_NAME) combines both"
+        way_out = "onnx.save(onnx.load(NAME), OTHER_NAME) combines the two"
         raise InputError(path, "external_data", f"is not supported: the weights must be in the model file; {way_out}")
     return data
 
@@ -205,7 +206,7 @@ _tried_out: set[bytes] = set()  # digests of files that are known to load within
 def _try_out(path: Path, data: bytes) -> None:
     """Load the file in a child process with limited memory and time. Raises InputError if that fails.
 
-    A few bytes of constants can expand to fill all memory when a model is loaded.
+    When a model is loaded, a few bytes of constants can expand until they fill all memory.
     """
     checksum = hashlib.sha256(data).digest()
     if checksum not in _tried_out:
@@ -221,14 +222,14 @@ def _tried_here(path: Path, data: bytes) -> None:
 
 
 def _why_not_loaded(error: Exception) -> str:
-    """Explain why onnxruntime cannot load a model, with both versions if the model is too new."""
+    """Return why onnxruntime could not load a model, with both versions if the model is too new."""
     text = str(error)
     for found in (NEWER_OPSET.search(text), NEWER_IR.search(text)):
         if found:
             what, version, most = found.groups()
             runtime = f"onnxruntime {onnxruntime().__version__}"
             remedy = f"export it with at most {most}, or install a newer onnxruntime"
-            return f"has {what.replace('Opset', 'opset')} {version}; {runtime} takes up to {most}: {remedy}"
+            return f"has {what.replace('Opset', 'opset')} {version}; {runtime} supports up to {most}: {remedy}"
     if found := re.search(r"No Op registered for (\S+)", text):
         return f"has an operator that onnxruntime does not know: {found[1]}"
     return f"is not a model that onnxruntime can load ({_first_line(error)})"

@@ -1,6 +1,6 @@
-"""The solver: a network's proposal, the middle panel's solution, then steps (docs/mathematics.md).
+"""Solver: propose the outer panels, solve the middle panel, then run steps (docs/mathematics.md).
 
-The devices (`cpu`, `gl`) implement single operations; this module calls them in order.
+The devices (`cpu`, `gl`) implement the single operations; this module calls them in order.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from runtime.model.proposal import Proposal
 from runtime.optics.malus import rest_code
 from runtime.optics.stack import PanelStack
 
-_Done = tuple[int, int | None]  # total steps; how many of them an earlier solution had done, None: not continued
+_Done = tuple[int, int | None]  # all steps; how many of them an earlier solution had done, None: not continued
 REDUCTIONS = (1, 2, 3, 4)  # supported rasters, as divisors of the display's rows and columns
 REFINED_STEPS = 8  # a solution is continued up to this many steps, the number of `best`
 REFINING = (Step(size=0.8, places="falling"), Step(size=0.8, places="rising"))  # alternate after the model's
 
 
 class StepPredictor(Predictor):
-    """Solves by steps from a network's proposal or from panels at rest, for any stack and eyes."""
+    """Model that runs steps from a network's proposal or from panels at rest, for any stack and eyes."""
 
     def __init__(
         self,
@@ -39,7 +39,7 @@ class StepPredictor(Predictor):
         threads: int = 2,
         backend: SolverBackend | None = None,
     ) -> None:
-        """proposal: None: panels start at rest; backend: None: the processor."""
+        """Create the model. Without a proposal, panels start at rest; the default backend is the processor."""
         self.stack, self.name, self._proposal, self._steps = stack, name, proposal, tuple(steps)
         self.provider, self.parameters, self._threads = "cpu", 0, threads
         if proposal is not None:
@@ -79,11 +79,11 @@ class StepPredictor(Predictor):
         state, pool = self._rasters[job.stack]
         buffer, rest, window = pool.take(), rest_code(job.stack.count), job.window
         done: _Done = 0, None
-        if window is None:  # everything that the eyes see; for a network of whole pictures, everything that it proposes
+        if window is None:  # solve all that the eyes see or, with a network of whole pictures, all that it proposes
             geometry = job.targets.visible if self.any_raster else job.targets.every_pixel
             done = self._improve(job, geometry, state, buffer, watch, outside=rest)
         else:
-            if window.colour is None or not window.box.width_px:  # fill with both eyes' common picture
+            if window.colour is None or not window.box.width_px:  # fill with the picture that both eyes see
                 self._improved = None
                 with state.begin(job, job.targets.visible):
                     state.close_middle()
@@ -103,7 +103,7 @@ class StepPredictor(Predictor):
         *,
         outside: int | tuple[int, ...] | None,
     ) -> _Done:
-        """Run steps from the proposal, or from the previous solution's panels if its rays were the same."""
+        """Run steps from the proposal, or from the previous solution's panels if their rays are the same."""
         before = self._improved
         resumed = job.continued and before is not None and before[1] == job.channels and geometry.is_like(before[0])
         first = before[2] if before is not None and resumed else None

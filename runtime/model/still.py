@@ -18,7 +18,7 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_raster, image_from_stack
 from runtime.records import F64, U8
 
-RAYS_PX = 0.6, 1.6  # picture pixels per panel pixel, each way; outside this range pictures are resized to 1
+RAYS_PX = 0.6, 1.6  # picture pixels per panel pixel, along rows and columns; other pictures are resized to 1
 
 
 def solve_still(
@@ -31,10 +31,10 @@ def solve_still(
     eye_sigma_mm: float = TRACKING_SIGMA_MM,
     trimmed: bool = False,
 ) -> Prediction:
-    """Return layers for pictures (h, w, 3 or 4) of a left and a right eye (2, 3), frame `stack`.
+    """Solve pictures (h, w, 3 or 4) of a left and a right eye (2, 3), frame `stack`.
 
-    The pictures are `fov_deg` wide, and each eye looks at the stack's origin. The solver follows the rays of
-    their pixels. trimmed: skip work that the pictures do not need, if the model can (`trim`).
+    The pictures are `fov_deg` wide, and each eye looks at the stack's origin. The solver follows the rays of the
+    pictures' pixels. trimmed: skip work that the pictures do not need, if the model can (`trim`).
     """
     watch = Stopwatch(*STAGES)
     pictures = [np.ascontiguousarray(picture[..., :3]) for picture in (left, right)]

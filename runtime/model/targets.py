@@ -1,4 +1,4 @@
-"""Targets of pictures: tables from 8-bit codes to sums of panel values, in fixed point."""
+"""Tables that convert a picture's 8-bit codes to target sums of panel values, in fixed point."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F32, I16, U8
 
 SLOPE_FLOOR = 0.25  # least weight of a ray, relative to the steepest slope of sin²
-COARSE_STEP = 16  # spacing in pixels of the quick test, which recognises most coloured pictures
+COARSE_STEP = 16  # spacing in pixels of a quick test that recognises most coloured pictures
 
 
 def rest_of(panels: int) -> int:
@@ -22,15 +22,16 @@ def rest_of(panels: int) -> int:
 
 
 def slope_of(panels: int) -> int:
-    """Return which slope of sin² the sums are on: 1 (falling, sums 1 to 2) or 2 (rising, sums 2 to 3)."""
+    """Return the slope of sin² used for the sums: 1 (falling, sums 1 to 2) or 2 (rising, 2 to 3)."""
     return int(rest_value(panels) * panels)
 
 
 @lru_cache(maxsize=8)
 def target_table(panels: int) -> F32:
-    """Return (256, 2): for each code, the panels' target sum in sixteenths of a code, and its weight.
+    """Return (256, 2) target sums of the panels and their weights, for each code an eye should see.
 
-    The sum is the solution nearest to the rest state. The weight is the slope of sin² there, 1 where it is steepest.
+    Sums are in sixteenths of a code; each is the solution nearest to the rest state. The weight is the slope of sin²
+    there, 1 where it is steepest.
     """
     intensities = np.arange(256) / 255.0
     slope = slope_of(panels)
@@ -42,13 +43,13 @@ def target_table(panels: int) -> F32:
 
 @lru_cache(maxsize=8)
 def middle_codes(panels: int) -> U8:
-    """Return (256,) codes of the middle panel that show an eye each code while the other panels rest."""
+    """Return the (256,) middle-panel codes with which an eye sees each code while the other panels rest."""
     codes = (target_table(panels)[:, 0] - (panels - 1) * rest_of(panels)) / SUBCODE
     return np.clip(np.rint(codes), 0, 255).astype(np.uint8)
 
 
 def outside_codes(panels: int, n: int, outside: int | tuple[int, ...]) -> list[int]:
-    """Return panel n's RGB code outside the window: at rest, or `outside` for the middle panel."""
+    """Return the RGB code of panel `n` outside the window: `outside` for the middle panel, others rest."""
     if n != panels // 2:
         return [rest_code(panels)] * 3
     return middle_codes(panels)[list(outside)].tolist() if isinstance(outside, tuple) else [outside] * 3
@@ -56,7 +57,7 @@ def outside_codes(panels: int, n: int, outside: int | tuple[int, ...]) -> list[i
 
 @lru_cache(maxsize=4)
 def phase_codes(branch: Branch = 2) -> I16:
-    """Return (256,) phase sums, in sixteenths of a panel code, by 8-bit code that an eye should see."""
+    """Return the (256,) phase sums, in sixteenths of a panel code, for each code that an eye should see."""
     codes = np.arange(256) / 255.0
     return np.rint(phase_from_intensity(codes, branch) * FULL).astype(np.int16)
 
@@ -71,7 +72,7 @@ def is_grey(picture: U8) -> bool:
 
 
 def without_alpha(picture: U8, channels: int) -> U8:
-    """Return a contiguous picture (h, w, 3), or (h, w) if it is grey and one channel suffices."""
+    """Return a contiguous picture (h, w, 3), or (h, w) if `channels` is 1 because it is grey."""
     if channels == 1:
         return np.asarray(cv2.extractChannel(picture, 0), np.uint8)
     if picture.shape[2] == 3:
@@ -83,7 +84,7 @@ def flat_layers(image: U8, stack: PanelStack) -> U8:
     """Return (N, h, w, 4) layers that show every eye the same picture (h, w, 4)."""
     middle = stack.count // 2
     layers = np.full((stack.count, stack.height_px, stack.width_px, 4), 255, np.uint8)
-    # The sum is at least the start of the slope. The other panels share that part; the middle one adds the picture.
+    # The other panels share the sum at which the slope starts; the middle one adds the picture to it.
     even = slope_of(stack.count) * 255 // (stack.count - 1)
     layers[..., :3] = even
     sums = np.rint(target_table(stack.count)[:, 0] / SUBCODE)

@@ -22,23 +22,23 @@ from runtime.records import F64, U8
 from runtime.support.gl import DrawnPicture
 from runtime.support.threads import PIECE_ROWS, parallel_map
 
-TOLERANCE_CODES = 2  # pictures within 2 codes count as equal; the error is a tenth of 8-bit quantisation's at 40 dB
+TOLERANCE_CODES = 2  # larger differences count; the error is a tenth of 8-bit quantisation's at 40 dB
 COARSE_STEP = 16  # spacing in pixels of the quick comparison that decides whether an exact one is worthwhile
 MAX_SHARE = 0.6  # share of the panel above which a window is not worth cutting out
 MAX_SLACK = 1.3  # a window of the previous solution may be this many times as large as the one needed
 WINDOW_SHARES = 16  # windows are whole sixteenths of the panel, so that only a few shapes occur
 # Measured with the shipped models: tapering the outer panels over 14 parallaxes around a differing region costs 0.06 dB
-# on a mid-grey background, where sin² is steepest; over 6 parallaxes it costs up to 0.4 dB there, but only 0.02 dB on
-# white or black, where sin² is level. A window must also contain the other panels' ends of its rays.
+# on a mid-grey background, where sin² is steepest. Over 6 parallaxes, it costs up to 0.4 dB there, but only 0.02 dB on
+# white or black, where sin² is level. A window must also contain the points where its rays cross the other panels.
 TAPER_PARALLAXES = (6.0, 14.0)
 PANEL_CROSSINGS = 2.0
 MARGIN_PX = 16
 EDGE_PX = 2
-COMPARED = 2  # captured pictures are compared on a raster this many times coarser than the panels
+COMPARED = 2  # captured pictures are compared on a raster this many times as coarse as the panels
 
 
 def trim(job: Job, before: SolveWindow | None = None) -> Job:
-    """Return the job with a window, unless it has one, and with one channel if nothing is coloured.
+    """Return a job with a window, unless it already has one, and one channel if nothing is coloured.
 
     before: the previous solution's window, which is kept if it still fits.
     """
@@ -50,9 +50,10 @@ def trim(job: Job, before: SolveWindow | None = None) -> Job:
 def extent_window(
     extent: PixelRect, colour: tuple[int, ...], eyes_m: F64, stack: PanelStack, before: SolveWindow | None = None
 ) -> SolveWindow | None:
-    """Return the window of content within `extent` of the middle panel, on an 8-bit background `colour`.
+    """Return the window for content that is inside `extent` on the middle panel; None: whole panel.
 
-    It is computed before the content is drawn. None: solving the whole panel is as fast.
+    It is computed before the content is drawn. colour: 8-bit codes of the background. The result is None if solving
+    the whole panel is as fast.
     """
     if not extent.width_px:
         return None
@@ -62,9 +63,9 @@ def extent_window(
 
 
 def differing_window(job: Job, before: SolveWindow | None = None) -> SolveWindow | None:
-    """Return the window in which the eyes' pictures differ; empty if they agree.
+    """Return the window in which the eyes' pictures differ, an empty one if they agree.
 
-    None: solving the whole panel is as fast, or the pictures are in textures.
+    Returns None if solving the whole panel is as fast, or if the pictures are in textures.
     """
     if any(isinstance(view.picture, DrawnPicture) for view in job.views):
         return None
@@ -91,14 +92,17 @@ def differing_window(job: Job, before: SolveWindow | None = None) -> SolveWindow
 
 
 def _on_middle_panel(view: TargetView, stack: PanelStack) -> bool:
-    """Return True if a view's pixels are the middle panel's."""
+    """Return True if a view's pixels are those of the middle panel."""
     middle = stack.panel(stack.count // 2)
     same_size = view.picture.shape[:2] == (stack.height_px, stack.width_px)
     return same_size and np.allclose(view.plane_from_picture, middle.plane_from_raster(), rtol=0, atol=1e-9)
 
 
 def _compared(job: Job) -> tuple[U8, U8, tuple[int, int]]:
-    """Return both pictures on a coarse raster of the middle panel's visible part, and its first pixel."""
+    """Return both pictures on a coarse raster of the middle panel's visible part.
+
+    The third value is the panel pixel at which the raster begins.
+    """
     visible = job.targets.visible
     box, middle = visible.boxes[visible.middle], job.stack.panel(visible.middle)
     size = max(1, box.height_px // COMPARED), max(1, box.width_px // COMPARED)
@@ -117,19 +121,19 @@ def _compared(job: Job) -> tuple[U8, U8, tuple[int, int]]:
 def _window_around(
     box: PixelRect, eyes_m: F64, stack: PanelStack, before: SolveWindow | None, *, steep: float
 ) -> SolveWindow | None:
-    """Return the window for a box in which the eyes' pictures differ; None if the whole panel is as fast."""
+    """Return the window for a box where the eyes' pictures differ, or None if the whole panel is as fast."""
     parallaxes = taper_parallaxes(steep)
     window = window_around(box, eyes_m, stack, parallaxes=parallaxes)
     if window is None:
         return None
     if before is not None and still_fits(before.box, window):
         window = before.box
-    # Near the window's edge, rays leave the window on another panel, so the centre panel has no valid target there.
+    # Rays near the window's edge leave it on another panel, so the centre panel has no valid target there.
     return SolveWindow(window, whole_rays(window, eyes_m, stack), taper_px(eyes_m, stack, parallaxes=parallaxes))
 
 
 def _is_grey(view: TargetView, job: Job, window: SolveWindow | None) -> bool:
-    """Return True if everything solved is grey; a texture counts as grey only if marked so."""
+    """Return True if everything to be solved is grey. A texture counts as grey only if it is marked so."""
     if isinstance(view.picture, DrawnPicture):
         return view.picture.grey
     if window is not None and _on_middle_panel(view, job.stack):
@@ -153,9 +157,9 @@ def differing_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES, know
 
 
 def coarse_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES) -> PixelRect:
-    """Return a box within `differing_box` from a few pixels, in a hundredth of the time.
+    """Return a box inside that of `differing_box`, from a few pixels and in a hundredth of the time.
 
-    It decides whether the window would be too large to be worth cutting out.
+    It shows whether the window would be too large to be worth cutting out.
     """
     few = [np.ascontiguousarray(picture[::COARSE_STEP, ::COARSE_STEP]) for picture in (left, right)]
     u0, v0, u1, v1 = (COARSE_STEP * corner for corner in _box(few[0], few[1], tolerance).corners)
@@ -170,15 +174,16 @@ def _box(left: U8, right: U8, tolerance: int) -> PixelRect:
 
 
 def parallax_margin_px(eyes_m: F64, stack: PanelStack) -> F64:
-    """Return the stray (2, N, 2) on each panel of rays through a centre-panel pixel: right, down.
+    """Return how far rays through a centre-panel pixel are from it on each panel: (2, N, 2) pixels.
 
-    To first order, at the window's centre. eyes_m: (2, 3) left, right; frame `stack`.
+    The axes are eye, panel, and right or down. This is a first-order result for the window's centre. eyes_m: (2, 3)
+    left, right; frame `stack`.
     """
     return np.asarray(_eyes_px(eyes_m, stack)[:, None] * _weights(eyes_m, stack)[..., None], np.float64)
 
 
 def steepness(codes: U8) -> float:
-    """Return how visible a phase error is on these 8-bit codes: 0 at black or white, 1 at mid-grey.
+    """Return how visible a phase error is on 8-bit codes: from 0 (black or white) to 1 (mid-grey).
 
     It is the root mean square of the slope of sin², 2·sqrt(I·(1 - I)).
     """
@@ -187,20 +192,23 @@ def steepness(codes: U8) -> float:
 
 
 def steepness_beside(picture: U8, box: PixelRect) -> float:
-    """Return `steepness` right and left of a box in a picture (h, w, 3 or 4), where drive is tapered."""
+    """Return the larger `steepness` to the left or right of a box, where the panels' drive is tapered.
+
+    picture: (h, w, 3 or 4).
+    """
     rows = slice(box.v0, box.v1, COARSE_STEP)
     beside = (picture[rows, : box.u0 : COARSE_STEP, :3], picture[rows, box.u1 :: COARSE_STEP, :3])
     return max(steepness(side) for side in beside)
 
 
 def taper_parallaxes(steep: float) -> float:
-    """Return the taper's width in parallaxes around a difference, given the background's steepness."""
+    """Return the width, in parallaxes, of the taper around a difference; steep: background's `steepness`."""
     least, most = TAPER_PARALLAXES
     return least + (most - least) * steep
 
 
 def taper_px(eyes_m: F64, stack: PanelStack, *, parallaxes: float) -> tuple[float, float]:
-    """Return the taper's width in pixels, right and down. eyes_m: (2, 3), frame `stack`."""
+    """Return the width in pixels, right and down, of a taper of `parallaxes`. eyes_m: (2, 3), `stack`."""
     left, right = parallax_margin_px(eyes_m, stack)
     across, down = np.abs(left - right).max(axis=0) * parallaxes
     return float(across), float(down)
@@ -209,8 +217,8 @@ def taper_px(eyes_m: F64, stack: PanelStack, *, parallaxes: float) -> tuple[floa
 def whole_rays(box: PixelRect, eyes_m: F64, stack: PanelStack) -> PixelRect:
     """Return the part of a window whose rays stay inside it on every panel, or end at the panels' edges.
 
-    A ray through p on the centre panel meets a panel of weight t at p(1 - t) + e·t. eyes_m: (2, 3) in frame
-    `stack`, not relative to the window.
+    A ray from an eye e through p on the centre panel meets a panel of weight t (`_weights`) at p(1 - t) + e·t.
+    eyes_m: (2, 3) in frame `stack`, not relative to the window.
     """
     weights = _weights(eyes_m, stack)
     limits = []
@@ -226,20 +234,21 @@ def whole_rays(box: PixelRect, eyes_m: F64, stack: PanelStack) -> PixelRect:
 
 
 def _weights(eyes_m: F64, stack: PanelStack) -> F64:
-    """Return the panels' positions (2, N) along each eye's ray: 0 at the centre panel, 1 at the eye."""
+    """Return the panels' positions (2, N) on the way from the centre panel (0) to each eye (1)."""
     middle_m = stack.x_m[stack.count // 2]
     return np.asarray((np.array(stack.x_m) - middle_m) / (eyes_m[:, :1] - middle_m), np.float64)
 
 
 def _eyes_px(eyes_m: F64, stack: PanelStack) -> F64:
-    """Return the eyes' positions (2, 2) in panel pixels from the panel's centre, columns and rows."""
+    """Return the eyes' (columns, rows) from the panel's centre, in panel pixels: (2, 2)."""
     return np.asarray(eyes_m[:, 1:] * (stack.width_px / stack.width_m, -stack.height_px / stack.height_m), np.float64)
 
 
 def window_around(box: PixelRect, eyes_m: F64, stack: PanelStack, *, parallaxes: float) -> PixelRect | None:
-    """Return a difference's window, with its margins, rounded up to sixteenths of the panel.
+    """Return the window for a box that differs, with margins, rounded up to sixteenths of the panel.
 
-    parallaxes: see `taper_parallaxes`. None: the window would be most of the panel, so the whole panel is as fast.
+    parallaxes: width of the taper (`taper_parallaxes`). Returns None if the window would be most of the panel, so that
+    solving the whole panel is as fast.
     """
     parallax, weights, eyes_px = parallax_margin_px(eyes_m, stack), _weights(eyes_m, stack), _eyes_px(eyes_m, stack)
     spans: list[tuple[int, int]] = []
@@ -259,6 +268,6 @@ def window_around(box: PixelRect, eyes_m: F64, stack: PanelStack, *, parallaxes:
 
 
 def still_fits(held: PixelRect, new: PixelRect) -> bool:
-    """Return True if the current window contains a new one and is not much larger, so it can be kept."""
+    """Return True if the window `held` contains `new` and is not much larger, so that it can be kept."""
     inside = held.u0 <= new.u0 and held.v0 <= new.v0 and held.u1 >= new.u1 and held.v1 >= new.v1
     return inside and held.width_px * held.height_px <= MAX_SLACK * new.width_px * new.height_px

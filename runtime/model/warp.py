@@ -17,14 +17,17 @@ from runtime.optics.stack import PlaneRaster
 from runtime.records import F64, I16, U8
 from runtime.support.threads import on_rows
 
-LEAST_PX, MIN_SCALE = 16, 0.25  # least side and scale of a picture; smaller ones add no information
+LEAST_PX, MIN_SCALE = 16, 0.25  # least side and scale of a resized picture; a smaller scale adds no information
 REACH_PX = EDGE_PX - 1.0  # largest extension of an image's edge
 LARGEST = 8191  # largest absolute value that the compiled loop can sample
 _TRANSPOSED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def source_px(image_from_raster: F64, size: tuple[int, int]) -> tuple[float, float]:
-    """Return an image's pixels per pixel of a raster, along and down, at the raster's middle."""
+    """Return how many image pixels a raster pixel spans, right and down, at the raster's middle.
+
+    size: (width, height) of the raster.
+    """
     a = image_from_raster
     x, y, w = a @ (size[0] / 2, size[1] / 2, 1.0)
     across, down = np.linalg.norm((a[:2, :2] - np.outer((x / w, y / w), a[2, :2])) / w, axis=0)
@@ -32,12 +35,12 @@ def source_px(image_from_raster: F64, size: tuple[int, int]) -> tuple[float, flo
 
 
 def resized_px(pixels: int, scale: float) -> int:
-    """Return the number of pixels that replace `pixels` if each of them covers `scale` old ones."""
+    """Return the number of pixels that replace `pixels` if each new one covers `scale` old ones."""
     return max(min(pixels, LEAST_PX), round(pixels / max(scale, MIN_SCALE)))
 
 
 def reduced_view(view: TargetView, middle: PlaneRaster, reduction: int) -> TargetView:
-    """Average a view down to a pixel per about `reduction` x `reduction` middle-panel pixels."""
+    """Average a view down to about one pixel per `reduction` x `reduction` middle-panel pixels."""
     picture = view.pixels
     picture_from_middle = np.linalg.inv(view.plane_from_picture) @ middle.plane_from_raster()
     scales = source_px(picture_from_middle, (middle.width_px, middle.height_px))
@@ -56,9 +59,10 @@ def reduced_view(view: TargetView, middle: PlaneRaster, reduction: int) -> Targe
 def picture_on(
     view: TargetView, middle: PlaneRaster, *, middle_from_result: F64, edge: int, size: tuple[int, int]
 ) -> U8:
-    """Return a view's picture (rows, columns, 3 or 4) on a raster mapped to the middle panel.
+    """Resample a view's picture (rows, columns, 3 or 4) to a raster of `size` (rows, columns).
 
-    A picture on that raster is returned unchanged. edge: OpenCV's border mode.
+    middle_from_result: 3x3 map from that raster's pixels to the middle panel's. A picture that is already on that
+    raster is returned unchanged. edge: OpenCV's border mode.
     """
     picture_from_result = np.linalg.inv(view.plane_from_picture) @ middle.plane_from_raster() @ middle_from_result
     picture_from_result = picture_from_result / picture_from_result[2, 2]
@@ -70,7 +74,7 @@ def picture_on(
 def resample(
     image: NDArray[Any], image_from_result: F64, *, size: tuple[int, int], edge: int = cv2.BORDER_CONSTANT
 ) -> NDArray[Any]:
-    """Return bilinear samples of an image (h, w[, C]) on a raster of (rows, columns).
+    """Sample an image (h, w[, C]) bilinearly on a raster of `size` (rows, columns).
 
     Pixel centres are at half-integers. edge: OpenCV's border mode.
     """
@@ -93,9 +97,9 @@ def warp(
 ) -> I16:
     """Resample an int16 image (h, w[, 3]) like `resample`, several times as fast.
 
-    Its values must be within ±LARGEST. The homography connects columns after both column laws, one of which is
-    even. outside: value more than reach_px (at most REACH_PX) outside the image; nearer, it is clamped to its edge.
-    threads: OpenCV's number by default.
+    Values must be within ±LARGEST. The homography applies to columns that the two column laws have transformed; at
+    least one law must be even. outside: value of pixels more than `reach_px` (at most REACH_PX) outside the image; up
+    to there, the edge's value is used. threads: by default OpenCV's number.
     """
     x, y, w = image_from_result @ (result_columns.middle or size[1] / 2, size[0] / 2, 1.0)
     right, down = image_from_result[:2, 0] - np.array([x, y]) / w * image_from_result[2, 0]

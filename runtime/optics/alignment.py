@@ -1,15 +1,16 @@
-"""Alignment of layers, solved for earlier eyes, to the current eyes.
+"""Align layers that were solved for earlier eyes to the current eyes.
 
-Parallel planes seen from one point differ by a scale and a shift. A ray from the middle between the eyes through
-point c of the reference plane (x = r) meets panel n (x = a) at c·k + m·(1 - k), k = (m_x - a) / (m_x - r). A point p
-shown on panel n for a new middle n is traced to the reference plane along the new ray, and from there to panel n along
-the old middle's: both are a scale and a shift, so that q = p·s + t with (o: the old middle, d = n - o, D = o_x - a)
+Parallel planes seen from one point differ by a scale and a shift. Let m be the point midway between the eyes. Its ray
+through a point c of the reference plane (x = r) meets the panel at x = a at c·k + m·(1 - k), k = (m_x - a) / (m_x - r).
+When this midpoint moves from o to n, the ray from n through a point p of the panel is traced to the reference plane,
+and from there back to the panel along the ray from o. Both steps are a scale and a shift, so they lead from p to
+q = p·s + t. With d = n - o and D = o_x - a,
 
     s = 1 + d_x·(r - a) / ((D + d_x)·(o_x - r)),    t = (a - r) / (o_x - r) · (o·d_x - d·D) / (D + d_x).
 
-In this form s = 1 and t = 0 without rounding error if the middle has not moved or the panel is the reference plane. The
-middle's rays map exactly, and so do both eyes' rays if the head faces the panels and has moved parallel to them. After
-the head comes nearer or moves away, the disparity is still the old one; no shift can change that.
+In this form s = 1 and t = 0 without rounding error if the midpoint has not moved or the panel is the reference plane.
+Rays from the midpoint map exactly. So do both eyes' rays if the head faces the panels and has moved parallel to them.
+If the head has come nearer or moved away, the disparity remains the old one; no shift can change that.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from runtime.optics.relief import Displacement, displacement, parallax
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8, PanelFrame, Parallax
 
-FARTHEST_M = 1e6  # coordinates beyond this count as not finite
+FARTHEST_M = 1e6  # coordinates beyond this are treated as not finite
 NEAREST_M = 0.01  # least distance of an eye from the front panel
 MOST_SHIFT = 0.5  # largest shift of a panel's middle, in panel widths or heights
 MOST_SCALE = 2.0  # largest enlargement or reduction of a panel
@@ -35,7 +36,7 @@ ROWS = 32  # rows per resampled strip; a strip's float32 pixels fit in a core's 
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Maps that draw each panel for the current eyes."""
+    """Maps with which the layers are drawn for the current eyes."""
 
     solved_from_shown: tuple[F64, ...]  # per panel (3, 3), scale and shift from shown pixels to the solved layer's
     limited: str = ""  # why the alignment stopped short of the current eyes; empty if it did not
@@ -73,7 +74,10 @@ def align(stack: PanelStack, *, solved_for_m: F64, eyes_m: F64) -> Alignment:
 
 
 def scale_and_shift(matrix: F64) -> tuple[float, float, float, float]:
-    """Return (scale_u, scale_v, shift_u, shift_v). Raises ValueError if the matrix does more."""
+    """Return (scale_u, scale_v, shift_u, shift_v) of a 3x3 matrix.
+
+    Raises ValueError if the matrix is not just a scale and a shift.
+    """
     (su, a, tu), (b, sv, tv), last = matrix.tolist()
     if a or b or last != [0.0, 0.0, 1.0]:
         raise ValueError("an alignment must be a scale and a shift")
@@ -81,17 +85,17 @@ def scale_and_shift(matrix: F64) -> tuple[float, float, float, float]:
 
 
 def is_identity(matrix: F64) -> bool:
-    """Return True if the solved pixels are shown without resampling."""
+    """Return True if this alignment shows the solved pixels without resampling."""
     return scale_and_shift(matrix) == (1.0, 1.0, 0.0, 0.0)
 
 
 def shown_layers(frame: PanelFrame) -> U8:
     """Return the (N, h, w, 4) layers exactly as shown, before each panel's curve, rotation and mirroring.
 
-    This is the reference for the presentation shader. It samples bilinearly with exact weights (for moved eyes, bicubic
-    sampling was never better by more than 0.05 dB: docs/mathematics.md), enlarges a coarse solution in the same pass,
-    fills the outside with the rest code, and mixes in the flat picture before rounding. A frame that needs none of this
-    is returned as its own array. Raises ValueError for a frame that has nothing to show.
+    This function is the reference for the presentation shader. It samples bilinearly with exact weights (for moved
+    eyes, bicubic sampling was never better by more than 0.05 dB: docs/mathematics.md), enlarges a coarse solution in
+    the same pass, fills pixels outside the layer with the rest code, and mixes in the flat picture before rounding. If
+    the frame needs none of this, its own array is returned. Raises ValueError if the frame has nothing to show.
     """
     flatness = 1.0 if frame.solved is None else frame.flatness
     if flatness > 0.0 and frame.flat is None:
@@ -151,7 +155,7 @@ def _solved_from_shown(stack: PanelStack, index: int, *, old: F64, step: F64) ->
 def _limits(
     stack: PanelStack, solved_for_m: F64, eyes_m: F64, *, old: F64, new: F64
 ) -> Iterator[tuple[float, float, str]]:
-    """Yield (most, least, why). A movement scaled by `share` is allowed if share · most <= least."""
+    """Yield (most, least, why) per limit. A share of the movement is allowed if share · most <= least."""
     front_m = stack.x_m[-1]
     for name, before, after in zip(("left", "right"), solved_for_m, eyes_m, strict=True):
         room_m = before[0] - front_m - NEAREST_M
@@ -164,7 +168,7 @@ def _limits(
     for n, x_m in enumerate(stack.x_m):
         if x_m == reference_m:
             continue
-        why = f"the eyes are {moved_m:.3g} m from where the layers were solved for, too far to align panel {n}"
+        why = f"the eyes are {moved_m:.3g} m from the position the layers were solved for, too far to align panel {n}"
         distance_m, weight = old[0] - x_m, (x_m - reference_m) / (old[0] - reference_m)
         for axis, size_m in ((1, stack.width_m), (2, stack.height_m)):
             shift = abs(weight * (old[axis] * step[0] - step[axis] * distance_m))
@@ -175,16 +179,20 @@ def _limits(
 
 
 def _places(count: int, shown: int, *, scale: float, shift: float) -> tuple[NDArray[np.intp], F32]:
-    """Return the padded source pixel (0: border) before each of `shown` pixels, and the distance past it."""
+    """Return the source pixel before each of `shown` pixels, and the distance past it.
+
+    Indices are those of a source padded by one pixel, so 0 is its border.
+    """
     place = np.clip((np.arange(shown) + 0.5) * scale + shift - 0.5, -1.0, count)
     first = np.minimum(np.floor(place), count - 1.0)
     return first.astype(np.intp) + 1, (place - first).astype(np.float32)
 
 
 def _resampled(layer: U8, matrix: F64, rest: int, *, size: tuple[int, int]) -> Iterator[tuple[slice, F32]]:
-    """Yield strips of rows of the shown layer (height, width) with their unrounded codes (rows, w, 4).
+    """Yield strips of rows of a shown layer of `size` (height, width), with unrounded codes (rows, w, 4).
 
-    The next strip overwrites the codes. A coarse layer is extended by a pixel, so that it does not fade at its edge.
+    Each strip overwrites the codes of the one before. A coarse layer is extended by a pixel on every side, so that it
+    does not fade at its edge.
     """
     su, sv, tu, tv = scale_and_shift(matrix)
     height, width = layer.shape[:2]
@@ -217,7 +225,7 @@ def _resampled(layer: U8, matrix: F64, rest: int, *, size: tuple[int, int]) -> I
 def _displaced(
     displacement: Displacement, layer: U8, matrix: F64, rest: int, *, size: tuple[int, int]
 ) -> Iterator[tuple[slice, F32]]:
-    """Yield the same strips as `_resampled`, with a separate displacement for every pixel."""
+    """Yield strips like those of `_resampled`, with a separate displacement for every pixel."""
     su, sv, tu, tv = scale_and_shift(matrix)
     height, width = layer.shape[:2]
     by_u, by_v, extended = width / size[1], height / size[0], int((height, width) != size)

@@ -24,9 +24,10 @@ Picture = U8 | F32  # (h, w, 3)
 
 
 def as_cameras(matrices: Any) -> tuple[F64, F64]:
-    """Return right-handed projections (2, 3, 4) from `stack` to pixels, and positions (2, 3) in metres.
+    """Return two cameras' projections (2, 3, 4), pixels from `stack`, and positions (2, 3) in metres.
 
-    Raises ValueError for anything but two invertible 3x4 matrices.
+    The projections are right-handed. Raises ValueError unless `matrices` are two 3x4 matrices whose left 3x3 parts
+    have an inverse.
     """
     try:
         cameras = np.asarray(matrices, np.float64)
@@ -94,7 +95,10 @@ def looking_at_origin(
 
 
 def _within(matrix: F64, half: F64, width: int, height: int) -> bool:
-    """Return True if a picture contains all directions up to `half` (2,) on every side of its centre."""
+    """Return True if a picture contains every direction (x, y, 1) with |x|, |y| up to `half` (2,).
+
+    matrix: 3x3, pixels from directions.
+    """
     corners = np.array([(x * half[0], y * half[1], 1.0) for x in (-1, 1) for y in (-1, 1)]) @ matrix.T
     if not (corners[:, 2] > 0).all():
         return False
@@ -103,7 +107,7 @@ def _within(matrix: F64, half: F64, width: int, height: int) -> bool:
 
 
 def _most(holds: Any, least: float = 0.0) -> float:
-    """Find the largest number from `least` to 1 for which the monotonic condition `holds`."""
+    """Return the largest number from `least` to 1 that satisfies the monotonic condition `holds`."""
     most = 1.0
     if holds(most):
         return most
@@ -114,12 +118,15 @@ def _most(holds: Any, least: float = 0.0) -> float:
 
 
 def _slope(matrix: F64) -> F64:
-    """Return the (2, 2) derivative of pixels with respect to direction, straight ahead."""
+    """Return the (2, 2) derivative of a picture's pixels with respect to direction, straight ahead."""
     return np.asarray(matrix[:2, :2] - np.outer(matrix[:2, 2], matrix[2, :2]))
 
 
 def doubts(eyes_m: ArrayLike, stack: PanelStack, *, fov_deg: float, size: tuple[int, int]) -> list[str]:
-    """Return a line per probable mistake in the eyes or picture size (width, height)."""
+    """Return one line for each probable mistake in the eyes or `fov_deg`.
+
+    size: (width, height) of the pictures.
+    """
     eyes, warnings = np.asarray(eyes_m, np.float64), []
     if fov_deg <= math.pi:
         warnings.append(f"fov_deg: {fov_deg:g} degrees looks like radians ({math.degrees(fov_deg):.1f} degrees)")

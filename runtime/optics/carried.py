@@ -1,9 +1,9 @@
-"""Carried, expected and light quality, at eyes other than those solved for (docs/contracts.md).
+"""Carried, expected and light quality of layers seen by other eyes than they were solved for.
 
-The picture that the layers were solved for is treated as painted on the centre panel: each pixel's ray is replaced by
-the ray from the true eye through the same point of that panel. Ghosts and colour fringes count as errors. The parallax
-between nominal and true eye does not count, because no shift of the layers can add it. Neither does the age of the
-view, which live quality measures (`evaluation.refresh_quality`).
+These measures are defined in docs/contracts.md. The picture that the layers were solved for is treated as painted on
+the centre panel: each pixel's ray is replaced by the ray from the true eye through the same point of that panel. Ghosts
+and colour fringes count as errors. The parallax between the nominal and the true eye does not count, because no shift
+of the layers can add it. The age of the view does not count either; `evaluation.refresh_quality` measures it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def carried_db(
     eyes_m: ArrayLike,
     fov_deg: float,
 ) -> float:
-    """Return the PSNR, with one ray per pixel, at eyes (2, 3) of layers solved for other eyes (2, 3).
+    """Return the PSNR at `eyes_m` (2, 3) of layers solved for `solved_for_m` (2, 3), one ray per pixel.
 
     layers: (N, H, W, 3 or 4) code values, exactly as displayed; drawn: an (h, w, 3) retina picture for each eye of
     `solved_for_m`, `fov_deg` wide, as code values or float in [0, 1].
@@ -48,7 +48,7 @@ def carried_db(
 
 
 class AtEyes(TypedDict):
-    """Eyes, pictures' width and tracking errors for an expected quality."""
+    """Eyes, field of view and tracking errors for which an expected quality is computed."""
 
     eyes_m: ArrayLike  # (2, 3) eyes that the layers were solved for
     fov_deg: float  # horizontal field of view of the pictures
@@ -64,16 +64,17 @@ def expected_errors(
     sampling: Sampling | None = None,
     **at: Unpack[AtEyes],
 ) -> dict[float, F64]:
-    """Return expected carried squared errors for normal tracking errors, keyed by standard deviation.
+    """Return the carried squared errors expected for normal tracking errors, by standard deviation.
 
     Each value is an array: the error of all rows, then of each group of rows. The expectation is a sum over five
     points, which is exact for second moments: no tracking error with weight 1/2, and two standard deviations left,
     right, up and down with weight 1/8 each.
 
-    drawn: an (h, w, 3) picture for each of the eyes (2, 3) that the layers were solved for. sampling: by default light,
-    the figure to quote, with four times as many rays per pixel in pictures of at most `PLENTY` values. Moved eyes get a
-    quarter of the rays, which costs less than 0.02 dB: every second pixel of every second row in larger pictures, two
-    rays instead of four in others. Other arguments and errors as for `carried_db`.
+    drawn: an (h, w, 3) picture for each of the eyes (2, 3) that the layers were solved for. sampling: by default the
+    one for light, the figure to quote, with four times as many rays per pixel in pictures of at most `PLENTY` values.
+    Moved eyes are sampled with a quarter of the rays, which costs less than 0.02 dB: larger pictures use every second
+    pixel of every second row, others use two rays across and down each pixel instead of four. The other arguments and
+    the exceptions are those of `carried_db`.
     """
     chosen = sampling or (LIGHT if drawn[0].size > PLENTY else LIGHT._replace(rays=2 * LIGHT.rays))
     seen_from_m = at.get("seen_from_m")
@@ -114,14 +115,17 @@ def expected_psnrs_db(
 
 
 def standard_error_db(errors: F64) -> float:
-    """Return a PSNR's standard error; errors: (1 + groups,) of all rows, then of each group."""
+    """Return the standard error in dB of the PSNR that belongs to the first of these errors.
+
+    errors: (1 + groups,) squared errors of all rows, then of each group of rows.
+    """
     groups = errors[1:]
     relative = float(np.std(groups, ddof=1)) / len(groups) ** 0.5 / max(float(errors[0]), 1e-12)
     return float(10 / math.log(10) * relative)
 
 
 def intensities(picture: U8 | F32) -> F32:
-    """Return a picture's (h, w, 3) float32 intensities in [0, 1], from code values or intensities."""
+    """Convert a picture of code values or intensities to (h, w, 3) float32 intensities in [0, 1]."""
     part = picture[..., :3].astype(np.float32)
     if picture.dtype == np.uint8:
         part /= np.float32(255)

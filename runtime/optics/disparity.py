@@ -1,4 +1,4 @@
-"""Disparity of a pair of pictures, compared with what a stack's gaps can show."""
+"""Compare the disparity of a pair of pictures with the largest that a stack's gaps can show."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from runtime.records import F32, F64, U8
 
 WIDTH_PX = 256  # width of the middle panel's raster on which the pictures are compared
 REACH_PX = WIDTH_PX // 4  # largest disparity searched, in either direction
-# Largest ghosts that are not reported: root mean square, relative to full scale. The example pair has about as large an
-# error of other kinds (37 dB of light), so larger ghosts would cost more than 3 dB.
+# Largest ghosts that are not reported, as a root mean square relative to full scale. The other errors of the example
+# pair are about as large (37 dB of light), so larger ghosts would cost more than 3 dB.
 GHOSTS_MOST = 0.015
 BEYOND_LEAST = 0.1  # share of the matches that must be outside the stack; disparity within it causes no ghosts
-LARGER, MOST_LARGER = 1.1, 20.0  # factor between the gaps that are tried; largest one, relative to the stack's
+LARGER, MOST_LARGER = 1.1, 20.0  # ratio of successive gaps that are tried; largest, relative to the stack's own
 ROLLED, TURNED = 0.05, 0.2  # largest slopes of the line between the eyes for which picture rows correspond
 LEAST_MATCHED = 0.1  # share of the panel that must be matched
 LEAST_ONCE = 1 / 3  # share of the matches that must be unambiguous; otherwise the picture is repetitive
-WINDOW_PX, APART_PX = 21, 4  # cost window, and least distance between two matches of a pixel
-NO_WORSE = 1.3, 1.0  # factor and codes: the second match is ambiguous up to this multiple of the first's error
+WINDOW_PX, APART_PX = 21, 4  # side of the cost window; least distance between two matches of a pixel
+NO_WORSE = 1.3, 1.0  # ambiguous: another match's error is at most this factor times the best one's, plus these codes
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,12 +38,13 @@ class _Compared:
     panel: PlaneRaster
 
     def ghosts(self, unit_m: float) -> float:
-        """Return the root mean square of the light, 0 to 1, that reaches the wrong eye for lack of range.
+        """Estimate the light that reaches the wrong eye because panel values are limited (RMS, 0 to 1).
 
-        The two eyes see a point of the front panel `unit_m` apart on the middle panel, and a point of the rear
-        panel as far apart in the other direction. The difference between their pictures, in panel values, is
-        therefore the slope of (front - rear) times `unit_m`, and front - rear stays between -1 and 1. Each row
-        is integrated from left to right. Beyond that range the difference is lost, and both eyes see the mean.
+        Both eyes' rays through one point of the front panel cross the middle panel `unit_m` apart, and those through
+        a point of the rear panel as far apart in the other direction. The difference between the eyes' pictures, in
+        panel values, is therefore the slope of (front - rear) times `unit_m`, and front - rear stays between -1 and
+        1. Each row is integrated from left to right. Beyond that range the difference is lost, and both eyes see the
+        mean.
         """
         light = np.stack(self.grey) / 255.0
         value = np.arcsin(np.sqrt(light)) / (np.pi / 2)
@@ -59,10 +60,10 @@ class _Compared:
         return float(np.sqrt(np.mean((share * (light[0] - light[1]) / 2)[both] ** 2))) if both.any() else 0.0
 
     def disparities_m(self) -> F64:
-        """Return the (n,) disparities, in metres on the middle panel, of the unambiguously matched points.
+        """Return the (n,) disparities of all unambiguously matched points, in metres on the middle panel.
 
-        They are positive in front of that panel, where points appear farther right to the left eye. The result
-        is empty if most of the picture is repetitive, or if too little of it matches.
+        A disparity is positive for a point in front of that panel, which appears farther right to the left eye. The
+        result is empty if most of the picture is repetitive, or if too little of it matches.
         """
         sides = 0, 0, REACH_PX, REACH_PX
         framed: list[Any] = [
@@ -82,7 +83,7 @@ class _Compared:
 
 
 def _compared(pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, *, fov_deg: float) -> _Compared:
-    """Compare pictures that are `fov_deg` wide and look at the stack's origin."""
+    """Resample both pictures, `fov_deg` wide and aimed at the stack's origin, to the coarse raster."""
     small = replace(stack, width_px=WIDTH_PX, height_px=max(16, round(WIDTH_PX * stack.height_m / stack.width_m)))
     panel, size = small.panel(stack.count // 2), (WIDTH_PX, small.height_px)
     framed: list[Any] = []
@@ -125,7 +126,7 @@ def _is_ambiguous(left: U8, right: U8, matched: F64) -> NDArray[np.bool_]:
 def disparity_doubts(
     pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, *, fov_deg: float, parallel: bool = True
 ) -> list[str]:
-    """Explain in one line why eyes (2, 3) will see ghosts of these pictures; empty if they will not.
+    """Return a one-line warning in a list if eyes (2, 3) will see ghosts in the pictures, otherwise [].
 
     parallel: the pictures may be a rectified pair from parallel cameras, passed by mistake as the eyes' own views.
     """
@@ -148,16 +149,16 @@ def disparity_doubts(
         if disparity_m <= -0.95 * apart_m:
             return "infinitely far behind"
         depth_mm = 1e3 * disparity_m * (away_m - centre_m) / (apart_m + disparity_m)
-        return f"{abs(depth_mm):.0f} mm {'before' if depth_mm > 0 else 'behind'}"
+        return f"{abs(depth_mm):.0f} mm {'in front of' if depth_mm > 0 else 'behind'}"
 
     low_m, middle_m, high_m = (float(value) for value in np.percentile(found_m, (10, 50, 90)))
     warning = "pictures: have more disparity than these gaps can show without ghosts, which are estimated at "
-    warning += f"{ghosts:.0%} of full scale. Things stand {place(low_m)} to {place(high_m)} the middle panel"
+    warning += f"{ghosts:.0%} of full scale. The scene is {place(low_m)} to {place(high_m)} the middle panel"
     factors = LARGER ** np.arange(1, 1 + np.log(MOST_LARGER) / np.log(LARGER))
     if larger := next((float(one) for one in factors if compared.ghosts(one * unit_m) <= GHOSTS_MOST), None):
-        warning += f"; {larger:.1f} times the gaps, or as many times less disparity, would show them"
+        warning += f"; gaps {larger:.1f} times as large, or disparity divided by that factor, would avoid the ghosts"
     if parallel and low_m > 0:
         shift_px = middle_m / _width_m(eyes_m.mean(axis=0), fov_deg) * pictures[0].shape[1] / 2
-        warning += ". All of it is before that panel, as in a rectified pair (parallel cameras): give the cameras, or "
-        warning += f"move the left picture {shift_px:.0f} pixels to the left and the right one as far to the right"
+        warning += ". All of it is in front of that panel, as in a rectified pair from parallel cameras: pass the "
+        warning += f"cameras, or shift the left picture {shift_px:.0f} pixels left and the right one as far right"
     return [warning]

@@ -44,12 +44,12 @@ ONE_RAY = Sampling(rays=0, pupil_mm=0.0)
 
 
 class LightView(NamedTuple):
-    """One eye's picture and the geometry of its rays."""
+    """An eye's target picture and the geometry of its rays."""
 
     target: F32  # (h, w, 3) intensities
     centre_from_image: F64  # (3, 3) from the image's pixels to the centre panel's
     panels_from_centre: F64  # (pupil points, N, 3, 3) from the centre panel's pixels to each panel's
-    toward: F64  # (3,) its dot product with (u, v, 1) is negative for rays towards the panels
+    toward: F64  # (3,) vector whose dot product with (u, v, 1) is negative for rays towards the panels
     first_ray: int  # number of the view's first ray, which seeds its random positions
 
 
@@ -63,13 +63,13 @@ def squared_errors(
     fov_deg: float,
     sampling: Sampling,
 ) -> F64:
-    """Return the (1 + groups,) mean squared errors of layers at eyes (2, 3), against carried pictures.
+    """Return (1 + groups,) mean squared errors of the light at `eyes_m` (2, 3), against carried targets.
 
-    layers: (N, H, W, 3 or 4) code values, rear to front; targets: (h, w, 3) intensities, `fov_deg` wide, for each eye
-    solved for. The first error is over all rows. The others are over interleaved groups of rows; their scatter gives
-    the standard error of the first. A pixel counts if all its rays cross every panel at least half a pixel inside its
-    edge. For nearly perfect light the result can be negative, because of the rays' noise.
-    Raises ValueError for an eye behind a panel, or where no pixel counts.
+    layers: (N, H, W, 3 or 4) code values, rear to front; targets: (h, w, 3) intensities, `fov_deg` wide, for each of
+    the eyes `solved_for_m` (2, 3). The first error is that of all rows. The others are those of interleaved groups of
+    rows; their scatter gives the standard error of the first. A pixel counts if all its rays cross every panel at
+    least half a pixel inside its edge. For nearly perfect light the result can be negative, because of the rays' noise.
+    Raises ValueError for an eye behind a panel, or if no pixel counts.
     """
     cores, step = len(os.sched_getaffinity(0)), sampling.step
     parts = -(-min(len(target) for target in targets) // step) if sampling.groups else 4 * cores
@@ -121,7 +121,10 @@ def _squared_error(
 def view_of(
     side: int, nominal_m: F64, true_m: F64, target: F32, stack: PanelStack, *, fov_deg: float, pupil_mm: float
 ) -> LightView:
-    """Return the picture and rays of one eye. Raises ValueError for an eye behind a panel."""
+    """Return the view of an eye at `true_m` (3,) of layers solved for `nominal_m` (3,).
+
+    side: 0 left, 1 right. Raises ValueError for an eye behind a panel.
+    """
     height, width = target.shape[:2]
     rays = Rays.of_eye(checked_eye(nominal_m, stack), width_px=width, height_px=height, fov_deg=fov_deg)
     centre = panel_from_image(rays.from_stack, stack.panel(stack.count // 2))

@@ -33,7 +33,8 @@ def intensity_from_phase(phase: NDArray[T]) -> NDArray[T]:
 def phase_from_intensity(intensity: NDArray[T], branch: Branch = 2) -> NDArray[T]:
     """Return the phase sums (...), in units of π/2, whose sin² is `intensity` clipped to [0, 1].
 
-    Branch 1 is in [0, 1], branch 2 in [1, 2]. With three panels, branch 2 keeps the outer two far from their limits.
+    Branch 1 gives sums in [0, 1], branch 2 in [1, 2]. With three panels, branch 2 keeps the outer two panels far from
+    their limits.
     """
     root = np.arcsin(np.sqrt(np.clip(intensity, 0.0, 1.0))) / HALF_PI
     result: NDArray[T] = root if branch == 1 else 2 - root

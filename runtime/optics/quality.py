@@ -1,4 +1,4 @@
-"""Displayed quality (docs/contracts.md): PSNR and SSIM of retina images, after clipping and 8 bits."""
+"""Displayed quality (docs/contracts.md): PSNR and SSIM of retina images rounded to 8 bits."""
 
 from __future__ import annotations
 
@@ -29,7 +29,10 @@ def psnr_db(mean_squared_error: float) -> float:
 
 
 def ssim(a: F32, b: F32, mask: Mask) -> float:
-    """Return the mean SSIM over a mask: 11x11 Gaussian window of sigma 1.5 (Wang et al. 2004)."""
+    """Return the mean SSIM of two images over a mask, as in Wang et al. 2004.
+
+    The window is an 11x11 Gaussian of sigma 1.5.
+    """
 
     def blur(x: F32) -> F32:
         return np.asarray(cv2.GaussianBlur(x, (11, 11), 1.5), dtype=np.float32)[inside]
@@ -63,9 +66,9 @@ def squared_error(image: F32, target: F32, mask: Mask) -> tuple[float, int]:
 
 
 def quality(seen: Sequence[F32], targets: Sequence[F32], masks: Sequence[Mask], *, similarity: bool = True) -> Quality:
-    """Return the displayed quality pooled over the eyes; its SSIM is NaN without `similarity`.
+    """Return the displayed quality, pooled over the eyes. Its SSIM is NaN unless `similarity` is True.
 
-    Raises ValueError if no ray of an eye crosses every panel.
+    Raises ValueError if, for some eye, no ray crosses every panel.
     """
     errors, weights, per_eye, similarities = 0.0, 0, [], []
     for image, target, mask in zip(seen, targets, masks, strict=True):

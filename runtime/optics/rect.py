@@ -10,7 +10,7 @@ from runtime.optics.stack import PlaneRaster
 
 @dataclass(frozen=True, slots=True)
 class PixelRect:
-    """Pixels [u0, u1) x [v0, v1) of a raster, u right, v down; empty if an end does not exceed its start."""
+    """Pixels [u0, u1) x [v0, v1) of a raster (u right, v down); empty if u1 <= u0 or v1 <= v0."""
 
     u0: int
     v0: int
@@ -31,11 +31,11 @@ class PixelRect:
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """Row and column slices, to index an image."""
+        """Slices (rows, columns) that index this box in an image."""
         return slice(self.v0, self.v1), slice(self.u0, self.u1)
 
     def beside(self, *, width_px: int, height_px: int) -> list[PixelRect]:
-        """Return the raster's other pixels as up to four boxes."""
+        """Return the other pixels of a raster of this size, as up to four boxes."""
         if not self.width_px or not self.height_px:
             return [PixelRect(0, 0, width_px, height_px)]
         boxes = (
@@ -62,7 +62,7 @@ class PixelRect:
 
 
 def union(boxes: Sequence[PixelRect]) -> PixelRect:
-    """Return the smallest box around all non-empty boxes; empty if there are none."""
+    """Return the smallest box that contains all non-empty boxes; an empty box if there are none."""
     filled = [box for box in boxes if box.width_px and box.height_px]
     if not filled:
         return PixelRect(0, 0, 0, 0)

@@ -35,10 +35,10 @@ def block_px(width_px: int) -> int:
 
 
 def relief_of(nearness: Sequence[F32], *, distance_m: Sequence[float]) -> F32:
-    """Combine both eyes' depth into one (h, w) relief, using at each pixel the one farther from 0.
+    """Combine both eyes' depth into one (h, w) relief. Each pixel takes the value that is farther from 0.
 
-    nearness: (h, w) per eye, inverse distance along x in 1/m, with 0 for the background, which has no relief.
-    distance_m: distance of each eye from the middle panel.
+    nearness: for each eye, the (h, w) inverse distances along x in 1/m; 0 for the background, whose relief is 0.
+    distance_m: each eye's distance from the middle panel.
     """
     rim = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
     reliefs = []
@@ -88,7 +88,7 @@ class Displacement:
     weight: float
 
     def at(self, columns: Pixels, rows: Pixels, *, size_px: tuple[int, int]) -> tuple[F32, F32]:
-        """Return the pixel centres' displacements, right and down: (rows, columns) in panel pixels."""
+        """Return the displacements, right and down, of pixel centres: two (rows, columns) in panel pixels."""
         scale_u, scale_v = self.middle_from_shown[0, 0], self.middle_from_shown[1, 1]
         u = columns * scale_u + self.middle_from_shown[0, 2]
         v = rows * scale_v + self.middle_from_shown[1, 2]
@@ -115,7 +115,7 @@ def displacement(relief: F32 | None, parallax: Parallax | None, panel: int) -> D
 
 
 def _between_centres(place: Pixels, count: int) -> tuple[NDArray[np.intp], F32]:
-    """Return the last pixel whose centre precedes each place, and the distance past it (clamped)."""
+    """Return the last of `count` pixel centres before each place, and the clamped distance past it."""
     inside = np.clip(place - 0.5, 0.0, count - 1.0)
     low = np.floor(inside)
     return low.astype(np.intp), (inside - low).astype(np.float32)

@@ -30,7 +30,7 @@ class Retina:
     mask: Mask  # (h, w)
 
     def codes(self) -> U8:
-        """Return (h, w, 3) 8-bit code values; black where a ray misses a panel."""
+        """Return the image as (h, w, 3) 8-bit code values, black where a ray misses a panel."""
         return np.asarray(as_codes(self.image) * self.mask[..., None], np.uint8)
 
 
@@ -72,7 +72,7 @@ class _Samples:
 
 
 def _mix(a: F32, b: F32, weight: F32) -> None:
-    """Write a + (b - a)·weight to `a`; `b` is overwritten."""
+    """Compute a + (b - a)·weight in `a`; `b` is overwritten."""
     b -= a
     b *= weight
     a += b
@@ -80,7 +80,7 @@ def _mix(a: F32, b: F32, weight: F32) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Rays:
-    """Rays through an eye's image. The eye looks at the stack's origin."""
+    """Rays through the pixels of an image, from an eye that looks at the stack's origin."""
 
     from_stack: F64  # (3, 4) `image_from_stack`
     u: F64  # (w,) columns
@@ -100,9 +100,9 @@ class Rays:
         return len(self.v), len(self.u)
 
     def on(self, raster: PlaneRaster, rows: slice = slice(None), *, moved: F64 | None = None) -> tuple[F64, F64]:
-        """Return the (h, w) pixels u and v at which some rows of rays cross a raster (M_RPU).
+        """Return the raster pixels, u and v (h, w), at which the rays of `rows` cross it (M_RPU).
 
-        moved: (3, 3) map applied to those pixels afterwards.
+        moved: (3, 3) map that is applied to those pixels afterwards.
         """
         h = panel_from_image(self.from_stack, raster)
         if moved is not None:
@@ -133,7 +133,7 @@ def seen_by(
     width_px: int | None = None,
     height_px: int | None = None,
 ) -> Retina:
-    """Compute a pinhole eye's image: sin² of the values summed along each ray (supplement, (6), (7)).
+    """Compute a pinhole eye's image from the panel values summed along each ray (supplement, (6), (7)).
 
     layers: (N, H, W, 3 or 4), rear to front, uint8 code values or float in [0, 1]; a fourth channel is ignored. By
     default the image has the layers' size. Raises ValueError for an eye behind a panel.
@@ -148,7 +148,7 @@ def seen_by(
 
 
 def _moved(stack: PanelStack, index: int, eye_m: F64) -> F64 | None:
-    """Return the 3x3 map from the ideal panel's pixels to a layer's for one eye; None: identity."""
+    """Return the 3x3 map for an eye from the ideal panel's pixels to a layer's; None: identity."""
     if stack.tilt is None:
         return None
     return layer_pixels_from_seen(stack.panel(index), layer_from_seen(stack, index, eye_m))
@@ -186,7 +186,7 @@ def through_layers(
 
 
 def as_codes(image: F32) -> U8:
-    """Return intensities (...), clipped to [0, 1], as 8-bit code values."""
+    """Clip intensities (...) to [0, 1] and convert them to 8-bit code values."""
     return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
@@ -201,7 +201,7 @@ def pupil_points(diameter_m: float, rings: int = 2) -> F64:
 
 
 def average(images: Iterable[F32]) -> F32:
-    """Return the mean (h, w, C) of images, as a finite pupil sees. Raises ValueError without any."""
+    """Return the mean (h, w, C) of images, which a finite pupil sees. Raises ValueError for no images."""
     total: F32 | None = None
     count = 0
     for image in images:

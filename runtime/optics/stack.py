@@ -49,7 +49,7 @@ class PlaneRaster:
 class Tilt:
     """Slopes of panels that are not quite parallel, and the position from which they were registered."""
 
-    depth: tuple[tuple[float, float, float], ...]  # per panel (d, r, u): the point (y, z) is d + r·y + u·z past its x_m
+    depth: tuple[tuple[float, float, float], ...]  # per panel (d, r, u): at (y, z), x = x_m + d + r·y + u·z
     seen_from_m: tuple[float, float, float]  # frame `stack`
 
 
@@ -70,7 +70,7 @@ class PanelStack:
 
     @property
     def is_evenly_spaced(self) -> bool:
-        """True if the gaps are equal enough for the shipped networks."""
+        """True if the gaps are equal enough for the shipped networks (`UNEVEN_MOST`)."""
         gaps = np.diff(self.x_m)
         return bool(gaps.size == 0 or np.ptp(gaps) <= UNEVEN_MOST * gaps.mean())
 

@@ -21,7 +21,7 @@ UNSEEN_PX = 0.05  # displacements below this, in panel pixels, are ignored
 
 
 def layer_from_seen(stack: PanelStack, index: int, eye_m: F64) -> F64:
-    """Return the 3x3 map from (y, z, 1) on the ideal panel to the layer's, as an eye (3,) sees them."""
+    """Return the 3x3 map, for an eye (3,), from (y, z, 1) on the ideal panel to the layer's (y, z, 1)."""
     if stack.tilt is None or not any(stack.tilt.depth[index]):
         return np.eye(3)
     return _projected(stack.tilt.depth[index], stack.tilt.seen_from_m, _triple(eye_m), stack.x_m[index])
@@ -60,7 +60,7 @@ def _projected(
     eye: tuple[float, float, float],
     x_m: float,
 ) -> F64:
-    """Project the ideal plane to the tilted one along the eye's rays, and back from `seen_from`."""
+    """Return the map to the tilted plane along the eye's rays, and back along rays from `seen_from`."""
     offset_m, right, up = depth
     normal, far = np.array([1.0, -right, -up]), x_m + offset_m
     origin, place = np.array(seen_from), np.array(eye)

@@ -14,8 +14,8 @@ from runtime.records import F64
 def stack_from_eye(eye_m: ArrayLike) -> F64:
     """Return the 4x4 pose of an eye that looks at the stack's origin (EyeReal supplement, (10)-(14)).
 
-    Axes: x right and parallel to the ground, y up, z from the scene towards the eye. On the vertical axis, where the
-    limit depends on the direction of approach, it is the limit from +x: r_x = +y.
+    Axes: x right and parallel to the ground, y up, z from the scene towards the eye. For an eye on the vertical axis
+    the pose is the limit from +x (r_x = +y), because the limit depends on the direction of approach.
 
     Raises ValueError if the eye is at the origin or not finite.
     """

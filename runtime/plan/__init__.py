@@ -1,1 +1,1 @@
-"""Savings and their measurement, and the drawing of targets, where content, views and models meet."""
+"""Plan which work to skip, measure what that saves, and draw the targets of a solution."""

@@ -22,7 +22,7 @@ from runtime.support.gl import DrawnPicture
 def raster_views(eyes_m: F64, raster: PlaneRaster, *, reduction: int = 1) -> tuple[View, View]:
     """Return the left and right eye's views of a raster; eyes (2, 3), frame `stack`.
 
-    reduction: divisor from the panels' rows and columns to the raster's.
+    reduction: divisor of the panels' rows and columns that gives the raster's.
     """
     left, right = (
         View(eye, side, raster_from_stack(eye, raster), raster.width_px, raster.height_px, reduction)
@@ -61,9 +61,9 @@ def drawn_job(
 ) -> Job:
     """Return the job for eyes (2, 3), frame `stack`, with content drawn on the middle panel's pixels.
 
-    Pictures stay in textures if the model can read them; otherwise they are the source's own arrays. reduction: divisor
-    of the panels' rows and columns. trimmed: skip work that the scene does not need (`trim`), including drawing if the
-    content knows its extent. before: the previous solution's window, on the same raster. in_depth: include the
+    Pictures stay in textures if the model can read textures; otherwise they are the source's own arrays. reduction:
+    divisor of the panels' rows and columns. trimmed: skip work that the scene does not need (`trim`), including drawing
+    if the content knows its extent. before: the previous solution's window, on the same raster. in_depth: include the
     content's relief, if the source knows it.
     """
     stack, trimmed = predictor.stack.reduced(reduction), trimmed and predictor.trims

@@ -1,4 +1,4 @@
-"""Measure the time and quality of each saving of the plan, on this machine and scene."""
+"""Measure what each saving of the plan changes in time and quality, on this machine and scene."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ MAX_DRIFT_M = 0.001  # a resting head may drift this far before its picture is r
 
 
 class TrialResult(NamedTuple):
-    """Median time per frame, drawing included, and quality, of one way to compute the layers."""
+    """Quality, and median time per frame including drawing, of one way to compute the layers."""
 
     frame_ms: float
     psnr_db: float
 
     def saving_over(self, other: TrialResult) -> Saving:
-        """Return the saving relative to another way, which saves less."""
+        """Return what this way saves and costs relative to `other`, a way that saves less."""
         return Saving(other.frame_ms - self.frame_ms, other.psnr_db - self.psnr_db)
 
 
 class Measurement(NamedTuple):
-    """Measurements of a scene with and without the plan, taken alternately."""
+    """Results for a scene with and without the plan, measured alternately."""
 
     numbers: Measured
     with_plan: TrialResult
@@ -56,7 +56,7 @@ class Measurement(NamedTuple):
 
 
 def measure(predictor: Predictor, content: ContentSource, eyes_m: F64, *, fov_deg: float) -> Measurement:
-    """Measure each saving with and without it, for eyes (2, 3) and pictures `fov_deg` wide."""
+    """Measure the scene with and without each saving, for eyes (2, 3) and pictures `fov_deg` wide."""
     stack = predictor.stack
 
     def psnr_db(layers: U8, at_m: F64) -> float:
@@ -97,7 +97,7 @@ def measure(predictor: Predictor, content: ContentSource, eyes_m: F64, *, fov_de
 
 
 def plan_for(config: Path | None, *, scene: str | None, model: str | None, scale: float) -> dict[str, Any]:
-    """Measure and plan one scene, and return what `phasestack plan` prints. Raises PhasestackError."""
+    """Measure one scene and return what `phasestack plan` prints. Raises PhasestackError."""
     settings = with_options(load_settings(config), scene=scene, model=model)
     cv2.setNumThreads(settings.model.threads or -1)
     stack = settings.stack.stack()

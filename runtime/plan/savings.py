@@ -1,4 +1,4 @@
-"""Decide from measurements which work can be skipped for a scene, display and viewer."""
+"""Decide which work can be skipped for a scene, display and viewer."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ OPTIONAL_PARTS = {
     "matplotlib": "reports",
 }
 
-VISIBLE_DEG = 80.0  # beyond this angle from the display's axis an eye cannot see it
+VISIBLE_DEG = 80.0  # an eye at a larger angle from the display's axis cannot see it
 RETURN_MARGIN_DEG = 3.0  # three standard deviations of an eye's direction at 0.2 m, for 3 mm of noise
 
 
 @dataclass(frozen=True, slots=True)
 class Saving:
-    """Time and quality lost by a saving, from measurements with and without it; None: not measured."""
+    """Time that a saving saves and quality that it costs; None: not measured."""
 
     saves_ms: float | None = None
     costs_db: float | None = None
@@ -45,23 +45,23 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """The savings in use, as flags for the pipeline and as text."""
+    """Savings in use: the eyes to solve for, and items to show to an operator."""
 
     eyes: tuple[bool, bool]  # left, right: True if it is solved for
     items: tuple[PlanItem, ...] = field(default=())
 
 
 def eyes_in_range(eyes_m: F64, *, range_deg: float = VISIBLE_DEG) -> tuple[bool, bool]:
-    """Return which eyes (2, 3) see the display: those in front, within `range_deg` of its axis."""
+    """Return (left, right): True if that eye is in front of the display, within `range_deg` of its axis."""
     off_axis = np.degrees(np.arctan2(np.linalg.norm(eyes_m[:, 1:], axis=1), eyes_m[:, 0]))
     left, right = (off_axis <= range_deg).tolist()
     return left, right
 
 
 def seeing_eyes(eyes_m: F64, before: tuple[bool, bool]) -> tuple[bool, bool]:
-    """Return `eyes_in_range` with hysteresis: an excluded eye returns only well within the range.
+    """Return `eyes_in_range` with hysteresis: an excluded eye returns only when well inside the range.
 
-    before: the previous result. Without the margin, noise would switch an eye at the limit on and off.
+    before: the previous result. Without hysteresis, noise would switch an eye at the limit on and off.
     """
     outer = eyes_in_range(eyes_m)
     inner = eyes_in_range(eyes_m, range_deg=VISIBLE_DEG - RETURN_MARGIN_DEG)
@@ -70,7 +70,7 @@ def seeing_eyes(eyes_m: F64, before: tuple[bool, bool]) -> tuple[bool, bool]:
 
 
 def selected_eyes(eyes_m: F64, seeing: tuple[bool, bool]) -> F64:
-    """Return the eyes (2, 3) to draw and solve for; an eye that cannot see is replaced by the other."""
+    """Return the eyes (2, 3) to draw and solve for. An eye that cannot see is replaced by the other."""
     if seeing == (True, False):
         return eyes_m[[0, 0]]
     if seeing == (False, True):
@@ -87,10 +87,10 @@ def make_plan(
     measured: Measured | None = None,
     loaded_modules: Collection[str] = (),
 ) -> Plan:
-    """Return the plan for a scene and a viewer, to be renewed when either changes.
+    """Return the plan for a scene and a viewer. It must be renewed when either changes.
 
-    eyes_m: (2, 3), if known; seeing: which eyes can see the display, if known from `seeing_eyes`; loaded_modules: names
-    in `sys.modules`.
+    eyes_m: (2, 3), if known. seeing: which eyes can see the display, if known (`seeing_eyes`). loaded_modules: names
+    of imported modules (`sys.modules`).
     """
     on, numbers = settings.plan.enabled, measured or Measured()
     if seeing is None and eyes_m is not None:
@@ -116,7 +116,7 @@ def make_plan(
 
 
 def network_items(info: ContentInfo, numbers: Measured) -> list[PlanItem]:
-    """Return the plan items for the savings in the model."""
+    """Return the plan items for work that the model skips."""
     items, share = [], numbers.left_out.solved_share
     if info.flat_x_m is not None and share == 0.0:
         why = "everything lies in the centre panel's plane: both eyes see the same"

@@ -132,7 +132,7 @@ def test_nodes_that_another_provider_runs_are_told_by_name(
         loaded = ModelSession(path, provider="remote")
     assert len(loaded.fell_back) > 50
     assert all(loaded.fell_back)
-    assert f"remote leaves {len(loaded.fell_back)} nodes to another: {loaded.fell_back[0]}, " in caplog.text
+    assert f"remote leaves {len(loaded.fell_back)} nodes to another provider: {loaded.fell_back[0]}, " in caplog.text
 
 
 def test_a_provider_that_is_installed_and_does_not_start_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,1 +1,1 @@
-"""The solver's operations as fragment shaders of OpenGL 3.3 core."""
+"""Operations of the solver as fragment shaders of OpenGL 3.3 core."""

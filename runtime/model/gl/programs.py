@@ -22,7 +22,7 @@ CONSTANTS = f"FULL {FULL:.1f}", f"EDGE_CLAMP_PX {EDGE_CLAMP_PX:.1f}"
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """The part of a texture that is in use, starting at its first row and column."""
+    """Part of a texture that is in use, starting at the texture's first row and column."""
 
     texture: Any  # moderngl.Texture
     width_px: int
@@ -34,7 +34,7 @@ class Image:
 
 
 def source(name: str, *, defines: Sequence[str] = ()) -> str:
-    """Return a shader's text with its includes. defines: names that its `#ifdef`s test."""
+    """Return a shader's source code with its includes. defines: names that its `#ifdef`s test."""
 
     def read(file: str) -> str:
         return (resources.files(SHADERS) / "shaders" / file).read_text(encoding="ascii")
@@ -44,7 +44,7 @@ def source(name: str, *, defines: Sequence[str] = ()) -> str:
 
 
 class Passes:
-    """The programs of one context, each compiled on its first use."""
+    """Shader programs of one context, each compiled on its first use."""
 
     def __init__(self, context: moderngl.Context) -> None:
         self.context = context
@@ -76,10 +76,10 @@ class Passes:
         defines: tuple[str, ...] = (),
         at: tuple[int, int, int, int] | None = None,
     ) -> None:
-        """Draw a pass into all outputs, at the first one's size.
+        """Draw the pass of a shader into all outputs.
 
-        Inputs and uniforms are named as in the shader; unused inputs are ignored. defines: of the shader; at:
-        first column and row, width, height.
+        Inputs and uniforms have the shader's names for them; unused inputs are ignored. defines: as for `source`;
+        at: (first column, first row, width, height) to draw, by default all of the first output.
         """
         raise_if_abandoned()
         program, array, held = self._program(name, defines)
@@ -95,7 +95,7 @@ class Passes:
         array.render(moderngl.TRIANGLES, vertices=3)
 
     def target(self, outputs: Sequence[Image]) -> Any:
-        """Return the framebuffer of some images."""
+        """Return a framebuffer that draws into these images."""
         key = tuple(output.texture.glo for output in outputs)
         if key not in self._targets:
             self._targets[key] = self.context.framebuffer([output.texture for output in outputs])
@@ -109,7 +109,7 @@ class Passes:
         texture.release()
 
     def release(self) -> None:
-        """Release programs and framebuffers. Textures belong to their owners."""
+        """Release programs and framebuffers, but no textures: their owners do that."""
         self.context.detect_framebuffer(0).use()
         for target in self._targets.values():
             target.release()

@@ -1,8 +1,8 @@
-"""The solver on OpenGL: panels are textures, and steps are passes of fragment shaders.
+"""Solver on OpenGL: panels are textures, and steps are passes of fragment shaders.
 
 All data between steps are 16-bit values from 0 to 1 (see `shaders/places.glsl` for their meaning), which every driver
-can filter and draw into. Textures have one component for one channel and otherwise four, of which one is unused,
-because three components cannot be drawn into.
+can filter and draw into. A texture has one component if one channel is solved. Otherwise it has four, one of them
+unused, because OpenGL need not support drawing into three.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ PANELS, MIDDLE = 3, 1
 
 
 class GlBackend:
-    """OpenGL backend of one context, whose programs its models share. Used on that context's thread."""
+    """Backend on one OpenGL context, whose programs its models share. Used on that context's thread."""
 
     name = "gl"
 
     def __init__(self, context: Any, stack: PanelStack) -> None:
-        """context: the caller releases it. Raises InputError if a panel is too large for the driver."""
+        """Raise InputError if a panel is too large for the driver. The caller releases `context`."""
         check_size(context, stack)
         self.context, self.passes = context, Passes(context)
 
@@ -52,11 +52,11 @@ class GlState:
     """`SolverState` of three panels, used only on its context's thread."""
 
     def __init__(self, passes: Passes, stack: PanelStack) -> None:
-        """passes: of a shared context. Raises InputError if a panel is too large for the driver."""
+        """Raise InputError if a panel is too large for the driver. `passes` may be shared."""
         check_size(passes.context, stack)
         self._passes, self._stack = passes, stack
         self._textures: dict[tuple[Any, ...], Any] = {}
-        self._names: dict[str, str] = {}  # which of two images plays which role
+        self._names: dict[str, str] = {}  # image now in use for each role, for pairs that are swapped
         self._closed = False
 
     @contextmanager
@@ -147,7 +147,7 @@ class GlState:
             self._textures = {}
 
     def _loaded(self, view: TargetView, side: int) -> tuple[Image, tuple[int, int]]:
-        """Return an eye's target, drawn or uploaded, and the column and row of its first ray."""
+        """Return the image of an eye's target and the (column, row) of its first ray; uploads arrays."""
         rays = self._geometry.rays
         if isinstance(view.picture, DrawnPicture):
             texture = view.picture.texture
@@ -178,7 +178,7 @@ class GlState:
         return max(self._stack.width_px, self._stack.height_px, rays.width_px, rays.height_px)
 
     def _panel(self, name: str, n: int) -> Image:
-        """Return a panel's box in an image as large as the panel, whose texture stays as the box moves."""
+        """Return an image for a panel's box. Its texture is as large as the panel, so the box may move."""
         box, key = self._geometry.boxes[n], (self._names.get(f"{name} {n}", name), n)
         size = self._stack.width_px, self._stack.height_px
         return Image(self._texture(key, size, self._components, dtype="nu2"), box.width_px, box.height_px)
@@ -188,7 +188,7 @@ class GlState:
         self._names[a], self._names[b] = self._names.get(b, other), self._names.get(a, one)
 
     def _rays(self, name: str, places: int = 1) -> Image:
-        """Return an image for one field of a ray set."""
+        """Return an image for one quantity of each ray in a set."""
         image = self._ray_image(name, self._components, "nu2")
         return Image(image.texture, image.width_px, image.height_px // places)
 
@@ -196,7 +196,7 @@ class GlState:
         return Image(self._texture(name, (self._longest, 1), 1, dtype="f4"), self._longest, 1)
 
     def _ray_image(self, name: str, components: int, dtype: str) -> Image:
-        """Return an image for all rays. Their number varies, but the texture only grows."""
+        """Return an image with a pixel per ray. The number of rays varies, but the texture only grows."""
         width_px, height_px = self._geometry.rays.width_px, self._geometry.rays.height_px
         size = width_px, height_px
         texture = self._textures.get(key := (name, components, dtype))
