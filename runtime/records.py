@@ -1,4 +1,4 @@
-"""Frozen records passed between stages. Their arrays are never modified after construction."""
+"""Frozen records that stages pass to each other. Their arrays never change after construction."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Inference = Literal["ran", "reused", "skipped"]
 
 
 class State(StrEnum):
-    """State of the daemon. The reason of DEGRADED names the missing parts."""
+    """State of the daemon. In DEGRADED, the reason names the missing parts."""
 
     STARTING = "starting"
     TRACKING = "tracking"
@@ -34,7 +34,7 @@ class State(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Intrinsics:
-    """A pinhole camera's intrinsic matrix; pixel centres are at half-integers."""
+    """Intrinsic parameters of a pinhole camera. Pixel centres are at half-integers."""
 
     width_px: int
     height_px: int
@@ -45,7 +45,10 @@ class Intrinsics:
 
     @classmethod
     def centred(cls, width_px: int, height_px: int, *, fov_rad: float) -> Intrinsics:
-        """Return intrinsics with square pixels, centred; fov_rad: horizontal field of view."""
+        """Return intrinsics of a camera with square pixels and a central axis.
+
+        fov_rad: horizontal field of view.
+        """
         focal_px = width_px / 2 / math.tan(fov_rad / 2)
         return cls(width_px, height_px, focal_px, focal_px, width_px / 2, height_px / 2)
 
@@ -56,15 +59,15 @@ class EyePoints:
 
     eyes_m: F64  # (2, 3) left and right eye in metres, frame `sensor` or `stack` according to context
     confidence: F64  # (2,) in [0, 1], left, right
-    completed: Literal["", "left", "right"] = ""  # the hidden eye, filled in from the head's pose
+    completed: Literal["", "left", "right"] = ""  # eye that was hidden and is filled in from the head's pose
     covariance_m2: F64 | None = None  # (3, 3) covariance of the midpoint of the eyes, same frame; None: unknown
 
 
 @dataclass(frozen=True, slots=True)
 class SensorFrame:
-    """A sensor's sample, with all its streams at one instant."""
+    """Sample of a sensor, with all its streams at one instant."""
 
-    sequence: int  # the device's frame number; gaps are lost frames
+    sequence: int  # frame number of the device; gaps are lost frames
     capture_ns: int  # time of exposure, on the monotonic clock
     eyes: EyePoints | None = None  # frame `sensor`; None: no face, or the sensor does not find eyes
     colour: U8 | None = None  # (h, w, 3) RGB
@@ -86,16 +89,16 @@ class EyesEstimate:
 
 @dataclass(frozen=True, slots=True)
 class Parallax:
-    """Motion of content on the panels when the eyes move away from those solved for (`optics.relief`).
+    """Motion of content on the panels when the eyes leave the position solved for (`optics.relief`).
 
-    Content of relief b that is now seen through pixel p of the middle panel was seen through p + b·(drift_px +
-    growth·p).
+    Content of relief b that is now seen through pixel p of the middle panel was seen, by the eyes solved for, through
+    pixel p + b·(drift_px + growth·p).
     """
 
     drift_px: tuple[float, float]  # right and down
-    growth: float  # scaling as the head comes nearer or moves away
+    growth: float  # relative growth as the head comes nearer or moves away
     middle_from_shown: tuple[F64, ...]  # per panel (3, 3), scale and shift along rays from the present midpoint
-    weights: tuple[float, ...]  # per panel: its pixels per pixel of the middle panel, along rays from the old midpoint
+    weights: tuple[float, ...]  # for each panel, pixels per middle-panel pixel along rays from the old midpoint
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,13 +106,13 @@ class PanelFrame:
     """Layers of all panels at one refresh: an aligned solution, the flat picture or a mix of both."""
 
     number: int  # number of the refresh, the same on all panels
-    solved: U8 | None  # (N, h, w, 4) RGBA layers solved for two eyes, rear to front, on any raster; None: not yet
+    solved: U8 | None  # (N, h, w, 4) RGBA layers for two eyes, rear to front, on any raster; None: no solution yet
     solved_version: int  # changes whenever `solved` changes
-    solved_from_shown: tuple[F64, ...] = ()  # per panel (3, 3), both in the panels' pixels; (): layers as solved
-    flat: U8 | None = None  # (N, height_px, width_px, 4): the flat picture, which is never aligned
+    solved_from_shown: tuple[F64, ...] = ()  # per panel (3, 3), in the panels' pixels; (): layers shown as solved
+    flat: U8 | None = None  # (N, height_px, width_px, 4) flat picture, which is never aligned
     flat_version: int = 0
     flatness: float = 0.0  # weight of `flat` in a linear mix of codes; 0: `solved` alone, 1: `flat` alone
-    size_px: tuple[int, int] | None = None  # columns and rows of the panels; None: as `solved`
+    size_px: tuple[int, int] | None = None  # columns and rows of the panels; None: those of `solved`
     relief: F32 | None = None  # (h, w) relief of the solution's content, on the middle panel; None: unknown
     parallax: Parallax | None = None  # None: content does not move on the middle panel
 
@@ -126,7 +129,7 @@ class PresentReport:
 
 @dataclass(frozen=True, slots=True)
 class PlanItem:
-    """A saving, with the omitted work, the reason, the time saved and the quality lost."""
+    """Saving of the plan: the omitted work, the reason, the time saved and the quality lost."""
 
     what: str
     why: str
@@ -136,7 +139,7 @@ class PlanItem:
 
 @dataclass(frozen=True, slots=True)
 class FrameTiming:
-    """Predicted wake, present and display times of one refresh, on the run's clock."""
+    """Predicted times, on the run's clock, at which a refresh wakes, presents and is displayed."""
 
     id: int  # refresh number
     wake_ns: int
@@ -146,16 +149,16 @@ class FrameTiming:
 
 @dataclass(frozen=True, slots=True)
 class SolveRequest:
-    """Request from the presenter to the solver, which replaces an older one that has not started."""
+    """Request from the presenter to the solver. It replaces an older request that has not begun."""
 
     time_ns: int  # instant to solve for: middle of the solution's expected display time
     eyes_m: F64 | None  # (2, 3) left, right; frame `stack`; predicted for `time_ns`; None: no viewer
     eyes_label: EyesLabel
     sigma_m: float  # standard deviation of these eyes per axis
     flat_wanted: bool  # the flat picture is shown or will be needed
-    paused: bool = False  # no new solutions
+    paused: bool = False  # True: no new solutions
     effort: Effort | None = None  # effort for a new solution; None: full
-    refined_to: Effort | None = None  # to continue the newest solution, if eyes and pictures are unchanged
+    refined_to: Effort | None = None  # effort to continue the newest solution with, if nothing has changed
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,14 +182,14 @@ class Measures:
     residual: float | None = None  # error of sampled rays against the solution's targets
     detail: Mapping[int, float] = field(default_factory=dict)  # error of the pictures on coarser rasters, by reduction
     contrast: float | None = None  # half the variance, the error between unrelated pictures
-    change: tuple[float, float, float] | None = None  # against the previous pictures: error, metres moved, seconds
+    change: tuple[float, float, float] | None = None  # from the previous pictures: error, metres moved, seconds
 
 
 @dataclass(frozen=True, slots=True)
 class Solution:
     """Immutable layers for one pair of eyes, or of the flat picture."""
 
-    number: int  # counts from 1, solutions and flat pictures together
+    number: int  # counted from 1, for solutions and flat pictures together
     layers: U8  # (N, h, w, 4) RGBA, rear to front; in the panels' pixels, or fewer (`effort.reduction`)
     solved_for_m: F64 | None  # (2, 3) left, right; frame `stack`; None: a flat picture
     solved_for_ns: int  # instant for which its eyes and content were predicted
@@ -206,14 +209,14 @@ class RefreshAccount:
     capture_ns: int  # capture time of the newest sample used; 0: none
     predicted_for_ns: int  # display time
     present_ns: int
-    eyes_m: F64 | None  # (2, 3) eyes that the panels are aligned to; frame `stack`
+    eyes_m: F64 | None  # (2, 3) eyes to which the panels are aligned; frame `stack`
     eyes_label: EyesLabel
     eye_sigma_mm: float | None  # standard deviation of the eyes per axis; None without eyes
     state: State
     solution: int | None  # number of the solution that is shown; None: the flat picture alone
     solved_for_m: F64 | None  # (2, 3)
     solution_age_ms: float | None  # display time minus the solution's instant
-    inference: Inference  # ran: first to show its solution; reused: a later one; skipped: shows no solution
+    inference: Inference  # ran: first refresh with its solution; reused: a later one; skipped: no solution
     presented: bool
     skew_ms: float
     photon_ns: int = 0  # display time, computed from the actual present time

@@ -13,7 +13,7 @@ from runtime.frame.solver_host import SolverHost
 from runtime.frame.viewer import Viewer
 from runtime.records import F64, Effort, EyesEstimate, EyesLabel, FrameTiming, Solution, SolveRequest
 
-HORIZON_NS = NS_PER_S // 8  # longest prediction after this refresh's display time
+HORIZON_NS = NS_PER_S // 8  # longest prediction, counted from this refresh's display time
 SPEED_NS = NS_PER_S // 2  # time constant of the running mean of a head's squared speed
 REQUESTS_KEPT = 256
 CALM_M_S = 0.02  # a seated head sways more slowly than this, and moves faster on purpose
@@ -24,11 +24,11 @@ class Aim:
     """Builds the solver requests of one run. Single-threaded; never reads a clock."""
 
     def __init__(self, viewer: Viewer, solver: SolverHost, *, period_ns: int, fixed: Effort | None = None) -> None:
-        """fixed: effort of every solution if `model.effort` is `full`; None: choose it."""
+        """Create the aim of a run. fixed: every solution's effort under `model.effort = full`; None: chosen."""
         self._viewer, self._solver, self._period_ns, self._fixed = viewer, solver, period_ns, fixed
         self._chooser = EffortChooser()
         self._calm_ns: int | None = None  # time since which the head has been slower than CALM_M_S
-        self._expected: dict[int, float] = {}  # expected squared distance of the true eyes, m², by requested instant
+        self._expected: dict[int, float] = {}  # expected squared distance to the true eyes, m², by requested instant
         self._speed2 = 0.0  # running mean, in (m/s)²
         self._learned: int | None = None  # number of the newest solution whose measures have been used
 
@@ -42,7 +42,10 @@ class Aim:
         flat_wanted: bool,
         paused: bool,
     ) -> SolveRequest:
-        """Return the next request. eyes: at this refresh's display time; shown: the newest solution."""
+        """Return the next request to the solver.
+
+        eyes: the eyes at this refresh's display time; shown: the newest solution.
+        """
         self._learn(shown, eyes)
         predictor, refined, costs = state.predictor, None, self._solver.costs
         whole = self._fixed or Effort(1, predictor.steps)
@@ -71,7 +74,7 @@ class Aim:
         return SolveRequest(then_ns, then_m, label, eyes.sigma_m, flat_wanted, paused, effort, refined)
 
     def _learn(self, shown: Solution | None, eyes: EyesEstimate) -> None:
-        """Learn from the newest solution's measures, and from how far the eyes have moved since."""
+        """Learn from the newest solution's measures, and from how far the eyes are from those solved for."""
         if shown is None or shown.solved_for_m is None:
             return
         expected_m2 = self._expected.get(shown.solved_for_ns, 0.0)
@@ -83,14 +86,17 @@ class Aim:
             self._chooser.pictures.learn(shown.measures, shown.effort)
 
     def _middle_ns(self, timing: FrameTiming, cost_ns: int) -> int:
-        """Return the middle of the display time of a solution that starts now.
+        """Return the middle of the time for which a solution that starts now will be shown.
 
-        It is complete after its cost, appears half a period later on average, and is shown until the next one appears.
+        It is complete after `cost_ns`, appears half a period later on average, and is shown until the next one appears.
         """
         return timing.photon_ns + cost_ns + (self._period_ns + max(cost_ns, self._period_ns)) // 2
 
     def _eyes_then(self, timing: FrameTiming, eyes: EyesEstimate, *, cost_ns: int) -> tuple[int, F64 | None, EyesLabel]:
-        """Return the instant to solve for, within the tracker's reliable range, and its predicted eyes."""
+        """Return the instant to solve for, and the eyes (2, 3) predicted for it with their label.
+
+        The eyes are predicted no further than `HORIZON_NS`.
+        """
         middle_ns = self._middle_ns(timing, cost_ns)
         reach_ns = min(middle_ns, timing.photon_ns + HORIZON_NS)
         then = self._viewer.ahead(reach_ns) if eyes.eyes_m is not None else eyes
@@ -118,7 +124,10 @@ class Aim:
         return outlook
 
     def _horizon_s(self, timing: FrameTiming, *, speed_m_s: float) -> float:
-        """Return for how long the motion should continue: a calm head's for as long as it has been calm."""
+        """Return for how long the head's motion is expected to continue.
+
+        A calm head is expected to stay calm for as long as it has been calm.
+        """
         if speed_m_s > CALM_M_S:
             self._calm_ns = None
             return HORIZON_S
@@ -127,7 +136,10 @@ class Aim:
         return max(HORIZON_S, (timing.photon_ns - self._calm_ns) / NS_PER_S)
 
     def _usual_speed_m_s(self, moved_m: float, eyes: EyesEstimate) -> float:
-        """Return the larger of the head's speed and its recent RMS, which covers turning points and lost eyes."""
+        """Return the head's speed or the RMS of its recent speed, whichever is larger.
+
+        The RMS gives a useful value at turning points and while the eyes are lost.
+        """
         speed_m_s = moved_m * NS_PER_S / self._period_ns
         if eyes.label != "held":
             gain = self._period_ns / (self._period_ns + SPEED_NS)
@@ -145,7 +157,7 @@ class Aim:
     def _refined(
         self, shown: Solution, most: int, costs: Costs, *, shown_error: float, horizon_s: float
     ) -> Effort | None:
-        """Return how to refine a resting head's solution (raster or steps), or None if it is good enough."""
+        """Return the effort that refines a resting head's solution, or None if it is good enough."""
         done, pictures = shown.effort, self._chooser.pictures
         if done is None:
             return None

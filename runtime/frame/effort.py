@@ -56,7 +56,7 @@ class Costs:
     stages: Mapping[int, Mapping[str, float]]  # by reduction and SOLVING_STAGES; `step` is the time of one step
 
     def ms(self, effort: Effort) -> float:
-        """Return the time from start to complete layers."""
+        """Return the time from the start of a solution to complete layers."""
         stages = self.stages[effort.reduction]
         steps = effort.steps - (effort.continued_from or 0)
         begun = ("finish",) if effort.continued_from is not None else ("render", "prepare", "inference", "finish")
@@ -69,10 +69,13 @@ def simulated_costs(stage_ms: Mapping[str, float], reductions: Iterable[int]) ->
 
 
 class CostBook:
-    """Running means of stage times by raster. A raster's times are forgotten if it is unused for long."""
+    """Running means of the stage times of each raster. Times of a raster long unused are forgotten."""
 
     def __init__(self, first: Mapping[int, Mapping[str, float]]) -> None:
-        """first: times by reduction and stage, measured with full pictures before the first refresh."""
+        """Create a book with the times `first`, measured with full pictures before the first refresh.
+
+        first: milliseconds by reduction and stage.
+        """
         self.first = first
         self._measured: dict[int, dict[str, float]] = {}
         self._unused: dict[int, int] = {}  # by reduction: solutions on other rasters since its last one
@@ -115,7 +118,7 @@ class CostBook:
 
 @dataclass(frozen=True, slots=True)
 class Outlook:
-    """Forecast for one effort: the tracker's, for the eyes in the middle of the solution's display time."""
+    """Forecast by the tracker of the eyes in the middle of a solution's display time, for one effort."""
 
     sigma_m: float = 0.0  # standard deviation per axis of the point midway between the eyes
     speed_m_s: float = 0.0
@@ -168,12 +171,12 @@ class PictureStatistics:
             self._learn_change(*measures.change)
 
     def stale(self, distance_m: float, elapsed_s: float) -> float:
-        """Return D, the squared error of a picture drawn for an earlier time and another head position."""
+        """Return D, the squared error of a picture drawn `elapsed_s` earlier and `distance_m` away."""
         y = self.rate_m * _outlines_off_m(distance_m) + self.rate_s2 * elapsed_s**2
         return y / (1 + y / self.contrast) + TAIL * y
 
     def own(self, effort: Effort) -> float:
-        """Return Q, the squared error at the eyes solved for."""
+        """Return Q, the squared error at the eyes that a solution is for."""
         return self.detail.get(effort.reduction, 0.0) + self.residual * step_share(effort.steps)
 
     def _learn_change(self, changed: float, distance_m: float, elapsed_s: float) -> None:
@@ -235,10 +238,10 @@ class EffortChooser:
         return best
 
     def mean_error(self, error: float, cost_ms: float, *, shown_error: float, horizon_s: float) -> float:
-        """Return the mean of the displayed error until completion and the solution's error afterwards.
+        """Return the mean over the horizon of `shown_error` until completion and `error` afterwards.
 
-        If the head starts to move before completion, the view is stale until then: with probability c/H, for c/2 on
-        average.
+        If the head starts to move before completion, the view is stale until then. This has probability c/H and lasts
+        c/2 on average.
         """
         waited = min(cost_ms / 1e3 / horizon_s, 0.9)
         return waited * shown_error + (1 - waited) * error + waited**2 / 2 * self.pictures.contrast

@@ -24,7 +24,7 @@ WRITTEN_WITHIN_S = 10.0  # timeout for writing the last refresh's layers
 
 
 class Output(Protocol):
-    """Receives the files of a run."""
+    """Destination of the files that a run writes."""
 
     def refresh(self, line: dict[str, Any]) -> None:
         """Add a line to frames.jsonl."""
@@ -33,7 +33,10 @@ class Output(Protocol):
         """Write the layers that the panels showed at a refresh."""
 
     def light_targets(self, frame: int, *, info: dict[str, Any], drawn: Pictures | None, true: Pictures | None) -> None:
-        """Write the targets of a refresh whose light was kept."""
+        """Write the target pictures of a refresh whose layers were kept.
+
+        drawn: for the eyes that the solution is for; true: for the true eyes.
+        """
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +56,7 @@ class KeptLight:
         self._kept: list[_Kept] = []
 
     def refreshed(self, refresh: Refresh) -> None:
-        """Write the layers of every N-th refresh; in real time, one write at a time."""
+        """Write the layers if this refresh is due; in real time, only one write runs at a time."""
         account = refresh.account
         if not self._every or account.frame % self._every != self._every - 1 or not account.presented:
             return
@@ -71,7 +74,7 @@ class KeptLight:
         kept = _Kept(account, solved_for_ns, self._drawer.shown_content())
         if self._truth.is_recorded:
             self._kept.append(kept)
-        else:  # a live run ends with a signal, and leaves no time to draw afterwards
+        else:  # a live run ends on a signal, which leaves no time to draw afterwards
             self._draw(kept, lambda: None)
 
     def finish(self, stopped: Callable[[], bool]) -> None:

@@ -1,4 +1,4 @@
-"""Measure solutions by samples, on the solver's thread: error, lost detail and rate of change."""
+"""Estimate solutions' error, lost detail and rate of change from samples, on the solver's thread."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ EVERY = 4  # residual and detail are measured for every 4th solution of an effor
 
 
 class SolutionMeter:
-    """Measures solutions, and compares each one's pictures with samples of the previous ones."""
+    """Meter that measures solutions, and compares each one's pictures with samples of the previous ones."""
 
     def __init__(self) -> None:
         self._before: tuple[tuple[int, ...], list[U8], Job, int] | None = None  # raster and window, pictures, job, time
@@ -62,10 +62,10 @@ class SolutionMeter:
 def sampled_light(layers: U8, job: Job, places: F64, *, boxes: bool) -> float | None:
     """Return the squared error of light at sampled pixels of both pictures, or None if no ray counts.
 
-    places: (2, K, 2) as fractions of the picture's size; both rays of a pair fall into the same pixel, so the mean
-    product of their errors is unbiased (docs/contracts.md: light). Rays that miss a panel are ignored. boxes: panel
-    pixels are uniform boxes; False for a coarse solution, which is enlarged bilinearly. layers: (N, h, w, 4) of the
-    job's stack.
+    layers: (N, h, w, 4) of the job's stack. places: (2, K, 2) as fractions of the picture's size. The two rays of a
+    pair fall into the same pixel, so the mean product of their errors is unbiased (docs/contracts.md: light). Rays
+    that miss a panel are ignored. boxes: True if panel pixels are uniform boxes; False for a coarse solution, which is
+    enlarged bilinearly.
     """
     stack, middle = job.stack, job.stack.count // 2
     rasters = [stack.panel(n) for n in range(stack.count)]
@@ -90,7 +90,7 @@ def sampled_light(layers: U8, job: Job, places: F64, *, boxes: bool) -> float | 
 
 
 def lost_detail(picture: U8) -> Mapping[int, float]:
-    """Return the squared error of a picture (h, w, 3 or 4) reduced and enlarged bilinearly, by reduction."""
+    """Return, by reduction, the squared error of a picture (h, w, 3 or 4) that is reduced and enlarged."""
     height = picture.shape[0]
     bands = [picture[first : first + BAND_ROWS, :, :3] for first in (height // 3, 2 * height // 3)]
     return {
@@ -117,7 +117,7 @@ def _halved(picture: U8) -> U8:
 
 
 def _grid(picture: U8) -> F32:
-    """Sample a picture on a coarse grid: (rows, columns, 3) in 0..1."""
+    """Sample a picture on the coarse grid `SAMPLED`; returns (rows, columns, 3) in 0..1."""
     rows, columns = _grid_lines(picture)
     return np.asarray(picture[rows][:, columns, :3] / np.float32(255), np.float32)
 
@@ -145,7 +145,10 @@ def _moved_grid(pictures: Sequence[U8], job: Job, eyes_m: F64) -> list[F32]:
 
 
 def _sampled(layer: U8, x: F64, y: F64, *, boxes: bool) -> tuple[F32, NDArray[np.bool_]]:
-    """Sample a layer (K, 3) at continuous pixels, as boxes or bilinearly (clamped), with a mask of those inside."""
+    """Sample a layer at K continuous pixels; return colours (K, 3) and a mask (K,) of pixels inside it.
+
+    boxes: True to sample pixels as uniform boxes, False for bilinear samples clamped at the edge.
+    """
     height, width = layer.shape[:2]
     inside = (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
     if boxes:

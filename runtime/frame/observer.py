@@ -17,7 +17,7 @@ from runtime.records import RefreshAccount, SensorFrame
 
 
 class RunObserver:
-    """Observer of one run. It receives every sample and refresh, and finally a call of `finish`."""
+    """Observer of one run. It receives every sample and refresh; `finish` ends it."""
 
     def __init__(
         self,
@@ -30,9 +30,10 @@ class RunObserver:
         on_account: Callable[[RefreshAccount], None] | None = None,
         simulated: bool = False,
     ) -> None:
-        """evaluate_every: measure quality at every N-th refresh and the last; 0: only the last; None: never.
+        """Create the observer of a run.
 
-        keep_light: keep the light of every N-th refresh; 0 keeps none.
+        evaluate_every: measure the quality of every N-th refresh and the last; 0: only of the last; None: of none.
+        keep_light: keep the layers of every N-th refresh; 0: of none.
         """
         self._measures, self._simulated, self._on_account = evaluate_every is not None, simulated, on_account
         self.last: Refresh | None = None
@@ -48,7 +49,7 @@ class RunObserver:
 
     @property
     def measured(self) -> dict[str, list[float]]:
-        """Return the sampled refreshes' quality, by name."""
+        """Return the quality figures of the sampled refreshes, by name."""
         return self._sampler.measured
 
     @property
@@ -57,7 +58,7 @@ class RunObserver:
         return self._sampler.live
 
     def measure_only_live(self) -> None:
-        """Measure only live quality, which takes a sixth of the time."""
+        """Measure only live quality from now on, which takes a sixth of the time."""
         self._sampler.only_live = True
 
     def sampled(self, sample: SensorFrame) -> None:
@@ -76,9 +77,9 @@ class RunObserver:
         self._sampler.advance()
 
     def finish(self, stopped: Callable[[], bool] = lambda: False) -> None:
-        """Write and measure what is queued, draw the kept refreshes' pictures, and measure the last refresh.
+        """Write and measure what is queued, draw the kept refreshes' targets, and measure the last refresh.
 
-        In real time the last refresh is measured only if no other was. stopped: returns True after a stop request.
+        In real time, the last refresh is measured only if no other was. stopped: returns True after a stop request.
         """
         self.truth.end()
         self._lines.advance()
@@ -95,5 +96,5 @@ class RunObserver:
         return {"live_db": self._sampler.live_db, "view_error_mm": self._lines.view_error_mm.of("p50", "p95")}
 
     def summary(self) -> dict[str, Any]:
-        """Return the measured part of summary.json; unmeasured figures are null."""
+        """Return the measured part of summary.json, where figures that were not measured are null."""
         return {**self.live(), **self._sampler.summary()}

@@ -9,24 +9,28 @@ from __future__ import annotations
 from runtime.clock import NS_PER_MS
 from runtime.records import FrameTiming
 
-PHASE_GAIN = 0.1  # share of the newest blank's error that corrects the predicted phase
+PHASE_GAIN = 0.1  # share of the newest blank's prediction error by which the phase is corrected
 WORK_GAIN = 0.05  # decay of the work-time estimate (increases use gain 0.5)
-LATE_SHARE = 0.5  # share of a period; a refresh that is later than this moves to the next slot
+LATE_SHARE = 0.5  # a refresh that is late by more than this share of a period moves to the next slot
 MARGIN_GROWTH = 1.5  # factor on the margin after a missed blank
 MARGIN_DECAY = 0.9995  # factor per met blank; if drawing exceeds the minimum margin, one blank in 800 is missed
 MARGIN_MIN_NS = NS_PER_MS
 
 
 class Pacer:
-    """Schedules refreshes on a grid of one period. Slots that can't be met are counted as missed.
+    """Scheduler of refreshes on a grid of one period. Slots that cannot be met count as missed.
 
-    A refresh skipped on purpose (unchanged picture) keeps its slot and does not count as missed.
+    A refresh that is skipped on purpose (unchanged picture) keeps its slot and does not count as missed.
     """
 
     def __init__(self, *, period_ns: int, photon_ns: int, work_ns: int = 0) -> None:
-        """photon_ns: from presenting to mid-light; work_ns: initial estimate of the time from waking to presenting."""
+        """Create a pacer for a display with this refresh period.
+
+        photon_ns: time from presenting to the middle of the display time. work_ns: first estimate of the time from
+        waking to presenting.
+        """
         if period_ns <= 0:
-            raise ValueError("a period must be positive")
+            raise ValueError("period_ns must be positive")
         self.period_ns, self._photon_ns = period_ns, photon_ns
         self._work_ns = float(work_ns)
         self._margin_ns = float(MARGIN_MIN_NS)
@@ -52,9 +56,10 @@ class Pacer:
         return FrameTiming(self._number, target_ns - lead_ns, target_ns, target_ns + self._photon_ns)
 
     def presented(self, timing: FrameTiming, *, woke_ns: int, done_ns: int, blank_ns: int | None = None) -> int:
-        """Record the outcome of a refresh and return the best estimate of its display time.
+        """Record the outcome of a refresh, and return the best estimate of its display time.
 
-        blank_ns: time of its vertical blank; None if the sink does not know it or skipped the swap.
+        woke_ns, done_ns: times at which it woke and had presented. blank_ns: time of its vertical blank; None if the
+        display driver does not know it or skipped the swap.
         """
         if blank_ns is None:
             self._learn_work(done_ns - woke_ns)
@@ -74,7 +79,7 @@ class Pacer:
         return blank_ns + self._photon_ns
 
     def _lead_ns(self) -> int:
-        """Return the time from waking to presenting."""
+        """Return how long before presenting a refresh must wake."""
         return round(self._work_ns + (self._margin_ns if self._has_blanks else 0.0))
 
     def _learn_work(self, work_ns: int) -> None:

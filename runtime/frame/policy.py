@@ -1,7 +1,7 @@
-"""Decide what to solve and show (flat, solved, reused), by pure functions without clock or I/O.
+"""Decide what to solve and show (flat, solved or reused), without a clock or I/O.
 
-Only the rest watch on the sensor's samples (`eyes.rest`) decides whether a head is still. Eyes labelled `rested` are
-solved for once; any other change of position requires a new solution.
+Only the rest watch (`eyes.rest`), which sees the sensor's samples, decides whether a head is still. Eyes labelled
+`rested` are solved for once; any other change of position requires a new solution.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ Kind = Literal["solve", "refine", "flat", "nothing"]
 
 @dataclass(frozen=True, slots=True)
 class SolutionKey:
-    """Inputs of the newest solution or flat picture, to detect when it is outdated."""
+    """Inputs of the newest solution or flat picture, by which it is recognized as outdated."""
 
     state_version: int
     revision: int  # the content's revision
-    eyes_m: F64 | None  # (2, 3) eyes solved for; None: flat picture
+    eyes_m: F64 | None  # (2, 3) eyes that it was solved for; None: a flat picture
     effort: Effort | None = None  # the solution's effort
-    episode: int = 0  # number of the current flat episode; the flat picture keeps one viewpoint throughout it
+    episode: int = 0  # number of the flat episode, in which the flat picture keeps one viewpoint
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,10 @@ class FramePolicy:
         solved: SolutionKey | None,
         flat: SolutionKey | None,
     ) -> Decision:
-        """plan: allowed savings; solved, flat: newest results; revision: the content's at `request.time_ns`."""
+        """Decide what the solver does next.
+
+        plan: savings in force; revision: the content's at `request.time_ns`; solved, flat: keys of the newest results.
+        """
         if request.flat_wanted and not self._flat_wanted:
             self.episode += 1
         self._flat_wanted = request.flat_wanted
@@ -79,7 +82,7 @@ class FramePolicy:
     def _eyes_to_solve(
         self, request: SolveRequest, plan: Plan | None, *, state_version: int, revision: int, solved: SolutionKey | None
     ) -> F64 | None:
-        """Return the eyes to solve for, or None if the newest solution is still valid or no eyes are known."""
+        """Return the eyes (2, 3) to solve for; None if the newest solution is valid or no eyes are known."""
         if request.eyes_m is None:
             return None
         eyes_m = request.eyes_m if plan is None else selected_eyes(request.eyes_m, plan.eyes)
@@ -90,7 +93,7 @@ class FramePolicy:
 
 
 def _is_more(effort: Effort | None, done: Effort | None) -> bool:
-    """Return True if an effort exceeds the effort already spent, by a finer raster or more steps."""
+    """Return True if `effort` exceeds the effort already `done`, by a finer raster or more steps."""
     if effort is None or done is None:
         return False
     return (-effort.reduction, effort.steps) > (-done.reduction, done.steps)
@@ -109,7 +112,7 @@ class Flatness:
     since_ns: int = -1
 
     def toward(self, target: float, *, now_ns: int) -> float:
-        """Move towards 0 or 1 by the time elapsed since the last call, and return the value."""
+        """Move `value` towards 0 or 1 according to the time since the last call, and return it."""
         elapsed_s = 0.0 if self.since_ns < 0 else (now_ns - self.since_ns) / NS_PER_S
         self.since_ns = now_ns
         step = elapsed_s / BLEND_S

@@ -1,8 +1,8 @@
-"""The presenter's loop, which aligns the newest solution to the eyes at every refresh.
+"""Presenter: the loop that aligns the newest solution to the eyes at every refresh.
 
-A refresh receives samples, predicts the eyes, aligns, presents and accounts for the result. The loop waits only for its
-slot. The solver (`solver_host`) runs in parallel and delivers complete solutions. The newest one is aligned to the eyes
-predicted for the refresh's display time.
+At each refresh, the loop takes samples, predicts the eyes, aligns the newest solution to the eyes at the refresh's
+display time, presents it and records the result. It waits only for its slot. The solver (`solver_host`) runs in
+parallel and delivers complete solutions.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Refresh:
 
 
 class Observer(Protocol):
-    """Observer of refreshes, which must return quickly."""
+    """Observer of refreshes. Its methods must return quickly."""
 
     def sampled(self, sample: SensorFrame) -> None:
         """Handle a sample that has arrived."""
@@ -83,7 +83,7 @@ class Observer(Protocol):
 
 
 class RefreshTimes:
-    """Stage times of a refresh. On a simulated clock each stage takes its configured time."""
+    """Stage times of a refresh. On a simulated clock, each stage takes its configured time."""
 
     def __init__(self, clock: Clock, simulated_ms: Mapping[str, float]) -> None:
         self._simulated = clock if isinstance(clock, SimulatedClock) else None
@@ -97,7 +97,7 @@ class RefreshTimes:
         return self._simulated is not None
 
     def lap(self, stage: str) -> None:
-        """Charge the time since the last lap to `stage`."""
+        """Add the time since the last lap to `stage`."""
         self._watch.lap(stage)
         if self._simulated is None:
             self.stage_ms[stage] = self._watch.stage_ms[stage]
@@ -108,13 +108,13 @@ class RefreshTimes:
             self.stage_ms[stage] = cost_ms
 
     def overhead_ms(self) -> float:
-        """Return the refresh's time up to now without presenting and waiting, on the machine's clock."""
+        """Return the time on the machine's clock that the refresh has taken, without presenting and waiting."""
         whole_ms = (perf_counter_ns() - self._start_ns) / NS_PER_MS
         return max(0.0, whole_ms - sum(self._watch.stage_ms.get(stage, 0.0) for stage in ("present", "wait")))
 
 
 class Presenter:
-    """Presents one run. It owns only its counters; the caller owns the parts that it passes in."""
+    """Presenter of one run. It owns only its counters; the caller owns the parts that are passed in."""
 
     def __init__(
         self,
@@ -132,7 +132,10 @@ class Presenter:
         observers: Sequence[Observer] = (),
         fixed: Effort | None = None,
     ) -> None:
-        """stage_ms: duration of each refresh stage on a simulated clock; fixed: effort under `full` (`Aim`)."""
+        """Create a presenter.
+
+        stage_ms: duration of each stage of a refresh on a simulated clock. fixed: as for `Aim`.
+        """
         self.run_cell, self.stack, self.clock = run, stack, clock
         self.pacer, self.samples, self.viewer, self.solver, self.panels = pacer, samples, viewer, solver, panels
         self._stage_ms = stage_ms
@@ -153,7 +156,7 @@ class Presenter:
         self._aligned: tuple[int, bytes, Alignment] | None = None  # solution number, eyes, and their alignment
 
     def run(self, *, frames: int | None = None) -> str:
-        """Refresh until the recording ends, `frames` are done or a stop is requested, and return the reason."""
+        """Refresh until the recording ends, `frames` are done or a stop is requested. Return the reason."""
         reason = ""
         while not reason:
             try:
@@ -167,7 +170,7 @@ class Presenter:
         return reason
 
     def refresh(self) -> RefreshAccount:
-        """Do one refresh and return its account. Raises EndOfRecording and FatalError."""
+        """Run one refresh and return its account. Raises EndOfRecording and FatalError."""
         times = RefreshTimes(self.clock, self._stage_ms)
         timing = self.pacer.predict(self.clock.now_ns())
         self.clock.sleep_until_ns(timing.wake_ns)
@@ -244,7 +247,10 @@ class Presenter:
         return frame, alignment.limited
 
     def _alignment(self, eyes: EyesEstimate, solution: Solution | None) -> Alignment:
-        """Return the alignment to the eyes, or the last one without eyes. It may need no matrices."""
+        """Return the solution's alignment to the eyes or, without eyes, the previous one.
+
+        It has no matrices if the layers can be shown as solved.
+        """
         plan = self.run_cell.state.settings.plan
         if solution is None or solution.solved_for_m is None or not plan.align:
             return Alignment(())
@@ -355,7 +361,7 @@ class Presenter:
     def summary(self, *, simulated: bool = False) -> dict[str, Any]:
         """Return the counted part of summary.json (docs/contracts.md).
 
-        simulated: times are on the run's clock.
+        simulated: True if the run's clock is simulated.
         """
         predictor = self.run_cell.state.predictor
         return {

@@ -1,4 +1,4 @@
-"""Write frames.jsonl and measure the view error, once the true eyes at the display time are known."""
+"""Write frames.jsonl, and measure each view error once the true eyes at the display time are known."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ LINE = (
 
 
 class RefreshLines:
-    """Writes refreshes in order, each as soon as its true eyes are known or known to be missing."""
+    """Writer of refreshes, in order and each as soon as its true eyes are known or known to be missing."""
 
     def __init__(self, truth: TrueEyes, write: Callable[[dict[str, Any]], None] | None) -> None:
         self._truth, self._write = truth, write
         self._waiting: deque[RefreshAccount] = deque()
-        self.view_error_mm = Quantiles()  # over refreshes that show a solution and have known true eyes
+        self.view_error_mm = Quantiles()  # of refreshes that show a solution and have known true eyes
 
     def add(self, account: RefreshAccount) -> None:
         """Queue a refresh."""
@@ -46,7 +46,7 @@ class RefreshLines:
 
 
 def line_of(account: RefreshAccount) -> dict[str, Any]:
-    """Return one line of frames.jsonl (docs/contracts.md)."""
+    """Return a refresh's line of frames.jsonl (docs/contracts.md)."""
     return {name: _plain(getattr(account, name)) for name in LINE}
 
 

@@ -28,7 +28,7 @@ class RunState:
 
 
 class RunCell:
-    """Holds the newest RunState. Any thread may read `state`; read it once per use."""
+    """Holder of the newest RunState. Any thread may read `state`, which should be read once per use."""
 
     def __init__(
         self, settings: Settings, *, calibration: Calibration, content: ContentSource, predictor: Predictor
@@ -39,20 +39,20 @@ class RunCell:
         self.state = RunState(0, settings, calibration, content, predictor)
 
     def next_number(self) -> int:
-        """Return the next number for a solution or flat picture, unique within the run across solvers."""
+        """Return the next number for a solution or flat picture. It is unique within the run."""
         with self._lock:
             return next(self._numbers)
 
     def begin(self) -> int:
-        """Start a new solver generation and return it. The previous one can no longer change the state."""
+        """Begin a new solver generation and return its number. Older ones can no longer change the state."""
         with self._lock:
             self.generation += 1
             return self.generation
 
     def replace(self, generation: int | None = None, **changes: Any) -> RunState:
-        """Replace fields and return the previous state, whose replaced parts the caller must close.
+        """Replace fields of the state and return the old one, whose replaced parts the caller must close.
 
-        generation: the calling solver's. Raises Stopped and changes nothing if a newer one has begun.
+        generation: number of the calling solver's. If a newer one has begun, raises Stopped and changes nothing.
         """
         with self._lock:
             if generation not in (None, self.generation):

@@ -1,9 +1,9 @@
 """Measure the quality of sampled refreshes once their true eyes are known.
 
 Targets are drawn on the solver's thread. In real time, a background thread compares them with the layers, one refresh
-at a time, newest first, and only for a small share of the time, because measuring must not slow down the solutions that
-it measures. A few samples that arrive meanwhile are queued and measured at the end; the others are dropped. On a
-simulated clock every sample is measured, in order.
+at a time and newest first. It uses only a small share of the time, because measuring must not slow down the solutions
+that it measures. A few refreshes that are due meanwhile are queued and measured at the end; the others are dropped. On
+a simulated clock, every due refresh is measured, in order.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F64, State
 from runtime.support.background import MEASURING_NICENESS, BackgroundJob
 
-HELD_MAX = 5  # samples queued in real time, with their layers
-HELD_BYTES = 200 << 20  # limit for their layers: 25 MB each at 1080p on the full raster
+HELD_MAX = 5  # refreshes queued in real time, with their layers
+HELD_BYTES = 200 << 20  # limit for these layers, which have 25 MB each at 1080p on the full raster
 MEASURING_SHARE = 0.1  # share of a real-time run spent on measuring
-MEASURED_WITHIN_S = 60.0  # timeout for measuring the queued samples after the run
+MEASURED_WITHIN_S = 60.0  # timeout for measuring the queued refreshes after the run
 LOOK_S = 0.02  # interval between checks for completion
 DRAWN_WITHIN_S = 10.0  # timeout for drawing the last refresh's targets
 
@@ -43,7 +43,7 @@ class _Sample:
 
 
 class QualitySampler:
-    """Measures every `every`-th refresh (0: none) and, in `finish`, the last one."""
+    """Sampler that measures every `every`-th refresh (0: none) and, in `finish`, the last one."""
 
     def __init__(
         self,
@@ -59,7 +59,7 @@ class QualitySampler:
         self.only_live = False  # measure live quality without the other figures
         self.measured: dict[str, list[float]] = {}  # FIGURES of the sampled refreshes
         self.live: dict[int, float] = {}  # mean squared error at the true eyes, by refresh number
-        self.moment: Moment | None = None  # the newest refresh measured, for stills, sheet and viewer
+        self.moment: Moment | None = None  # newest refresh measured, for stills, contact sheet and viewer page
         self._waiting: deque[_Sample] = deque()
         self._job: BackgroundJob[RefreshQuality] | None = None
         self._job_frame = self._moment_frame = -1
@@ -68,7 +68,7 @@ class QualitySampler:
         self._began_s = self._resumes_s = 0.0  # start of the newest measurement; earliest start of the next
 
     def refreshed(self, refresh: Refresh) -> None:
-        """Queue a refresh if it is due. In real time it may replace a queued one."""
+        """Queue a refresh if it is due. In real time, it may replace one that is queued."""
         is_sample = self._every and refresh.account.frame % self._every == self._every - 1
         if not is_sample or not refresh.account.presented:
             return
@@ -86,7 +86,7 @@ class QualitySampler:
         return bool(self._waiting) or self._drawing or self._job is not None
 
     def drain(self, stopped: Callable[[], bool]) -> None:
-        """Measure the queued samples after the run. Start no more once `stopped` returns True."""
+        """Measure the queued refreshes after the run. None is started once `stopped` returns True."""
         ends_s = time.monotonic() + MEASURED_WITHIN_S
         self._collect()
         while self._is_busy and not stopped() and time.monotonic() < ends_s:
@@ -95,9 +95,9 @@ class QualitySampler:
                 time.sleep(LOOK_S)
 
     def advance(self, *, at_once: bool = False) -> None:
-        """Collect a finished measurement, and start those whose true eyes are now known.
+        """Collect a finished measurement, and start those of refreshes whose true eyes are now known.
 
-        at_once: start the next one now; otherwise, in real time, respect MEASURING_SHARE.
+        at_once: start the next one now, even if that exceeds MEASURING_SHARE in real time.
         """
         self._collect()
         now_s = time.monotonic()
@@ -120,7 +120,7 @@ class QualitySampler:
             self._resumes_s = now_s + (now_s - self._began_s) * (1 / MEASURING_SHARE - 1)
 
     def finish(self, last: Refresh) -> None:
-        """Measure the run's last refresh, which enters the means only if no other was measured."""
+        """Measure the run's last refresh. It enters the means only if no other was measured."""
         queue: SimpleQueue[RefreshTargets | None] = SimpleQueue()
         true_m = self._truth.at(last.account.photon_ns)
         self._drawer.draw(self._wanted(last, true_m), None, queue.put)
@@ -153,7 +153,7 @@ class QualitySampler:
         self._drawer.draw(wanted, sample.content, compare)
 
     def _wanted(self, refresh: Refresh, true_m: F64 | None) -> dict[str, tuple[F64, int]]:
-        """Return the eyes and instants for which to draw targets."""
+        """Return the eyes (2, 3) and instants for which to draw targets, by the targets' names."""
         account, solution = refresh.account, refresh.solution
         wanted: dict[str, tuple[F64, int]] = {}
         if true_m is not None:
@@ -190,11 +190,11 @@ class QualitySampler:
 
     @property
     def live_db(self) -> float | None:
-        """Live quality (docs/contracts.md, Error) over the refreshes measured so far, in dB."""
+        """Live quality in dB (docs/contracts.md, Error) of the refreshes measured so far."""
         return round(psnr_db(float(np.mean(list(self.live.values())))), 3) if self.live else None
 
     def summary(self) -> dict[str, Any]:
-        """Return the measured part of summary.json; unmeasured figures are null."""
+        """Return the measured part of summary.json, where figures that were not measured are null."""
         means = {
             name: round(float(np.mean(self.measured[name])), 3) if name in self.measured else None for name in FIGURES
         }
@@ -203,7 +203,7 @@ class QualitySampler:
 
 
 def has_picture(refresh: Refresh) -> bool:
-    """Return True if the panels show only the solution for two eyes, without the flat picture."""
+    """Return True if the panels show only a solution for two eyes, without the flat picture."""
     solution = refresh.solution
     return (
         refresh.account.presented

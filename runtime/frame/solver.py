@@ -1,4 +1,4 @@
-"""The solver draws content and computes layers for the predicted eyes, on its GL context's thread."""
+"""Solver: draw content and compute layers for the predicted eyes, on the thread of its GL context."""
 
 from __future__ import annotations
 
@@ -32,18 +32,22 @@ FLAT_EYE_M = (0.7, 0.0, 0.0)  # viewpoint of the flat picture before any viewer 
 
 @dataclass(frozen=True, slots=True)
 class SolverUpdate:
-    """Results of one request. In `news`, the newest results so far."""
+    """Results of one request or, as `SolverHost.news`, the newest results so far."""
 
-    solution: Solution | None = None  # new solution for two eyes
+    solution: Solution | None = None  # a new solution for two eyes
     flat: Solution | None = None  # a new flat picture
     missing: dict[str, str] = field(default_factory=dict)  # failed parts (content, model), with the reason
 
 
 class Solver:
-    """Computes one solution or flat picture per step, from the run's state at the start of the step."""
+    """Solver that computes one solution or flat picture per step, from the run's state when it begins."""
 
     def __init__(self, run: RunCell, stack: PanelStack, *, timed: bool = True) -> None:
-        """timed: apply `model.budget_ms`; False on a simulated clock, where results must not depend on the machine."""
+        """Create a solver for a run.
+
+        timed: True to apply `model.budget_ms`. It is False on a simulated clock, so that results do not depend on the
+        machine.
+        """
         self.run, self.stack, self._timed = run, stack, timed
         self.measured = Measured()  # measured times and errors of the plan's items
         self.plan: Plan | None = None
@@ -52,16 +56,17 @@ class Solver:
         self._policy = FramePolicy()
         self._solved: SolutionKey | None = None
         self._flat: SolutionKey | None = None
-        self._windows: dict[int, SolveWindow | None] = {}  # windows that the newest solutions covered, by reduction
+        self._windows: dict[int, SolveWindow | None] = {}  # windows of the newest solutions, by reduction
         self._kept: Job | None = None  # the last job with copies of its pictures; None: pictures must be drawn
         self._meter = SolutionMeter()
         self._middle_m: F64 = np.array(FLAT_EYE_M)
         self._missing: dict[str, str] = {}
 
     def step(self, request: SolveRequest, state: RunState | None = None) -> SolverUpdate:
-        """Carry out a request. Failed parts are named in the result; earlier results stay valid.
+        """Carry out a request. Failed parts are named in the result; earlier results remain valid.
 
-        state: the state to draw and solve with; None for the newest. Raises ContextLost if this solver is unusable.
+        state: state with which to draw and solve; None: the newest. Raises ContextLost if this solver has become
+        unusable.
         """
         state = state or self.run.state
         self._replan(state, request.eyes_m)
@@ -136,7 +141,7 @@ class Solver:
         return SolverUpdate(solution=solution)
 
     def _drawn(self, state: RunState, request: SolveRequest, eyes_m: F64, reduction: int) -> Job:
-        """Draw the targets. A resting head's are kept, so that its solution can be refined."""
+        """Draw the targets. Those of a resting head are kept, so that its solution can be refined."""
         job = drawn_job(
             state.predictor,
             state.content,
@@ -175,7 +180,7 @@ class Solver:
         return SolverUpdate(flat=flat, missing=missing)
 
     def plan_items(self, measured: Measured | None = None) -> tuple[PlanItem, ...]:
-        """Return the savings in force with their known times and errors. Thread-safe."""
+        """Return the savings in force, with their times and errors if measured. Thread-safe."""
         state = self.run.state
         return self._plan_of(state, self._seeing, measured or self.measured).items
 

@@ -1,4 +1,4 @@
-"""The presenter's interface to a solver, and its implementation for a simulated clock."""
+"""Interface of the presenter to a solver, and its implementation for a simulated clock."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from runtime.records import SolveRequest
 
 FIRST_REQUEST = SolveRequest(0, None, "none", 0.0, flat_wanted=True)  # before the first refresh: flat picture
 
-SHOWN_STAGES = ("render", "prepare", "inference", "finish")  # stages in frames.jsonl; steps count as `finish`
+SHOWN_STAGES = ("render", "prepare", "inference", "finish")  # stages in frames.jsonl, where steps belong to `finish`
 
 
 class SolverParts(Protocol):
@@ -24,13 +24,13 @@ class SolverParts(Protocol):
         """Carry out one request."""
 
     def simulated_costs(self) -> Costs:
-        """Return the current costs of solutions on a simulated clock."""
+        """Return the costs of solutions on a simulated clock, under the current settings."""
 
     def first_costs(self) -> Mapping[int, Mapping[str, float]]:
         """Return the stage times in milliseconds, by reduction, measured while warming up."""
 
     def close(self) -> None:
-        """Release everything that no newer solver uses, on the thread that created it."""
+        """Release everything that no newer solver uses. Called on the thread that created it."""
 
 
 Task = Callable[[SolverParts], bool]  # called between steps on the solver's thread until it returns True
@@ -46,11 +46,11 @@ class SolverHost(ABC):
 
     @abstractmethod
     def post(self, request: SolveRequest) -> None:
-        """Request a solution, replacing any request not yet begun."""
+        """Request a solution. The request replaces an earlier one that has not begun."""
 
     @abstractmethod
     def news(self) -> SolverUpdate:
-        """Return the newest complete solution and flat picture, and the failures."""
+        """Return the newest complete solution and flat picture, and the failed parts."""
 
     @abstractmethod
     def do(self, task: Task) -> None:
@@ -62,12 +62,12 @@ class SolverHost(ABC):
 
 
 def taken_in(news: SolverUpdate, step: SolverUpdate) -> SolverUpdate:
-    """Return the news, updated with a step's results and failures."""
+    """Return `news` updated with the results and failures of a step."""
     return SolverUpdate(step.solution or news.solution, step.flat or news.flat, step.missing)
 
 
 class SimulatedSolver(SolverHost):
-    """Solves immediately, and publishes the result once the simulated clock has advanced by its cost."""
+    """Solver that computes at once and publishes a result when the simulated clock has passed its cost."""
 
     def __init__(self, parts: SolverParts, clock: Clock) -> None:
         self._parts, self._clock = parts, clock

@@ -23,14 +23,14 @@ from runtime.support.untrusted_input import LIMITS
 
 log = logging.getLogger("phasestack.solver")
 
-LATE_S = 0.5  # a longer step is late; a single step of twice this is a fault
-ABANDON_S = 10.0  # a step that takes longer is abandoned and a new solver started
-# Starting a solver may take `LIMITS.start_s`; a task, which loads content, `LIMITS.load_s`.
+LATE_S = 0.5  # a longer step is late; a single step that takes twice this is a fault
+ABANDON_S = 10.0  # a step that takes longer is abandoned, and a new solver is started
+# Starting a solver may take `LIMITS.start_s`, and a task, which loads content, `LIMITS.load_s`.
 IDLE_S = 0.02  # interval between checks for tasks while requests are absent
 USUAL_S = 0.2  # when stopping, a running step gets this long to finish
-LATE_STEPS = 3  # this many consecutive late steps raise a fault, this many on time clear it
-ANSWER_STEP_MS = 500  # resolution of the reported time without a response
-ABANDONED_MAX = 4  # hung threads; with more, no new solver is started
+LATE_STEPS = 3  # this many consecutive late steps raise a fault; this many on time clear it
+ANSWER_STEP_MS = 500  # resolution of the reported time without an answer
+ABANDONED_MAX = 4  # with this many hung threads, no new solver is started
 
 
 class _Attempt:
@@ -47,16 +47,20 @@ class _Attempt:
         self.thread: threading.Thread | None = None
 
     def leave(self) -> None:
-        """Abandon a step between two drawing calls, because a drawing thread keeps taking the GIL."""
+        """Make the thread give up between two drawing calls, because drawing keeps taking the GIL."""
         if self.thread is not None and self.thread is not threading.current_thread():
             abandon(self.thread)
 
 
 class SolverThread(SolverHost):
-    """Runs a solver in parallel with the presenter. `post`, `news` and `watch` never wait."""
+    """Host that runs a solver in parallel with the presenter. `post`, `news` and `watch` never wait."""
 
     def __init__(self, make: Callable[[], SolverParts], clock: Clock) -> None:
-        """make: creates a solver with its own GL context on the calling thread; called again after a hang."""
+        """Start a solver on a new thread.
+
+        make: function that creates a solver, with its own GL context, on the thread that calls it. It is called again
+        after a hang.
+        """
         self._make, self._clock = make, clock
         self._late_ns, self._abandon_ns = round(LATE_S * NS_PER_S), round(ABANDON_S * NS_PER_S)
         self._lock = threading.Condition()
@@ -71,9 +75,10 @@ class SolverThread(SolverHost):
         self._attempt = self._begin(1)
 
     def wait_ready(self, go_on: Callable[[], bool] = lambda: True, *, max_s: float = math.inf) -> None:
-        """Wait until the solver accepts requests. go_on: polled; returns False to stop waiting.
+        """Wait until the solver accepts requests.
 
-        Raises the error that prevented the start, and FatalError after `max_s`.
+        go_on: function that is polled and returns False to stop waiting. Raises the error that prevented the start,
+        or FatalError after `max_s`.
         """
         begun_ns = self._clock.now_ns()
         while not self._attempt.ready.wait(0.1):
@@ -104,7 +109,7 @@ class SolverThread(SolverHost):
         self._tasks.put(task)
 
     def close(self, timeout_s: float = 1.0) -> None:
-        """Stop, but do not wait for a solver that is still starting (`commands.guard` ends the process)."""
+        """Stop. A solver that is still starting is not waited for (`commands.guard` ends the process)."""
         self._closing.set()
         with self._lock:
             self._lock.notify_all()
@@ -118,7 +123,7 @@ class SolverThread(SolverHost):
             thread.join(patience_s(timeout_s))
 
     def _late_reason(self) -> str:
-        """Return why the solver is unavailable or late, or "" if it is fine. Replace a hung thread."""
+        """Return why the solver is unavailable or late, otherwise "". Replaces a hung thread."""
         attempt = self._attempt
         busy_ns = self._clock.now_ns() - attempt.busy_since_ns if attempt.busy_since_ns else 0
         if attempt.error is not None:
@@ -195,7 +200,7 @@ class SolverThread(SolverHost):
             attempt.error, attempt.busy_since_ns = error.with_traceback(None), self._clock.now_ns()
         except ThreadAbandoned:
             raise
-        except BaseException as error:  # not an expected failure, but a bug here or in a library
+        except BaseException as error:  # not an expected failure but a bug, here or in a library
             log.exception("solver")
             attempt.error, attempt.busy_since_ns = error.with_traceback(None), self._clock.now_ns()
         finally:
@@ -204,7 +209,7 @@ class SolverThread(SolverHost):
                 attempt.error = None
 
     def _adopt_model(self, attempt: _Attempt, parts: SolverParts) -> None:
-        """Start new measurements if a task has replaced the model, whose rasters and costs may differ."""
+        """Discard measured costs if a task has replaced the model, whose rasters and costs may differ."""
         assert attempt.costs is not None
         if (first := parts.first_costs()) != attempt.costs.first:
             attempt.costs = CostBook(first)
@@ -228,14 +233,14 @@ class SolverThread(SolverHost):
             self._costs = attempt.costs.costs()
 
     def _publish(self, attempt: _Attempt, step: SolverUpdate) -> bool:
-        """Add a step's result to the news; return False if this attempt has been abandoned."""
+        """Add the results of a step to the news. Return False if this attempt has been abandoned."""
         with self._lock:
             if not attempt.abandoned.is_set():
                 self._news = taken_in(self._news, step)
             return not attempt.abandoned.is_set()
 
     def _do_tasks(self, attempt: _Attempt, parts: SolverParts) -> None:
-        """Run each task once; unfinished ones are queued again for after the next step."""
+        """Run each task once. Unfinished tasks are queued again, to run after the next step."""
         for _ in range(self._tasks.qsize()):
             if attempt.abandoned.is_set():
                 return

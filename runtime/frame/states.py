@@ -16,14 +16,14 @@ PARTS: tuple[Part, ...] = ("sensor", "content", "model", "panel")
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """Conditions observed in one turn of the loop."""
+    """Conditions observed at one refresh."""
 
     eyes: EyesLabel
     missing: dict[Part, str]  # failed parts, with a short reason
     presented: bool  # True once any frame has been on the panels
     flat_wanted: bool = False  # the operator asked for the 2D picture
     stopping: str = ""  # reason for stopping; empty: not stopping
-    limited: str = ""  # why the alignment to the eyes is at its limit; empty: it is not
+    limited: str = ""  # why the alignment to the eyes is at its limit; empty if it is not
     late: str = ""  # message if there are fewer refreshes than the display's rate requires; otherwise empty
     paused: bool = False  # the operator froze the picture; it is still aligned to the eyes
 
@@ -52,7 +52,7 @@ def judge(conditions: Conditions) -> tuple[State, str]:
 
 
 class StateMachine:
-    """The daemon's current state, and the time spent in each state."""
+    """Current state of the daemon, and the time spent in each state."""
 
     def __init__(self, *, now_ns: int) -> None:
         self.state = State.STARTING
@@ -63,11 +63,11 @@ class StateMachine:
 
     @property
     def name(self) -> str:
-        """The state as people read it: `tracking`, `degraded: sensor, panel`."""
+        """Name of the state for people, such as `tracking` or `degraded: sensor, panel`."""
         return f"{self.state}: {', '.join(self.missing)}" if self.state is State.DEGRADED else str(self.state)
 
     def update(self, conditions: Conditions, *, now_ns: int) -> bool:
-        """Update from one turn. Returns True if the state or the missing parts changed. Stopping is final."""
+        """Update the state. Return True if it or its missing parts have changed. Stopping is final."""
         self._held_ns[self.state] += now_ns - self._counted_ns
         self._counted_ns = now_ns
         if self.state is State.STOPPING:
@@ -79,20 +79,20 @@ class StateMachine:
         return self.name != before
 
     def seconds(self, *, now_ns: int) -> dict[str, float]:
-        """Return the seconds spent so far in each state that was ever entered."""
+        """Return the seconds spent so far in each state that has been entered."""
         durations_ns = dict(self._held_ns)
         durations_ns[self.state] += now_ns - self._counted_ns
         return {str(state): held_ns / NS_PER_S for state, held_ns in durations_ns.items() if held_ns > 0}
 
 
 WINDOW_NS = NS_PER_S
-LATE_SHARE = 0.9  # share of a second's refreshes below which the display is late
-WELL_SHARE = 0.95  # share from which it is on time again
-REFRESHES_MAX = 1024  # most refreshes counted in the window
+LATE_SHARE = 0.9  # the display is late below this share of a second's refreshes
+WELL_SHARE = 0.95  # it is on time again from this share on
+REFRESHES_MAX = 1024  # largest number of refreshes counted in the window
 
 
 class Lateness:
-    """Detects a full second in which the window has too few refreshes. Updated once per refresh."""
+    """Detector of late refreshes: too few in the last second, for a full second."""
 
     def __init__(self, period_ns: int) -> None:
         self._wanted = WINDOW_NS / period_ns
@@ -103,7 +103,10 @@ class Lateness:
         self._told_ns = 0
 
     def update(self, *, presented: bool, now_ns: int) -> str:
-        """Return "" if on time, otherwise `late: 38 of 60 refreshes a second`, updated once a second."""
+        """Count a refresh. Return "" if on time, otherwise `late: 38 of 60 refreshes a second`.
+
+        The message is updated once a second.
+        """
         if self._begun_ns is None:
             self._begun_ns = now_ns
         if presented:

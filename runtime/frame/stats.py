@@ -1,4 +1,4 @@
-"""Statistics of a run in bounded memory, on the run's clock (`overhead_ms` on the machine's)."""
+"""Statistics of a run in bounded memory. Times are on the run's clock (`overhead_ms`: the machine's)."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from runtime.evaluation.refresh_quality import view_error_mm
 from runtime.frame.solver_host import SHOWN_STAGES
 from runtime.records import RefreshAccount, State
 
-WINDOW = 8192  # most values kept for a quantile
+WINDOW = 8192  # largest number of values kept for a quantile
 NOW_NS = NS_PER_S  # window of the present rates: the last second
-NOW_KEPT = 1024  # most refreshes in that window
+NOW_KEPT = 1024  # largest number of refreshes in that window
 STAGES = ("sensor", "track", *SHOWN_STAGES, "present", "wait")
 OVERHEAD_STAGES = ("sensor", "track")
 
 
 class Quantiles:
-    """Quantiles over a run. Beyond `size` values, every second one is dropped; the maximum is exact."""
+    """Quantiles over a run. If `size` values are kept, every second one is dropped; the maximum is exact."""
 
     def __init__(self, size: int = WINDOW) -> None:
         self._values = np.zeros(size)
@@ -64,7 +64,10 @@ class RunStats:
         self._recent: deque[tuple[int, bool, bool]] = deque(maxlen=NOW_KEPT)  # time, presented, shows a new solution
 
     def add(self, account: RefreshAccount, *, overhead_ms: float, missed_blanks: int = 0) -> None:
-        """Count a refresh. overhead_ms: its time on the machine's clock, without presenting and waiting."""
+        """Count a refresh.
+
+        overhead_ms: time that it took on the machine's clock, without presenting and waiting.
+        """
         now_ns, ran = account.present_ns, account.inference == "ran"
         self._first_ns = now_ns if self._first_ns < 0 else self._first_ns
         if self._effort is not None:
@@ -102,13 +105,13 @@ class RunStats:
         return (self._last_ns - self._first_ns) / NS_PER_S if self.frames else 0.0
 
     def reuse_saves_ms(self) -> float | None:
-        """Return the solver time that a refresh saves by reusing a solution; None before the first reuse."""
+        """Return the solver time in ms saved by a refresh that reuses a solution; None before the first."""
         medians = [self._stages[stage].of("p50") for stage in SHOWN_STAGES]
         known = [median["p50"] for median in medians if median is not None]
         return sum(known) if known and self.presented > self.solutions > 0 else None
 
     def rates_now(self) -> dict[str, float | None]:
-        """Return refreshes and solutions per second over the last second; None with fewer than two refreshes."""
+        """Return the present refreshes and solutions per second, or None with fewer than two refreshes."""
         newest_first = reversed(tuple(self._recent))
         recent = [*takewhile(lambda entry: entry[0] > self._last_ns - NOW_NS, newest_first)][::-1]
         if len(recent) < 2:
@@ -124,7 +127,7 @@ class RunStats:
         self.faults[part] = self.faults.get(part, 0) + 1
 
     def summary(self, *, stale_inputs: int, simulated: bool = False) -> dict[str, Any]:
-        """Return the counted part of summary.json (docs/contracts.md); unmeasured figures are null."""
+        """Return the counted part of summary.json (docs/contracts.md). Figures not measured are null."""
         seconds = self.seconds()
         return {
             "frames": self.frames,

@@ -13,7 +13,7 @@ from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import retina_pictures
 from runtime.records import F64
 
-Wanted = Mapping[str, tuple[F64, int]]  # for each field of `RefreshTargets`: eyes (2, 3), frame `stack`, and an instant
+Wanted = Mapping[str, tuple[F64, int]]  # by field of `RefreshTargets`: eyes (2, 3), frame `stack`, and an instant
 
 
 class TargetDrawer:
@@ -27,18 +27,19 @@ class TargetDrawer:
         fov_deg: Callable[[], float],
         shown_content: Callable[[], object | None] = lambda: None,
     ) -> None:
-        """fov_deg: returns the targets' current field of view, which a reload may change.
+        """Create a drawer of targets.
 
-        shown_content: returns the run's current content, or None if it is never replaced.
+        fov_deg: function that returns the targets' present field of view, which a reload may change. shown_content:
+        function that returns the run's present content, or None if it is never replaced.
         """
         self._solver, self._stack, self.fov_deg = solver, stack, fov_deg
         self.shown_content = shown_content
 
     def draw(self, wanted: Wanted, content: object | None, then: Callable[[RefreshTargets | None], None]) -> None:
-        """Draw the pictures and pass them to `then`, on the solver's thread.
+        """Draw the wanted pictures and pass them to `then`, on the solver's thread.
 
-        content: the run's content at that refresh; None: the current one. `then` gets None if drawing failed (the
-        state gives the reason) or the content has been replaced.
+        content: the run's content at that refresh; None: the present one. `then` receives None if drawing failed (the
+        run's state gives the reason) or the content has been replaced.
         """
 
         def task(parts: Any) -> bool:

@@ -20,7 +20,7 @@ class TrueEyes:
 
     @property
     def is_recorded(self) -> bool:
-        """True once a sample has contained true eyes, which a live sensor never does."""
+        """True once a sample has contained true eyes. Samples of live sensors never do."""
         return bool(self._known)
 
     def add(self, capture_ns: int, eyes_m: F64) -> None:

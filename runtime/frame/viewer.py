@@ -1,4 +1,4 @@
-"""The viewer's eyes at any instant, from samples by calibration, tracking and rest detection."""
+"""Estimate the viewer's eyes at any instant: calibrate samples, track them and detect rest."""
 
 from __future__ import annotations
 
@@ -22,12 +22,15 @@ IN_FRONT_M = 0.01  # eyes nearer to the front panel than this, or behind it, are
 
 
 class Viewer:
-    """The viewer's eyes in the `stack` frame. Single-threaded; never reads a clock."""
+    """Viewer, whose eyes are estimated in the `stack` frame. Single-threaded; never reads a clock."""
 
     def __init__(
         self, settings: Settings, calibration: Calibration, *, front_m: float, in_stack_frame: bool = False
     ) -> None:
-        """front_m: x of the front panel; in_stack_frame: the sensor's points need no calibration."""
+        """Create a viewer who has not been seen.
+
+        front_m: x of the front panel. in_stack_frame: True if the sensor's points are already in frame `stack`.
+        """
         self._settings, self._calibration = settings, calibration
         self._nearest_m, self._in_stack_frame = front_m + IN_FRONT_M, in_stack_frame
         self._tracker = self._new_tracker()
@@ -51,12 +54,12 @@ class Viewer:
 
     @property
     def warning(self) -> str:
-        """Why most recent samples are implausible (eyes swapped, millimetres, ...); empty if they are not."""
+        """Reason why most recent samples are implausible (eyes swapped, millimetres, ...), or ""."""
         return self._refusals.warning
 
     @property
     def refused(self) -> Mapping[str, int]:
-        """Return the number of rejected samples by reason."""
+        """Return the number of refused samples by reason."""
         return self._refusals.counts
 
     @property
@@ -67,7 +70,10 @@ class Viewer:
         return round((len(self._captures_ns) - 1) * NS_PER_S / (self._captures_ns[-1] - self._captures_ns[0]), 2)
 
     def take(self, frame: SensorFrame, *, serial: str) -> None:
-        """Process a sample. If the tracker rejects it, it is only counted."""
+        """Process a sample. If the tracker refuses it, it is only counted.
+
+        serial: serial number of the sensor.
+        """
         self._captures_ns.append(frame.capture_ns)
         points = frame.eyes
         if points is not None and not self._in_stack_frame:
@@ -92,7 +98,7 @@ class Viewer:
         return self._served(self._tracker.ahead(time_ns))
 
     def _served(self, eyes: EyesEstimate) -> EyesEstimate:
-        """Return a resting head's fixed position, no eyes if they are inside the panels, else `eyes`."""
+        """Return `eyes`, with the fixed position of a resting head, or without eyes inside the panels."""
         if eyes.eyes_m is None:
             return eyes
         if self._rest is not None and self._rest.place is not None:

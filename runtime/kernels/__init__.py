@@ -1,7 +1,7 @@
-"""The compiled C++ loops, called through `ctypes`, which releases the GIL meanwhile.
+"""Compiled C++ loops, called through `ctypes`, which releases the GIL meanwhile.
 
-The structures below mirror those of the C++ files field by field; `KernelImage` is `Image` there, `KernelView` is
-`View` and `ErrorSum` is `Result`. `library` compares their sizes and the limit on ray sets.
+The structures below mirror those of the C++ files field by field. `KernelImage` is called `Image` there, `KernelView`
+`View`, and `ErrorSum` `Result`. `library` compares their sizes and the limit on ray sets.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 MAX_PANELS = 5
 MAX_SETS = 4  # sets of rays: both eyes at two head positions
-MARGIN = 64  # elements after an image's rows that the loops may touch
+MARGIN = 64  # elements after an image's rows that the loops may read or overwrite
 SUBCODE = 16  # fixed point: sixteenths of an 8-bit panel code
-FULL = 255 * SUBCODE  # a panel's whole range, a quarter turn
+FULL = 255 * SUBCODE  # a panel's whole range, which is a quarter turn of polarization
 EDGE_PX = 4  # pixels outside an image that may be sampled
-EDGE_CLAMP_PX = 2  # pixels outside a picture to which its border ray bundles are extended (clamp to edge)
+EDGE_CLAMP_PX = 2  # the values of a picture's border rays are repeated for this many pixels outside it
 TABLE_STEPS = 16  # table entries per code value, for the intensities of bilinear rays
 _AGAIN = "install phasestack again (it needs g++)"
 _pointer, _int, _long, _float, _double = (
@@ -35,7 +35,7 @@ class KernelImage(ctypes.Structure):
 
     @classmethod
     def of(cls, array: NDArray[Any], *, rows: int, width: int) -> KernelImage:
-        """Return part of an int16 array (rows, elements), which the caller must keep alive."""
+        """Return an image of part of an int16 array (rows, elements), which the caller must keep alive."""
         return cls(array.ctypes.data, array.strides[0] // array.itemsize, rows, width, len(array))
 
 
@@ -57,7 +57,7 @@ class Problem(ctypes.Structure):
 
 
 class Warp(ctypes.Structure):
-    """Map from a raster to an image, and how far (below `EDGE_PX`) its edge is clamped."""
+    """Map from a raster to an image, and the distance (below `EDGE_PX`) to which its edge is repeated."""
 
     _fields_ = (
         ("image_from_raster", _double * 9), ("image_bend", _double), ("image_middle", _double),
@@ -90,7 +90,7 @@ COMPILED = {
 
 @cache
 def library() -> Any:
-    """Return the compiled library. Raises ImportError if it is missing, or was built from other sources."""
+    """Return the compiled library. Raises ImportError if it is missing or from another version."""
     built = Path(__file__).with_name("compiled" + EXTENSION_SUFFIXES[0])  # a file built for another Python may be stale
     if not built.exists():
         raise ImportError(f"runtime.kernels is not compiled for this Python: {_AGAIN}")
