@@ -1,1 +1,1 @@
-"""Eye finder, which locates eyes in pictures, and tracker, which predicts them in the stack frame."""
+"""Eye finder, which locates eyes in pictures, and tracker, which predicts them in frame `stack`."""

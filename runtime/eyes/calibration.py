@@ -1,8 +1,8 @@
-"""Calibration from the sensor frame to the stack frame: loading, checks, use and error estimate.
+"""Calibration from the sensor frame to the stack frame: load, check and apply it, estimate its error.
 
-Its seven parameters are a rotation vector (3, rad, about the axes of `stack`), a shift (3, m) and a log scale (1),
-about a pivot w0 (the pairs' centre, in `stack`), which makes them nearly uncorrelated. A small change d moves a point
-w by  d_rot × (w - w0) + d_shift + d_scale·(w - w0).
+It has seven parameters: a rotation vector (3, rad, about the axes of `stack`), a shift (3, m) and a log scale (1). They
+refer to a pivot w0 in `stack`, the centre of the calibration's point pairs, which makes them nearly uncorrelated. A
+small change d of the parameters moves a point w by d_rot × (w - w0) + d_shift + d_scale·(w - w0).
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from runtime.errors import InputError
 from runtime.records import F64, EyePoints
 
 DEMO_FILE = Path(__file__).parent / "data" / "demo-calibration.toml"
-SIMILARITY_TOLERANCE = 1e-3  # relative; accepts matrices with four digits, but not sheared ones
+SIMILARITY_TOLERANCE = 1e-3  # relative; accepts matrices rounded to four digits, but not sheared ones
 PLAUSIBLE_SCALE = (0.8, 1.25)  # scale between two frames in metres
-SCALE = (5e-4, 2e3)  # allows for millimetres in one of the two point sets; anything outside is an error
-NEAR_M, MAX_DISTANCE_M = 5.0, 20.0  # distance from sensor to display above which to warn or to refuse
+SCALE = (5e-4, 2e3)  # scales that may result from millimetres in one of the two point sets; others are errors
+NEAR_M, MAX_DISTANCE_M = 5.0, 20.0  # distances from the sensor to the display above which to warn and to refuse
 
 Number = Annotated[float, Field(strict=True, ge=-MOST, le=MOST)]  # refuses "1.0" and true
 Row4 = tuple[Number, Number, Number, Number]
@@ -58,7 +58,7 @@ class CalibrationFile(Lenient):
     units: Literal["m"] = "m"
     method: str = ""
     date: str | datetime.date = ""
-    sensor_serial: str = ""  # empty for any device
+    sensor_serial: str = ""  # empty: any device
     condition: Annotated[float, Field(ge=0)] | None = None
     residuals: Residuals | None = None
     covariance: CovarianceTable | None = None
@@ -66,7 +66,7 @@ class CalibrationFile(Lenient):
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """Similarity from the sensor frame to the stack frame, with its source and warnings."""
+    """Similarity transform from the sensor frame to the stack frame, with its source and warnings."""
 
     stack_from_sensor: F64  # (4, 4) [sR t; 0 1]
     file: CalibrationFile
@@ -93,7 +93,10 @@ class Calibration:
         )
 
     def position_error_m(self, stack_m: ArrayLike) -> F64 | None:
-        """RMS error in metres that the calibration causes at points (..., 3) in the stack frame, if known."""
+        """Return the RMS error in metres due to the calibration at points (..., 3), frame `stack`.
+
+        The result is None if the file states no covariance.
+        """
         if self.file.covariance is None:
             return None
         jacobian = position_jacobian(stack_m, pivot_m=self.file.covariance.pivot_m)
@@ -102,7 +105,7 @@ class Calibration:
         return error_m
 
     def serial_warning(self, serial: str) -> str:
-        """Return a warning in one line if this is not the calibrated sensor, otherwise an empty string."""
+        """Return a one-line warning if `serial` is not that of the calibrated sensor, otherwise ""."""
         calibrated = self.file.sensor_serial
         if not calibrated or serial == calibrated:
             return ""
@@ -111,7 +114,7 @@ class Calibration:
 
 
 def position_jacobian(stack_m: ArrayLike, *, pivot_m: ArrayLike) -> F64:
-    """Return the derivative (..., 3, 7) of points in the stack frame by the seven parameters."""
+    """Return the derivative (..., 3, 7) of points (..., 3), frame `stack`, by the seven parameters."""
     arm = np.asarray(stack_m, dtype=np.float64) - np.asarray(pivot_m, dtype=np.float64)
     jacobian = np.zeros((*arm.shape, 7))
     jacobian[..., 0, 1], jacobian[..., 0, 2] = arm[..., 2], -arm[..., 1]
@@ -123,7 +126,7 @@ def position_jacobian(stack_m: ArrayLike, *, pivot_m: ArrayLike) -> F64:
 
 
 def similarity_defect(matrix: ArrayLike) -> float:
-    """Return how far the upper left 3x3 is from a scaled rotation: max |A^T A / s² - I|.
+    """Return how far a matrix's upper left 3x3 part A is from a scaled rotation: max |A^T A / s² - I|.
 
     This is 0 for an exact similarity, even a reflected one, and infinite for a zero matrix.
     """
@@ -136,9 +139,9 @@ def similarity_defect(matrix: ArrayLike) -> float:
 
 
 def check_similarity(matrix: F64, *, source: str | Path) -> None:
-    """Raise InputError that names the field unless the 4x4 matrix is a plausible similarity.
+    """Raise InputError, which names the field, unless a 4x4 matrix is a plausible similarity.
 
-    The determinant must be positive, the scale within `SCALE`, and the sensor within `MAX_DISTANCE_M`.
+    Its determinant must be positive, its scale in the range `SCALE`, and the sensor within `MAX_DISTANCE_M`.
     """
     name = "stack_from_sensor"
     if not np.abs(matrix).max() <= MOST:
@@ -180,11 +183,11 @@ def _warnings(matrix: F64, source: str) -> tuple[str, ...]:
 
 
 def load_calibration(path: Path | None) -> Calibration:
-    """Load and check a calibration file, or the demo recording's if `path` is None.
+    """Load and check a calibration file, or that of the demo recording if `path` is None.
 
-    Raises InputError that names file and field if the file is missing or malformed, or if its matrix has the wrong
-    shape, is not finite, is no similarity or is mirrored. A scale far from 1 is only a warning
-    (`Calibration.warnings`).
+    Raises InputError, which names file and field, if the file is missing or malformed, or if its matrix has the wrong
+    shape, is not finite, is not a similarity or is mirrored. A scale far from 1 only adds a line to
+    `Calibration.warnings`.
     """
     file = DEMO_FILE if path is None else path
     table = read_table(file)
@@ -198,7 +201,7 @@ def load_calibration(path: Path | None) -> Calibration:
 
 
 def demo_stack_from_sensor() -> F64:
-    """Return the 4x4 transform of the demo's sensor, which faces +x and is tilted 10 degrees down."""
+    """Return the 4x4 calibration of the demo's sensor, which faces +x and is tilted down by 10 degrees."""
     return load_calibration(None).stack_from_sensor
 
 

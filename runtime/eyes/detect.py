@@ -1,4 +1,4 @@
-"""Eye positions and their covariance from pictures, via the viewer's pupils and distance."""
+"""Find eye positions and their covariance in pictures, from the viewer's pupils and distance."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from runtime.eyes.face_depth import EyeDepths, FaceDepth
 from runtime.eyes.pupils import SIDES, PupilFinder, Pupils
 from runtime.records import F64, EyePoints, Intrinsics, SensorFrame
 
-# Standard deviation of the midpoint relative to one pupil. Sideways errors of both pupils are nearly independent, but
-# vertical errors are shared.
+# Standard deviation of the midpoint relative to that of one pupil. The sideways errors of the two pupils are nearly
+# independent, but their vertical errors are the same.
 MIDDLE_SIDEWAYS, MIDDLE_UP = 0.55, 1.1
 RANGE_MAX_M = 4.0  # faces farther away are not viewers
-LOCK_NS = NS_PER_S  # a viewer unseen for this long is replaced; when another person walks past, gaps are shorter
-FILLED_IN_CONFIDENCE = 0.4  # confidence of a hidden eye
+LOCK_NS = NS_PER_S  # a viewer unseen for this long is replaced; another person who walks past hides them more briefly
+FILLED_IN_CONFIDENCE = 0.4  # confidence of a hidden eye that is filled in
 
 log = logging.getLogger(__name__)
 
@@ -30,7 +30,7 @@ class EyeFinder:
     """
 
     def __init__(self, settings: Settings | None = None) -> None:
-        """Takes the viewer's eye separation, if known, from `settings.calibration`."""
+        """Create a finder. `settings.calibration` gives the viewer's eye separation, if known."""
         settings = settings or Settings()
         self._new_depth = partial(FaceDepth, eye_distance_m=settings.calibration.ipd_m)
         self._finder = PupilFinder(lock_ns=LOCK_NS)
@@ -39,7 +39,7 @@ class EyeFinder:
         self.pupils: Pupils | None = None  # pupils in the last frame, even without a distance
 
     def forget(self) -> None:
-        """Reset the finder. The next frame counts as the first."""
+        """Reset the finder, so that the next frame counts as the first."""
         self._finder.forget()
 
     @property
@@ -90,9 +90,10 @@ def _eye_points(pupils: Pupils, depths: EyeDepths, intrinsics: Intrinsics) -> Ey
 
 
 def covariance(point: F64, line: F64, sideways_m: float, up_m: float, along_m: float) -> F64:
-    """Return the covariance (3, 3) in m², given standard deviations across and along the line of sight.
+    """Return the covariance (3, 3), in m², of a point (3,) seen from the origin.
 
-    line: vector (3,) between the eyes, whose component perpendicular to the line of sight defines sideways.
+    sideways_m, up_m, along_m: standard deviations across and along the line of sight. line: vector (3,) between the
+    eyes, whose component perpendicular to the line of sight defines sideways.
     """
     sight = point / np.linalg.norm(point)
     sideways = line - (line @ sight) * sight

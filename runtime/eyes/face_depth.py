@@ -1,9 +1,9 @@
-"""Distance from the camera to the eyes, measured on the rigid face and averaged over time.
+"""Measure the distance from the camera to the eyes on the rigid face, averaged over time.
 
-The filter estimates one number: the viewer's eye separation in metres, from depth measurements. Distance is that
-number times the focal length over the separation in pixels (measured along the line between the eyes in space, from the
-mesh). Holes and bad frames therefore do no harm, and averaging reduces depth noise without lag. Without depth, the
-separation comes from the settings, or is learnt from the size of the irises.
+The filter estimates one number from depth measurements: the viewer's eye separation in metres. The distance is that
+number times the focal length, divided by the separation in pixels (measured along the line between the eyes in space,
+with the mesh). Holes and bad frames therefore do no harm, and averaging reduces depth noise without lag. Without depth,
+the separation comes from the settings, or is learnt from the size of the irises.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from runtime.records import F64, U16, Intrinsics
 M_PER_MM = 1e-3
 EYE_DISTANCE_M = (0.063, 0.0036)  # adults: mean and standard deviation
 KNOWN_SIGMA_M = 0.001  # standard deviation of an eye distance measured by an optician
-IRIS_M, IRIS_SIGMA = 0.0117, 0.07  # diameter of an iris; relative spread, people's and the network's together
-PERSON_M = (0.045, 0.085)  # people's eye separations, including children; other depths are rejected
-FLYING_M = 0.03  # deviation from the other points that identifies a flying pixel or the wall
+IRIS_M, IRIS_SIGMA = 0.0117, 0.07  # diameter of an iris; relative spread of people's irises and of the network's errors
+PERSON_M = (0.045, 0.085)  # eye separations of people, including children; depths that imply others are rejected
+FLYING_M = 0.03  # a point that deviates more from the others is a flying pixel or the wall
 POINTS_MIN = 8  # minimum number of rigid mesh points with depth
-RELIEF_MAX, RELIEF_PICTURES = 1.3, 30  # times the mesh's relief; pictures averaged
-POINT_SIGMA_M = 0.0005  # lower limit for the mean of many points, whose errors are not independent
-SHAPE_SIGMA_M = 0.006  # deviation of this viewer's eyes from the mesh's, along the line of sight
-EYE_SIGMA_M, EYE_GATE_M = 0.002, 0.02  # sigma of one measurement at an eye; larger deviations (glasses) are rejected
+RELIEF_MAX, RELIEF_PICTURES = 1.3, 30  # largest relief of a face, relative to the mesh's; pictures averaged
+POINT_SIGMA_M = 0.0005  # lower limit for the sigma of the mean of many points, whose errors are not independent
+SHAPE_SIGMA_M = 0.006  # sigma of the viewer's eyes relative to the mesh's, along the line of sight
+EYE_SIGMA_M, EYE_GATE_M = 0.002, 0.02  # sigma of a measurement at an eye; larger deviations (glasses) are rejected
 EYE_WINDOW = 0.12  # radius of the depth window at an eye, in eye distances
 PICTURE_SHARE, TURN_SHARE = 0.0007, 0.3  # relative uncertainty added per picture, and per change of foreshortening
 
@@ -43,7 +43,7 @@ class FaceDepth:
     """Estimator of the depth of one viewer's face. Every viewer needs a new instance."""
 
     def __init__(self, *, eye_distance_m: float = 0.0) -> None:
-        """eye_distance_m: eye separation of this viewer; 0 to learn it."""
+        """Create an estimator. eye_distance_m: the viewer's eye separation; 0: it is learnt."""
         self._known = eye_distance_m > 0
         self._distance, sigma = (eye_distance_m, KNOWN_SIGMA_M) if self._known else EYE_DISTANCE_M
         self._variance = sigma**2
@@ -81,21 +81,21 @@ class FaceDepth:
             self._learn(length / pupils.iris_px)
         middle = self._distance * away
         shape = self._shape - self._shape.mean()
-        # An eye separation from depth already includes the pixels' error. For a known or learnt one it is added.
+        # An eye separation from depth already includes the pixels' error. It must be added to a known or learnt one's.
         added = self._shape_variance.mean() if self.has_measured else 2 * (pupils.sigma_px / length * middle) ** 2
         sigma = np.sqrt(self._variance * away**2 + added)
         relief_m = (eyes * self._relief + tilts[1]) * self._distance / length
         return EyeDepths(middle + relief_m + shape, float(sigma))
 
     def _predict(self, foreshortening: float) -> None:
-        """Increase the uncertainty for one more picture, and for any turn of the head since the previous one."""
+        """Increase the uncertainty for one more picture, and for a turn of the head since the previous one."""
         turn = TURN_SHARE * (foreshortening - self._foreshortening)
         self._foreshortening = foreshortening
         if self.has_measured:
             self._variance += (PICTURE_SHARE**2 + turn**2) * self._distance**2
 
     def _learn(self, ratio: float) -> None:
-        """Estimate the eye separation without depth from the irises, whose size varies least between people."""
+        """Estimate the eye separation from the irises, whose size varies least between people."""
         self._irises = [*self._irises[-99:], ratio]
         iris = IRIS_M * float(np.median(self._irises))
         weights = np.array([EYE_DISTANCE_M[1], IRIS_SIGMA * iris]) ** -2.0
@@ -107,9 +107,9 @@ class FaceDepth:
     ) -> None:
         """Update the estimate from a depth picture.
 
-        relief: (468,) m, depths of the mesh's points relative to the midpoint of the eyes, away from the camera; eyes:
-        (2,) the same for the eyes; tilts: m, depth of the rigid points and (2,) of the eyes on a plane across the line
-        of sight; away: distance in eye separations.
+        relief: (468,) m, depths of the mesh's points behind the midpoint of the eyes; eyes: (2,) m, the same for the
+        eyes. tilts: m, depths that the rigid points and (2,) the eyes would have on a plane perpendicular to the line
+        of sight. away: distance in eye separations.
         """
         face, shape = _sampled(depth_mm, pupils.mesh_px[RIGID, :2] * scale), relief[RIGID]
         good = face > 0
@@ -146,7 +146,7 @@ class FaceDepth:
         self.has_measured = True
 
     def _fit_relief(self, depths: F64, shape: F64) -> None:
-        """Update the ratio of this face's relief to that of the mesh. It is near 0 for a printed face."""
+        """Update the ratio of the face's relief to the mesh's, which is near 0 for a printed face."""
         off = shape - shape.mean()
         seen = float(np.clip(off @ (depths - depths.mean()) / max(float(off @ off), 1e-12), 0, RELIEF_MAX))
         self._reliefs = min(self._reliefs + 1, RELIEF_PICTURES)
@@ -154,7 +154,7 @@ class FaceDepth:
 
 
 def _sampled(depth_mm: U16, points: F64) -> F64:
-    """Return the depths (n,) in metres at continuous pixels, or 0 outside the picture."""
+    """Return the depths (n,), in metres, at continuous pixels (n, 2); 0 outside the picture."""
     height, width = depth_mm.shape
     x, y = np.floor(points).astype(int).T
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
@@ -163,7 +163,7 @@ def _sampled(depth_mm: U16, points: F64) -> F64:
 
 
 def _window(depth_mm: U16, centre: F64, radius: float) -> F64:
-    """Return the depths (n,) in metres of the pixels around a point."""
+    """Return the depths (n,), in metres, of the pixels around a point."""
     height, width = depth_mm.shape
     x0, y0 = np.clip(np.floor(centre - radius), 0, [width, height]).astype(int)
     x1, y1 = np.clip(np.floor(centre + radius) + 1, 0, [width, height]).astype(int)

@@ -1,6 +1,6 @@
-"""Motion of a face between pictures to 1/50 pixel, from the optical flow of its rigid parts.
+"""Measure how a face moves between pictures, to 1/50 pixel, by the optical flow of its rigid parts.
 
-The errors of the networks are independent from picture to picture, while optical flow between two pictures is far more
+The networks' errors are independent from picture to picture, while the optical flow between two pictures is far more
 precise. The pupils therefore follow the flow, and the networks correct them slowly.
 """
 
@@ -21,9 +21,9 @@ RIGID = np.array([
     362, 130, 359,
 ])  # fmt: skip
 BRIDGE = 168  # mesh point on the bridge of the nose, between the eyes
-SIZE = 192  # side of the grey crop, pixels
+SIZE = 192  # side in pixels of the grey crop
 EYE_DISTANCE = 64.0  # distance between the eyes in the crop, pixels
-WINDOW = 17  # side of the window compared around a point, pixels of the crop
+WINDOW = 17  # side, in pixels of the crop, of the window that is compared around a point
 RETURNS_WITHIN = 0.4  # forward-backward error in pixels above which a point is discarded
 POINTS_MIN, INLIERS_MIN = 10, 8
 
@@ -37,7 +37,10 @@ class FaceFlow:
         self._mesh = np.zeros((0, 2))
 
     def remember(self, picture: U8, mesh: F64, eye_distance: float) -> None:
-        """Remember the face in this picture. mesh: (468, 3) in pixels. eye_distance: in pixels."""
+        """Remember the face in a picture.
+
+        mesh: (468, 3) in pixels; eye_distance: separation of the eyes in pixels.
+        """
         scale = EYE_DISTANCE / eye_distance
         offset = SIZE / 2 - scale * mesh[BRIDGE, :2]
         self._crop_from_picture = np.array([[scale, 0, offset[0]], [0, scale, offset[1]]])
@@ -68,9 +71,9 @@ class FaceFlow:
 
 
 def _flow(before: Any, after: Any, start: Any, guess: Any) -> tuple[Any, Any]:
-    """Return positions (n, 2) in `after` of points of `before`, and a mask (n, 1) of those found.
+    """Return the positions (n, 2) in `after` of the points `start` of `before`, and a mask of those found.
 
-    Overwrites `guess`.
+    guess: first positions, which are overwritten.
     """
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
     ends, is_found, _ = cv2.calcOpticalFlowPyrLK(

@@ -1,9 +1,9 @@
 """Interacting multiple models (Blom and Bar-Shalom 1988): Kalman filters that differ in agility.
 
 Each model uses Singer's acceleration (1970), which decays with a time constant and is driven by noise whose strength
-differs between models. A still head needs heavy filtering and a fast one light filtering, and a head can change within
-a tenth of a second. Measurement noise is a covariance matrix: a camera measures right and up twenty times as precisely
-as depth.
+differs between models. A still head needs heavy filtering, a fast head needs light filtering, and one can become the
+other within a tenth of a second. Measurement noise is a covariance matrix, because a camera measures right and up
+twenty times as precisely as depth.
 
 A state has nine numbers: position, velocity and acceleration, each along x, y and z, in metres and seconds.
 """
@@ -20,14 +20,14 @@ import numpy as np
 from runtime.records import F64
 
 FADE_S = 0.25  # time constant of an acceleration's decay
-ROUNDING = 1e-12  # of a covariance's trace: (10 nm)² of a head's (1 cm)²
+ROUNDING = 1e-12  # share of a covariance's trace that is added: (10 nm)² for a head's (1 cm)²
 WEIGHT_FLOOR = 1e-6  # minimum probability of a model, so that it can recover
 _NODES, _SHARES = np.polynomial.legendre.leggauss(10)
 _AXES = np.eye(3)
 
 
 class Belief(NamedTuple):
-    """States, covariances and probabilities of all motion models."""
+    """State, covariance and probability of every motion model."""
 
     state: F64  # (models, 9)
     covariance: F64  # (models, 9, 9)
@@ -35,20 +35,20 @@ class Belief(NamedTuple):
 
 
 def _response(times_s: F64) -> F64:
-    """Return position, velocity and acceleration (3, n) after an initial acceleration of 1."""
+    """Return position, velocity and acceleration (3, n) after an acceleration of 1 at time 0."""
     x = times_s / FADE_S
     gone = -np.expm1(-x)
     return np.array([FADE_S**2 * (x - gone), FADE_S * gone, 1 - gone])
 
 
 def _of_each_axis(matrix: F64) -> F64:
-    """Return the matrix (9, 9) that applies a (3, 3) matrix to each of x, y and z."""
+    """Return the (9, 9) matrix that applies a (3, 3) matrix to x, y and z separately."""
     return (matrix[:, None, :, None] * _AXES[:, None, :]).reshape(9, 9)
 
 
 @lru_cache(maxsize=8)
 def _transition(dt_s: float) -> F64:
-    """Return the transition matrix (9, 9) to the state dt_s later."""
+    """Return the (9, 9) transition matrix to the state `dt_s` later."""
     step = np.eye(3)
     step[0, 1] = dt_s
     step[:, 2] = _response(np.array([dt_s]))[:, 0]
@@ -57,18 +57,19 @@ def _transition(dt_s: float) -> F64:
 
 @lru_cache(maxsize=8)
 def _noise(dt_s: float) -> F64:
-    """Return the covariance (9, 9) that acceleration noise of 1 m/s² (standard deviation) adds in dt_s.
+    """Return the (9, 9) covariance that acceleration noise of 1 m/s² (standard deviation) adds in `dt_s`.
 
-    Gauss-Legendre quadrature stays positive where the closed form suffers from cancellation.
+    It is integrated by Gauss-Legendre quadrature, because the closed form suffers from cancellation.
     """
     response = _response(dt_s * (_NODES + 1) / 2)
     return _of_each_axis((response * (_SHARES * dt_s / FADE_S)) @ response.T)
 
 
 def started(place: F64, *, noise: F64, speed: float, acceleration: Sequence[float]) -> Belief:
-    """Return the belief after a first measurement (3,) with covariance (3, 3). Its mean velocity is zero.
+    """Return the belief after a first measurement `place` (3,), with a mean velocity of zero.
 
-    speed (m/s) and acceleration (m/s², one value per model) are standard deviations per axis.
+    noise: covariance (3, 3) of the measurement. speed (m/s) and acceleration (m/s², one value per model) are standard
+    deviations per axis.
     """
     count = len(acceleration)
     state, covariance = np.zeros((count, 9)), np.zeros((count, 9, 9))
@@ -80,9 +81,9 @@ def started(place: F64, *, noise: F64, speed: float, acceleration: Sequence[floa
 
 
 def predicted(belief: Belief, dt_s: float, *, acceleration: Sequence[float], stay_s: float) -> Belief:
-    """Predict the belief dt_s >= 0 ahead by mixing the models, then moving them.
+    """Return the belief `dt_s` >= 0 later: the models are mixed, then moved.
 
-    stay_s: mean time in one model.
+    acceleration: as for `started`; stay_s: mean time for which one model applies.
     """
     count = len(belief.weight)
     leave = -math.expm1(-dt_s / stay_s) / count  # probability of a switch to each model, including this one
@@ -101,15 +102,15 @@ def predicted(belief: Belief, dt_s: float, *, acceleration: Sequence[float], sta
 
 
 def surprise(belief: Belief, measured: F64, *, noise: F64) -> float:
-    """Return the smallest squared Mahalanobis distance of a measurement from any model.
+    """Return the smallest squared Mahalanobis distance of a measurement (3,) from any model.
 
-    For a good measurement it follows chi² with three degrees of freedom.
+    For a good measurement, it follows a chi² distribution with three degrees of freedom.
     """
     return float(_chi2(measured - belief.state[:, :3], _total(belief, noise)).min())
 
 
 def _total(belief: Belief, noise: F64) -> F64:
-    """Return the covariance (n, 3, 3) of the innovation, regularized against rounding after a long jump."""
+    """Return the covariances (n, 3, 3) of the innovation, regularized against rounding after a long jump."""
     total = belief.covariance[:, :3, :3] + noise
     spread: F64 = np.trace(total, axis1=1, axis2=2)[:, None, None] * ROUNDING
     return np.asarray(total + spread * np.eye(3), np.float64)
@@ -122,7 +123,7 @@ def _chi2(off: F64, covariance: F64) -> F64:
 
 
 def corrected(belief: Belief, measured: F64, *, noise: F64) -> Belief:
-    """Return the belief updated with a measurement (3,) whose covariance is (3, 3)."""
+    """Return the belief updated with a measurement (3,). noise: its covariance (3, 3)."""
     total = _total(belief, noise)
     gain = np.linalg.solve(total, belief.covariance[:, :3, :]).transpose(0, 2, 1)
     off = measured - belief.state[:, :3]
@@ -137,7 +138,10 @@ def corrected(belief: Belief, measured: F64, *, noise: F64) -> Belief:
 
 
 def _positive(covariance: F64) -> F64:
-    """Return covariances (n, 9, 9) with positive eigenvalues, in case rounding after a long jump made any negative."""
+    """Return covariances (n, 9, 9) with all eigenvalues made positive.
+
+    Rounding after a long jump can make some of them negative.
+    """
     try:
         np.linalg.cholesky(covariance)
     except np.linalg.LinAlgError:
@@ -149,13 +153,13 @@ def _positive(covariance: F64) -> F64:
 
 
 def ahead(belief: Belief, dt_s: float) -> F64:
-    """Predict the position (3,) dt_s ahead as the mean over all models, weighted by probability."""
+    """Return the position (3,) `dt_s` later, as the mean over all models weighted by probability."""
     position: F64 = _transition(dt_s)[:3] @ (belief.weight @ belief.state)
     return position
 
 
 def spread(belief: Belief, dt_s: float, *, acceleration: Sequence[float], about: F64) -> F64:
-    """Return the second moment (3, 3), in m², of the predicted position about a point (3,)."""
+    """Return the second moment (3, 3), in m², of the position `dt_s` later about a point `about` (3,)."""
     step = _transition(dt_s)[:3]
     added = np.square(acceleration)[:, None, None] * _noise(dt_s)[:3, :3]
     apart = belief.state @ step.T - about

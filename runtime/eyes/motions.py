@@ -1,4 +1,4 @@
-"""Simulated head motions and depth camera samples for benchmarks and tests."""
+"""Simulated head motions, and simulated samples of a depth camera, for benchmarks and tests."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from runtime.records import F64, EyePoints
 IPD_M = 0.063
 DISTANCE_M = 0.6  # distance of the resting eyes from the panels
 DROPOUT_S = 0.2  # length of every dropout
-NECK_TO_EYES_M = np.array([-0.09, 0.0, 0.14])  # forward (towards the display), sideways, up
+NECK_TO_EYES_M = np.array([-0.09, 0.0, 0.14])  # x (negative: towards the display), sideways, up
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,11 +24,11 @@ class Observation:
     points: EyePoints | None  # frame `stack`
 
 
-Motion = Callable[[F64], tuple[F64, F64]]  # times (n,) s -> neck (n, 3) m, frame `stack`; pitch (n,) rad
+Motion = Callable[[F64], tuple[F64, F64]]  # from times (n,) s: neck (n, 3) m, frame `stack`, and pitch (n,) rad
 
 
 def minimum_jerk(times_s: F64, *, knots_s: F64, values: F64) -> F64:
-    """Interpolate values (k, ...) by minimum-jerk movements that stop at knots (Flash and Hogan 1985)."""
+    """Interpolate values (k, ...) by minimum-jerk movements between stops (Flash and Hogan 1985)."""
     index = np.clip(np.searchsorted(knots_s, times_s, side="right") - 1, 0, len(knots_s) - 2)
     s = np.clip((times_s - knots_s[index]) / (knots_s[index + 1] - knots_s[index]), 0, 1)
     blend = s**3 * (10 + s * (6 * s - 15))
@@ -89,14 +89,14 @@ class Path:
     start_s: float = 0.0
     pace: float = 1.0
     size: float = 1.0
-    side: float = 1.0  # -1: left and right are exchanged
+    side: float = 1.0  # -1: left and right exchanged
 
 
 BENCHMARK_PATH = Path()
 
 
 def path_of(seed: int) -> Path:
-    """Return the random path of a seed. Seed 0 gives the path of the benchmark."""
+    """Return the random path for a seed. Seed 0 gives the benchmark's path."""
     if seed == 0:
         return BENCHMARK_PATH
     random = np.random.default_rng([seed, 0x70617468])
@@ -106,7 +106,7 @@ def path_of(seed: int) -> Path:
 
 
 def true_eyes(motion: str, times_s: F64, *, path: Path = BENCHMARK_PATH) -> F64:
-    """Return the left and right eye (n, 2, 3) in the stack frame, in metres."""
+    """Return the left and right eye (n, 2, 3) during a motion, in metres, frame `stack`."""
     neck, pitch = MOTIONS[motion](path.start_s + path.pace * times_s)
     neck, pitch = path.size * neck * [1.0, path.side, 1.0], path.size * pitch
     forward, _, up = NECK_TO_EYES_M
@@ -131,7 +131,7 @@ def observe(
     seed: int = 1,
     path: Path = BENCHMARK_PATH,
 ) -> list[Observation]:
-    """Simulate samples that a sensor takes of a motion. `seed` selects the noise.
+    """Simulate a sensor's samples of a motion. seed: selects the noise.
 
     Outliers displace one or both eyes by 4 to 20 cm. If `dropout_every_s` is 0, there are no dropouts.
     """

@@ -1,7 +1,7 @@
-"""The three face networks and the square crops that they take as input.
+"""Run the three face networks on square crops of a picture.
 
 Pixels are continuous: the centre of the first one is (0.5, 0.5). *Left* is the viewer's left, which is on the right of
-an unmirrored picture, and comes first. `docs/sensors.md` gives the origin of the models.
+an unmirrored picture. It comes first unless stated otherwise. `docs/sensors.md` gives the origin of the models.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ CROP_BLUR = 0.45  # standard deviation of the anti-aliasing filter, in the crop'
 
 
 def load_network(name: str) -> Any:
-    """Load a single-threaded onnxruntime session and warm it up, because the first run is slow.
+    """Load a network as a single-threaded onnxruntime session and run it once, as first runs are slow.
 
-    name: name of a file in the folder `models`.
+    name: of a file in the folder `models`.
     """
     ort = onnxruntime()
     options = ort.SessionOptions()
@@ -51,7 +51,10 @@ def inverse(matrix: F64) -> F64:
 
 
 def resampled(picture: U8, size: tuple[int, int], crop_from_picture: F64) -> U8:
-    """Warp a picture by an affine (2, 3) of continuous pixels, antialiased and clamped to the edge."""
+    """Warp a picture by an affine matrix (2, 3) of continuous pixels, with anti-aliasing.
+
+    Outside the picture, the pixels of its edge are repeated. size: (width, height) of the result.
+    """
     ratio = 1 / np.sqrt(abs(np.linalg.det(crop_from_picture[:, :2])))  # picture pixels per crop pixel
     corners = np.array([[0, 0], [size[0], 0], [0, size[1]], [size[0], size[1]]], np.float64)
     seen = transformed(inverse(crop_from_picture), corners)
@@ -73,16 +76,16 @@ class Square:
 
     centre: F64  # (2,) px
     side: float  # px
-    angle: float  # of its lower edge, radians clockwise on the screen
+    angle: float  # direction of its lower edge, radians clockwise on the screen
 
     def picture_from_crop(self, size: int, *, mirrored: bool = False) -> F64:
-        """Return the matrix (2, 3) from continuous pixels of a `size`-pixel crop to those of the picture."""
+        """Return the matrix (2, 3) from continuous pixels of a crop, `size` pixels wide, to the picture's."""
         c, s = np.cos(self.angle) * self.side / size, np.sin(self.angle) * self.side / size
         matrix = np.array([[-c if mirrored else c, -s], [-s if mirrored else s, c]])
         return np.column_stack([matrix, self.centre - matrix @ [size / 2, size / 2]])
 
     def crop(self, picture: U8, size: int, *, mirrored: bool = False) -> tuple[F32, F64]:
-        """Return the crop (1, size, size, 3) with values in [0, 1], and its matrix `picture_from_crop`."""
+        """Return a crop (1, size, size, 3) with values in [0, 1], and its matrix `picture_from_crop`."""
         matrix = self.picture_from_crop(size, mirrored=mirrored)
         pixels = resampled(picture, (size, size), inverse(matrix))
         return np.divide(pixels[None], 255, dtype=np.float32), matrix
@@ -116,7 +119,10 @@ class FaceNetwork:
         self._session = load_network("yunet.onnx")
 
     def find(self, picture: U8, *, longest_px: int, score_min: float) -> list[FoundFace]:
-        """Find the faces in an RGB picture (h, w, 3), reduced to `longest_px` if larger, best first."""
+        """Return the faces in an RGB picture (h, w, 3), best first.
+
+        longest_px: longer side to which a larger picture is reduced; score_min: minimum score of a face.
+        """
         height, width = picture.shape[:2]
         scale = min(1.0, longest_px / max(height, width))
         small = picture
@@ -166,7 +172,7 @@ class MeshNetwork:
 
 
 class IrisNetwork:
-    """Network that finds the iris in a square around an eye. Right eyes of the viewer are mirrored."""
+    """Network that finds the iris in a square around an eye. Its input is mirrored for right eyes."""
 
     SIZE = 64
 

@@ -24,7 +24,7 @@ IPD_MIN_M, IPD_MAX_M = 0.050, 0.078  # range of people's eye separations
 WINDOW = 30  # samples; one second of a typical depth camera
 SAMPLES_MIN = 10  # minimum number of samples before a reason is reported
 WARNING_SHARE = 0.5  # share of samples refused for one reason above which to warn
-UNIT_SLACK = 1.25  # factor applied to the limits when checking for millimetres
+UNIT_SLACK = 1.25  # factor by which the limits are widened when checking for millimetres
 DISTANT_M = 20.0  # distance from the display beyond which no sensor sees a face
 UPSIDE_DOWN_COSINE = -0.5  # with a roll of more than 120 degrees, the eyes are swapped
 
@@ -39,9 +39,9 @@ _HINTS = {
 
 
 def reason_against(eyes_m: F64, *, in_front_m: float = 0.0) -> str:
-    """Return why points (2, 3) cannot be the eyes of a viewer, or an empty string.
+    """Return why points (2, 3) cannot be a viewer's left and right eye, or an empty string.
 
-    in_front_m: minimum x. Eyes are swapped if the line from left to right points to the viewer's left.
+    in_front_m: minimum x. Eyes count as swapped if the vector from left to right points to the viewer's left.
     """
     (lx, ly, lz), (rx, ry, rz) = eyes_m.tolist()
     if not all(map(math.isfinite, (lx, ly, lz, rx, ry, rz))):
@@ -62,7 +62,7 @@ def reason_against(eyes_m: F64, *, in_front_m: float = 0.0) -> str:
 
 
 class RefusalWatch:
-    """Counter of refused samples by reason, which warns once if most are refused for the same one."""
+    """Counter of refused samples by reason. It warns once if most are refused for the same reason."""
 
     def __init__(self) -> None:
         self._last: deque[str] = deque(maxlen=WINDOW)
@@ -75,7 +75,10 @@ class RefusalWatch:
         return self._counts
 
     def update(self, reason: str) -> str:
-        """Count a sample by reason for refusal, or "". Returns a line to log when the warning changes."""
+        """Count a sample and return a line to log if the warning has changed, otherwise "".
+
+        reason: why the sample was refused, or "" if it was accepted.
+        """
         self._last.append(reason if reason in MISTAKES else "")
         if reason:
             self._counts[reason] += 1

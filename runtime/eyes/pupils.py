@@ -17,38 +17,39 @@ Seen = Literal["found", "followed", "filled in"]
 Side = Literal["", "left", "right"]
 SIDES: tuple[Side, Side] = ("left", "right")
 
-LEVELS_PX = (320, 640)  # longer side of the searched picture; the second if the first shows no face
+LEVELS_PX = (320, 640)  # longer side of the picture that is searched; the second is used if the first shows no face
 SCORE_MIN = 0.8  # minimum score of a face; people in the dark at 1.5 m score 0.85, most dogs less than 0.8
 PRESENCE_FOUND, PRESENCE_FOLLOWED = 0.9, 0.5  # minimum probability of a face in the mesh's crop
 CANDIDATES_MAX = 4  # maximum number of faces examined when looking for the viewer
-FARTHEST_OUT = 0.7  # relative penalty for a face in the corner of the picture when choosing a viewer
+FARTHEST_OUT = 0.7  # relative penalty, when a viewer is chosen, for a face in the corner of the picture
 CORNERS = ((362, 263), (33, 133))  # mesh points at the corners of the left and right eye
-EYE_SQUARE = 2.7  # side of the iris network's input, in eye widths; the most accurate value from 1.8 to 3.1
+EYE_SQUARE = 2.7  # side of the iris network's input, in eye widths; the most accurate of values from 1.8 to 3.1
 FACE_SQUARE = 1.5  # side of the mesh network's input, in sizes of the face
 MOVED_FAR = 0.35  # movement in eye separations after which the mesh network runs again
 
 # A human iris measures 11.7 mm, and the eyes are 50 to 75 mm apart. This excludes dogs and monkeys.
 IRIS_RANGE = (0.12, 0.33)  # diameter in eye distances; turning the head shortens the distance
 IRIS_RATIO_MAX = 1.4  # maximum ratio of the two irises
-# The upper lid hides part of the iris and the network returns the centre of the visible rest: too low by this share of
-# the eye distance (0.6 mm), independent of camera and distance. Fitted to all 51 faces measured; fitted to random
-# halves of them, the error on the other half is 0.61 to 0.67 mm up to 1 m.
+# The upper lid hides part of the iris, and the network returns the centre of the visible rest. This is too low by the
+# following share of the eye distance (0.6 mm), for any camera and distance. The share was fitted to all 51 faces
+# measured; when it is fitted to a random half of them, the error on the other half is 0.61 to 0.67 mm up to 1 m.
 TOO_LOW = 0.0093
 OPEN_MIN = 0.12  # minimum height of an open eye over its width; a blink hides the iris
 
 PULL = 0.1  # share of the deviation from the networks' estimate that each picture corrects
-# Gaze changes: the gain rises by GAZE_PULL as the distance goes from GAZE_FROM to GAZE_FULL eye distances.
+# When the gaze changes, the gain rises by up to GAZE_PULL as the deviation goes from GAZE_FROM to GAZE_FULL (in eye
+# distances).
 GAZE_FROM, GAZE_FULL, GAZE_PULL = 0.02, 0.06, 0.6
-# Eyes turn together. If one seems to turn alone by more than this (in eye separations), a hand or hair hides it and the
-# network only guesses its position. It is then moved with the face for at most CARRIED_MAX pictures.
+# Eyes turn together. If one seems to turn alone by more than this (in eye separations), a hand or hair hides it, and
+# the network only guesses its position. It is then moved with the face for at most CARRIED_MAX pictures.
 APART_MAX, CARRIED_MAX = 0.06, 30
 
-SAME_LOOKS = 0.75  # minimum correlation of two views of one person; 19 in 20 other people are below
+SAME_LOOKS = 0.75  # minimum correlation of two views of one person; 19 in 20 other people have less
 SAME_LOOKS_FOLLOWED = 0.6  # the same for a face at the viewer's last position
 LOOKS_PULL = 0.05  # rate at which the stored appearance adapts to light and pose
 
-# Standard deviation of a pupil along an axis: people's spread about the networks' mean (eye distances),
-# pixel noise (px), and the share of a surprise in one picture that remains.
+# Parts of the standard deviation of a pupil along an axis: people's spread about the networks' mean (in eye distances),
+# pixel noise (px), and the remaining share of an unexpected change in one picture.
 SIGMA_PERSON, SIGMA_PICTURE_PX, SIGMA_SURPRISE = 0.0088, 0.14, 0.5
 
 
@@ -61,7 +62,7 @@ class Pupils:
     mesh_px: F64  # (468, 3) face points; z in pixels, away from the camera
     iris_px: float  # mean diameter of the irises
     seen: Seen
-    hidden: Side  # eye that is hidden and was estimated from the rest of the face
+    hidden: Side  # eye that is hidden and is estimated from the rest of the face
     certainty: float  # probability that this is a face
 
     @property
@@ -71,7 +72,7 @@ class Pupils:
 
 @dataclass(frozen=True, slots=True)
 class _Look:
-    """Estimates of the networks for one face in one picture."""
+    """Estimates by the networks for one face in one picture."""
 
     mesh: F64  # (468, 3) px
     presence: float
@@ -98,7 +99,7 @@ class PupilFinder:
     """
 
     def __init__(self, *, lock_ns: int = 0) -> None:
-        """lock_ns: time after which another person may replace an unseen viewer."""
+        """Create a finder. lock_ns: time after which another person may replace a viewer who is not seen."""
         self._faces, self._meshes, self._irises = FaceNetwork(), MeshNetwork(), IrisNetwork()
         self._flow, self._lock_ns = FaceFlow(), lock_ns
         self.viewer = 0  # incremented with every new viewer
@@ -183,7 +184,7 @@ class PupilFinder:
         return _Look(mesh, presence, eyes, iris, openness, _looks(picture, mesh, float(np.linalg.norm(line))))
 
     def _steadied(self, picture: U8, look: _Look, seen: Seen) -> Pupils:
-        """Reduce the jitter of the networks by moving the previous pupils, if any, along with the face."""
+        """Return the pupils with less jitter: the previous ones moved with the face, then corrected."""
         eyes, surprise, hidden = look.eyes.copy(), np.zeros(2), np.zeros(2, bool)
         last = self._last if self._steps else None
         if last is not None:
@@ -219,13 +220,13 @@ class PupilFinder:
 
 
 def _worth(face: FoundFace, middle: F64) -> float:
-    """Return the score of a face when choosing the viewer: its size, reduced towards the edges."""
+    """Return a face's score as a possible viewer: its size, reduced towards the picture's edges."""
     away = np.abs(face.box[:2] + face.box[2:] / 2 - middle) / middle
     return face.size * (1 - FARTHEST_OUT * float(np.linalg.norm(away) / np.sqrt(2)))
 
 
 def _square_of(mesh: F64) -> Square:
-    """Return the region of the next input to the mesh network, given a previous mesh."""
+    """Return the square to which to apply the mesh network next, around the face of a previous mesh."""
     line = mesh[CORNERS[0][1], :2] - mesh[CORNERS[1][0], :2]
     angle = float(np.arctan2(line[1], line[0]))
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -235,7 +236,7 @@ def _square_of(mesh: F64) -> Square:
 
 
 def _looks(picture: U8, mesh: F64, eye_distance: float) -> F64:
-    """Return grey values (468,) at the face points, with mean 0 and norm 1 to be independent of light."""
+    """Return grey values (468,) at a face's points. Mean 0 and norm 1 make them independent of light."""
     margin = max(2, round(eye_distance / 4))
     height, width = picture.shape[:2]
     x0, y0 = np.clip(mesh[:, :2].min(axis=0).astype(int) - margin, 0, [width - 1, height - 1])
@@ -251,7 +252,7 @@ def _looks(picture: U8, mesh: F64, eye_distance: float) -> F64:
 
 
 def _similarity(last: F64, mesh: F64) -> F64:
-    """Return the similarity (2, 3) that maps the old corners of the eyes to the new ones."""
+    """Return the similarity (2, 3) that maps the eye corners of a mesh `last` to those of `mesh`."""
     corners = np.ravel(CORNERS)
     matrix, _ = cv2.estimateAffinePartial2D(last[corners, :2], mesh[corners, :2], method=cv2.LMEDS)
     return np.eye(2, 3) if matrix is None else np.asarray(matrix, np.float64)

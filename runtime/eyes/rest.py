@@ -1,7 +1,7 @@
-"""Detection of a head at rest from accepted samples.
+"""Detect a head at rest from accepted samples.
 
-The tracker's predictions jitter by several times the sensor's noise, because the prediction horizon amplifies the noise
-in the estimated velocity. For a head at rest, the median of its samples is the best estimate of its position, and the
+The tracker's predictions jitter by several times the sensor's noise, because predicting ahead amplifies the noise in
+the estimated velocity. For a head at rest, the median of its samples is the best estimate of its position, and the
 picture can stand still.
 """
 
@@ -20,28 +20,31 @@ FEWEST = 8  # minimum number of samples for any conclusion
 KEPT = 256  # samples kept of a resting head
 GRACE_M = 0.0005  # added to every threshold, for sensors without noise
 NOISE_MAX_M = 0.005  # with more noise no head counts as resting, because a departure would go unnoticed
-# In standard deviations of one sample; white noise at 60 samples a second exceeds each once in hours.
-SINGLE = 4.5  # two consecutive samples, off in the same direction
-MEDIAN_OF_FIVE = 2.6  # of the newest five samples
-HALVES = 4.5  # difference between the means of two halves, over the root of their length
-MAD_TO_SIGMA = 1.4826  # standard deviation of normal noise over its median absolute deviation
-MEDIAN_EFFICIENCY = 1.25  # standard deviation of a median over that of a mean
+# Thresholds in standard deviations of one sample. White noise at 60 samples a second exceeds each once in hours.
+SINGLE = 4.5  # for two consecutive samples that deviate in the same direction
+MEDIAN_OF_FIVE = 2.6  # for the median of the newest five samples
+HALVES = 4.5  # for the difference between the means of two halves, divided by the root of their length
+MAD_TO_SIGMA = 1.4826  # standard deviation of normal noise, divided by its median absolute deviation
+MEDIAN_EFFICIENCY = 1.25  # standard deviation of a median, divided by that of a mean
 LEVER_M = 0.15  # RMS distance of a point from the centre of a display half a metre wide
-NEAREST_M = 0.1  # nearest distance from the display; smaller ones are raised to it
+NEAREST_M = 0.1  # smaller distances from the display are raised to this
 
 
 class RestWatch:
     """Detector of a resting head and its position. Not thread-safe; reads no clock."""
 
     def __init__(self, *, max_drift_m: float) -> None:
-        """max_drift_m: drift in excess of the noise that updates the position of a resting head."""
+        """Create a detector.
+
+        max_drift_m: the position of a resting head is updated when it drifts by more than this beyond the noise.
+        """
         self._max_drift_m = max_drift_m
         self._times = np.zeros(2 * KEPT, np.int64)
         self._eyes = np.zeros((2 * KEPT, 2, 3))
         self._count = 0
         self.place: F64 | None = None  # (2, 3) the resting eyes, a new array for each rest; None while they move
         self.noise_m = np.zeros(6)  # standard deviation of one sample, as `_shifts` measures it
-        self.sigma_m = 0.0  # standard deviation of `place` along an axis, undetected drift included
+        self.sigma_m = 0.0  # standard deviation of `place` along an axis, including undetected drift
 
     def update(self, eyes_m: F64, *, capture_ns: int) -> None:
         """Add one sample (2, 3) in the stack frame."""
@@ -96,7 +99,10 @@ class RestWatch:
         self.sigma_m = float(np.hypot(median_sigma_m, drift_m / 2**0.5))  # drift is mostly in one direction
 
     def _measure_noise(self) -> None:
-        """Measure noise as the distance of samples from the line between neighbours, to exclude steady motion."""
+        """Measure noise as the distance of samples from the line between their neighbours.
+
+        This excludes steady motion.
+        """
         first = max(0, self._count - KEPT // 2)
         times, shifts = self._times[first : self._count], _shifts(self._eyes[first : self._count], self._eyes[first])
         later = ((times[1:-1] - times[:-2]) / (times[2:] - times[:-2]))[:, None]  # neighbours may be missing
@@ -120,13 +126,13 @@ class RestWatch:
         return not self._left(np.median(recent, axis=0))
 
     def _left(self, place: F64) -> bool:
-        """Return True if the newest samples deviate more than noise explains."""
+        """Return True if the newest samples deviate from `place` by more than noise explains."""
         shifts = _shifts(self._eyes[self._count - 5 : self._count], place)
         if (np.abs(np.median(shifts, axis=0)) > MEDIAN_OF_FIVE * self.noise_m + GRACE_M).any():
             return True
         last, newest = shifts[-2:]
         reach = SINGLE * self.noise_m + GRACE_M
-        # Outliers deviate in random directions, so two consecutive samples must deviate in the same one.
+        # Outliers deviate in random directions, so two consecutive samples must deviate in the same direction.
         together = np.minimum(last, newest) > reach
         opposite = np.maximum(last, newest) < -reach
         return bool((together | opposite).any())
@@ -143,10 +149,10 @@ class RestWatch:
 
 
 def _shifts(eyes_m: F64, place: F64) -> F64:
-    """Return displacements (n, 6) of samples (n, 2, 3) from a place (2, 3), by effect on the display.
+    """Return the displacements (n, 6), as seen on the display, of samples (n, 2, 3) from a place (2, 3).
 
-    For each eye these are right and up as seen from the display's centre, and the effect of its distance on off-centre
-    points, all in metres.
+    They are in metres. For each eye, two are right and up as seen from the display's centre, and one is the effect of
+    the eye's distance on off-centre points.
     """
     away = eyes_m - place
     distance = np.maximum(place[:, :1], NEAREST_M)

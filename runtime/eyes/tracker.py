@@ -1,4 +1,4 @@
-"""Tracker of the eyes, with gating, filtering, history and prediction."""
+"""Track the eyes: refuse implausible samples, filter the others and predict."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from runtime.records import F64, EyePoints, EyesEstimate, EyesLabel
 
 HISTORY = 256  # filtered samples kept: four seconds at 60 Hz
 CONFIDENCE_MIN = 0.3  # samples with less confidence (a blink) are refused
-CHI2_GATE = 21.1  # chi² with three degrees of freedom; refuses one good sample in 10,000
-CHI2_DOUBT = 11.3  # 1 % gate: a sample beyond it is rolled back if the next two fit better without it
-ACCELERATION = (0.05, 0.4, 2.0)  # m/s², standard deviations for a calm, a moving and a fast head
+CHI2_GATE = 21.1  # limit of chi² with three degrees of freedom; it refuses one good sample in 10,000
+CHI2_DOUBT = 11.3  # 1 % limit; a sample beyond it is undone if the next two fit better without it
+ACCELERATION = (0.05, 0.4, 2.0)  # standard deviations in m/s² for a calm, a moving and a fast head
 STAY_S = 1.0  # mean time that a head stays calm, moving or fast
 # m/s², standard deviations for half the vector between the eyes: a head that hardly turns, and one that shakes
 TURN_ACCELERATION = (0.03, 0.4)
-FIRST_SPEED = 0.3  # m/s, standard deviation for a head just found
-REACH_SPEED, REACH_ACCELERATION = 2.0, 30.0  # m/s, m/s²: limits of a head's motion
-KEEP_S = 0.4  # a longer gap discards a head's motion
+FIRST_SPEED = 0.3  # standard deviation in m/s for a head just found
+REACH_SPEED, REACH_ACCELERATION = 2.0, 30.0  # limits of a head's motion in m/s and m/s²
+KEEP_S = 0.4  # after a longer gap, a head's motion is discarded
 ANOTHER_AFTER_S = 0.5  # another person replaces a viewer unseen for this long, or for hold_s if that is shorter
 LOSS_S = 0.2  # after this long without a sample, eyes are held instead of predicted
 HORIZON_S = 0.2  # longest prediction
-DECAY_S = 0.06  # time constant of a lost head's slowing to rest
+DECAY_S = 0.06  # time constant with which a lost head slows to rest
 REVIVE_S = 0.06  # duration of the blend when lost eyes are found again
-CLOCK_RESET_NS = NS_PER_S  # a capture this far in the past means that the clock was set back
-COMPLETED_NOISE = 2.0  # factor on the standard deviation of a pair with a filled-in eye
-NOISE_FLOOR_M = 2e-5  # floor for drivers' covariances, since no sensor measures a pupil better
-ESTABLISHED = 3  # samples after which a head is established; one with fewer may be a mistake
+CLOCK_RESET_NS = NS_PER_S  # a capture time this far in the past means that the clock was set back
+COMPLETED_NOISE = 2.0  # factor on the standard deviation of a pair of eyes of which one is filled in
+NOISE_FLOOR_M = 2e-5  # smallest standard deviation accepted from a driver; no sensor measures a pupil better
+ESTABLISHED = 3  # a head with fewer samples may be a mistake
 SIGMA_AHEAD_S = 1.0  # uncertainty is not extrapolated beyond this horizon
-NEAREST_M = 0.1  # nearest distance from the display when weighing depth errors
+NEAREST_M = 0.1  # smaller distances from the display are raised to this when depth errors are weighed
 PANEL_M = (0.5184, 0.2916)  # default width and height
 NO_JUMP = np.zeros((2, 3))
 
@@ -46,12 +46,12 @@ ELSEWHERE = "not where the viewer is"
 
 
 class _Head(NamedTuple):
-    """Estimated motion of one head after its newest sample."""
+    """Estimated motion of one head, as of its newest sample."""
 
     capture_ns: int
     middle: imm.Belief  # midpoint of the eyes, frame `stack`
     half: imm.Belief  # vector from the midpoint to the right eye
-    samples: int  # number processed
+    samples: int  # number of samples processed
     surprise: float  # chi² of the newest sample
 
     def age_s(self, time_ns: int) -> float:
@@ -72,7 +72,7 @@ class _Sample(NamedTuple):
     noise_m2: F64  # (3, 3) covariance of the midpoint, and of `half_m`
 
     def begun(self) -> _Head:
-        """Start a head from this sample alone."""
+        """Return a new head from this sample alone."""
         middle = imm.started(self.middle_m, noise=self.noise_m2, speed=FIRST_SPEED, acceleration=ACCELERATION)
         half = imm.started(self.half_m, noise=self.noise_m2, speed=FIRST_SPEED / 3, acceleration=TURN_ACCELERATION)
         return _Head(self.capture_ns, middle, half, 1, 0.0)
@@ -109,10 +109,10 @@ class _Sample(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Shown:
-    """Viewer's head after a sample, with the jump that is still to be smoothed out."""
+    """The viewer's head after a sample, with the jump that remains to be smoothed out."""
 
     head: _Head
-    jump_m: F64  # (2, 3) from the measured eyes to those last shown, at `jump_ns`; decays afterwards
+    jump_m: F64  # (2, 3) from the measured eyes to those last shown, at `jump_ns`; it decays afterwards
     jump_ns: int
 
     def eyes_m(self, ahead_s: float, time_ns: int) -> F64:
@@ -125,7 +125,7 @@ class _Shown:
 
 
 class _Other(NamedTuple):
-    """Head seen away from the viewer."""
+    """Head that was seen away from the viewer's."""
 
     head: _Head
     may_be_viewer: bool  # True if the viewer could have moved there
@@ -146,7 +146,10 @@ class Tracker:
         panel_m: tuple[float, float] = PANEL_M,
         in_front_m: float = 0.0,
     ) -> None:
-        """panel_m: (width, height), which sets the weight of depth errors. in_front_m: minimum x of an eye."""
+        """Create a tracker.
+
+        panel_m: (width, height), which determines the weight of depth errors. in_front_m: minimum x of an eye.
+        """
         self.settings = settings or TrackerSettings()
         self._panel_m, self._in_front_m = panel_m, in_front_m
         self._history: deque[_Shown] = deque(maxlen=HISTORY)
@@ -184,7 +187,7 @@ class Tracker:
         self._newest_ns, self._asked_ns = -1, 0
 
     def _noise(self, points: EyePoints) -> F64:
-        """Return the covariance (3, 3), in m², of the midpoint, from the driver (with a floor) or the settings."""
+        """Return the midpoint's covariance (3, 3), in m²: the driver's, with a floor, or the settings'."""
         noise: F64 = self.settings.noise_m**2 / 2 * np.eye(3)
         if points.covariance_m2 is not None and np.isfinite(points.covariance_m2).all():
             variances, axes = np.linalg.eigh((points.covariance_m2 + points.covariance_m2.T) / 2)
@@ -229,7 +232,10 @@ class Tracker:
         return ""
 
     def _follow(self, head: _Head, *, is_return: bool = False) -> None:
-        """Make `head` the viewer's. is_return: blend from the last position shown, after a loss or a jump."""
+        """Make `head` the viewer's.
+
+        is_return: after a loss or a jump, blend from the last position shown.
+        """
         jump_m, jump_ns = (self._history[-1].jump_m, self._history[-1].jump_ns) if self._history else (NO_JUMP, 0)
         if is_return:
             jump_ns = max(self._asked_ns, head.capture_ns)
@@ -241,7 +247,7 @@ class Tracker:
             self._other = None
 
     def ahead(self, time_ns: int) -> EyesEstimate:
-        """Estimate like `at` for a time that is not shown, without affecting later calls to `at`."""
+        """Return an estimate like `at`, for a time that is not shown. Later calls of `at` are not affected."""
         asked_ns = self._asked_ns
         estimate = self.at(time_ns)
         self._asked_ns = asked_ns
@@ -284,7 +290,7 @@ class Tracker:
         return self._estimate(time_ns, after.head, eyes_m, "interpolated")
 
     def _estimate(self, time_ns: int, head: _Head, eyes_m: F64, label: EyesLabel) -> EyesEstimate:
-        """Add the standard deviation of `eyes_m`, given how far the head may have moved since its sample."""
+        """Return the estimate for `eyes_m`, with the standard deviation that has grown since the sample."""
         age_s = min(max(head.age_s(time_ns), 0.0), SIGMA_AHEAD_S)
         middle_m, half_m = (eyes_m[0] + eyes_m[1]) / 2, (eyes_m[1] - eyes_m[0]) / 2
         if label in ("exact", "interpolated"):
@@ -296,11 +302,11 @@ class Tracker:
 
 
 def sideways_sigma_m(error_m2: F64, eye_m: F64, *, panel_m: tuple[float, float]) -> float:
-    """Return the sideways standard deviation with the effect of a position covariance (3, 3).
+    """Return the sideways standard deviation whose effect equals that of a position covariance (3, 3).
 
-    If an eye is nearer than its estimated distance x by d, a display point is affected as by a sideways displacement of
-    d·u/x, where u is the distance from that point to the foot of the eye's perpendicular. The result is the root mean
-    square over the display.
+    If an eye is nearer than its estimated distance x by d, the effect on a display point equals that of a sideways
+    displacement of d·u/x, where u is the distance from that point to the foot of the eye's perpendicular. The result is
+    the root mean square over the display.
     """
     x, y, z = max(float(eye_m[0]), NEAREST_M), float(eye_m[1]), float(eye_m[2])
     lever2 = (y * y + z * z + (panel_m[0] ** 2 + panel_m[1] ** 2) / 12) / (x * x)
