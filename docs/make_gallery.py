@@ -86,8 +86,7 @@ HEAD = """\
 of a solution runs from two decoded pictures to 8-bit layers. Memory is the peak of the method's own process. Run times
 depend on the machine and its load, so compare ratios.
 
-`bench compare` divides all times by a reference time from the same run. It does not compare times if the machine was
-busy. It exits with 1 if a model became slower by more than the noise, lost 0.1 dB or took 15% more memory.
+`bench compare` exits with 1 if a model became slower by more than the noise, lost 0.1 dB or took 15% more memory.
 
 `report --pairs` reads every [case file](contracts.md#cases-pairs-calibration) in DIR. Its optional field `off`
 lists pictures that should be seen from a point `mm` away from an eye.
