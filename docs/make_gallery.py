@@ -89,7 +89,11 @@ depend on the machine and its load, so compare ratios.
 `bench compare` exits with 1 if a model became slower by more than the noise, lost 0.1 dB or took 15% more memory.
 
 `report --pairs` reads every [case file](contracts.md#cases-pairs-calibration) in DIR. Its optional field `off`
-lists pictures that should be seen from a point `mm` away from an eye.
+lists pictures that should be seen from a point `mm` away from an eye:
+
+    {"panels": {"width_m": 0.5184, "height_m": 0.2916, "x_m": [-0.06, 0.0, 0.06]},
+     "eyes": [[0.78, -0.03, 0.24], [0.78, 0.03, 0.24]], "images": ["left.png", "right.png"], "fov": 40.0,
+     "off": [{"mm": 2, "eye": [0.78, -0.028, 0.24], "image": "left-2mm-right.png"}]}
 
 ![result of the demo: layers, and for each eye the target, the view and their difference](images/contact-sheet.jpg)
 
