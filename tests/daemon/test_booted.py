@@ -298,7 +298,7 @@ def test_an_upgrade_swaps_the_program_and_goes_back_if_it_cannot_start(pc: Pc) -
     program.write_text(good + "\n\nraise RuntimeError('a bad release')\n")
     failed = pc.run("cd /root/phasestack && make install")
     program.write_text(good)
-    assert failed.returncode != 0 and "back to the one before" in failed.stderr
+    assert failed.returncode != 0 and "the previous one is restored" in failed.stderr
     assert eventually(lambda: pc.is_active("phasestack") and pc.shows(), within_s=90)
     assert not list((pc.root / "opt/phasestack").glob("lib.*"))
 
