@@ -21,6 +21,9 @@ WHOLE = """#version 330
 void main() { gl_Position = vec4(vec2((gl_VertexID << 1) & 2, gl_VertexID & 2) * 2.0 - 1.0, 0.0, 1.0); }
 """
 NEAREST = """#version 330
+#ifdef GL_ARB_texture_gather
+#extension GL_ARB_texture_gather : enable
+#endif
 uniform sampler2D depth;
 uniform int every;
 uniform ivec2 first;
@@ -30,6 +33,15 @@ out float nearness;
 void main() {
     ivec2 begin = ivec2(gl_FragCoord.xy) * every - first, last = textureSize(depth, 0) - 1;
     float nearest = 1.0;
+#ifdef GL_ARB_texture_gather
+    if (every % 2 == 0) {
+        vec4 four = vec4(1.0);
+        for (int j = 1; j < every; j += 2)
+            for (int i = 1; i < every; i += 2)
+                four = min(four, textureGather(depth, vec2(begin + ivec2(i, j)) / vec2(last + 1)));
+        nearest = min(min(four.x, four.y), min(four.z, four.w));
+    } else
+#endif
     for (int j = 0; j < every; j++)
         for (int i = 0; i < every; i++)
             nearest = min(nearest, texelFetch(depth, clamp(begin + ivec2(i, j), ivec2(0), last), 0).r);
@@ -200,4 +212,7 @@ class CanvasSource(ContentSource):
 
     def _framebuffer(self, size: tuple[int, int], colour: Any, *, samples: int = 0) -> Any:
         # Depth is a texture because Mesa never frees a renderbuffer's memory if a context that shares it releases it.
-        return self.context.framebuffer([colour], self.context.depth_texture(size, samples=samples))
+        depth = self.context.depth_texture(size, samples=samples)
+        if not samples:
+            depth.repeat_x = depth.repeat_y = False
+        return self.context.framebuffer([colour], depth)

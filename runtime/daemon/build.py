@@ -38,7 +38,7 @@ from runtime.sensor.browser import BrowserCamera, BrowserEyes
 from runtime.sensor.registry import open_sensor
 from runtime.sensor.samples import FindEyes, RecordedSamples, Samples
 from runtime.sensor.worker import SensorWorker
-from runtime.support.background import PRESENTER_NICENESS, niceness
+from runtime.support.background import before_all_others
 from runtime.support.gl import offscreen_context
 from runtime.support.untrusted_input import LIMITS
 
@@ -234,7 +234,7 @@ def build_run(
         gc.collect()
         gc.freeze()
         cleanup.callback(gc.unfreeze)
-        cleanup.enter_context(niceness(PRESENTER_NICENESS))  # for this thread only, after all others have started
+        cleanup.enter_context(before_all_others())  # for this thread only, after all others have started
     run = Run(presenter, observer, maker, simulated)
     host.watches(run)
     return run

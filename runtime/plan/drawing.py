@@ -78,8 +78,11 @@ def drawn_job(
         raster = window.box.cut(raster)
     views = raster_views(eyes_m, raster, reduction=reduction)
     content.expect(views, time_ns=time_ns)
-    pictures = [_picture(predictor, content, view, time_ns=time_ns) for view in views]
+    drawn = [_drawn(predictor, content, view, time_ns=time_ns) for view in views]
     relief = _relief(content, views, stack, window) if in_depth else None
+    # Reading back waits until the picture is complete, so both are drawn before either is read.
+    reads_textures = predictor.reads_textures_of(content.draws_in)
+    pictures = [p.pixels() if isinstance(p, DrawnPicture) and not reads_textures else p for p in drawn]
     job = Job(Targets(stack, eyes_m, drawn_views(pictures, stack, window)), window=window, relief=relief)
     return trim(job, before) if trimmed else job
 
@@ -110,19 +113,19 @@ def _relief(
     return relief_of((left, right), distance_m=[float(view.eye_m[0]) - middle_m for view in views])
 
 
-def _picture(predictor: Predictor, content: ContentSource, view: View, *, time_ns: int) -> U8 | DrawnPicture:
-    """Return a view's picture: a texture if the model reads the content's textures, otherwise an array.
+def _drawn(predictor: Predictor, content: ContentSource, view: View, *, time_ns: int) -> U8 | DrawnPicture:
+    """Return a view's picture as a texture, or as an array if the content does not draw with OpenGL.
 
     Raises ContentFailure and ContextLost.
     """
-    if content.draws_in is None or not predictor.reads_textures_of(content.draws_in):
-        return content.render(view, time_ns=time_ns)
     try:
         picture = content.draw(view, time_ns=time_ns)
     except PhasestackError:
         raise
     except Exception as error:  # moderngl raises various exceptions for a lost context
-        raise ContextLost(f"OpenGL: {error}") from error
+        if predictor.reads_textures_of(content.draws_in):
+            raise ContextLost(f"OpenGL: {error}") from error
+        raise
     if picture is None:
         return content.render(view, time_ns=time_ns)
     plain = content.info.background is None or len(set(content.info.background)) == 1

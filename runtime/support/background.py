@@ -15,7 +15,8 @@ from runtime.errors import PhasestackError, TransientError, one_line
 
 log = logging.getLogger("phasestack.background")
 
-PRESENTER_NICENESS = -10
+PRESENTER_NICENESS = -10  # where realtime priority is not allowed
+REALTIME_PRIORITY = 1  # the lowest, which still comes before every ordinary thread
 SOLVER_NICENESS = 5
 BACKGROUND_NICENESS = 10
 MEASURING_NICENESS = 15  # for measurements and writing files, which are not urgent
@@ -114,13 +115,22 @@ class BackgroundJob(Generic[T]):
 
 
 @contextmanager
-def niceness(value: int) -> Iterator[None]:
-    """Set the calling thread's niceness within a block, and restore it afterwards."""
+def before_all_others() -> Iterator[None]:
+    """Run the calling thread with realtime priority within a block, or with a low niceness if that is not allowed.
+
+    At ordinary priority the kernel lets a busy thread finish its slice, which would delay a refresh by up to 3 ms.
+    Threads and processes started within the block have ordinary priority.
+    """
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
     before = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
-    set_niceness(value)
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(REALTIME_PRIORITY))
+    except OSError:
+        set_niceness(PRESENTER_NICENESS)
     try:
         yield
     finally:
+        os.sched_setscheduler(0, policy, parameters)
         set_niceness(before)
 
 
