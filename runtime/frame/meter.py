@@ -19,7 +19,7 @@ from runtime.support.gl import DrawnPicture
 RAYS = 1024  # rays per eye
 SAMPLED = 54, 96  # rows and columns of the grid for comparing successive pictures
 BAND_ROWS = 64  # height of each of the two bands in which detail is measured
-EVERY = 4  # residual and detail are measured for every 4th solution of an effort
+EVERY = 4  # residual and detail are measured for every 4th solution of an effort, change for every 4th solution
 
 
 class SolutionMeter:
@@ -28,6 +28,7 @@ class SolutionMeter:
     def __init__(self) -> None:
         self._before: tuple[tuple[int, ...], list[U8], Job, int] | None = None  # raster and window, pictures, job, time
         self._counts: dict[Effort, int] = {}
+        self._solutions = 0
         self._places = np.random.default_rng(1).random((2, RAYS, 2))
 
     def measure(self, job: Job, layers: U8, effort: Effort, *, time_ns: int) -> Measures | None:
@@ -37,26 +38,37 @@ class SolutionMeter:
         key = Effort(effort.reduction, effort.steps)
         count = self._counts.get(key, 0)
         self._counts[key] = count + 1
-        pictures = [_halved(view.pixels) for view in job.views]
-        samples = [_grid(picture) for picture in pictures]
-        box = () if job.window is None else job.window.box.corners
-        raster = (job.stack.width_px, job.stack.height_px, *box)
-        before, self._before = self._before, (raster, pictures, job, time_ns)
-        change = None
-        if before is not None and before[0] == raster:
-            _, earlier, solved, earlier_ns = before
-            moved_m = float(np.linalg.norm((job.eyes_m - solved.eyes_m).mean(axis=0)))
-            shown = _moved_grid(earlier, solved, job.eyes_m)
-            changed = float(np.mean([((new - old) ** 2).mean() for new, old in zip(samples, shown, strict=True)]))
-            change = changed, moved_m, abs(time_ns - earlier_ns) / NS_PER_S
+        change = self._change(job, time_ns=time_ns)
         if count % EVERY:
             return Measures(change=change)
+        samples = [_grid(_halved(view.pixels)) for view in job.views]
         return Measures(
             residual=sampled_light(layers, job, self._places, boxes=effort.reduction == 1),
             detail=lost_detail(job.views[0].pixels) if effort.reduction == 1 else {},
             contrast=float(np.mean([sample.var(axis=(0, 1)) for sample in samples])) / 2,
             change=change,
         )
+
+    def _change(self, job: Job, *, time_ns: int) -> tuple[float, float, float] | None:
+        """Return `Measures.change`. Keep copies of one solution's pictures in `EVERY`, and compare the next one's."""
+        turn, self._solutions = self._solutions % EVERY, self._solutions + 1
+        before, self._before = self._before, None
+        if turn > 1 or (turn == 1 and before is None):
+            return None
+        box = () if job.window is None else job.window.box.corners
+        raster = (job.stack.width_px, job.stack.height_px, *box)
+        if turn == 0:
+            self._before = raster, [_halved(view.pixels) for view in job.views], job, time_ns
+            return None
+        assert before is not None
+        before_raster, earlier, solved, earlier_ns = before
+        if before_raster != raster:
+            return None
+        samples = [_grid(_halved(view.pixels)) for view in job.views]
+        moved_m = float(np.linalg.norm((job.eyes_m - solved.eyes_m).mean(axis=0)))
+        shown = _moved_grid(earlier, solved, job.eyes_m)
+        changed = float(np.mean([((new - old) ** 2).mean() for new, old in zip(samples, shown, strict=True)]))
+        return changed, moved_m, abs(time_ns - earlier_ns) / NS_PER_S
 
 
 def sampled_light(layers: U8, job: Job, places: F64, *, boxes: bool) -> float | None:
@@ -75,16 +87,15 @@ def sampled_light(layers: U8, job: Job, places: F64, *, boxes: bool) -> float | 
         middle_from_picture = rasters[middle].raster_from_plane() @ view.plane_from_picture
         column, row = (places[0] * (width, height)).astype(int).T
         target = view.pixels[row, column, :3] / np.float32(255)
-        errors, counts = [], np.ones(len(row), bool)
-        for offset in places % (1 / 64) * 64:  # position within the pixel, independent of the chosen pixel
-            at = middle_from_picture @ np.stack([column + offset[:, 0], row + offset[:, 1], np.ones(len(row))])
-            total = np.zeros((len(row), 3), np.float32)
-            for n in range(stack.count):
-                x, y, w = at / at[2] if n == middle else panel_from_middle(stack, rasters, eye_m, n) @ (at / at[2])
-                values, inside = _sampled(layers[n], x / w, y / w, boxes=boxes)
-                total, counts = total + values, counts & inside
-            errors.append(np.sin(np.float32(np.pi / 2 / 255) * total) ** 2 - target)
-        products.append((errors[0] * errors[1])[counts])
+        offset = (places % (1 / 64) * 64).reshape(-1, 2).T  # position within the pixel, independent of the chosen pixel
+        at = middle_from_picture @ np.stack([*(np.tile((column, row), 2) + offset), np.ones(2 * len(row))])
+        total, counts = np.zeros((2 * len(row), 3), np.float32), np.ones(2 * len(row), bool)
+        for n in range(stack.count):
+            x, y, w = at / at[2] if n == middle else panel_from_middle(stack, rasters, eye_m, n) @ (at / at[2])
+            values, inside = _sampled(layers[n], x / w, y / w, boxes=boxes)
+            total, counts = total + values, counts & inside
+        first, second = np.split(np.sin(np.float32(np.pi / 2 / 255) * total) ** 2 - np.tile(target, (2, 1)), 2)
+        products.append((first * second)[np.logical_and(*np.split(counts, 2))])
     product = np.concatenate(products)
     return max(float(product.mean()), 0.0) if product.size else None
 

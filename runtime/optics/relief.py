@@ -25,22 +25,26 @@ from runtime.records import F32, F64, Parallax
 
 WIDEST_PX = 480  # columns of a relief; more of them do not give finer outlines
 RIM_PX = 2  # relief pixels by which nearer content is dilated, so that its outline moves with it
+COARSE_RIM_PX = 1  # the same for a coarse raster, whose relief has fewer pixels
 
 Pixels = NDArray[np.floating[Any]]
 
 
 def block_px(width_px: int) -> int:
-    """Return the side in pixels, on a raster `width_px` wide, of the block that one relief pixel covers."""
+    """Return the side of the block that one relief pixel covers, in pixels of any raster.
+
+    width_px: columns of the full raster. A coarse raster has blocks of as many of its own, larger pixels.
+    """
     return -(-width_px // WIDEST_PX)
 
 
-def relief_of(nearness: Sequence[F32], *, distance_m: Sequence[float]) -> F32:
+def relief_of(nearness: Sequence[F32], *, distance_m: Sequence[float], rim_px: int = RIM_PX) -> F32:
     """Combine both eyes' depth into one (h, w) relief. Each pixel takes the value that is farther from 0.
 
     nearness: for each eye, the (h, w) inverse distances along x in 1/m; 0 for the background, whose relief is 0.
-    distance_m: each eye's distance from the middle panel.
+    distance_m: each eye's distance from the middle panel. rim_px: dilation of nearer content, in relief pixels.
     """
-    rim = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
+    rim = np.ones((2 * rim_px + 1,) * 2, np.uint8)
     reliefs = []
     for inverse, eye_m in zip(nearness, distance_m, strict=True):
         kept = cv2.dilate(inverse, rim)

@@ -12,7 +12,7 @@ from runtime.model.job import Job, SolveWindow, Targets, drawn_views
 from runtime.model.predictor import Predictor
 from runtime.model.trim import extent_window, trim
 from runtime.optics.rect import PixelRect, union
-from runtime.optics.relief import block_px, relief_of
+from runtime.optics.relief import COARSE_RIM_PX, RIM_PX, block_px, relief_of
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import image_from_stack, raster_from_stack
 from runtime.records import F32, F64, U8
@@ -79,7 +79,7 @@ def drawn_job(
     views = raster_views(eyes_m, raster, reduction=reduction)
     content.expect(views, time_ns=time_ns)
     drawn = [_drawn(predictor, content, view, time_ns=time_ns) for view in views]
-    relief = _relief(content, views, stack, window) if in_depth else None
+    relief = _relief(content, views, stack, window, every=block_px(predictor.stack.width_px)) if in_depth else None
     # Reading back waits until the picture is complete, so both are drawn before either is read.
     reads_textures = predictor.reads_textures_of(content.draws_in)
     pictures = [p.pixels() if isinstance(p, DrawnPicture) and not reads_textures else p for p in drawn]
@@ -96,10 +96,9 @@ def _extent(content: ContentSource, eyes_m: F64, middle: PlaneRaster, *, time_ns
 
 
 def _relief(
-    content: ContentSource, views: tuple[View, View], stack: PanelStack, window: SolveWindow | None
+    content: ContentSource, views: tuple[View, View], stack: PanelStack, window: SolveWindow | None, *, every: int
 ) -> F32 | None:
     """Return the relief, on the middle panel, of the content drawn for both views; None without depth."""
-    every = block_px(stack.width_px)
     u0, v0 = (0, 0) if window is None else (window.box.u0, window.box.v0)
     left, right = (content.nearness(view, every=every, first=(u0 % every, v0 % every)) for view in views)
     if left is None or right is None:
@@ -110,7 +109,8 @@ def _relief(
         whole[:, v0 // every :, u0 // every :][:, :rows, :columns] = left, right
         left, right = whole
     middle_m = stack.x_m[stack.count // 2]
-    return relief_of((left, right), distance_m=[float(view.eye_m[0]) - middle_m for view in views])
+    distance_m = [float(view.eye_m[0]) - middle_m for view in views]
+    return relief_of((left, right), distance_m=distance_m, rim_px=RIM_PX if views[0].reduction == 1 else COARSE_RIM_PX)
 
 
 def _drawn(predictor: Predictor, content: ContentSource, view: View, *, time_ns: int) -> U8 | DrawnPicture:

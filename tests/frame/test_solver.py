@@ -143,7 +143,7 @@ def broken(part: Any, name: str, fault: Exception, monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize("fault", [ContentFailure("no such frame"), ZeroDivisionError("in a mesh")])
-@pytest.mark.parametrize("where", ["render", "revision"])
+@pytest.mark.parametrize("where", ["draw", "revision"])
 def test_content_that_fails_is_named_with_its_reason_and_tried_again(
     solver: Solver, content: ContentSource, monkeypatch: pytest.MonkeyPatch, fault: Exception, where: str
 ) -> None:
