@@ -87,6 +87,7 @@ class _Reducer:
                 self._drop(next(iter(self._targets)))
             self._targets[size] = self._context.framebuffer([self._context.texture(size, 1, dtype="f4")])
         target = self._targets[size]
+        finish()  # without Python's lock; drawing from an unfinished depth would wait with it
         self._context.enable_only(self._context.NOTHING)
         target.use()
         depth.compare_func = ""
