@@ -135,6 +135,17 @@ def test_the_flat_picture_is_drawn_from_the_middle_of_the_last_eyes(solver: Solv
     assert not np.array_equal(solver.step(wish(None, flat=True)).flat.layers, aside_flat)
 
 
+def test_of_four_solutions_one_is_measured_and_the_next_one_compared_with_it(solver: Solver) -> None:
+    eyes = [EYES + [0.0, 0.002 * n, 0.0] for n in range(8)]
+    measures = [solver.step(wish(eyes_m)).solution.measures for eyes_m in eyes]
+    assert [m.residual is not None for m in measures] == [True, False, False, False] * 2
+    assert [m.change is not None for m in measures] == [False, True, False, False] * 2
+    changed, moved_m, elapsed_s = measures[1].change
+    assert changed > 0.0
+    assert moved_m == pytest.approx(0.002)
+    assert elapsed_s == 0.0
+
+
 def broken(part: Any, name: str, fault: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*arguments: Any, **keywords: Any) -> Any:
         raise fault

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import cv2
 import pytest
 
-from runtime.support.background import set_niceness
+from runtime.support.background import before_all_others, set_niceness
 from runtime.support.threads import fresh_threads, parallel_map
 
 
@@ -47,3 +47,29 @@ def test_fresh_threads_have_the_niceness_of_their_caller() -> None:
     assert pool == [19, 19]
     fresh_threads()
     assert priorities() == [own] * 3
+
+
+def test_the_presenter_comes_before_all_others_and_what_it_starts_does_not() -> None:
+    """Policies and niceness of a thread within the block, of a thread started there, and after it."""
+    found: list[tuple[int, int]] = []
+
+    def note() -> None:
+        found.append((os.sched_getscheduler(0), os.getpriority(os.PRIO_PROCESS, threading.get_native_id())))
+
+    def presenter() -> None:
+        note()
+        with before_all_others():
+            note()
+            started = threading.Thread(target=note)
+            started.start()
+            started.join()
+        note()
+
+    thread = threading.Thread(target=presenter)
+    thread.start()
+    thread.join()
+    outside, within, started, after = found
+    assert after == outside
+    assert started[0] == os.SCHED_OTHER
+    if os.getuid() == 0:
+        assert within[0] & ~os.SCHED_RESET_ON_FORK == os.SCHED_RR or within[1] < outside[1]
