@@ -136,8 +136,8 @@ def test_the_flat_picture_is_drawn_from_the_middle_of_the_last_eyes(solver: Solv
 
 
 def test_of_four_solutions_one_is_measured_and_the_next_one_compared_with_it(solver: Solver) -> None:
-    eyes = [EYES + [0.0, 0.002 * n, 0.0] for n in range(8)]
-    measures = [solver.step(wish(eyes_m)).solution.measures for eyes_m in eyes]
+    step_m = np.array([0.0, 0.002, 0.0])
+    measures = [solver.step(wish(EYES + n * step_m)).solution.measures for n in range(8)]
     assert [m.residual is not None for m in measures] == [True, False, False, False] * 2
     assert [m.change is not None for m in measures] == [False, True, False, False] * 2
     changed, moved_m, elapsed_s = measures[1].change
