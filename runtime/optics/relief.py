@@ -33,7 +33,7 @@ Pixels = NDArray[np.floating[Any]]
 def block_px(width_px: int) -> int:
     """Return the side of the block that one relief pixel covers, in pixels of any raster.
 
-    width_px: columns of the full raster. A coarse raster has blocks of as many of its own, larger pixels.
+    width_px: columns of the full raster. Blocks of a coarse raster have the same number of pixels, each larger.
     """
     return -(-width_px // WIDEST_PX)
 
