@@ -135,7 +135,7 @@ def test_the_flat_picture_is_drawn_from_the_middle_of_the_last_eyes(solver: Solv
     assert not np.array_equal(solver.step(wish(None, flat=True)).flat.layers, aside_flat)
 
 
-def test_of_four_solutions_one_is_measured_and_the_next_one_compared_with_it(solver: Solver) -> None:
+def test_one_solution_in_four_is_measured_and_the_next_compared_with_it(solver: Solver) -> None:
     step_m = np.array([0.0, 0.002, 0.0])
     measures = [solver.step(wish(EYES + n * step_m)).solution.measures for n in range(8)]
     assert [m.residual is not None for m in measures] == [True, False, False, False] * 2
