@@ -116,7 +116,7 @@ class BackgroundJob(Generic[T]):
 
 @contextmanager
 def before_all_others() -> Iterator[None]:
-    """Run the calling thread with realtime priority within a block, or with a low niceness if that is not allowed.
+    """Give the calling thread realtime priority within a block, or if not allowed, a low niceness.
 
     At ordinary priority the kernel lets a busy thread finish its slice, which would delay a refresh by up to 3 ms.
     Threads and processes started within the block have ordinary priority.
