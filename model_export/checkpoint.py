@@ -1,4 +1,4 @@
-"""Checkpoints, which are read as weights only (no code from them runs) and written atomically."""
+"""Read checkpoints as weights only, so that no code from them runs, and write them atomically."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WIDTH_KEY = "subnets.in_conv.0.weight"
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """Read a checkpoint: a table with at least `model`, a table of tensors. Raises InputError.
+    """Read a checkpoint, a table whose entry `model` is a table of tensors. Raises InputError.
 
     Only plain values, tensors and an `argparse.Namespace` of plain values (saved by the published code) are
     deserialised.
@@ -46,7 +46,7 @@ def eyereal_width(state: Mapping[str, Tensor], *, source: Path) -> int:
 
 
 def fill(net: nn.Module, state: Mapping[str, Tensor], *, source: str | Path, arch: str) -> None:
-    """Load the weights, which must match the network. Raises InputError that names the first wrong one."""
+    """Load weights into a network. Raises InputError, which names the first weight that does not match."""
     expected = net.state_dict()
     missing = [key for key in expected if key not in state]
     # Old checkpoints lack this counter, which inference does not use.
@@ -66,7 +66,7 @@ def fill(net: nn.Module, state: Mapping[str, Tensor], *, source: str | Path, arc
 
 
 def save_checkpoint(path: Path, table: dict[str, Any]) -> None:
-    """Write a checkpoint atomically. The table must be readable as weights only."""
+    """Write a checkpoint atomically. The table may contain only what `load_checkpoint` reads."""
     buffer = io.BytesIO()
     torch.save(table, buffer)
     write_bytes(path, buffer.getvalue())

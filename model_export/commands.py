@@ -14,7 +14,7 @@ from runtime.support.options import number
 
 
 def require(*modules: str) -> None:
-    """Raise MissingPart with the package to install if a module of the `export` extra is missing."""
+    """Raise MissingPart, which names the extra to install, if one of the modules is missing."""
     for module in modules:
         if importlib.util.find_spec(module) is None:
             raise MissingPart(f"{module} is not installed; run: pip install 'phasestack[export]'")
@@ -87,7 +87,7 @@ def train(
 
 
 def options_of(texts: list[str] | None) -> dict[str, Any]:
-    """Parse NAME=VALUE options. Each value is JSON, or else text. Raises InputError."""
+    """Parse NAME=VALUE options. A value that is not JSON is taken as text. Raises InputError."""
     options: dict[str, Any] = {}
     for text in texts or []:
         name, equals, value = text.partition("=")
@@ -116,10 +116,10 @@ def export(
     option: Options = None,
     as_json: Annotated[bool, typer.Option("--json", help="the checks as one object on stdout")] = False,
 ) -> None:
-    """Write a model and its contract as ONNX, if its results agree with those of torch.
+    """Write a model and its contract as an ONNX file, if its results agree with those of torch.
 
-    fast, balanced and best are built from their recipes, without --checkpoint or --random-init. If a check fails, exits
-    with 1.
+    fast, balanced and best are built from their recipes, without --checkpoint or --random-init. Exits with 1 if a check
+    fails.
 
     Example: phasestack export --arch eyereal --checkpoint published.pth --out eyereal.onnx
     """
@@ -146,7 +146,7 @@ def validate(
     file: Annotated[Path, typer.Argument(help="the ONNX file")],
     as_json: Annotated[bool, typer.Option("--json", help="the checks as one object on stdout")] = False,
 ) -> None:
-    """Check the contract, names and shapes of a model file, and its values for stress inputs.
+    """Check a model file: its contract, names and shapes, and its results for stress inputs.
 
     Exits with 1 if a check fails.
 

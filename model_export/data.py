@@ -1,4 +1,4 @@
-"""Endless procedural training pairs, made of textured planes that are seen from random positions."""
+"""Procedural training pairs, in any number: textured planes seen from random positions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class TrainingPair:
 
 
 def random_stack(random: Random, *, width_px: int, height_px: int) -> PanelStack:
-    """Return random, evenly spaced panels: the prototype with fewer pixels, a part of it or another size."""
+    """Return random, evenly spaced panels: the prototype's with fewer pixels, a part of them, or others."""
     width_m = PITCH_WIDTH_M * math.exp(random.uniform(math.log(0.25), math.log(1.6)))
     gap_m = math.exp(random.uniform(math.log(0.005), math.log(0.5)))
     if random.random() < 0.6:  # a practical range
@@ -58,7 +58,7 @@ def random_eyes(random: Random, stack: PanelStack) -> F64:
 
 
 def is_served(eyes_m: F64, stack: PanelStack) -> bool:
-    """Return True if each eye sees the share `LEAST_COMMON` of the width and height through all panels."""
+    """Return True if each eye sees at least `LEAST_COMMON` of the width and height through all panels."""
     for eye in eyes_m:
         edges = []
         for x_m in stack.x_m:
@@ -87,7 +87,10 @@ def random_place(
 def random_pair(
     random: Random, *, width_px: int, height_px: int, stack: PanelStack | None = None, fov_deg: float = 0.0
 ) -> TrainingPair:
-    """Draw a random training pair for `stack` or for random panels. fov_deg 0: as wide as the panels."""
+    """Draw a random training pair for `stack` or, if it is None, for random panels.
+
+    fov_deg: horizontal field of view of the pictures; 0: as wide as the panels.
+    """
     stack, eyes = random_place(random, width_px=width_px, height_px=height_px, stack=stack)
     scene = random_scene(random, stack, eyes.mean(axis=0))
     fov_deg = fov_deg or filling_fov_deg(stack, eyes.mean(axis=0))
@@ -97,6 +100,6 @@ def random_pair(
 
 
 def filling_fov_deg(stack: PanelStack, eye_m: F64) -> float:
-    """Return the horizontal field of view of the panels at an eye's distance, at most WIDEST_DEG."""
+    """Return the horizontal field of view that the panels fill at an eye's distance, at most WIDEST_DEG."""
     distance_m = float(np.linalg.norm(eye_m))
     return min(WIDEST_DEG, math.degrees(2 * math.atan(stack.width_m / 2 / distance_m)))

@@ -1,4 +1,4 @@
-"""`phasestack export`: write weights to an ONNX file and check it."""
+"""Export a model as an ONNX file and check it (`phasestack export`)."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def in_torch(module: nn.Module) -> Reference:
 
 
 def spectral_model(name: str) -> tuple[bytes, nn.Module]:
-    """Build a shipped model from its recipe. Returns its ONNX file with the contract, and its module."""
+    """Build a shipped model from its recipe. Return its ONNX file with the contract, and its module."""
     recipe = read_recipe(name)
     net = SpectralSolver(recipe.cell_px).eval()
     contract = Contract(
@@ -106,9 +106,9 @@ def spectral_model(name: str) -> tuple[bytes, nn.Module]:
 def picture_network(
     arch: str, checkpoint: Path | None, random_init: int | None, options: dict[str, Any]
 ) -> tuple[Network, str]:
-    """Return a picture network, trained or untrained, and a digest of the source of its weights.
+    """Return a picture network, trained or untrained, and a digest that identifies its weights.
 
-    A checkpoint of `phasestack train` contains the options of the network and must be of network `arch`.
+    A checkpoint of `phasestack train` contains the options of its network, which must be `arch`.
     """
     if checkpoint is None:
         if random_init is None:
@@ -132,7 +132,7 @@ def picture_network(
 def picture_file(
     network: Network, origin: str, *, width_px: int, height_px: int, eye_order: EyeOrder = "left-right"
 ) -> bytes:
-    """Export a picture network as ONNX for one size. Raises InputError if torch cannot export it."""
+    """Export a picture network as ONNX, for pictures of one size. Raises InputError if torch cannot."""
     form, net, size = network.form, network.net.eval(), {"width_px": width_px, "height_px": height_px}
     probe(network, **size)
     check_static(network, **size)

@@ -1,4 +1,4 @@
-"""The published network (EyeReal's U-Net), with the parameter names of its published checkpoints."""
+"""Published network (EyeReal's U-Net), with the parameter names of its published checkpoints."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from torch.nn import functional
 
 from runtime.config import Section
 
-PICTURE_FOV_DEG = 40.0  # horizontal field of view; the published code feeds black outside it
+PICTURE_FOV_DEG = 40.0  # horizontal field of view, outside which the published code makes the input black
 OFFSET = 0.2  # the published code shows sigmoid(y) - 0.2, clipped at the panel
 INPUT, OUTPUT = "eyes", "panels"
 LEAST_PX = 32  # minimum side, because it is halved five times
-NORM_MOMENTUM = 0.02  # of running means; with one pair per batch, torch's default (0.1) would average only ten pairs
+NORM_MOMENTUM = 0.02  # of running means; torch's default (0.1) would average only ten pairs, with one pair per batch
 
 
 def _block(channels: int, middle: int, out: int) -> nn.Sequential:
@@ -46,7 +46,7 @@ class Up(nn.Module):
 
 
 class UNet(nn.Module):
-    """The published `subnets`: 17,303,721 parameters at width 32, 4,329,561 at width 16."""
+    """Published network `subnets`, with 17,303,721 parameters at width 32, or 4,329,561 at width 16."""
 
     def __init__(self, width: int = 32, channels: int = 18, out: int = 9) -> None:
         super().__init__()
@@ -74,10 +74,10 @@ class UNet(nn.Module):
 
 
 class EyeRealNet(nn.Module):
-    """Network from the eyes' pictures, warped to the pixels of every panel, to panel values.
+    """Network that maps the eyes' pictures, warped to the pixels of every panel, to panel values.
 
-    Input channels: panel-major, then eye, then RGB, intensities in [0, 1]. Output channels: panel-major, then RGB, in
-    [-0.2, 0.8], as published; the panel clips negative values.
+    Input channels are intensities in [0, 1], ordered by panel, then eye, then RGB. Output channels are ordered by
+    panel, then RGB. As published, they are in [-0.2, 0.8]; the panel clips negative values.
     """
 
     input_frame, input_value, output = "panel", "intensity", "panels"

@@ -1,27 +1,29 @@
-"""Differentiable light and solver step in plain torch.
+"""Light and a step of the solver, as differentiable functions in plain torch.
 
 The runtime's kernels are tested against this reference, and networks are trained through it. Equations are those of
 docs/mathematics.md, "A step".
 
-*Light.* Panel n shows x_n in [0, 1]; along a ray s = sum of x_n, and I = sin²(pi/2·s) = (1 - Re exp(i·pi·s))/2. A pixel
-of an eye's picture is a bundle of rays. Within it the panels' values are nearly independent, so that
+*Light.* Panel n shows x_n in [0, 1]. Along a ray, s is the sum of x_n, and the intensity is I = sin²(pi/2·s) =
+(1 - Re exp(i·pi·s))/2. A pixel of an eye's picture is a bundle of rays. Within it, the values of different panels are
+nearly independent, so that
 
     E[exp(i·pi·s)] = Z = prod_n z_n,   z_n = sum_q w_nq·exp(i·pi·x_nq)                                        (L1)
     I = (1 - Re Z)/2                                                                                          (L2)
 
-with w_nq the share of the bundle on panel n that pixel q covers: bilinear weights, for a bundle as wide as a pixel.
+where w_nq is the share of the bundle that pixel q covers on panel n (bilinear weights if the bundle is as wide as a
+pixel).
 
-*A step.* With target T and residual e = I - T (0 if a ray misses a panel), the derivative of the squared error with
-respect to a common change of all pixels of a panel that a bundle crosses, and a bound on its curvature, are sums over
-all sets:
+*A step.* With target T and residual e = I - T (0 if a ray misses a panel), consider a common change of all pixels of a
+panel that a bundle crosses. The derivative of the squared error, and a bound on its curvature, are sums over all sets:
 
     g_q = sum w·e·Im Z            (pi/2 times it is the derivative of sum e²/2)                               (L3)
     D_q = sum w·(Im Z)²                                                                                       (L4)
     x' = clip(y - size·2/(pi·N)·g/max(D, floor·E), 0, 1),     y' = x' + momentum·(x' - x)                   (L5)
 
 for N panels and E ray sets. The sum over rays through a panel's pixel (the transpose of bilinear sampling) is computed
-as one bilinear sample of the rays' values through the inverse homography. Both agree if a ray's pixel and a panel's
-have equal size, and otherwise differ by a factor common to g and D. Pictures are clamped to the edge for two pixels.
+as one bilinear sample of the rays' values through the inverse homography. The two agree if the pixels of rays and panel
+have equal size, and otherwise differ by a factor that is common to g and D. The edge pixels of pictures are repeated
+outwards for two pixels.
 """
 
 from __future__ import annotations
@@ -52,9 +54,9 @@ LEAST_ERROR = 1e-6  # minimum squared error, which limits the PSNR to 60 dB
 
 @dataclass(frozen=True, slots=True)
 class Views:
-    """E sets of rays, alternating between left and right eye, with one pair per position of the head."""
+    """E sets of rays: for each position of the head, one set for the left eye and one for the right."""
 
-    panels_from_rays: Tensor  # (E, N, 3, 3) float64, from the rays' raster to panel pixels, centres at halves
+    panels_from_rays: Tensor  # (E, N, 3, 3) float64, from the rays' raster to panel pixels; centres at half-integers
     width_px: int  # of the rays' raster
     height_px: int
 
@@ -69,10 +71,10 @@ class Views:
         fov_deg: float | None,
         places_m: ArrayLike = ((0.0, 0.0, 0.0),),
     ) -> Views:
-        """Return rays through the pixels of a picture `fov_deg` wide or, if None, of the centre panel.
+        """Return the rays through the pixels of a picture `fov_deg` wide or, if None, of the centre panel.
 
-        eyes_m: (2, 3) left, right, frame `stack`; places_m: displacements of both eyes, whose rays pass through the
-        same points of the centre panel. Raises ValueError for an eye in the centre panel's plane.
+        eyes_m: (2, 3) left, right, frame `stack`. places_m: displacements of both eyes for further sets, whose rays
+        pass through the same points of the centre panel. Raises ValueError for an eye in the centre panel's plane.
         """
         sets = []
         for place in np.asarray(places_m, np.float64):
@@ -86,9 +88,9 @@ class Views:
 
 
 def light(panels: Tensor, views: Views) -> tuple[Tensor, Tensor]:
-    """Return intensities (E, C, h, w) of panels (N, C, H, W) by (L1), (L2), and a mask of rays.
+    """Return intensities (E, C, h, w) of panels (N, C, H, W) by (L1) and (L2), and a mask of rays.
 
-    Differentiable with respect to the panels, whose device and dtype the results have.
+    They are differentiable with respect to the panels, and have the panels' device and dtype.
     """
     bundles, counts = _bundles(panels, views)
     return torch.stack([(1 - reduce(torch.mul, z).real) / 2 for z in bundles]), counts
@@ -97,7 +99,10 @@ def light(panels: Tensor, views: Views) -> tuple[Tensor, Tensor]:
 def traced(
     panels: Tensor, views: Views, *, rays: int = 2, random: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Estimate unbiased intensities from rays x rays random rays per pixel, with a mask of valid pixels."""
+    """Estimate intensities without bias, and return them with a mask of valid pixels.
+
+    rays: across and down a pixel; each is at a random position in its part of the pixel.
+    """
     size, angle = (views.height_px, views.width_px), torch.pi * panels
     total, counts = torch.zeros((), dtype=panels.dtype, device=panels.device), torch.tensor(True, device=panels.device)
     for stratum in range(rays * rays):
@@ -113,7 +118,7 @@ def traced(
 def light_db(
     panels: Tensor, targets: Tensor, views: Views, *, rays: int = 3, random: torch.Generator | None = None
 ) -> float:
-    """Return the PSNR of light from the panels at point eyes, against targets (E, C, h, w).
+    """Return the PSNR of the panels' light at pinhole eyes, against targets (E, C, h, w).
 
     The errors of two independent sets of rays are multiplied, so that the mean is an unbiased squared error.
     """
@@ -135,8 +140,8 @@ def step(
 ) -> tuple[Tensor, Tensor]:
     """Compute one step (L5): x' and y' from panels x and their extrapolation y, both (N, C, H, W).
 
-    targets: (2, C, h, w) of the left and the right eye. If the views have fewer rows, head positions alternate from row
-    to row of the targets.
+    targets: (2, C, h, w) for the left and the right eye. If the views have fewer rows, their head positions take turns
+    at the rows of the targets.
     """
     sets, turns = len(views.panels_from_rays), targets.shape[-2] // views.height_px
     back, size_px = torch.linalg.inv(views.panels_from_rays), y.shape[-2:]
@@ -161,7 +166,7 @@ def improved(panels: Tensor, targets: Tensor, views: Views, sizes: Sequence[Any]
 
 
 def _bundles(panels: Tensor, views: Views) -> tuple[list[Tensor], Tensor]:
-    """Return z_n of every ray set, complex (N, C, h, w), and a mask (E, 1, h, w) of the rays that count."""
+    """Return every ray set's z_n, complex (N, C, h, w), and a mask (E, 1, h, w) of rays that count."""
     angle = torch.pi * panels
     parts = torch.cat([torch.cos(angle), torch.sin(angle)], dim=1)  # (N, 2C, H, W)
     bundles, counts = [], []
@@ -175,10 +180,11 @@ def _bundles(panels: Tensor, views: Views) -> tuple[list[Tensor], Tensor]:
 def _sample(
     images: Tensor, matrices: Tensor, size: Sequence[int], *, near_px: float, within: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Sample images (N, K, H, W) to (N, K, h, w) through homographies (N, 3, 3) from pixels of the result.
+    """Sample images (N, K, H, W) to (N, K, h, w) through `matrices` (N, 3, 3) from pixels of the result.
 
-    Bilinear at pixel centres, or nearest at positions `within` (2, h, w) the pixels, columns and rows in [0, 1].
-    Samples not `near_px` inside an image are zero; the second result, (N, 1, h, w), is the mask of those inside.
+    Samples are bilinear at pixel centres. With `within`, (2, h, w) column and row positions in [0, 1] inside the
+    pixels, they are the nearest pixels there. Samples less than `near_px` inside an image are zero; the second result,
+    (N, 1, h, w), is a mask of the others.
     """
     height, width = images.shape[-2:]
     to: dict[str, Any] = {"dtype": torch.float64, "device": images.device}

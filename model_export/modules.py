@@ -28,7 +28,7 @@ STEPS_MOST = 64  # maximum number of steps in a contract
 
 
 class Form(Section):
-    """Input and output format of a picture network, given by class attributes or defaults."""
+    """Input and output format of a picture network, from class attributes or defaults."""
 
     input_frame: Literal["centre", "panel"] = Field(
         "centre", description="both eyes' pictures, resampled to the pixels of the centre panel or of every panel"
@@ -52,7 +52,7 @@ class Form(Section):
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """Instance of a module, with its format and options."""
+    """Picture network: an instance of a module, with its format and options."""
 
     arch: str
     net: nn.Module
@@ -60,7 +60,7 @@ class Network:
     options: dict[str, Any]
 
     def steps(self) -> tuple[Sequence[Any], Sequence[Any]]:
-        """Sizes and momenta of the solver steps after the network, either learned or constant."""
+        """Sizes and momenta of the solver steps after the network. They are learned or constant."""
         learned = [getattr(self.net, name, None) for name in ("step_sizes", "step_momenta")]
         if isinstance(learned[0], Tensor) and isinstance(learned[1], Tensor):
             return list(learned[0].clamp(1e-3, 3)), list(learned[1].clamp(0, 0.99))
@@ -69,7 +69,7 @@ class Network:
 
 @contextmanager
 def blamed(arch: str, field: str) -> Iterator[None]:
-    """Convert any exception of a user's module to an InputError in one line."""
+    """Convert any exception of a user's module to a one-line InputError for `field`."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -124,7 +124,7 @@ def probe(network: Network, *, width_px: int, height_px: int) -> None:
 
 
 def check_static(network: Network, *, width_px: int, height_px: int) -> None:
-    """Raise InputError if the module branches on values, which a graph cannot represent."""
+    """Raise InputError if the module branches on its input's values, which a graph cannot represent."""
     example = torch.zeros(1, network.form.channels, height_px, width_px)
     try:
         with quiet(), redirect_stderr(StringIO()), torch.no_grad():  # torch prints graphs that it cannot trace
@@ -137,7 +137,7 @@ def check_static(network: Network, *, width_px: int, height_px: int) -> None:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Suppress warnings meant for developers of the exporter, and graphs printed from C++."""
+    """Suppress warnings for developers of the exporter, and graphs that C++ code prints."""
     sys.stdout.flush()
     level, output = logging.root.manager.disable, os.dup(1)
     with Path(os.devnull).open("wb") as nothing:

@@ -1,4 +1,4 @@
-"""The shipped network, which solves in closed form along the eyes' baseline for a tracking error."""
+"""Shipped network, which solves along the line of the eyes in closed form, for a tracking error."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from runtime.kernels import FULL
 
 INPUTS = ("left", "right", "waves", "shifted_waves", "spectrum", "modes_in", "eye_sigma_px")
 OUTPUTS = ("rear", "front", "check")
-BLOCK_ROWS = 8  # rows transformed together; the raster consists of whole blocks
+BLOCK_ROWS = 8  # rows that are transformed together; the raster consists of whole blocks
 BOX = 0.5  # outer panels start in the middle of their range and can change by this much
 IN_SCALE = 64  # codes per unit of the transformed inputs, which in codes would overflow half precision
 
 
 class SpectralSolver(nn.Module):
-    """Solver for both outer panels, given the eyes' residuals, one epipolar row at a time.
+    """Solver for both outer panels, given the eyes' residuals on epipolar rows.
 
-    Let front = h + g and rear = h - g about the middle of their range, s the parallax in columns of half the eyes'
-    separation on either panel, e that of the centre panel, and w a frequency along the eyes' line. The difference of
-    the eyes' pictures is D = 4i·(sin(ws)cos(we)·g + cos(ws)sin(we)·h). A tracking error with standard deviations of c
-    columns and r rows moves the panels' pictures in opposite directions. It attenuates the mean of a wave to
-    m = exp(-(c²w² + r²v²)/2) and turns the rest into noise. The expected squared error has a closed-form minimum for
-    every frequency (`gains`). Frequencies combine those of the chain with those of a block of `BLOCK_ROWS` rows and
-    one cell's columns.
+    Let the panels be front = h + g and rear = h - g about the middle of their range. Let s be the parallax, in columns,
+    that half the eyes' separation causes on either panel, e that of the centre panel, and w and v frequencies along the
+    eyes' line and across it. The difference of the eyes' pictures is D = 4i·(sin(ws)cos(we)·g + cos(ws)sin(we)·h). A
+    tracking error with standard deviations of c columns and r rows moves the panels' pictures in opposite directions.
+    It attenuates the mean of a wave to m = exp(-(c²w² + r²v²)/2) and turns the rest into noise. The expected squared
+    error has a closed-form minimum for every frequency (`gains`). The frequencies are those of the chain, combined with
+    those of a block of `BLOCK_ROWS` rows and one cell's columns.
     """
 
     def __init__(self, cell_px: int = 4) -> None:
@@ -51,10 +51,13 @@ class SpectralSolver(nn.Module):
         self.register_buffer("v", v.repeat_interleave(2 * cell_px), persistent=False)
         self.log_floor = nn.Parameter(torch.log(torch.tensor([0.01, 0.2])))  # regularisation λ of g and of h
         self.log_rough = nn.Parameter(torch.log(torch.tensor([0.05, 0.2])))  # its growth with w²
-        self.log_sigma_scale = nn.Parameter(torch.zeros(2))  # factor on eye_sigma_px along the line and across it
+        self.log_sigma_scale = nn.Parameter(torch.zeros(2))  # factors on eye_sigma_px along and across the eyes' line
 
     def gains(self, spectrum: Tensor, eye_sigma_px: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(patterns, cells + 1) each: numerator and denominator of g without h's share, and h's gain."""
+        """Return the numerator and denominator of g's gain without h's share, and the gain of h.
+
+        Each is (patterns, cells + 1).
+        """
         scale = torch.exp(self.log_sigma_scale)
         # A mode of the chain times a pattern of the block is two waves, at the pattern's frequency ± `offset`.
         offset = 2 * torch.asin(torch.clamp(spectrum / 4, 0, 1))[None] / (2 * self.cell_px)
@@ -76,13 +79,14 @@ class SpectralSolver(nn.Module):
         return share * m * spectrum[None], share * alpha2 + cost_g, gain_h
 
     def forward(self, *feeds: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Rear and front panel (rows, cells + 1, 2K·C), 16-bit codes, from one parallax before column 0.
+        """Return the rear and the front panel, and a check that is finite if all intermediate numbers are.
 
-        The third result is finite if all intermediate numbers are.
+        The panels are (rows, cells + 1, 2K·C) 16-bit codes, which begin one parallax before column 0.
 
-        feeds: `INPUTS`. left, right (rows, cells, 2K·C), 16-bit codes: each eye's residual along its rays through the
-        raster; waves (cells + 1, cells + 1) V, shifted_waves Ũ, spectrum (cells + 1,) s and modes_in
-        (cells + 1, cells) U^T (`runtime.model.chain.chain_modes`); eye_sigma_px (3,): c columns, r rows, e columns.
+        feeds: `INPUTS`, in this order. left, right: (rows, cells, 2K·C) 16-bit codes, each eye's residual along its
+        rays through the raster. waves, shifted_waves, spectrum, modes_in: V and Ũ (cells + 1, cells + 1), s
+        (cells + 1,) and U^T (cells + 1, cells) of `runtime.model.chain.chain_modes`. eye_sigma_px: (3,) c columns, r
+        rows, e columns.
         """
         rear, front, check = self._solved(feeds, added=0.5)
         # The cast truncates. Adding a half makes it round, because values are clamped to be non-negative.
@@ -90,10 +94,10 @@ class SpectralSolver(nn.Module):
         return (*codes, check)  # type: ignore[return-value]
 
     def _solved(self, feeds: tuple[Tensor, ...], *, added: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Rear and front panel (1, block's rows, all else) in codes plus `added`, and the check.
+        """Return rear and front panel (1, block's rows, all else), in codes plus `added`, and the check.
 
-        A cell's row stays contiguous throughout, with the rows of all blocks next to each other. This makes copies
-        cheap, and the products with the rows' and the chain's matrices few and large.
+        Each row of a cell stays contiguous throughout, and the same row of all blocks is stored together. This makes
+        copies cheap, and the products with the rows' and the chain's matrices few and large.
         """
         left, right, waves, shifted_waves, spectrum, modes_in, eye_sigma_px = feeds
         channels = left.shape[2] // (2 * self.cell_px)
@@ -112,9 +116,10 @@ class SpectralSolver(nn.Module):
         return rear, front, _size(both)
 
     def _in_columns(self, x: Tensor, gains: Tensor, channels: int) -> Tensor:
-        """Scale each of the columns' waves in x (n rows' waves, modes, blocks, 2K·C) by its gain (n·2K, modes).
+        """Scale the waves along the columns of x by their gains.
 
-        Uses one matrix per mode and wave of the rows: transform to the columns' waves, scale, transform back.
+        x: (n waves of the rows, modes, blocks, 2K·C); gains: (n·2K, modes). One matrix for each mode and wave of the
+        rows transforms to the columns' waves, scales them, and transforms back.
         """
         count, modes, _, row = x.shape
         # Projections of a cell's row on each of the columns' waves.
@@ -131,12 +136,12 @@ def _same(channels: int, *, like: Tensor) -> Tensor:
 
 
 def _by_block_rows(image: Tensor) -> Tensor:
-    """Rearrange (rows, cells, 2K·C) to (block's rows, cells, blocks, 2K·C)."""
+    """Rearrange an image (rows, cells, 2K·C) to (block's rows, cells, blocks, 2K·C)."""
     return image.reshape(-1, BLOCK_ROWS, *image.shape[1:]).permute(1, 2, 0, 3)
 
 
 def _by_rows(x: Tensor, *, like: Tensor) -> Tensor:
-    """Invert `_by_block_rows`, from (block's rows, all else), for one cell more than the input `like`."""
+    """Invert `_by_block_rows` for x (block's rows, all else), with one cell more than the input `like`."""
     cells, row = like.shape[1] + 1, like.shape[2]
     return x.reshape(BLOCK_ROWS, cells, -1, row).permute(2, 0, 1, 3).reshape(-1, cells, row)
 
@@ -148,7 +153,10 @@ def _size(x: Tensor) -> Tensor:
 
 
 def _fourier(size: int) -> tuple[Tensor, Tensor]:
-    """Return the orthonormal real Fourier basis (size, size), one wave per row, and frequencies in rad per sample."""
+    """Return the orthonormal real Fourier basis (size, size) and its frequencies in radians per sample.
+
+    Each row of the basis is one wave.
+    """
     at = torch.arange(size, dtype=torch.float64)
     rows, w = [torch.ones(size, dtype=torch.float64) / math.sqrt(size)], [0.0]
     for k in range(1, (size + 1) // 2):
@@ -162,7 +170,10 @@ def _fourier(size: int) -> tuple[Tensor, Tensor]:
 
 
 def _cosines(size: int) -> tuple[Tensor, Tensor]:
-    """Return the orthonormal cosine basis (size, size), one wave per row, and frequencies in rad per sample."""
+    """Return the orthonormal cosine basis (size, size) and its frequencies in radians per sample.
+
+    Each row of the basis is one wave.
+    """
     k, at = torch.arange(size, dtype=torch.float64)[:, None], torch.arange(size, dtype=torch.float64) + 0.5
     basis = torch.cos(math.pi * k * at / size) * math.sqrt(2 / size)
     basis[0] /= math.sqrt(2)

@@ -1,4 +1,4 @@
-"""Conversion of torch modules to ONNX files with a contract."""
+"""Convert torch modules to ONNX files with a contract."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def spectral_bytes(net: nn.Module, *, cell_px: int) -> bytes:
 
 
 def ports(names: Sequence[str]) -> tuple[Port, ...]:
-    """Declare inputs or outputs for a contract."""
+    """Return a contract's declaration of inputs or outputs with these names."""
     return tuple(Port(name=name, axes=(CELL_AXES | PICTURE_AXES)[name]) for name in names)
 
 
@@ -71,7 +71,10 @@ def _exported(
     *,
     folded: bool = True,
 ) -> bytes:
-    """Export a module. folded: fold constants; otherwise keep the names of weights."""
+    """Export a module as ONNX.
+
+    folded: True to fold constants, False to keep the names of weights.
+    """
     buffer = io.BytesIO()
     with quiet(), torch.no_grad():
         torch.onnx.export(

@@ -1,4 +1,4 @@
-"""Training pairs for picture networks: input, targets and true eyes."""
+"""Prepare training pairs for picture networks: input, targets and true eyes."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ PICTURE_FOV_DEG = 40.0  # field of view of pictures in the published data set
 
 @dataclass(frozen=True)
 class TrainingPairs(Dataset[dict[str, Tensor]]):
-    """Dataset for training a picture network. Each pair depends only on (seed, number)."""
+    """Data set for training a picture network. Each pair depends only on (seed, number)."""
 
     form: Form
     seed: int
@@ -48,7 +48,7 @@ class TrainingPairs(Dataset[dict[str, Tensor]]):
     scene: str = ""  # scene to draw instead, rotated about the vertical axis
 
     def __getitem__(self, number: int) -> dict[str, Tensor]:
-        """Return network input, targets, and rays of the estimated and the true eyes."""
+        """Return the network's input, the targets, and the rays of the estimated and the true eyes."""
         pair = self.pair(number)
         random = np.random.default_rng([self.seed, number, 1])
         pose = stack_from_eye(pair.eyes_m.mean(axis=0))
@@ -83,7 +83,7 @@ class TrainingPairs(Dataset[dict[str, Tensor]]):
         return random_pair(random, **self._size, stack=self.stack, fov_deg=self.form.picture_fov_deg)
 
     def _drawn(self, random: np.random.Generator) -> TrainingPair:
-        """Draw the scene at a random time and rotation about the vertical, for random eyes."""
+        """Draw the scene for random eyes, at a random time and a random rotation about the vertical."""
         width_px, height_px = self.width_px, self.height_px
         stack, eyes_m = random_place(random, **self._size, stack=self.stack or prototype(**self._size))
         fov_deg = self.form.picture_fov_deg or filling_fov_deg(stack, eyes_m.mean(axis=0))
@@ -104,7 +104,10 @@ def opened(scene: str, stack: PanelStack, _process: int) -> ContentSource:
 
 
 def folder_pairs(folder: Path) -> tuple[Pair, ...]:
-    """Read a folder in the format of the published data set, named after its scene. Raises InputError."""
+    """Read the pairs in a folder in the published data set's format. Raises InputError.
+
+    The folder's name must contain the name of its scene.
+    """
     name = next((name for name in preset_names() if name in folder.resolve().name), "")
     if not name:
         raise InputError(folder, "name", f"contains none of {', '.join(preset_names())}")
@@ -131,7 +134,7 @@ def photographed(pair: Pair, stack: PanelStack, fov_deg: float) -> TrainingPair:
 
 
 def network_input(pair: TrainingPair, form: Form) -> F32:
-    """Return the input (channels, H, W) of a picture network, by panel, then eye, then RGB."""
+    """Return a picture network's input (channels, H, W), ordered by panel, then eye, then RGB."""
     stack, table = pair.stack, np.arange(256, dtype=np.float32) / np.float32(255)
     if form.input_value == "phase":
         table = phase_from_intensity(table, form.branch)

@@ -18,7 +18,7 @@ Random = np.random.Generator
 
 @dataclass(frozen=True, slots=True)
 class Plane:
-    """Textured parallelogram. Texture (u, v) in [0, 1]² is at corner + u·across + v·down."""
+    """Textured parallelogram. Point (u, v) in [0, 1]² of the texture is at corner + u·across + v·down."""
 
     texture: U8  # (h, w, 4) RGBA
     corner_m: F64  # (3,) frame `stack`
@@ -30,10 +30,10 @@ Scene = tuple[Plane, ...]
 
 
 def draw(scene: Scene, projection: F64, *, width_px: int, height_px: int) -> U8:
-    """Draw a scene (h, w, 3) through a 3x4 projection from the stack frame to pixels.
+    """Draw a picture (h, w, 3) of a scene through a 3x4 projection from the stack frame to pixels.
 
-    The nearest plane wins, by its exact depth in each pixel; half-transparent edges blend with planes drawn earlier.
-    Nothing behind the eye is drawn.
+    Each pixel shows the nearest plane, by its exact depth there; half-transparent edges blend with planes drawn
+    earlier. Nothing behind the eye is drawn.
     """
     width, height = width_px * FINER, height_px * FINER
     picture = np.zeros((height, width, 3), np.float32)
@@ -66,7 +66,7 @@ def _part(raster_from_plane: F64, width: int, height: int) -> tuple[slice, slice
 
 
 def _draw_plane(texture: U8, raster_from_plane: F64, part: tuple[slice, slice], picture: F32, nearness: F32) -> None:
-    """Draw one plane where it is nearer than the picture."""
+    """Draw one plane where it is nearer than what the picture shows; update both arrays."""
     rows, columns = part
     left, top = columns.start, rows.start
     height, width = texture.shape[:2]
@@ -90,7 +90,7 @@ def _shift(right: float, down: float) -> F64:
 
 
 def random_scene(random: Random, stack: PanelStack, middle_m: F64) -> Scene:
-    """Return a random backdrop and cards at many depths around the panels, for a viewer near `middle_m`."""
+    """Return a random backdrop, and cards at many depths around the panels, for a viewer near `middle_m`."""
     centre_m = stack.x_m[1]
     distance_m = middle_m[0] - centre_m
     deep_m = (stack.x_m[-1] - centre_m) * math.exp(random.uniform(math.log(0.3), math.log(6.0)))
@@ -125,9 +125,9 @@ def random_scene(random: Random, stack: PanelStack, middle_m: F64) -> Scene:
 
 
 def _texture(random: Random, width: int, height: int, tones: U8, *, see_through: bool) -> U8:
-    """Return noise (height, width, 4) with power that falls with frequency, or discs and boxes.
+    """Return a texture (height, width, 4): noise whose power falls with frequency, or discs and boxes.
 
-    see_through: opaque only on lines.
+    see_through: True for a texture that is opaque only on lines.
     """
     picture = np.full((height, width, 4), 255, np.uint8)
     if random.random() < 0.5:

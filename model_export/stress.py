@@ -1,4 +1,4 @@
-"""Inputs for checks of a model: an ordinary pair, and extreme pictures."""
+"""Inputs with which a model is checked: an ordinary pair, and extreme pictures."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from runtime.records import F32
 Feeds = dict[str, np.ndarray]
 ORDINARY = "ordinary pair"
 EXTRA = ("one eye black", "noise")
-LARGE_PX = 1_000_000  # number of pixels from which slow cases are skipped
+LARGE_PX = 1_000_000  # for pictures with more pixels, some cases are skipped
 
 
 def stress_pictures(height: int, width: int) -> dict[str, tuple[F32, F32]]:
-    """Return named pairs of left and right pictures (h, w, 3), with intensities in [0, 1]."""
+    """Return, by name, pairs of left and right pictures (h, w, 3) with intensities in [0, 1]."""
     v, u = np.mgrid[0:height, 0:width]
 
     def grey(values: np.ndarray) -> F32:
@@ -48,7 +48,7 @@ def ordinary_pictures(height: int, width: int) -> tuple[F32, F32]:
 
 
 def spectral_cases(cell_px: int) -> dict[str, Feeds]:
-    """Return inputs of the spectral solver: short and long epipolar rows, for exact and uncertain eyes."""
+    """Return inputs of the spectral solver: short and long epipolar rows, exact and uncertain eyes."""
     cases = {}
     for cells, eye_sigma_px in ((16, (0.0, 0.0, 0.5)), (112, (0.13, 0.15, 0.3)), (400, (0.5, 0.6, 0.1))):
         size = (64, cells * 2 * cell_px)
@@ -76,7 +76,7 @@ def picture_cases(contract: Contract, height: int, width: int) -> dict[str, Feed
 
 
 def picture_feeds(pictures: tuple[F32, F32], contract: Contract, panels: int) -> Feeds:
-    """Return an input (1, panels x 6, h, w), by panel, then eye, then RGB."""
+    """Return a picture network's input (1, panels x 6, h, w), ordered by panel, then eye, then RGB."""
     if contract.input_value == "phase":
         left, right = (phase_from_intensity(picture, contract.branch) for picture in pictures)
         pictures = left, right

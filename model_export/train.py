@@ -1,7 +1,7 @@
-"""`phasestack train`: gradient training of a picture network, with the light at the eyes as the loss.
+"""Train a picture network, with the light at the eyes as the loss (`phasestack train`).
 
-AdamW with cosine decay of the learning rate. Pair k and all random numbers of iteration k depend only on (seed, k), so
-a resumed training gives the same result as an uninterrupted one.
+The optimizer is AdamW, with cosine decay of the learning rate. Pair k and all random numbers of iteration k depend only
+on (seed, k), so a resumed training gives the same result as an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ from runtime.support.artifacts import write_bytes, write_text
 from runtime.support.progress import progress_bar
 
 HELD_OUT_SEED = 9_000_001  # seed of the validation pairs; greater than any training seed
-HELD_OUT, HELD_OUT_SHARE = 6, 8  # number of procedural validation pairs; one in this many pairs of a folder
+HELD_OUT, HELD_OUT_SHARE = 6, 8  # number of procedural validation pairs; of a folder, one in this many is held out
 FIRST_SAVED = 10  # iteration of the first checkpoint, so that a short training can be resumed
-SMALL_PX = 30_000  # pixels of a batch up to which one thread is faster (17 s instead of 24 at 160x90)
+SMALL_PX = 30_000  # up to this many pixels in a batch, one thread is faster (17 s instead of 24 at 160x90)
 COLUMNS = ("iteration", "light_db", "held_out_light_db")
 Device = Literal["auto", "cpu", "cuda"]
 Batch = dict[str, Tensor]
 
 
 class Training(Section):
-    """Everything that determines the result of a training. Stored in checkpoints."""
+    """Everything that determines the result of a training, as stored in checkpoints."""
 
     arch: str
     options: Annotated[dict[str, Any], Field(default_factory=dict)]
@@ -63,7 +63,7 @@ class Training(Section):
 
 
 def run_training(out: Path, training: Training, *, device: Device = "auto", resume: bool = False) -> dict[str, Any]:
-    """Train, and regularly write the checkpoint, the curve and its plot. Raises InputError."""
+    """Train, and write the checkpoint, the curve and its plot at regular intervals. Raises InputError."""
     place, start = _placed(device), time.monotonic()
     network = make_network(training.arch, training.options, seed=training.seed)
     probe(network, width_px=training.width_px, height_px=training.height_px)
@@ -133,7 +133,10 @@ def run_training(out: Path, training: Training, *, device: Device = "auto", resu
 
 @contextlib.contextmanager
 def _signals() -> Iterator[list[int]]:
-    """Yield a list that receives SIGINT or SIGTERM, to stop after the iteration. A second one stops at once."""
+    """Yield a list that receives SIGINT or SIGTERM. A second signal stops at once.
+
+    After the first one, the caller stops when the iteration ends.
+    """
     came: list[int] = []
 
     def take(number: int, frame: FrameType | None) -> None:
@@ -159,7 +162,7 @@ def displayed(panels: Tensor) -> Tensor:
 
 
 def _loss(network: Network, batch: Batch) -> Tensor:
-    """Return the negative mean of the light in dB, which gives easy and hard pairs equal weight."""
+    """Return the negative mean of the pairs' light in dB, which gives easy and hard pairs equal weight."""
     with torch.autocast(batch["input"].device.type, torch.bfloat16, enabled=batch["input"].is_cuda):
         answer = network.net.train()(batch["input"])
     losses = []
@@ -172,7 +175,7 @@ def _loss(network: Network, batch: Batch) -> Tensor:
 
 
 def _shown(network: Network, answer: Tensor, batch: Batch) -> Iterator[Tensor]:
-    """Yield the displayed panels of each pair: the output after the solver steps for the estimated eyes."""
+    """Yield each pair's displayed panels: the output, after the solver's steps for the estimated eyes."""
     for panels, targets, matrices in zip(displayed(answer.float()), batch["targets"], batch["believed"], strict=True):
         views = Views(matrices, targets.shape[-1], targets.shape[-2])
         x = panels.reshape(PANELS, COLOURS, *panels.shape[1:])
@@ -234,9 +237,9 @@ def _on(batch: Batch, device: torch.device) -> Batch:
 def _resumed(
     out: Path, training: Training, network: Network, *parts: Any
 ) -> tuple[int, list[list[float]], list[float]]:
-    """Restore weights, optimizer and rate. Returns iterations done, the curve, and lights since its last point.
+    """Restore weights, optimizer and learning rate from a checkpoint. Raises InputError.
 
-    Raises InputError.
+    Returns the number of iterations done, the curve, and the iterations' light since the curve's last point.
     """
     path = out / "checkpoint.pth"
     table = load_checkpoint(path)

@@ -1,4 +1,4 @@
-"""The steps of the solver as a trainable network, whose weights are their sizes and momenta."""
+"""Steps of the solver as a trainable network, whose weights are their sizes and momenta."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Unrolled(nn.Module):
         self.step_momenta = nn.Parameter(torch.full((steps,), MOMENTUM))
 
     def forward(self, eyes: Tensor) -> Tensor:
-        """Map intensities (n, 6, h, w) to (n, 9, h, w): a third of the phase sum of the mean picture each."""
+        """Map intensities (n, 6, h, w) to (n, 9, h, w): every panel gets a third of the mean picture's phase."""
         mean = (eyes[:, :3] + eyes[:, 3:]) / 2
         phase = torch.asin(mean.clamp(0, 1).sqrt()) * (2 / torch.pi)
         return ((2 - phase) / 3).repeat(1, 3, 1, 1)

@@ -1,7 +1,7 @@
-"""Checks of a model file: requirements of the runtime, then values for ordinary and stress inputs.
+"""Check a model file: the runtime's requirements, then its results for ordinary and stress inputs.
 
-Values are compared with the torch module being exported. For an existing file, they are compared with the same graph
-run without onnxruntime's optimisations, so every file that the runtime accepts can be checked.
+On export, results are compared with those of the torch module. For an existing file, they are compared with those of
+the same graph without onnxruntime's optimisations, so every file that the runtime accepts can be checked.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Report:
         return json.dumps({"file": self.file, "passed": self.passed, "checks": [asdict(c) for c in self.checks]})
 
     def table(self) -> str:
-        """Return a readable table of checks, with what was found and required."""
+        """Return a readable table of the checks, with what was found and what is required."""
         rows = [f"{'ok' if c.passed else 'FAILED':8}{c.name}: {c.found}; wanted: {c.wanted}" for c in self.checks]
         failed = sum(not check.passed for check in self.checks)
         end = f"{failed} of {len(self.checks)} checks failed" if failed else f"all {len(self.checks)} checks passed"
@@ -68,7 +68,7 @@ Reference = Callable[[Feeds], Sequence[np.ndarray]]
 
 
 def validate_file(path: Path) -> Report:
-    """Check a file. Raises InputError if every command would refuse it."""
+    """Check a model file. Raises InputError if every command would refuse it."""
     session = ModelSession(path)
     contract = session.contract
     if contract.input_frame != "chain":
@@ -79,7 +79,7 @@ def validate_file(path: Path) -> Report:
 
 
 def check_model(data: bytes, *, source: str, reference: Reference | None = None) -> Report:
-    """Check a model against its torch module or, without one, against its unoptimised graph.
+    """Check a model against its torch module `reference` or, without one, against its unoptimised graph.
 
     Raises InputError if the bytes are not an ONNX model or have no known contract.
     """
@@ -127,7 +127,7 @@ def _run(session: onnxruntime.InferenceSession) -> Reference:
 
 
 def _ports(session: onnxruntime.InferenceSession, contract: Contract) -> list[Check]:
-    """Check that names and ranks of the graph's inputs and outputs match the contract."""
+    """Check that the names and ranks of the graph's inputs and outputs match the contract."""
     checks = []
     for what, items, ports in (
         ("inputs", session.get_inputs(), contract.inputs),
@@ -142,7 +142,7 @@ def _ports(session: onnxruntime.InferenceSession, contract: Contract) -> list[Ch
 def _panels(answer: Sequence[np.ndarray]) -> np.ndarray:
     """Return the outputs of a model as panel values in one row.
 
-    Outputs are panels in sixteenths of codes, or one tensor of values.
+    answer: panels in sixteenths of a code, or one tensor of values.
     """
     if any(part.size == 1 and not np.isfinite(part).all() for part in answer):
         return np.full(1, np.nan, np.float32)
@@ -153,7 +153,7 @@ def _panels(answer: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _compared(name: str, run: Reference, reference: Reference, feeds: Feeds) -> Check:
-    """Run one input through both models and check shape, finite values and the maximum difference."""
+    """Run one input through both models, and check shape, finite values and the largest difference."""
     name = f"{'values' if name.startswith(ORDINARY) else 'drift'}, {name}"
     try:
         found = _panels(run(feeds))

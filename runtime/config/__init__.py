@@ -1,4 +1,4 @@
-"""Validated, frozen settings from one TOML file. `settings.py` has their defaults and descriptions."""
+"""Validated, immutable settings from a TOML file. `settings.py` has their defaults and descriptions."""
 
 from runtime.config.files import changed, load_settings, load_stack, with_options
 from runtime.config.settings import (

@@ -1,4 +1,4 @@
-"""Load settings and panels files, and override settings with options or an operator's choices."""
+"""Load settings files and panels files, and override settings by options or an operator's choices."""
 
 from __future__ import annotations
 
@@ -12,14 +12,17 @@ from runtime.support.sections import Section, read_table, validated
 
 
 def load_settings(path: Path | None) -> Settings:
-    """Read the settings from a file, or return the defaults. Raises InputError."""
+    """Read the settings from a file, or return the defaults if `path` is None. Raises InputError."""
     if path is None:
         return Settings()
     return validated(Settings, read_table(path), source=path, folder=path.absolute().parent)
 
 
 def load_stack(path: Path, *, width_px: int, height_px: int) -> PanelStack:
-    """Read `--panels FILE`, whose size in pixels defaults to the arguments. Raises InputError."""
+    """Read the panels from `--panels FILE`. Raises InputError.
+
+    width_px, height_px: size of the panels, used if the file states none.
+    """
     table = {"width_px": width_px, "height_px": height_px} | read_table(path)
     for name in ("width_m", "height_m", "x_m"):
         if name not in table:
@@ -41,7 +44,7 @@ def with_options(
     model: str | None = None,
     backend: str | None = None,
 ) -> Settings:
-    """Return the settings with command-line options applied. Raises InputError that names the option.
+    """Return the settings with command-line options applied. Raises InputError, which names the option.
 
     loop: restart the recording when it ends.
     """
@@ -61,7 +64,7 @@ def with_options(
 
 
 def changed(settings: Settings, section: str, values: dict[str, Any], *, source: str) -> Settings:
-    """Return the settings with values of one section replaced. Raises InputError that names `source`."""
+    """Return the settings with `values` of one section replaced. Raises InputError, which names `source`."""
     old: Section = getattr(settings, section)
     new = validated(type(old), old.model_dump() | values, source=source)
     return settings.model_copy(update={section: new})

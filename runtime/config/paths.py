@@ -14,9 +14,9 @@ from runtime.support.plugins import located
 
 
 def path_in(folder: Path | None, value: str, *, or_name: bool = False) -> str:
-    """Return a path resolved against the configuration's folder.
+    """Return a path resolved against the folder of the configuration.
 
-    or_name: leave a bare word without a suffix unchanged, because it is a name.
+    or_name: leave a single word without a suffix unchanged, because it is a name.
     """
     if folder is None or Path(value).name in ("", ".."):
         return value

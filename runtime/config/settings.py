@@ -1,6 +1,6 @@
-"""All settings, each with its type, range, default and description.
+"""Settings, each with its type, range, default and description.
 
-The ranges cover every display that can be built, so a value in the wrong unit is refused with a suggestion.
+The ranges cover every display that can be built. A value in a wrong unit is therefore refused, with a suggestion.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG
 from runtime.support.sections import Section
 
 MOST = 1e9  # limit for numbers without a narrower range
-PIXEL_ASPECT_TOLERANCE = 0.03  # relative; data sheets give a rounded active area
+PIXEL_ASPECT_TOLERANCE = 0.03  # relative; allows for data sheets that round the active area
 LEAST_GAP_M = 1e-5  # minimum distance between panels; any real panel is thicker
-PANELS_MOST = 8  # most panels in a stack
+PANELS_MOST = 8  # largest number of panels in a stack
 
 NonNegative = Annotated[float, Field(ge=0, le=MOST)]
 Unit = Annotated[float, Field(ge=0, le=1)]
@@ -128,7 +128,7 @@ class SensorSettings(Section):
 
 
 class TrackerSettings(Section):
-    """The tracker, which follows the two eyes."""
+    """The tracker, which follows the viewer's eyes."""
 
     hold_s: Annotated[float, within(0.0, 60.0, "s")] = Field(
         0.5,
@@ -233,7 +233,7 @@ class ContentSettings(Section):
 
 
 def _accept_legacy_backend(name: Any) -> Any:
-    """Return the backend's current name. Old scripts use `opencv` for `cpu`."""
+    """Return the current name of a backend. Old scripts use `opencv` for `cpu`."""
     return "cpu" if name == "opencv" else name
 
 
@@ -334,7 +334,7 @@ class LoopSettings(Section):
 
 
 class PlanSettings(Section):
-    """Savings that the solver and the loop may use."""
+    """Savings that the solver and the display loop may use."""
 
     enabled: bool = Field(
         True,

@@ -1,4 +1,4 @@
-"""Draw the contact sheet of a run: its layers and, for each eye, target, retina image and error."""
+"""Draw the contact sheet of a run: the layers and, for each eye, target, retina image and error."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from runtime.records import F32, F64, U8
 
 TILE_WIDTH = 640  # pixels
 MARGIN = 12  # pixels
-LINE_LETTERS = 58  # letters per tile in a line below the headline
+LINE_LETTERS = 58  # letters that fit below one tile in a line under the headline
 HEADLINE, TITLE = 52, 34
 ERROR_GAIN = 8  # amplification of the difference
 INK = (40, 40, 40)
@@ -27,12 +27,12 @@ PAPER = 246
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """One refresh of a run for the contact sheet, and its unaligned solution for the viewer page."""
+    """A refresh of a run for the contact sheet, and its solution before alignment for the viewer page."""
 
-    layers: U8  # (N, h, w, 3 or 4), as the panels showed them: aligned
+    layers: U8  # (N, h, w, 3 or 4), aligned as the panels showed them
     eye_views: EyeViews
     light_db: float  # light PSNR for a tracking error of 1 mm
-    lines: tuple[str, ...]  # state the refresh, and how far the eyes had moved
+    lines: tuple[str, ...]  # lines that state the refresh and how far the eyes had moved
     solution: U8  # (N, h, w, 3 or 4), before alignment
     solved_for_m: F64  # (2, 3) eyes, frame `stack`
     asked_for: tuple[U8, ...]  # (h, w, 3) targets of the solution
@@ -40,9 +40,9 @@ class Moment:
 
 
 def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, lines: Sequence[str] = ()) -> U8:
-    """Draw an (h, w, 3) RGB sheet: a row of layers, then for each eye target, retina image and error.
+    """Draw an (h, w, 3) RGB sheet: a row of layers, then a row per eye: target, retina image and error.
 
-    headline: a sentence with the figure to quote; lines: text below it.
+    headline: sentence with the figure to quote; lines: text below it.
     """
     height, width = layers.shape[1:3]
     tile = (TILE_WIDTH, round(TILE_WIDTH * height / width))
@@ -79,7 +79,7 @@ def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, line
 
 
 def headline(light_db: float | None) -> str:
-    """Return the sentence that states the figure to quote."""
+    """Return a sentence that states the figure to quote, `light_db`."""
     if light_db is None or math.isnan(light_db):
         return "light PSNR at these eyes was not measured"
     conditions = f"pixels as squares, pupil {PUPIL_MM:g} mm, tracking error {TRACKING_SIGMA_MM:g} mm"

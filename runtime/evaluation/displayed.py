@@ -27,17 +27,17 @@ SIGMAS_MM = (0.0, 1.0, 2.0)  # standard deviations: none, a good tracker's, twic
 
 @dataclass(frozen=True, slots=True)
 class EyeViews:
-    """Retina images of both eyes, seen through the layers, and their targets."""
+    """Retina images of both eyes through the layers, and their targets."""
 
     seen: tuple[Retina, ...]
     wanted: tuple[Picture, ...]
-    quality: Quality  # measured at exactly the eyes that the layers were solved for or aligned to
+    quality: Quality  # measured exactly at the eyes that the layers were solved for or aligned to
     stack: PanelStack
     eyes_m: F64  # (2, 3)
     fov_deg: float
 
     def viewer(self, layers: U8, text: Sequence[str], *, relief: F32 | None = None) -> str:
-        """Return a viewer page of the layers seen from these eyes, with a title and lines of text."""
+        """Return an HTML page of the layers seen from these eyes. text: its title, then lines."""
         wanted, eyes_m = [as_codes(intensities(picture)) for picture in self.wanted], np.asarray(self.eyes_m)
         return viewer_html(layers, wanted, self.stack, eyes_m=eyes_m, fov_deg=self.fov_deg, text=text, relief=relief)
 
@@ -55,12 +55,12 @@ class EyeViews:
 def displayed(
     layers: U8, wanted: Sequence[Picture], stack: PanelStack, *, eyes_m: F64, fov_deg: float, similarity: bool = True
 ) -> EyeViews:
-    """Compute retina images of eyes (2, 3), frame `stack`, through layers, and compare with targets.
+    """Compute the images that eyes (2, 3), frame `stack`, see through layers, and compare with targets.
 
-    layers: (N, H, W, 3 or 4), rear to front. Targets are `fov_deg` wide, one per eye. If their aspect ratio equals the
-    panels', they are compared at the panels' resolution, otherwise at their own, but with at most as many pixels as a
-    panel. similarity: compute SSIM; otherwise it is NaN. Raises ValueError for eyes behind a panel, or that see no part
-    of the panels.
+    layers: (N, H, W, 3 or 4), rear to front. wanted: one target per eye, `fov_deg` wide. If the targets have the
+    panels' aspect ratio, they are compared at the panels' resolution, otherwise at their own, but with at most as many
+    pixels as a panel. similarity: True to compute SSIM, which is otherwise NaN. Raises ValueError for eyes that are
+    behind a panel or see no part of the panels.
     """
     wanted = [on_panels_raster(picture, stack) for picture in wanted]
     seen = tuple(
@@ -73,18 +73,18 @@ def displayed(
 
 
 class Expected(NamedTuple):
-    """Expected PSNR (docs/contracts.md, Error) by tracking error in millimetres: "0", "1", "2"."""
+    """Expected PSNR (docs/contracts.md, Error), keyed by the tracking error in mm: "0", "1", "2"."""
 
-    db: dict[str, float]  # NaN if such an error moves an eye so far that it sees no part of the panels
+    db: dict[str, float]  # NaN if this error moves an eye so far that it sees no part of the panels
     standard_error_db: dict[str, float]  # computed from groups of rows; empty without groups
 
 
 def expected_quality(
     eye_views: EyeViews, layers: U8, *, sampling: Sampling | None = None, sigmas_mm: Sequence[float] = SIGMAS_MM
 ) -> Expected:
-    """Measure expected quality for several tracking errors.
+    """Measure the expected quality for several tracking errors.
 
-    sampling: by default light, sampled as in `expected_errors`.
+    sampling: by default that of light, as in `expected_errors`.
     """
     groups = sampling.groups if sampling else 0
     errors = dict.fromkeys(sigmas_mm, np.full(1 + groups, np.nan))
@@ -104,9 +104,9 @@ def expected_quality(
 
 
 def on_panels_raster(picture: Picture, stack: PanelStack) -> Picture:
-    """Resample a picture to the panels' resolution, or only reduce it if its aspect ratio differs.
+    """Resample a picture to the panels' resolution. If its aspect ratio differs, only reduce it.
 
-    Detail finer than the panels' pixels cannot be shown, and would take time and memory to measure.
+    Detail finer than the panels' pixels cannot be shown, and measuring it would take time and memory.
     """
     height_px, width_px = picture.shape[:2]
     size = (stack.width_px, stack.height_px)

@@ -1,7 +1,7 @@
 """Write a benchmark motion as a recording with its true eyes, for `phasestack record --motion`.
 
-With the true eyes, a run's summary can state the quality at them. The sensor has the pose of the demo's calibration,
-which is the default.
+With the true eyes, the summary of a run can state the quality at the true eyes. The sensor's pose is that of the demo's
+calibration, which is the default.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
 
 SECONDS, RATE_HZ, NOISE_MM = 12.0, 30.0, 3.0
-SECONDS_MAX = 3600.0  # longest recording, as it is built in memory
+SECONDS_MAX = 3600.0  # longest recording, because it is built in memory
 
 
 def write_motion(
@@ -32,10 +32,10 @@ def write_motion(
     rate_hz: float = RATE_HZ,
     noise_mm: float = NOISE_MM,
 ) -> dict[str, Any]:
-    """Write the recording and return its description.
+    """Write a recording of a motion, and return its description.
 
-    seed: selects path and noise; 0: the benchmark's. Raises InputError for an unknown motion, a length out of range, or
-    a file that cannot be written.
+    seed: selects path and noise; 0: those of the benchmark. Raises InputError for an unknown motion, a length out of
+    range, or a file that cannot be written.
     """
     if motion not in MOTIONS:
         raise InputError("record", "--motion", f"unknown motion {motion!r}; choose from {', '.join(MOTIONS)}")

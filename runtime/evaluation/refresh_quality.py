@@ -1,4 +1,4 @@
-"""Measure one sampled refresh at the eyes to which it was aligned, and (*live*) at the true eyes."""
+"""Measure a sampled refresh at the eyes that it was aligned to and, *live*, at the true eyes."""
 
 from __future__ import annotations
 
@@ -17,20 +17,21 @@ from runtime.records import F64, U8, RefreshAccount
 
 log = logging.getLogger("phasestack.quality")
 
-# Sampling of light. A displaced view's errors are at edges: a quarter of a small picture's pixels is off by 0.6 dB.
+# Sampling of light. A displaced view has its errors at edges: with a quarter of a small picture's pixels, the figure is
+# off by 0.6 dB.
 ALIGNED, LIVE = Sampling(step=2), Sampling(rays=4)
 ALIGNED_LARGE, LIVE_LARGE = Sampling(step=4), Sampling(step=2)  # for pictures with more values than `PLENTY`
 FIGURES = ("light_db", "psnr_db", "ssim", "carried_db", "psnr_db_true_eyes", "carried_db_true_eyes")
-Pictures = tuple[U8, U8]  # (h, w, 3) retina pictures of the left and right eye, panel size
+Pictures = tuple[U8, U8]  # (h, w, 3) retina pictures of the left and right eye, as large as a panel
 
 
 @dataclass(frozen=True, slots=True)
 class RefreshTargets:
     """Target pictures of a refresh; None if they were not drawn."""
 
-    fov_deg: float  # horizontal, of every picture
+    fov_deg: float  # horizontal field of view of every picture
     solved: Pictures | None = None  # for the eyes and the instant of the solution
-    used: Pictures | None = None  # for the eyes aligned to, at the solution's instant
+    used: Pictures | None = None  # for the eyes that the layers were aligned to, at the solution's instant
     true: Pictures | None = None  # for the true eyes, at the display time
 
 
@@ -40,7 +41,7 @@ class RefreshQuality:
 
     figures: dict[str, float] = field(default_factory=dict)  # by name in FIGURES
     live_error: float | None = None  # mean squared error of light at the true eyes
-    moment: Moment | None = None  # for stills, sheet and viewer
+    moment: Moment | None = None  # for stills, contact sheet and viewer page
 
 
 def view_error_mm(eyes_m: F64, solved_for_m: F64) -> float:
@@ -49,9 +50,9 @@ def view_error_mm(eyes_m: F64, solved_for_m: F64) -> float:
 
 
 def live_error(layers: U8, targets: Pictures, stack: PanelStack, *, eyes_m: F64, fov_deg: float) -> float:
-    """Return the mean squared error of light at eyes (2, 3) against the target pictures for these eyes.
+    """Return the mean squared error of light at eyes (2, 3) against target pictures for these eyes.
 
-    layers: (N, H, W, 3 or 4), as the panels show them. Raises ValueError if the eyes see no part of them.
+    layers: (N, H, W, 3 or 4), as the panels show them. Raises ValueError if the eyes see no part of the panels.
     """
     pictures = [intensities(picture) for picture in targets]
     sampling = LIVE_LARGE if pictures[0].size > PLENTY else LIVE
@@ -64,11 +65,11 @@ def live_error(layers: U8, targets: Pictures, stack: PanelStack, *, eyes_m: F64,
 def measure_refresh(
     account: RefreshAccount, layers: U8, carried: tuple[U8, U8] | None, targets: RefreshTargets, stack: PanelStack
 ) -> RefreshQuality:
-    """Measure a refresh as far as its targets were drawn, skipping eyes that see no part of the panels.
+    """Measure a refresh as far as its targets were drawn. Skip eyes that see no part of the panels.
 
     account: includes the true eyes, if known. layers: (N, h, w, 4), as the panels showed them. carried: the layers
-    aligned as if all content were on the middle panel, and the layers before alignment; None unless the panels show
-    only a solution.
+    aligned as if all content were on the middle panel, and the layers before alignment. It is None unless the panels
+    show only a solution.
     """
     error = None
     if targets.true is not None and account.true_eyes_m is not None:
@@ -123,7 +124,7 @@ def _at_aligned_eyes(
 
 
 def _line(account: RefreshAccount) -> str:
-    """Return the sheet's line, which states the refresh and how far the eyes had moved."""
+    """Return the line of the contact sheet that states the refresh and how far the eyes had moved."""
     assert account.eyes_m is not None and account.solved_for_m is not None
     moved_mm = view_error_mm(account.eyes_m, account.solved_for_m)
     return (

@@ -22,18 +22,22 @@ log = logging.getLogger("phasestack.output")
 
 Work = Callable[[], object]
 WAITING = 4096  # jobs queued for the disk: a minute of lines
-WAITING_PICTURES = 4  # queued jobs with a refresh's pictures: 25 MB each at 1080p
+WAITING_PICTURES = 4  # queued jobs with a refresh's pictures, which take 25 MB each at 1080p
 
 
 class RunOutput:
-    """Writes a run's files into a folder, where they appear together after a clean exit.
+    """Writer of a run's files to a folder, where they appear together after a clean exit.
 
-    A background thread writes, so that no refresh waits for the disk. If the disk fails during the run (full, gone,
-    permission lost), the files are abandoned: `problem` gives the reason, one line is logged, and the run continues.
+    A background thread writes them, so that no refresh waits for the disk. If the disk fails during the run (full,
+    gone, permission lost), the files are abandoned and the run continues. `problem` gives the reason, and one line is
+    logged.
     """
 
     def __init__(self, target: Path, *, every_one: bool = True) -> None:
-        """every_one: wait for a slow disk instead of dropping lines and pictures."""
+        """Create a writer of a run's files to the folder `target`.
+
+        every_one: True to wait for a slow disk, False to drop lines and pictures instead.
+        """
         self._folder = OutputFolder(target)
         self._target, self._every_one = target, every_one
         self._lines: TextIO | None = None
@@ -45,7 +49,7 @@ class RunOutput:
         self.left_out = 0  # lines and pictures dropped because the disk was too slow
 
     def __enter__(self) -> RunOutput:
-        """Create the folder. Raises InputError if it can't be written."""
+        """Create the folder. Raises InputError if it cannot be written."""
         self._folder.__enter__()
         try:
             self._lines = (self._folder.staging / "frames.jsonl").open("w", encoding="utf-8")
@@ -85,7 +89,7 @@ class RunOutput:
     def light_targets(
         self, frame: int, *, info: Mapping[str, Any], drawn: Pictures | None, true: Pictures | None
     ) -> None:
-        """Write the rest of `light/<frame>/`: light.json as `info`, and retina pictures.
+        """Write the other files of `light/<frame>/`: light.json with `info`, and retina pictures.
 
         drawn: targets of the eyes solved for; true: targets of the true eyes. Neither may be changed afterwards.
         """
@@ -102,7 +106,7 @@ class RunOutput:
         return self._folder.staging / "light" / str(frame)
 
     def run_is_over(self) -> None:
-        """Block on disk writes and speed them up from now on: they can no longer delay a refresh."""
+        """Wait for disk writes from now on, and speed them up, because they can no longer delay a refresh."""
         self._every_one = True
         set_niceness(0, self._writer)
         fresh_threads()  # the solver's and the measurements' have a low priority
@@ -110,9 +114,9 @@ class RunOutput:
     def finish(
         self, summary: dict[str, Any], layers: U8 | None, moment: Moment | None = None, *, unseen: str = ""
     ) -> None:
-        """Write the last frame, the summary, and the stills, sheet and viewer of the newest measured refresh.
+        """Write the last frame, the summary, and the pictures and pages of the newest measured refresh.
 
-        unseen: the viewer's page if no refresh was measured.
+        unseen: viewer page to write if no refresh was measured.
         """
 
         def write() -> None:
@@ -134,7 +138,7 @@ class RunOutput:
         self._work.put((write, lambda: None))
 
     def _pictures_later(self, work: Work) -> None:
-        """Queue a job with pictures, within their memory limit."""
+        """Queue a job with pictures, or drop it at the limit on their memory."""
         if self.problem:
             return
         if not self._pictures.acquire(blocking=self._every_one):
@@ -144,7 +148,7 @@ class RunOutput:
             self._pictures.release()
 
     def _later(self, work: Work, *, then: Work = lambda: None) -> bool:
-        """Queue a job; return False if it was dropped."""
+        """Queue a job. Return False if it was dropped. then: called after the job in any case."""
         if self.problem:
             return False
         try:
@@ -155,7 +159,7 @@ class RunOutput:
         return True
 
     def _write(self) -> None:
-        """Run queued jobs in order, until None; the body of the writer's thread."""
+        """Run queued jobs in order, on the writer's thread, until one is None."""
         set_niceness(MEASURING_NICENESS)
         while (queued := self._work.get()) is not None:
             work, then = queued
@@ -184,7 +188,7 @@ class RunOutput:
 
 
 def in_one_line(summary: dict[str, Any]) -> str:
-    """Return a run in one line, with the one figure for its motion, for its contact sheet."""
+    """Return a line about a run for its contact sheet, with the one figure for its motion."""
     line = f"The run: {summary['presented']} of {summary['frames']} refreshes presented, model {summary['model']}"
     if summary.get("live_db") is not None:
         line += f"; while the head moved, PSNR {summary['live_db']:.1f} dB at the true eyes (live), delays included"

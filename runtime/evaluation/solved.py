@@ -23,13 +23,13 @@ WHOLE_PX = 1920 * 1200  # size of the largest picture whose light is measured at
 
 @dataclass(frozen=True, slots=True)
 class PairQuality:
-    """Quality at the eyes (docs/contracts.md, Error), by tracking error: "0", "1", "2" mm.
+    """Quality at the eyes (docs/contracts.md, Error), keyed by the tracking error in mm: "0", "1", "2".
 
     A value is NaN if it was not requested, or if its tracking error moves an eye so far that it sees no part of the
     panels.
     """
 
-    light_db: BySigma  # square pixels and a finite pupil; quote "1", the error of a good tracker
+    light_db: BySigma  # with square pixels and a finite pupil; quote "1", the error of a good tracker
     expected_db: BySigma  # one ray per pixel
     psnr_db: float  # one ray per pixel, at exactly known eyes
     ssim: float
@@ -49,9 +49,9 @@ class PairQuality:
 
 @dataclass(frozen=True)
 class SolvedPair:
-    """Layers with their retina images and quality, which are computed on first access.
+    """Layers, with their retina images and quality, which are computed on first access.
 
-    Access raises ValueError if an eye sees no part of the display.
+    The first access raises ValueError if an eye sees no part of the display.
     """
 
     layers: U8  # (N, h, w, 3 or 4), rear to front
@@ -73,7 +73,10 @@ class SolvedPair:
         return self._measured(self.eye_views, sigmas_mm=SIGMAS_MM, every=every)
 
     def sampled(self, *, sigmas_mm: Sequence[float], every: int) -> PairQuality:
-        """Measure light at every `every`-th pixel each way, with its standard error and without SSIM."""
+        """Measure light at every `every`-th pixel of every `every`-th row, with its standard error.
+
+        SSIM is not computed.
+        """
         views = displayed(
             self.layers, self.pictures, self.stack, eyes_m=self.eyes_m, fov_deg=self.fov_deg, similarity=False
         )
@@ -93,7 +96,7 @@ class SolvedPair:
         return tuple(retina.codes() for retina in self.eye_views.seen)
 
     def viewer(self, lines: Sequence[str]) -> str:
-        """Return a viewer page of the layers."""
+        """Return an HTML page that shows the layers to a viewer, with lines of text."""
         return self.eye_views.viewer(self.layers, [headline(self.quality.light_db["1"]), *lines])
 
     def write(self, folder: Path, *, lines: Sequence[str]) -> None:

@@ -1,4 +1,4 @@
-"""Time repeated trials, with warm-up, repetition, alternation and median."""
+"""Time calls in repeated trials, after a warm-up and in turn, and take the median."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Timed(Generic[T]):
-    """The times of a call's runs, and its last result."""
+    """Times of the runs of a call, and its last result."""
 
     answer: T
     times_ms: tuple[float, ...]
@@ -30,9 +30,9 @@ class Timed(Generic[T]):
 def timed(
     call: Callable[[], T], *, runs: int, most: int | None = None, enough_s: float = 0.0, slow_s: float = float("inf")
 ) -> Timed[T]:
-    """Time a warm function, at least `runs` times, then until `enough_s` or `most` runs.
+    """Time a call after a warm-up: at least `runs` times, then until `enough_s` or `most` runs.
 
-    slow_s: a first run that takes longer than this counts and is the only one.
+    slow_s: if the first run takes at least this long, it counts and is the only one.
     """
     answer, took_ms = _timed(call)
     if took_ms >= slow_s * 1e3:
