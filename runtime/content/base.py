@@ -1,7 +1,7 @@
-"""The interface of content sources, which draw the picture of a scene for one eye in a given raster.
+"""Interface of content sources, which draw a scene's picture for one eye on a given raster.
 
-`ContentSource` is also the base of user-defined scenes: `scene = "mypackage.tunnel:Tunnel"`. Only `render` must be
-implemented; the other methods are optimisations, whose defaults are correct for any scene.
+`ContentSource` is also the base of user-defined scenes, such as `scene = "mypackage.tunnel:Tunnel"`. A scene must
+implement only `render`; the other methods are optimisations, whose defaults are correct for any scene.
 """
 
 from __future__ import annotations
@@ -27,26 +27,26 @@ WHITE: Colour = (1.0, 1.0, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One eye, and the raster to draw for it."""
+    """One eye, and the raster on which to draw for it."""
 
     eye_m: F64  # (3,) frame `stack`
     side: int  # 0: left, 1: right
     pixels_from_stack: F64  # (3, 4) projection; third coordinate in metres, positive in front of the eye
     width_px: int
     height_px: int
-    reduction: int = 1  # divisor of the display's rows and columns; outlines keep their width there
+    reduction: int = 1  # divisor of the display's rows and columns; outlines keep their width on the display
     display_from_view: F64 | None = None  # 3x3 rotation from the placed scene's frame; the lamp is fixed to the display
 
 
 @dataclass(frozen=True, slots=True)
 class ContentInfo:
-    """Static properties of a scene; the solver skips work that they make unnecessary."""
+    """Static properties of a scene. The solver skips work that they make unnecessary."""
 
     name: str
     moving: bool = False
     grey: bool = False
     background: Colour | None = WHITE  # uniform colour behind the scene; None: there is none
-    flat_x_m: float | None = None  # x of the plane that contains the whole scene: both eyes see the same picture
+    flat_x_m: float | None = None  # x of the plane that contains the whole scene, if it is flat
     left_out: tuple[str, ...] = ()  # parts of the file that are not drawn
 
 
@@ -58,7 +58,7 @@ class ContentSource(ABC):
     draws_in: object = None  # GL context of its textures; None: it returns arrays
 
     def __init__(self, options: Any, *, stack: Any, context: Any) -> None:
-        """Construct a user-defined scene. Raises InputError if it cannot be shown.
+        """Create a user-defined scene. Raises InputError if it cannot be shown.
 
         options: an instance of `Options`; stack: the panels (`PanelStack`); context: the current moderngl context.
         """
@@ -66,32 +66,36 @@ class ContentSource(ABC):
 
     @abstractmethod
     def render(self, view: View, *, time_ns: int) -> U8:
-        """Return the eye's picture in the view's raster: (height_px, width_px, 4) RGBA, row 0 at the top.
+        """Return the eye's picture on the view's raster: (height_px, width_px, 4) RGBA, row 0 at the top.
 
-        Colour is already blended with the background. Alpha is the content's coverage, 0 only where nothing but the
-        background shows. The array belongs to the source and stays valid until the next `render` for the same side.
-        `time_ns` is the run's clock, for moving content. Raises ContentFailure, after which the last picture stays.
+        Colours are already blended with the background. Alpha is the content's coverage; it is 0 only where nothing but
+        the background shows. The array belongs to the source and stays valid until the next `render` for the same side.
+        time_ns: time on the run's clock, for moving content. If it raises ContentFailure, the last picture stays.
         """
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture | None:
-        """Return a texture, valid until the side's next picture; None: use `render`. Raises ContentFailure."""
+        """Return the picture as a texture, or None if `render` must be used. Raises ContentFailure.
+
+        The texture is valid until the next picture for the same side.
+        """
         return None
 
     def nearness(self, view: View, *, every: int, first: tuple[int, int]) -> F32 | None:
-        """Return (h, w) inverse distances, 1/m, of the nearest points in blocks of the side's newest picture.
+        """Return (h, w) inverse distances, in 1/m, of the nearest points in blocks of the newest picture.
 
-        The distance is the view's third coordinate. A value of 0 means that only the background shows. None:
-        unknown, so content is aligned to new eyes as if it were on the middle panel. every: size of a block in
-        pixels; first: number of pixels (right, down), less than `every`, that are cut off the first block.
+        The picture is the newest one of the view's side, and a distance is the view's third coordinate. The value is 0
+        where only the background shows. If the result is None (unknown), content is aligned to new eyes as if it were
+        on the middle panel. every: size of a block in pixels; first: number of pixels (right, down), less than
+        `every`, that are cut off the first block.
         """
         return None
 
     def expect(self, views: Sequence[View], *, time_ns: int) -> None:  # noqa: B027 - most have nothing to prepare
-        """Prepare for the two eyes' views that will be rendered next. Raises ContentFailure."""
+        """Prepare for the views of both eyes that will be drawn next. Raises ContentFailure."""
 
     @property
     def program(self) -> dict[str, Any] | None:
-        """Return `address` and recent `frame_ms` of a scene that another program draws, otherwise None."""
+        """Return `address` and recent `frame_ms` if another program draws the scene, otherwise None."""
         return None
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect | None:
@@ -99,20 +103,20 @@ class ContentSource(ABC):
         return None
 
     def revision(self, *, time_ns: int) -> int:
-        """Return a number that changes whenever `render` may draw the same view differently."""
+        """Return a number that changes when `render` may draw the same view differently."""
         return time_ns if self.info.moving else 0
 
     def describe(self, *, time_ns: int) -> dict[str, Any] | None:
-        """Return a playlist's entries, the current one and its remaining time; None for other sources."""
+        """Return a playlist's entries, the current one and its remaining time, or None for other sources."""
         return None
 
     def skip(self, *, time_ns: int) -> bool:
-        """Go to a playlist's next entry; return False if there is no other."""
+        """Go to the next entry of a playlist. Return False if there is no other."""
         return False
 
     @property
     def problem(self) -> str:
-        """The current fault in one line, while the last good picture stays; empty without one."""
+        """Current fault in one line, during which the last good picture stays; empty if there is none."""
         return ""
 
     def close(self) -> None:  # noqa: B027 - most sources hold nothing
@@ -120,7 +124,7 @@ class ContentSource(ABC):
 
 
 class ForwardingSource(ContentSource):
-    """A source that shows another source."""
+    """Source that shows another source."""
 
     source: ContentSource  # the source that is currently shown
     _drew: tuple[ContentSource | None, ContentSource | None] = (None, None)  # source of each side's newest picture

@@ -1,4 +1,4 @@
-"""Pure functions that turn a view's 3x4 projection into a rasteriser's camera and project boxes."""
+"""Convert a view's 3x4 projection to a rasteriser's camera, and project boxes."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ NEAREST_M = 1e-3  # distance of the near plane from the eye
 def clip_from_stack(view: View, corners_m: F64) -> F64:
     """Return a view's 4x4 OpenGL clip matrix, with near and far planes around (8n, 3) corners.
 
-    GL's first row in memory is its lowest. The raster's v therefore runs along GL's +y, so that row 0 of the raster is
-    row 0 of what GL reads back and nothing need be flipped. Raises ValueError if no corner is in front of the eye.
+    OpenGL's first row in memory is its lowest. The raster's v therefore runs along OpenGL's +y, so that row 0 of the
+    raster is row 0 of the pixels read back, and nothing need be flipped. Raises ValueError if no corner is in front of
+    the eye.
     """
     near_m, far_m = depth_bounds(view, corners_m)
     if not 0.0 < near_m < far_m:
@@ -34,14 +35,20 @@ def box_corners(low_m: ArrayLike, high_m: ArrayLike) -> F64:
 
 
 def project(pixels_from_stack: F64, points_m: F64) -> tuple[F64, F64]:
-    """Return (n, 2) pixels and (n,) depths in metres of (n, 3) `stack` points; undefined behind the eye."""
+    """Return the pixels (n, 2) and depths (n,) in metres of points (n, 3) in frame `stack`.
+
+    Pixels of points behind the eye are undefined.
+    """
     homogeneous = points_m @ pixels_from_stack[:, :3].T + pixels_from_stack[:, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
         return homogeneous[:, :2] / homogeneous[:, 2:], homogeneous[:, 2]
 
 
 def covered_box(view: View, corners_m: F64, *, align_px: int = 32) -> PixelRect:
-    """Return the pixels that a hull of corners may cover, in steps of `align_px`; empty behind the eye."""
+    """Return the box of pixels that the hull of some corners may cover, rounded up to `align_px`.
+
+    It is empty if the corners are behind the eye.
+    """
     pixels, depths = project(view.pixels_from_stack, corners_m)
     if depth_bounds(view, corners_m)[1] <= 2 * NEAREST_M:
         return PixelRect(0, 0, 0, 0)
@@ -56,7 +63,7 @@ def covered_box(view: View, corners_m: F64, *, align_px: int = 32) -> PixelRect:
 
 
 def depth_bounds(view: View, corners_m: F64) -> tuple[float, float]:
-    """Return near and far distances, in metres, around all corners in front of the eye, with a margin."""
+    """Return the near and far distance in metres, with a margin, of all corners in front of the eye."""
     depths = project(view.pixels_from_stack, corners_m)[1]
     far = float(depths.max()) * 1.001 + NEAREST_M
     return max(float(depths.min()) * 0.999 - NEAREST_M, min(NEAREST_M, far / 2)), far

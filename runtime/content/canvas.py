@@ -60,7 +60,7 @@ class _Target:
 
 
 class _Reducer:
-    """Reduces depth to the nearest value per block; reading back all of it would hold Python's lock."""
+    """Reducer of depth to the nearest value per block, because reading back all would hold Python's lock."""
 
     def __init__(self, context: Any) -> None:
         self._context = context
@@ -113,14 +113,18 @@ class _Reducer:
 
 
 class CanvasSource(ContentSource):
-    """A source that draws with OpenGL into one framebuffer per view size, read back on request.
+    """Source that draws with OpenGL into one framebuffer per view size, which is read back on request.
 
     Only the box that the content may cover is cleared, drawn and resolved from its samples, because resolving is
     the most expensive step on a software rasteriser.
     """
 
     def __init__(self, context: Any, *, info: ContentInfo, samples: int = 0, deep: bool = False) -> None:
-        """samples: per pixel; deep: draw in half floats, for sums of many layers, some brighter than white."""
+        """Create the source.
+
+        samples: number of samples per pixel. deep: True to draw in half floats, for sums of many layers of which some
+        are brighter than white.
+        """
         self.info, self.context = info, context
         self.draws_in = context
         self.held: list[Any] = []  # GL objects to release with the source
@@ -138,7 +142,10 @@ class CanvasSource(ContentSource):
         return self.draw(view, time_ns=time_ns).pixels()
 
     def drawn(self, view: View, box: PixelRect, paint: Callable[[], None]) -> DrawnPicture:
-        """Clear `box`, let `paint` draw inside it, and return the picture, valid until the side's next one."""
+        """Clear `box`, let `paint` draw inside it, and return the picture.
+
+        The picture is valid until the next one for the same side.
+        """
         raise_if_abandoned()
         self._bounds[view.side] = None
         target = self._target(view.width_px, view.height_px)

@@ -49,7 +49,7 @@ def load_compressed_splats(path: Path) -> Gaussians:
 
 
 def _spz(path: Path) -> Gaussians:
-    """Read all splats' positions, then their opacities, colours, scales, rotations and harmonics."""
+    """Read an SPZ file: all positions, then all opacities, colours, scales, rotations and harmonics."""
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
     zipped = zlib.decompressobj(31) if data[:2] == b"\x1f\x8b" else None
     head = zipped.decompress(data, SPZ_SHORT) if zipped else data[: SPZ_HEADER.size]
@@ -80,7 +80,7 @@ def _spz(path: Path) -> Gaussians:
 
 
 def _zstd_blocks(data: bytes, table: int, sizes: list[int]) -> list[bytes]:
-    """Return the streams of version 4, decompressed to at most their sizes. Empty streams may be missing."""
+    """Return the streams of version 4, decompressed to at most `sizes`. Empty streams may be missing."""
     import zstandard
 
     names = [size for size in sizes if size]
@@ -94,21 +94,21 @@ def _zstd_blocks(data: bytes, table: int, sizes: list[int]) -> list[bytes]:
 
 
 def _fixed(places: U8, bits: int) -> F32:
-    """Return (n, 3) signed 24-bit fixed-point numbers with `bits` fractional bits."""
+    """Decode signed 24-bit fixed-point numbers (n, 3) with `bits` fractional bits."""
     low, middle, high = places.reshape(-1, 3, 3).astype(np.int32).transpose(2, 0, 1)
     return np.asarray(((high << 24 | middle << 16 | low << 8) >> 8) * 2.0**-bits, np.float32)
 
 
 def _three_bytes(turns: U8) -> F32:
-    """Return (n, 4) quaternions w, x, y, z from bytes of x, y and z."""
+    """Decode quaternions (n, 4) w, x, y, z from bytes of x, y and z."""
     xyz = turns / np.float32(127.5) - 1
     return np.column_stack([np.sqrt(np.maximum(1 - (xyz**2).sum(1), 0)), xyz]).astype(np.float32)
 
 
 def _four_bytes(turns: U32) -> F32:
-    """Return (n, 4) quaternions w, x, y, z from packed words.
+    """Decode quaternions (n, 4) w, x, y, z from packed words.
 
-    A word contains the index (in x, y, z, w) of the largest component, then a sign and 9 bits of each other one.
+    A word contains the index (in x, y, z, w) of the largest component, then a sign and 9 bits for each of the others.
     """
     share = fields_of(turns, (1, 9, 1, 9, 1, 9))
     three = (1 - 2 * share[:, ::2]) * share[:, 1::2] * np.float32(np.sqrt(0.5))
@@ -116,7 +116,7 @@ def _four_bytes(turns: U32) -> F32:
 
 
 def _sog(path: Path) -> Gaussians:
-    """Read pictures with one pixel per splat; their bytes are values between bounds or codebook indices."""
+    """Read a SOG: pictures with one pixel per splat, whose bytes are fractions or codebook indices."""
     with _SogFiles(path) as files:
         meta = untrusted_input.parsed_json(files.read("meta.json"), source=path)
         if meta.get("version") != 2:
@@ -139,7 +139,7 @@ def _sog(path: Path) -> Gaussians:
             higher = np.array(more["codebook"], np.float32)[entries[label]]
             harmonics = with_higher(harmonics, higher[:, :MOST])
     if 3 * (harmonics.shape[1] - 1) not in COEFFICIENTS:
-        raise InputError(path, "shN", "holds no harmonics of degree 1 to 3")
+        raise InputError(path, "shN", "contains no harmonics of degree 1 to 3")
     three = (turns[:, :3] / np.float32(255) - np.float32(0.5)) * np.float32(np.sqrt(2))
     return drawable(
         path,
@@ -152,7 +152,7 @@ def _sog(path: Path) -> Gaussians:
 
 
 class _SogFiles:
-    """The files of a SOG in a folder or a ZIP archive."""
+    """Files of a SOG in a folder or a ZIP archive."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

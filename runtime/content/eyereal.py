@@ -1,4 +1,4 @@
-"""A folder of the EyeReal data set: picture pairs whose names contain the positions of the eyes."""
+"""Read a folder of the EyeReal data set: picture pairs whose names contain the eyes' positions."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ KEPT = 4  # pairs kept in memory
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """The two files of a pair, the viewer's left one first."""
+    """Two files of a pair, that of the viewer's left eye first."""
 
     number: int
     paths: tuple[Path, Path]
@@ -34,7 +34,7 @@ class Pair:
     looks_at_m: F64  # (3,) the scene's origin, at which both eyes look; it may be in front of or behind the display
 
     def image_from_stack(self, side: int, *, width_px: int, height_px: int, fov_deg: float) -> F64:
-        """Return the (3, 4) projection of one of its pictures."""
+        """Return the (3, 4) projection of the left (`side` 0) or right (1) picture."""
         around_origin = np.eye(4)
         around_origin[:3, 3] = -self.looks_at_m
         eye = self.eyes_m[side] - self.looks_at_m
@@ -47,11 +47,11 @@ def is_data_set(folder: Path) -> bool:
 
 
 def read_folder(folder: Path, preset: str) -> tuple[Pair, ...]:
-    """Return all pairs, ordered by number.
+    """Return all pairs of a folder, ordered by number.
 
-    Raises InputError if there is no pair, half a pair, or an eye behind the display. File names contain the eyes in
-    the scene's digital units. Which of `_0` and `_1` is left follows from these positions. `_left` and `_right`,
-    used by newer data, must agree with them. preset: the scene's name.
+    preset: name of the scene. File names contain the eyes' positions in the scene's digital units, from which it
+    follows whether `_0` or `_1` is the left picture. The names `_left` and `_right` of newer data must agree with these
+    positions. Raises InputError if there is no pair, if a pair is incomplete, or if an eye is behind the display.
     """
     stack_from_scene: F64 = np.linalg.inv(drawn_scene_from_stack(preset)).astype(np.float64)
     files: dict[int, list[tuple[str, Path, F64]]] = {}
@@ -74,7 +74,7 @@ def read_folder(folder: Path, preset: str) -> tuple[Pair, ...]:
             raise InputError(halves[0][1], f"pair{number}", problem)
         (name, left, left_eye), (_, right, right_eye) = sorted(halves, key=lambda half: half[2][1])
         if left_eye[1] == right_eye[1]:
-            raise InputError(left, f"pair{number}", "both eyes are at the same y: left can't be told from right")
+            raise InputError(left, f"pair{number}", "both eyes have the same y, so it is unclear which one is the left")
         if name == "right":
             raise InputError(right, f"pair{number}", f"_left is to the right of _right with preset {preset}")
         pairs.append(Pair(number, (left, right), np.array([left_eye, right_eye]), stack_from_scene[:3, 3]))
@@ -86,7 +86,7 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
     path, settings = file.path, file.settings
     name = file.preset or next((name for name in preset_names() if name in path.resolve().name), "")
     if not name:
-        raise InputError(path, "name", "names no preset: set content.scene to one and content.file to the folder")
+        raise InputError(path, "name", "names no preset: set content.scene to a preset and content.file to this folder")
     pairs = read_folder(path, name)
     background = settings.background or WHITE
     make = partial(EyeRealSource, pairs, fov_deg=settings.fov_deg, background=background, name=name)
@@ -95,7 +95,7 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
 
 
 class EyeRealSource(ContentSource):
-    """Shows the pair taken nearest to the viewer, warped to the view through the display's centre plane."""
+    """Source that shows the pair taken nearest to the viewer, warped through the display's centre plane."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Read a film's arrangement of views: `st3d`, `sv3d` or spherical XML in MP4, StereoMode in Matroska."""
+"""Read how a film arranges its views: `st3d`, `sv3d` or XML in MP4, StereoMode in Matroska."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MODES = {1: "side-by-side", 3: "top-bottom", 10: "anaglyph", 11: "cross-eyed"}
 
 @dataclass(frozen=True, slots=True)
 class FilmHeader:
-    """The arrangement that a film states; fields that it does not state are empty or 0."""
+    """Arrangement of views that a film states. Fields that it does not state are empty or 0."""
 
     layout: str = ""  # same syntax as `content.layout`
     span_deg: int = 0  # longitude covered by equirectangular views
@@ -61,7 +61,7 @@ def _mp4(file: IO[bytes]) -> FilmHeader:
         span_deg = 180 if cut > 0.25 else 360
     elif XML_AROUND.search(movie):
         span_deg = 360
-    left_out = "its second view (MV-HEVC): convert it to side by side" if MULTIVIEW in movie else ""
+    left_out = "its second view (MV-HEVC); convert it to side by side" if MULTIVIEW in movie else ""
     return FilmHeader(("", "top-bottom", "side-by-side")[layout], span_deg, left_out)
 
 
@@ -71,12 +71,12 @@ def _matroska(file: IO[bytes]) -> FilmHeader:
     for wanted in (SEGMENT, TRACKS, TRACK, VIDEO, STEREO_MODE):
         places = [held for place in places for number, held in _elements(data, place) if number == wanted]
     mode = max((int.from_bytes(data[place], "big") for place in places), default=0)
-    left_out = "" if not mode or mode in MODES else f"its stereo (mode {mode}): convert it to side by side"
+    left_out = "" if not mode or mode in MODES else f"its second view (stereo mode {mode}); convert it to side by side"
     return FilmHeader(MODES.get(mode, ""), left_out=left_out)
 
 
 def _elements(data: bytes, within: slice) -> Iterator[tuple[int, slice]]:
-    """Yield the numbers and contents of the elements within another element, as far as they were read."""
+    """Yield the number and content of each element within another, as far as it was read."""
     place, end = within.start, min(within.stop, len(data))
     while place < end:
         number_bytes = 9 - data[place].bit_length()

@@ -1,4 +1,4 @@
-"""Sequences of pictures (a still, an animation, a folder, a film) with the layout of each."""
+"""Open sequences of pictures (a still, an animation, a folder or a film) with their layouts."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ VIDEO_PROPERTIES = (
 
 
 class Frames(ABC):
-    """A sequence of pictures. Constructors raise InputError; later failures raise ContentFailure."""
+    """Sequence of pictures. Constructors raise InputError; later failures raise ContentFailure."""
 
     count: int
     rate_hz: float
@@ -72,7 +72,10 @@ class PictureFiles(Frames):
     """
 
     def __init__(self, paths: Sequence[Path], settings: ContentSettings, *, folder: Path | None = None) -> None:
-        """folder: the pictures' folder, if any; its undecodable files are skipped and logged."""
+        """Open the pictures. Raises InputError.
+
+        folder: folder of the pictures, if any. Its files that cannot be decoded are skipped and logged.
+        """
         self._background = settings.background or DARK
         self.layouts, self._paths, refused = [], [], []
         for number, path in enumerate(paths):
@@ -177,7 +180,7 @@ class Video(Frames):
 
 
 def layout_in(header: Header, path: Path, settings: ContentSettings, folder: Path | None = None) -> Layout:
-    """Return a picture's layout, from the file if it contains two views, otherwise from the names."""
+    """Return a picture's layout, from the file if it contains two views, otherwise from its name."""
     layout = layout_of(path, settings, stated=header.layout)
     if header.is_around:
         layout = replace(layout, span_deg=360)
@@ -221,7 +224,7 @@ def _open_film(path: Path, settings: ContentSettings) -> Video:
 
 
 def _why_none(folder: Path) -> str:
-    """Return an error message for a folder without pictures."""
+    """Return the problem of a folder without pictures, for an error message."""
     if problem := camera_set_in(folder):
         return problem
     message = "the folder holds no pictures"
@@ -232,7 +235,7 @@ def _why_none(folder: Path) -> str:
 
 
 def read_pair(path: Path, settings: ContentSettings) -> list[U8]:
-    """Return the left and right eye's views from one file, with square pixels, over white.
+    """Return the left and right eye's views in one file, with square pixels, over white.
 
     Raises InputError if the file contains a single view or a quilt.
     """

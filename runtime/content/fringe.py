@@ -1,7 +1,7 @@
-"""Smooth outlines without multisampling, by a ramp one pixel wide outside each silhouette edge.
+"""Smooth outlines without multisampling, with a ramp one pixel wide outside each silhouette edge.
 
-Four samples per pixel take a software rasteriser four times as long, while outlines are a few hundred edges. The ramps
-enlarge the object by half a pixel on average.
+Four samples per pixel take a software rasteriser four times as long, while outlines have only a few hundred edges. The
+ramps enlarge an object by half a pixel on average.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ CORNER_ENDS = (0, 0, 1, 1, 0, 1)
 
 @dataclass(frozen=True, slots=True)
 class Edges:
-    """All edges of a triangle mesh, each with its one or two faces."""
+    """Edges of a triangle mesh, each with its one or two faces."""
 
     faces: I32  # (e, 2) faces; the second is -1 at a border
-    ends: I32  # (e, 2, 2) the edge's vertices for each face, in the same order for both
+    ends: I32  # (e, 2, 2) both vertices of the edge in each face, in the same order
     apex: I32  # (e, 2) third vertex of each face
     normals: F64  # (t, 3) normals of the faces, not normalised
     heights: F64  # (t,) plane offsets: a face is visible to eyes whose product with its normal is larger
@@ -68,7 +68,10 @@ class Outlines:
     """Edges of several parts, from which the outlines that an eye sees are selected together."""
 
     def __init__(self, each: Sequence[Edges], *, vertices: Sequence[int]) -> None:
-        """each: the parts' edges; vertices: their numbers of vertices. Results count over all parts."""
+        """Collect the edges of all parts. each: edges of every part; vertices: its number of vertices.
+
+        In results, vertices are numbered consecutively over all parts.
+        """
         faces_before = np.cumsum([0, *(len(edges.normals) for edges in each)])
         self.vertices_before = np.cumsum([0, *vertices])
         self._faces = list(pairwise(faces_before.tolist()))
@@ -83,10 +86,10 @@ class Outlines:
         self._part = np.repeat(np.arange(len(each)), [len(edges.faces) for edges in each])
 
     def seen(self, eyes: Sequence[F64 | None]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return (k, 3) vertices of the edges on the outlines, and (k,) the parts to which they belong.
+        """Return vertices (k, 3) of the edges on the outlines, and the parts (k,) to which they belong.
 
-        The vertices are both ends and the apex of the visible face. eyes: (3,) in each part's own frame; None
-        excludes the part. Normals must point outwards.
+        An edge's vertices are its ends and the apex of its visible face. eyes: for each part, the eye (3,) in the
+        part's frame; None excludes the part. Normals must point outwards.
         """
         edges = self._edges
         facing = np.zeros(len(edges.normals), bool)
@@ -104,8 +107,8 @@ def ramps(points: F64, *, width_px: int, height_px: int, ramp_px: float = 1.0) -
     """Return two triangles along each outline edge, with coverage 1 at the edge and 0 `ramp_px` outside.
 
     points: (k, 3, 4) clip coordinates of the edges' ends and apexes. Returns (m, 6, 5) clip coordinates and
-    coverage, and the indices among the k edges. Edges partly behind the eye, or too short to have a direction, are
-    left out. The corners have the colours of the ends in `CORNER_ENDS`.
+    coverage of the corners, and the indices (m,) of the edges. Edges that are partly behind the eye or too short to
+    have a direction are left out. Each corner gets the colour of the end that `CORNER_ENDS` names.
     """
     scale = np.array([width_px / 2, height_px / 2])
     kept = np.flatnonzero((points[..., 3] > 1e-6).all(1))

@@ -1,4 +1,4 @@
-"""3D Gaussian splats (Kerbl et al. 2023) as arrays: reading from .ply, projection and colours."""
+"""Read 3D Gaussian splats (Kerbl et al. 2023) from .ply files, project them and compute colours."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from runtime.records import F32, F64
 log = logging.getLogger("phasestack.content")
 
 LOW_PASS_PX2 = 0.3  # added to each splat's covariance, so that no splat falls between pixels
-ALPHA_MIN = 1 / 255  # least alpha of a splat at a pixel; less changes no code value
+ALPHA_MIN = 1 / 255  # smallest alpha of a splat at a pixel that can change a code value
 LARGEST_COORDINATE = 1e15  # products of two or three such coordinates still fit in float32
 LARGEST_RELATIVE_SCALE = 100.0  # largest scale of a splat, in units of the scene's extent
-STRAY = 1.0  # percentage of the splats at each end of an axis that the scale ignores
-FAINT = 0.1  # splats of less opacity are ignored for scale and bounds
+STRAY = 1.0  # percentage of the splats, at each end of an axis, that are ignored for the scale
+FAINT = 0.1  # splats with less opacity are ignored for scale and bounds
 REACH = 2.0  # standard deviations of a splat that must be visible
 AT_ONCE = 1 << 17  # splats processed and drawn together, which bounds the memory
 SAMPLED = 10_000  # points whose neighbours are searched
@@ -44,7 +44,7 @@ I64 = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Gaussians:
-    """A scene of n splats in a common frame."""
+    """Scene of n splats in a common frame."""
 
     centres: F32  # (n, 3)
     covariances: F32  # (n, 6): xx, xy, xz, yy, yz, zz
@@ -79,7 +79,7 @@ def load_gaussians(header: PlyHeader) -> Gaussians:
         raise InputError(path, "f_rest", f"{rest} properties; 0, 9, 24 or 45 are needed")
 
     def columns(*wanted: str) -> F32:
-        """Return an (n, len(wanted)) array of these properties."""
+        """Return the wanted properties as an array (n, len(wanted))."""
         if missing := [name for name in wanted if name not in names]:
             raise InputError(path, missing[0], "the property is missing: not a 3D Gaussian splat file")
         with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite
@@ -103,7 +103,7 @@ def load_gaussians(header: PlyHeader) -> Gaussians:
 def drawable(path: Path, *, centres: F32, log_scales: F32, quaternions: F32, logits: F32, harmonics: F32) -> Gaussians:
     """Return the splats that can be drawn: finite, with a rotation, and not much larger than the scene.
 
-    quaternions: (n, 4) w, x, y, z of any length; logits: (n,) of the opacities. Raises InputError if none is left.
+    quaternions: (n, 4) w, x, y, z of any length; logits: (n,) of the opacities. Raises InputError if no splat remains.
     """
     with np.errstate(invalid="ignore"):  # NaN compares as false
         usable = (np.abs(centres) < LARGEST_COORDINATE).all(1) & (quaternions != 0).any(1) & ~np.isnan(logits)
@@ -134,7 +134,10 @@ def flat_harmonics(colours: F32) -> F32:
 
 
 def with_higher(flat: F32, higher: NDArray[Any], *, zero: float = 0.0, unit: float = 1.0) -> F32:
-    """Join harmonics to (n, k, 3): flat (n, 1, 3) and (higher - zero) * unit (n, k - 1, 3)."""
+    """Join flat harmonics (n, 1, 3) and decoded higher ones (n, k - 1, 3) to (n, k, 3).
+
+    higher: encoded as (value / unit + zero).
+    """
     harmonics = np.empty((len(flat), 1 + higher.shape[1], 3), np.float32)
     harmonics[:, :1], harmonics[:, 1:] = flat, higher
     harmonics[:, 1:] -= np.float32(zero)
@@ -143,7 +146,7 @@ def with_higher(flat: F32, higher: NDArray[Any], *, zero: float = 0.0, unit: flo
 
 
 def dotted(ends: F32, colours: F32) -> tuple[F32, F32]:
-    """Convert lines (n, 2, 3) to points (m, 3), interpolating the colours (n, 2, 3) of their ends."""
+    """Convert lines (n, 2, 3) to points (m, 3) with interpolated colours. colours: (n, 2, 3) of the ends."""
     lengths = np.nan_to_num(np.linalg.norm(np.diff(ends.astype(np.float64), axis=1)[:, 0], axis=1))
     share = np.minimum(lengths / max(float(lengths.sum()), 1e-30), 1.0)
     counts = 2 + (share * min(DOTS * len(ends), MOST_DOTS)).astype(np.int64)
@@ -155,9 +158,10 @@ def dotted(ends: F32, colours: F32) -> tuple[F32, F32]:
 
 
 def of_points(places: F32, colours: F32) -> Gaussians:
-    """Return points as small round splats, about as large as the spacing of the points.
+    """Convert points to small round splats, about as large as the spacing of the points.
 
-    colours: (n, 3), 0-1. NaN: colour by position, because a single colour would show only an outline.
+    colours: (n, 3), 0-1. A point whose colour is NaN is coloured by its position, because a single colour would show
+    only an outline.
     """
     low, high = np.percentile(places, [1, 99], axis=0)
     by_place = 0.25 + 0.7 * np.clip((places - low) / np.maximum(high - low, 1e-30), 0, 1)
@@ -173,7 +177,10 @@ def of_points(places: F32, colours: F32) -> Gaussians:
 
 
 def bounds(gaussians: Gaussians) -> tuple[F64, F64]:
-    """Return the corners (3,) of a box around visible splats, to two sigma, without outliers."""
+    """Return the lowest and highest corner (3,) of a box around visible splats, without outliers.
+
+    The box includes two standard deviations of each splat.
+    """
     seen = gaussians.opacities > FAINT
     seen = seen if seen.any() else np.ones_like(seen)
     centres = gaussians.centres[seen].astype(np.float64)
@@ -184,7 +191,10 @@ def bounds(gaussians: Gaussians) -> tuple[F64, F64]:
 
 
 def covariances_of(scales: F32, quaternions: F32) -> F32:
-    """Return (n, 6) R diag(s²) R^T from (n, 3) standard deviations and (n, 4) quaternions w, x, y, z."""
+    """Return covariances (n, 6), R diag(s²) R^T.
+
+    scales: (n, 3) standard deviations s; quaternions: (n, 4) w, x, y, z of the rotations R.
+    """
     packed = np.empty((len(scales), 6), np.float32)
     for first in range(0, len(scales), AT_ONCE):
         rows = slice(first, first + AT_ONCE)
@@ -195,7 +205,7 @@ def covariances_of(scales: F32, quaternions: F32) -> F32:
 
 
 def moved(gaussians: Gaussians, target_from_source: F64) -> Gaussians:
-    """Move splats to another frame by a 4x4 similarity; harmonics keep the file's directions."""
+    """Move splats to another frame by a 4x4 similarity. Harmonics keep the directions of the file."""
     linear = target_from_source[:3, :3]
     centres = gaussians.centres @ linear.T + target_from_source[:3, 3]
     packed = np.empty_like(gaussians.covariances)
@@ -209,8 +219,7 @@ def moved(gaussians: Gaussians, target_from_source: F64) -> Gaussians:
 def seen_splats(gaussians: Gaussians, view: View, *, nearest_m: float = 1e-3) -> Splats:
     """Return visible splats, sorted and projected to first order (EWA, Zwicker et al. 2001).
 
-    Any 3x4 projection will do, because the Jacobian is (P_i - u_i P_3)/w: a panel's pixels are as good as an eye's
-    image.
+    The view may have any 3x4 projection P, to a panel's pixels or to an eye's image: the Jacobian is (P_i - u_i P_3)/w.
     """
     projection = view.pixels_from_stack.astype(np.float32)
     homogeneous = gaussians.centres @ projection[:, :3].T + projection[:, 3]
@@ -253,9 +262,10 @@ def seen_splats(gaussians: Gaussians, view: View, *, nearest_m: float = 1e-3) ->
 
 
 def nearest_blocks(splats: Splats, view: View, *, every: int, first: tuple[int, int]) -> F32:
-    """Return `ContentSource.nearness`, (h, w) in 1/m, of the nearest splat with alpha over `SOLID`.
+    """Return `ContentSource.nearness` (h, w), in 1/m, of the nearest splats whose alpha exceeds `SOLID`.
 
-    Each splat is treated as a square with its area, or as little as half as wide, at the distance of its centre.
+    A splat is treated as a square at the distance of its centre. Its width is that of a square of equal area, or less,
+    down to half of it.
     """
     shape = -(-(view.height_px + first[1]) // every), -(-(view.width_px + first[0]) // every)
     solid = np.flatnonzero(splats.opacities > SOLID)  # farthest first
@@ -276,7 +286,7 @@ def nearest_blocks(splats: Splats, view: View, *, every: int, first: tuple[int, 
 
 
 def harmonic_basis(directions: F32, count: int) -> F32:
-    """Return (n, count) real spherical harmonics, in the reference implementation's order and signs."""
+    """Return real spherical harmonics (n, count) with the reference implementation's order and signs."""
     x, y, z = directions.T
     basis = [np.full_like(x, FLAT_HARMONIC)]
     if count > 1:
@@ -301,7 +311,10 @@ def harmonic_basis(directions: F32, count: int) -> F32:
 
 
 def colours_towards(harmonics: F32, directions: F32) -> F32:
-    """Return (n, 3) colours >= 0 of coefficients (n, k, 3) along unit directions (n, 3) from the eye."""
+    """Return the colours (n, 3), at least 0, of splats seen along unit directions (n, 3) from the eye.
+
+    harmonics: (n, k, 3) coefficients.
+    """
     if harmonics.shape[1] == 1:
         return np.asarray(np.maximum(harmonics[:, 0] * np.float32(FLAT_HARMONIC) + np.float32(0.5), 0))
     basis = harmonic_basis(directions, harmonics.shape[1])

@@ -1,4 +1,4 @@
-"""Convert a glTF 2.0 file's scene to parts to draw: its nodes, primitives and materials at rest."""
+"""Convert the nodes, primitives and materials of a glTF 2.0 scene, at rest, to parts that are drawn."""
 
 from __future__ import annotations
 
@@ -41,10 +41,13 @@ WITHOUT = UNSEEN | {
 
 
 class GltfScene:
-    """The parts of a file's scene, and descriptions of what is not drawn."""
+    """Parts of the scene in a file, and descriptions of what is not drawn."""
 
     def __init__(self, path: Path, data: bytes, read: Read) -> None:
-        """Raises InputError if the file is not glTF 2.0, is damaged or over a limit, or needs an extension."""
+        """Read a scene. Raises InputError for a file that cannot be drawn.
+
+        Such a file is not glTF 2.0, is damaged, exceeds a limit, or requires an unsupported extension.
+        """
         self.path = path
         self.parts: list[Part] = []
         self.points: list[tuple[F32, F32]] = []  # (n, 3) positions and (n, 3) sRGB colours, 0-1
@@ -80,13 +83,13 @@ class GltfScene:
         return min((self.file.count(index) for name, index in own.items() if name in PLACES), default=1)
 
     def _instanced(self, node: Table, matrix: F64) -> list[F64]:
-        """Return each instance's 4x4 scene_from_mesh."""
+        """Return the 4x4 matrix scene_from_mesh of each instance of a node's mesh."""
         own = node.get("extensions", {}).get(INSTANCES, {}).get("attributes", {})
         read = {PLACES[name]: self.file.accessor(index) for name, index in own.items() if name in PLACES}
         return [matrix @ _local({name: rows[k] for name, rows in read.items()}) for k in range(self._instances(node))]
 
     def _textures(self) -> Iterator[Table]:
-        """Yield the texture references of the drawn material properties, so not of normal maps, for example."""
+        """Yield the texture references of the material properties that are drawn (not of normal maps)."""
         for material in self.file.all("materials"):
             glossy = material.get("extensions", {}).get(GLOSSY, {})
             base = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
@@ -107,7 +110,7 @@ class GltfScene:
         self.left_out |= {str(name) for name in file.table.get("extensionsUsed", [])} - DRAWN - UNSEEN - {*COMPRESSED}
 
     def _world(self) -> dict[int, tuple[Table, F64]]:
-        """Return nodes and 4x4 scene_from_node by number. Raises InputError if nested too deep."""
+        """Return each node and its 4x4 scene_from_node, by number. Raises InputError if nested too deep."""
         nodes, scenes = self.file.all("nodes"), self.file.all("scenes")
         children = {child for node in nodes for child in node.get("children", [])}
         roots = [number for number in range(len(nodes)) if number not in children]
@@ -126,7 +129,7 @@ class GltfScene:
         return placed_nodes
 
     def _joints(self, node: Table, world: dict[int, tuple[Table, F64]]) -> F64:
-        """Return (j, 4, 4) scene_from_mesh for each joint of a skin, with its nodes at rest (section 3.7.3)."""
+        """Return scene_from_mesh (j, 4, 4) for the joints of a node's skin at rest (section 3.7.3)."""
         skin = self.file.item("skins", node["skin"])
         stand = np.array([world[joint][1] if joint in world else np.eye(4) for joint in skin["joints"]])
         if "inverseBindMatrices" not in skin:
@@ -191,7 +194,7 @@ class GltfScene:
         self.parts.append(Part(shape, vertex_colours=colours, is_linear=not is_plain, **look))
 
     def _skinned(self, joints: F64, attribute: Any) -> F64:
-        """Return (v, 4, 4): for each vertex, the weighted mean of its joints' matrices."""
+        """Return a matrix (v, 4, 4) for each vertex: the weighted mean of its joints' matrices."""
         names, weights = attribute("JOINTS_0"), attribute("WEIGHTS_0")
         for number in range(1, 4):
             if (more := attribute(f"JOINTS_{number}")) is not None:
@@ -204,7 +207,7 @@ class GltfScene:
         return total
 
     def _draco(self, primitive: Table) -> tuple[dict[str, Array], Array | None]:
-        """Return a Draco-compressed primitive's attributes and vertex indices; nothing for others."""
+        """Return the attributes and vertex indices of a primitive if it is Draco-compressed, else nothing."""
         own = primitive.get("extensions", {}).get(DRACO)
         if own is None:
             return {}, None
@@ -230,7 +233,7 @@ class GltfScene:
         return values, np.asarray(decoded.faces).reshape(-1)
 
     def _look(self, index: int | None) -> tuple[dict[str, Any], Table]:
-        """Return the `Part` fields of a material, with linear colours, and how its texture is applied."""
+        """Return a material's fields of `Part`, with linear colours, and how its texture is applied."""
         file, material = self.file, {} if index is None else self.file.item("materials", index)
         own = material.get("extensions", {})
         base, prefix = material.get("pbrMetallicRoughness", {}), "baseColor"
@@ -265,7 +268,7 @@ class GltfScene:
 
 
 def _problem(error: Exception) -> str:
-    """Return the fault of a file, in words, from the error that reading it raised."""
+    """Describe the fault of a file, given the error that reading it raised."""
     if isinstance(error, KeyError):
         return f"{untrusted_input.shown(str(error))} is missing"
     if isinstance(error, IndexError):
@@ -288,7 +291,7 @@ def _local(node: Table) -> F64:
 
 
 def _faces(corners: Array, mode: int) -> Array:
-    """Return rows of attributes: (t, 3) triangles, (n, 2) lines or (n,) points (3.7.2.1).
+    """Group `corners` into triangles (t, 3), lines (n, 2) or points (n,), as `mode` says (3.7.2.1).
 
     Raises ValueError for an unknown mode.
     """

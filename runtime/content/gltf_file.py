@@ -1,6 +1,6 @@
-"""The container of a glTF 2.0 file: its JSON, buffers, accessors and pictures.
+"""Read the container of a glTF 2.0 file: its JSON, buffers, accessors and pictures.
 
-This is own code because trimesh drops samplers, sparse accessors and normalized integers, pygltflib does not decode
+No library is used for this: trimesh drops samplers, sparse accessors and normalized integers, pygltflib does not decode
 accessors, and assimp-py does not return embedded pictures.
 """
 
@@ -29,7 +29,7 @@ Table = dict[str, Any]
 Array = NDArray[Any]
 Read = Callable[[str], bytes]  # reads a file in the same folder, given its URI or name
 
-ELEMENTS_PER_TRIANGLE = 10  # for all accessors together, to derive their limit from that on triangles
+ELEMENTS_PER_TRIANGLE = 10  # gives the limit for all accessors together, from the limit on triangles
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 SHAPES = {"SCALAR": (1,), "VEC2": (2,), "VEC3": (3,), "VEC4": (4,), "MAT2": (2, 2), "MAT3": (3, 3), "MAT4": (4, 4)}
 PICTURE_EXTENSIONS = ("EXT_texture_webp", "EXT_texture_avif")  # others, such as KTX2, are not decoded
@@ -43,7 +43,7 @@ WAY_OUT = "save it without that compression, in Blender or with `gltf-transform`
 
 
 class GltfFile:
-    """One file. Raises LookupError, TypeError or ValueError if malformed, otherwise InputError."""
+    """One glTF file. Raises LookupError, TypeError or ValueError if malformed, otherwise InputError."""
 
     def __init__(self, path: Path, data: bytes, read: Read) -> None:
         text, self._binary = (data, b"") if data[:4] != b"glTF" else _chunks(path, data)
@@ -60,7 +60,7 @@ class GltfFile:
             untrusted_input.within(elements, most, source=path, field=f"accessors[{number}].count")
 
     def all(self, kind: str) -> list[Table]:
-        """Return the objects of a kind, such as `meshes`; empty if the file has none."""
+        """Return all objects of a kind, such as `meshes`, or an empty list if the file has none."""
         objects: list[Table] = self.table.get(kind, [])
         return objects
 
@@ -73,9 +73,9 @@ class GltfFile:
         return _count(self.item("accessors", accessor))
 
     def accessor(self, index: int, *, rows: Array | None = None, as_float: bool = True) -> Array:
-        """Return an accessor's elements (n, ...), or chosen rows of them.
+        """Return the elements (n, ...) of an accessor, or only some rows of them.
 
-        as_float: convert to float32 with `fractions`; otherwise the numbers are returned as stored.
+        as_float: True to convert to float32 with `fractions`; False to return the numbers as stored.
         """
         accessor = self.item("accessors", index)
         values = self._stored(accessor)
@@ -108,7 +108,7 @@ class GltfFile:
         return np.ndarray((count, *shape), dtype, data, first, (stride, *strides))
 
     def view(self, index: int) -> tuple[memoryview, int]:
-        """Return a buffer view's bytes and stride; a stride of 0 means contiguous elements."""
+        """Return the bytes of a buffer view, and its stride (0: elements are contiguous)."""
         view = self.item("bufferViews", index)
         number, first, size = view["buffer"], view.get("byteOffset", 0), view["byteLength"]
         buffer = self._buffer(number)
@@ -144,7 +144,7 @@ class GltfFile:
             raise ValueError(f"a data URI that is not base64: {error}") from None
 
     def picture(self, texture: Table) -> U8:
-        """Return a texture's picture (h, w, 4) RGBA; its header has been checked. Raises InputError."""
+        """Return a texture's picture, (h, w, 4) RGBA. Its header must have been checked. Raises InputError."""
         number = self._image_of(texture)
         if number not in self._pictures:
             image = decoded_picture(self._coded(number), source=self.path, field="texture", name=f"images[{number}]")
@@ -163,7 +163,7 @@ class GltfFile:
             untrusted_input.within(pixels, LIMITS.texture_pixels, source=self.path, field="textures' pixels")
 
     def _image_of(self, texture: Table) -> int:
-        """Return the number of a texture's image: if its extensions offer several, one that can be decoded."""
+        """Return the number of a texture's image. If extensions offer several, it is one that can be decoded."""
         own: Table = texture.get("extensions", {})
         for offered in (*(own[name] for name in PICTURE_EXTENSIONS if name in own), texture):
             if offered.get("source") is not None:

@@ -1,4 +1,4 @@
-"""Warp pictures with a known projection into the raster of a view."""
+"""Warp pictures with a known projection to the raster of a view."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def rgba_from_rgb(rgb: U8) -> U8:
 
 
 def image_from_view(image_from_stack: F64, pixels_from_stack: F64, *, x_m: float) -> F64 | None:
-    """Return the 3x3 map to picture pixels from view pixels through x = x_m; None for an eye there.
+    """Return the 3x3 map to picture pixels from view pixels through the plane x = `x_m`.
 
-    If picture and view belong to the same eye, every plane gives the same matrix; otherwise the picture hangs in
-    this plane.
+    If picture and view belong to the same eye, every plane gives the same matrix; otherwise the picture appears in
+    this plane. The result is None for an eye in the plane.
     """
     # The pixels of this raster are metres: u is y, v is -z.
     plane = PlaneRaster(x_m=x_m, left_m=0.0, top_m=0.0, pitch_u_m=1.0, pitch_v_m=1.0, width_px=1, height_px=1)
@@ -34,7 +34,7 @@ def image_from_view(image_from_stack: F64, pixels_from_stack: F64, *, x_m: float
 
 
 def plane_from_pixels(pixels_from_stack: F64, plane: PlaneRaster) -> F64 | None:
-    """Return the 3x3 map to a plane's pixels from a view's; None for an eye in the plane."""
+    """Return the 3x3 map to a plane's pixels from a view's, or None for an eye in the plane."""
     try:
         return panel_from_image(pixels_from_stack, plane)
     except ValueError:
@@ -42,7 +42,7 @@ def plane_from_pixels(pixels_from_stack: F64, plane: PlaneRaster) -> F64 | None:
 
 
 def reduction(picture_from_view: F64, view: View) -> int:
-    """Return the number of halvings before a warp, so that a sample covers at most about 1.5 pixels."""
+    """Return how often to halve a picture before a warp, so that a sample covers at most 1.5 pixels."""
     middle = np.array([view.width_px, view.height_px]) / 2 + np.array([[0, 0], [1, 0], [0, 1]])
     mapped = cv2.perspectiveTransform(middle[None], picture_from_view)[0]
     steps = np.linalg.norm(mapped[1:] - mapped[0], axis=1)
@@ -50,7 +50,7 @@ def reduction(picture_from_view: F64, view: View) -> int:
 
 
 class WarpedPicture:
-    """An RGBA picture with its reduced copies, which can be warped into a view's raster."""
+    """RGBA picture with reduced copies, which can be warped to a view's raster."""
 
     def __init__(self, rgba: U8, *, background: tuple[float, float, float]) -> None:
         self._levels = [np.ascontiguousarray(rgba)]
@@ -58,7 +58,7 @@ class WarpedPicture:
         self._out: dict[tuple[int, int, int], U8] = {}
 
     def warped(self, picture_from_view: F64 | None, view: View) -> U8:
-        """Return the picture (h, w, 4) at the view's pixels; outside it, the background with alpha 0.
+        """Return the picture (h, w, 4) on the view's raster. Outside it, the background has alpha 0.
 
         The next call with the same size and side overwrites the array.
         """

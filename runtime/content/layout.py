@@ -1,4 +1,4 @@
-"""Arrangement of a picture's views, from a setting, its name or the similarity of its halves."""
+"""Find the arrangement of a picture's views from a setting, its name or the similarity of its halves."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from runtime.records import U8
 QUILT = re.compile(r"(?<![a-z0-9])qs([0-9]{1,6})x([0-9]{1,6})(?:a([0-9]*\.?[0-9]+))?(?![0-9])")
 ASPECT_MIN, ASPECT_MAX = 0.05, 20.0  # width over height of one view
 RIGHT_FIRST = (".jps", ".pns")  # these formats are side by side and cross-eyed by convention
-MARKS = {  # words that may be anywhere in a name, for example in the middle of a film's
+MARKS = {  # words that may be anywhere in a name
     "half-side-by-side": "(half|h) ?(sbs|side by side|lr|left right)|sbs h(alf)?",
     "half-top-bottom": "(half|h) ?(tb|tab|over under|top bottom)|(half|h|3d) (ou|hou)|halfou|(ou|tb|tab) half",
     "cross-eyed": "cross ?eyed?|crossview|sbs rl",
@@ -38,7 +38,7 @@ FULL = re.compile(r"(^|[^a-z])(full|fsbs|ftb|fou)")  # in a film's name: its vie
 ALIKE = 0.8  # correlation above which halves may be two views
 SMALL_PX = (64, 48)  # size of halves for comparison
 SHIFT_PX = 6  # largest shift between views, in these pixels
-ROUGH = 6.0  # standard deviation, codes; smoother halves always agree
+ROUGH = 6.0  # standard deviation in codes; smoother halves always agree, so they are not compared
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,10 @@ class Layout:
     view_aspect: float = 0.0  # width over height of a quilt's views; 0: as given by their pixels
 
     def views(self, picture: U8) -> list[U8]:
-        """Return the views, cropped straight ahead if equirectangular. Raises ValueError as `parts` does."""
+        """Return the views of a picture. Equirectangular ones are cropped straight ahead.
+
+        Raises ValueError if the picture is too small (`parts`).
+        """
         parts = self.parts(picture)
         height, width = parts[0].shape[:2]
         squeezed = (1.0, 0.5, 2.0) if len(parts) == 2 else (1.0,)  # whether or not the name states it
@@ -86,7 +89,7 @@ class Layout:
         ]
 
     def pixel_aspect(self, *, width_px: int, height_px: int) -> float:
-        """Return the width of a view's pixel over its height, for a view of this size."""
+        """Return the aspect ratio (width over height) of the pixels of a view of this size."""
         if self.half:
             return float(self.columns) if self.columns > 1 else 1 / self.rows
         return self.view_aspect * height_px / width_px if self.view_aspect else 1.0
@@ -96,7 +99,7 @@ MONO, PAIR = Layout("mono"), Layout("side-by-side", columns=2)  # PAIR: two pict
 
 
 def layout_of(path: Path, settings: ContentSettings, *, stated: str = "") -> Layout:
-    """Return a file's layout: as set, as the file states it, or by its name. Raises InputError."""
+    """Return a file's layout: as set, as `stated` in the file, or by its name. Raises InputError."""
     named = settings.layout
     if named == "auto":
         named = stated or _named(path)
@@ -116,7 +119,10 @@ def layout_of(path: Path, settings: ContentSettings, *, stated: str = "") -> Lay
 
 
 def of_film(layout: Layout, path: Path, *, width_px: int, height_px: int) -> Layout:
-    """Return a film's layout by its name; views are squeezed if the picture has the shape of one."""
+    """Return a film's layout. Its views count as squeezed if the picture has the shape of a single view.
+
+    layout: as given by the name.
+    """
     aspect = width_px / height_px
     squeezed = {"side-by-side": aspect < NARROW, "top-bottom": aspect > LOW}.get(layout.kind, False)
     is_half = squeezed and not layout.span_deg and not FULL.search(path.stem.lower())
@@ -147,7 +153,7 @@ def _span_deg(path: Path) -> int:
 
 
 def hint(picture: U8) -> str:
-    """Return the layout suggested by halves that nearly agree, otherwise an empty string."""
+    """Return the layout that a picture probably has because its halves nearly agree, otherwise ""."""
     for layout in ("side-by-side", "top-bottom"):
         columns = 2 if layout == "side-by-side" else 1
         if min(picture.shape[0] * columns, picture.shape[1] * (3 - columns)) < 4 * SMALL_PX[0]:
@@ -163,6 +169,6 @@ def hint(picture: U8) -> str:
 
 
 def _detail(view: U8) -> U8:
-    """Return a view reduced, grey and high-pass filtered, because any two skies are alike."""
+    """Reduce a view to a small grey picture, high-pass filtered because any two skies are alike."""
     small = cv2.cvtColor(cv2.resize(view, SMALL_PX, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
     return np.asarray(small.astype(np.float32) - cv2.GaussianBlur(small, (0, 0), 8).astype(np.float32), np.float32)

@@ -1,4 +1,4 @@
-"""Read meshes (glTF/GLB, OBJ, OFF, PLY and STL), which are drawn with one lamp."""
+"""Read meshes (glTF/GLB, OBJ, OFF, PLY and STL). They are drawn with one lamp."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ class MeshData:
     points: tuple[tuple[F32, F32], ...]  # (n, 3) positions and colours, drawn only if there are no parts
     low: F64  # (3,) lowest corner of its bounding box
     high: F64
-    facing: F64  # (3,) area-weighted mean normal: length at most 1; 0 for a closed surface
+    facing: F64  # (3,) area-weighted mean normal; its length is at most 1, and 0 for a closed surface
     left_out: tuple[str, ...] = ()  # descriptions of what is not drawn
 
 
 def prepare(file: SceneFile) -> Callable[..., ContentSource]:
-    """Read the file and find its outlines; the returned function uploads them to GL. Raises InputError."""
+    """Read a mesh and find its outlines. Return a function that uploads them to GL. Raises InputError."""
     data = load_mesh(file.path)
     if data.left_out:
         log.warning("%s: is drawn without %s", file.path, ", ".join(data.left_out))
@@ -107,7 +107,7 @@ def load_mesh(path: Path) -> MeshData:
 
 
 def folder_reader(path: Path, field: str) -> Callable[[str], bytes]:
-    """Return a function that reads the files that a mesh refers to by URI or path, or raises InputError."""
+    """Return a function that reads a file to which a mesh refers by URI or path, or raises InputError."""
     read_files: dict[str, bytes] = {}
 
     def read(name: str) -> bytes:
@@ -120,7 +120,7 @@ def folder_reader(path: Path, field: str) -> Callable[[str], bytes]:
 
 
 def _file_of(uri: str, *, source: Path, field: str) -> Path:
-    """Return the path of the file in the folder of `source` to which a URI refers. Raises InputError."""
+    """Return the path of the file, in the folder of `source`, to which a URI refers. Raises InputError."""
     shown = untrusted_input.shown(uri, most=200)
     if "://" in uri or uri.startswith("data:"):
         raise InputError(source, field, f"{shown}: only files next to this one are read")
@@ -133,7 +133,7 @@ def _file_of(uri: str, *, source: Path, field: str) -> Path:
 
 
 def _check(path: Path, parts: Sequence[Part], places: Sequence[F32], left_out: set[str]) -> None:
-    """Raise InputError if nothing would be visible, or if some coordinates cannot be drawn."""
+    """Raise InputError if nothing would be visible, or if any coordinates cannot be drawn."""
     if not any(len(place) for place in places):
         alone = f", and {' and '.join(sorted(left_out))} are not drawn" if left_out else ""
         raise InputError(path, "faces", f"the file has none{alone}")
@@ -148,7 +148,7 @@ def _check(path: Path, parts: Sequence[Part], places: Sequence[F32], left_out: s
 
 
 def _check_counts(path: Path, data: bytes) -> None:
-    """Check a file's stated counts against the limits before its loader allocates, or raise InputError."""
+    """Raise InputError if the counts that a file states exceed a limit, before a loader allocates memory."""
     suffix, promised = path.suffix.lower(), 0
     if suffix == ".ply":
         read_header(path)
@@ -168,7 +168,7 @@ def _is_binary_stl(path: Path, data: bytes) -> bool:
 
 
 def _binary_stl(data: bytes) -> Part:
-    """Read binary STL without trimesh, which needs ten times the memory for the largest files."""
+    """Read binary STL without trimesh, which needs ten times as much memory for the largest files."""
     facets = np.frombuffer(data, [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")], offset=STL_HEAD)
     corners = np.ascontiguousarray(facets["corners"])
     triangles = np.arange(3 * len(facets), dtype=np.int32).reshape(-1, 3)

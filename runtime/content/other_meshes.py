@@ -1,4 +1,4 @@
-"""Read OBJ, OFF, PLY and STL with trimesh, as parts to draw."""
+"""Read OBJ, OFF, PLY and STL files with trimesh, as parts that are drawn."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ log = logging.getLogger("phasestack.content")
 BOMS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 # Options before a texture's name in an MTL file: `-s 1 1 1`, `-blendu off`, `-imfchan r`.
 OPTIONS = re.compile(r"(?:-[a-zA-Z]+(?:\s+(?:on|off|[rgbmlz]|[-+.\d]+(?:[eE][-+]?\d+)?))*\s+)+")
-DRIVE = re.compile(r"[A-Za-z]:.*/")  # path on the author's Windows machine; only its file name is used
+DRIVE = re.compile(r"[A-Za-z]:.*/")  # a path on the author's Windows machine, of which only the file name is used
 
 
 class FolderResolver(trimesh.resolvers.FilePathResolver):
-    """Reads files in the mesh's folder, and keeps the reason of a refusal, which loaders would discard."""
+    """Reader of files in a mesh's folder. It keeps the reason for a refusal, which loaders discard."""
 
     def __init__(self, path: Path, read: Read, *, has_materials: bool) -> None:
         super().__init__(str(path))
@@ -64,7 +64,7 @@ class FolderResolver(trimesh.resolvers.FilePathResolver):
         return data
 
     def _named(self, name: str) -> str | None:
-        """Return the file's name in the folder, without options and backslashes, in its actual case."""
+        """Return the name that a file has in the folder, given a name with options, backslashes or other case."""
         name = DRIVE.sub("", OPTIONS.sub("", name, count=1).strip().replace("\\", "/"))
         untrusted_input.checked_path(name, source=self._path, field="texture")
         if Path(name).is_absolute() or (self._path.parent / name).exists():
@@ -77,7 +77,7 @@ class FolderResolver(trimesh.resolvers.FilePathResolver):
 
 
 def read_mesh(path: Path, data: bytes, read: Read) -> tuple[list[Part], list[tuple[F32, F32]]]:
-    """Return the file's parts, or points (n, 3) with their colours if it has no faces. Raises InputError."""
+    """Return a file's parts or, if it has no faces, its points and their colours. Raises InputError."""
     kind = path.suffix.lower().removeprefix(".")
     progress.tell(f"{path.name}: triangles", 0)
     mark = {"obj": b"mtllib", "ply": b"TextureFile"}.get(kind, b"")
@@ -114,12 +114,12 @@ def read_mesh(path: Path, data: bytes, read: Read) -> tuple[list[Part], list[tup
 
 
 def _text(data: bytes) -> str:
-    """Decode an OBJ file. Only names and comments can be non-ASCII; their encodings vary."""
+    """Decode an OBJ file. Only names and comments can be non-ASCII, in various encodings."""
     return data.decode("utf-16" if data[:2] in BOMS else "utf-8", errors="replace")
 
 
 def _wires(file: io.StringIO) -> F32 | None:
-    """Return (n, 2, 3) ends of an OBJ's lines; None if it has none."""
+    """Return the ends (n, 2, 3) of the lines in an OBJ file, or None if it has no lines."""
     places: list[list[str]] = []
     ends: list[tuple[int, int]] = []
     for kind, *words in filter(None, map(str.split, file.getvalue().splitlines())):
@@ -147,7 +147,7 @@ def _points(cloud: Any) -> list[tuple[F32, F32]]:
 
 
 def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8]) -> Part:
-    """Return a trimesh as a part, with its material or face or vertex colours; otherwise grey."""
+    """Convert a trimesh to a part with its material, or its face or vertex colours, otherwise grey."""
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(path, "faces", "are not triangles of existing vertices")
@@ -180,7 +180,7 @@ def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8]) -> Part:
 
 
 def _unit(colours: Any) -> F32:
-    """Return colours (n, 3 or 4), given as integers or fractions, as floats in [0, 1]."""
+    """Convert colours (n, 3 or 4), given as integers or fractions, to floats in [0, 1]."""
     numbers = np.asarray(colours)
     scale = np.float32(np.iinfo(numbers.dtype).max if numbers.dtype.kind == "u" else 1.0)
     return np.asarray(np.clip(numbers.astype(np.float32) / scale, 0.0, 1.0), dtype=np.float32)
@@ -189,7 +189,7 @@ def _unit(colours: Any) -> F32:
 def _material(material: Any, pictures: dict[int, U8]) -> tuple[U8 | None, Colour, float]:
     """Return a trimesh material's texture (RGBA), the colour that multiplies it, and the opacity.
 
-    Black with a texture counts as white, because some exporters write black for materials that only have a texture.
+    Black with a texture counts as white, because some exporters write black for materials that have only a texture.
     """
     image, diffuse = getattr(material, "image", None), getattr(material, "diffuse", None)
     red, green, blue = _unit(np.ones(3) if diffuse is None else diffuse)[:3].tolist()

@@ -25,7 +25,7 @@ U32 = NDArray[np.uint32]
 def load_compressed(header: PlyHeader) -> Gaussians:
     """Read SuperSplat's compressed form: numbers of 8 to 11 bits between the bounds of their chunk.
 
-    Raises InputError if a splat has no bounds or none can be drawn.
+    Raises InputError if a splat has no bounds, or if no splat can be drawn.
     """
     elements = read_elements(header)
     splats, bounds = elements["vertex"], elements.get("chunk")
@@ -36,7 +36,7 @@ def load_compressed(header: PlyHeader) -> Gaussians:
     place, turn, scale, colour = (splats[f"packed_{kind}"].astype(np.uint32) for kind in kinds)
 
     def bounds_of(name: str, axes: str) -> list[F32]:
-        """Return two (n, 3) arrays: lower and upper bounds of each splat's chunk."""
+        """Return two (n, 3) arrays: the lower and the upper bounds of each splat's chunk."""
         columns = [[f"{end}_{name}{axis}" for axis in axes] for end in ("min", "max")]
         if missing := {*columns[0], *columns[1]} - {*(bounds.dtype.names or ())}:
             raise InputError(header.path, "chunk", f"has no {min(missing)}")
@@ -84,7 +84,7 @@ def load_splat(path: Path) -> Gaussians:
 
 
 def fields_of(packed: U32, bits: tuple[int, ...]) -> F32:
-    """Return (n, len(bits)) fields of words as fractions of their maximum, highest bits first."""
+    """Return the fields (n, len(bits)) of words, highest bits first, as fractions of their maximum."""
     parts = []
     for width in reversed(bits):
         most = (1 << width) - 1
@@ -98,12 +98,15 @@ def _between(share: F32, low: F32, high: F32) -> F32:
 
 
 def _turns(packed: U32) -> F32:
-    """Return (n, 4) quaternions w, x, y, z; two bits index the largest component, which is implied."""
+    """Decode quaternions (n, 4) w, x, y, z. Two bits index the largest component, which is implied."""
     return with_largest((fields_of(packed, (10, 10, 10)) - np.float32(0.5)) * np.float32(np.sqrt(2)), packed >> 30)
 
 
 def with_largest(three: NDArray[np.floating[Any]], number: NDArray[np.integer[Any]]) -> F32:
-    """Return (n, 4) unit quaternions from three components and the largest one's index; zeros if above 3."""
+    """Return unit quaternions (n, 4), given three components and the index `number` of the largest one.
+
+    A quaternion is zero if its index is above 3.
+    """
     largest = np.sqrt(np.maximum(1 - (three**2).sum(1), 0))
     quaternions = np.zeros((len(three), 4), np.float32)
     for place in range(4):

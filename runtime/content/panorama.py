@@ -15,19 +15,19 @@ ASPECT_OFF = 0.02  # tolerance for a view's aspect ratio
 
 
 def is_around(width: float, height: float, span_deg: int) -> bool:
-    """Return True if a view of square pixels has the aspect ratio of span_deg by 180 degrees."""
+    """Return True if a view with square pixels has the aspect ratio of `span_deg` by 180 degrees."""
     return abs(width / height * 180 / span_deg - 1) < ASPECT_OFF
 
 
 def ahead(view: U8, span_deg: int) -> U8:
-    """Return the middle of an equirectangular view as a pinhole camera sees it, at the view's resolution."""
+    """Return the middle of an equirectangular view as seen by a pinhole camera, at the view's resolution."""
     u, v = _places(view.shape[1], view.shape[0], span_deg)
     return np.asarray(cv2.remap(view, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
 @lru_cache(maxsize=2)
 def _places(width: int, height: int, span_deg: int) -> tuple[F32, F32]:
-    """Return columns and rows in the view for each pixel of the crop, pixel centres at integers."""
+    """Return the columns and rows in the view of each pixel of the crop. Pixel centres are at integers."""
     columns = max(round(width * AHEAD_DEG / span_deg), 16)
     rows, half = max(round(columns / SHAPE), 9), np.tan(np.radians(AHEAD_DEG / 2))
     x = ((np.arange(columns) + 0.5) * 2 / columns - 1) * half

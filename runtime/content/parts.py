@@ -1,4 +1,4 @@
-"""Parts, which are triangles with one material, and the merging of parts with equal materials."""
+"""Represent triangles with one material as parts, and merge parts with equal materials."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BLACK: Colour = (0.0, 0.0, 0.0)
 UNCOLOURED: Colour = (0.70, 0.74, 0.80)  # colour for files without colours
 OPAQUE_FROM = 0.99  # alpha from which a pixel counts as opaque
 LARGEST_TEXTURE_PX = 4096
-OUTLINED_MAX = 200_000  # triangles of a part and of a file; beyond it, finding outlines costs more than drawing
+OUTLINED_MAX = 200_000  # triangles of a part and of a file; with more, finding outlines costs more than drawing
 Wrap = Literal["repeat", "clamp", "mirror"]
 
 
@@ -35,11 +35,11 @@ class Part:
 
     shape: Shape
     picture: U8 | None = None  # (h, w, 4) RGBA, row 0 at uv 0; parts may share one array
-    colour: Colour = WHITE  # factor of all colours, 0-1
+    colour: Colour = WHITE  # factor on all colours, 0-1
     vertex_colours: F32 | None = None  # (v, 3 or 4), 0-1: RGB or RGBA
     lit: bool = True
     grey: bool = False
-    turning: bool = False  # its placement changes, so its box covers every orientation
+    turning: bool = False  # True: its placement changes, so its box covers every orientation
     sampler: Sampler = Sampler()
     opacity: float = 1.0
     alpha: Literal["opaque", "mask", "blend"] = "mask"
@@ -51,7 +51,7 @@ class Part:
 
     @property
     def features(self) -> tuple[str, ...]:
-        """Shader switches that the part needs."""
+        """Names of the shader switches that the part needs."""
         least = self.opacity
         if self.picture is not None:
             least *= float(self.picture[..., 3].min()) / 255
@@ -74,7 +74,7 @@ class Part:
 
 
 def texture_of(image: Any) -> U8:
-    """Return Pillow's image as (h, w, 4) RGBA, reduced to the largest supported texture."""
+    """Convert a Pillow image to (h, w, 4) RGBA, reduced to the size of the largest supported texture."""
     if image.mode not in ("L", "RGB", "RGBA") or "transparency" in image.info:  # a palette cannot be averaged
         image = image.convert("RGBA")
     image.thumbnail((LARGEST_TEXTURE_PX, LARGEST_TEXTURE_PX))
@@ -82,15 +82,15 @@ def texture_of(image: Any) -> U8:
 
 
 def coded(light: ArrayLike) -> F32:
-    """Return sRGB codes in 0-1 for linear light in 0-1."""
+    """Convert linear light in 0-1 to sRGB codes in 0-1."""
     linear = np.clip(np.asarray(light, np.float32), 0.0, 1.0)
     return np.where(linear <= 0.0031308, linear * np.float32(12.92), 1.055 * linear ** np.float32(1 / 2.4) - 0.055)
 
 
 def merged(parts: Sequence[Part]) -> list[Part]:
-    """Merge triangles into one part per material, up to the size whose outlines are drawn.
+    """Merge parts with equal materials, up to the size whose outlines are drawn.
 
-    Colours do not separate parts, because they become vertex colours.
+    Parts may have different colours, which become vertex colours.
     """
     alike: dict[tuple[object, ...], list[list[Part]]] = {}
     for part in parts:

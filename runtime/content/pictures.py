@@ -17,9 +17,9 @@ from runtime.records import U8
 
 
 def screen(stack: PanelStack, *, width_px: int, height_px: int, pixel_aspect: float = 1.0) -> PlaneRaster:
-    """Return a picture's pixel grid on the stack's centre plane, as large as the display allows.
+    """Return the pixel grid of a picture on the stack's centre plane, as large as the display allows.
 
-    pixel_aspect: width of a pixel over its height.
+    pixel_aspect: width of a pixel divided by its height.
     """
     pitch_m = min(stack.width_m / (width_px * pixel_aspect), stack.height_m / height_px)
     return PlaneRaster(
@@ -42,10 +42,10 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
 
 
 class PicturesSource(ContentSource):
-    """Shows the views of pictures or films on the centre panel's plane."""
+    """Source that shows the views of pictures or films on the centre panel's plane."""
 
     def __init__(self, frames: Frames, *, file: SceneFile, context: object = None) -> None:
-        """Raises InputError if the picture is too small for its layout."""
+        """Create the source. Raises InputError if the picture is too small for its layout."""
         self._frames, self._file = frames, file
         first = frames.frame(0)
         try:
@@ -85,7 +85,7 @@ class PicturesSource(ContentSource):
         self._views, self._at = views, number  # views of the picture with this number
 
     def _view_for(self, view: View) -> int:
-        """Return the index of an eye's view: its side, or a quilt's nearest in angle about the vertical."""
+        """Return the index of the picture's view for an eye: its side or, in a quilt, the nearest in angle."""
         if len(self._views) <= 2:
             return min(view.side, len(self._views) - 1)
         angle = np.arctan2(view.eye_m[1], view.eye_m[0])

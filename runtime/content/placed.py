@@ -1,7 +1,7 @@
 """Place any source's scene (shift, rotation, scale, turntable) by moving the eye the opposite way.
 
-The source needs no support for it: the view's projection times the placement is another projection, for the eye as seen
-in the scene's frame.
+The source need not support this, because the view's projection times the placement is another projection, for the eye
+as seen in the scene's frame.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ NS_PER_MIN = 60 * NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class Placing:
-    """Placement of a scene: p_stack = offset + scale · R · p, R the rotation, then the turntable's."""
+    """Placement of a scene: p_stack = offset + scale · R · p. R rotates, then turns like a turntable."""
 
     scale: float = 1.0
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # frame `stack`
@@ -51,22 +51,22 @@ def placing_of(settings: ContentSettings) -> Placing:
 
 
 def placed_source(source: ContentSource, placing: Placing) -> ContentSource:
-    """Return the source with this placement, which replaces an earlier one."""
+    """Return a source with this placement, which replaces an earlier placement."""
     if isinstance(source, PlacedSource):
         source = source.source
     return source if placing == Placing() else PlacedSource(source, placing)
 
 
 class PlacedSource(ForwardingSource):
-    """A source with a placement."""
+    """Source with a placement."""
 
     def __init__(self, source: ContentSource, placing: Placing) -> None:
-        """source: closed together with this one."""
+        """Create the source. `source` is closed together with it."""
         self.source, self.placing = source, placing
 
     @property
     def info(self) -> ContentInfo:  # type: ignore[override]
-        """The source's own info, except for properties that the placement invalidates."""
+        """Info of the placed source, without properties that the placement invalidates."""
         return _moved(self.source.info, self.placing)
 
     def forwarded(self, view: View, time_ns: int) -> tuple[ContentSource, View, int]:

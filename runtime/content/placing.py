@@ -1,4 +1,4 @@
-"""A scene file, and the placement of its coordinates in the stack frame, from a preset or by fitting."""
+"""Place the coordinates of a scene's file in the stack frame, by a preset or by fitting."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from runtime.records import F64
 
 log = logging.getLogger("phasestack.content")
 
-FILL = 0.75  # share of the display's width and height for a fitted scene, whose front appears larger
+FILL = 0.75  # share of the display's width and height that a fitted scene gets, as its front appears larger
 DEEPER = 2.0  # a fitted scene may be this many times as deep as `depth_m`
 BACK = 0.5  # a flat mesh is turned around if its mean normal points away from the viewer by this much
 FLAT = 0.1  # a mesh thinner than this fraction of its other sides is flat, and turned to face the viewer
@@ -27,7 +27,7 @@ DARK = (0.12, 0.12, 0.12)  # background of all but the built-in scenes, on which
 
 @dataclass(frozen=True, slots=True)
 class SceneFile:
-    """A file, the settings to show it with, and the display."""
+    """File of a scene, the settings with which it is shown, and the display."""
 
     path: Path
     settings: ContentSettings
@@ -40,10 +40,11 @@ class SceneFile:
         return self.settings.background or DARK
 
     def placed(self, low: F64, high: F64, *, custom: tuple[str, str] | None = None, facing: F64 | None = None) -> F64:
-        """Return the 4x4 stack_from_scene of content with these corners: preset, fitted, or in its metres.
+        """Return the 4x4 stack_from_scene of content: by its preset, fitted, or unscaled in metres.
 
-        custom: the up axis and the axis towards the viewer of the file's format; None: chosen by the file name. facing:
-        area-weighted mean normal (3,) of the surface; with it, a flat mesh is turned to face the viewer.
+        low, high: (3,) corners of the content. custom: axes (up, towards the viewer) that are usual in the file's
+        format; None: chosen by the file's name. facing: area-weighted mean normal (3,) of the surface; with it, a flat
+        mesh is turned to face the viewer.
         """
         if self.preset:
             return stack_from_preset(self.preset)
@@ -55,7 +56,7 @@ class SceneFile:
         return matrix
 
     def _axes(self, low: F64, high: F64, custom: tuple[str, str] | None, facing: F64 | None) -> F64:
-        """Return the 3x3 scene_from_stack rotation: as set, by the format's or display's custom, or guessed."""
+        """Return the 3x3 scene_from_stack rotation: as set, as usual in the file's format, or guessed."""
         if self.settings.axes != "auto":
             up, out = self.settings.axes.split()
         elif not self.settings.fit and self.path.suffix.lower() not in GLTF:
@@ -71,7 +72,7 @@ class SceneFile:
 def guessed_axes(low: F64, high: F64) -> tuple[str, str]:
     """Guess the axes (up, towards the viewer) from an extent: (+y, +z) or (+z, -y).
 
-    If exactly one range begins near 0 or above, its axis is up; otherwise the longer axis is.
+    If exactly one of the y and z ranges begins near 0 or above, its axis is up; otherwise the longer axis is.
     """
     size = np.maximum(high - low, 1e-30)
     y, z = np.maximum(low / size + 0.5, 0.0)[1:]  # 0: centred on the origin; 0.5: begins at the origin
@@ -82,7 +83,7 @@ def guessed_axes(low: F64, high: F64) -> tuple[str, str]:
 def turned_to_viewer(up: str, out: str, *, size: F64, facing: F64) -> tuple[str, str]:
     """Return the axes (up, to the viewer), changed for a flat mesh so that its front faces the viewer.
 
-    size: (3,) of its bounding box. A mesh that is flat along the up axis is seen from above, its near edge at the
+    size: (3,) of the bounding box. A mesh that is flat along the up axis is seen from above, with its near edge at the
     bottom.
     """
     thinnest = int(size.argmin())

@@ -1,6 +1,7 @@
-"""A playlist shows scenes one after another, each with its own duration and settings.
+"""Play a list of scenes one after another, each with a duration and settings.
 
-All scenes are loaded before the first is shown, so missing files are refused at the start and changes take no time.
+All scenes are loaded before the first one is shown, so missing files are refused at the start, and changing scenes
+takes no time.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ from runtime.support.picture_header import CAMERA_SET
 from runtime.support.plausible import within
 from runtime.support.plugins import located
 
-ENTRIES_MAX = 64  # most entries, because all are kept in memory
+ENTRIES_MAX = 64  # largest number of entries, because all are kept in memory
 
 
 class PlaylistFile(Section):
-    """A playlist file in TOML (or JSON), with a table `[[show]]` for each scene."""
+    """Playlist file in TOML (or JSON), with a table `[[show]]` for each scene."""
 
     repeat: bool = Field(True, description="restart after the last scene; false: keep showing it")
     show: list[dict[str, Any]] = Field(min_length=1, max_length=ENTRIES_MAX, description="the scenes, in order")
@@ -48,7 +49,7 @@ class Entry(ContentSettings):
 
 @dataclass(frozen=True, slots=True)
 class Playlist:
-    """A parsed playlist file, whose scenes have not been opened yet."""
+    """Parsed playlist file, whose scenes have not been opened yet."""
 
     path: Path
     repeat: bool
@@ -56,9 +57,9 @@ class Playlist:
 
 
 def read_playlist(path: Path, settings: ContentSettings) -> Playlist:
-    """Read a playlist. Raises InputError, naming file, entry and field.
+    """Read a playlist. Raises InputError, which names file, entry and field.
 
-    settings: defaults for every entry, except for the placement, which applies to the whole list.
+    settings: defaults for every entry. Their placement is not a default; it applies to the whole list.
     """
     table = read_table(path)
     if "frames" in table and "show" not in table:
@@ -82,10 +83,10 @@ def read_playlist(path: Path, settings: ContentSettings) -> Playlist:
 
 
 class PlaylistSource(ForwardingSource):
-    """Plays a list of scenes one after another. Time counts from the first request."""
+    """Source that plays a list of scenes one after another. Time counts from the first request."""
 
     def __init__(self, playlist: Playlist, openers: list[Callable[..., ContentSource]], *, context: Any) -> None:
-        """Prepare every entry. Raises InputError if one can't be shown."""
+        """Prepare every entry. Raises InputError if one of them cannot be shown."""
         self._list = playlist
         self._ends_ns = list(accumulate(round(entry.seconds * NS_PER_S) for entry in playlist.entries))
         self._begin_ns: int | None = None
@@ -103,7 +104,7 @@ class PlaylistSource(ForwardingSource):
 
     @property
     def info(self) -> ContentInfo:  # type: ignore[override]
-        """Return the current entry's info, with the playlist's name."""
+        """Info of the current entry, under the playlist's name."""
         index, inner = self._number % len(self._sources), self.source.info
         name = f"{self._list.path.stem}: {inner.name} ({index + 1} of {len(self._sources)})"
         return replace(inner, name=name, moving=True)
@@ -113,7 +114,7 @@ class PlaylistSource(ForwardingSource):
         return self._sources[self._number % len(self._sources)]
 
     def describe(self, *, time_ns: int) -> dict[str, Any]:
-        """Return the status entry: the scenes and their durations, the current one and its remaining time."""
+        """Return the scenes and their durations, the current scene and its remaining time, for the status."""
         entries = [{"scene": entry.scene, "seconds": entry.seconds} for entry in self._list.entries]
         index, since_ns = self._at(time_ns)
         left_s = self._list.entries[index % len(entries)].seconds - since_ns / NS_PER_S
@@ -148,7 +149,7 @@ class PlaylistSource(ForwardingSource):
         return since_ns
 
     def _at(self, time_ns: int) -> tuple[int, int]:
-        """Return the entry at a time, counted over all rounds, and its age."""
+        """Return the entry at a time, counted over all rounds, and how long it has been shown in ns."""
         passed_ns = max(0, time_ns - (time_ns if self._begin_ns is None else self._begin_ns))
         count, round_ns = len(self._ends_ns), self._ends_ns[-1]
         if not self._list.repeat:

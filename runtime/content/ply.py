@@ -1,6 +1,6 @@
 """Read the header of a PLY file, and its elements as tables.
 
-This is own code because plyfile is licensed under the GPL, and trimesh returns only properties that it knows.
+No library is used for this: plyfile is licensed under the GPL, and trimesh returns only properties that it knows.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ SPLAT_MARKS = {"f_dc_0", "scale_0", "rot_0", PACKED}
 
 @dataclass(frozen=True, slots=True)
 class PlyHeader:
-    """The header of a PLY file."""
+    """Header of a PLY file."""
 
     path: Path
     order: str  # a key of ORDERS
     counts: dict[str, int]  # number of each element, in the file's order
-    properties: dict[str, list[tuple[str, str]]]  # per element: names and types; `list` is one of the types
+    properties: dict[str, list[tuple[str, str]]]  # names and types, by element; `list` is one of the types
     starts_at: int  # offset of the first element in bytes
     size: int  # size of the file in bytes
 
@@ -52,7 +52,7 @@ class PlyHeader:
 
 
 def read_header(path: Path) -> PlyHeader:
-    """Read a file's header. Raises InputError if it is missing, or counts exceed a limit."""
+    """Read a file's header. Raises InputError if it is missing or if counts exceed a limit."""
     with untrusted_input.open_regular(path, most_bytes=LIMITS.file_bytes) as file:
         head = file.read(LONGEST_HEADER)
         size = file.seek(0, 2)
@@ -91,7 +91,7 @@ def read_header(path: Path) -> PlyHeader:
 def read_elements(header: PlyHeader) -> dict[str, Table]:
     """Return structured arrays, by name, of the elements before the first one with a list.
 
-    The vertices are among them. Raises InputError if the file is truncated, text, or has a list before their end.
+    The vertices are among them. Raises InputError if the file is truncated or text, or has a list before their end.
     """
     path, place, found = header.path, header.starts_at, dict[str, Table]()
     if header.order == "ascii":

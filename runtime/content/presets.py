@@ -1,4 +1,4 @@
-"""The paper's 17 scenes: scale, pose and depth, by its supplement and by the published code."""
+"""Presets for the paper's 17 scenes: scale, pose and depth, by its supplement and its published code."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Triple = tuple[float, float, float]
 
 @cache
 def preset_file() -> dict[str, Any]:
-    """Return the data file's contents; its comments explain the keys."""
+    """Return the contents of presets.toml, whose comments explain the keys."""
     return tomllib.loads(FILE.read_text(encoding="utf-8"))
 
 
@@ -41,12 +41,12 @@ def stack_from_preset(name: str) -> F64:
 def drawn_scene_from_stack(name: str) -> F64:
     """Return the 4x4 map from metres in `stack` to scene units, as the published code drew the data set.
 
-    That code has its own scale, uses the scene's axes, and places the panels differently for evaluation.
+    That code uses another scale and the scene's axes, and places the panels differently for evaluation.
     """
     code, matrix = preset_file()["scene"][name]["published"], np.eye(4)
     axes = axes_matrix(out=code["out"], up=code["up"])
     gap = code["thickness_cm"] * code["scale_per_cm"]
-    # That code's ground is half a gap behind the middle panel, along `out`, and may be specified in gaps.
+    # The ground in that code is half a gap behind the middle panel, along `out`, and may be specified in gaps.
     middle = gap / 2 + code.get("ground", gap * code.get("ground_coefficient", 0.0))
     matrix[:3, :3] = axes * (code["scale_per_cm"] / CM)
     matrix[:3, 3] = np.array(code.get("shift", (0.0, 0.0, 0.0))) + axes[:, 0] * middle
@@ -54,7 +54,7 @@ def drawn_scene_from_stack(name: str) -> F64:
 
 
 def rotation_matrix(angles_deg: Triple, order: str) -> F64:
-    """Return the 3x3 rotation about x, y, z in `order` (lower case: fixed axes, else moving)."""
+    """Return the 3x3 rotation about x, y and z in `order` (lower case: fixed axes; upper: moving)."""
     angles = [angles_deg["xyz".index(letter)] for letter in order.lower()]
     return np.asarray(Rotation.from_euler(order, angles, degrees=True).as_matrix())
 

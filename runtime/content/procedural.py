@@ -20,7 +20,7 @@ MODELLED_HEIGHT_M = 0.2916  # height of the display for which the scenes' length
 
 
 def parts_of(built_in: Scene) -> list[DrawnPart]:
-    """Return a scene's parts, one per thing. This slow half of opening a scene needs no GL."""
+    """Return the parts of a scene, one per thing. This slow half of opening a scene needs no GL."""
     pictures = {name: textures.texture(name) for name in {thing.texture for thing in built_in.things}}
     return [
         DrawnPart(
@@ -38,7 +38,7 @@ def parts_of(built_in: Scene) -> list[DrawnPart]:
 
 
 class ProceduralSource(TriangleSource):
-    """A built-in scene, scaled to the display's height."""
+    """Source of a built-in scene, scaled to the display's height."""
 
     def __init__(
         self,
@@ -49,7 +49,10 @@ class ProceduralSource(TriangleSource):
         background: Colour | None = None,
         parts: Sequence[DrawnPart] | None = None,
     ) -> None:
-        """background: None: the scene's own; parts: `parts_of` the scene, prepared on another thread."""
+        """Create the source.
+
+        background: by default that of the scene. parts: `parts_of` the scene, if prepared on another thread.
+        """
         self._scene = SCENES[built_in]() if isinstance(built_in, str) else built_in
         self._scale = stack.height_m / MODELLED_HEIGHT_M
         parts = parts or parts_of(self._scene)

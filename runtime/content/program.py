@@ -1,6 +1,6 @@
 """Show pictures from another program (renderer, game, web page) that answers requests for them.
 
-The protocol is in docs/programs.md. After a late or missing answer the last pictures stay.
+The protocol is in docs/programs.md. If an answer is late or missing, the last pictures stay.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from runtime.support.background import begin
 log = logging.getLogger("phasestack.content")
 
 HOST = "127.0.0.1"
-ANSWERED_S = 0.4  # time limit for both pictures
-GIVEN_UP_S = 2.0  # a late frame is abandoned after this, and another may be requested
-IN_FLIGHT_MAX = 2  # most frames that are requested and not yet answered
+ANSWERED_S = 0.4  # time limit for both pictures of a frame
+GIVEN_UP_S = 2.0  # a late frame is abandoned after this time, and another may be requested
+IN_FLIGHT_MAX = 2  # largest number of frames that are requested and not yet answered
 HELLO_S = 5.0  # time limit for a program's greeting
 NEAR_M, FAR_M = 0.05, 100.0
 HEAD = struct.Struct("<II")  # of an answer: frame number and side (0 left, 1 right)
@@ -59,7 +59,7 @@ def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
 
 
 def camera_of(view: View) -> dict[str, Any]:
-    """Return a view's OpenGL view and projection matrices: column-major, depth -1 to 1, metres."""
+    """Return the OpenGL view and projection matrices of a view: column-major, depth -1 to 1, metres."""
     pixels = view.pixels_from_stack
     forward = pixels[2, :3] / np.linalg.norm(pixels[2, :3])
     right, down = (row[:3] - (row[:3] @ forward) * forward for row in pixels[:2])
@@ -80,7 +80,7 @@ def camera_of(view: View) -> dict[str, Any]:
 
 @dataclass(slots=True)
 class _Frame:
-    """One request to a program for a frame."""
+    """Request to a program for one frame."""
 
     views: Sequence[View]
     asked_s: float
@@ -96,7 +96,7 @@ class Programs:
     """Connections to drawing programs, and their answers. Thread-safe."""
 
     def __init__(self, port: int, *, most_bytes: int) -> None:
-        """Raises InputError if the port is in use."""
+        """Listen on a port. Raises InputError if it is in use. most_bytes: size limit of a message."""
         self._token = secrets.token_urlsafe(24)
         self._changed = threading.Condition()
         self._drawing: ServerConnection | None = None  # the newest connection that draws
@@ -118,7 +118,7 @@ class Programs:
         log.info("waiting for a program; its address is in `phasestack status` (program)")
 
     def ask(self, views: Sequence[View], *, time_ns: int) -> int:
-        """Request a frame's pictures and return its number. Raises ContentFailure without a program."""
+        """Request the pictures of a frame and return its number. Raises ContentFailure without a program."""
         view, now_s = views[0], time.monotonic()
         with self._changed:
             self._count += 1
@@ -151,7 +151,7 @@ class Programs:
         raise ContentFailure(self.problem or f"the program has not answered within {1e3 * ANSWERED_S:.0f} ms")
 
     def done(self, number: int) -> None:
-        """Stop waiting for a frame. It still counts as in flight until it is answered."""
+        """Stop waiting for a frame. It counts as in flight until it is answered."""
         with self._changed:
             frame = self._frames.get(number)
             if frame is not None:
@@ -214,7 +214,7 @@ class Programs:
         with self._changed:
             frame = self._frames.get(number)
             if connection is not self._drawing or frame is None:
-                return  # it was abandoned
+                return  # the frame was abandoned
             height, width = frame.views[0].height_px, frame.views[0].width_px
             if len(message) - HEAD.size != 4 * width * height:
                 size = len(message) - HEAD.size
@@ -229,7 +229,7 @@ class Programs:
 
 
 class ProgramSource(ContentSource):
-    """Shows pictures of the connected program, drawn for exactly the eyes that are solved for."""
+    """Source that shows pictures of the connected program, drawn for exactly the eyes solved for."""
 
     def __init__(self, programs: Programs, *, background: Any) -> None:
         self._programs = programs

@@ -39,7 +39,7 @@ OTHER_FILES = {  # by suffix: kind of file, and the way out
     **dict.fromkeys((".fbx", ".dae", ".blend", ".3ds", ".x3d", ".wrl", ".abc"), ("a 3D scene", TO_GLTF)),
     **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), ("a USD scene", TO_GLTF)),
     **dict.fromkeys(
-        (".3mf", ".step", ".stp", ".iges", ".igs"), ("a model of CAD or 3D print", "export it as STL or glTF")
+        (".3mf", ".step", ".stp", ".iges", ".igs"), ("a CAD or 3D-print model", "export it as STL or glTF")
     ),
     **dict.fromkeys((".xyz", ".pts", ".pcd", ".las", ".laz", ".e57"), ("a point cloud", TO_PLY)),
     **dict.fromkeys(FILMS, ("a film", "convert it: `ffmpeg -i in{} out.mp4`")),
@@ -53,16 +53,16 @@ Opener = Callable[..., ContentSource]  # called with `context`
 def open_content(settings: ContentSettings, stack: PanelStack, context: Any) -> ContentSource:
     """Open `settings.scene`: a built-in scene, a preset, a class, a file or a folder.
 
-    context: the moderngl context of the thread that will call `render`. Raises InputError, naming file and field.
+    context: the moderngl context of the thread that will call `render`. Raises InputError, which names file and field.
     """
     return prepare_content(settings, stack)(context=context)
 
 
 def prepare_content(settings: ContentSettings, stack: PanelStack) -> Opener:
-    """Read and check `settings.scene`; the returned function creates the source on the context's thread.
+    """Read and check `settings.scene`. Return a function that creates the source on the context's thread.
 
     This slow part needs no GL and may run on any thread. Files are read in a child process, and `support.progress`
-    receives the progress. Raises InputError, naming file and field.
+    receives the progress. Raises InputError, which names file and field.
     """
     file = SceneFile(Path(settings.scene), settings, stack)
     too_slow = InputError(settings.scene, "", f"takes longer to load than {LIMITS.load_s:g} s")
@@ -121,7 +121,7 @@ def _from_path(file: SceneFile) -> Opener:
 
 
 def _is_harmless(file: SceneFile) -> bool:
-    """Return True if a file's header rules out long or memory-hungry decoding."""
+    """Return True if a file's header shows that decoding is quick and needs little memory."""
     from runtime.content.layout import layout_of
 
     mark = HARMLESS.get(file.path.suffix.lower())
@@ -135,7 +135,10 @@ def _is_harmless(file: SceneFile) -> bool:
 
 
 def _read(file: SceneFile) -> Opener:
-    """Read a path, choosing the reader by its name and first bytes. The result can be pickled."""
+    """Read a file or folder with the reader that its name and first bytes require.
+
+    The result can be pickled.
+    """
     path = file.path
     suffix = path.suffix.lower()
     if path.is_dir():
@@ -188,7 +191,7 @@ def _playlist(file: SceneFile) -> Opener:
 
 
 def _plugin(name: str, file: SceneFile) -> Opener:
-    """Import a user's class and check its options; the returned function creates and tries it."""
+    """Import a user's class and check its options. Return a function that creates and tries the source."""
     plugin = plugin_class(name, ContentSource, field="content.scene")
     options = validated(strict(plugin.Options), file.settings.options, source="content.options")
 

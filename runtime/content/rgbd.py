@@ -1,7 +1,8 @@
-"""A picture with depth: colour and a grey depth map side by side, drawn as two surfaces.
+"""Draw a picture with depth (colour and a grey depth map, side by side) as two surfaces.
 
-The front one is the picture, split where its depth jumps. The other one is the background behind its edges, made up
-from the colours next to them, so that a viewer who looks past an edge sees neither a hole nor a stretched foreground.
+The front surface is the picture, split where its depth jumps. The other one is the background behind its edges,
+invented from the colours next to them, so that a viewer who looks past an edge sees neither a hole nor a stretched
+foreground.
 """
 
 from __future__ import annotations
@@ -34,17 +35,17 @@ FINEST_COLUMNS = 1600  # resolution at edges
 NOMINAL_DISTANCE_M = 0.6  # distance from which the surface looks exactly like the picture
 TORN_RELATIVE = 0.12  # share of the depth range; a larger step between neighbours is an edge rather than a slope
 BLURRED_PX = 5  # an edge of the depth map may be blurred over this width
-MIXED_PX = 2  # this near to an edge, colours are mixed from both sides
+MIXED_PX = 2  # up to this distance from an edge, colours are mixed from both sides
 REACH_PX = 10  # largest distance from which a colour is taken
 BEHIND_SHARE = 0.1  # how far behind an edge the background is filled in, as a share of the picture's width
 SET_BACK = 0.004  # offset of the invented surface behind the true one, as a share of the depth range
-SAMPLES = 4  # per pixel, because the split edges are its outlines
+SAMPLES = 4  # samples per pixel, which smooth the split edges
 
 Mask = NDArray[np.bool_]
 
 
 def split_rgbd(rgb: U8, path: Path) -> tuple[U8, F32]:
-    """Return the halves as colour (h, w, 3) and depth (h, w) in [0, 1], 1 nearest. Raises InputError."""
+    """Split a picture into colour (h, w, 3) and depth (h, w), from 0 to 1 (nearest). Raises InputError."""
     width = rgb.shape[1] // 2
     if width < 2 or rgb.shape[0] < 2:
         raise InputError(path, "layout", "the picture is too small for colour and depth side by side")
@@ -55,9 +56,9 @@ def split_rgbd(rgb: U8, path: Path) -> tuple[U8, F32]:
 
 
 def surfaces(colour: U8, depth: F32, *, stack: PanelStack, depth_m: tuple[float, float]) -> list[Part]:
-    """Return front surface and background as triangles, with each point on its ray at its depth.
+    """Return the front surface and the background as triangles. Each point is on its ray, at its depth.
 
-    colour: (h, w, 3); depth: (h, w), 1 nearest.
+    colour: (h, w, 3); depth: (h, w), 1 is nearest; depth_m: depth range (rear, front).
     """
     depth = sharpened(depth)
     colour = unmixed(colour, depth)
@@ -81,7 +82,7 @@ def surfaces(colour: U8, depth: F32, *, stack: PanelStack, depth_m: tuple[float,
 
 
 def sharpened(depth: F32) -> F32:
-    """Return the depth (h, w) with blurred edges sharpened; their pixels go to the nearer side."""
+    """Sharpen blurred edges of a depth map (h, w). Their pixels get the depth of the nearer side."""
     kernel = np.ones((BLURRED_PX, BLURRED_PX), np.uint8)
     high, low = cv2.dilate(depth, kernel), cv2.erode(depth, kernel)
     snapped = np.where(high - depth < depth - low, high, low)
@@ -89,7 +90,7 @@ def sharpened(depth: F32) -> F32:
 
 
 def unmixed(colour: U8, depth: F32) -> U8:
-    """Return the colours (h, w, 3), those next to a depth edge replaced from farther inside."""
+    """Return the colours (h, w, 3), with those next to a depth edge replaced by colours farther inside."""
     side = 2 * MIXED_PX + 1
     kernel = np.ones((side, side), np.uint8)
     mixed = cv2.dilate(depth, kernel) - cv2.erode(depth, kernel) > TORN_RELATIVE
@@ -110,8 +111,8 @@ def unmixed(colour: U8, depth: F32) -> U8:
 def background(depth: F32, colour: U8) -> tuple[F32, U8, Mask]:
     """Return the background behind edges: depth (h, w), colour (h, w, 3) and a mask of invented pixels.
 
-    Behind the near side, they continue those of the far side at the nearest edge. A ring of the far side itself is
-    included, so that no gap remains there.
+    Behind the near side, depth and colour continue those of the far side at the nearest edge. A ring of the far side
+    itself is included, so that no gap remains there.
     """
     far_side = depth < cv2.dilate(depth, np.ones((5, 5), np.uint8)) - TORN_RELATIVE
     if not far_side.any():
@@ -171,15 +172,18 @@ def _placed(depth: F32, quads: I32, picture: U8, *, stack: PanelStack, depth_m: 
 
 
 def _edge_to_edge(index: Any, count: int) -> F64:
-    """Return pixel centres, stretched so that the outermost are at the picture's edge."""
+    """Return the pixel centres, stretched so that the outermost ones are at the picture's edge."""
     place = index + 0.5
     return np.where(index == 0, 0.0, np.where(index == count - 1, float(count), place))
 
 
 def prepare(file: SceneFile) -> Callable[..., TriangleSource]:
-    """Read the file; the returned function uploads it to GL. Raises InputError if the file has no depth."""
+    """Read a picture with depth. Return a function that uploads it to GL.
+
+    Raises InputError if the file has no depth.
+    """
     colour, depth = split_rgbd(open_frames(file.path, file.settings).frame(0), file.path)
-    # The outlines of a torn surface run through its inside, so they need samples instead of ramps.
+    # Outlines of a split surface are also inside it, so they need samples instead of ramps.
     surface_parts = surfaces(colour, depth, stack=file.stack, depth_m=file.settings.depth_m)
     parts = [DrawnPart(part, outlined=False) for part in surface_parts]
     info = ContentInfo(file.path.stem, background=file.background)

@@ -1,4 +1,4 @@
-"""The built-in scenes. Their lengths scale with the display, so that every stack shows all of them."""
+"""Built-in scenes. Their lengths scale with the display, so that every stack shows all of them."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from runtime.records import F64
 
 @dataclass(frozen=True, slots=True)
 class Thing:
-    """One object. Lengths are in metres for a display 0.2916 m high, in frame `stack` after `centre_m`."""
+    """One object of a scene. Lengths are in metres, for a display 0.2916 m high."""
 
     shape: Shape  # centred on its own origin
     texture: str
     centre_m: tuple[float, float, float]
-    colour: Colour = WHITE  # multiplies the texture
+    colour: Colour = WHITE  # factor on the texture's colours
     rotation: F64 | None = None  # 3x3 stack_from_thing
     turns_per_s: float = 0.0  # about the vertical, in a moving scene
     lit: bool = True
@@ -28,7 +28,7 @@ class Thing:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Things on a uniform background."""
+    """Scene of things on a uniform background."""
 
     name: str
     things: tuple[Thing, ...]
@@ -84,7 +84,7 @@ def _demo(turns_per_s: float = 0.0) -> tuple[Thing, ...]:
 
 
 def _room() -> tuple[Thing, ...]:
-    """Return a dim room, wider than the display and behind it, with objects; the nearest is a globe."""
+    """Return a dim room behind the display and wider than it, with objects of which a globe is nearest."""
     wide, high, back = 0.56, 0.34, -0.14
     deep = 0.02 - back
     middle, down = (0.02 + back) / 2, shapes.rotation_about(1, -np.pi / 2)

@@ -16,7 +16,7 @@ I32 = NDArray[np.int32]
 
 AT_ONCE = 1 << 17  # vertices or faces processed together, which bounds the memory
 
-# 5x7 letters, one string per row; only those that the built-in scenes need.
+# Letters of 5x7 cells, one string per row: only those that the built-in scenes need.
 GLYPHS = {
     "3": ("####.", "....#", "....#", ".###.", "....#", "....#", "####."),
     "D": ("####.", "#...#", "#...#", "#...#", "#...#", "#...#", "####."),
@@ -30,7 +30,7 @@ GLYPHS = {
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """Triangles with normals and texture coordinates."""
+    """Shape of triangles with normals and texture coordinates."""
 
     positions_m: F32  # (v, 3)
     normals: F32  # (v, 3), unit
@@ -69,7 +69,10 @@ def flat_normals(corners: ArrayLike) -> F32:
 
 
 def placed(positions: ArrayLike, normals: ArrayLike | None, matrices: F64) -> tuple[F32, F32 | None]:
-    """Return (v, 3) positions and unit normals, moved by one 4x4 matrix or by one per vertex (v, 4, 4)."""
+    """Move positions and normals (v, 3) by a 4x4 matrix, or by one per vertex (v, 4, 4).
+
+    The resulting normals have length 1.
+    """
     positions = np.asarray(positions)
     moved = np.empty(positions.shape, np.float32)
     turned = None if normals is None else np.empty(positions.shape, np.float32)
@@ -87,7 +90,7 @@ def placed(positions: ArrayLike, normals: ArrayLike | None, matrices: F64) -> tu
 
 
 def _times(matrix: NDArray[Any], vectors: NDArray[Any]) -> NDArray[Any]:
-    """Multiply vectors (v, 3) by one 3x3 matrix, or each by its own."""
+    """Multiply vectors (v, 3) by a 3x3 matrix, or by one matrix per vector (v, 3, 3)."""
     return np.asarray(vectors @ matrix.T if matrix.ndim == 2 else np.einsum("nij,nj->ni", matrix, vectors))
 
 
@@ -101,7 +104,7 @@ def rotation_about(axis: int, angle_rad: float) -> F64:
 
 
 def _grid(u: F64, v: F64) -> tuple[F64, F64, I32]:
-    """Return parameters and triangles of a (len(v), len(u)) grid of vertices."""
+    """Return the parameters u and v of each vertex in a (len(v), len(u)) grid, and the grid's triangles."""
     columns, rows = len(u), len(v)
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1)
     first = np.column_stack([corner, corner + 1, corner + columns])
@@ -115,7 +118,7 @@ def _shape(positions: F64, normals: F64, uv: F64, triangles: I32) -> Shape:
 
 
 def card(width_m: float, height_m: float, *, repeat: tuple[float, float] = (1.0, 1.0)) -> Shape:
-    """Return a rectangle in the plane x = 0, its picture upright and unmirrored for an eye at +x."""
+    """Return a rectangle in the plane x = 0. Its picture is upright and unmirrored for an eye at +x."""
     s, t, triangles = _grid(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
     positions = np.column_stack([0 * s, (s - 0.5) * width_m, (0.5 - t) * height_m])
     return _shape(
@@ -124,7 +127,7 @@ def card(width_m: float, height_m: float, *, repeat: tuple[float, float] = (1.0,
 
 
 def box(size_m: Sequence[float]) -> Shape:
-    """Return a box around the origin, each face with the whole texture."""
+    """Return a box around the origin. Each face shows the whole texture."""
     sx, sy, sz = size_m
     turns = [
         (np.eye(3), (sy, sz), sx),
@@ -160,7 +163,7 @@ def _runs(marks: str) -> list[tuple[int, int]]:
 
 
 def lettering(text: str, *, cell_m: float, depth_m: float) -> Shape:
-    """Return letters of square bars (5 x 7 cells, gaps of one) around the origin, read from +x."""
+    """Return a text around the origin, readable from +x. Letters have 5 x 7 cells and gaps of one cell."""
     left = -(len(text) * 6 - 1) / 2
     bars = []
     for index, letter in enumerate(text):

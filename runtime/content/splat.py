@@ -59,7 +59,7 @@ void main() {
 
 
 def prepare(file: SceneFile) -> Callable[..., SplatSource]:
-    """Read the file; the returned function uploads it to GL. Raises InputError."""
+    """Read a file of splats. Return a function that uploads them to GL. Raises InputError."""
     suffix = file.path.suffix.lower()
     if suffix == ".ply":
         header = read_header(file.path)
@@ -72,7 +72,7 @@ def prepare(file: SceneFile) -> Callable[..., SplatSource]:
 
 
 class SplatSource(CanvasSource):
-    """A scene of splats, placed in the stack frame."""
+    """Source of a scene of splats, placed in the stack frame."""
 
     def __init__(self, gaussians: Gaussians, *, stack_from_scene: F64, context: Any, info: ContentInfo) -> None:
         super().__init__(context, info=info, deep=True)
@@ -115,7 +115,7 @@ class SplatSource(CanvasSource):
         return None if splats is None else nearest_blocks(splats, view, every=every, first=first)
 
     def _prepare(self, view: View, splats: Splats, some: slice) -> int:
-        """Fill the vertex buffer with some splats of a view, and return their number."""
+        """Fill the vertex buffer with the splats `some` of a view, and return their number."""
         index, reach = splats.index[some], splats.reach[some]
         count = len(index)
         directions = self._gaussians.centres[index] - view.eye_m.astype(np.float32)

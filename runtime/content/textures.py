@@ -1,4 +1,4 @@
-"""Procedural textures of the built-in scenes, (256, 256, 4) RGBA, identical on every machine."""
+"""Procedural textures of the built-in scenes: (256, 256, 4) RGBA, identical on every machine."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ def _coordinates() -> tuple[F64, F64]:
 
 
 def _mixed(weight: F64, first: tuple[int, int, int], second: tuple[int, int, int]) -> U8:
-    """Return a picture that mixes two colours; weight 1 is the first."""
+    """Return a picture that mixes two colours. Where the weight is 1, it has the first colour."""
     rgb = weight[..., None] * np.array(first) + (1 - weight[..., None]) * np.array(second)
     alpha = np.full((*weight.shape, 1), 255.0)
     return np.concatenate([np.clip(np.rint(rgb), 0, 255), alpha], axis=2).astype(np.uint8)
 
 
 def _noise(seed: int, octaves: int = 4) -> F64:
-    """Return smooth noise in [0, 1], a sum of random waves that tiles."""
+    """Return smooth noise in [0, 1]: a sum of random waves that repeats without a seam."""
     u, v = _coordinates()
     random = np.random.default_rng(seed)
     total = np.zeros_like(u)
@@ -102,5 +102,5 @@ TEXTURES = {
 
 
 def texture(name: str) -> U8 | None:
-    """Return a texture (256, 256, 4) by name; None for `plain`, where the object's own colour shows."""
+    """Return a texture (256, 256, 4) by name, or None for `plain`, which leaves the object's colour."""
     return None if name == "plain" else TEXTURES[name]()

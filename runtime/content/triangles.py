@@ -1,6 +1,6 @@
 """Draw triangles with colours, pictures and one lamp directly at the pixels of a view.
 
-Parts without lamp, picture, vertex colours or holes use shaders without them.
+The shaders of a part contain code for lamp, picture, vertex colours or holes only if the part needs it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from runtime.records import F32, F64, U8
 from runtime.support.background import raise_if_abandoned
 from runtime.support.gl import DrawnPicture
 
-PROJECTED_MAX = 5000  # most vertices of a part to project for its extent; beyond, its box is projected
+PROJECTED_MAX = 5000  # a part with more vertices has its box projected for its extent, instead of its vertices
 DRAWN_AT_ONCE = 20_000  # number of triangles
 UPLOADED_AT_ONCE = 8 << 20  # number of bytes
 ATTRIBUTES = ("in_normal", "in_uv", "in_colour")
@@ -128,10 +128,10 @@ void main() {
 
 
 class DrawnPart:
-    """A part with its buffers, prepared on any thread without GL and uploaded later by its source."""
+    """Part with its buffers, prepared on any thread without GL and uploaded later by its source."""
 
     def __init__(self, part: Part, *, outlined: bool = True) -> None:
-        """outlined: also prepare the ramps along its outline."""
+        """Prepare a part. outlined: also prepare the ramps along its outline."""
         mesh = part.shape
         self.features, self.sampler = part.features, part.sampler
         self.pictures, self.glow, self.two_sided = (part.picture, part.glow_picture), part.glow, part.two_sided
@@ -159,7 +159,7 @@ class DrawnPart:
         return self.vertices[:, :3]
 
     def upload(self, context: Any, surface_program: Any, outline: Any, textures: list[Any]) -> None:
-        """Create its GL objects. The source owns and shares program, outline (a vertex array) and textures."""
+        """Create the part's GL objects. Program, outline (a vertex array) and textures are the source's."""
         self.surface_program, self.outline, self.textures = surface_program, outline, textures
         self._buffer, self._triangles = (_uploaded(context, array) for array in (self.vertices, self.triangles))
         if self.edges is None and not self.is_projected:  # may free hundreds of MiB
@@ -168,19 +168,19 @@ class DrawnPart:
         self.surface = context.vertex_array(surface_program, [layout], index_buffer=self._triangles)
 
     def draw_surface(self) -> None:
-        """Draw in several calls, because a software rasteriser holds Python's lock during each."""
+        """Draw the part in several calls, because a software rasteriser holds Python's lock during each."""
         for first in range(0, self.corner_count, 3 * DRAWN_AT_ONCE):
             raise_if_abandoned()
             self.surface.render(first=first, vertices=min(3 * DRAWN_AT_ONCE, self.corner_count - first))
 
     def release(self) -> None:
-        """Release its GL objects, except shared ones; a vertex array does not release its buffers."""
+        """Release the part's GL objects, except shared ones. A vertex array does not release its buffers."""
         for held in (self.surface, self._buffer, self._triangles):
             held.release()
 
 
 class _Place:
-    """A part's position in a scene, with the matrices that do not depend on the view."""
+    """Position of a part in a scene, with the matrices that do not depend on the view."""
 
     def __init__(self, stack_from_part: F64) -> None:
         linear = stack_from_part[:3, :3]
@@ -191,7 +191,7 @@ class _Place:
 
 
 class _Look:
-    """The matrices of a part's position in a view."""
+    """Matrices of a part's position in one view."""
 
     def __init__(self, place: _Place, clip_from_stack: F64, view: View) -> None:
         inverse = place.part_from_stack
@@ -221,7 +221,7 @@ class _Arrangement:
 
 
 class TriangleSource(CanvasSource):
-    """A source of placed parts over a background."""
+    """Source that draws placed parts over a background."""
 
     def __init__(
         self,
@@ -232,9 +232,10 @@ class TriangleSource(CanvasSource):
         info: ContentInfo,
         samples: int = 0,
     ) -> None:
-        """stack_from_parts: 4x4 similarities; samples: per pixel for outlines; 0: draw ramps instead.
+        """Create the source.
 
-        Ramps are faster on a software rasteriser.
+        stack_from_parts: a 4x4 similarity for each part. samples: number per pixel, to smooth outlines; 0: they are
+        smoothed by ramps instead, which is faster on a software rasteriser.
         """
         super().__init__(context, info=info, samples=samples)
         self.parts, self.stack_from_parts = list(parts), list(stack_from_parts)
@@ -260,7 +261,7 @@ class TriangleSource(CanvasSource):
         self.held += [*self._textures.values(), *self._programs.values()]
 
     def places(self, time_ns: int) -> Sequence[F64]:
-        """Return each part's 4x4 stack_from_part; moving scenes compute it for each time."""
+        """Return the 4x4 stack_from_part of each part. Moving scenes compute it for each time."""
         return self.stack_from_parts
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect:
@@ -285,7 +286,7 @@ class TriangleSource(CanvasSource):
         return found
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
-        """Draw the view; the same view and time give the same bytes."""
+        """Draw the picture of a view. The same view and time give the same bytes."""
         arranged = self._arranged(time_ns)
         corners_m = arranged.corners_m.reshape(-1, 3)
         area = camera.covered_box(view, corners_m)
@@ -337,7 +338,7 @@ class TriangleSource(CanvasSource):
         return self._programs[features]
 
     def _outline(self, features: tuple[str, ...]) -> Any:
-        """Return the vertex array for outlines of parts with these features."""
+        """Return the vertex array with which outlines of parts with these features are drawn."""
         if features not in self._outlines:
             program = self._program((*features, "OUTLINE"))
             names = ("in_clip", "in_coverage", *ATTRIBUTES)
@@ -407,7 +408,7 @@ def _gl(matrix: F64) -> F32:
 
 
 def _layout(program: Any, buffer: Any, names: tuple[str, ...], sizes: tuple[int, ...]) -> tuple[Any, ...]:
-    """Return a buffer's description for a program, without attributes that the compiler removed."""
+    """Return the description of a buffer for a program, without attributes that the compiler removed."""
     used = [name for name in names if name in program]
     formats = [f"{size}f" if name in used else f"{size * 4}x" for name, size in zip(names, sizes, strict=True)]
     return (buffer, " ".join(formats), *used)

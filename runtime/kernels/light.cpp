@@ -1,4 +1,4 @@
-// Squared error of some rows of one eye's view of the displayed layers, ray by ray (runtime/optics/light.py).
+// Compute the squared error of some rows of an eye's view of displayed layers, ray by ray (runtime/optics/light.py).
 #include <cstdint>
 
 #include "sampling.hpp"
@@ -66,7 +66,7 @@ INLINE bool see(const View &view, double u, double v, int point, float *seen) {
 
 }  // namespace
 
-// Sum, over every step-th row from first to end, of the products of both sets' errors, and the number of terms.
+// Sum the products of both sets' errors over every step-th row from first to end, and count the terms.
 FOR_EVERY_CPU void squared_error(const View *given, int first, int end, Result *result) {
   const View &view = *given;
   const int in_set = std::max(view.rays * view.rays, 1), sets = view.rays ? 2 : 1, side = std::max(view.rays, 1);

@@ -1,4 +1,4 @@
-// The sampler of all kernels: bilinear samples of images along the rows of a raster, through a homography.
+// Sampler of all kernels: it samples images bilinearly along the rows of a raster, through a homography.
 #pragma once
 
 #include <algorithm>

@@ -1,4 +1,4 @@
-// The solver's steps on the processor (docs/mathematics.md, L1 to L5; model_export/light.py is the reference).
+// Steps of the solver on the processor (docs/mathematics.md, L1 to L5). The reference is model_export/light.py.
 //
 // Rays are processed row by row. Residuals go to a ring buffer of rows; a panel row is updated once every ray that
 // crosses it has been processed. Phasors are kept in a ring buffer too, from a row's first ray to its last, so only the
@@ -98,7 +98,7 @@ int first_until(const std::vector<int> &until, int r) {
 }
 
 // Divide the ray rows evenly. A partition updates the panel rows whose last ray is in its share, and also processes the
-// rays before its share that cross those rows.
+// earlier rays that cross those rows.
 void assign_rows(const Problem &problem, int part, int parts, Share &share) {
   const int first = int(int64_t(problem.height) * part / parts);
   share.first = first, share.end = int(int64_t(problem.height) * (part + 1) / parts);
@@ -342,7 +342,7 @@ INLINE void residual(const Problem &problem, const Share &share, int set, int r,
   clear_outside(problem, share, set, r, span);
 }
 
-// Set row q of the middle panel to the mean of all rays' residuals there, or to rest without rays.
+// Set row q of the middle panel to the mean residual of all rays there, or to the rest value if there are no rays.
 template <int C>
 INLINE void fill(const Problem &problem, const Share &share, int q, Work &work) {
   const Image &image = problem.panel[problem.panels / 2].last;

@@ -348,7 +348,7 @@ def test_a_gltf_is_refused_by_what_it_says_of_itself(tmp_path: Path, name: str) 
     [
         ("a.fbx", "is a 3D scene (.fbx), which is not supported: export it as glTF (.glb), as Blender does"),
         ("a.usdz", "is a USD scene (.usdz), which is not supported: export it as glTF"),
-        ("a.3mf", "is a model of CAD or 3D print (.3mf), which is not supported: export it as STL or glTF"),
+        ("a.3mf", "is a CAD or 3D-print model (.3mf), which is not supported: export it as STL or glTF"),
         ("a.xyz", "is a point cloud (.xyz), which is not supported: save it as PLY"),
         (
             "a.LCC",
