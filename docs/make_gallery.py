@@ -69,8 +69,7 @@ for each solution. The table gives [live quality](contracts.md#error) in dB, the
 [reprojected](mathematics.md#reprojection) by its depth.
 """
 LEANING = """\
-The film shows every fourth refresh of the left eye's view while a head leans at 0.6 m: with `model.effort = "full"`
-("before"), with `"auto"` ("now"), and the true view.
+The film shows every fourth refresh: with `model.effort = "full"` ("before"), with `"auto"` ("now"), and the true view.
 """
 HEAD = """\
 <!-- Written by `make gallery`: change docs/make_gallery.py, not this page. -->
@@ -83,10 +82,8 @@ HEAD = """\
     phasestack bench compare old.json new.json
 
 **Quote [light](contracts.md#error) at a tracking error of 1 mm** (`light_db`, `"1"`). *One ray* is `psnr_db`. The time
-of a solution runs from two decoded pictures to 8-bit layers. Memory is the peak of the method's own process. Run times
-depend on the machine and its load, so compare ratios.
-
-`bench compare` exits with 1 if a model became slower by more than the noise, lost 0.1 dB or took 15% more memory.
+of a solution runs from two decoded pictures to 8-bit layers. Memory is the peak of the method's own process. Compare
+ratios of run times.
 
 `report --pairs` reads every [case file](contracts.md#cases-pairs-calibration) in DIR. Its optional field `off`
 lists pictures that should be seen from a point `mm` away from an eye:
