@@ -313,7 +313,7 @@ def _head(presenter: Presenter) -> tuple[RecordingHeader, str]:
 
 
 def write_file(folder: Path, kind: str, kept: list[BlackBoxMessage], header: RecordingHeader, settings: str) -> Path:
-    """Write a new file atomically and return its path. Raises OSError.
+    """Write a new file atomically and return its path. Raises OSError if it cannot be written.
 
     Only the owner can read it, because it shows viewers' movements. Its number is higher than all others in the folder,
     because the wall clock may be set back.

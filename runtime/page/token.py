@@ -17,7 +17,7 @@ MOST_BYTES = 4096  # maximum number of bytes read from the file
 
 
 def token_of(path: Path) -> str:
-    """Read the token from a file, which is created if missing. Raises InputError."""
+    """Read the token from a file, or create the file. Raises InputError if either fails."""
     token, name = secrets.token_urlsafe(TOKEN_BYTES), ""
     try:
         if not os.path.lexists(path):

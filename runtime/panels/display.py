@@ -72,10 +72,11 @@ watch: xlib.ServerWatch | None = None  # watches the connection of this process
 
 
 def _connect() -> None:
-    """Connect GLFW to the X server until the process ends. Raises PanelLost, MissingPart.
+    """Connect GLFW to the X server until the process ends.
 
     The connection stays open because, when the panels lose their contexts, another thread may still use a context of
     the same EGL display. If GLFW closed that display, Mesa would use freed memory.
+    Raises PanelLost if no X server can be reached, and MissingPart if GLFW does not use X11.
     """
     global watch
     if watch is not None:
@@ -127,7 +128,10 @@ class Display:
         return in_order([monitor for monitor, _ in self._pairs()])
 
     def fullscreen_window(self, monitor: Monitor, *, title: str) -> Window:
-        """Open a borderless window that fills a monitor and make its context current. Raises PanelLost."""
+        """Open a borderless window that fills a monitor, and make its context current.
+
+        Raises PanelLost if the monitor is no longer connected or the X server does not support OpenGL.
+        """
         share = self.root.handle
         handles = {connected.connector: handle for connected, handle in self._pairs()}
         if monitor.connector not in handles:

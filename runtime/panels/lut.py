@@ -42,9 +42,10 @@ def measured_curve(path: Path) -> F32:
 
 
 def curve(*, lut: str, gamma: float) -> F32:
-    """Return grey (256, 3) in [0, 1] by 8-bit phase and channel: measured, or with phase = grey^gamma.
+    """Return grey (256, 3) in [0, 1] by 8-bit phase and channel.
 
-    Raises InputError.
+    The curve is read from the file `lut` or, if `lut` is empty, follows phase = grey^gamma. Raises InputError if the
+    file is invalid.
     """
     if lut:
         return measured_curve(Path(lut))

@@ -246,7 +246,10 @@ class Painter:
         screen_px: tuple[int, int],
         layer_px: tuple[int, int],
     ) -> None:
-        """Prepare one panel. Raises InputError for an invalid grey curve, ValueError for a homography."""
+        """Prepare one panel.
+
+        Raises InputError for an invalid grey curve, and ValueError for a singular homography.
+        """
         matrix = layer_from_screen(
             screen_width_px=screen_px[0],
             screen_height_px=screen_px[1],

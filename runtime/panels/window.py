@@ -85,7 +85,10 @@ class WindowPanels(PanelSink):
         return [window.handle for window, _ in self._surfaces]
 
     def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
-        """Show a frame on all panels, unless it is unchanged and still shown. Raises PanelLost."""
+        """Show a frame on all panels, unless it is unchanged and still shown.
+
+        Raises PanelLost while a window, monitor or context is lost.
+        """
         if not self._surfaces and not self._may_try():
             raise PanelLost(self._lost)
         try:
@@ -232,7 +235,10 @@ def _reset_status() -> str:
 
 
 def every_monitor() -> tuple[WindowPanels, list[U8], tuple[Monitor, ...]]:
-    """Open windows on all monitors. Returns these, their test cards and the monitors. Raises PanelLost."""
+    """Open a window on every monitor. Returns the windows, their test cards and the monitors.
+
+    Raises PanelLost if there is no X server or active monitor, or if a window cannot be opened.
+    """
     monitors = connected_monitors()
     width, height = max(m.width_px for m in monitors), max(m.height_px for m in monitors)
     bound = tuple(PanelSettings(connector=monitor.connector) for monitor in monitors)

@@ -50,7 +50,7 @@ class GrowingPage:
         self.write()
 
     def write(self) -> None:
-        """Write everything measured so far. Raises InputError."""
+        """Write everything measured so far. Raises InputError if the files cannot be written."""
         doing = self.record.get("measuring")
         notes = [f"Not finished: this page grows as figures come in. Last known step: {doing}."] if doing else []
         if busy := too_busy(self.record["yardsticks_ms"]):

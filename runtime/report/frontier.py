@@ -145,7 +145,7 @@ def measure(
 
 
 def apart(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-    """Call an importable function in a new process. Raises FatalError."""
+    """Call an importable function in a new process. Raises FatalError if the process dies."""
     # Its stdout goes to stderr, because ours may be JSON.
     with ProcessPoolExecutor(1, get_context("spawn"), initializer=os.dup2, initargs=(2, 1)) as pool:
         try:

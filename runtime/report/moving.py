@@ -45,7 +45,10 @@ def simulated_run(
     keep_light: int = 0,
     output: Output | None = None,
 ) -> dict[str, Any]:
-    """Return summary.json of a simulated run. Raises FatalError."""
+    """Return the contents of summary.json for a simulated run.
+
+    Raises FatalError if the run cannot be built from its settings.
+    """
     options = RunOptions(max_speed=True, measure=True, scale=scale, fixed=fixed, keep_light=keep_light)
     with ExitStack() as cleanup:
         run = build_run(settings, options, cleanup, output=output)
@@ -69,7 +72,10 @@ def settings_for(recording: Path, *, scene: str, effort: str) -> Settings:
 def moving_run(
     motion: str, effort: Effort | None, *, seconds: float = SECONDS, scale: float = 0.5, seed: int = SEED
 ) -> Moving:
-    """Run one motion with one effort (None: the loop chooses). Raises FatalError without any result."""
+    """Run one motion with one effort, or let the loop choose the effort if it is None.
+
+    Raises FatalError if the run gives no measurement.
+    """
     with tempfile.TemporaryDirectory(prefix="phasestack-") as folder:
         recording = Path(folder) / "motion.mcap"
         head = "still" if motion == "film" else motion

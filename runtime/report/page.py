@@ -80,7 +80,10 @@ class Page:
         return [figure for section in self.sections for figure in section.figures]
 
     def write(self, out: Path, *, record: str, data: Any) -> None:
-        """Write index.html, its PNGs and `data` (as `record`) into `out`, all or none. Raises InputError."""
+        """Write index.html, its PNGs and `data` (to the file `record`) into the folder `out`.
+
+        All files appear together or not at all. Raises InputError if they cannot be written.
+        """
         with OutputFolder(out) as folder:
             write_json(folder.staging / record, data)
             write_text(folder.staging / "index.html", self.html())

@@ -96,13 +96,19 @@ class SteppedSensor(Sensor):
         self._frames = self._next = None
 
     def peek(self) -> SensorFrame | None:
-        """Return the sample that `next_sample` will deliver, or None at the end. Raises SensorLost."""
+        """Return the sample that `next_sample` will deliver, or None at the end.
+
+        Raises SensorLost if the driver is not open.
+        """
         if self._frames is None:
             raise SensorLost(f"{self._source}: not open")
         return self._next
 
     def next_sample(self) -> SensorFrame:
-        """Return the next sample without waiting. Raises EndOfRecording, SensorLost."""
+        """Return the next sample without waiting.
+
+        Raises EndOfRecording after the last sample, and SensorLost if the driver is not open.
+        """
         frame = self.peek()
         if frame is None or self._frames is None:
             raise EndOfRecording(f"{self._source}: the recording has ended")
@@ -130,7 +136,11 @@ class SteppedSensor(Sensor):
         return following is not None and self.available_ns(following) <= now_ns
 
     def _first_due(self, timeout_s: float) -> SensorFrame:
-        """Wait for the oldest unread sample. Raises SensorTimeout, EndOfRecording, SensorLost."""
+        """Wait for the oldest unread sample.
+
+        Raises SensorTimeout if it does not arrive in time, EndOfRecording after the last sample, and SensorLost if the
+        driver is not open.
+        """
         following = self.peek()
         if following is None:
             return self.next_sample()  # raises EndOfRecording

@@ -258,7 +258,10 @@ def _text(error: Exception) -> str:
 
 
 def _pixels(frame: Any) -> U8 | U16:
-    """Copy depth as (h, w) uint16 in millimetres, or colour as (h, w, 3) RGB. Raises ValueError."""
+    """Copy depth as (h, w) uint16 in millimetres, or colour as (h, w, 3) RGB.
+
+    Raises ValueError if the pixel format is not supported or the frame is too short.
+    """
     pixel_format, height, width = frame.videoMode.pixelFormat.value, frame.height, frame.width
     data = np.frombuffer(frame.get_buffer_as_uint8(), np.uint8)
     kinds = {DEPTH_1_MM: (2, 1), DEPTH_100_UM: (2, 1), RGB888: (1, 3), GRAY8: (1, 1)}

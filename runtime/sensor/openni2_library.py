@@ -34,7 +34,7 @@ _loaded = False
 
 
 def find_library(folder: str = "") -> tuple[Path, Path]:
-    """Return the paths of the library file and of its driver folder. Raises MissingPart."""
+    """Return the paths of the library file and its driver folder. Raises MissingPart if they are not found."""
     for place in (folder,) if folder else LIBRARY_FOLDERS:
         drivers = Path(place) / "OpenNI2" / "Drivers"
         for library in sorted(Path(place).glob("libOpenNI2.so*")):
@@ -44,7 +44,10 @@ def find_library(folder: str = "") -> tuple[Path, Path]:
 
 
 def load(folder: str = "") -> Any:
-    """Load the library and return the module `openni.openni2`. Raises MissingPart, SensorLost."""
+    """Load the library and return the module `openni.openni2`.
+
+    Raises MissingPart if the package or the library is missing, and SensorLost if the library cannot be started.
+    """
     global _loaded
     try:
         from openni import openni2

@@ -76,7 +76,10 @@ class RealSenseDriver(Sensor):
         self._times, self._number = DeviceClock(), -1
 
     def _serial_to_open(self) -> str:
-        """Return the serial number of the configured or only camera. Raises SensorLost."""
+        """Return the serial number of the configured or only camera.
+
+        Raises SensorLost if no connected camera matches or if several do.
+        """
         source = self._settings.source
         configured = self.serial or ("" if source in ("", "demo", "any") else source)
         info = self._rs.camera_info.serial_number
@@ -110,7 +113,10 @@ class RealSenseDriver(Sensor):
             raise SensorLost(f"RealSense: {error}") from None
 
     def _next(self, deadline_ns: int) -> Any:
-        """Wait for an unread depth picture. Raises SensorTimeout, EndOfRecording, RuntimeError."""
+        """Wait for an unread depth picture.
+
+        Raises SensorTimeout after the deadline, EndOfRecording at the end of a recording, and the SDK's RuntimeError.
+        """
         while True:
             remaining_ms = max(1, (deadline_ns - self._clock.now_ns()) // NS_PER_MS)
             done, frames = self._pipeline.try_wait_for_frames(remaining_ms)
@@ -126,7 +132,10 @@ class RealSenseDriver(Sensor):
         return self._playback is not None and not self._settings.loop and self._playback.current_status() != playing
 
     def _is_new(self, frames: Any) -> bool:
-        """Return True if the depth picture is new. The SDK may pair one with several colour pictures."""
+        """Return True if the depth picture is new.
+
+        The SDK may deliver the same depth picture with several colour pictures.
+        """
         depth = frames.get_depth_frame()
         if not depth or not frames.get_color_frame() or depth.get_frame_number() == self._number:
             return False

@@ -163,7 +163,10 @@ class Recording:
     """Open recording, which reads one sample at a time so that images do not fill the memory."""
 
     def __init__(self, path: Path) -> None:
-        """Read the header and the first sample. Raises InputError."""
+        """Read the header and the first sample.
+
+        Raises InputError if the file cannot be read, is not a recording or contains no complete sample.
+        """
         self.path, self.is_whole = path, True  # is_whole: no damage was found so far
         self._written_by = ("", "")  # profile and library
         self.header = self._read_header()
@@ -226,7 +229,11 @@ class Recording:
             self.is_whole = False
 
     def samples(self) -> Iterator[SensorFrame]:
-        """Yield all complete samples in order. A sample is complete with its eye points. Raises InputError."""
+        """Yield all complete samples in order.
+
+        A sample is complete once its eye points have been read. Raises InputError if the file cannot be read or a
+        message is malformed.
+        """
         parts: dict[str, Any] = {}
         intrinsics: Intrinsics | None = None
         for topic, message in self._records():

@@ -145,7 +145,7 @@ class RecordingHeader:
 
 
 def _read(kind: type[M], data: bytes) -> M:
-    """Parse a message. Raises ValueError that names the field, in one line."""
+    """Parse a message. Raises ValueError with one line that names the invalid field."""
     try:
         return kind.model_validate_json(data)
     except ValidationError as error:
@@ -179,7 +179,7 @@ def eyes_message(frame: SensorFrame) -> bytes:
 
 
 def frame_from_eyes_message(data: bytes) -> SensorFrame:
-    """Decode the result of `eyes_message`. Raises ValueError."""
+    """Decode the result of `eyes_message`. Raises ValueError if it is malformed."""
     sample = _read(EyeSample, data)
     eyes_m, covariance_m2 = _array(sample.eyes_m), sample.covariance_m2
     eyes = None
@@ -204,7 +204,10 @@ def colour_message(colour: U8, *, capture_ns: int) -> bytes:
 
 
 def colour_from_message(data: bytes, *, max_pixels: int = 1 << 26) -> U8:
-    """Decode the result of `colour_message` to (h, w, 3), apart from JPEG's losses. Raises ValueError."""
+    """Decode the result of `colour_message` to an (h, w, 3) picture, with JPEG's losses.
+
+    Raises ValueError if the message is malformed, or if the picture is too large or cannot be decoded.
+    """
     coded = base64.b64decode(_read(ColourImage, data).data)
     width, height = picture_size(coded)
     if max(width, height) > IMAGE_SIDE_MAX_PX or width * height > max_pixels:
@@ -223,7 +226,10 @@ def depth_message(depth_mm: U16, *, capture_ns: int) -> bytes:
 
 
 def depth_from_message(data: bytes) -> U16:
-    """Decode the result of `depth_message` to exact (h, w) millimetres. Raises ValueError."""
+    """Decode the result of `depth_message` to (h, w) millimetres, without loss.
+
+    Raises ValueError if the message is malformed or its data do not match its size.
+    """
     image = _read(DepthImage, data)
     raw = base64.b64decode(image.data)
     if len(raw) != 2 * image.width * image.height:
@@ -242,7 +248,10 @@ def calibration_message(intrinsics: Intrinsics, *, capture_ns: int) -> bytes:
 
 
 def intrinsics_from_message(data: bytes) -> Intrinsics:
-    """Decode the result of `calibration_message`. Raises ValueError."""
+    """Decode the result of `calibration_message`.
+
+    Raises ValueError if it is malformed or a focal length is not positive.
+    """
     camera = _read(Camera, data)
     k = camera.K
     if k[0] <= 0 or k[4] <= 0:

@@ -49,7 +49,7 @@ class RecordedSamples(Samples):
     """Recording on the simulated clock. Each sample arrives at its capture time plus the latency."""
 
     def __init__(self, driver: Sensor) -> None:
-        """Raises InputError if the driver is not a recording's or the recording cannot be read."""
+        """Raises InputError if the driver does not play a recording, or if the recording cannot be read."""
         if not isinstance(driver, SteppedSensor):
             raise InputError("run", "--max-speed", f"requires a recording, not the sensor {driver.name}")
         self._driver = driver

@@ -58,7 +58,7 @@ class UsbDevice:
         return f"{self.known.name} ({usb_id}, {SPEEDS.get(self.speed, 'unknown')})"
 
     def problems(self) -> list[str]:
-        """Return the problems that prevent its use, each with a remedy."""
+        """Return the problems that prevent the use of this device, each with a remedy."""
         problems = []
         if self.known.needs_usb3 and 0 < self.speed < SUPER_SPEED:
             problems.append(f"connected at {SPEEDS[self.speed]}, needs USB 3; use a blue port and the original cable")
@@ -82,7 +82,7 @@ def _described(device: Any, known: KnownDevice) -> UsbDevice:
 
 
 def find_devices(backend: Any = None) -> list[UsbDevice]:
-    """Return all known devices, ordered by bus and address. Raises MissingPart without libusb."""
+    """Return all known devices, ordered by bus and address. Raises MissingPart if libusb is missing."""
     try:
         import usb.core
     except ImportError as error:

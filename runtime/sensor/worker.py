@@ -276,7 +276,7 @@ class SensorWorker(Samples):
                 self._set(attempt, SensorState.RUNNING, "")
 
     def _timely(self, frames: list[SensorFrame], now_ns: int) -> list[SensorFrame]:
-        """Return the frames with plausible capture times. Raises FatalError if none ever was."""
+        """Return the frames with plausible capture times. Raises FatalError if there has never been one."""
         timely = [frame for frame in frames if -AHEAD_NS <= now_ns - frame.capture_ns <= BEHIND_NS]
         if len(timely) < len(frames):
             ahead_s = (frames[-1].capture_ns - now_ns) / NS_PER_S

@@ -25,7 +25,7 @@ STAGING = ".phasestack-staging-"
 
 
 def sync(path: Path) -> None:
-    """Sync a file's data or a folder's entries to disk. Raises OSError."""
+    """Sync a file's data or a folder's entries to disk. Raises OSError if this fails."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -34,16 +34,16 @@ def sync(path: Path) -> None:
 
 
 def put_in_place(part: Path, path: Path) -> None:
-    """Rename a finished file to its final name and sync both. Raises OSError."""
+    """Sync a finished file, rename it and sync its folder. Raises OSError if any step fails."""
     sync(part)
     part.replace(path)
     sync(path.parent)
 
 
 def write_bytes(path: Path, data: bytes, *, like: Path | None = None) -> None:
-    """Write a file and its folders atomically. Raises InputError.
+    """Write a file atomically and create its folders. Raises InputError if it cannot be written.
 
-    like: file whose owner and mode are copied; None for the replaced file, if there is one.
+    like: file whose owner and mode are copied. By default it is the file that is replaced, if there is one.
     """
     like = like or path
     try:

@@ -59,7 +59,8 @@ def read_views(path: Path, *, background: Colour = WHITE) -> list[U8]:
 def read_animation(path: Path, *, background: Colour = WHITE) -> tuple[list[U8], list[float]]:
     """Read the frames of an animated picture and their durations in milliseconds.
 
-    An animation larger than the largest picture becomes a still, with a warning in the log. Raises InputError.
+    An animation larger than the largest picture becomes a still, with a warning in the log.
+    Raises InputError if the file cannot be read or decoded.
     """
     data, header = read_coded(path)
     with opened(data) as image:
@@ -74,7 +75,7 @@ def read_animation(path: Path, *, background: Colour = WHITE) -> tuple[list[U8],
 
 
 def _decoded(path: Path, data: bytes, frames: tuple[int, ...], background: Colour) -> Iterator[tuple[U8, float]]:
-    """Yield frames with their durations. Raises InputError, naming the file."""
+    """Yield frames with their durations. Raises InputError if one cannot be decoded or is too large."""
     if is_cut_off(data):
         raise InputError(path, "", undecodable(data))
     try:

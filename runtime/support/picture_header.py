@@ -109,9 +109,10 @@ def _formats() -> tuple[str, ...]:
 
 
 def _header_of(path: Path, coded: bytes | IO[bytes]) -> Header:
-    """Return the header of a picture file, from its bytes or the open file. Raises InputError.
+    """Return the header of a picture, read from its bytes or the open file.
 
     If an MPO does not declare its second picture as a view, it counts as one only in a file named .mpo.
+    Raises InputError for a camera's raw picture, and for one that cannot be decoded or exceeds the size limit.
     """
     if path.suffix.lower() in RAW:  # of a TIFF, Pillow would show the thumbnail
         raise InputError(path, "", "is {}, which is not supported: {}".format(*RAW_KIND))
@@ -217,7 +218,10 @@ def _viewpoint(image: Any) -> int | None:
 
 
 def picture_size(coded: bytes) -> tuple[int, int]:
-    """Return the stored width and height of an encoded picture. Raises ValueError."""
+    """Return the stored width and height of an encoded picture.
+
+    Raises ValueError if its header cannot be decoded.
+    """
     try:
         with opened(coded) as image:
             width, height = image.size
@@ -309,7 +313,7 @@ def check_size(
 
 
 def decoded_picture(coded: bytes, *, source: str | Path, field: str, name: str) -> Any:
-    """Open a picture that is complete and within the limit. Raises InputError."""
+    """Decode a picture. Raises InputError if it is damaged, incomplete or exceeds the size limit."""
     try:
         width, height = picture_size(coded)
         check_size(width, height, source=source, field=field, name=name, head=coded)
@@ -329,7 +333,10 @@ def camera_set_in(folder: Path) -> str:
 
 
 def read_coded(path: Path) -> tuple[bytes, Header]:
-    """Read a picture file without decoding it, and check its header. Raises InputError."""
+    """Read a picture file without decoding it, and check its header.
+
+    Raises InputError if the file cannot be read, its header is refused, or it is a folder with a camera set.
+    """
     if untrusted_input.is_there(path, folder=True) and (problem := camera_set_in(path)):
         raise InputError(path, "", problem)
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
@@ -337,6 +344,9 @@ def read_coded(path: Path) -> tuple[bytes, Header]:
 
 
 def header_of_file(path: Path) -> Header:
-    """Return the header of a picture file. Raises InputError, also for more pixels than the limit."""
+    """Return the header of a picture file.
+
+    Raises InputError if the file cannot be read, is not a supported picture or exceeds the limit of pixels.
+    """
     with untrusted_input.open_regular(path, most_bytes=LIMITS.file_bytes) as file:
         return _header_of(path, file)

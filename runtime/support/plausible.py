@@ -31,7 +31,7 @@ def within(low: float, high: float, unit: str, *, zero: bool = False) -> AfterVa
 
 
 def check_text(value: str) -> str:
-    """Return the text if it can be a name or a path. Raises ValueError."""
+    """Return the text if it can be a name or a path. Raises ValueError otherwise."""
     if "\0" in value:
         raise ValueError("contains a NUL character")
     try:

@@ -44,9 +44,9 @@ LIMITS = Limits()  # not configurable; tests lower them
 
 
 def checked_path(path: str | Path, *, source: str | Path = "", field: str = "") -> Path:
-    """Check that a path is valid on this system, even if it does not exist. Raises InputError.
+    """Check that a path, which need not exist, is valid on this system. Raises InputError if not.
 
-    source, field: names for the error if the path came from elsewhere.
+    source, field: file and setting that contain the path, for the error message. The default is the path itself.
     """
     try:
         os.lstat(path)
@@ -93,7 +93,7 @@ def open_regular(
 
 
 def read_bytes(path: str | Path, *, most_bytes: int, source: str | Path = "", field: str = "") -> bytes:
-    """Read a whole regular file. Raises InputError."""
+    """Read a whole regular file. Raises InputError if it cannot be read or exceeds `most_bytes`."""
     name = source or str(path)
     with open_regular(path, most_bytes=most_bytes, source=source, field=field) as file:
         try:
@@ -109,13 +109,16 @@ def read_bytes(path: str | Path, *, most_bytes: int, source: str | Path = "", fi
 
 
 def read_text(path: str | Path, *, most_bytes: int = JSON_BYTES_MAX, source: str | Path = "", field: str = "") -> str:
-    """Read a whole regular file of UTF-8 text. Raises InputError."""
+    """Read a whole text file.
+
+    Raises InputError if it cannot be read, exceeds `most_bytes` or is not UTF-8.
+    """
     data = read_bytes(path, most_bytes=most_bytes, source=source, field=field)
     return decoded(data, source=source or str(path), field=field)
 
 
 def decoded(data: bytes, *, source: str | Path, field: str = "") -> str:
-    """Decode UTF-8, without a byte-order mark. Raises InputError."""
+    """Decode UTF-8 and drop a byte-order mark. Raises InputError if the data are not UTF-8."""
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -123,12 +126,15 @@ def decoded(data: bytes, *, source: str | Path, field: str = "") -> str:
 
 
 def read_json(path: str | Path, *, most_bytes: int = JSON_BYTES_MAX) -> Any:
-    """Read a JSON file. Raises InputError."""
+    """Read a JSON file. Raises InputError if it cannot be read or `parsed_json` refuses it."""
     return parsed_json(read_bytes(path, most_bytes=most_bytes), source=path)
 
 
 def parsed_json(text: str | bytes, *, source: str | Path, most_depth: int = JSON_DEPTH_MAX) -> Any:
-    """Parse strict JSON (no NaN or Infinity) of limited depth. Raises InputError."""
+    """Parse strict JSON, without NaN or Infinity.
+
+    Raises InputError if it is malformed, contains too many values or is nested deeper than `most_depth`.
+    """
     data = text if isinstance(text, bytes) else text.encode(errors="surrogatepass")
     within(sum(map(data.count, (b",", b"{", b"["))), LIMITS.json_values, source=source, field="JSON values")
     try:
@@ -161,7 +167,7 @@ def _whole(digits: str) -> int | float:
 
 
 def whole_from_text(text: str, *, source: str | Path, field: str) -> int:
-    """Parse a non-negative integer in decimal digits. Raises InputError."""
+    """Parse a non-negative integer. Raises InputError for other text or too many digits."""
     # `isdigit` accepts a superscript two, and `int` other scripts' digits.
     if not (text.isascii() and text.isdigit()):
         raise InputError(source, field, f"is not a whole number: {shown(text)}")
