@@ -233,7 +233,10 @@ def _median_px(problem: _Problem, state: _State) -> float:
 
 
 def adjust(seen: Sequence[SeenMarks], stack: PanelStack, *, reference: int) -> Bundle:
-    """Fit all panels to photographs of equal size from one camera. Raises Undetermined."""
+    """Fit all panels to photographs of equal size from one camera.
+
+    Raises Undetermined if the photographs do not determine the panels.
+    """
     problem = _Problem(seen, stack, reference=reference)
     used = np.ones(len(problem.image_px), bool)
     state = _solved(problem, problem.start(), used, robust=True)
@@ -267,7 +270,10 @@ def adjust(seen: Sequence[SeenMarks], stack: PanelStack, *, reference: int) -> B
 
 
 def _covariance(problem: _Problem, state: _State, used: NDArray[np.bool_], *, sigma: float) -> F64:
-    """Return the covariance of a step for points with noise `sigma`. Raises Undetermined."""
+    """Return the covariance of the unknowns for points with noise `sigma`.
+
+    Raises Undetermined if the photographs do not determine all unknowns.
+    """
     slopes = problem.slopes(state)
     slopes[: 2 * len(used)] /= sigma
     weighted = slopes[np.concatenate([np.repeat(used, 2), np.ones(len(problem.prior_scale), bool)])]

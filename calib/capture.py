@@ -186,7 +186,10 @@ def capture_live(
 
 
 def capture_recording(out: Path, settings: Settings, *, source: str) -> dict[str, Any]:
-    """Write a pair for every sample of a recording with known true eyes. Raises InputError."""
+    """Write a pair for every sample of a recording that contains true eye positions.
+
+    Raises InputError if there is no such sample with usable eyes.
+    """
     chosen = settings.sensor.model_copy(update={"driver": "replay", "source": source, "loop": False})
     samples = RecordedSamples(open_sensor(chosen, SimulatedClock()))
     file, pairs, known = PairsFile(out), [], False

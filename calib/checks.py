@@ -49,7 +49,10 @@ def check_pairs(pairs: Pairs) -> list[str]:
 
 
 def check_solution(pairs: Pairs, solution: CalibrationSolution, volume_m: F64) -> list[str]:
-    """Return warnings about a solution. volume_m: points (..., 3) that viewers use. Raises InputError."""
+    """Return warnings about a solution.
+
+    volume_m: points (..., 3) that viewers use. Raises InputError if the residuals or the expected errors are too large.
+    """
     warnings = []
     check_similarity(solution.similarity.matrix, source=pairs.source)
     axis = "xyz"[int(np.argmax(solution.axis_rms_m))]

@@ -15,7 +15,7 @@ from runtime.support.ranges import SCALE
 if TYPE_CHECKING:
     from runtime.config import Settings
 
-ConfigOption = Annotated[Path | None, typer.Option(help="configuration file; default: built-in settings")]
+ConfigOption = Annotated[Path | None, typer.Option(help="configuration file (default: built-in settings)")]
 JsonOption = Annotated[bool, typer.Option("--json", help="print the result as one JSON object")]
 
 app = typer.Typer(
@@ -153,11 +153,11 @@ def capture(
 @app.command()
 def solve(
     pairs: Annotated[Path, typer.Option(help="CSV or JSON file of point pairs (sensor_x, stack_x, ...) in metres")],
-    out: Annotated[Path, typer.Option(help="calibration file to write (TOML); a previous one is kept")],
+    out: Annotated[Path, typer.Option(help="calibration file to write (TOML); the version that it replaces is kept")],
     method: Annotated[
         str, typer.Option(help="seed, least-squares, inverse, robust or fixed-scale; default: the best for these pairs")
     ] = "",
-    scale: Annotated[float, number(*SCALE, help="the scale, for the method fixed-scale")] = 1.0,
+    scale: Annotated[float, number(*SCALE, help="known scale (only for the method fixed-scale)")] = 1.0,
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:

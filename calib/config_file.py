@@ -47,7 +47,10 @@ def _version(path: Path, number: int) -> Path:
 
 
 def read_document(config: Path) -> TOMLDocument:
-    """Read a configuration. It is empty if the file does not exist yet. Raises InputError."""
+    """Read a configuration, or return an empty document if the file does not exist.
+
+    Raises InputError if the configuration is invalid.
+    """
     if not untrusted_input.is_there(config):
         return tomlkit.document()
     load_settings(config)
@@ -58,7 +61,10 @@ def read_document(config: Path) -> TOMLDocument:
 
 
 def rewrite(config: Path, change: Callable[[TOMLDocument], None]) -> Path | None:
-    """Change a configuration if the result is valid. Returns the old version's path. Raises InputError."""
+    """Change a configuration. Returns the path of the old version.
+
+    Raises InputError, and writes nothing, if the result is invalid.
+    """
     document = read_document(config)
     change(document)
     text = tomlkit.dumps(document)

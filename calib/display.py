@@ -27,13 +27,16 @@ class PanelDisplay:
         self._keys = WindowKeys(sink)
 
     def show(self, layers: U8) -> None:
-        """Show (N, H, W, 4) layers on all panels. Raises PanelLost."""
+        """Show (N, H, W, 4) layers on all panels. Raises PanelLost if a panel is lost."""
         self._layers = layers
         self._number += 1
         self._sink.present(PanelFrame(self._number, layers, self._number))
 
     def key(self) -> Key | None:
-        """Return the next key or None. Presents the layers again, so that windows respond. Raises PanelLost."""
+        """Return the next key or None. Raises PanelLost if a panel is lost.
+
+        Presents the layers again, so that windows respond.
+        """
         if self._layers is not None:
             self.show(self._layers)
         return self._keys.poll()
@@ -44,9 +47,10 @@ class PanelDisplay:
 
 
 def open_display(settings: Settings, *, registered: bool = False, grey_curve: bool = True) -> PanelDisplay:
-    """Open the configured panels. registered, grey_curve: apply these corrections.
+    """Open the configured panels.
 
-    Raises InputError, MissingPart, PanelLost.
+    registered, grey_curve: whether to apply these corrections. Raises InputError for unsuitable settings, MissingPart
+    if OpenGL or X11 is missing, and PanelLost if a monitor is missing.
     """
     stack = settings.stack.stack()
     changes: dict[str, object] = {} if registered else {"homography": IDENTITY}
@@ -60,7 +64,10 @@ def open_display(settings: Settings, *, registered: bool = False, grey_curve: bo
 
 
 def show_until_key(display: PanelDisplay, layers: U8, title: str) -> None:
-    """Show (N, H, W, 4) layers until Enter or q, then close the display. Raises PanelLost."""
+    """Show (N, H, W, 4) layers until Enter or q is pressed, then close the display.
+
+    Raises PanelLost if a panel is lost.
+    """
     keys, clock = TerminalKeys(), MonotonicClock()
     try:
         display.show(layers)

@@ -107,7 +107,10 @@ def grey_charts(stack: PanelStack, panel: int) -> U8:
 def lut_from_photographs(
     out: Path, pictures: Iterable[tuple[str, U8]], stack: PanelStack, *, panel: int, source: str
 ) -> dict[str, Any]:
-    """Compute and write the LUT of a panel from named photographs (h, w) of its chart. Raises InputError."""
+    """Compute and write the LUT of a panel from named photographs (h, w) of its chart.
+
+    Raises InputError if a photograph or the measurement is unusable.
+    """
     measured = [histograms(picture, stack, panel, source=f"{source}, {name}") for name, picture in pictures]
     intensity, residual = measure(measured, stack, panel, source=source)
     write_lut(out, intensity)
@@ -127,7 +130,7 @@ def write_lut(out: Path, intensity: F64) -> None:
 def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F64:
     """Return (P, 256) histograms of the code values in the middle of each patch of a photograph (h, w).
 
-    Raises InputError.
+    Raises InputError if the photograph is too dark or overexposed, or does not show the whole chart.
     """
     seen = find_marks(picture, stack, name="")
     mine, marks_seen = seen.panel == panel, seen.marks[panel]

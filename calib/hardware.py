@@ -60,7 +60,10 @@ class SetupHardware:
         self._clock.sleep_until_ns(self._clock.now_ns() + POLL_NS)
 
     def monitors(self) -> tuple[Monitor, ...]:
-        """Open a window on every active monitor and return the monitors. Raises InputError."""
+        """Open a window on every active monitor and return the monitors.
+
+        Raises InputError if there is no X server or active monitor, or if a window cannot be opened.
+        """
         self.let_go()
         try:
             panels, cards, monitors = every_monitor()
@@ -70,7 +73,7 @@ class SetupHardware:
         return monitors
 
     def show_card(self, number: int, words: Sequence[str]) -> None:
-        """Show a card with `words` on monitor `number`, in its orientation, and clear the others."""
+        """Show a card with the text `words` on monitor `number` and clear the other monitors."""
         cards, monitors = self._cards
         height, width = cards[number].shape[:2]
         lines = [line for text in words for line in wrap(text, CARD_CHARACTERS)]
@@ -81,7 +84,8 @@ class SetupHardware:
     def photographs(self, settings: Settings, pictures: U8, *, panel: int | None, say: Say) -> Iterator[Named]:
         """Show pictures (N, H, W) on the uncorrected panels, wait for photographs and yield them.
 
-        The pictures are the boards or, if `panel` is given, its grey chart. Raises InputError, PanelLost.
+        The pictures are the boards or, if `panel` is given, its grey chart. Raises InputError if there are no usable
+        photographs, and PanelLost if a panel is lost.
         """
         self.let_go()
         folder = self._photos if panel is None else self._photos / f"grey-{panel}"
@@ -98,7 +102,10 @@ class SetupHardware:
         return photographs(folder)
 
     def open_sensor(self, settings: Settings) -> str:
-        """Start the sensor and wait until it works. Returns its name. Raises InputError."""
+        """Start the sensor and wait until it works. Returns its name.
+
+        Raises InputError if it does not work in time or needs no calibration.
+        """
         self._stop_sensor()
         open_sensor(settings.sensor, self._clock)  # refuses unknown names before anything starts
         worker = SensorWorker(

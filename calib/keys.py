@@ -55,7 +55,7 @@ class TerminalKeys:
     """Keys and lines from standard input. Between `poll` and `close` a terminal is in character mode."""
 
     def __init__(self, descriptor: int | None = None, *, quit_at_end: bool = True) -> None:
-        """quit_at_end: report `QUIT` at the end of input; otherwise report no more keys."""
+        """quit_at_end: whether the end of input counts as the key `QUIT`. If not, no more keys are reported."""
         self._quit_at_end = quit_at_end
         self._descriptor = _standard_input() if descriptor is None else descriptor
         self._rest = b""

@@ -83,7 +83,7 @@ class Pairs:
 def read_pairs(path: Path) -> Pairs:
     """Read pairs from CSV (header `COLUMNS`) or JSON (a list of objects, or `{"pairs": [...]}`).
 
-    Raises InputError, naming the file and the wrong rows and columns.
+    Raises InputError, which names the file and the invalid rows and columns.
     """
     labels, rows = _read_rows(path)
     if len(rows) > MAX_PAIRS:

@@ -18,7 +18,10 @@ SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
 
 
 def photographs(folder: Path) -> Iterator[tuple[str, U8]]:
-    """Yield names and grey pixels (h, w) of the photographs in a folder, by name. Raises InputError."""
+    """Yield the name and grey pixels (h, w) of each photograph in a folder, in order of names.
+
+    Raises InputError if the folder contains no photographs or too many, or if one cannot be read.
+    """
     if not untrusted_input.is_there(folder, folder=True):
         raise InputError(folder, "", "is not a folder")
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
@@ -31,7 +34,7 @@ def photographs(folder: Path) -> Iterator[tuple[str, U8]]:
 
 
 def read_photograph(path: Path) -> U8:
-    """Read grey pixels (h, w) as the sensor recorded them, without EXIF rotation. Raises InputError."""
+    """Read grey pixels (h, w) without EXIF rotation. Raises InputError if they cannot be decoded."""
     data, _ = read_coded(path)
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
     picture = None if is_cut_off(data) else cv2.imdecode(np.frombuffer(data, np.uint8), flags)

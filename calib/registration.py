@@ -82,7 +82,7 @@ def geometry_of(panels: Sequence[PlacedPanel], stack: PanelStack, *, eye_m: F64)
 
 
 def register_photographs(seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m: F64) -> Registration:
-    """Fit the panels' poses and check them. Raises Undetermined, with the reason."""
+    """Fit the panels' poses and check them. Raises Undetermined, with the reason, if a check fails."""
     reference = stack.count // 2
     excluded = {s.name: s.fault for s in seen if s.fault}
     excluded |= _other_sizes([s for s in seen if not s.fault])
@@ -176,7 +176,7 @@ def register_photos(
 ) -> dict[str, Any]:
     """Register the panels from named photographs (h, w), report, and optionally write to `config`.
 
-    Raises InputError, before writing anything.
+    Raises InputError, and writes nothing, if the photographs do not determine the panels.
     """
     stack = settings.stack.stack()
     if config is not None and len(settings.output.panels) not in (0, stack.count):

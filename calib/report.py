@@ -45,7 +45,7 @@ class Points(NamedTuple):
 
 
 def write_report(file: Path, out: Path, *, viewing: CalibrationSettings) -> dict[str, Any]:
-    """Write `index.html`, its PNGs and `report.json`. Raises InputError."""
+    """Write `index.html`, its PNGs and `report.json`. Raises InputError if the file is invalid."""
     calibration, table = load_calibration(file), read_table(file)
     points = _stored_points(table.get("data"), calibration, source=file)
     summary = _summary(calibration, points, viewing_volume_m(viewing))
@@ -68,7 +68,10 @@ def write_report(file: Path, out: Path, *, viewing: CalibrationSettings) -> dict
 
 
 def _stored_points(data: Any, calibration: Calibration, *, source: Path) -> Points | None:
-    """Return the pairs in a calibration file's `[data]`, or None if there are none. Raises InputError."""
+    """Return the pairs in a calibration file's `[data]`, or None if there are none.
+
+    Raises InputError if they are invalid.
+    """
     if not isinstance(data, dict) or "sensor_m" not in data:
         return None
     found = validated(StoredPairs, data, source=f"{source}: data")

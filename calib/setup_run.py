@@ -25,7 +25,7 @@ def progress_path(config: Path) -> Path:
 
 
 def read_progress(path: Path) -> dict[str, Any]:
-    """Read the figures of finished steps, by step name. Raises InputError."""
+    """Read the figures of finished steps, by step name. Raises InputError if the file is invalid."""
     if not untrusted_input.is_there(path):
         return {}
     try:
@@ -39,7 +39,10 @@ def read_progress(path: Path) -> dict[str, Any]:
 def run_setup(
     config: Path, *, out: Path, photos: Path, simulate: bool, seed: int, to_stderr: bool
 ) -> tuple[dict[str, Any], str]:
-    """Run the setup and return its summary, also as text. Raises InputError."""
+    """Run the setup. Returns its summary as a dictionary and as text.
+
+    Raises InputError if the configuration or the file of finished steps is invalid.
+    """
 
     def say(text: str) -> None:
         typer.echo(text, err=to_stderr)

@@ -40,7 +40,7 @@ class Similarity:
 
     @property
     def matrix(self) -> F64:
-        """(..., 4, 4) [sR t; 0 1]."""
+        """Matrices (..., 4, 4) of the form [sR t; 0 1]."""
         matrix = np.zeros((*self.scale.shape, 4, 4))
         matrix[..., :3, :3] = self.scale[..., None, None] * self.rotation
         matrix[..., :3, 3] = self.translation_m

@@ -60,7 +60,9 @@ class SimulatedHardware(SetupHardware):
     def photographs(self, settings: Settings, pictures: U8, *, panel: int | None, say: Say) -> Iterator[Named]:
         folder = self._photos if panel is None else self._photos / f"grey-{panel}"
         if not folder.is_dir():
-            raise InputError(folder, "", "contains no photographs: a simulated display has none (n: skip)")
+            raise InputError(
+                folder, "", "contains no photographs, because the display is simulated; press n to skip this step"
+            )
         return photographs(folder)
 
     def open_sensor(self, settings: Settings) -> str:

@@ -29,9 +29,10 @@ STORED_PAIRS = 500  # most pairs stored in the calibration file
 def solve_file(
     pairs_path: Path, out: Path, *, settings: Settings, method: str = "", known_scale: float = 1.0
 ) -> dict[str, Any]:
-    """Write the calibration. Returns the summary, with every method's figures. Raises InputError.
+    """Write the calibration. Returns the summary, with every method's figures.
 
-    method: empty for the one with the smallest error at the eye for such pairs; known_scale: for `fixed-scale`.
+    method: name of a method, or empty for the one with the least expected error at the eye. known_scale: scale for the
+    method `fixed-scale`. Raises InputError if the pairs cannot be read or do not determine the calibration.
     """
     if method and method not in METHODS:
         raise InputError("calibrate solve", "--method", f"must be one of {', '.join(METHODS)}, not {method}")

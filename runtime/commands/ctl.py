@@ -15,7 +15,7 @@ app = typer.Typer(
     help="Control the running daemon. Exits with 1 if no daemon answers.\n\nExample: phasestack ctl scene demo",
 )
 
-Config = Annotated[Path | None, typer.Option(help="the daemon's configuration file, to find its socket")]
+Config = Annotated[Path | None, typer.Option(help="configuration file that names the daemon's socket")]
 
 
 @app.command()

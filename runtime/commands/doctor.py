@@ -43,7 +43,9 @@ class Row:
 
 
 def doctor(
-    config: Annotated[Path | None, typer.Option(help="configuration file to check; default: built-in settings")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="configuration file to check (default: built-in settings)")
+    ] = None,
     as_service: Annotated[
         bool,
         typer.Option("--service", help="check as the service's user, with its groups and configuration (needs root)"),
@@ -76,7 +78,10 @@ def doctor(
 
 
 def _become_service() -> None:
-    """Switch to the service's user, groups and environment, but not its sandbox. Raises InputError."""
+    """Switch to the service's user, groups and environment, but not its sandbox.
+
+    Raises InputError if the service is not installed or this user may not switch.
+    """
     import grp
     import pwd
     import shlex

@@ -15,7 +15,7 @@ JSON_S = 2.0  # how long a live sensor is watched with --json
 def eyes(
     files: Annotated[
         list[Path] | None,
-        typer.Argument(help="pictures, films or recordings; default: the configured sensor, live"),
+        typer.Argument(help="pictures, films or recordings (default: live frames from the configured sensor)"),
     ] = None,
     config: Annotated[Path | None, typer.Option(help="configuration file with the sensor to use")] = None,
     sequence: Annotated[

@@ -68,7 +68,10 @@ class Watcher:
 def look_at_files(
     files: list[Path], settings: Settings, *, sequence: bool, rate_hz: float, out: Path | None
 ) -> list[Row]:
-    """Return a row for each frame of each file, in order. Raises InputError and leaves `out` unchanged."""
+    """Return a row for each frame of each file, in order.
+
+    Raises InputError if a file cannot be read or decoded, and then leaves `out` unchanged.
+    """
     watcher, rows, follows = Watcher(settings), [], False
     with OutputFolder(out) if out is not None else nullcontext() as folder:
         for place, path in enumerate(files):
@@ -86,7 +89,10 @@ def look_at_files(
 
 
 def _frames(path: Path, place: int, rate_hz: float) -> Iterator[SensorFrame]:
-    """Yield a file's pictures. place: index of a still picture in a sequence. Raises InputError."""
+    """Yield a file's pictures. Raises InputError if the file cannot be read or decoded.
+
+    place: index of a still picture in a sequence
+    """
     kind = path.suffix.lower()
     if kind == RECORDING:
         for frame in Recording(path).samples():
@@ -99,7 +105,7 @@ def _frames(path: Path, place: int, rate_hz: float) -> Iterator[SensorFrame]:
 
 
 def _filmed(path: Path, rate_hz: float) -> Iterator[SensorFrame]:
-    """Yield a film's pictures. Raises InputError."""
+    """Yield a film's pictures. Raises InputError if it cannot be decoded."""
     with held_back():  # FFmpeg's and OpenCV's messages become one error
         capture = open_film(path)
     try:

@@ -11,10 +11,10 @@ DEFAULT_PORT = 8717
 
 
 def page(
-    config: Annotated[Path | None, typer.Option(help="the daemon's configuration file, to find its socket")] = None,
+    config: Annotated[Path | None, typer.Option(help="configuration file that names the daemon's socket")] = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0 picks a free one")] = DEFAULT_PORT,
     token_file: Annotated[
-        Path | None, typer.Option(help="file with the login token, created if missing; default: in the state folder")
+        Path | None, typer.Option(help="file with the login token, created if missing (default: in the state folder)")
     ] = None,
 ) -> None:
     """Serve the operator's page, which shows and controls the running daemon.

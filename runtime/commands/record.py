@@ -33,13 +33,14 @@ def record(
         bool, typer.Option("--images", help="also record colour and depth pictures (these show faces)")
     ] = False,
     seconds: Annotated[
-        float | None, number(0.1, RECORD_MOST_S, "s", help="length in s; default: 600, or 12 with --motion")
+        float | None, number(0.1, RECORD_MOST_S, "s", help="length in seconds (default: 600, or 12 with --motion)")
     ] = None,
     motion: Annotated[str | None, typer.Option(help="simulate a head: still, lean, nod, walk or stop-and-go")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="with --motion: seed of the head's path")] = None,
-    rate_hz: Annotated[float | None, number(15, 240, "Hz", help="with --motion: samples per second")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="seed of the head's path (only with --motion)")] = None,
+    rate_hz: Annotated[float | None, number(15, 240, "Hz", help="samples per second (only with --motion)")] = None,
     noise_mm: Annotated[
-        float | None, number(0, 100, "mm", help="with --motion: standard deviation of the sensor's noise per axis")
+        float | None,
+        number(0, 100, "mm", help="standard deviation of the sensor's noise per axis (only with --motion)"),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print the result as one JSON object")] = False,
 ) -> None:

@@ -15,12 +15,14 @@ from runtime.support.options import blame_option, number
 def run(
     config: Annotated[Path | None, typer.Option(help="configuration file; `phasestack config` prints one")] = None,
     replay: Annotated[
-        str | None, typer.Option(help="recording to play instead of the sensor; `demo` is built in and repeats")
+        str | None,
+        typer.Option(help="recording to play instead of the sensor; `demo` is the built-in one, which repeats"),
     ] = None,
     headless: Annotated[bool, typer.Option("--headless", help="render offscreen instead of opening windows")] = False,
     frames: Annotated[int | None, typer.Option(min=1, help="stop after this many refreshes")] = None,
     max_speed: Annotated[
-        bool, typer.Option("--max-speed", help="play a recording on a simulated clock: reproducible and without waits")
+        bool,
+        typer.Option("--max-speed", help="play a recording on a simulated clock, reproducibly and without waiting"),
     ] = False,
     out: Annotated[Path | None, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = None,
     scene: Annotated[str | None, typer.Option(help="scene to show: a built-in name, a file or a folder")] = None,
@@ -34,7 +36,7 @@ def run(
         typer.Option(help="device for everything except the network: cpu, gl or auto (the faster)"),
     ] = None,
     keep_light: Annotated[
-        int, typer.Option(min=0, help="with --out: write the panels' layers every N refreshes; 0 never does")
+        int, typer.Option(min=0, help="write the panels' layers to the --out folder every N refreshes (0: never)")
     ] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="print the summary as one JSON object")] = False,
 ) -> None:

@@ -59,7 +59,10 @@ class Files:
         return self.left.name if self.right is None else f"{self.left.name} and {self.right.name}"
 
     def read(self) -> list[Any]:
-        """Read the pictures for the left and the right eye. Raises InputError."""
+        """Read the pictures for the left and the right eye.
+
+        Raises InputError if they cannot be read or differ in size.
+        """
         if self.right is None:
             return list(read_pair(self.left, with_options(Settings(), layout=self.layout).content))
         if self.layout is not None:
@@ -83,7 +86,10 @@ def solve_pair(
     backend: str | None,
     plan: bool,
 ) -> dict[str, Any]:
-    """Solve a pair, write layers and pictures, and return the content of solve.json. Raises InputError."""
+    """Solve a pair, write layers and pictures, and return the content of solve.json.
+
+    Raises InputError if a file, an option or the eye positions cannot be used.
+    """
     watch = Stopwatch()
     settings = with_options(Settings(), model=model, backend=backend).model
     cv2.setNumThreads(settings.threads)

@@ -11,7 +11,9 @@ from runtime.support.options import blame_option, number
 
 
 def try_(
-    config: Annotated[Path | None, typer.Option(help="configuration file; default: panels of 960x540 pixels")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="configuration file (default: settings for panels of 960x540 pixels)")
+    ] = None,
     scene: Annotated[str | None, typer.Option(help="scene to show: a built-in name, a file or a folder")] = None,
     layout: Annotated[
         str | None, typer.Option(help="arrangement of the views in pictures, as in content.layout")

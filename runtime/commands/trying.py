@@ -35,7 +35,7 @@ MEASURED_EVERY_S = 4.0  # interval between measurements of the light at the eyes
 def settings_of(
     config: Path | None, *, scene: str | None, layout: str | None, model: str | None, webcam: bool
 ) -> Settings:
-    """Return the settings of `phasestack try`. Raises InputError."""
+    """Return the settings of `phasestack try`. Raises InputError if they are invalid."""
     settings = load_settings(config) if config else changed(Settings(), "stack", SIZE_PX, source="try")
     settings = with_options(settings, scene=scene or (None if config else SCENE), layout=layout, model=model)
     if settings.sensor.driver != "usb-camera" or not webcam:
@@ -49,7 +49,10 @@ def settings_of(
 
 
 def try_display(settings: Settings, *, port: int, opens: bool, seconds: float | None, as_json: bool) -> None:
-    """Serve the page and run the daemon until it is stopped. Raises InputError."""
+    """Serve the page and run the daemon until it is stopped.
+
+    Raises InputError if the port is in use or the settings cannot be used.
+    """
     is_sensor = settings.sensor.driver == "browser"
     link = BrowserLink(settings.stack.stack(), settings.content.fov_deg, is_sensor=is_sensor)
     ends_s = float("inf") if seconds is None else time.monotonic() + seconds

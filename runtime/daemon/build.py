@@ -140,7 +140,8 @@ def build_run(
 ) -> Run:
     """Build a run that is ready for its first refresh. Closing `cleanup` closes all its parts.
 
-    Raises FatalError, PanelLost, and Stopped on the host's request.
+    Raises FatalError for unusable settings or files, PanelLost if a panel is missing and the host does not wait for it,
+    and Stopped if the host cancels the start.
     """
     host = host or Host()
     if options.scale != 1.0 and settings.output.kind != "offscreen":

@@ -39,7 +39,7 @@ class Choices:
     chosen: dict[tuple[str, str], Any] = field(default_factory=dict)  # by section and key
 
     def settings(self) -> Settings:
-        """Return the settings with all choices applied. Raises InputError."""
+        """Return the settings with all choices applied. Raises InputError if they are invalid."""
         settings = self.configured
         for (section, key), value in self.chosen.items():
             settings = changed(settings, section, {key: value}, source="ctl")
@@ -55,7 +55,10 @@ class Choices:
         return replace(self, chosen=kept).choosing("content", scene=scene)
 
     def reloaded(self, read: Callable[[], Settings]) -> Choices:
-        """Return the new configuration with every choice whose setting it has not changed. Raises InputError."""
+        """Return the new configuration, with the choices whose settings it has not changed.
+
+        Raises InputError if the configuration is invalid or changes a setting that requires a restart.
+        """
         settings, before = read(), self.configured
         frozen = [name for name in NEEDS_RESTART if attrgetter(name)(settings) != attrgetter(name)(before)]
         if frozen:
@@ -78,7 +81,7 @@ class _Change:
     choices: Choices | None = None  # set by the loading thread before its job ends
 
     def settings(self, before: Choices) -> Settings:
-        """Apply the operator's choice and return the new settings. Raises InputError."""
+        """Apply the operator's choice and return the new settings. Raises InputError if they are invalid."""
         self.choices = self.choose(before)
         return self.choices.settings()
 
@@ -134,7 +137,10 @@ class Changes:
         self._next = change
 
     def place(self, command: Command) -> None:
-        """Move the scene, on the solver's thread so that settings and content agree. Raises InputError."""
+        """Move the scene. Raises InputError if the placement is invalid.
+
+        This happens on the solver's thread, so that settings and content agree.
+        """
         values = command.value or status.placing_in(self.choices.configured)
         changed(self._presenter.run_cell.state.settings, "content", values, source="place")
 

@@ -40,7 +40,7 @@ def candidates(configured: str) -> tuple[Path, ...]:
 
 
 def sockets(config: Path | None) -> tuple[Path, ...]:
-    """Return the sockets to try for a configuration file. Raises InputError."""
+    """Return the sockets to try for a configuration file. Raises InputError if the file is invalid."""
     if config is None:
         return candidates(DEFAULT_SOCKET)  # avoids loading the settings, so that clients start quickly
     from runtime.config import load_settings
@@ -55,7 +55,10 @@ class NotRunning(TransientError):
 
 
 def ask(paths: Iterable[Path], request: dict[str, Any], *, timeout_s: float = 10.0) -> dict[str, Any]:
-    """Send a request and return the answer. Raises NotRunning. timeout_s: limit per socket operation."""
+    """Send a request and return the answer. Raises NotRunning if no daemon answers.
+
+    timeout_s: limit per socket operation
+    """
     problems, hangs = [], False
     for path in paths:
         try:
@@ -99,7 +102,7 @@ def _advice(error: Exception) -> str:
 
 
 def unit_properties(*names: str) -> dict[str, str]:
-    """Return properties of the systemd unit, or nothing if the unit is not installed."""
+    """Return properties of the systemd unit, or an empty dictionary if it is not installed."""
     command = ["systemctl", "show", UNIT, f"--property=LoadState,{','.join(names)}"]
     try:
         shown = subprocess.run(command, capture_output=True, text=True, timeout=5.0).stdout

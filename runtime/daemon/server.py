@@ -48,7 +48,11 @@ class StatusServer:
     """
 
     def __init__(self, path: Path, *, clock: Clock) -> None:
-        """Start serving. Raises SocketInUse, InputError, TransientError."""
+        """Start serving.
+
+        Raises SocketInUse if another phasestack owns the socket, InputError if the socket cannot be created, and
+        TransientError if the thread cannot be started.
+        """
         self.path = path
         self.commands: queue.SimpleQueue[Command] = queue.SimpleQueue()
         self.lookups: dict[str, Callable[[], dict[str, Any]]] = {}  # called on the server's thread
@@ -162,7 +166,10 @@ class StatusServer:
             longest.cancel("too many clients")
 
     async def _request(self, reader: StreamReader, task: asyncio.Task[None]) -> bytes:
-        """Return the next request with its newline, or the incomplete rest of the input. Raises Refusal."""
+        """Return the next request with its newline, or the incomplete rest of the input.
+
+        Raises Refusal if the request is too long or does not arrive in time.
+        """
         self._reading[task] = None
         try:
             async with asyncio.timeout(REQUEST_S):

@@ -28,7 +28,10 @@ class SocketInUse(TransientError):
 
 
 def listening_socket(path: Path) -> socket.socket:
-    """Create a listening socket. Raises SocketInUse, or InputError if it cannot be created."""
+    """Create a listening socket.
+
+    Raises SocketInUse if another phasestack owns it, and InputError if it cannot be created.
+    """
     made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -73,7 +76,10 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _remove_dead(path: Path) -> None:
-    """Remove the socket of a dead daemon. Raises SocketInUse if a daemon listens, InputError if it is no socket."""
+    """Remove the socket of a dead daemon.
+
+    Raises SocketInUse if a daemon is listening, and InputError if the file is not a socket.
+    """
     if not os.path.lexists(path):
         return
     if not stat.S_ISSOCK(path.lstat().st_mode):

@@ -45,11 +45,11 @@ class RunningSolver:
 
     @property
     def is_newest(self) -> bool:
-        """True until another solver begins. From then on, this one must not change anything."""
+        """True until another solver starts. After that, this one must not change anything."""
         return self.run.generation == self.generation
 
     def replace(self, **changes: Any) -> RunState:
-        """Replace parts of the run's state (`RunCell.replace`). Raises Stopped if another solver has begun."""
+        """Replace parts of the run's state (`RunCell.replace`). Raises Stopped if another solver has started."""
         before = self.run.replace(self.generation, **changes)
         self._owned = replace(before, **changes)
         return before
@@ -104,9 +104,10 @@ class SolverMaker:
         self._prepared: tuple[ContentSettings, Opener] | None = None  # content that was read but not opened
 
     def __call__(self, *, context: Any = None, simulated: bool = False) -> RunningSolver:
-        """Create a solver with the current settings. Raises FatalError and leaves nothing open.
+        """Create a solver with the current settings. After an error nothing stays open.
 
-        context: the context to share with the panels; None creates a new one.
+        context: the context to share with the panels; None creates a new one. Raises FatalError if the content or the
+        model cannot be used.
         """
         own = context is None
         generation = self.run.begin() if self.run is not None else 0
@@ -150,9 +151,9 @@ class SolverMaker:
         return prepared[1]
 
     def _chosen(self, predictor: Predictor, context: Any, *, simulated: bool) -> Choice:
-        """Choose the device. A restarted solver keeps the choice of the first one.
+        """Choose the device. After a restart the new solver uses the same device as the first.
 
-        On a simulated clock the choice is fixed, because runs must be identical to the byte.
+        On a simulated clock the choice is fixed, because runs must be byte-for-byte identical.
         """
         device = "cpu" if simulated and self._device == "auto" else self._device
         choice = choose(device, predictor, lambda: context)
@@ -161,7 +162,10 @@ class SolverMaker:
 
 
 def ready_predictor(settings: Settings, stack: PanelStack) -> Predictor:
-    """Load and warm up the configured model. Raises InputError, MissingPart."""
+    """Load and warm up the configured model.
+
+    Raises InputError if the model cannot be used, and MissingPart if a package that it requires is missing.
+    """
     predictor = load_predictor(settings.model.name, stack, settings.model)
     try:
         predictor.warm_up(np.array(EYES_M))

@@ -98,7 +98,7 @@ class Daemon(Host):
             self._server.lookups |= {"log": self.recorder.look_at_log} if self.recorder is not None else {}
 
     def wait_for_panel(self, why: str) -> bool:
-        """Without a panel, report it and wait a second (as a service) or refuse to start."""
+        """Report a missing panel. Then wait a second (as a service) or refuse to start."""
         if not self._notifier.supervised or self._signals.stop:
             return False
         if why != self._waits_for:
@@ -171,7 +171,7 @@ def _news(loading: Reconfiguration | None, refused: str, recorder: Recorder | No
 def run_daemon(read_settings: Callable[[], Settings], options: RunOptions) -> dict[str, Any]:
     """Run the daemon from start to stop and return its summary.
 
-    Raises FatalError for a wrong configuration or file, and TransientError if another start may help.
+    Raises FatalError for an invalid configuration or file, and TransientError if another start may help.
     """
     keep_freed_memory()  # must precede the start of any thread
     settings = read_settings()

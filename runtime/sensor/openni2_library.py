@@ -34,7 +34,7 @@ _loaded = False
 
 
 def find_library(folder: str = "") -> tuple[Path, Path]:
-    """Return the paths of the library file and its driver folder. Raises MissingPart if they are not found."""
+    """Return the paths of the library and its driver folder. Raises MissingPart if they are not found."""
     for place in (folder,) if folder else LIBRARY_FOLDERS:
         drivers = Path(place) / "OpenNI2" / "Drivers"
         for library in sorted(Path(place).glob("libOpenNI2.so*")):
