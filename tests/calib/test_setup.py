@@ -158,7 +158,7 @@ def test_a_display_that_is_not_there_has_no_photographs_and_says_so(tmp_path: Pa
     setup.hardware._photos = tmp_path / "none"
     with pytest.raises(SetupStopped):
         grey(setup)
-    assert any("grey-0" in said and "a simulated display has none" in said for said in setup.say.__self__)
+    assert any("grey-0" in said and "the display is simulated" in said for said in setup.say.__self__)
 
 
 class FourMonitors(SimulatedHardware):
