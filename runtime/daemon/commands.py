@@ -45,7 +45,7 @@ def parse(request: Any) -> Command:
     if name not in NAMES:
         raise ValueError(f"command: unknown command; must be one of status, {', '.join(NAMES)}")
     if name in ("scene", "model") and not (isinstance(value, str) and value):
-        raise ValueError(f"value: the command `{name}` requires a name")
+        raise ValueError(f"value: {name} requires a name")
     if name == "place":
         value = value if value is not None else {}
         if not isinstance(value, dict):
