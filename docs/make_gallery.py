@@ -82,7 +82,8 @@ HEAD = """\
     phasestack bench compare old.json new.json
 
 **Quote [light](contracts.md#error) at a tracking error of 1 mm** (`light_db`, `"1"`). *One ray* is `psnr_db`. The time
-of a solution runs from two decoded pictures to 8-bit layers. Memory is the peak of the method's own process. Compare ratios.
+of a solution runs from two decoded pictures to 8-bit layers. Memory is the peak of the method's own process.
+Compare ratios.
 
 `report --pairs` reads every [case file](contracts.md#cases-pairs-calibration) in DIR. Its optional field `off`
 lists pictures that should be seen from a point `mm` away from an eye:
