@@ -128,7 +128,7 @@ def test_content_that_raises_keeps_the_last_picture(
         raise fault
 
     with monkeypatch.context() as patch:
-        patch.setattr(rig.content, "render", fail)
+        patch.setattr(rig.content, "draw", fail)
         patch.setattr(rig.content, "revision", lambda time_ns: time_ns)
         account = rig.refresh_until("degraded: content")
         assert account.presented

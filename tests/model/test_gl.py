@@ -222,7 +222,7 @@ def test_a_gpu_of_200_gigabytes_a_second_has_the_bandwidth(name: str, solutions:
 
 def test_automatic_takes_the_faster_one_and_says_what_was_measured(gl: GlBackend) -> None:
     choice = choose("auto", load_predictor("fast", STACK), lambda: gl.passes.context)
-    assert choice.why.startswith("measured at ")
+    assert choice.why.startswith("the faster at ")
     cpu_ms, gl_ms = (float(part.split(" ms")[0].split()[-1]) for part in choice.why.split(", "))
     assert choice.backend.name == ("gl" if gl_ms < cpu_ms else "cpu")
 
