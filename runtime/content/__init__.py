@@ -1,1 +1,1 @@
-"""Content sources, which draw the picture of a scene for one eye in a given raster."""
+"""Content sources, each of which draws a scene as one eye sees it, on a given grid of pixels."""

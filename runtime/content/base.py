@@ -1,7 +1,7 @@
-"""Interface of content sources, which draw a scene's picture for one eye on a given raster.
+"""Interface of content sources, which draw a scene as one eye sees it, on a given grid of pixels.
 
-`ContentSource` is also the base of user-defined scenes, such as `scene = "mypackage.tunnel:Tunnel"`. A scene must
-implement only `render`; the other methods are optimisations, whose defaults are correct for any scene.
+`ContentSource` is also the base class of user-defined scenes, such as `scene = "mypackage.tunnel:Tunnel"`. A scene
+only has to implement `render`. The other methods are optimisations, and their defaults are correct for any scene.
 """
 
 from __future__ import annotations
@@ -27,111 +27,144 @@ WHITE: Colour = (1.0, 1.0, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One eye, and the raster on which to draw for it."""
+    """An eye and the raster on which to draw the eye's picture."""
 
-    eye_m: F64  # (3,) frame `stack`
-    side: int  # 0: left, 1: right
-    pixels_from_stack: F64  # (3, 4) projection; third coordinate in metres, positive in front of the eye
+    eye_m: F64  # (3,) position in frame `stack`
+    side: int  # 0 is the left eye, 1 the right eye
+    pixels_from_stack: F64  # (3, 4) projection; the third coordinate is in metres, positive in front of the eye
     width_px: int
     height_px: int
-    reduction: int = 1  # divisor of the display's rows and columns; outlines keep their width on the display
-    display_from_view: F64 | None = None  # 3x3 rotation from the placed scene's frame; the lamp is fixed to the display
+    reduction: int = 1  # display pixels per raster pixel, in each direction; outlines keep their width on the display
+    display_from_view: F64 | None = None  # 3x3 rotation of a moved scene; the lamp is fixed to the display
 
 
 @dataclass(frozen=True, slots=True)
 class ContentInfo:
-    """Static properties of a scene. The solver skips work that they make unnecessary."""
+    """Static properties of a scene, from which the solver derives the work that it can skip."""
 
     name: str
     moving: bool = False
     grey: bool = False
-    background: Colour | None = WHITE  # uniform colour behind the scene; None: there is none
-    flat_x_m: float | None = None  # x of the plane that contains the whole scene, if it is flat
-    left_out: tuple[str, ...] = ()  # parts of the file that are not drawn
+    background: Colour | None = WHITE  # uniform colour behind the scene, or None if the background is not uniform
+    flat_x_m: float | None = None  # x coordinate of the plane that contains the whole scene, or None if not flat
+    left_out: tuple[str, ...] = ()  # features of the file that are not drawn
 
 
 class ContentSource(ABC):
-    """A scene. The thread that owns its GL context creates, uses and closes it."""
+    """Scene that can be drawn for any eye position.
 
-    Options: ClassVar[type[BaseModel]] = Section  # options that [content.options] may contain, for user-defined scenes
+    A source must be created, used and closed on the thread that owns its GL context.
+    """
+
+    Options: ClassVar[type[BaseModel]] = Section  # model that validates [content.options] for a user-defined scene
     info: ContentInfo
-    draws_in: object = None  # GL context of its textures; None: it returns arrays
+    draws_in: object = None  # GL context that owns the textures from `draw`, or None if the source returns arrays
 
     def __init__(self, options: Any, *, stack: Any, context: Any) -> None:
-        """Create a user-defined scene. Raises InputError if it cannot be shown.
+        """Create a user-defined scene.
 
-        options: an instance of `Options`; stack: the panels (`PanelStack`); context: the current moderngl context.
+        Args:
+            options: Instance of `Options`.
+            stack: Panels of the display (`PanelStack`).
+            context: Current moderngl context.
+
+        Raises:
+            InputError: The scene cannot be shown.
         """
         self.info = ContentInfo(type(self).__name__, moving=True, background=None)
 
     @abstractmethod
     def render(self, view: View, *, time_ns: int) -> U8:
-        """Return the eye's picture on the view's raster: (height_px, width_px, 4) RGBA, row 0 at the top.
+        """Return the eye's picture on the view's raster as an RGBA array (height_px, width_px, 4).
 
-        Colours are already blended with the background. Alpha is the content's coverage; it is 0 only where nothing but
-        the background shows. The array belongs to the source and stays valid until the next `render` for the same side.
-        time_ns: time on the run's clock, for moving content. If it raises ContentFailure, the last picture stays.
+        Row 0 is at the top. Colours are already blended with the background. Alpha is the content's coverage and is 0
+        only where nothing but the background is visible. The array belongs to the source and stays valid until the next
+        call of `render` for the same side.
+
+        Args:
+            view: Eye and raster to draw for.
+            time_ns: Time on the run's clock, which determines the state of moving content.
+
+        Raises:
+            ContentFailure: The picture cannot be drawn at the moment. The last picture stays on the display.
         """
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture | None:
-        """Return the picture as a texture, or None if `render` must be used. Raises ContentFailure.
+        """Return the picture as a texture, or None if the caller has to use `render`.
 
-        The texture is valid until the next picture for the same side.
+        The texture stays valid until the source draws the next picture for the same side. Raises ContentFailure if the
+        picture cannot be drawn at the moment.
         """
         return None
 
     def nearness(self, view: View, *, every: int, first: tuple[int, int]) -> F32 | None:
-        """Return (h, w) inverse distances, in 1/m, of the nearest points in blocks of the newest picture.
+        """Return the inverse distance of the nearest point in each block of pixels, in 1/m.
 
-        The picture is the newest one of the view's side, and a distance is the view's third coordinate. The value is 0
-        where only the background shows. If the result is None (unknown), content is aligned to new eyes as if it were
-        on the middle panel. every: size of a block in pixels; first: number of pixels (right, down), less than
-        `every`, that are cut off the first block.
+        The blocks divide the newest picture that was drawn for the view's side. Distances are measured along the third
+        coordinate of the view's projection.
+
+        Args:
+            view: View for which the newest picture was drawn.
+            every: Side of a square block, in pixels.
+            first: Columns and rows, less than `every`, that the first block lacks at its left and its top.
+
+        Returns:
+            Array (h, w) with one value per block, which is 0 where only the background is visible. The result is None
+            if distances are unknown. Content is then aligned to new eye positions as if it were on the middle panel.
         """
         return None
 
     def expect(self, views: Sequence[View], *, time_ns: int) -> None:  # noqa: B027 - most have nothing to prepare
-        """Prepare for the views of both eyes that will be drawn next. Raises ContentFailure."""
+        """Prepare for the views that will be drawn next, usually one for each eye.
+
+        Raises ContentFailure if these views cannot be drawn at the moment.
+        """
 
     @property
     def program(self) -> dict[str, Any] | None:
-        """Return `address` and recent `frame_ms` if another program draws the scene, otherwise None."""
+        """Status of the program that draws the scene, or None if the source draws the scene itself.
+
+        The keys are `address`, to which the program connects, and `frame_ms`, the duration of a recent frame.
+        """
         return None
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect | None:
-        """Return a box of the view's pixels outside which only the background shows; None: unknown."""
+        """Return a box of pixels outside which only the background is visible, or None if unknown."""
         return None
 
     def revision(self, *, time_ns: int) -> int:
-        """Return a number that changes when `render` may draw the same view differently."""
+        """Return a number that changes whenever `render` might draw the same view differently."""
         return time_ns if self.info.moving else 0
 
     def describe(self, *, time_ns: int) -> dict[str, Any] | None:
-        """Return a playlist's entries, the current one and its remaining time, or None for other sources."""
+        """Return the entries and current position of a playlist, or None if the source is not a playlist."""
         return None
 
     def skip(self, *, time_ns: int) -> bool:
-        """Go to the next entry of a playlist. Return False if there is no other."""
+        """Skip to the next entry of a playlist. Return False if no entry follows."""
         return False
 
     @property
     def problem(self) -> str:
-        """Current fault in one line, during which the last good picture stays; empty if there is none."""
+        """Description of the current fault in one line, or an empty string if the source works.
+
+        The last good picture stays on the display until the fault is resolved.
+        """
         return ""
 
     def close(self) -> None:  # noqa: B027 - most sources hold nothing
-        """Release GL objects and files. May be called twice."""
+        """Release GL objects and files. The method may be called more than once."""
 
 
 class ForwardingSource(ContentSource):
-    """Source that shows another source."""
+    """Source that forwards every request to another source, which the subclass chooses."""
 
-    source: ContentSource  # the source that is currently shown
+    source: ContentSource  # source that is currently shown
     _drew: tuple[ContentSource | None, ContentSource | None] = (None, None)  # source of each side's newest picture
 
     @abstractmethod
     def forwarded(self, view: View, time_ns: int) -> tuple[ContentSource, View, int]:
-        """Return the source, view and time to which a request is forwarded."""
+        """Return the source to which a request is forwarded, and the view and time to request there."""
 
     @property
     def problem(self) -> str:

@@ -1,4 +1,4 @@
-"""Convert a view's 3x4 projection to a rasteriser's camera, and project boxes."""
+"""Convert the 3x4 projection of a view to an OpenGL clip matrix, and project points and boxes."""
 
 from __future__ import annotations
 
@@ -13,11 +13,17 @@ NEAREST_M = 1e-3  # distance of the near plane from the eye
 
 
 def clip_from_stack(view: View, corners_m: F64) -> F64:
-    """Return a view's 4x4 OpenGL clip matrix, with near and far planes around (8n, 3) corners.
+    """Return the 4x4 OpenGL clip matrix of a view.
 
-    OpenGL's first row in memory is its lowest. The raster's v therefore runs along OpenGL's +y, so that row 0 of the
-    raster is row 0 of the pixels read back, and nothing need be flipped. Raises ValueError if no corner is in front of
-    the eye.
+    The raster's v axis runs along +y in OpenGL, which stores the lowest row first. Row 0 of the raster is then row 0
+    of the pixels that are read back, and the picture need not be flipped.
+
+    Args:
+        view: View whose projection is converted.
+        corners_m: Corners (8n, 3) of n boxes in frame `stack`, which the near and far planes enclose.
+
+    Raises:
+        ValueError: No corner is in front of the eye.
     """
     near_m, far_m = depth_bounds(view, corners_m)
     if not 0.0 < near_m < far_m:
@@ -35,9 +41,9 @@ def box_corners(low_m: ArrayLike, high_m: ArrayLike) -> F64:
 
 
 def project(pixels_from_stack: F64, points_m: F64) -> tuple[F64, F64]:
-    """Return the pixels (n, 2) and depths (n,) in metres of points (n, 3) in frame `stack`.
+    """Project points (n, 3) in frame `stack` to pixels (n, 2) and depths (n,) in metres.
 
-    Pixels of points behind the eye are undefined.
+    The pixel coordinates of points behind the eye are undefined.
     """
     homogeneous = points_m @ pixels_from_stack[:, :3].T + pixels_from_stack[:, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -45,9 +51,14 @@ def project(pixels_from_stack: F64, points_m: F64) -> tuple[F64, F64]:
 
 
 def covered_box(view: View, corners_m: F64, *, align_px: int = 32) -> PixelRect:
-    """Return the box of pixels that the hull of some corners may cover, rounded up to `align_px`.
+    """Return a box of pixels that contains the projection of the convex hull of some points.
 
-    It is empty if the corners are behind the eye.
+    The box is empty if all points are behind the eye, and covers the whole raster if some of them are.
+
+    Args:
+        view: View whose pixels are meant.
+        corners_m: Points (n, 3) in frame `stack`.
+        align_px: The box is enlarged to multiples of this number of pixels.
     """
     pixels, depths = project(view.pixels_from_stack, corners_m)
     if depth_bounds(view, corners_m)[1] <= 2 * NEAREST_M:
@@ -63,7 +74,7 @@ def covered_box(view: View, corners_m: F64, *, align_px: int = 32) -> PixelRect:
 
 
 def depth_bounds(view: View, corners_m: F64) -> tuple[float, float]:
-    """Return the near and far distance in metres, with a margin, of all corners in front of the eye."""
+    """Return near and far distances in metres that enclose all corners in front of the eye with a margin."""
     depths = project(view.pixels_from_stack, corners_m)[1]
     far = float(depths.max()) * 1.001 + NEAREST_M
     return max(float(depths.min()) * 0.999 - NEAREST_M, min(NEAREST_M, far / 2)), far

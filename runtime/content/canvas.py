@@ -1,4 +1,4 @@
-"""Offscreen RGBA8 framebuffers with smoothed edges, kept per size, for sources that draw with OpenGL."""
+"""Offscreen RGBA8 framebuffers with antialiasing for sources that draw with OpenGL."""
 
 from __future__ import annotations
 
@@ -54,13 +54,16 @@ OVER = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl
 
 @dataclass(slots=True)
 class _Target:
-    smooth: Any  # multisampled or half-float framebuffer; None if neither is needed
-    plain: list[Any]  # one per side
-    pictures: list[U8]  # (h, w, 4) arrays, one per side, reused
+    smooth: Any  # multisampled or half-float framebuffer, or None if the plain ones suffice
+    plain: list[Any]  # RGBA8 framebuffers, one for each side
+    pictures: list[U8]  # arrays (h, w, 4), one for each side, into which pixels are read back
 
 
 class _Reducer:
-    """Reducer of depth to the nearest value per block, because reading back all would hold Python's lock."""
+    """Reduces a depth buffer on the GPU to the nearest value in each block of pixels.
+
+    Reading back the full depth buffer would hold Python's global lock for too long.
+    """
 
     def __init__(self, context: Any) -> None:
         self._context = context
@@ -78,16 +81,22 @@ class _Reducer:
         at_near: float,
         at_far: float,
     ) -> F32:
-        """Return (rows, columns) values: at_near at depth 0, at_far at depth 1, 0 where nothing was drawn.
+        """Return an array (rows, columns) of values that vary linearly with the least depth in each block.
 
-        size: (columns, rows).
+        Args:
+            depth: Depth texture.
+            size: Number of blocks (columns, rows).
+            every: Side of a square block, in pixels.
+            first: Columns and rows of pixels that the first block lacks at its left and its top.
+            at_near: Value for depth 0.
+            at_far: Value for depth 1. Blocks in which nothing was drawn have the value 0 instead.
         """
         if size not in self._targets:
             if len(self._targets) >= SIZES_KEPT:
                 self._drop(next(iter(self._targets)))
             self._targets[size] = self._context.framebuffer([self._context.texture(size, 1, dtype="f4")])
         target = self._targets[size]
-        finish()  # without Python's lock; drawing from an unfinished depth would wait with it
+        finish()  # releases Python's lock; rendering from an unfinished depth buffer would hold it while waiting
         self._context.enable_only(self._context.NOTHING)
         target.use()
         depth.compare_func = ""
@@ -113,27 +122,30 @@ class _Reducer:
 
 
 class CanvasSource(ContentSource):
-    """Source that draws with OpenGL into one framebuffer per view size, which is read back on request.
+    """Base class of sources that draw with OpenGL into one framebuffer for each size of view.
 
-    Only the box that the content may cover is cleared, drawn and resolved from its samples, because resolving is
-    the most expensive step on a software rasteriser.
+    Only the box that the content may cover is drawn and resolved from multiple samples, because resolving is the most
+    expensive step on a software rasteriser. Pixels are read back only on request.
     """
 
     def __init__(self, context: Any, *, info: ContentInfo, samples: int = 0, deep: bool = False) -> None:
         """Create the source.
 
-        samples: number of samples per pixel. deep: True to draw in half floats, for sums of many layers of which some
-        are brighter than white.
+        Args:
+            context: Current moderngl context.
+            info: Properties of the scene.
+            samples: Number of samples per pixel, or 0 for no multisampling.
+            deep: Draw in half floats, to blend many layers of which some are brighter than white.
         """
         self.info, self.context = info, context
         self.draws_in = context
-        self.held: list[Any] = []  # GL objects to release with the source
+        self.held: list[Any] = []  # GL objects that are released together with the source
         self._deep = deep
         self._samples = min(samples, context.max_samples)
         self._clear_colour = (*(info.background or WHITE), 0.0)
         self._targets: dict[tuple[int, int], _Target] = {}
         self._reducer: _Reducer | None = None
-        self._bounds: list[tuple[float, float] | None] = [None] * SIDES  # near and far of each side's newest picture
+        self._bounds: list[tuple[float, float] | None] = [None] * SIDES  # near and far planes of each side's picture
 
     @abstractmethod
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture: ...
@@ -142,9 +154,9 @@ class CanvasSource(ContentSource):
         return self.draw(view, time_ns=time_ns).pixels()
 
     def drawn(self, view: View, box: PixelRect, paint: Callable[[], None]) -> DrawnPicture:
-        """Clear `box`, let `paint` draw inside it, and return the picture.
+        """Clear the framebuffer of a view, call `paint` to draw inside `box`, and return the picture.
 
-        The picture is valid until the next one for the same side.
+        The picture stays valid until the next one is drawn for the same side.
         """
         raise_if_abandoned()
         self._bounds[view.side] = None
@@ -178,7 +190,7 @@ class CanvasSource(ContentSource):
             self._reducer = _Reducer(self.context)
         size = -(-(view.width_px + first[0]) // every), -(-(view.height_px + first[1]) // every)
         depth = target.plain[view.side].depth_attachment
-        # Between the near and the far plane, depth is linear in the inverse distance.
+        # A depth between the near and the far plane is linear in the inverse distance.
         return self._reducer.reduced(
             depth, size, every=every, first=first, at_near=1 / near_m, at_far=1 / far_m
         )  # fmt: skip
@@ -194,7 +206,7 @@ class CanvasSource(ContentSource):
 
     def _forget_oldest(self) -> None:
         target = self._targets.pop(next(iter(self._targets)))
-        # moderngl binds the last framebuffer again in later calls, so a released one must not be current.
+        # moderngl binds the current framebuffer again in later calls, so it must not be one that has been released.
         self.context.detect_framebuffer(0).use()
         for framebuffer in (*target.plain, *([target.smooth] if target.smooth else [])):
             for attachment in (*framebuffer.color_attachments, framebuffer.depth_attachment):
@@ -219,7 +231,7 @@ class CanvasSource(ContentSource):
         return self._targets[size]
 
     def _framebuffer(self, size: tuple[int, int], colour: Any, *, samples: int = 0) -> Any:
-        # Depth is a texture because Mesa never frees a renderbuffer's memory if a context that shares it releases it.
+        # The depth buffer is a texture because Mesa leaks a renderbuffer that is released by a context sharing it.
         depth = self.context.depth_texture(size, samples=samples)
         if not samples:
             depth.repeat_x = depth.repeat_y = False

@@ -1,4 +1,4 @@
-"""Read splats compressed as SPZ (versions 1 to 4) or SOG (version 2, as one file or a folder)."""
+"""Read Gaussian splats compressed as SPZ (versions 1 to 4) or SOG (version 2, as a file or a folder)."""
 
 from __future__ import annotations
 
@@ -22,34 +22,40 @@ from runtime.support.picture_header import decoded_picture
 from runtime.support.untrusted_input import LIMITS
 
 SPZ_HEADER = struct.Struct("<4sIIBBBBI12x")  # magic, version, count, degree, position bits, flags, streams, table
-SPZ_SHORT = 16  # bytes of the header before version 4
-SPZ_COLOUR = 0.15  # units of a flat harmonic over the range of a colour's byte
-SOG_PARTS = {"means": 2, "scales": 1, "quats": 1, "sh0": 1}  # number of pictures per property
-FIRST_TAG = 252  # lowest alpha of a rotation; the difference from it is the index of the largest component
-WIDE = 64  # palette entries per row of `shN_centroids`
-MOST = max(COEFFICIENTS) // 3  # coefficients per channel that are drawn; those of degree 4 are not
+SPZ_SHORT = 16  # size of the header in bytes, before version 4
+SPZ_COLOUR = 0.15  # scale of colours in SPZ, relative to coefficients of degree 0
+SOG_PARTS = {"means": 2, "scales": 1, "quats": 1, "sh0": 1}  # number of pictures for each property
+FIRST_TAG = 252  # alpha if a rotation's largest component has index 0; 253 to 255 stand for 1 to 3
+WIDE = 64  # number of palette entries in a row of `shN_centroids`
+MOST = max(COEFFICIENTS) // 3  # most coefficients above degree 0 per channel; those of degree 4 are not drawn
 U32 = NDArray[np.uint32]
 
 
 def is_sog_folder(folder: Path) -> bool:
-    """Return True if a folder contains the files of a SOG."""
+    """Return True if a folder contains an unpacked SOG file."""
     return (folder / "meta.json").is_file() and (folder / "means_l.webp").is_file()
 
 
 def load_compressed_splats(path: Path) -> Gaussians:
-    """Read an SPZ or SOG file, or a folder with SOG's pictures. Raises InputError."""
+    """Read an SPZ file, a SOG file or a folder that contains an unpacked SOG file.
+
+    Raises InputError if the file is damaged, exceeds a limit, has an unsupported version, or contains no visible splat.
+    """
     try:
         with np.errstate(all="ignore"):
             return _spz(path) if path.suffix.lower() == ".spz" else _sog(path)
     except (InputError, ImportError, MemoryError):
         raise
-    except Exception:  # zlib, zipfile, zstandard and malformed JSON raise various errors
+    except Exception:  # zlib, zipfile and zstandard raise various errors, as does malformed JSON
         kind = "an SPZ" if path.suffix.lower() == ".spz" else "a SOG"
         raise InputError(path, "", f"is damaged, or not {kind} file") from None
 
 
 def _spz(path: Path) -> Gaussians:
-    """Read an SPZ file: all positions, then all opacities, colours, scales, rotations and harmonics."""
+    """Read an SPZ file.
+
+    The file stores the positions of all splats, followed by all opacities, colours, scales, rotations and harmonics.
+    """
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
     zipped = zlib.decompressobj(31) if data[:2] == b"\x1f\x8b" else None
     head = zipped.decompress(data, SPZ_SHORT) if zipped else data[: SPZ_HEADER.size]
@@ -80,7 +86,13 @@ def _spz(path: Path) -> Gaussians:
 
 
 def _zstd_blocks(data: bytes, table: int, sizes: list[int]) -> list[bytes]:
-    """Return the streams of version 4, decompressed to at most `sizes`. Empty streams may be missing."""
+    """Decompress the streams of an SPZ file of version 4. Empty streams may be missing from the file.
+
+    Args:
+        data: Contents of the file.
+        table: Offset of the table of stream sizes, in bytes.
+        sizes: Expected size of each stream in bytes. No stream is decompressed beyond its expected size.
+    """
     import zstandard
 
     names = [size for size in sizes if size]
@@ -94,21 +106,22 @@ def _zstd_blocks(data: bytes, table: int, sizes: list[int]) -> list[bytes]:
 
 
 def _fixed(places: U8, bits: int) -> F32:
-    """Decode signed 24-bit fixed-point numbers (n, 3) with `bits` fractional bits."""
+    """Decode positions (n, 3) from signed 24-bit fixed-point numbers with `bits` fractional bits."""
     low, middle, high = places.reshape(-1, 3, 3).astype(np.int32).transpose(2, 0, 1)
     return np.asarray(((high << 24 | middle << 16 | low << 8) >> 8) * 2.0**-bits, np.float32)
 
 
 def _three_bytes(turns: U8) -> F32:
-    """Decode quaternions (n, 4) w, x, y, z from bytes of x, y and z."""
+    """Decode quaternions (n, 4), ordered w, x, y, z, of which the bytes (n, 3) contain x, y and z."""
     xyz = turns / np.float32(127.5) - 1
     return np.column_stack([np.sqrt(np.maximum(1 - (xyz**2).sum(1), 0)), xyz]).astype(np.float32)
 
 
 def _four_bytes(turns: U32) -> F32:
-    """Decode quaternions (n, 4) w, x, y, z from packed words.
+    """Decode quaternions (n, 4), ordered w, x, y, z, from packed 32-bit words.
 
-    A word contains the index (in x, y, z, w) of the largest component, then a sign and 9 bits for each of the others.
+    The two highest bits of a word are the index of the largest component, in the order x, y, z, w. The other three
+    components follow, each as a sign and a magnitude of 9 bits.
     """
     share = fields_of(turns, (1, 9, 1, 9, 1, 9))
     three = (1 - 2 * share[:, ::2]) * share[:, 1::2] * np.float32(np.sqrt(0.5))
@@ -116,7 +129,11 @@ def _four_bytes(turns: U32) -> F32:
 
 
 def _sog(path: Path) -> Gaussians:
-    """Read a SOG: pictures with one pixel per splat, whose bytes are fractions or codebook indices."""
+    """Read a SOG file or folder.
+
+    SOG stores the properties of splats in pictures that have one pixel for each splat. The bytes of a pixel are
+    fractions of a range or indices of a codebook.
+    """
     with _SogFiles(path) as files:
         meta = untrusted_input.parsed_json(files.read("meta.json"), source=path)
         if meta.get("version") != 2:
@@ -152,7 +169,7 @@ def _sog(path: Path) -> Gaussians:
 
 
 class _SogFiles:
-    """Files of a SOG in a folder or a ZIP archive."""
+    """Reads the members of a SOG file, which is a folder or a ZIP archive."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -176,12 +193,12 @@ class _SogFiles:
         return self._zip.read(name)
 
     def picture(self, name: str) -> U8:
-        """Return a picture (h, w, 4) RGBA. Raises InputError."""
+        """Return a picture as an RGBA array (h, w, 4). Raises InputError if the picture cannot be decoded."""
         image = decoded_picture(self.read(name), source=self._path, field=untrusted_input.shown(name), name="")
         return np.asarray(image.convert("RGBA"))
 
     def pixels(self, name: str, count: int) -> U8:
-        """Return the first `count` pixels (count, 4) of an RGBA picture. Raises InputError if it has fewer."""
+        """Return the first `count` pixels (count, 4) of a picture. Raises InputError if there are fewer."""
         pixels = self.picture(name).reshape(-1, 4)[:count]
         if len(pixels) < count:
             raise InputError(self._path, untrusted_input.shown(name), f"has {len(pixels)} of {count} pixels")

@@ -1,4 +1,4 @@
-"""Read a folder of the EyeReal data set: picture pairs whose names contain the eyes' positions."""
+"""Read folders of the EyeReal data set: pairs of pictures whose names contain the eyes' positions."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from runtime.support.picture_file import read_image
 
 NUMBER = r"(-?(?:\d+\.?\d*|\.\d+))"
 NAME = re.compile(rf"pair(\d+)_x{NUMBER}_y{NUMBER}_z{NUMBER}_([01]|left|right)\.(?:jpg|jpeg|png)$", re.IGNORECASE)
-KEPT = 4  # pairs kept in memory
+KEPT = 4  # number of pairs that are kept in memory
 
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """Two files of a pair, that of the viewer's left eye first."""
+    """Pictures of a scene for the left and the right eye, in two files."""
 
     number: int
-    paths: tuple[Path, Path]
-    eyes_m: F64  # (2, 3) left, right; frame `stack`
-    looks_at_m: F64  # (3,) the scene's origin, at which both eyes look; it may be in front of or behind the display
+    paths: tuple[Path, Path]  # left, right
+    eyes_m: F64  # (2, 3) positions of the left and right eye, frame `stack`
+    looks_at_m: F64  # (3,) scene's origin, at which both eyes look, frame `stack`; it may be off the display
 
     def image_from_stack(self, side: int, *, width_px: int, height_px: int, fov_deg: float) -> F64:
-        """Return the (3, 4) projection of the left (`side` 0) or right (1) picture."""
+        """Return the (3, 4) projection from `stack` to pixels of the left (`side` 0) or right (1) picture."""
         around_origin = np.eye(4)
         around_origin[:3, 3] = -self.looks_at_m
         eye = self.eyes_m[side] - self.looks_at_m
@@ -42,16 +42,23 @@ class Pair:
 
 
 def is_data_set(folder: Path) -> bool:
-    """Return True if the folder contains pictures that follow the data set's naming scheme."""
+    """Return True if a folder contains a picture that is named as in the data set."""
     return folder.is_dir() and any(NAME.match(path.name) for path in folder.iterdir())
 
 
 def read_folder(folder: Path, preset: str) -> tuple[Pair, ...]:
     """Return all pairs of a folder, ordered by number.
 
-    preset: name of the scene. File names contain the eyes' positions in the scene's digital units, from which it
-    follows whether `_0` or `_1` is the left picture. The names `_left` and `_right` of newer data must agree with these
-    positions. Raises InputError if there is no pair, if a pair is incomplete, or if an eye is behind the display.
+    File names contain the eyes' positions in the scene's digital units. These positions determine whether `_0` or `_1`
+    is the left picture. The names `_left` and `_right` in newer data must agree with the positions.
+
+    Args:
+        folder: Folder of the pictures.
+        preset: Name of the scene.
+
+    Raises:
+        InputError: There is no pair, a pair is incomplete, an eye is behind the display, or the left and the right
+            picture cannot be told apart.
     """
     stack_from_scene: F64 = np.linalg.inv(drawn_scene_from_stack(preset)).astype(np.float64)
     files: dict[int, list[tuple[str, Path, F64]]] = {}
@@ -82,7 +89,11 @@ def read_folder(folder: Path, preset: str) -> tuple[Pair, ...]:
 
 
 def prepare(file: SceneFile) -> Callable[..., ContentSource]:
-    """Read a folder with the chosen preset, or with the preset in its name. Raises InputError."""
+    """Read a folder of pairs, and return a function that creates its source.
+
+    The preset is the chosen one or, by default, the preset whose name occurs in the folder's name. Raises InputError if
+    no preset is known, or if the pairs cannot be read.
+    """
     path, settings = file.path, file.settings
     name = file.preset or next((name for name in preset_names() if name in path.resolve().name), "")
     if not name:
@@ -90,12 +101,15 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
     pairs = read_folder(path, name)
     background = settings.background or WHITE
     make = partial(EyeRealSource, pairs, fov_deg=settings.fov_deg, background=background, name=name)
-    make()  # refuses an unreadable picture now
+    make()  # reports an unreadable picture now
     return make
 
 
 class EyeRealSource(ContentSource):
-    """Source that shows the pair taken nearest to the viewer, warped through the display's centre plane."""
+    """Source that shows the pair whose left eye is nearest to the viewer's.
+
+    Its pictures are warped to the viewer's eyes as if they were on the plane x = 0, at the centre of the display.
+    """
 
     def __init__(
         self,
@@ -114,7 +128,7 @@ class EyeRealSource(ContentSource):
         self.info = ContentInfo(name=name, background=background)
 
     def render(self, view: View, *, time_ns: int) -> U8:
-        if view.side == 0:  # the right eye gets the same pair
+        if view.side == 0:  # the right eye sees the pair that was chosen for the left eye
             self._chosen = int(np.linalg.norm(self._eyes_m[:, 0] - view.eye_m, axis=1).argmin())
         try:
             picture, projection = self._loaded(self._chosen)[view.side]

@@ -1,4 +1,7 @@
-"""Read how a film arranges its views: `st3d`, `sv3d` or XML in MP4, StereoMode in Matroska."""
+"""Read the arrangement of views that a film file declares.
+
+MP4 files declare it in the boxes `st3d` and `sv3d` or in XML, and Matroska files in the element StereoMode.
+"""
 
 from __future__ import annotations
 
@@ -10,28 +13,28 @@ from typing import IO
 
 from runtime.support import untrusted_input
 
-MOVIE_BYTES, HEAD_BYTES = 32 << 20, 1 << 20  # most bytes read: of an MP4's `moov`, of a Matroska's head
-BOXES_MAX = 10_000  # most top-level boxes of an MP4
+MOVIE_BYTES, HEAD_BYTES = 32 << 20, 1 << 20  # most bytes read from an MP4's `moov` box and a Matroska file
+BOXES_MAX = 10_000  # most top-level boxes that are read from an MP4 file
 ST3D = re.compile(rb"\0\0\0\x0dst3d.{4}([\1\2])", re.DOTALL)
-EQUI = re.compile(rb"\0\0\0\x1cequi.{12}(.{4})(.{4})", re.DOTALL)  # crop on the left and right
+EQUI = re.compile(rb"\0\0\0\x1cequi.{12}(.{4})(.{4})", re.DOTALL)  # the groups are the crop on the left and right
 XML_STEREO = re.compile(rb"GSpherical:StereoMode>\s*(left-right|top-bottom)")
 XML_AROUND = re.compile(rb"GSpherical:Spherical>\s*true")
-MULTIVIEW = b"vexu"  # box in films from headsets and phones
+MULTIVIEW = b"vexu"  # box in films that headsets and phones record
 SEGMENT, TRACKS, TRACK, VIDEO, STEREO_MODE = 0x18538067, 0x1654AE6B, 0xAE, 0xE0, 0x53B8
 MODES = {1: "side-by-side", 3: "top-bottom", 10: "anaglyph", 11: "cross-eyed"}
 
 
 @dataclass(frozen=True, slots=True)
 class FilmHeader:
-    """Arrangement of views that a film states. Fields that it does not state are empty or 0."""
+    """Arrangement of views that a film file declares. Fields that are not declared are empty or 0."""
 
-    layout: str = ""  # same syntax as `content.layout`
-    span_deg: int = 0  # longitude covered by equirectangular views
-    left_out: str = ""  # stated, but not supported
+    layout: str = ""  # in the syntax of `content.layout`
+    span_deg: int = 0  # longitude that equirectangular views cover
+    left_out: str = ""  # description of a view that is declared but not supported
 
 
 def film_header(path: Path) -> FilmHeader:
-    """Return the header of a film. Raises InputError if it cannot be read."""
+    """Return what a film file declares about its views. Raises InputError if the file cannot be read."""
     with untrusted_input.open_regular(path) as file:
         if file.read(4) == b"\x1a\x45\xdf\xa3":
             return _matroska(file)
@@ -76,7 +79,7 @@ def _matroska(file: IO[bytes]) -> FilmHeader:
 
 
 def _elements(data: bytes, within: slice) -> Iterator[tuple[int, slice]]:
-    """Yield the number and content of each element within another, as far as it was read."""
+    """Yield the number and the range of content of each Matroska element in a part of `data`."""
     place, end = within.start, min(within.stop, len(data))
     while place < end:
         number_bytes = 9 - data[place].bit_length()

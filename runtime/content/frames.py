@@ -1,4 +1,4 @@
-"""Open sequences of pictures (a still, an animation, a folder or a film) with their layouts."""
+"""Open stills, animations, folders of pictures and films as sequences of pictures with layouts."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ PICTURES = (
     ".png", ".jpg", ".jpeg", ".jfif", ".mpo", ".jps", ".pns", ".bmp", ".tif", ".tiff", ".webp", ".gif", ".apng",
     ".avif", ".heic", ".heif", ".hif", ".ppm", ".pgm", ".tga",
 )  # fmt: skip
-NOT_READ = (*RAW, ".jxl", ".exr", ".hdr", ".psd", ".svg", ".jp2", *VIDEOS)  # skipped and logged in a folder
-TOLD = 3  # skipped files of a folder that the log names
-TELL_EVERY = 64  # pictures between two progress reports
-VIDEO_FRAMES_MAX = 1e8  # most frames that a header may claim: five weeks at 30 per second
+NOT_READ = (*RAW, ".jxl", ".exr", ".hdr", ".psd", ".svg", ".jp2", *VIDEOS)  # skipped and logged if found in a folder
+TOLD = 3  # number of skipped files that the log names for a folder
+TELL_EVERY = 64  # number of pictures between two progress reports
+VIDEO_FRAMES_MAX = 1e8  # most frames that a header may declare: five weeks at 30 frames per second
 VIDEO_PROPERTIES = (
     cv2.CAP_PROP_FRAME_COUNT,
     cv2.CAP_PROP_FPS,
@@ -44,15 +44,22 @@ VIDEO_PROPERTIES = (
 
 
 class Frames(ABC):
-    """Sequence of pictures. Constructors raise InputError; later failures raise ContentFailure."""
+    """Sequence of pictures that is played repeatedly.
 
-    count: int
-    rate_hz: float
-    layouts: Sequence[Layout]  # one per picture, or a single one for all
+    A constructor raises InputError if the files cannot be shown. Pictures that cannot be decoded later raise
+    ContentFailure.
+    """
+
+    count: int  # number of pictures
+    rate_hz: float  # pictures per second
+    layouts: Sequence[Layout]  # layout of each picture, or a single layout for all pictures
 
     @abstractmethod
     def frame(self, index: int) -> U8:
-        """Return an (h, w, 3) RGB picture that contains the views of its layout. Raises ContentFailure."""
+        """Return a picture (h, w, 3) in RGB, which contains all views of the picture's layout.
+
+        Raises ContentFailure if the picture cannot be decoded.
+        """
 
     def layout(self, index: int) -> Layout:
         return self.layouts[min(index, len(self.layouts) - 1)]
@@ -61,20 +68,27 @@ class Frames(ABC):
         """Return the index of the picture shown at a time."""
         return int(time_ns * self.rate_hz / NS_PER_S) % self.count
 
-    def close(self) -> None:  # noqa: B027 - most hold nothing
-        """Release files."""
+    def close(self) -> None:  # noqa: B027 - most sequences hold no files open
+        """Close files that are open."""
 
 
 class PictureFiles(Frames):
-    """One still picture, or those of a folder in the order of their names.
+    """Sequence of still pictures, each of which is a file.
 
-    A file that contains two views is returned with the views side by side.
+    If a file contains two views and both are shown, they are joined side by side.
     """
 
     def __init__(self, paths: Sequence[Path], settings: ContentSettings, *, folder: Path | None = None) -> None:
-        """Open the pictures. Raises InputError.
+        """Read the headers of all pictures, and decode the first picture.
 
-        folder: folder of the pictures, if any. Its files that cannot be decoded are skipped and logged.
+        Args:
+            paths: Files of the pictures, in order.
+            settings: Settings of the content.
+            folder: Folder that contains the pictures, or None for a single file. Films in a folder and files whose
+                headers cannot be read are skipped and logged.
+
+        Raises:
+            InputError: No file can be used, or the first picture cannot be decoded.
         """
         self._background = settings.background or DARK
         self.layouts, self._paths, refused = [], [], []
@@ -84,7 +98,7 @@ class PictureFiles(Frames):
             try:
                 if folder is not None and path.suffix.lower() in VIDEOS:
                     raise InputError(path, "", "is a film: set content.scene to the film itself")
-                header = header_of_file(path)  # the header alone, so that a long sequence opens quickly
+                header = header_of_file(path)  # decoding every picture would take too long
             except InputError as error:
                 refused.append(error)
                 continue
@@ -116,7 +130,7 @@ class PictureFiles(Frames):
 
 
 class Animation(Frames):
-    """An animated picture, decoded as a whole."""
+    """Sequence of the frames of an animated picture, all of which are decoded at the start."""
 
     def __init__(self, path: Path, settings: ContentSettings) -> None:
         self.layouts = [layout_of(path, settings)]
@@ -133,7 +147,7 @@ class Animation(Frames):
 
 
 class Video(Frames):
-    """A video file, decoded by OpenCV while it plays."""
+    """Sequence of the frames of a video file, which OpenCV decodes during playback."""
 
     def __init__(self, path: Path, layout: Layout) -> None:
         self._path, self.layouts = path, [layout]
@@ -166,7 +180,7 @@ class Video(Frames):
         if not done:
             if self._next == 0:
                 raise InputError(self._path, "frames", "the first frame cannot be decoded")
-            self.count = self._next  # containers may claim more frames than they contain
+            self.count = self._next  # containers may declare more frames than they contain
             raise ContentFailure(f"{self._path}: frame {index} cannot be decoded")
         self._next = index + 1
         self._last = np.ascontiguousarray(bgr[..., ::-1], np.uint8)
@@ -180,7 +194,11 @@ class Video(Frames):
 
 
 def layout_in(header: Header, path: Path, settings: ContentSettings, folder: Path | None = None) -> Layout:
-    """Return a picture's layout, from the file if it contains two views, otherwise from its name."""
+    """Return the layout of a picture.
+
+    The layout of a file that contains two views is side by side, unless the settings request a single view or the
+    cross-eyed order. For other files, the settings, the header, or the name of the file or of `folder` determine it.
+    """
     layout = layout_of(path, settings, stated=header.layout)
     if header.is_around:
         layout = replace(layout, span_deg=360)
@@ -192,7 +210,10 @@ def layout_in(header: Header, path: Path, settings: ContentSettings, folder: Pat
 
 
 def open_frames(path: Path, settings: ContentSettings) -> Frames:
-    """Open a picture, an animation, a video or a folder of pictures. Raises InputError."""
+    """Open a picture, an animation, a video or a folder of pictures.
+
+    Raises InputError if the file cannot be shown, or if the folder contains no picture that can be shown.
+    """
     if not path.is_dir():
         if path.suffix.lower() in VIDEOS:
             return _open_film(path, settings)
@@ -204,7 +225,7 @@ def open_frames(path: Path, settings: ContentSettings) -> Frames:
 
 
 def _suggest(path: Path, picture: U8) -> None:
-    """Log a hint if a picture that is shown flat probably has several views."""
+    """Log a hint if a picture that is shown as a single view probably contains several."""
     if "quilt" in path.stem.lower():
         log.warning("%s: if it is a quilt, pass --layout qs8x6a0.75 (columns, rows, aspect ratio of a view)", path)
     elif found := hint(picture):
@@ -224,7 +245,7 @@ def _open_film(path: Path, settings: ContentSettings) -> Video:
 
 
 def _why_none(folder: Path) -> str:
-    """Return the problem of a folder without pictures, for an error message."""
+    """Return an error message that describes why a folder contains no pictures."""
     if problem := camera_set_in(folder):
         return problem
     message = "the folder holds no pictures"
@@ -235,9 +256,10 @@ def _why_none(folder: Path) -> str:
 
 
 def read_pair(path: Path, settings: ContentSettings) -> list[U8]:
-    """Return the left and right eye's views in one file, with square pixels, over white.
+    """Read the views of the left and the right eye from one file.
 
-    Raises InputError if the file contains a single view or a quilt.
+    The views are resized to square pixels, and transparent areas are white. Raises InputError if the file cannot be
+    read, or if it does not contain exactly two views.
     """
     views = read_views(path)
     if len(views) == 2:
