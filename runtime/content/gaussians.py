@@ -1,4 +1,4 @@
-"""Read 3D Gaussian splats (Kerbl et al. 2023) from .ply files, project them and compute colours."""
+"""Read 3D Gaussian splats (Kerbl et al. 2023) from PLY files, project them and compute their colours."""
 
 from __future__ import annotations
 
@@ -21,54 +21,54 @@ from runtime.records import F32, F64
 
 log = logging.getLogger("phasestack.content")
 
-LOW_PASS_PX2 = 0.3  # added to each splat's covariance, so that no splat falls between pixels
-ALPHA_MIN = 1 / 255  # smallest alpha of a splat at a pixel that can change a code value
-LARGEST_COORDINATE = 1e15  # products of two or three such coordinates still fit in float32
+LOW_PASS_PX2 = 0.3  # variance added to the projection of each splat, to keep small splats visible between pixels
+ALPHA_MIN = 1 / 255  # smallest alpha of a splat that can change a pixel's 8-bit value
+LARGEST_COORDINATE = 1e15  # products of two coordinates of this size still fit in float32
 LARGEST_RELATIVE_SCALE = 100.0  # largest scale of a splat, in units of the scene's extent
-STRAY = 1.0  # percentage of the splats, at each end of an axis, that are ignored for the scale
-FAINT = 0.1  # splats with less opacity are ignored for scale and bounds
-REACH = 2.0  # standard deviations of a splat that must be visible
-AT_ONCE = 1 << 17  # splats processed and drawn together, which bounds the memory
-SAMPLED = 10_000  # points whose neighbours are searched
-DOTS, MOST_DOTS = 500, 200_000  # most dots of a line, and of all lines together
-FINEST_POINT, LARGEST_POINT = 5e-4, 0.01  # standard deviation of a point, in units of the scene's extent
-FLAT_HARMONIC = 0.28209479177387814  # harmonic of degree 0
-COEFFICIENTS = (0, 9, 24, 45)  # number of f_rest properties for harmonics up to degree 0, 1, 2, 3
-SOLID = 0.3  # alpha from which a splat counts as a surface; two such splats hide half of the background
-SQUARE = 0.89  # half the side of a square with the area of a disc of radius 1
-LARGEST_STEP = 7  # half sides of squares in blocks: 0, 1, 2, 4 to 64
-PACKED = [0, 1, 2, 4, 5, 8]  # elements of a 3x3 matrix, row by row
+STRAY = 1.0  # percentage of splats that bounds exclude as outliers at each end of an axis
+FAINT = 0.1  # opacity up to which bounds ignore a splat
+REACH = 2.0  # standard deviations of each splat that bounds include
+AT_ONCE = 1 << 17  # number of splats that are processed or drawn together, which limits the memory used
+SAMPLED = 10_000  # approximate number of points from which the spacing of points is estimated
+DOTS, MOST_DOTS = 500, 200_000  # largest number of dots: per line on average, and for all lines together
+FINEST_POINT, LARGEST_POINT = 5e-4, 0.01  # limits of a point's standard deviation, in units of the scene's extent
+FLAT_HARMONIC = 0.28209479177387814  # spherical harmonic of degree 0
+COEFFICIENTS = (0, 9, 24, 45)  # numbers of f_rest properties for harmonics up to degree 0, 1, 2 and 3
+SOLID = 0.3  # alpha above which a splat counts as a surface; two such splats hide half of the background
+SQUARE = 0.89  # half the side of a square that has the area of a disc of radius 1
+LARGEST_STEP = 7  # index of the largest square; its half side is 64 blocks
+PACKED = [0, 1, 2, 4, 5, 8]  # row-major indices of the elements that are stored of a symmetric 3x3 matrix
 
 I64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
 class Gaussians:
-    """Scene of n splats in a common frame."""
+    """Scene of n Gaussian splats in a common frame."""
 
     centres: F32  # (n, 3)
-    covariances: F32  # (n, 6): xx, xy, xz, yy, yz, zz
+    covariances: F32  # (n, 6) elements xx, xy, xz, yy, yz, zz
     opacities: F32  # (n,) in [0, 1]
-    harmonics: F32  # (n, k, 3), k = 1, 4, 9 or 16; directions in the file's frame
+    harmonics: F32  # (n, k, 3) RGB coefficients for k = 1, 4, 9 or 16; directions are in the file's frame
 
 
 @dataclass(frozen=True, slots=True)
 class Splats:
-    """Projections of splats for one eye: ellipses in pixels, farthest first."""
+    """Ellipses in pixels to which m visible splats are projected for one eye, farthest first."""
 
-    index: I64  # (m,) indices of the gaussians
+    index: I64  # (m,) indices of the splats in the scene
     centres_px: F32  # (m, 2)
     major_px: F32  # (m, 2) one standard deviation along the longer axis
-    minor_px: F32  # (m, 2)
-    reach: F32  # (m,) standard deviations at which alpha falls to 1/255
+    minor_px: F32  # (m, 2) one standard deviation along the shorter axis
+    reach: F32  # (m,) number of standard deviations at which alpha falls to 1/255
     opacities: F32  # (m,)
-    nearness: F32  # (m,) 1/m, inverse of the view's third coordinate
+    nearness: F32  # (m,) inverse of the view's third coordinate, in 1/m
 
 
 def load_gaussians(header: PlyHeader) -> Gaussians:
-    """Return the usable splats of a file in the reference implementation's format.
+    """Read the usable splats of a PLY file in the format of the reference implementation.
 
-    Raises InputError if a property is missing or no splat can be drawn.
+    Raises InputError if the file is damaged or not binary, a property is missing, or no splat is visible.
     """
     path, table = header.path, read_elements(header)["vertex"]
     if not len(table):
@@ -79,10 +79,10 @@ def load_gaussians(header: PlyHeader) -> Gaussians:
         raise InputError(path, "f_rest", f"{rest} properties; 0, 9, 24 or 45 are needed")
 
     def columns(*wanted: str) -> F32:
-        """Return the wanted properties as an array (n, len(wanted))."""
+        """Return the named properties as columns of an array."""
         if missing := [name for name in wanted if name not in names]:
             raise InputError(path, missing[0], "the property is missing: not a 3D Gaussian splat file")
-        with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite
+        with np.errstate(over="ignore"):  # doubles beyond the range of float32 become infinite
             return np.column_stack([table[name] for name in wanted]).astype(np.float32)
 
     harmonics = np.empty((len(table), 1 + rest // 3, 3), np.float32)
@@ -101,17 +101,29 @@ def load_gaussians(header: PlyHeader) -> Gaussians:
 
 
 def drawable(path: Path, *, centres: F32, log_scales: F32, quaternions: F32, logits: F32, harmonics: F32) -> Gaussians:
-    """Return the splats that can be drawn: finite, with a rotation, and not much larger than the scene.
+    """Return the splats that can be drawn.
 
-    quaternions: (n, 4) w, x, y, z of any length; logits: (n,) of the opacities. Raises InputError if no splat remains.
+    Splats are dropped if they are not finite, have no rotation, or are much larger than the scene. The log states how
+    many have been dropped.
+
+    Args:
+        path: File of the splats, for messages.
+        centres: Positions (n, 3).
+        log_scales: Natural logarithms (n, 3) of the standard deviations along each splat's axes.
+        quaternions: Rotations (n, 4), ordered w, x, y, z, of any length above 0.
+        logits: Logits (n,) of the opacities.
+        harmonics: Coefficients (n, k, 3) of spherical harmonics.
+
+    Raises:
+        InputError: No visible splat remains.
     """
-    with np.errstate(invalid="ignore"):  # NaN compares as false
+    with np.errstate(invalid="ignore"):  # comparisons with NaN are false
         usable = (np.abs(centres) < LARGEST_COORDINATE).all(1) & (quaternions != 0).any(1) & ~np.isnan(logits)
         for values in (quaternions, harmonics.reshape(len(centres), -1)):
             usable &= np.isfinite(values).all(1)
         some = centres[usable]
         extent = _extent(some) if len(some) else 0.0
-        # Trainers write minus infinity for the thickness of a disc.
+        # The logarithm may be minus infinity, which trainers write for the thickness of a disc.
         usable &= (log_scales < np.log(LARGEST_RELATIVE_SCALE * (extent or 1.0))).all(1)
     if not usable.all():
         log.warning("%s: is drawn without %d of its %d splats, which are unusable", path, (~usable).sum(), len(usable))
@@ -124,19 +136,26 @@ def drawable(path: Path, *, centres: F32, log_scales: F32, quaternions: F32, log
 
 
 def _extent(places: F32) -> float:
-    """Return the longest side of the box around the middle 98 percent of the positions along each axis."""
+    """Return the longest side of a box that excludes one percent of the positions at each end of an axis."""
     return float(np.ptp(np.percentile(places, [1, 99], axis=0), axis=0).max())
 
 
 def flat_harmonics(colours: F32) -> F32:
-    """Return (n, 1, 3) harmonics of degree 0 that show (n, 3) colours from all directions."""
+    """Return harmonics (n, 1, 3) of degree 0 for colours (n, 3) that are the same from all directions."""
     return np.asarray((colours - np.float32(0.5)) / np.float32(FLAT_HARMONIC), np.float32)[:, None]
 
 
 def with_higher(flat: F32, higher: NDArray[Any], *, zero: float = 0.0, unit: float = 1.0) -> F32:
-    """Join flat harmonics (n, 1, 3) and decoded higher ones (n, k - 1, 3) to (n, k, 3).
+    """Decode harmonics of higher degrees and append them to those of degree 0.
 
-    higher: encoded as (value / unit + zero).
+    Args:
+        flat: Coefficients (n, 1, 3) of degree 0.
+        higher: Encoded coefficients (n, k - 1, 3) of higher degrees, each equal to value / unit + zero.
+        zero: Code of the value 0.
+        unit: Difference in value between consecutive codes.
+
+    Returns:
+        Coefficients (n, k, 3) of all degrees.
     """
     harmonics = np.empty((len(flat), 1 + higher.shape[1], 3), np.float32)
     harmonics[:, :1], harmonics[:, 1:] = flat, higher
@@ -146,7 +165,15 @@ def with_higher(flat: F32, higher: NDArray[Any], *, zero: float = 0.0, unit: flo
 
 
 def dotted(ends: F32, colours: F32) -> tuple[F32, F32]:
-    """Convert lines (n, 2, 3) to points (m, 3) with interpolated colours. colours: (n, 2, 3) of the ends."""
+    """Convert lines to dense points, whose colours are interpolated along each line.
+
+    Args:
+        ends: Positions (n, 2, 3) of the ends of each line.
+        colours: Colours (n, 2, 3) of the ends.
+
+    Returns:
+        Positions (m, 3) and colours (m, 3) of the points.
+    """
     lengths = np.nan_to_num(np.linalg.norm(np.diff(ends.astype(np.float64), axis=1)[:, 0], axis=1))
     share = np.minimum(lengths / max(float(lengths.sum()), 1e-30), 1.0)
     counts = 2 + (share * min(DOTS * len(ends), MOST_DOTS)).astype(np.int64)
@@ -158,10 +185,12 @@ def dotted(ends: F32, colours: F32) -> tuple[F32, F32]:
 
 
 def of_points(places: F32, colours: F32) -> Gaussians:
-    """Convert points to small round splats, about as large as the spacing of the points.
+    """Convert points to small round splats whose size is about the spacing of the points.
 
-    colours: (n, 3), 0-1. A point whose colour is NaN is coloured by its position, because a single colour would show
-    only an outline.
+    Args:
+        places: Positions (n, 3) of the points.
+        colours: Colours (n, 3), 0-1. A point whose colour is NaN is coloured by its position, because points of one
+            colour would show nothing but an outline.
     """
     low, high = np.percentile(places, [1, 99], axis=0)
     by_place = 0.25 + 0.7 * np.clip((places - low) / np.maximum(high - low, 1e-30), 0, 1)
@@ -177,9 +206,9 @@ def of_points(places: F32, colours: F32) -> Gaussians:
 
 
 def bounds(gaussians: Gaussians) -> tuple[F64, F64]:
-    """Return the lowest and highest corner (3,) of a box around visible splats, without outliers.
+    """Return the lowest and the highest corner (3,) of a bounding box of the splats.
 
-    The box includes two standard deviations of each splat.
+    The box includes two standard deviations of each splat, but excludes faint splats and outliers.
     """
     seen = gaussians.opacities > FAINT
     seen = seen if seen.any() else np.ones_like(seen)
@@ -191,9 +220,11 @@ def bounds(gaussians: Gaussians) -> tuple[F64, F64]:
 
 
 def covariances_of(scales: F32, quaternions: F32) -> F32:
-    """Return covariances (n, 6), R diag(s²) R^T.
+    """Return the covariances R diag(s²) R^T of splats, packed as (n, 6).
 
-    scales: (n, 3) standard deviations s; quaternions: (n, 4) w, x, y, z of the rotations R.
+    Args:
+        scales: Standard deviations s (n, 3) along each splat's axes.
+        quaternions: Rotations R (n, 4), ordered w, x, y, z, of any length above 0.
     """
     packed = np.empty((len(scales), 6), np.float32)
     for first in range(0, len(scales), AT_ONCE):
@@ -205,7 +236,7 @@ def covariances_of(scales: F32, quaternions: F32) -> F32:
 
 
 def moved(gaussians: Gaussians, target_from_source: F64) -> Gaussians:
-    """Move splats to another frame by a 4x4 similarity. Harmonics keep the directions of the file."""
+    """Transform splats to another frame by a 4x4 similarity. Harmonics stay in the frame of the file."""
     linear = target_from_source[:3, :3]
     centres = gaussians.centres @ linear.T + target_from_source[:3, 3]
     packed = np.empty_like(gaussians.covariances)
@@ -217,9 +248,15 @@ def moved(gaussians: Gaussians, target_from_source: F64) -> Gaussians:
 
 
 def seen_splats(gaussians: Gaussians, view: View, *, nearest_m: float = 1e-3) -> Splats:
-    """Return visible splats, sorted and projected to first order (EWA, Zwicker et al. 2001).
+    """Project the visible splats to first order (EWA, Zwicker et al. 2001), and sort them by distance.
 
-    The view may have any 3x4 projection P, to a panel's pixels or to an eye's image: the Jacobian is (P_i - u_i P_3)/w.
+    The view's 3x4 projection P may lead to the pixels of a panel or to those of an eye's image. The Jacobian of pixel
+    coordinate u_i is (P_i - u_i P_3) / w.
+
+    Args:
+        gaussians: Splats in frame `stack`.
+        view: View for which the splats are projected.
+        nearest_m: Splats whose centre is nearer to the eye than this distance are left out.
     """
     projection = view.pixels_from_stack.astype(np.float32)
     homogeneous = gaussians.centres @ projection[:, :3].T + projection[:, 3]
@@ -245,7 +282,7 @@ def seen_splats(gaussians: Gaussians, view: View, *, nearest_m: float = 1e-3) ->
     keep = np.flatnonzero(inside)
     keep = keep[np.argsort(-w[shown[keep]], kind="stable")]
     a, b, c = a[keep], b[keep], c[keep]
-    # The half-angle gives the eigenvectors of [[a, b], [b, c]], and is exact for b = 0.
+    # This half-angle formula for the eigenvectors of [[a, b], [b, c]] is exact for b = 0.
     mean, swing = (a + c) / 2, np.hypot((a - c) / 2, b)
     angle = np.arctan2(b, (a - c) / 2) / 2
     cosine, sine = np.cos(angle), np.sin(angle)
@@ -262,10 +299,11 @@ def seen_splats(gaussians: Gaussians, view: View, *, nearest_m: float = 1e-3) ->
 
 
 def nearest_blocks(splats: Splats, view: View, *, every: int, first: tuple[int, int]) -> F32:
-    """Return `ContentSource.nearness` (h, w), in 1/m, of the nearest splats whose alpha exceeds `SOLID`.
+    """Return the inverse distances (h, w), in 1/m, of the nearest splats whose alpha exceeds `SOLID`.
 
-    A splat is treated as a square at the distance of its centre. Its width is that of a square of equal area, or less,
-    down to half of it.
+    The arguments and the result are the same as for `ContentSource.nearness`. A splat is treated as a square at the
+    distance of its centre. The square has the area in which alpha exceeds `SOLID`, but half its side is rounded down
+    to 0 or a power of two, in blocks.
     """
     shape = -(-(view.height_px + first[1]) // every), -(-(view.width_px + first[0]) // every)
     solid = np.flatnonzero(splats.opacities > SOLID)  # farthest first
@@ -280,13 +318,16 @@ def nearest_blocks(splats: Splats, view: View, *, every: int, first: tuple[int, 
         near = (abs(u - column[some]) <= reach) & (abs(v - row[some]) <= reach)
         u, v, some = u[near].astype(np.intp), v[near].astype(np.intp), some[near]
         layer = np.zeros(shape, np.float32)
-        layer[v, u] = splats.nearness[solid[some]]  # the last of several splats in a block is the nearest
+        layer[v, u] = splats.nearness[solid[some]]  # the last of several splats in a block, which is the nearest, wins
         np.maximum(nearness, cv2.dilate(layer, np.ones((2 * reach + 1,) * 2, np.uint8)), out=nearness)
     return nearness
 
 
 def harmonic_basis(directions: F32, count: int) -> F32:
-    """Return real spherical harmonics (n, count) with the reference implementation's order and signs."""
+    """Return the first `count` real spherical harmonics (n, count) of unit directions (n, 3).
+
+    Their order and signs are those of the reference implementation.
+    """
     x, y, z = directions.T
     basis = [np.full_like(x, FLAT_HARMONIC)]
     if count > 1:
@@ -311,9 +352,11 @@ def harmonic_basis(directions: F32, count: int) -> F32:
 
 
 def colours_towards(harmonics: F32, directions: F32) -> F32:
-    """Return the colours (n, 3), at least 0, of splats seen along unit directions (n, 3) from the eye.
+    """Return the colours (n, 3) of splats as the eye sees them. Negative values are clipped to 0.
 
-    harmonics: (n, k, 3) coefficients.
+    Args:
+        harmonics: Coefficients (n, k, 3) of spherical harmonics.
+        directions: Unit vectors (n, 3) from the eye to the splats, in the frame of the harmonics.
     """
     if harmonics.shape[1] == 1:
         return np.asarray(np.maximum(harmonics[:, 0] * np.float32(FLAT_HARMONIC) + np.float32(0.5), 0))

@@ -1,4 +1,4 @@
-"""Convert the nodes, primitives and materials of a glTF 2.0 scene, at rest, to parts that are drawn."""
+"""Convert the nodes, primitives and materials of a glTF 2.0 scene to parts, without its animations."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ POINTS, LINES, LOOP, LINE_STRIP, TRIANGLES, STRIP, FAN = range(7)  # modes of pr
 WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 NEAREST = 9728
 PLACES = {"TRANSLATION": "translation", "ROTATION": "rotation", "SCALE": "scale"}  # attributes of instances
-OWN_PROBLEMS = ("an accessor", "bufferViews[", "a primitive", "a data URI")  # how our own messages begin
+OWN_PROBLEMS = ("an accessor", "bufferViews[", "a primitive", "a data URI")  # first words of this reader's own messages
 DRACO = "KHR_draco_mesh_compression"
 INSTANCES = "EXT_mesh_gpu_instancing"
 GLOSSY = "KHR_materials_pbrSpecularGlossiness"
@@ -32,7 +32,7 @@ DRAWN = {
     "KHR_mesh_quantization", "EXT_texture_webp", "EXT_texture_avif", INSTANCES,
 }  # fmt: skip
 UNSEEN = {"KHR_materials_ior", "KHR_materials_specular", "KHR_materials_variants", "KHR_xmp_json_ld"}
-# A file that requires one of these is drawn without it.
+# Extensions that are ignored, even if a file requires them.
 WITHOUT = UNSEEN | {
     "KHR_lights_punctual", "KHR_materials_clearcoat", "KHR_materials_sheen", "KHR_materials_transmission",
     "KHR_materials_volume", "KHR_materials_anisotropy", "KHR_materials_iridescence", "KHR_materials_dispersion",
@@ -41,17 +41,23 @@ WITHOUT = UNSEEN | {
 
 
 class GltfScene:
-    """Parts of the scene in a file, and descriptions of what is not drawn."""
+    """Loads the scene of a glTF file as parts and points, and records the features that are not drawn."""
 
     def __init__(self, path: Path, data: bytes, read: Read) -> None:
-        """Read a scene. Raises InputError for a file that cannot be drawn.
+        """Load a scene.
 
-        Such a file is not glTF 2.0, is damaged, exceeds a limit, or requires an unsupported extension.
+        Args:
+            path: File of the scene.
+            data: Contents of the file, as glTF or GLB.
+            read: Function that reads other files to which the scene refers.
+
+        Raises:
+            InputError: The file is not glTF 2.0, is damaged, exceeds a limit, or requires an unsupported extension.
         """
         self.path = path
         self.parts: list[Part] = []
-        self.points: list[tuple[F32, F32]] = []  # (n, 3) positions and (n, 3) sRGB colours, 0-1
-        self.left_out: set[str] = set()
+        self.points: list[tuple[F32, F32]] = []  # positions (n, 3) and sRGB colours (n, 3), 0-1
+        self.left_out: set[str] = set()  # features that are not drawn
         try:
             self.file = GltfFile(path, data, read)
             self._check()
@@ -78,7 +84,7 @@ class GltfScene:
         return corners // 3 if primitive.get("mode", TRIANGLES) <= TRIANGLES else corners
 
     def _instances(self, node: Table) -> int:
-        """Return the number of instances of a node's mesh (EXT_mesh_gpu_instancing)."""
+        """Return the number of instances of a node's mesh, which EXT_mesh_gpu_instancing may multiply."""
         own = node.get("extensions", {}).get(INSTANCES, {}).get("attributes", {})
         return min((self.file.count(index) for name, index in own.items() if name in PLACES), default=1)
 
@@ -89,7 +95,7 @@ class GltfScene:
         return [matrix @ _local({name: rows[k] for name, rows in read.items()}) for k in range(self._instances(node))]
 
     def _textures(self) -> Iterator[Table]:
-        """Yield the texture references of the material properties that are drawn (not of normal maps)."""
+        """Yield the texture references of all materials, except for properties that are not drawn."""
         for material in self.file.all("materials"):
             glossy = material.get("extensions", {}).get(GLOSSY, {})
             base = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
@@ -110,7 +116,10 @@ class GltfScene:
         self.left_out |= {str(name) for name in file.table.get("extensionsUsed", [])} - DRAWN - UNSEEN - {*COMPRESSED}
 
     def _world(self) -> dict[int, tuple[Table, F64]]:
-        """Return each node and its 4x4 scene_from_node, by number. Raises InputError if nested too deep."""
+        """Return the nodes of the scene by number, each with its 4x4 matrix scene_from_node.
+
+        Raises InputError if nodes are nested too deep.
+        """
         nodes, scenes = self.file.all("nodes"), self.file.all("scenes")
         children = {child for node in nodes for child in node.get("children", [])}
         roots = [number for number in range(len(nodes)) if number not in children]
@@ -129,7 +138,7 @@ class GltfScene:
         return placed_nodes
 
     def _joints(self, node: Table, world: dict[int, tuple[Table, F64]]) -> F64:
-        """Return scene_from_mesh (j, 4, 4) for the joints of a node's skin at rest (section 3.7.3)."""
+        """Return matrices scene_from_mesh (j, 4, 4) for the joints of a node's skin (section 3.7.3)."""
         skin = self.file.item("skins", node["skin"])
         stand = np.array([world[joint][1] if joint in world else np.eye(4) for joint in skin["joints"]])
         if "inverseBindMatrices" not in skin:
@@ -138,9 +147,12 @@ class GltfScene:
         return np.asarray(stand @ columns[: len(stand)].transpose(0, 2, 1))
 
     def _add(self, primitive: Table, *, weights: list[float], matrices: F64) -> None:
-        """Add the triangles, lines or points of a primitive.
+        """Add the triangles, lines or points of a primitive to the scene.
 
-        matrices: one 4x4 scene_from_mesh or, for a skinned mesh, one per joint.
+        Args:
+            primitive: Primitive as described in the file.
+            weights: Weights of the primitive's morph targets.
+            matrices: Matrix scene_from_mesh (4, 4) or, for a skinned mesh, one matrix (j, 4, 4) for each joint.
         """
         file, mode = self.file, primitive.get("mode", TRIANGLES)
         if "POSITION" not in primitive["attributes"]:
@@ -153,8 +165,8 @@ class GltfScene:
         faces = _faces(corners, mode)
         has_normals = "NORMAL" in primitive["attributes"] and mode >= TRIANGLES
         if has_normals or mode < TRIANGLES:
-            rows, faces = np.unique(faces, return_inverse=True)  # vertices of other primitives are dropped
-        else:  # flat shading: triangles share no vertices (section 3.7.2.1)
+            rows, faces = np.unique(faces, return_inverse=True)  # drop vertices that only other primitives use
+        else:  # flat shading requires that triangles share no vertices (section 3.7.2.1)
             rows, faces = faces.reshape(-1), np.arange(faces.size).reshape(-1, 3)
 
         def attribute(name: str) -> F32 | None:
@@ -194,7 +206,12 @@ class GltfScene:
         self.parts.append(Part(shape, vertex_colours=colours, is_linear=not is_plain, **look))
 
     def _skinned(self, joints: F64, attribute: Any) -> F64:
-        """Return a matrix (v, 4, 4) for each vertex: the weighted mean of its joints' matrices."""
+        """Return matrices (v, 4, 4) for all vertices, each a weighted mean of the matrices of joints.
+
+        Args:
+            joints: Matrices (j, 4, 4) of all joints.
+            attribute: Function that returns a vertex attribute by name, or None.
+        """
         names, weights = attribute("JOINTS_0"), attribute("WEIGHTS_0")
         for number in range(1, 4):
             if (more := attribute(f"JOINTS_{number}")) is not None:
@@ -207,7 +224,11 @@ class GltfScene:
         return total
 
     def _draco(self, primitive: Table) -> tuple[dict[str, Array], Array | None]:
-        """Return the attributes and vertex indices of a primitive if it is Draco-compressed, else nothing."""
+        """Decode the attributes and the vertex indices of a primitive that is compressed with Draco.
+
+        The results are empty and None if the primitive is not compressed, or if DracoPy is not installed and the file
+        contains the same data uncompressed. Raises InputError if compressed data are needed but cannot be decoded.
+        """
         own = primitive.get("extensions", {}).get(DRACO)
         if own is None:
             return {}, None
@@ -215,7 +236,7 @@ class GltfScene:
             import DracoPy
         except ImportError:
             accessors = [self.file.item("accessors", index) for index in primitive["attributes"].values()]
-            if all("bufferView" in accessor for accessor in accessors):  # the file has the same data uncompressed
+            if all("bufferView" in accessor for accessor in accessors):  # the file contains the same data uncompressed
                 return {}, None
             problem = f"Draco needs `pip install 'phasestack[draco]'`; or {WAY_OUT}"
             raise InputError(self.path, DRACO, problem) from None
@@ -233,7 +254,11 @@ class GltfScene:
         return values, np.asarray(decoded.faces).reshape(-1)
 
     def _look(self, index: int | None) -> tuple[dict[str, Any], Table]:
-        """Return a material's fields of `Part`, with linear colours, and how its texture is applied."""
+        """Convert a material to fields of `Part`, with linear colours.
+
+        Returns:
+            The fields, and the reference from the material to its texture, which states the texture coordinates.
+        """
         file, material = self.file, {} if index is None else self.file.item("materials", index)
         own = material.get("extensions", {})
         base, prefix = material.get("pbrMetallicRoughness", {}), "baseColor"
@@ -268,7 +293,7 @@ class GltfScene:
 
 
 def _problem(error: Exception) -> str:
-    """Describe the fault of a file, given the error that reading it raised."""
+    """Return a description of the error that was raised while reading a file."""
     if isinstance(error, KeyError):
         return f"{untrusted_input.shown(str(error))} is missing"
     if isinstance(error, IndexError):
@@ -278,7 +303,7 @@ def _problem(error: Exception) -> str:
 
 
 def _local(node: Table) -> F64:
-    """Return a node's 4x4 parent_from_node."""
+    """Return the 4x4 matrix parent_from_node of a node."""
     if "matrix" in node:
         return np.asarray(np.array(node["matrix"], np.float64).reshape(4, 4).T)
     x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))
@@ -291,9 +316,9 @@ def _local(node: Table) -> F64:
 
 
 def _faces(corners: Array, mode: int) -> Array:
-    """Group `corners` into triangles (t, 3), lines (n, 2) or points (n,), as `mode` says (3.7.2.1).
+    """Group vertex indices into triangles (t, 3), lines (n, 2) or points (n,), depending on the mode.
 
-    Raises ValueError for an unknown mode.
+    Section 3.7.2.1 defines the modes. Raises ValueError if the mode is unknown.
     """
     corners = np.asarray(corners).astype(np.int64)
     if mode == POINTS:
@@ -319,7 +344,7 @@ def _coordinates(use: Table) -> tuple[int, Table]:
 
 
 def _transformed(uv: F32, use: Table) -> F32:
-    """Apply KHR_texture_transform to texture coordinates: scale, rotate, shift."""
+    """Scale, rotate and then shift texture coordinates (v, 2) according to KHR_texture_transform."""
     own = _coordinates(use)[1]
     if not own:
         return uv

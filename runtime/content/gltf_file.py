@@ -1,7 +1,7 @@
-"""Read the container of a glTF 2.0 file: its JSON, buffers, accessors and pictures.
+"""Read the JSON, the buffers, the accessors and the pictures of a glTF 2.0 file.
 
-No library is used for this: trimesh drops samplers, sparse accessors and normalized integers, pygltflib does not decode
-accessors, and assimp-py does not return embedded pictures.
+No existing library is suitable: trimesh drops samplers, sparse accessors and normalized integers, pygltflib does not
+decode accessors, and assimp-py does not return embedded pictures.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from runtime.support.untrusted_input import LIMITS
 
 Table = dict[str, Any]
 Array = NDArray[Any]
-Read = Callable[[str], bytes]  # reads a file in the same folder, given its URI or name
+Read = Callable[[str], bytes]  # reads a file to which the scene refers, given its URI or name
 
-ELEMENTS_PER_TRIANGLE = 10  # gives the limit for all accessors together, from the limit on triangles
+ELEMENTS_PER_TRIANGLE = 10  # most elements in all accessors together, per triangle that the limits allow
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 SHAPES = {"SCALAR": (1,), "VEC2": (2,), "VEC3": (3,), "VEC4": (4,), "MAT2": (2, 2), "MAT3": (3, 3), "MAT4": (4, 4)}
-PICTURE_EXTENSIONS = ("EXT_texture_webp", "EXT_texture_avif")  # others, such as KTX2, are not decoded
+PICTURE_EXTENSIONS = ("EXT_texture_webp", "EXT_texture_avif")  # formats that are decoded, unlike KTX2
 COMPRESSED = {
     "KHR_draco_mesh_compression": "Draco",
     "EXT_meshopt_compression": "meshopt",
@@ -43,7 +43,11 @@ WAY_OUT = "save it without that compression, in Blender or with `gltf-transform`
 
 
 class GltfFile:
-    """One glTF file. Raises LookupError, TypeError or ValueError if malformed, otherwise InputError."""
+    """Reads the objects of a glTF 2.0 file by number.
+
+    All methods raise LookupError, TypeError or ValueError if the file is malformed, and InputError if data are missing,
+    unsupported or larger than a limit.
+    """
 
     def __init__(self, path: Path, data: bytes, read: Read) -> None:
         text, self._binary = (data, b"") if data[:4] != b"glTF" else _chunks(path, data)
@@ -60,12 +64,12 @@ class GltfFile:
             untrusted_input.within(elements, most, source=path, field=f"accessors[{number}].count")
 
     def all(self, kind: str) -> list[Table]:
-        """Return all objects of a kind, such as `meshes`, or an empty list if the file has none."""
+        """Return all objects of a kind, such as `meshes`. The list is empty if the file contains none."""
         objects: list[Table] = self.table.get(kind, [])
         return objects
 
     def item(self, kind: str, index: int) -> Table:
-        """Return one object of a kind. Raises IndexError if it is missing or the index is negative."""
+        """Return an object by kind and index. Raises IndexError if the index is negative or too large."""
         items = self.all(kind)
         return items[range(len(items))[index]]
 
@@ -73,9 +77,12 @@ class GltfFile:
         return _count(self.item("accessors", accessor))
 
     def accessor(self, index: int, *, rows: Array | None = None, as_float: bool = True) -> Array:
-        """Return the elements (n, ...) of an accessor, or only some rows of them.
+        """Return the elements (n, ...) of an accessor.
 
-        as_float: True to convert to float32 with `fractions`; False to return the numbers as stored.
+        Args:
+            index: Number of the accessor.
+            rows: Indices of the elements to return. All elements are returned by default.
+            as_float: Convert the elements to float32 with `fractions`. If False, numbers are returned as stored.
         """
         accessor = self.item("accessors", index)
         values = self._stored(accessor)
@@ -89,11 +96,11 @@ class GltfFile:
         return fractions(values, accessor) if as_float else values
 
     def _stored(self, accessor: Table) -> Array:
-        """Return a strided view of an accessor's bytes; zeros if it has no buffer view."""
+        """Return a strided view of the bytes of an accessor, or zeros if the accessor has no buffer view."""
         count, shape = _count(accessor), SHAPES[accessor["type"]]
         dtype = np.dtype(COMPONENTS[accessor["componentType"]])
         column = shape[0] * dtype.itemsize
-        # Columns of matrices start at multiples of four bytes.
+        # Each column of a matrix starts at a multiple of four bytes.
         steps = (column,) if len(shape) == 1 else (-(-column // 4) * 4, dtype.itemsize)
         size = column if len(shape) == 1 else steps[0] * shape[1]
         strides = (dtype.itemsize,) if len(shape) == 1 else steps
@@ -108,7 +115,7 @@ class GltfFile:
         return np.ndarray((count, *shape), dtype, data, first, (stride, *strides))
 
     def view(self, index: int) -> tuple[memoryview, int]:
-        """Return the bytes of a buffer view, and its stride (0: elements are contiguous)."""
+        """Return the bytes of a buffer view, and its stride in bytes, which is 0 if elements are contiguous."""
         view = self.item("bufferViews", index)
         number, first, size = view["buffer"], view.get("byteOffset", 0), view["byteLength"]
         buffer = self._buffer(number)
@@ -144,7 +151,10 @@ class GltfFile:
             raise ValueError(f"a data URI that is not base64: {error}") from None
 
     def picture(self, texture: Table) -> U8:
-        """Return a texture's picture, (h, w, 4) RGBA. Its header must have been checked. Raises InputError."""
+        """Return the picture of a texture as an RGBA array (h, w, 4).
+
+        `check_pictures` must have checked the picture before. Raises InputError if the picture cannot be decoded.
+        """
         number = self._image_of(texture)
         if number not in self._pictures:
             image = decoded_picture(self._coded(number), source=self.path, field="texture", name=f"images[{number}]")
@@ -152,7 +162,10 @@ class GltfFile:
         return self._pictures[number]
 
     def check_pictures(self, textures: list[Table]) -> None:
-        """Check all pictures' headers before any is decoded. Raises InputError."""
+        """Check the headers of all pictures before any picture is decoded.
+
+        Raises InputError if a picture or all pictures together have too many pixels.
+        """
         pixels = 0
         for number in sorted({self._image_of(texture) for texture in textures}):
             coded = self._coded(number)
@@ -163,7 +176,10 @@ class GltfFile:
             untrusted_input.within(pixels, LIMITS.texture_pixels, source=self.path, field="textures' pixels")
 
     def _image_of(self, texture: Table) -> int:
-        """Return the number of a texture's image. If extensions offer several, it is one that can be decoded."""
+        """Return the number of a texture's image, preferring images in the formats of extensions.
+
+        Raises InputError if the texture has no image in a supported format.
+        """
         own: Table = texture.get("extensions", {})
         for offered in (*(own[name] for name in PICTURE_EXTENSIONS if name in own), texture):
             if offered.get("source") is not None:
@@ -174,13 +190,13 @@ class GltfFile:
         raise InputError(self.path, "textures", problem)
 
     def _coded(self, number: int) -> bytes:
-        """Return an image's encoded bytes."""
+        """Return the encoded bytes of an image."""
         image = self.item("images", number)
         return self._of_uri(image["uri"]) if "uri" in image else bytes(self.view(image["bufferView"])[0])
 
 
 def fractions(values: Array, accessor: Table) -> F32:
-    """Return an accessor's numbers as floats; normalized integers become fractions (3.6.2.2)."""
+    """Convert numbers of an accessor to float32. Normalized integers become fractions (section 3.6.2.2)."""
     floats = np.asarray(values, np.float32)
     if accessor.get("normalized", False) and values.dtype.kind in "iu":
         floats = np.maximum(floats / np.float32(np.iinfo(values.dtype).max), np.float32(-1.0))
@@ -195,7 +211,7 @@ def _count(accessor: Table) -> int:
 
 
 def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
-    """Return the JSON and the buffer of a GLB."""
+    """Return the JSON text and the binary buffer of a GLB file. Raises InputError if the file is cut off."""
     if int.from_bytes(data[4:8], "little") == 1:
         raise InputError(path, "asset.version", VERSION_1)
     size = int.from_bytes(data[12:16], "little")

@@ -1,4 +1,4 @@
-"""Warp pictures with a known projection to the raster of a view."""
+"""Warp pictures whose projection is known to the raster of a view."""
 
 from __future__ import annotations
 
@@ -17,24 +17,34 @@ _MINUS_HALF = np.array([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5], [0.0, 0.0, 1.0]])
 
 
 def rgba_from_rgb(rgb: U8) -> U8:
-    """Return an (h, w, 3) RGB picture as opaque (h, w, 4) RGBA, which warps in half the time."""
+    """Convert an RGB picture (h, w, 3) to opaque RGBA (h, w, 4), which OpenCV warps in half the time."""
     return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA))
 
 
 def image_from_view(image_from_stack: F64, pixels_from_stack: F64, *, x_m: float) -> F64 | None:
-    """Return the 3x3 map to picture pixels from view pixels through the plane x = `x_m`.
+    """Return the 3x3 homography from the pixels of a view to those of a picture that appears on a plane.
 
-    If picture and view belong to the same eye, every plane gives the same matrix; otherwise the picture appears in
-    this plane. The result is None for an eye in the plane.
+    The choice of the plane does not matter if the picture and the view belong to the same eye position.
+
+    Args:
+        image_from_stack: Projection (3, 4) to the pixels of the picture.
+        pixels_from_stack: Projection (3, 4) to the pixels of the view.
+        x_m: The plane is x = `x_m` in frame `stack`.
+
+    Returns:
+        The homography, or None if the eye of the view is in the plane.
     """
-    # The pixels of this raster are metres: u is y, v is -z.
+    # The pixel coordinates of this raster are metres along y (u) and -z (v).
     plane = PlaneRaster(x_m=x_m, left_m=0.0, top_m=0.0, pitch_u_m=1.0, pitch_v_m=1.0, width_px=1, height_px=1)
     plane_from_view = plane_from_pixels(pixels_from_stack, plane)
     return None if plane_from_view is None else image_from_raster(image_from_stack, plane) @ plane_from_view
 
 
 def plane_from_pixels(pixels_from_stack: F64, plane: PlaneRaster) -> F64 | None:
-    """Return the 3x3 map to a plane's pixels from a view's, or None for an eye in the plane."""
+    """Return the 3x3 homography from the pixels of a view to the pixels of a plane.
+
+    The result is None if the eye of the view is in the plane.
+    """
     try:
         return panel_from_image(pixels_from_stack, plane)
     except ValueError:
@@ -42,7 +52,11 @@ def plane_from_pixels(pixels_from_stack: F64, plane: PlaneRaster) -> F64 | None:
 
 
 def reduction(picture_from_view: F64, view: View) -> int:
-    """Return how often to halve a picture before a warp, so that a sample covers at most 1.5 pixels."""
+    """Return how often to halve a picture before a warp, which limits aliasing.
+
+    Neighbouring pixels at the middle of the view are then less than 1.5 pixels of the picture apart, along at least one
+    axis of the view.
+    """
     middle = np.array([view.width_px, view.height_px]) / 2 + np.array([[0, 0], [1, 0], [0, 1]])
     mapped = cv2.perspectiveTransform(middle[None], picture_from_view)[0]
     steps = np.linalg.norm(mapped[1:] - mapped[0], axis=1)
@@ -50,7 +64,7 @@ def reduction(picture_from_view: F64, view: View) -> int:
 
 
 class WarpedPicture:
-    """RGBA picture with reduced copies, which can be warped to a view's raster."""
+    """Picture that can be warped to the raster of a view. Reduced copies of the picture limit aliasing."""
 
     def __init__(self, rgba: U8, *, background: tuple[float, float, float]) -> None:
         self._levels = [np.ascontiguousarray(rgba)]
@@ -58,9 +72,15 @@ class WarpedPicture:
         self._out: dict[tuple[int, int, int], U8] = {}
 
     def warped(self, picture_from_view: F64 | None, view: View) -> U8:
-        """Return the picture (h, w, 4) on the view's raster. Outside it, the background has alpha 0.
+        """Return the picture warped to the view's raster, as an RGBA array (h, w, 4).
 
-        The next call with the same size and side overwrites the array.
+        Pixels outside the picture have the background's colour and alpha 0. The next call for the same size and side
+        overwrites the array.
+
+        Args:
+            picture_from_view: Homography (3, 3) from the pixels of the view to those of the picture. If None, only the
+                background is drawn.
+            view: View whose raster is used.
         """
         key = (view.width_px, view.height_px, view.side)
         if key not in self._out:

@@ -1,4 +1,7 @@
-"""Find the arrangement of a picture's views from a setting, its name or the similarity of its halves."""
+"""Determine how views are arranged in a picture.
+
+The arrangement follows from settings, file headers or file names. The similarity of a picture's halves gives a hint.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +19,8 @@ from runtime.records import U8
 
 QUILT = re.compile(r"(?<![a-z0-9])qs([0-9]{1,6})x([0-9]{1,6})(?:a([0-9]*\.?[0-9]+))?(?![0-9])")
 ASPECT_MIN, ASPECT_MAX = 0.05, 20.0  # width over height of one view
-RIGHT_FIRST = (".jps", ".pns")  # these formats are side by side and cross-eyed by convention
-MARKS = {  # words that may be anywhere in a name
+RIGHT_FIRST = (".jps", ".pns")  # formats that are side by side and cross-eyed by convention
+MARKS = {  # words that are accepted anywhere in a name
     "half-side-by-side": "(half|h) ?(sbs|side by side|lr|left right)|sbs h(alf)?",
     "half-top-bottom": "(half|h) ?(tb|tab|over under|top bottom)|(half|h|3d) (ou|hou)|halfou|(ou|tb|tab) half",
     "cross-eyed": "cross ?eyed?|crossview|sbs rl",
@@ -26,54 +29,56 @@ MARKS = {  # words that may be anywhere in a name
     "anaglyph": "anaglyph",
     "rgbd": "rgbd",
 }
-LAST_MARKS = {  # ambiguous words: accepted only at the end, before words with digits such as 1080p
+LAST_MARKS = {  # ambiguous words, accepted only at the end or before words with digits such as 1080p
     "half-top-bottom": "hou",
     "cross-eyed": "rl|right left",
     "side-by-side": "lr|left right|2x1|parallel",
     "top-bottom": "ou|tb|tab|top bottom|1x2",
 }
-COPY = re.compile(r"( copy)?( ?\([0-9]+\))?$")  # suffix added by a browser or desktop to a second download
-NARROW, LOW = 2.5, 1.28  # below NARROW or above LOW (width over height), a film's two views are squeezed
-FULL = re.compile(r"(^|[^a-z])(full|fsbs|ftb|fou)")  # in a film's name: its views are not squeezed
-ALIKE = 0.8  # correlation above which halves may be two views
-SMALL_PX = (64, 48)  # size of halves for comparison
-SHIFT_PX = 6  # largest shift between views, in these pixels
-ROUGH = 6.0  # standard deviation in codes; smoother halves always agree, so they are not compared
+COPY = re.compile(r"( copy)?( ?\([0-9]+\))?$")  # suffix that a browser or desktop adds to the name of a copy
+NARROW, LOW = 2.5, 1.28  # a film's aspect ratio below (side-by-side) or above (top-bottom) which views are squeezed
+FULL = re.compile(r"(^|[^a-z])(full|fsbs|ftb|fou)")  # mark in a film's name if its views are not squeezed
+ALIKE = 0.8  # correlation above which the halves of a picture may be two views
+SMALL_PX = (64, 48)  # size to which halves are reduced for comparison
+SHIFT_PX = 6  # largest shift between views, in pixels of the reduced halves
+ROUGH = 6.0  # standard deviation in 8-bit values; smoother halves always correlate, so they are not compared
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Arrangement of the views in a picture."""
+    """Arrangement of views in a picture, by which `views` splits a picture into its views."""
 
     kind: str  # mono, rgbd, quilt, side-by-side, top-bottom or anaglyph
     columns: int = 1
     rows: int = 1
-    half: bool = False  # the views are squeezed to half their width or height
-    right_first: bool = False  # the right eye's view comes first
-    span_deg: int = 0  # longitude covered by equirectangular views; 0: flat views
-    view_aspect: float = 0.0  # width over height of a quilt's views; 0: as given by their pixels
+    half: bool = False  # True if the views are squeezed to half their width or height
+    right_first: bool = False  # True if the right eye's view comes first
+    span_deg: int = 0  # longitude that equirectangular views cover, or 0 for flat views
+    view_aspect: float = 0.0  # width over height of a quilt's views, or 0 if their pixels are square
 
     def views(self, picture: U8) -> list[U8]:
-        """Return the views of a picture. Equirectangular ones are cropped straight ahead.
+        """Split a picture into its views, in the order of `parts`. Equirectangular views are cropped.
 
-        Raises ValueError if the picture is too small (`parts`).
+        The crop is the part of a view that is straight ahead. Raises ValueError if the picture is smaller than one
+        pixel per view.
         """
         parts = self.parts(picture)
         height, width = parts[0].shape[:2]
-        squeezed = (1.0, 0.5, 2.0) if len(parts) == 2 else (1.0,)  # whether or not the name states it
+        squeezed = (1.0, 0.5, 2.0) if len(parts) == 2 else (1.0,)  # names need not state that views are squeezed
         if not self.span_deg or not any(is_around(width * by, height, self.span_deg) for by in squeezed):
             return parts
         return [ahead(part, self.span_deg) for part in parts]
 
     def parts(self, picture: U8) -> list[U8]:
-        """Return [left, right], a single view, or a quilt's views from the leftmost camera to the rightmost.
+        """Split a picture into its views, without cropping them.
 
+        The result is [left, right], a single view, or the views of a quilt from the leftmost to the rightmost camera.
         Raises ValueError if the picture is smaller than one pixel per view.
         """
         height, width = picture.shape[:2]
         if not 0 < self.columns <= width or not 0 < self.rows <= height:
             raise ValueError(f"{width} x {height} pixels cannot hold {self.columns} x {self.rows} views")
-        if self.kind == "anaglyph":  # red is the left eye's, cyan the right eye's
+        if self.kind == "anaglyph":  # the left eye's view is red, the right eye's view is cyan
             cyan = cv2.addWeighted(picture[..., 1], 0.8, picture[..., 2], 0.2, 0)
             return [np.repeat(np.asarray(part)[..., None], 3, axis=2) for part in (picture[..., 0], cyan)]
         wide, high = width // self.columns, height // self.rows
@@ -81,7 +86,7 @@ class Layout:
             rows, columns = (0, height - high)[: self.rows], (0, width - wide)[: self.columns]
             views = [picture[v : v + high, u : u + wide] for v in rows for u in columns]
             return views[::-1] if self.right_first else views
-        # The first view is at the bottom left; the views continue rightwards, then upwards.
+        # A quilt starts at the bottom left and continues to the right, then upwards.
         return [
             picture[height - (row + 1) * high : height - row * high, column * wide : (column + 1) * wide]
             for row in range(self.rows)
@@ -89,17 +94,26 @@ class Layout:
         ]
 
     def pixel_aspect(self, *, width_px: int, height_px: int) -> float:
-        """Return the aspect ratio (width over height) of the pixels of a view of this size."""
+        """Return the aspect ratio (width over height) of pixels in a view that has the given size."""
         if self.half:
             return float(self.columns) if self.columns > 1 else 1 / self.rows
         return self.view_aspect * height_px / width_px if self.view_aspect else 1.0
 
 
-MONO, PAIR = Layout("mono"), Layout("side-by-side", columns=2)  # PAIR: two pictures in one file
+MONO, PAIR = Layout("mono"), Layout("side-by-side", columns=2)  # PAIR is for files that contain two pictures
 
 
 def layout_of(path: Path, settings: ContentSettings, *, stated: str = "") -> Layout:
-    """Return a file's layout: as set, as `stated` in the file, or by its name. Raises InputError."""
+    """Return the layout of a file from the settings, its header, or its name, in this order.
+
+    Args:
+        path: File or folder, whose name may contain the layout.
+        settings: Settings of the content.
+        stated: Layout that the file's header declares, in the syntax of `content.layout`, or an empty string.
+
+    Raises:
+        InputError: A quilt has no views, or an implausible aspect ratio.
+    """
     named = settings.layout
     if named == "auto":
         named = stated or _named(path)
@@ -119,9 +133,13 @@ def layout_of(path: Path, settings: ContentSettings, *, stated: str = "") -> Lay
 
 
 def of_film(layout: Layout, path: Path, *, width_px: int, height_px: int) -> Layout:
-    """Return a film's layout. Its views count as squeezed if the picture has the shape of a single view.
+    """Return the layout of a film, whose views are squeezed if the frame has the shape of a single view.
 
-    layout: as given by the name.
+    Args:
+        layout: Layout that the film's name or header states.
+        path: File of the film. Views are not squeezed if its name says so.
+        width_px: Width of a frame.
+        height_px: Height of a frame.
     """
     aspect = width_px / height_px
     squeezed = {"side-by-side": aspect < NARROW, "top-bottom": aspect > LOW}.get(layout.kind, False)
@@ -130,7 +148,7 @@ def of_film(layout: Layout, path: Path, *, width_px: int, height_px: int) -> Lay
 
 
 def _named(path: Path) -> str:
-    """Return the layout given by a file or folder name, in the syntax of `content.layout`."""
+    """Return the layout that a file or folder name states, in the syntax of `content.layout`."""
     if path.suffix.lower() in RIGHT_FIRST:
         return "cross-eyed"
     stem = COPY.sub("", path.name if path.is_dir() else path.stem).lower()
@@ -145,7 +163,7 @@ def _named(path: Path) -> str:
 
 
 def _span_deg(path: Path) -> int:
-    """Return 360 or 180 if the name contains such a word; `views` also checks the shape."""
+    """Return the longitude that a file name states, 360 or 180 degrees, or 0 if the name states none."""
     words = re.split(r"[^a-z0-9]+", path.stem.lower())
     if {"180", "vr180", "180x180"} & set(words):
         return 180
@@ -153,7 +171,10 @@ def _span_deg(path: Path) -> int:
 
 
 def hint(picture: U8) -> str:
-    """Return the layout that a picture probably has because its halves nearly agree, otherwise ""."""
+    """Return the layout that a picture probably has, or an empty string.
+
+    The halves of a picture are probably two views if they correlate after a small shift.
+    """
     for layout in ("side-by-side", "top-bottom"):
         columns = 2 if layout == "side-by-side" else 1
         if min(picture.shape[0] * columns, picture.shape[1] * (3 - columns)) < 4 * SMALL_PX[0]:
@@ -169,6 +190,9 @@ def hint(picture: U8) -> str:
 
 
 def _detail(view: U8) -> U8:
-    """Reduce a view to a small grey picture, high-pass filtered because any two skies are alike."""
+    """Reduce a view to a small grey picture for comparison.
+
+    The picture is high-pass filtered, because smooth areas such as skies always look alike.
+    """
     small = cv2.cvtColor(cv2.resize(view, SMALL_PX, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
     return np.asarray(small.astype(np.float32) - cv2.GaussianBlur(small, (0, 0), 8).astype(np.float32), np.float32)
