@@ -1,4 +1,4 @@
-"""Read meshes (glTF/GLB, OBJ, OFF, PLY and STL). They are drawn with one lamp."""
+"""Read meshes from glTF, GLB, OBJ, OFF, PLY and STL files."""
 
 from __future__ import annotations
 
@@ -28,25 +28,29 @@ from runtime.support.untrusted_input import LIMITS
 
 log = logging.getLogger("phasestack.content")
 
-STL_HEAD, STL_FACET = 84, 50  # bytes of a binary file's header and of each triangle
-UNREAD = ("tristrips", "edge")  # elements of a PLY that are not drawn
+STL_HEAD, STL_FACET = 84, 50  # sizes in bytes of a binary file's header and of a triangle
+UNREAD = ("tristrips", "edge")  # elements of PLY files that are not drawn
 OFF_COUNTS = re.compile(rb"^\s*[A-Z4n]*OFF\s+(?:#.*\s+)*(\d{1,18})\s+(\d{1,18})")
 
 
 @dataclass(frozen=True, slots=True)
 class MeshData:
-    """A loaded mesh, in the file's coordinates."""
+    """Triangles or points of a mesh file, in the file's coordinates."""
 
     parts: tuple[Part, ...]
-    points: tuple[tuple[F32, F32], ...]  # (n, 3) positions and colours, drawn only if there are no parts
-    low: F64  # (3,) lowest corner of its bounding box
-    high: F64
-    facing: F64  # (3,) area-weighted mean normal; its length is at most 1, and 0 for a closed surface
-    left_out: tuple[str, ...] = ()  # descriptions of what is not drawn
+    points: tuple[tuple[F32, F32], ...]  # positions (n, 3) and colours (n, 3); empty if there are parts
+    low: F64  # (3,) lowest corner of the bounding box
+    high: F64  # (3,) highest corner of the bounding box
+    facing: F64  # (3,) area-weighted mean normal; the length is at most 1, and 0 for a closed surface
+    left_out: tuple[str, ...] = ()  # features of the file that are not drawn
 
 
 def prepare(file: SceneFile) -> Callable[..., ContentSource]:
-    """Read a mesh and find its outlines. Return a function that uploads them to GL. Raises InputError."""
+    """Read a mesh file, and return a function that creates the source in a GL context.
+
+    The edges of small meshes are prepared here, because this needs no GL context. Raises InputError if the mesh cannot
+    be drawn.
+    """
     data = load_mesh(file.path)
     if data.left_out:
         log.warning("%s: is drawn without %s", file.path, ", ".join(data.left_out))
@@ -65,14 +69,18 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
 
 
 def load_mesh(path: Path) -> MeshData:
-    """Read a mesh. Raises InputError if it is unreadable, over a limit, not finite or empty."""
+    """Read a mesh file.
+
+    Raises InputError if the file is damaged, exceeds a limit, has coordinates that are not finite, or contains nothing
+    that can be drawn.
+    """
     progress.tell(f"reading {path.name}", 0)
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
     _check_counts(path, data)
     parts: list[Part] = []
     points: list[tuple[F32, F32]] = []
     left_out: set[str] = set()
-    with np.errstate(all="ignore"):  # coordinates that overflow are refused below
+    with np.errstate(all="ignore"):  # `_check` reports coordinates that overflow
         if path.suffix.lower() == ".ply":
             left_out = {name for name, count in read_header(path).counts.items() if count and name in UNREAD}
         elif path.suffix.lower() == ".off" and data.lstrip().startswith(b"COFF"):
@@ -107,7 +115,15 @@ def load_mesh(path: Path) -> MeshData:
 
 
 def folder_reader(path: Path, field: str) -> Callable[[str], bytes]:
-    """Return a function that reads a file to which a mesh refers by URI or path, or raises InputError."""
+    """Return a function that reads files to which a mesh refers by URI or path.
+
+    The function keeps the contents of each file in memory. It raises InputError if a reference is not a relative path,
+    or if the file cannot be read.
+
+    Args:
+        path: File of the mesh.
+        field: Kind of reference, for error messages.
+    """
     read_files: dict[str, bytes] = {}
 
     def read(name: str) -> bytes:
@@ -120,7 +136,10 @@ def folder_reader(path: Path, field: str) -> Callable[[str], bytes]:
 
 
 def _file_of(uri: str, *, source: Path, field: str) -> Path:
-    """Return the path of the file, in the folder of `source`, to which a URI refers. Raises InputError."""
+    """Return the path to which a URI or relative path in the file `source` refers.
+
+    Raises InputError if the URI has a scheme, the path is absolute, or the file does not exist.
+    """
     shown = untrusted_input.shown(uri, most=200)
     if "://" in uri or uri.startswith("data:"):
         raise InputError(source, field, f"{shown}: only files next to this one are read")
@@ -133,12 +152,12 @@ def _file_of(uri: str, *, source: Path, field: str) -> Path:
 
 
 def _check(path: Path, parts: Sequence[Part], places: Sequence[F32], left_out: set[str]) -> None:
-    """Raise InputError if nothing would be visible, or if any coordinates cannot be drawn."""
+    """Raise InputError if there is nothing to draw, or if coordinates are not finite or too large."""
     if not any(len(place) for place in places):
         alone = f", and {' and '.join(sorted(left_out))} are not drawn" if left_out else ""
         raise InputError(path, "faces", f"the file has none{alone}")
     for points in places:
-        broken = int((~(np.abs(points) <= LARGEST_COORDINATE).all(1)).sum())  # NaN too
+        broken = int((~(np.abs(points) <= LARGEST_COORDINATE).all(1)).sum())  # also counts NaN
         if broken:
             problem = f"{broken} of {len(points)} are not finite, or beyond {LARGEST_COORDINATE:g}"
             raise InputError(path, "vertices", problem)
@@ -148,7 +167,7 @@ def _check(path: Path, parts: Sequence[Part], places: Sequence[F32], left_out: s
 
 
 def _check_counts(path: Path, data: bytes) -> None:
-    """Raise InputError if the counts that a file states exceed a limit, before a loader allocates memory."""
+    """Raise InputError if a file declares too many elements, before a loader allocates memory for them."""
     suffix, promised = path.suffix.lower(), 0
     if suffix == ".ply":
         read_header(path)
@@ -168,7 +187,7 @@ def _is_binary_stl(path: Path, data: bytes) -> bool:
 
 
 def _binary_stl(data: bytes) -> Part:
-    """Read binary STL without trimesh, which needs ten times as much memory for the largest files."""
+    """Read a binary STL file. The largest files would take ten times as much memory with trimesh."""
     facets = np.frombuffer(data, [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")], offset=STL_HEAD)
     corners = np.ascontiguousarray(facets["corners"])
     triangles = np.arange(3 * len(facets), dtype=np.int32).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Read OBJ, OFF, PLY and STL files with trimesh, as parts that are drawn."""
+"""Read OBJ, OFF, PLY and STL files with trimesh, and convert them to parts or points."""
 
 from __future__ import annotations
 
@@ -28,13 +28,17 @@ from runtime.support.untrusted_input import LIMITS
 log = logging.getLogger("phasestack.content")
 
 BOMS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-# Options before a texture's name in an MTL file: `-s 1 1 1`, `-blendu off`, `-imfchan r`.
+# Options before the name of a texture in an MTL file, such as `-s 1 1 1`, `-blendu off` or `-imfchan r`.
 OPTIONS = re.compile(r"(?:-[a-zA-Z]+(?:\s+(?:on|off|[rgbmlz]|[-+.\d]+(?:[eE][-+]?\d+)?))*\s+)+")
-DRIVE = re.compile(r"[A-Za-z]:.*/")  # a path on the author's Windows machine, of which only the file name is used
+DRIVE = re.compile(r"[A-Za-z]:.*/")  # folder on the author's Windows machine, which is removed from a path
 
 
 class FolderResolver(trimesh.resolvers.FilePathResolver):
-    """Reader of files in a mesh's folder. It keeps the reason for a refusal, which loaders discard."""
+    """Reads the files to which a mesh refers, for the loaders of trimesh.
+
+    A missing material file is replaced by an empty file, and a missing texture by a grey one. Other problems are kept
+    in `refused`, because the loaders discard exceptions.
+    """
 
     def __init__(self, path: Path, read: Read, *, has_materials: bool) -> None:
         super().__init__(str(path))
@@ -64,7 +68,11 @@ class FolderResolver(trimesh.resolvers.FilePathResolver):
         return data
 
     def _named(self, name: str) -> str | None:
-        """Return the name that a file has in the folder, given a name with options, backslashes or other case."""
+        """Return the name of an existing file in the mesh's folder, or None if no file matches.
+
+        The given name may contain options of an MTL file, a Windows path, or letters in the wrong case. Absolute paths
+        are returned unchanged.
+        """
         name = DRIVE.sub("", OPTIONS.sub("", name, count=1).strip().replace("\\", "/"))
         untrusted_input.checked_path(name, source=self._path, field="texture")
         if Path(name).is_absolute() or (self._path.parent / name).exists():
@@ -77,7 +85,19 @@ class FolderResolver(trimesh.resolvers.FilePathResolver):
 
 
 def read_mesh(path: Path, data: bytes, read: Read) -> tuple[list[Part], list[tuple[F32, F32]]]:
-    """Return a file's parts or, if it has no faces, its points and their colours. Raises InputError."""
+    """Convert a mesh file to parts, and the points or lines in a file to points with colours.
+
+    Args:
+        path: File of the mesh.
+        data: Contents of the file.
+        read: Function that reads other files to which the mesh refers.
+
+    Returns:
+        The parts, and pairs of positions (n, 3) and colours (n, 3) of points.
+
+    Raises:
+        InputError: The file is damaged, or a file to which it refers cannot be used.
+    """
     kind = path.suffix.lower().removeprefix(".")
     progress.tell(f"{path.name}: triangles", 0)
     mark = {"obj": b"mtllib", "ply": b"TextureFile"}.get(kind, b"")
@@ -90,7 +110,7 @@ def read_mesh(path: Path, data: bytes, read: Read) -> tuple[list[Part], list[tup
         meshes = [(scene.geometry[name], matrix) for matrix, name in map(scene.graph.get, scene.graph.nodes_geometry)]
         has_faces = any(len(getattr(mesh, "faces", ())) for mesh, _ in meshes)
         wires = _wires(file) if isinstance(file, io.StringIO) and not has_faces else None
-    except Exception as error:  # trimesh's loaders raise the errors of their parsers
+    except Exception as error:  # loaders of trimesh raise various errors
         if resolver.refused is not None:
             raise resolver.refused from None
         why = (
@@ -107,19 +127,22 @@ def read_mesh(path: Path, data: bytes, read: Read) -> tuple[list[Part], list[tup
         if not len(getattr(mesh, "faces", ())):
             points += _points(mesh)
             continue
-        if mesh.visual.kind == "texture" and not resolver.has_materials:  # drop the loader's own grey
+        if mesh.visual.kind == "texture" and not resolver.has_materials:  # drop the loader's default grey
             mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=mesh.visual.vertex_attributes.get("color"))
         parts.append(_part(mesh, matrix, path, pictures))
     return parts, points if wires is None else [dotted(wires, np.full_like(wires, np.nan))]
 
 
 def _text(data: bytes) -> str:
-    """Decode an OBJ file. Only names and comments can be non-ASCII, in various encodings."""
+    """Decode an OBJ file in UTF-16 or UTF-8.
+
+    Invalid characters are replaced, because characters outside ASCII can occur only in names and comments.
+    """
     return data.decode("utf-16" if data[:2] in BOMS else "utf-8", errors="replace")
 
 
 def _wires(file: io.StringIO) -> F32 | None:
-    """Return the ends (n, 2, 3) of the lines in an OBJ file, or None if it has no lines."""
+    """Return the ends (n, 2, 3) of the lines in an OBJ file, or None if the file contains no lines."""
     places: list[list[str]] = []
     ends: list[tuple[int, int]] = []
     for kind, *words in filter(None, map(str.split, file.getvalue().splitlines())):
@@ -147,7 +170,17 @@ def _points(cloud: Any) -> list[tuple[F32, F32]]:
 
 
 def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8]) -> Part:
-    """Convert a trimesh to a part with its material, or its face or vertex colours, otherwise grey."""
+    """Convert a mesh of trimesh to a part with a material, with vertex or face colours, or in plain grey.
+
+    Args:
+        mesh: Mesh that trimesh has loaded.
+        matrix: Matrix (4, 4) from the frame of the mesh to that of the scene.
+        path: File of the mesh.
+        pictures: Textures that have already been converted, by the `id` of their material. The dict is updated.
+
+    Raises:
+        InputError: A face is not a triangle of existing vertices.
+    """
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(path, "faces", "are not triangles of existing vertices")
@@ -156,7 +189,7 @@ def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8]) -> Part:
     if kind == "texture":
         picture, colour, opacity = _material(visual.material, pictures)
         colours = visual.vertex_attributes.get("color")
-        if path.suffix.lower() == ".ply":  # PLY has no materials, but trimesh adds a coloured one
+        if path.suffix.lower() == ".ply":  # PLY has no materials, but trimesh adds a coloured material
             colour = WHITE
     elif kind == "vertex":
         colours, colour = visual.vertex_colors, WHITE
@@ -180,16 +213,17 @@ def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8]) -> Part:
 
 
 def _unit(colours: Any) -> F32:
-    """Convert colours (n, 3 or 4), given as integers or fractions, to floats in [0, 1]."""
+    """Convert colours (n, 3 or 4) from integers or fractions to float32 in [0, 1]."""
     numbers = np.asarray(colours)
     scale = np.float32(np.iinfo(numbers.dtype).max if numbers.dtype.kind == "u" else 1.0)
     return np.asarray(np.clip(numbers.astype(np.float32) / scale, 0.0, 1.0), dtype=np.float32)
 
 
 def _material(material: Any, pictures: dict[int, U8]) -> tuple[U8 | None, Colour, float]:
-    """Return a trimesh material's texture (RGBA), the colour that multiplies it, and the opacity.
+    """Return the RGBA texture of a material, the colour that multiplies the texture, and the opacity.
 
-    Black with a texture counts as white, because some exporters write black for materials that have only a texture.
+    A black material with a texture is treated as white, because some exporters write black for materials that consist
+    only of a texture.
     """
     image, diffuse = getattr(material, "image", None), getattr(material, "diffuse", None)
     red, green, blue = _unit(np.ones(3) if diffuse is None else diffuse)[:3].tolist()
@@ -202,7 +236,10 @@ def _material(material: Any, pictures: dict[int, U8]) -> tuple[U8 | None, Colour
 
 
 def _opacity(fields: dict[str, Any]) -> float:
-    """Return the opacity in an MTL file (`d` or 1 - `Tr`), or 1 if it is invalid or hides everything."""
+    """Return the opacity of a material from an MTL file, which is `d` or 1 - `Tr`.
+
+    The result is 1 if the opacity is missing, invalid or 0.
+    """
     for name, sign, start in (("d", 1.0, 0.0), ("tr", -1.0, 1.0)):
         try:
             value = start + sign * float(fields[name][-1])

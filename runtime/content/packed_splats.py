@@ -1,4 +1,4 @@
-"""Read packed splats: SuperSplat's compressed .ply, and .splat with 32 bytes per splat."""
+"""Read Gaussian splats from SuperSplat's compressed .ply files and from .splat files."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ from runtime.records import F32
 from runtime.support import untrusted_input
 from runtime.support.untrusted_input import LIMITS
 
-CHUNK = 256  # number of splats with common bounds
+CHUNK = 256  # number of consecutive splats that share bounds
 SPLAT = np.dtype([("place", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("turn", "u1", 4)])
 U32 = NDArray[np.uint32]
 
 
 @np.errstate(all="ignore")
 def load_compressed(header: PlyHeader) -> Gaussians:
-    """Read SuperSplat's compressed form: numbers of 8 to 11 bits between the bounds of their chunk.
+    """Read a compressed PLY file of SuperSplat.
 
-    Raises InputError if a splat has no bounds, or if no splat can be drawn.
+    The file stores numbers of 8 to 11 bits, which are fractions between the bounds of a chunk of splats. Raises
+    InputError if the file is damaged, bounds or harmonics are missing for some splats, or no splat is visible.
     """
     elements = read_elements(header)
     splats, bounds = elements["vertex"], elements.get("chunk")
@@ -36,7 +37,7 @@ def load_compressed(header: PlyHeader) -> Gaussians:
     place, turn, scale, colour = (splats[f"packed_{kind}"].astype(np.uint32) for kind in kinds)
 
     def bounds_of(name: str, axes: str) -> list[F32]:
-        """Return two (n, 3) arrays: the lower and the upper bounds of each splat's chunk."""
+        """Return the lower bounds (n, 3) and the upper bounds (n, 3) of each splat's chunk."""
         columns = [[f"{end}_{name}{axis}" for axis in axes] for end in ("min", "max")]
         if missing := {*columns[0], *columns[1]} - {*(bounds.dtype.names or ())}:
             raise InputError(header.path, "chunk", f"has no {min(missing)}")
@@ -65,7 +66,10 @@ def load_compressed(header: PlyHeader) -> Gaussians:
 
 @np.errstate(all="ignore")
 def load_splat(path: Path) -> Gaussians:
-    """Read a .splat: position, scale, RGBA, rotation. Raises InputError for a wrong length."""
+    """Read a .splat file, which stores position, scale, RGBA colour and rotation in 32 bytes per splat.
+
+    Raises InputError if the file is empty, has a size that is not a multiple of 32 bytes, or contains no visible splat.
+    """
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
     if not data or len(data) % SPLAT.itemsize:
         problem = f"is cut off, or not a .splat: it has {len(data)} bytes, not a multiple of {SPLAT.itemsize}"
@@ -84,7 +88,12 @@ def load_splat(path: Path) -> Gaussians:
 
 
 def fields_of(packed: U32, bits: tuple[int, ...]) -> F32:
-    """Return the fields (n, len(bits)) of words, highest bits first, as fractions of their maximum."""
+    """Unpack the bit fields of words as fractions (n, len(bits)) of the largest value of each field.
+
+    Args:
+        packed: Words (n,).
+        bits: Width of each field in bits, from the highest field to the lowest.
+    """
     parts = []
     for width in reversed(bits):
         most = (1 << width) - 1
@@ -98,14 +107,19 @@ def _between(share: F32, low: F32, high: F32) -> F32:
 
 
 def _turns(packed: U32) -> F32:
-    """Decode quaternions (n, 4) w, x, y, z. Two bits index the largest component, which is implied."""
+    """Decode quaternions (n, 4), ordered w, x, y, z, from packed words.
+
+    The two highest bits of a word are the index of the largest component, which is not stored.
+    """
     return with_largest((fields_of(packed, (10, 10, 10)) - np.float32(0.5)) * np.float32(np.sqrt(2)), packed >> 30)
 
 
 def with_largest(three: NDArray[np.floating[Any]], number: NDArray[np.integer[Any]]) -> F32:
-    """Return unit quaternions (n, 4), given three components and the index `number` of the largest one.
+    """Return unit quaternions (n, 4), of which the largest component is computed from the other three.
 
-    A quaternion is zero if its index is above 3.
+    Args:
+        three: Components (n, 3) of each quaternion, without the largest component.
+        number: Index (n,) at which the largest component is inserted. If an index is above 3, the quaternion is zero.
     """
     largest = np.sqrt(np.maximum(1 - (three**2).sum(1), 0))
     quaternions = np.zeros((len(three), 4), np.float32)

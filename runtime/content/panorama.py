@@ -1,4 +1,4 @@
-"""Crop equirectangular pictures of 360 or 180 degrees straight ahead."""
+"""Crop equirectangular pictures of 360 or 180 degrees to the part that is straight ahead."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 
 from runtime.records import F32, U8
 
-AHEAD_DEG = 75.0  # horizontal field of view of the crop: a display's, with some margin
+AHEAD_DEG = 75.0  # horizontal field of view of the crop, slightly larger than that of a display
 SHAPE = 16 / 9  # width over height of the crop
-ASPECT_OFF = 0.02  # tolerance for a view's aspect ratio
+ASPECT_OFF = 0.02  # relative tolerance for the aspect ratio of a view
 
 
 def is_around(width: float, height: float, span_deg: int) -> bool:
@@ -20,14 +20,20 @@ def is_around(width: float, height: float, span_deg: int) -> bool:
 
 
 def ahead(view: U8, span_deg: int) -> U8:
-    """Return the middle of an equirectangular view as seen by a pinhole camera, at the view's resolution."""
+    """Return the middle of an equirectangular view (h, w, 3), reprojected to a pinhole camera.
+
+    The resolution is about that of the view.
+    """
     u, v = _places(view.shape[1], view.shape[0], span_deg)
     return np.asarray(cv2.remap(view, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
 @lru_cache(maxsize=2)
 def _places(width: int, height: int, span_deg: int) -> tuple[F32, F32]:
-    """Return the columns and rows in the view of each pixel of the crop. Pixel centres are at integers."""
+    """Return the column and the row in the view that each pixel of the crop shows, as two arrays.
+
+    Pixel centres have integer coordinates, as OpenCV requires.
+    """
     columns = max(round(width * AHEAD_DEG / span_deg), 16)
     rows, half = max(round(columns / SHAPE), 9), np.tan(np.radians(AHEAD_DEG / 2))
     x = ((np.arange(columns) + 0.5) * 2 / columns - 1) * half

@@ -1,4 +1,4 @@
-"""Represent triangles with one material as parts, and merge parts with equal materials."""
+"""Parts, which are triangles with a common material, and merging of parts that have equal materials."""
 
 from __future__ import annotations
 
@@ -14,44 +14,44 @@ from runtime.content.shapes import Shape, join
 from runtime.records import F32, U8
 
 BLACK: Colour = (0.0, 0.0, 0.0)
-UNCOLOURED: Colour = (0.70, 0.74, 0.80)  # colour for files without colours
+UNCOLOURED: Colour = (0.70, 0.74, 0.80)  # colour of meshes from files without colours
 OPAQUE_FROM = 0.99  # alpha from which a pixel counts as opaque
 LARGEST_TEXTURE_PX = 4096
-OUTLINED_MAX = 200_000  # triangles of a part and of a file; with more, finding outlines costs more than drawing
+OUTLINED_MAX = 200_000  # most triangles of a part or file with outlines; in larger ones, these cost more than drawing
 Wrap = Literal["repeat", "clamp", "mirror"]
 
 
 @dataclass(frozen=True, slots=True)
 class Sampler:
-    """Wrap modes of a texture (across, down), and whether it is magnified without interpolation."""
+    """Settings with which a texture is sampled."""
 
-    wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
-    nearest: bool = False
+    wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")  # wrap modes across and down
+    nearest: bool = False  # True to magnify the texture without interpolation
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """Triangles with one material, in their own frame."""
+    """Triangles with a common material, in a frame that `TriangleSource` places in the scene."""
 
     shape: Shape
-    picture: U8 | None = None  # (h, w, 4) RGBA, row 0 at uv 0; parts may share one array
+    picture: U8 | None = None  # RGBA texture (h, w, 4) whose row 0 is at v = 0; parts may share an array
     colour: Colour = WHITE  # factor on all colours, 0-1
-    vertex_colours: F32 | None = None  # (v, 3 or 4), 0-1: RGB or RGBA
-    lit: bool = True
-    grey: bool = False
-    turning: bool = False  # True: its placement changes, so its box covers every orientation
+    vertex_colours: F32 | None = None  # RGB or RGBA colours (v, 3 or 4), 0-1
+    lit: bool = True  # True if the lamp shades the part
+    grey: bool = False  # True to draw the part without colour
+    turning: bool = False  # True if the part rotates, which requires a bounding box for every orientation
     sampler: Sampler = Sampler()
     opacity: float = 1.0
     alpha: Literal["opaque", "mask", "blend"] = "mask"
-    cutoff: float = 0.5  # for a mask: pixels with less alpha are discarded
-    two_sided: bool = True  # False: back faces of a translucent part are culled
-    is_linear: bool = False  # colours (not pictures) are linear light; the shader computes in linear light
-    glow: Colour = BLACK  # emitted light, linear, multiplied by `glow_picture`
-    glow_picture: U8 | None = None
+    cutoff: float = 0.5  # alpha below which a mask discards pixels
+    two_sided: bool = True  # False to cull the back faces of a translucent part
+    is_linear: bool = False  # True if colours (not pictures) are linear light and the shader computes in linear light
+    glow: Colour = BLACK  # emitted light (linear), which `glow_picture` modulates
+    glow_picture: U8 | None = None  # RGBA texture (h, w, 4)
 
     @property
     def features(self) -> tuple[str, ...]:
-        """Names of the shader switches that the part needs."""
+        """Names of the preprocessor symbols for which the part's shaders are compiled."""
         least = self.opacity
         if self.picture is not None:
             least *= float(self.picture[..., 3].min()) / 255
@@ -74,23 +74,23 @@ class Part:
 
 
 def texture_of(image: Any) -> U8:
-    """Convert a Pillow image to (h, w, 4) RGBA, reduced to the size of the largest supported texture."""
-    if image.mode not in ("L", "RGB", "RGBA") or "transparency" in image.info:  # a palette cannot be averaged
+    """Convert a Pillow image to an RGBA array (h, w, 4), whose sides are reduced to the texture limit."""
+    if image.mode not in ("L", "RGB", "RGBA") or "transparency" in image.info:  # palette indices cannot be averaged
         image = image.convert("RGBA")
     image.thumbnail((LARGEST_TEXTURE_PX, LARGEST_TEXTURE_PX))
     return np.array(image.convert("RGBA"))
 
 
 def coded(light: ArrayLike) -> F32:
-    """Convert linear light in 0-1 to sRGB codes in 0-1."""
+    """Encode linear light as sRGB. Both are in [0, 1]."""
     linear = np.clip(np.asarray(light, np.float32), 0.0, 1.0)
     return np.where(linear <= 0.0031308, linear * np.float32(12.92), 1.055 * linear ** np.float32(1 / 2.4) - 0.055)
 
 
 def merged(parts: Sequence[Part]) -> list[Part]:
-    """Merge parts with equal materials, up to the size whose outlines are drawn.
+    """Merge parts whose materials are equal, into parts of at most `OUTLINED_MAX` triangles.
 
-    Parts may have different colours, which become vertex colours.
+    The materials of merged parts may differ in colour and opacity, which become vertex colours.
     """
     alike: dict[tuple[object, ...], list[list[Part]]] = {}
     for part in parts:
@@ -109,7 +109,7 @@ def merged(parts: Sequence[Part]) -> list[Part]:
 
 
 def _coloured(part: Part) -> F32:
-    """Return the vertex colours (v, 4) of a part, multiplied by its colour and opacity."""
+    """Return RGBA vertex colours (v, 4) that include the part's colour and opacity."""
     colours = np.ones((len(part.shape.positions_m), 4), np.float32)
     if part.vertex_colours is not None:
         colours[:, : part.vertex_colours.shape[1]] = part.vertex_colours

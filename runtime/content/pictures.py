@@ -1,4 +1,4 @@
-"""Show pictures, picture folders and videos on the centre panel's plane, with a view for each eye."""
+"""Show pictures, folders of pictures and videos on the centre panel, with a view for each eye."""
 
 from __future__ import annotations
 
@@ -17,9 +17,13 @@ from runtime.records import U8
 
 
 def screen(stack: PanelStack, *, width_px: int, height_px: int, pixel_aspect: float = 1.0) -> PlaneRaster:
-    """Return the pixel grid of a picture on the stack's centre plane, as large as the display allows.
+    """Return the pixel grid of a picture on the plane x = 0, enlarged or reduced to fit the display.
 
-    pixel_aspect: width of a pixel divided by its height.
+    Args:
+        stack: Panels of the display.
+        width_px: Width of the picture.
+        height_px: Height of the picture.
+        pixel_aspect: Width of a pixel divided by its height.
     """
     pitch_m = min(stack.width_m / (width_px * pixel_aspect), stack.height_m / height_px)
     return PlaneRaster(
@@ -34,18 +38,21 @@ def screen(stack: PanelStack, *, width_px: int, height_px: int, pixel_aspect: fl
 
 
 def prepare(file: SceneFile) -> Callable[..., ContentSource]:
-    """Open a picture, a video or a folder of pictures. Raises InputError."""
+    """Open a picture, a video or a folder of pictures, and return a function that creates the source.
+
+    Raises InputError if the file cannot be shown, or if its first picture is too small for its layout.
+    """
     frames = open_frames(file.path, file.settings)
     make = partial(PicturesSource, frames, file=file)
-    make()  # refuses now a picture that is too small for its layout
+    make()  # reports now if the first picture is too small for its layout
     return make
 
 
 class PicturesSource(ContentSource):
-    """Source that shows the views of pictures or films on the centre panel's plane."""
+    """Source that shows pictures or a film on the centre panel's plane, with a view for each eye."""
 
     def __init__(self, frames: Frames, *, file: SceneFile, context: object = None) -> None:
-        """Create the source. Raises InputError if the picture is too small for its layout."""
+        """Create the source. Raises InputError if the first picture is too small for its layout."""
         self._frames, self._file = frames, file
         first = frames.frame(0)
         try:
@@ -75,17 +82,23 @@ class PicturesSource(ContentSource):
         return self._shown[which].warped(matrix, view)
 
     def _take(self, number: int, picture: U8) -> None:
-        """Use a picture from now on. Raises ValueError if it is too small."""
+        """Split a picture into the views that are shown from now on.
+
+        Raises ValueError if the picture is too small for its layout.
+        """
         layout = self._frames.layout(number)
         views = layout.views(picture)
         height, width = views[0].shape[:2]
         aspect = layout.pixel_aspect(width_px=width, height_px=height)
         self._screen = screen(self._file.stack, width_px=width, height_px=height, pixel_aspect=aspect)
         self._shown: dict[int, WarpedPicture] = {}
-        self._views, self._at = views, number  # views of the picture with this number
+        self._views, self._at = views, number  # `_at` is the number of the picture
 
     def _view_for(self, view: View) -> int:
-        """Return the index of the picture's view for an eye: its side or, in a quilt, the nearest in angle."""
+        """Return the index of the view that an eye sees.
+
+        The eye's side determines the view of a stereo picture. In a quilt, it is the view nearest in angle.
+        """
         if len(self._views) <= 2:
             return min(view.side, len(self._views) - 1)
         angle = np.arctan2(view.eye_m[1], view.eye_m[0])

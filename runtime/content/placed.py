@@ -1,7 +1,7 @@
-"""Place any source's scene (shift, rotation, scale, turntable) by moving the eye the opposite way.
+"""Shift, rotate and scale the scene of any source, by transforming the eye in the opposite direction.
 
-The source need not support this, because the view's projection times the placement is another projection, for the eye
-as seen in the scene's frame.
+The source need not support placement. The view's projection multiplied by the placement is simply another projection,
+for an eye whose position is given in the frame of the scene.
 """
 
 from __future__ import annotations
@@ -23,22 +23,25 @@ NS_PER_MIN = 60 * NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class Placing:
-    """Placement of a scene: p_stack = offset + scale · R · p. R rotates, then turns like a turntable."""
+    """Placement of a scene, p_stack = offset + scale · R · p_scene.
+
+    The rotation R is `rotation_deg`, followed by the current rotation of the turntable.
+    """
 
     scale: float = 1.0
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # frame `stack`
-    rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # about x, y, z of `stack`, in this order
-    turntable_per_min: float = 0.0  # about the vertical
+    rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # about the fixed axes x, y and z, in this order
+    turntable_per_min: float = 0.0  # revolutions about the vertical axis
 
     def rotation(self, time_ns: int) -> F64:
-        """Return the 3x3 rotation stack_from_scene."""
-        # Remove whole turns first, to keep precision on a clock that has run for months.
+        """Return the 3x3 rotation from the scene's frame to `stack` at a time."""
+        # Whole revolutions are removed first, which keeps precision on a clock that has run for months.
         period_ns = NS_PER_MIN / self.turntable_per_min if self.turntable_per_min else np.inf
         turntable = rotation_matrix((0.0, 0.0, 360.0 * (time_ns % period_ns) / period_ns), "xyz")
         return turntable @ rotation_matrix(self.rotation_deg, "xyz")
 
     def stack_from_scene(self, time_ns: int) -> F64:
-        """Return the 4x4 similarity stack_from_scene."""
+        """Return the 4x4 similarity from the scene's frame to `stack` at a time."""
         matrix = np.eye(4)
         matrix[:3, :3] = self.scale * self.rotation(time_ns)
         matrix[:3, 3] = self.offset_m
@@ -46,31 +49,31 @@ class Placing:
 
 
 def placing_of(settings: ContentSettings) -> Placing:
-    """Return the placement that the settings describe."""
+    """Return the placement that the settings specify."""
     return Placing(settings.scale, settings.offset_m, settings.rotation_deg, settings.turntable_per_min)
 
 
 def placed_source(source: ContentSource, placing: Placing) -> ContentSource:
-    """Return a source with this placement, which replaces an earlier placement."""
+    """Return a source that shows `source` with a placement, which replaces any earlier placement."""
     if isinstance(source, PlacedSource):
         source = source.source
     return source if placing == Placing() else PlacedSource(source, placing)
 
 
 class PlacedSource(ForwardingSource):
-    """Source with a placement."""
+    """Source that shows another source at a different position, orientation and scale."""
 
     def __init__(self, source: ContentSource, placing: Placing) -> None:
-        """Create the source. `source` is closed together with it."""
+        """Create the source, which takes ownership of `source` and closes it."""
         self.source, self.placing = source, placing
 
     @property
     def info(self) -> ContentInfo:  # type: ignore[override]
-        """Info of the placed source, without properties that the placement invalidates."""
+        """Properties of the placed scene, some of which differ from those of the original scene."""
         return _moved(self.source.info, self.placing)
 
     def forwarded(self, view: View, time_ns: int) -> tuple[ContentSource, View, int]:
-        """Return the view of the same eye and pixels in the scene's frame."""
+        """Return the source and the time unchanged, and the view transformed to the scene's frame."""
         matrix = self.placing.stack_from_scene(time_ns)
         turn = matrix[:3, :3] / self.placing.scale
         eye = turn.T @ (view.eye_m - matrix[:3, 3]) / self.placing.scale
@@ -94,6 +97,6 @@ class PlacedSource(ForwardingSource):
 
 def _moved(info: ContentInfo, placing: Placing) -> ContentInfo:
     still = not placing.turntable_per_min
-    # It stays flat only if its plane remains the middle panel's.
+    # A flat scene stays flat only if its plane remains that of the middle panel.
     is_flat = still and placing.rotation_deg[1:] == (0.0, 0.0) and placing.offset_m[0] == 0.0
     return replace(info, moving=info.moving or not still, flat_x_m=info.flat_x_m if is_flat else None)

@@ -1,4 +1,4 @@
-"""Place the coordinates of a scene's file in the stack frame, by a preset or by fitting."""
+"""Map the coordinates of scene files to the stack frame, with presets or by fitting to the display."""
 
 from __future__ import annotations
 
@@ -15,36 +15,41 @@ from runtime.records import F64
 
 log = logging.getLogger("phasestack.content")
 
-FILL = 0.75  # share of the display's width and height that a fitted scene gets, as its front appears larger
-DEEPER = 2.0  # a fitted scene may be this many times as deep as `depth_m`
-BACK = 0.5  # a flat mesh is turned around if its mean normal points away from the viewer by this much
-FLAT = 0.1  # a mesh thinner than this fraction of its other sides is flat, and turned to face the viewer
-STANDS = 0.2  # an axis is up if its range begins higher than the other's by this fraction of the height
+FILL = 0.75  # largest width and height of a fitted scene relative to the display, as its front appears larger
+DEEPER = 2.0  # largest depth of a fitted scene relative to the range `depth_m`
+BACK = 0.5  # component of the mean normal away from the viewer above which a flat mesh is turned around
+FLAT = 0.1  # thickness relative to the other sides below which a mesh is flat
+STANDS = 0.2  # difference in where the y and z ranges begin, relative to their sizes, that identifies the up axis
 GLTF = (".glb", ".gltf")
 CUSTOMS = {".glb": ("+y", "+z"), ".gltf": ("+y", "+z"), ".obj": ("+y", "+z"), ".stl": ("+z", "-y")}  # up, to viewer
-DARK = (0.12, 0.12, 0.12)  # background of all but the built-in scenes, on which brighter and darker ghosts are visible
+DARK = (0.12, 0.12, 0.12)  # default background of files, on which both brighter and darker ghosts are visible
 
 
 @dataclass(frozen=True, slots=True)
 class SceneFile:
-    """File of a scene, the settings with which it is shown, and the display."""
+    """File of a scene, with the settings and the display that determine where its content is placed."""
 
     path: Path
     settings: ContentSettings
     stack: PanelStack
-    preset: str = ""  # name of the file's preset
+    preset: str = ""  # name of the preset for the file, or an empty string
 
     @property
     def background(self) -> tuple[float, float, float]:
-        """Background colour of the scene."""
+        """Colour of the background, which is dark unless the settings specify another colour."""
         return self.settings.background or DARK
 
     def placed(self, low: F64, high: F64, *, custom: tuple[str, str] | None = None, facing: F64 | None = None) -> F64:
-        """Return the 4x4 stack_from_scene of content: by its preset, fitted, or unscaled in metres.
+        """Return the 4x4 matrix stack_from_scene for the content of the file.
 
-        low, high: (3,) corners of the content. custom: axes (up, towards the viewer) that are usual in the file's
-        format; None: chosen by the file's name. facing: area-weighted mean normal (3,) of the surface; with it, a flat
-        mesh is turned to face the viewer.
+        The preset determines the matrix if there is one. Otherwise, the content is fitted to the display or, depending
+        on the settings, its coordinates are used as metres without scaling.
+
+        Args:
+            low: Lowest corner (3,) of the content.
+            high: Highest corner (3,) of the content.
+            custom: Usual axes (up, towards the viewer) of the file's format. The default depends on the file's suffix.
+            facing: Area-weighted mean normal (3,) of the surface. If given, a flat mesh is turned to face the viewer.
         """
         if self.preset:
             return stack_from_preset(self.preset)
@@ -56,7 +61,7 @@ class SceneFile:
         return matrix
 
     def _axes(self, low: F64, high: F64, custom: tuple[str, str] | None, facing: F64 | None) -> F64:
-        """Return the 3x3 scene_from_stack rotation: as set, as usual in the file's format, or guessed."""
+        """Return the 3x3 rotation scene_from_stack from the settings, the file's format, or a guess."""
         if self.settings.axes != "auto":
             up, out = self.settings.axes.split()
         elif not self.settings.fit and self.path.suffix.lower() not in GLTF:
@@ -70,21 +75,35 @@ class SceneFile:
 
 
 def guessed_axes(low: F64, high: F64) -> tuple[str, str]:
-    """Guess the axes (up, towards the viewer) from an extent: (+y, +z) or (+z, -y).
+    """Guess the axes (up, towards the viewer) of content, which are either (+y, +z) or (+z, -y).
 
-    If exactly one of the y and z ranges begins near 0 or above, its axis is up; otherwise the longer axis is.
+    Objects often stand on the ground at height 0. If only one of the y and z ranges begins near 0 or above, the
+    corresponding axis is up. Otherwise, the longer axis is up.
+
+    Args:
+        low: Lowest corner (3,) of the content.
+        high: Highest corner (3,) of the content.
     """
     size = np.maximum(high - low, 1e-30)
-    y, z = np.maximum(low / size + 0.5, 0.0)[1:]  # 0: centred on the origin; 0.5: begins at the origin
+    y, z = np.maximum(low / size + 0.5, 0.0)[1:]  # 0 if centred on the origin, 0.5 if beginning at the origin
     z_is_up = z > y if abs(z - y) > STANDS else size[2] > size[1]
     return ("+z", "-y") if z_is_up else ("+y", "+z")
 
 
 def turned_to_viewer(up: str, out: str, *, size: F64, facing: F64) -> tuple[str, str]:
-    """Return the axes (up, to the viewer), changed for a flat mesh so that its front faces the viewer.
+    """Change the axes of a flat mesh to those with which its front faces the viewer.
 
-    size: (3,) of the bounding box. A mesh that is flat along the up axis is seen from above, with its near edge at the
-    bottom.
+    A mesh that is flat along the up axis is shown as seen from above, with its near edge at the bottom. The axes of
+    other meshes are returned unchanged.
+
+    Args:
+        up: Axis that points up.
+        out: Axis that points towards the viewer.
+        size: Size (3,) of the bounding box.
+        facing: Area-weighted mean normal (3,) of the surface.
+
+    Returns:
+        The axes (up, towards the viewer).
     """
     thinnest = int(size.argmin())
     axis = "xyz"[thinnest]
@@ -103,10 +122,17 @@ def _opposite(axis: str) -> str:
 
 
 def fitted(low: F64, high: F64, *, axes: F64, stack: PanelStack, depth_m: tuple[float, float]) -> F64:
-    """Return the 4x4 stack_from_scene that centres a box and scales it to the display's size and depth.
+    """Return the 4x4 matrix stack_from_scene that fits a box to the display's size and depth.
 
-    A scene deeper than `depth_m` (rear, front) begins at the front and extends beyond the rear, where most of it is
-    hidden. low, high: (3,) corners in the scene's coordinates; axes: 3x3 scene_from_stack rotation.
+    The box is scaled and centred. A scene deeper than the range `depth_m` begins at the front of the range and extends
+    beyond its rear, where most of the scene is hidden.
+
+    Args:
+        low: Lowest corner (3,) of the box, in the frame of the scene.
+        high: Highest corner (3,) of the box, in the frame of the scene.
+        axes: Rotation (3, 3) scene_from_stack.
+        stack: Panels of the display.
+        depth_m: Range (rear, front) of x in which content is placed.
     """
     size = np.abs(axes.T @ (high - low))
     room = np.array([DEEPER * (depth_m[1] - depth_m[0]), stack.width_m * FILL, stack.height_m * FILL])

@@ -1,7 +1,7 @@
 """Play a list of scenes one after another, each with a duration and settings.
 
-All scenes are loaded before the first one is shown, so missing files are refused at the start, and changing scenes
-takes no time.
+All scenes are loaded before the first scene is shown. Missing files are therefore reported at the start, and changing
+to the next scene takes no time.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from runtime.support.picture_header import CAMERA_SET
 from runtime.support.plausible import within
 from runtime.support.plugins import located
 
-ENTRIES_MAX = 64  # largest number of entries, because all are kept in memory
+ENTRIES_MAX = 64  # largest number of entries, all of which are kept in memory
 
 
 class PlaylistFile(Section):
-    """Playlist file in TOML (or JSON), with a table `[[show]]` for each scene."""
+    """Contents of a playlist file in TOML or JSON, with a table `[[show]]` for each scene."""
 
     repeat: bool = Field(True, description="restart after the last scene; false: keep showing it")
     show: list[dict[str, Any]] = Field(min_length=1, max_length=ENTRIES_MAX, description="the scenes, in order")
 
 
 class Entry(ContentSettings):
-    """One scene of a playlist, with its own placement."""
+    """Scene of a playlist, with the settings and the placement that apply to this scene."""
 
     scene: str = Field(min_length=1, description="like content.scene; paths are relative to the playlist's folder")
     seconds: Annotated[float, within(0.5, 86_400.0, "s")] = Field(description="how long it is shown")
@@ -49,7 +49,7 @@ class Entry(ContentSettings):
 
 @dataclass(frozen=True, slots=True)
 class Playlist:
-    """Parsed playlist file, whose scenes have not been opened yet."""
+    """Validated playlist, whose scenes have not been opened."""
 
     path: Path
     repeat: bool
@@ -57,9 +57,14 @@ class Playlist:
 
 
 def read_playlist(path: Path, settings: ContentSettings) -> Playlist:
-    """Read a playlist. Raises InputError, which names file, entry and field.
+    """Read a playlist file.
 
-    settings: defaults for every entry. Their placement is not a default; it applies to the whole list.
+    Args:
+        path: Playlist file.
+        settings: Default settings for all entries, except for the placement, which applies to the playlist as a whole.
+
+    Raises:
+        InputError: The file is not a valid playlist. The message names the file, the entry and the field.
     """
     table = read_table(path)
     if "frames" in table and "show" not in table:
@@ -83,14 +88,23 @@ def read_playlist(path: Path, settings: ContentSettings) -> Playlist:
 
 
 class PlaylistSource(ForwardingSource):
-    """Source that plays a list of scenes one after another. Time counts from the first request."""
+    """Source that plays a list of scenes one after another, starting with the first request."""
 
     def __init__(self, playlist: Playlist, openers: list[Callable[..., ContentSource]], *, context: Any) -> None:
-        """Prepare every entry. Raises InputError if one of them cannot be shown."""
+        """Create the sources of all entries.
+
+        Args:
+            playlist: Playlist to show.
+            openers: Function for each entry that creates its source, given `context`.
+            context: Current moderngl context.
+
+        Raises:
+            InputError: An entry cannot be shown.
+        """
         self._list = playlist
         self._ends_ns = list(accumulate(round(entry.seconds * NS_PER_S) for entry in playlist.entries))
         self._begin_ns: int | None = None
-        self._number = 0  # number of the current entry, counted over all rounds
+        self._number = 0  # number of the current entry, counted across repetitions
         self._sources: list[ContentSource] = []
         try:
             for number, opener in enumerate(openers):
@@ -104,7 +118,7 @@ class PlaylistSource(ForwardingSource):
 
     @property
     def info(self) -> ContentInfo:  # type: ignore[override]
-        """Info of the current entry, under the playlist's name."""
+        """Properties of the current scene, with a name that begins with the playlist's name."""
         index, inner = self._number % len(self._sources), self.source.info
         name = f"{self._list.path.stem}: {inner.name} ({index + 1} of {len(self._sources)})"
         return replace(inner, name=name, moving=True)
@@ -114,7 +128,11 @@ class PlaylistSource(ForwardingSource):
         return self._sources[self._number % len(self._sources)]
 
     def describe(self, *, time_ns: int) -> dict[str, Any]:
-        """Return the scenes and their durations, the current scene and its remaining time, for the status."""
+        """Return the status of the playlist.
+
+        Its keys are `entries` (scenes and durations), `index` (current entry) and `left_s` (remaining time of the
+        current scene, or None if the scene stays).
+        """
         entries = [{"scene": entry.scene, "seconds": entry.seconds} for entry in self._list.entries]
         index, since_ns = self._at(time_ns)
         left_s = self._list.entries[index % len(entries)].seconds - since_ns / NS_PER_S
@@ -142,14 +160,17 @@ class PlaylistSource(ForwardingSource):
             source.close()
 
     def _turn_to(self, time_ns: int) -> int:
-        """Switch to the entry that is due, and return how long it has been shown."""
+        """Switch to the entry that is due at a time, and return how long the entry has been due, in ns."""
         if self._begin_ns is None:
             self._begin_ns = time_ns
         self._number, since_ns = self._at(time_ns)
         return since_ns
 
     def _at(self, time_ns: int) -> tuple[int, int]:
-        """Return the entry at a time, counted over all rounds, and how long it has been shown in ns."""
+        """Return the number of the entry at a time, and how long the entry has been due, in ns.
+
+        Entries are counted across repetitions of the playlist.
+        """
         passed_ns = max(0, time_ns - (time_ns if self._begin_ns is None else self._begin_ns))
         count, round_ns = len(self._ends_ns), self._ends_ns[-1]
         if not self._list.repeat:
