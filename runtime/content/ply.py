@@ -1,6 +1,6 @@
-"""Read the header of a PLY file, and its elements as tables.
+"""Read the headers of PLY files, and read elements of binary files as structured arrays.
 
-No library is used for this: plyfile is licensed under the GPL, and trimesh returns only properties that it knows.
+No existing library is suitable: plyfile is licensed under the GPL, and trimesh returns only the properties it knows.
 """
 
 from __future__ import annotations
@@ -25,34 +25,38 @@ TYPES = {
     "double": "f8", "float64": "f8",
 }  # fmt: skip
 ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
-PACKED = "packed_position"  # property of splats in SuperSplat's compressed form
+PACKED = "packed_position"  # property that marks SuperSplat's compressed splats
 SPLAT_MARKS = {"f_dc_0", "scale_0", "rot_0", PACKED}
 
 
 @dataclass(frozen=True, slots=True)
 class PlyHeader:
-    """Header of a PLY file."""
+    """Description of the elements in a PLY file, as declared by its header."""
 
     path: Path
-    order: str  # a key of ORDERS
-    counts: dict[str, int]  # number of each element, in the file's order
-    properties: dict[str, list[tuple[str, str]]]  # names and types, by element; `list` is one of the types
+    order: str  # byte order of the elements, or `ascii`; a key of ORDERS
+    counts: dict[str, int]  # number of elements of each kind, in the order in which they are stored
+    properties: dict[str, list[tuple[str, str]]]  # (name, type) of the properties of each kind; a type may be `list`
     starts_at: int  # offset of the first element in bytes
     size: int  # size of the file in bytes
 
     @property
     def kind(self) -> str:
-        """Kind of content, which determines the file's limits: `splats` or `triangles`."""
+        """Kind of content, `splats` or `triangles`, which determines the limits for the file."""
         return "splats" if SPLAT_MARKS & {name for name, _ in self.properties["vertex"]} else "triangles"
 
     @property
     def is_packed(self) -> bool:
-        """True if its splats are in SuperSplat's compressed form."""
+        """True if the file contains splats in SuperSplat's compressed form."""
         return PACKED in {name for name, _ in self.properties["vertex"]}
 
 
 def read_header(path: Path) -> PlyHeader:
-    """Read a file's header. Raises InputError if it is missing or if counts exceed a limit."""
+    """Read the header of a PLY file.
+
+    Raises InputError if the header is missing, incomplete or not understood, or if a number of elements exceeds a limit
+    or the file's size.
+    """
     with untrusted_input.open_regular(path, most_bytes=LIMITS.file_bytes) as file:
         head = file.read(LONGEST_HEADER)
         size = file.seek(0, 2)
@@ -83,15 +87,16 @@ def read_header(path: Path) -> PlyHeader:
         field, kind = f"element {untrusted_input.shown(name)}", header.kind
         most = getattr(LIMITS, kind) * (3 if kind == "triangles" and name == "vertex" else 1)
         untrusted_input.within(count, most, source=path, field=field)
-        if count > size:  # every element has at least one byte
+        if count > size:  # every element takes at least one byte
             raise InputError(path, field, f"the file is cut off: {count:,} are declared in {size:,} bytes")
     return header
 
 
 def read_elements(header: PlyHeader) -> dict[str, Table]:
-    """Return structured arrays, by name, of the elements before the first one with a list.
+    """Read the elements of a binary PLY file as structured arrays, by name.
 
-    The vertices are among them. Raises InputError if the file is truncated or text, or has a list before their end.
+    Reading ends at the first kind of element that has a list property. Raises InputError if the file is cut off or in
+    text form, or if the vertices have not been read by then.
     """
     path, place, found = header.path, header.starts_at, dict[str, Table]()
     if header.order == "ascii":

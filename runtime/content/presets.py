@@ -1,4 +1,4 @@
-"""Presets for the paper's 17 scenes: scale, pose and depth, by its supplement and its published code."""
+"""Scale and pose of the EyeReal paper's 17 scenes, from its supplement and from its published code."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from scipy.spatial.transform import Rotation
 from runtime.records import F64
 
 FILE = Path(__file__).with_name("presets.toml")
-CM = 0.01  # metres
+CM = 0.01  # one centimetre in metres
 
 Triple = tuple[float, float, float]
 
 
 @cache
 def preset_file() -> dict[str, Any]:
-    """Return the contents of presets.toml, whose comments explain the keys."""
+    """Return the contents of presets.toml. Comments in the file explain the keys."""
     return tomllib.loads(FILE.read_text(encoding="utf-8"))
 
 
@@ -30,7 +30,10 @@ def preset_names() -> tuple[str, ...]:
 
 
 def stack_from_preset(name: str) -> F64:
-    """Return the supplement's 4x4 map from scene units to `stack` metres: R·scene/(100 r_p2d) + t."""
+    """Return the 4x4 map from scene units to metres in `stack`, as the supplement specifies it.
+
+    The map is R · p / (100 r_p2d) + t, where r_p2d is the scale in scene units per centimetre.
+    """
     table, matrix = preset_file()["scene"][name], np.eye(4)
     rotation = rotation_matrix(table["rotation_deg"], preset_file()["rotation_order"])
     matrix[:3, :3] = rotation / (table["scale_per_cm"] / CM)
@@ -41,12 +44,13 @@ def stack_from_preset(name: str) -> F64:
 def drawn_scene_from_stack(name: str) -> F64:
     """Return the 4x4 map from metres in `stack` to scene units, as the published code drew the data set.
 
-    That code uses another scale and the scene's axes, and places the panels differently for evaluation.
+    This code uses different scales than the supplement, aligns the panels with the scene's axes, and places the panels
+    differently for evaluation.
     """
     code, matrix = preset_file()["scene"][name]["published"], np.eye(4)
     axes = axes_matrix(out=code["out"], up=code["up"])
     gap = code["thickness_cm"] * code["scale_per_cm"]
-    # The ground in that code is half a gap behind the middle panel, along `out`, and may be specified in gaps.
+    # In the published code, the ground is half a gap behind the middle panel along `out`. It may be given in gaps.
     middle = gap / 2 + code.get("ground", gap * code.get("ground_coefficient", 0.0))
     matrix[:3, :3] = axes * (code["scale_per_cm"] / CM)
     matrix[:3, 3] = np.array(code.get("shift", (0.0, 0.0, 0.0))) + axes[:, 0] * middle
@@ -54,13 +58,25 @@ def drawn_scene_from_stack(name: str) -> F64:
 
 
 def rotation_matrix(angles_deg: Triple, order: str) -> F64:
-    """Return the 3x3 rotation about x, y and z in `order` (lower case: fixed axes; upper: moving)."""
+    """Return the 3x3 rotation about the axes x, y and z by the given angles.
+
+    Args:
+        angles_deg: Angles about x, y and z.
+        order: Order of the rotations in SciPy's notation, about fixed axes (`xyz`) or about moving axes (`XYZ`).
+    """
     angles = [angles_deg["xyz".index(letter)] for letter in order.lower()]
     return np.asarray(Rotation.from_euler(order, angles, degrees=True).as_matrix())
 
 
 def axes_matrix(*, out: str, up: str) -> F64:
-    """Return the 3x3 scene_from_stack rotation; its columns point out of the screen, right and up."""
+    """Return the 3x3 rotation scene_from_stack, given two axes of the scene, such as `+z`.
+
+    The columns are the scene's directions out of the screen, to the right and up.
+
+    Args:
+        out: Axis that points out of the screen.
+        up: Axis that points up.
+    """
     columns = []
     for axis in (out, up):
         column = np.zeros(3)

@@ -1,4 +1,4 @@
-"""Draw the built-in scenes directly at the pixels of a view."""
+"""Draw the built-in scenes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ MODELLED_HEIGHT_M = 0.2916  # height of the display for which the scenes' length
 
 
 def parts_of(built_in: Scene) -> list[DrawnPart]:
-    """Return the parts of a scene, one per thing. This slow half of opening a scene needs no GL."""
+    """Prepare the parts of a scene, one for each object.
+
+    This is the slower half of opening a scene. It needs no GL context and may run on any thread.
+    """
     pictures = {name: textures.texture(name) for name in {thing.texture for thing in built_in.things}}
     return [
         DrawnPart(
@@ -51,7 +54,12 @@ class ProceduralSource(TriangleSource):
     ) -> None:
         """Create the source.
 
-        background: by default that of the scene. parts: `parts_of` the scene, if prepared on another thread.
+        Args:
+            built_in: Scene, or its name.
+            stack: Panels of the display, to whose height the scene is scaled.
+            context: Current moderngl context.
+            background: Colour of the background. The scene determines it by default.
+            parts: Result of `parts_of` for the scene, if it has been prepared on another thread.
         """
         self._scene = SCENES[built_in]() if isinstance(built_in, str) else built_in
         self._scale = stack.height_m / MODELLED_HEIGHT_M
@@ -72,7 +80,7 @@ class ProceduralSource(TriangleSource):
         return [self._placed(thing, time_ns / NS_PER_S) for thing in self._scene.things]
 
     def _placed(self, thing: Thing, time_s: float) -> F64:
-        """Return a thing's 4x4 stack_from_thing at a time."""
+        """Return the 4x4 matrix that places an object in frame `stack` at a time."""
         turn = np.eye(3) if thing.rotation is None else thing.rotation
         if self._scene.moving and thing.turns_per_s:
             turn = shapes.rotation_about(2, 2 * np.pi * thing.turns_per_s * time_s) @ turn

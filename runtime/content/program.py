@@ -1,6 +1,6 @@
-"""Show pictures from another program (renderer, game, web page) that answers requests for them.
+"""Show pictures that another program, such as a renderer, a game or a web page, draws on request.
 
-The protocol is in docs/programs.md. If an answer is late or missing, the last pictures stay.
+docs/programs.md describes the protocol. If an answer is late or missing, the last pictures stay on the display.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ log = logging.getLogger("phasestack.content")
 
 HOST = "127.0.0.1"
 ANSWERED_S = 0.4  # time limit for both pictures of a frame
-GIVEN_UP_S = 2.0  # a late frame is abandoned after this time, and another may be requested
-IN_FLIGHT_MAX = 2  # largest number of frames that are requested and not yet answered
+GIVEN_UP_S = 2.0  # time after which an unanswered frame is abandoned
+IN_FLIGHT_MAX = 2  # largest number of frames that have been requested but not answered
 HELLO_S = 5.0  # time limit for a program's greeting
 NEAR_M, FAR_M = 0.05, 100.0
-HEAD = struct.Struct("<II")  # of an answer: frame number and side (0 left, 1 right)
+HEAD = struct.Struct("<II")  # header of an answer: frame number and side (0 left, 1 right)
 SIDES = ("left", "right")
 
 
@@ -51,7 +51,10 @@ class ProgramOptions(Section):
 
 
 def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
-    """Start listening for programs. Raises InputError if the port is in use."""
+    """Start listening for drawing programs, and return a function that creates the source.
+
+    Raises InputError if the options are invalid or the port cannot be opened.
+    """
     options = validated(ProgramOptions, file.settings.options, source="content.options")
     size_px = file.stack.width_px * file.stack.height_px
     source = ProgramSource(Programs(options.port, most_bytes=8 * size_px + HEAD.size), background=file.background)
@@ -59,7 +62,11 @@ def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
 
 
 def camera_of(view: View) -> dict[str, Any]:
-    """Return the OpenGL view and projection matrices of a view: column-major, depth -1 to 1, metres."""
+    """Return the description of a view that is sent to programs.
+
+    It contains the side and position of the eye, and the view and projection matrices for OpenGL, as lists in
+    column-major order. Lengths are in metres, and depth is in [-1, 1].
+    """
     pixels = view.pixels_from_stack
     forward = pixels[2, :3] / np.linalg.norm(pixels[2, :3])
     right, down = (row[:3] - (row[:3] @ forward) * forward for row in pixels[:2])
@@ -80,12 +87,12 @@ def camera_of(view: View) -> dict[str, Any]:
 
 @dataclass(slots=True)
 class _Frame:
-    """Request to a program for one frame."""
+    """Frame that has been requested from a program, with the pictures received so far."""
 
     views: Sequence[View]
-    asked_s: float
-    pictures: dict[int, U8] = field(default_factory=dict)  # by side
-    awaited: bool = True  # `answer` may still be called for it
+    asked_s: float  # time of the request on the monotonic clock
+    pictures: dict[int, U8] = field(default_factory=dict)  # received pictures by side
+    awaited: bool = True  # True if `answer` may still be called for the frame
 
     @property
     def complete(self) -> bool:
@@ -93,18 +100,29 @@ class _Frame:
 
 
 class Programs:
-    """Connections to drawing programs, and their answers. Thread-safe."""
+    """Server to which drawing programs connect to receive requests and to send pictures. Thread-safe.
+
+    The program that connected last draws. Programs that only listen receive the same requests.
+    """
 
     def __init__(self, port: int, *, most_bytes: int) -> None:
-        """Listen on a port. Raises InputError if it is in use. most_bytes: size limit of a message."""
+        """Listen on a port.
+
+        Args:
+            port: TCP port, or 0 for any free port.
+            most_bytes: Largest size of a message that is accepted.
+
+        Raises:
+            InputError: The port cannot be opened.
+        """
         self._token = secrets.token_urlsafe(24)
         self._changed = threading.Condition()
-        self._drawing: ServerConnection | None = None  # the newest connection that draws
+        self._drawing: ServerConnection | None = None  # most recent connection of a program that draws
         self._listening: set[ServerConnection] = set()
-        self._frames: dict[int, _Frame] = {}  # unanswered frames by number
+        self._frames: dict[int, _Frame] = {}  # requested frames, by number
         self._count, self._bottom_up = 0, False
         self.problem = ""
-        self.frame_ms: float | None = None  # recent time from a request to its last picture
+        self.frame_ms: float | None = None  # time from a recent request to the last picture of the answer
         try:
             self._server = serve(
                 self._connected, HOST, port, process_request=self._refused, max_size=most_bytes, compression=None
@@ -118,7 +136,15 @@ class Programs:
         log.info("waiting for a program; its address is in `phasestack status` (program)")
 
     def ask(self, views: Sequence[View], *, time_ns: int) -> int:
-        """Request the pictures of a frame and return its number. Raises ContentFailure without a program."""
+        """Request the pictures of a frame, and return the frame's number.
+
+        Args:
+            views: Views to draw, all of the same size.
+            time_ns: Time on the run's clock.
+
+        Raises:
+            ContentFailure: No program is connected, or too many requests are unanswered.
+        """
         view, now_s = views[0], time.monotonic()
         with self._changed:
             self._count += 1
@@ -140,7 +166,10 @@ class Programs:
         return number
 
     def answer(self, number: int, side: int) -> U8:
-        """Wait for one picture of a frame, and return it. Raises ContentFailure."""
+        """Wait for one picture of a frame, and return the picture.
+
+        Raises ContentFailure if the picture does not arrive in time or the program disconnects.
+        """
         with self._changed:
             frame = self._frames.get(number)
             if frame is not None:
@@ -151,7 +180,10 @@ class Programs:
         raise ContentFailure(self.problem or f"the program has not answered within {1e3 * ANSWERED_S:.0f} ms")
 
     def done(self, number: int) -> None:
-        """Stop waiting for a frame. It counts as in flight until it is answered."""
+        """Declare that no more pictures of a frame are needed.
+
+        The frame counts as in flight until it is answered or abandoned.
+        """
         with self._changed:
             frame = self._frames.get(number)
             if frame is not None:
@@ -170,7 +202,10 @@ class Programs:
         return None
 
     def _connected(self, connection: ServerConnection) -> None:
-        """Serve a connection on its thread. Its first message states whether it draws or listens."""
+        """Serve a connection on the connection's thread.
+
+        The first message of a program states whether the program draws or only listens.
+        """
         why = "it closed the connection"
         try:
             hello = json.loads(connection.recv(timeout=HELLO_S))
@@ -207,7 +242,7 @@ class Programs:
             before.close(1001, "another program has replaced it")
 
     def _take(self, connection: ServerConnection, message: str | bytes) -> None:
-        """Accept one picture. Raises ValueError for any other message."""
+        """Store a picture from a program. Raises ValueError if the message has the wrong type or size."""
         if not isinstance(message, bytes) or len(message) < HEAD.size:
             raise ValueError("its answer is not a picture")
         number, side = HEAD.unpack_from(message)
@@ -229,12 +264,12 @@ class Programs:
 
 
 class ProgramSource(ContentSource):
-    """Source that shows pictures of the connected program, drawn for exactly the eyes solved for."""
+    """Source that shows pictures that a connected program draws for the requested eye positions."""
 
     def __init__(self, programs: Programs, *, background: Any) -> None:
         self._programs = programs
         self.info = ContentInfo("program", moving=True, background=background)
-        self._expected: tuple[int, list[View]] | None = None  # the requested frame and its views
+        self._expected: tuple[int, list[View]] | None = None  # number and views of the frame that has been requested
         weakref.finalize(self, programs.close)
 
     @property

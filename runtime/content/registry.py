@@ -1,4 +1,4 @@
-"""Open the content source that `content.scene` names. Loaders are imported on demand."""
+"""Open the content source that the setting `content.scene` specifies. Readers are imported on demand."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from runtime.support.untrusted_input import LIMITS
 MESHES = (".glb", ".gltf", ".obj", ".off", ".stl")
 SPLATS = (".ply", ".splat", ".spz", ".sog")  # a .ply may be a mesh
 PLAYLISTS = (".toml", ".json")
-HARMLESS = {".png": PNG, ".jpg": JPEG, ".jpeg": JPEG}  # small stills with these first bytes are read in this process
-HARMLESS_PX = 4096 * 4096
+HARMLESS = {".png": PNG, ".jpg": JPEG, ".jpeg": JPEG}  # first bytes of stills that are read without a child process
+HARMLESS_PX = 4096 * 4096  # most pixels of such a still
 TO_GLTF, TO_PLY = "export it as glTF (.glb), as Blender does", "save it as PLY, as CloudCompare does"
 TO_SPLATS = "convert it: `npx @playcanvas/splat-transform in{} out.ply`"
 FILMS = (".wmv", ".flv", ".mpg", ".mpeg", ".ts", ".m2ts", ".mts", ".3gp", ".ogv", ".vob")
-OTHER_FILES = {  # by suffix: kind of file, and the way out
+OTHER_FILES = {  # kind of file and remedy, by the suffix of unsupported files
     **dict.fromkeys((".fbx", ".dae", ".blend", ".3ds", ".x3d", ".wrl", ".abc"), ("a 3D scene", TO_GLTF)),
     **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), ("a USD scene", TO_GLTF)),
     **dict.fromkeys(
@@ -47,22 +47,32 @@ OTHER_FILES = {  # by suffix: kind of file, and the way out
 }
 LFS = b"version https://git-lfs"
 TRIED_PX = (32, 18)  # size of the trial picture of a user-defined scene
-Opener = Callable[..., ContentSource]  # called with `context`
+Opener = Callable[..., ContentSource]  # creates a source, given the keyword argument `context`
 
 
 def open_content(settings: ContentSettings, stack: PanelStack, context: Any) -> ContentSource:
-    """Open `settings.scene`: a built-in scene, a preset, a class, a file or a folder.
+    """Open the scene that the settings specify: a built-in scene, a preset, a class, a file or a folder.
 
-    context: the moderngl context of the thread that will call `render`. Raises InputError, which names file and field.
+    Args:
+        settings: Settings of the content.
+        stack: Panels of the display.
+        context: Current moderngl context of the thread that will use the source.
+
+    Raises:
+        InputError: The scene cannot be shown. The message names the file and the field.
     """
     return prepare_content(settings, stack)(context=context)
 
 
 def prepare_content(settings: ContentSettings, stack: PanelStack) -> Opener:
-    """Read and check `settings.scene`. Return a function that creates the source on the context's thread.
+    """Read and check the scene that the settings specify, and return a function that creates the source.
 
-    This slow part needs no GL and may run on any thread. Files are read in a child process, and `support.progress`
-    receives the progress. Raises InputError, which names file and field.
+    Preparation is slow, but needs no GL context and may run on any thread. Files are read in a child process, except
+    for small pictures. The progress is reported to `support.progress`. The returned function must be called on the
+    thread of the GL context.
+
+    Raises:
+        InputError: The scene cannot be shown or takes too long to load. The message names the file and the field.
     """
     file = SceneFile(Path(settings.scene), settings, stack)
     too_slow = InputError(settings.scene, "", f"takes longer to load than {LIMITS.load_s:g} s")
@@ -121,7 +131,7 @@ def _from_path(file: SceneFile) -> Opener:
 
 
 def _is_harmless(file: SceneFile) -> bool:
-    """Return True if a file's header shows that decoding is quick and needs little memory."""
+    """Return True if a file's header shows that decoding the file is quick and needs little memory."""
     from runtime.content.layout import layout_of
 
     mark = HARMLESS.get(file.path.suffix.lower())
@@ -135,9 +145,9 @@ def _is_harmless(file: SceneFile) -> bool:
 
 
 def _read(file: SceneFile) -> Opener:
-    """Read a file or folder with the reader that its name and first bytes require.
+    """Read a file or folder with the reader for its suffix and contents.
 
-    The result can be pickled.
+    The returned function can be pickled, so a child process can read the file.
     """
     path = file.path
     suffix = path.suffix.lower()
@@ -191,7 +201,11 @@ def _playlist(file: SceneFile) -> Opener:
 
 
 def _plugin(name: str, file: SceneFile) -> Opener:
-    """Import a user's class and check its options. Return a function that creates and tries the source."""
+    """Import the class of a user-defined scene, and return a function that creates the source.
+
+    The returned function draws a trial picture, and raises InputError if the picture or the source is faulty. Raises
+    InputError if the class cannot be imported or the options are invalid.
+    """
     plugin = plugin_class(name, ContentSource, field="content.scene")
     options = validated(strict(plugin.Options), file.settings.options, source="content.options")
 
