@@ -1,8 +1,8 @@
 """Draw a picture with depth (colour and a grey depth map, side by side) as two surfaces.
 
-The front surface is the picture, split where its depth jumps. The other one is the background behind its edges,
-invented from the colours next to them, so that a viewer who looks past an edge sees neither a hole nor a stretched
-foreground.
+The front surface shows the picture. It is split where the depth jumps, because the foreground would be stretched there.
+The second surface fills the hole that a viewer would see by looking past such an edge. It shows background that is
+invented from depths and colours next to the edge.
 """
 
 from __future__ import annotations
@@ -30,22 +30,26 @@ from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8
 
-COLUMNS = 320  # resolution of the smooth surface: as fine as depth cameras, and fast without a GPU
-FINEST_COLUMNS = 1600  # resolution at edges
+COLUMNS = 320  # resolution of smooth areas, as fine as that of depth cameras and fast without a GPU
+FINEST_COLUMNS = 1600  # largest resolution at edges
 NOMINAL_DISTANCE_M = 0.6  # distance from which the surface looks exactly like the picture
-TORN_RELATIVE = 0.12  # share of the depth range; a larger step between neighbours is an edge rather than a slope
-BLURRED_PX = 5  # an edge of the depth map may be blurred over this width
-MIXED_PX = 2  # up to this distance from an edge, colours are mixed from both sides
-REACH_PX = 10  # largest distance from which a colour is taken
-BEHIND_SHARE = 0.1  # how far behind an edge the background is filled in, as a share of the picture's width
-SET_BACK = 0.004  # offset of the invented surface behind the true one, as a share of the depth range
-SAMPLES = 4  # samples per pixel, which smooth the split edges
+TORN_RELATIVE = 0.12  # step between neighbours, as a share of the depth range, above which a slope is an edge
+BLURRED_PX = 5  # width over which an edge of the depth map may be blurred
+MIXED_PX = 2  # distance from an edge up to which colours may be mixed from both sides
+REACH_PX = 10  # largest distance from which a colour is taken to replace a mixed colour
+BEHIND_SHARE = 0.1  # width of the background that is invented behind an edge, as a share of the picture's width
+SET_BACK = 0.004  # offset of the invented surface to the rear, as a share of the depth range
+SAMPLES = 4  # samples per pixel, which smooth split edges
 
 Mask = NDArray[np.bool_]
 
 
 def split_rgbd(rgb: U8, path: Path) -> tuple[U8, F32]:
-    """Split a picture into colour (h, w, 3) and depth (h, w), from 0 to 1 (nearest). Raises InputError."""
+    """Split a picture into its left half, colour (h, w, 3), and its right half, depth (h, w).
+
+    Depth is 0 at the rear and 1 at the front. Raises InputError if the picture is too small, or if the right half is
+    not grey.
+    """
     width = rgb.shape[1] // 2
     if width < 2 or rgb.shape[0] < 2:
         raise InputError(path, "layout", "the picture is too small for colour and depth side by side")
@@ -56,9 +60,15 @@ def split_rgbd(rgb: U8, path: Path) -> tuple[U8, F32]:
 
 
 def surfaces(colour: U8, depth: F32, *, stack: PanelStack, depth_m: tuple[float, float]) -> list[Part]:
-    """Return the front surface and the background as triangles. Each point is on its ray, at its depth.
+    """Return the front surface and, if there are edges, the background behind them.
 
-    colour: (h, w, 3); depth: (h, w), 1 is nearest; depth_m: depth range (rear, front).
+    Each point of a surface is on the ray that leads from the nominal eye position to the point's pixel.
+
+    Args:
+        colour: Picture (h, w, 3).
+        depth: Depth (h, w), from 0 (rear) to 1 (front).
+        stack: Panels of the display, to whose size the picture is fitted.
+        depth_m: Coordinates x in frame `stack` of depth 0 and depth 1.
     """
     depth = sharpened(depth)
     colour = unmixed(colour, depth)
@@ -82,7 +92,10 @@ def surfaces(colour: U8, depth: F32, *, stack: PanelStack, depth_m: tuple[float,
 
 
 def sharpened(depth: F32) -> F32:
-    """Sharpen blurred edges of a depth map (h, w). Their pixels get the depth of the nearer side."""
+    """Sharpen the edges of a depth map (h, w).
+
+    The depth of a pixel in a blurred edge is replaced by the depth of one side, whichever is closer to the pixel's.
+    """
     kernel = np.ones((BLURRED_PX, BLURRED_PX), np.uint8)
     high, low = cv2.dilate(depth, kernel), cv2.erode(depth, kernel)
     snapped = np.where(high - depth < depth - low, high, low)
@@ -90,7 +103,14 @@ def sharpened(depth: F32) -> F32:
 
 
 def unmixed(colour: U8, depth: F32) -> U8:
-    """Return the colours (h, w, 3), with those next to a depth edge replaced by colours farther inside."""
+    """Replace colours next to a depth edge, which may be mixed from both sides.
+
+    The new colour is taken from a pixel on the same side that is farther from the edge.
+
+    Args:
+        colour: Picture (h, w, 3).
+        depth: Depth (h, w), from 0 to 1.
+    """
     side = 2 * MIXED_PX + 1
     kernel = np.ones((side, side), np.uint8)
     mixed = cv2.dilate(depth, kernel) - cv2.erode(depth, kernel) > TORN_RELATIVE
@@ -98,21 +118,28 @@ def unmixed(colour: U8, depth: F32) -> U8:
     if not beside.any():
         return colour
     there, wanted = np.argwhere(beside), np.argwhere(mixed)
-    far_apart = 4 * side / TORN_RELATIVE  # pixels per unit of depth, so that the other side is never the nearest
+    far_apart = 4 * side / TORN_RELATIVE  # pixels per unit of depth, which keeps the other side from being nearest
     away, nearest = cKDTree(np.column_stack([there, depth[beside] * far_apart])).query(
         np.column_stack([wanted, depth[mixed] * far_apart]), distance_upper_bound=REACH_PX
     )
-    near = np.isfinite(away)  # a part too thin to have an inside keeps its own colours
+    near = np.isfinite(away)  # parts that are too thin to have a clean inside keep their colours
     result = colour.copy()
     result[tuple(wanted[near].T)] = colour[beside][nearest[near]]
     return result
 
 
 def background(depth: F32, colour: U8) -> tuple[F32, U8, Mask]:
-    """Return the background behind edges: depth (h, w), colour (h, w, 3) and a mask of invented pixels.
+    """Invent the background behind depth edges.
 
-    Behind the near side, depth and colour continue those of the far side at the nearest edge. A ring of the far side
-    itself is included, so that no gap remains there.
+    The depth and the colour of the far side are continued behind the near side. The mask also includes a band of the
+    far side itself, which closes gaps at the edge.
+
+    Args:
+        depth: Depth (h, w), from 0 to 1.
+        colour: Picture (h, w, 3).
+
+    Returns:
+        Depth (h, w) and colour (h, w, 3) of the background, and a mask (h, w) of the pixels that belong to it.
     """
     far_side = depth < cv2.dilate(depth, np.ones((5, 5), np.uint8)) - TORN_RELATIVE
     if not far_side.any():
@@ -124,7 +151,10 @@ def background(depth: F32, colour: U8) -> tuple[F32, U8, Mask]:
 
 
 def _quads(depth: F32) -> I32:
-    """Return quads (n, 4) as depth map indices: large on smooth areas, single pixels at edges."""
+    """Divide a depth map into quads (n, 4), whose corners are flat indices of pixels.
+
+    Smooth areas have large quads, and edges have quads of single pixels. Quads that cross an edge are left out.
+    """
     rows, columns = depth.shape
     step = -(-columns // COLUMNS)
     down = np.unique(np.r_[np.arange(0, rows - 1, step), rows - 1])
@@ -154,7 +184,7 @@ def _corners(row: Any, column: Any, columns: int) -> I32:
 
 
 def _placed(depth: F32, quads: I32, picture: U8, *, stack: PanelStack, depth_m: tuple[float, float]) -> Part:
-    """Return the quads of a depth map as triangles in the stack's frame."""
+    """Convert the quads of a depth map to triangles in frame `stack`, with the picture as their texture."""
     rows, columns = depth.shape
     used, corners = np.unique(quads, return_inverse=True)
     corners = corners.reshape(-1, 4)
@@ -172,18 +202,18 @@ def _placed(depth: F32, quads: I32, picture: U8, *, stack: PanelStack, depth_m: 
 
 
 def _edge_to_edge(index: Any, count: int) -> F64:
-    """Return the pixel centres, stretched so that the outermost ones are at the picture's edge."""
+    """Return the coordinates of pixel centres. Those of the outermost pixels are moved to the edge."""
     place = index + 0.5
     return np.where(index == 0, 0.0, np.where(index == count - 1, float(count), place))
 
 
 def prepare(file: SceneFile) -> Callable[..., TriangleSource]:
-    """Read a picture with depth. Return a function that uploads it to GL.
+    """Read a picture with depth, and return a function that creates the source in a GL context.
 
-    Raises InputError if the file has no depth.
+    Raises InputError if the picture cannot be read or its right half is not a depth map.
     """
     colour, depth = split_rgbd(open_frames(file.path, file.settings).frame(0), file.path)
-    # Outlines of a split surface are also inside it, so they need samples instead of ramps.
+    # The edges of a split surface are also inside its outline, so they need multisampling instead of ramps.
     surface_parts = surfaces(colour, depth, stack=file.stack, depth_m=file.settings.depth_m)
     parts = [DrawnPart(part, outlined=False) for part in surface_parts]
     info = ContentInfo(file.path.stem, background=file.background)

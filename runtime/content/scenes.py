@@ -1,4 +1,4 @@
-"""Built-in scenes. Their lengths scale with the display, so that every stack shows all of them."""
+"""Built-in scenes, whose lengths are scaled to the height of the display."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from runtime.records import F64
 
 @dataclass(frozen=True, slots=True)
 class Thing:
-    """One object of a scene. Lengths are in metres, for a display 0.2916 m high."""
+    """Object in a scene. Lengths are in metres for a display that is 0.2916 m high."""
 
-    shape: Shape  # centred on its own origin
-    texture: str
-    centre_m: tuple[float, float, float]
-    colour: Colour = WHITE  # factor on the texture's colours
-    rotation: F64 | None = None  # 3x3 stack_from_thing
-    turns_per_s: float = 0.0  # about the vertical, in a moving scene
-    lit: bool = True
+    shape: Shape  # centred on the origin
+    texture: str  # name of a texture, or `plain`
+    centre_m: tuple[float, float, float]  # position of the shape's origin in frame `stack`
+    colour: Colour = WHITE  # factor on the colours of the texture
+    rotation: F64 | None = None  # 3x3 rotation from the shape's frame to `stack`
+    turns_per_s: float = 0.0  # revolutions about the vertical axis, in a moving scene
+    lit: bool = True  # True if the lamp shades the object
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Scene of things on a uniform background."""
+    """Built-in scene, which consists of objects on a uniform background."""
 
     name: str
     things: tuple[Thing, ...]
     background: Colour = WHITE
     moving: bool = False
     grey: bool = False
-    flat: bool = False  # everything is in the middle panel's plane
+    flat: bool = False  # True if all objects are in the plane of the middle panel
 
 
 def _turned(yaw_deg: float, pitch_deg: float = 0.0) -> F64:
@@ -84,7 +84,10 @@ def _demo(turns_per_s: float = 0.0) -> tuple[Thing, ...]:
 
 
 def _room() -> tuple[Thing, ...]:
-    """Return a dim room behind the display and wider than it, with objects of which a globe is nearest."""
+    """Return a dim room with objects, the nearest of which is a globe.
+
+    The room is behind the display and wider than the display.
+    """
     wide, high, back = 0.56, 0.34, -0.14
     deep = 0.02 - back
     middle, down = (0.02 + back) / 2, shapes.rotation_about(1, -np.pi / 2)
@@ -125,7 +128,7 @@ def _sparse() -> tuple[Thing, ...]:
 
 
 def _texture() -> tuple[Thing, ...]:
-    """Return a wall that fills the picture from any position, and things in front of it."""
+    """Return objects in front of a wall that fills the picture from any position."""
     wall = shapes.card(3.2, 2.4, repeat=(12.0, 9.0))
     return (Thing(wall, "mosaic", (-0.10, 0.0, 0.0), lit=False), *_demo()[3:])
 

@@ -1,4 +1,4 @@
-"""Shapes as triangle lists in their own coordinates. Their normals point outwards."""
+"""Triangle meshes (shapes) and functions that create them. The normals of a shape point outwards."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from runtime.records import F32, F64
 
 I32 = NDArray[np.int32]
 
-AT_ONCE = 1 << 17  # vertices or faces processed together, which bounds the memory
+AT_ONCE = 1 << 17  # number of vertices or faces that are processed together, which limits the memory used
 
-# Letters of 5x7 cells, one string per row: only those that the built-in scenes need.
+# Letters that built-in scenes need, with 5 x 7 cells and one string per row.
 GLYPHS = {
     "3": ("####.", "....#", "....#", ".###.", "....#", "....#", "####."),
     "D": ("####.", "#...#", "#...#", "#...#", "#...#", "#...#", "####."),
@@ -30,15 +30,15 @@ GLYPHS = {
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """Shape of triangles with normals and texture coordinates."""
+    """Triangle mesh with normals and texture coordinates."""
 
-    positions_m: F32  # (v, 3)
-    normals: F32  # (v, 3), unit
-    uv: F32  # (v, 2)
-    triangles: I32  # (t, 3)
+    positions_m: F32  # (v, 3) vertices
+    normals: F32  # (v, 3) unit normals of the vertices
+    uv: F32  # (v, 2) texture coordinates of the vertices
+    triangles: I32  # (t, 3) indices of the vertices of each triangle
 
     def moved(self, rotation: F64 | None = None, offset_m: ArrayLike = (0.0, 0.0, 0.0)) -> Shape:
-        """Return the shape rotated about its origin and then shifted."""
+        """Return a copy of the shape that is rotated about the origin by a 3x3 matrix and then shifted."""
         turn = np.eye(3) if rotation is None else rotation
         positions = self.positions_m @ turn.T + np.asarray(offset_m)
         return Shape(positions.astype(np.float32), (self.normals @ turn.T).astype(np.float32), self.uv, self.triangles)
@@ -58,7 +58,11 @@ def join(shapes: Sequence[Shape]) -> Shape:
 
 
 def flat_normals(corners: ArrayLike) -> F32:
-    """Return (t, 3) unit normals of triangles with corners (t, 3, 3); zero for triangles without area."""
+    """Return the unit normals (t, 3) of triangles, which are zero for triangles without area.
+
+    Args:
+        corners: Positions (t, 3, 3) of the three corners of each triangle.
+    """
     corners = np.asarray(corners)
     normals = np.empty((len(corners), 3), np.float32)
     for first in range(0, len(corners), AT_ONCE):
@@ -69,20 +73,26 @@ def flat_normals(corners: ArrayLike) -> F32:
 
 
 def placed(positions: ArrayLike, normals: ArrayLike | None, matrices: F64) -> tuple[F32, F32 | None]:
-    """Move positions and normals (v, 3) by a 4x4 matrix, or by one per vertex (v, 4, 4).
+    """Transform positions and normals by an affine matrix.
 
-    The resulting normals have length 1.
+    Args:
+        positions: Positions (v, 3) of the vertices.
+        normals: Normals (v, 3) of the vertices, or None.
+        matrices: Matrix (4, 4) for all vertices, or one matrix (v, 4, 4) for each vertex.
+
+    Returns:
+        Positions (v, 3) and unit normals (v, 3). The normals are None if none are given.
     """
     positions = np.asarray(positions)
     moved = np.empty(positions.shape, np.float32)
     turned = None if normals is None else np.empty(positions.shape, np.float32)
-    for first in range(0, len(positions), AT_ONCE):  # chunks, because this needs double precision
+    for first in range(0, len(positions), AT_ONCE):  # chunks limit the memory that double precision needs
         rows = slice(first, first + AT_ONCE)
         matrix = matrices[rows] if matrices.ndim == 3 else matrices
         linear = matrix[..., :3, :3]
         moved[rows] = _times(linear, positions[rows]) + matrix[..., :3, 3]
         if normals is not None and turned is not None:
-            # Joints rotate and scale uniformly; nodes may transform in any linear way.
+            # Joints are assumed to scale uniformly, whereas nodes may have any linear transformation.
             turn = linear if matrices.ndim == 3 else np.linalg.pinv(linear).T
             normal = _times(turn, np.asarray(normals)[rows])
             turned[rows] = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
@@ -90,12 +100,12 @@ def placed(positions: ArrayLike, normals: ArrayLike | None, matrices: F64) -> tu
 
 
 def _times(matrix: NDArray[Any], vectors: NDArray[Any]) -> NDArray[Any]:
-    """Multiply vectors (v, 3) by a 3x3 matrix, or by one matrix per vector (v, 3, 3)."""
+    """Multiply vectors (v, 3) by a matrix (3, 3), or by a matrix (v, 3, 3) for each vector."""
     return np.asarray(vectors @ matrix.T if matrix.ndim == 2 else np.einsum("nij,nj->ni", matrix, vectors))
 
 
 def rotation_about(axis: int, angle_rad: float) -> F64:
-    """Return the 3x3 right-handed rotation about x (0), y (1) or z (2)."""
+    """Return the 3x3 matrix of a right-handed rotation about the axis x (0), y (1) or z (2)."""
     cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
     i, j = (axis + 1) % 3, (axis + 2) % 3
     matrix = np.eye(3)
@@ -104,7 +114,11 @@ def rotation_about(axis: int, angle_rad: float) -> F64:
 
 
 def _grid(u: F64, v: F64) -> tuple[F64, F64, I32]:
-    """Return the parameters u and v of each vertex in a (len(v), len(u)) grid, and the grid's triangles."""
+    """Return a triangulated grid of vertices, with the given parameters along columns and rows.
+
+    Returns:
+        The parameters u and v of each vertex, and the triangles (t, 3) of the grid.
+    """
     columns, rows = len(u), len(v)
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1)
     first = np.column_stack([corner, corner + 1, corner + columns])
@@ -118,7 +132,13 @@ def _shape(positions: F64, normals: F64, uv: F64, triangles: I32) -> Shape:
 
 
 def card(width_m: float, height_m: float, *, repeat: tuple[float, float] = (1.0, 1.0)) -> Shape:
-    """Return a rectangle in the plane x = 0. Its picture is upright and unmirrored for an eye at +x."""
+    """Return a rectangle in the plane x = 0, whose texture is upright and not mirrored as seen from +x.
+
+    Args:
+        width_m: Width along y.
+        height_m: Height along z.
+        repeat: Number of repetitions of the texture along the width and the height.
+    """
     s, t, triangles = _grid(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
     positions = np.column_stack([0 * s, (s - 0.5) * width_m, (0.5 - t) * height_m])
     return _shape(
@@ -127,7 +147,7 @@ def card(width_m: float, height_m: float, *, repeat: tuple[float, float] = (1.0,
 
 
 def box(size_m: Sequence[float]) -> Shape:
-    """Return a box around the origin. Each face shows the whole texture."""
+    """Return a box that is centred on the origin. Each face shows the whole texture."""
     sx, sy, sz = size_m
     turns = [
         (np.eye(3), (sy, sz), sx),
@@ -141,7 +161,7 @@ def box(size_m: Sequence[float]) -> Shape:
 
 
 def sphere(radius_m: float, *, columns: int = 48, rows: int = 24) -> Shape:
-    """Return a sphere with its poles on the z axis."""
+    """Return a sphere that is centred on the origin and has its poles on the z axis."""
     s, t, triangles = _grid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1))
     longitude, polar = s * 2 * np.pi, t * np.pi
     normal = np.column_stack([np.cos(longitude) * np.sin(polar), np.sin(longitude) * np.sin(polar), np.cos(polar)])
@@ -149,7 +169,14 @@ def sphere(radius_m: float, *, columns: int = 48, rows: int = 24) -> Shape:
 
 
 def torus(radius_m: float, tube_m: float, *, columns: int = 64, rows: int = 24) -> Shape:
-    """Return a torus around the x axis."""
+    """Return a torus around the x axis.
+
+    Args:
+        radius_m: Distance from the centre of the torus to the centre of the tube.
+        tube_m: Radius of the tube.
+        columns: Number of segments around the axis.
+        rows: Number of segments around the tube.
+    """
     s, t, triangles = _grid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1))
     around, across = s * 2 * np.pi, t * 2 * np.pi
     normal = np.column_stack([np.sin(across), np.cos(around) * np.cos(across), np.sin(around) * np.cos(across)])
@@ -158,12 +185,18 @@ def torus(radius_m: float, tube_m: float, *, columns: int = 64, rows: int = 24) 
 
 
 def _runs(marks: str) -> list[tuple[int, int]]:
-    """Return the start and length of each unbroken run of `#`."""
+    """Return the start and the length of each run of `#`."""
     return [(match.start(), match.end() - match.start()) for match in re.finditer("#+", marks)]
 
 
 def lettering(text: str, *, cell_m: float, depth_m: float) -> Shape:
-    """Return a text around the origin, readable from +x. Letters have 5 x 7 cells and gaps of one cell."""
+    """Return a text of solid letters, which is centred on the origin and readable from +x.
+
+    Args:
+        text: Text in letters that `GLYPHS` contains.
+        cell_m: Size of a cell. A letter has 5 x 7 cells, and one empty cell separates letters.
+        depth_m: Depth along x.
+    """
     left = -(len(text) * 6 - 1) / 2
     bars = []
     for index, letter in enumerate(text):
@@ -178,7 +211,14 @@ def lettering(text: str, *, cell_m: float, depth_m: float) -> Shape:
 
 
 def fence(width_m: float, height_m: float, *, bars: int, bar_m: float) -> Shape:
-    """Return thin upright bars with two rails, in the plane x = 0."""
+    """Return a fence in the plane x = 0, which consists of upright bars and two rails.
+
+    Args:
+        width_m: Width along y.
+        height_m: Height along z.
+        bars: Number of bars.
+        bar_m: Thickness of bars and rails.
+    """
     upright = [
         box((bar_m, bar_m, height_m)).moved(offset_m=(0.0, y, 0.0))
         for y in np.linspace(-width_m / 2, width_m / 2, bars)

@@ -1,4 +1,4 @@
-"""Draw 3D Gaussian splats, sorted and blended, directly at the pixels of a view."""
+"""Draw 3D Gaussian splats by sorting and blending them with OpenGL."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from runtime.records import F32, F64
 from runtime.support.background import raise_if_abandoned
 from runtime.support.gl import DrawnPicture
 
-CUSTOM, CUSTOM_SPZ = ("-y", "-z"), ("+y", "+z")  # up, and to the viewer: trainers use OpenCV's camera axes
-FLOATS = 8  # per corner: clip position (2), position in standard deviations (2), colour and opacity (4)
+CUSTOM, CUSTOM_SPZ = ("-y", "-z"), ("+y", "+z")  # axes (up, to the viewer); trainers use the camera axes of OpenCV
+FLOATS = 8  # floats per corner: clip position (2), position in standard deviations (2), colour and opacity (4)
 VERTEX = """
 #version 330
 in vec2 in_place;
@@ -59,7 +59,10 @@ void main() {
 
 
 def prepare(file: SceneFile) -> Callable[..., SplatSource]:
-    """Read a file of splats. Return a function that uploads them to GL. Raises InputError."""
+    """Read a file of splats, and return a function that creates the source in a GL context.
+
+    Raises InputError if the file cannot be read or contains no visible splat.
+    """
     suffix = file.path.suffix.lower()
     if suffix == ".ply":
         header = read_header(file.path)
@@ -72,12 +75,12 @@ def prepare(file: SceneFile) -> Callable[..., SplatSource]:
 
 
 class SplatSource(CanvasSource):
-    """Source of a scene of splats, placed in the stack frame."""
+    """Source that draws a scene of Gaussian splats."""
 
     def __init__(self, gaussians: Gaussians, *, stack_from_scene: F64, context: Any, info: ContentInfo) -> None:
         super().__init__(context, info=info, deep=True)
         self._gaussians = moved(gaussians, stack_from_scene)
-        self._seen: list[Splats | None] = [None] * SIDES  # for each side's newest picture
+        self._seen: list[Splats | None] = [None] * SIDES  # visible splats in each side's newest picture
         linear = stack_from_scene[:3, :3]
         self._scene_from_stack_rotation = (np.linalg.inv(linear) * np.cbrt(np.linalg.det(linear))).astype(np.float32)
         self._program = context.program(vertex_shader=VERTEX, fragment_shader=FRAGMENT)
@@ -94,7 +97,7 @@ class SplatSource(CanvasSource):
         self.held += [self._program, self._buffer, indices, self._vertices]
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
-        """Draw all splats that the eye can see, farthest first."""
+        """Draw the visible splats from the farthest to the nearest."""
         splats = self._seen[view.side] = seen_splats(self._gaussians, view)
         count = len(splats.index)
 
@@ -104,7 +107,7 @@ class SplatSource(CanvasSource):
             for first in range(0, count, AT_ONCE):
                 raise_if_abandoned()
                 if first:
-                    self._buffer.orphan()  # the GPU may still read its storage
+                    self._buffer.orphan()  # the GPU may still be reading the previous storage
                 self._vertices.render(vertices=6 * self._prepare(view, splats, slice(first, first + AT_ONCE)))
 
         whole = PixelRect(0, 0, view.width_px, view.height_px if count else 0)
@@ -115,7 +118,7 @@ class SplatSource(CanvasSource):
         return None if splats is None else nearest_blocks(splats, view, every=every, first=first)
 
     def _prepare(self, view: View, splats: Splats, some: slice) -> int:
-        """Fill the vertex buffer with the splats `some` of a view, and return their number."""
+        """Fill the vertex buffer with a slice of the visible splats, and return the number of splats written."""
         index, reach = splats.index[some], splats.reach[some]
         count = len(index)
         directions = self._gaussians.centres[index] - view.eye_m.astype(np.float32)

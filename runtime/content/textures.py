@@ -1,4 +1,4 @@
-"""Procedural textures of the built-in scenes: (256, 256, 4) RGBA, identical on every machine."""
+"""Procedural RGBA textures (256, 256, 4) of the built-in scenes, which are the same on every machine."""
 
 from __future__ import annotations
 
@@ -16,14 +16,20 @@ def _coordinates() -> tuple[F64, F64]:
 
 
 def _mixed(weight: F64, first: tuple[int, int, int], second: tuple[int, int, int]) -> U8:
-    """Return a picture that mixes two colours. Where the weight is 1, it has the first colour."""
+    """Return a picture that mixes two colours.
+
+    Args:
+        weight: Weight (h, w) of the first colour, 0-1.
+        first: First colour, 0-255.
+        second: Second colour, 0-255.
+    """
     rgb = weight[..., None] * np.array(first) + (1 - weight[..., None]) * np.array(second)
     alpha = np.full((*weight.shape, 1), 255.0)
     return np.concatenate([np.clip(np.rint(rgb), 0, 255), alpha], axis=2).astype(np.uint8)
 
 
 def _noise(seed: int, octaves: int = 4) -> F64:
-    """Return smooth noise in [0, 1]: a sum of random waves that repeats without a seam."""
+    """Return smooth noise in [0, 1], a sum of random waves that tiles without a seam."""
     u, v = _coordinates()
     random = np.random.default_rng(seed)
     total = np.zeros_like(u)
@@ -36,7 +42,7 @@ def _noise(seed: int, octaves: int = 4) -> F64:
 
 
 def checker() -> U8:
-    """Return 8 x 8 squares with fine lines between them."""
+    """Return a chequerboard of 8 x 8 squares with fine lines between the squares."""
     u, v = _coordinates()
     squares = (np.floor(u * 8) + np.floor(v * 8)) % 2
     lines = np.minimum(np.abs(u * 8 - np.rint(u * 8)), np.abs(v * 8 - np.rint(v * 8))) < 0.04
@@ -44,7 +50,7 @@ def checker() -> U8:
 
 
 def crate() -> U8:
-    """Return planks with grain, a frame and a diagonal."""
+    """Return one side of a wooden crate: planks with grain, a frame and a diagonal."""
     u, v = _coordinates()
     grain = 0.5 + 0.5 * np.sin(2 * np.pi * (18 * v + 1.5 * np.sin(2 * np.pi * (u + 2 * _noise(3, 2)))))
     frame = np.minimum(np.minimum(u, 1 - u), np.minimum(v, 1 - v)) < 0.11
@@ -55,7 +61,7 @@ def crate() -> U8:
 
 
 def globe() -> U8:
-    """Return seas and lands with a graticule."""
+    """Return a map of land and sea with a grid of meridians and parallels."""
     u, v = _coordinates()
     lines = (np.abs(u * 12 - np.rint(u * 12)) < 0.05) | (np.abs(v * 12 - np.rint(v * 12)) < 0.05)
     land = np.clip((_noise(11) - 0.52) * 20, 0, 1)
@@ -65,7 +71,7 @@ def globe() -> U8:
 
 
 def stripes() -> U8:
-    """Return slanted stripes in two colours."""
+    """Return diagonal stripes in two colours."""
     u, v = _coordinates()
     return _mixed((np.floor((u + v) * 4) % 2), (226, 44, 78), (255, 214, 226))
 
@@ -82,7 +88,7 @@ def picture() -> U8:
 
 
 def mosaic() -> U8:
-    """Return coloured tiles with grout and grain, which repeat without a seam."""
+    """Return coloured tiles with grain and light grout. The texture tiles without a seam."""
     u, v = _coordinates()
     column, row = (np.floor(u * 12)).astype(int), (np.floor(v * 12)).astype(int)
     colours = np.random.default_rng(23).uniform(0.25, 1.0, (12, 12, 3))[row, column]
@@ -102,5 +108,5 @@ TEXTURES = {
 
 
 def texture(name: str) -> U8 | None:
-    """Return a texture (256, 256, 4) by name, or None for `plain`, which leaves the object's colour."""
+    """Return a texture (256, 256, 4) by name, or None for `plain`, which stands for a uniform colour."""
     return None if name == "plain" else TEXTURES[name]()

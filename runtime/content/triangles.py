@@ -1,6 +1,7 @@
-"""Draw triangles with colours, pictures and one lamp directly at the pixels of a view.
+"""Draw textured, coloured and lit triangles with OpenGL.
 
-The shaders of a part contain code for lamp, picture, vertex colours or holes only if the part needs it.
+The shaders of each part are compiled with only those features that the part needs, such as lamp, texture or vertex
+colours.
 """
 
 from __future__ import annotations
@@ -23,13 +24,13 @@ from runtime.records import F32, F64, U8
 from runtime.support.background import raise_if_abandoned
 from runtime.support.gl import DrawnPicture
 
-PROJECTED_MAX = 5000  # a part with more vertices has its box projected for its extent, instead of its vertices
-DRAWN_AT_ONCE = 20_000  # number of triangles
-UPLOADED_AT_ONCE = 8 << 20  # number of bytes
+PROJECTED_MAX = 5000  # most vertices that are projected to find a part's extent; for more, its box is projected instead
+DRAWN_AT_ONCE = 20_000  # number of triangles in a draw call
+UPLOADED_AT_ONCE = 8 << 20  # number of bytes in an upload
 ATTRIBUTES = ("in_normal", "in_uv", "in_colour")
-OUTLINE_FLOATS = 5 + 9  # per corner: clip coordinates and coverage, then the attributes
+OUTLINE_FLOATS = 5 + 9  # floats per corner: clip coordinates and coverage (5), attributes (9)
 
-ANY_ALPHA = 2.0  # above every alpha
+ANY_ALPHA = 2.0  # limit that is larger than every alpha
 VERTEX = """
 #ifdef OUTLINE
 in vec4 in_clip;
@@ -128,10 +129,19 @@ void main() {
 
 
 class DrawnPart:
-    """Part with its buffers, prepared on any thread without GL and uploaded later by its source."""
+    """Part that is prepared for drawing, and after `upload` also owns GL objects.
+
+    A part can be prepared on any thread, without a GL context. The source of the part uploads it later.
+    """
 
     def __init__(self, part: Part, *, outlined: bool = True) -> None:
-        """Prepare a part. outlined: also prepare the ramps along its outline."""
+        """Prepare a part for drawing.
+
+        Args:
+            part: Part to draw.
+            outlined: Find the edges of the part, whose outlines can then be smoothed. Translucent and large parts are
+                never outlined.
+        """
         mesh = part.shape
         self.features, self.sampler = part.features, part.sampler
         self.pictures, self.glow, self.two_sided = (part.picture, part.glow_picture), part.glow, part.two_sided
@@ -139,7 +149,7 @@ class DrawnPart:
         self.is_blended = "BLEND" in self.features
         self.triangles = np.ascontiguousarray(mesh.triangles, np.int32)
         self.corner_count, self.is_projected = self.triangles.size, len(mesh.positions_m) <= PROJECTED_MAX
-        # (v, 12) position, normal, texture coordinates, colour and alpha
+        # (v, 12) position (3), normal (3), texture coordinates (2), colour and alpha (4)
         self.vertices = np.ones((len(mesh.positions_m), 12), np.float32)
         for first, values in ((0, mesh.positions_m), (3, mesh.normals), (6, mesh.uv), (8, part.vertex_colours)):
             if values is not None:
@@ -150,58 +160,68 @@ class DrawnPart:
         if part.turning:
             reach = float(np.linalg.norm(mesh.positions_m, axis=1).max())
             low, high = np.full(3, -reach), np.full(3, reach)
-        self.corners_m = camera.box_corners(low, high)  # (8, 3) corners of its box, in the part's frame
+        self.corners_m = camera.box_corners(low, high)  # (8, 3) corners of the bounding box, in the part's frame
         self.textures: list[Any] = []
 
     @property
     def positions(self) -> F32:
-        """Current positions (v, 3)."""
+        """Positions (v, 3) of the vertices, in the part's frame. They may be empty after `upload`."""
         return self.vertices[:, :3]
 
     def upload(self, context: Any, surface_program: Any, outline: Any, textures: list[Any]) -> None:
-        """Create the part's GL objects. Program, outline (a vertex array) and textures are the source's."""
+        """Create the part's GL objects.
+
+        Args:
+            context: Current moderngl context.
+            surface_program: Shader program for the triangles, owned by the source.
+            outline: Vertex array for outlines, owned by the source.
+            textures: Textures of the part, owned by the source.
+        """
         self.surface_program, self.outline, self.textures = surface_program, outline, textures
         self._buffer, self._triangles = (_uploaded(context, array) for array in (self.vertices, self.triangles))
-        if self.edges is None and not self.is_projected:  # may free hundreds of MiB
+        if self.edges is None and not self.is_projected:  # this may free hundreds of MiB
             self.vertices, self.triangles = self.vertices[:0].copy(), self.triangles[:0].copy()
         layout = _layout(surface_program, self._buffer, ("in_position", *ATTRIBUTES), (3, 3, 2, 4))
         self.surface = context.vertex_array(surface_program, [layout], index_buffer=self._triangles)
 
     def draw_surface(self) -> None:
-        """Draw the part in several calls, because a software rasteriser holds Python's lock during each."""
+        """Draw the part's triangles.
+
+        Large parts are drawn in several calls, because a software rasteriser holds Python's lock during each call.
+        """
         for first in range(0, self.corner_count, 3 * DRAWN_AT_ONCE):
             raise_if_abandoned()
             self.surface.render(first=first, vertices=min(3 * DRAWN_AT_ONCE, self.corner_count - first))
 
     def release(self) -> None:
-        """Release the part's GL objects, except shared ones. A vertex array does not release its buffers."""
+        """Release the GL objects that the part owns. Releasing a vertex array does not release its buffers."""
         for held in (self.surface, self._buffer, self._triangles):
             held.release()
 
 
 class _Place:
-    """Position of a part in a scene, with the matrices that do not depend on the view."""
+    """Placement of a part in a scene, with matrices that do not depend on the view."""
 
     def __init__(self, stack_from_part: F64) -> None:
         linear = stack_from_part[:3, :3]
         volume = float(np.linalg.det(linear))
         self.stack_from_part = stack_from_part
-        self.part_from_stack = np.linalg.inv(stack_from_part) if volume else None  # None: flattened to no volume
+        self.part_from_stack = np.linalg.inv(stack_from_part) if volume else None  # None if the part is flattened
         self.normals = np.linalg.pinv(linear).T * np.cbrt(abs(volume))
 
 
 class _Look:
-    """Matrices of a part's position in one view."""
+    """Placement of a part as seen in one view, with the matrices that shaders need."""
 
     def __init__(self, place: _Place, clip_from_stack: F64, view: View) -> None:
         inverse = place.part_from_stack
-        self.eye = None if inverse is None else inverse[:3, :3] @ view.eye_m + inverse[:3, 3]  # None: no volume
+        self.eye = None if inverse is None else inverse[:3, :3] @ view.eye_m + inverse[:3, 3]  # in the part's frame
         turned = place.normals if view.display_from_view is None else view.display_from_view @ place.normals
         self.clip_from_part = clip_from_stack @ place.stack_from_part
         self._clip, self._normals = _gl(self.clip_from_part), _gl(turned)
 
     def set(self, program: Any, part: DrawnPart) -> None:
-        """Set a program's uniforms and textures for a part."""
+        """Set the uniforms and the textures with which a program draws a part."""
         for name, matrix in (("stack_from_part", self._normals), ("clip_from_part", self._clip)):
             if (uniform := program.get(name, None)) is not None:
                 uniform.write(matrix)
@@ -212,16 +232,16 @@ class _Look:
 
 @dataclass(frozen=True, slots=True)
 class _Arrangement:
-    """Positions of all parts at one time."""
+    """Placements of all parts of a scene at a time."""
 
-    places: list[_Place]  # one per part; parts at the same position share it
-    points_m: F64  # (n, 3) points around all parts, frame `stack`
-    corners_m: F64  # (p, 8, 3) corners of each part's box, frame `stack`
-    nearest_first: NDArray[np.intp]  # (p,)
+    places: list[_Place]  # placement of each part; parts may share a placement
+    points_m: F64  # (n, 3) points whose convex hull contains all parts, frame `stack`
+    corners_m: F64  # (p, 8, 3) corners of each part's bounding box, frame `stack`
+    nearest_first: NDArray[np.intp]  # (p,) indices of the parts from the nearest to the farthest
 
 
 class TriangleSource(CanvasSource):
-    """Source that draws placed parts over a background."""
+    """Source that draws parts, each with a placement, over a uniform background."""
 
     def __init__(
         self,
@@ -234,13 +254,18 @@ class TriangleSource(CanvasSource):
     ) -> None:
         """Create the source.
 
-        stack_from_parts: a 4x4 similarity for each part. samples: number per pixel, to smooth outlines; 0: they are
-        smoothed by ramps instead, which is faster on a software rasteriser.
+        Args:
+            parts: Parts to draw.
+            stack_from_parts: Placement of each part, a 4x4 similarity.
+            context: Current moderngl context.
+            info: Properties of the scene.
+            samples: Number of samples per pixel. If 0, outlines are smoothed by ramps instead of multisampling, which
+                is faster on a software rasteriser.
         """
         super().__init__(context, info=info, samples=samples)
         self.parts, self.stack_from_parts = list(parts), list(stack_from_parts)
         self._with_ramps = samples == 0
-        self._still: _Arrangement | None = None  # arrangement of a scene that does not move
+        self._still: _Arrangement | None = None  # arrangement of a static scene
         self._programs: dict[tuple[str, ...], Any] = {}
         self._textures: dict[tuple[int, Sampler], Any] = {}
         self._outlined = [(n, part, part.edges) for n, part in enumerate(self.parts) if part.edges is not None]
@@ -250,7 +275,7 @@ class TriangleSource(CanvasSource):
             self._edges = Outlines([edges for _, _, edges in self._outlined], vertices=counts)
             self._corners = np.concatenate([part.vertices for _, part, _ in self._outlined])
             for (begin, end), (_, part, _) in zip(pairwise(self._edges.vertices_before), self._outlined, strict=True):
-                part.vertices = self._corners[begin:end]  # avoids a second copy
+                part.vertices = self._corners[begin:end]  # a view avoids a second copy
         self._outline_buffer = context.buffer(reserve=max(edges, 1) * 6 * OUTLINE_FLOATS * 4, dynamic=True)
         self._outlines: dict[tuple[str, ...], Any] = {}
         for part in self.parts:
@@ -261,7 +286,10 @@ class TriangleSource(CanvasSource):
         self.held += [*self._textures.values(), *self._programs.values()]
 
     def places(self, time_ns: int) -> Sequence[F64]:
-        """Return the 4x4 stack_from_part of each part. Moving scenes compute it for each time."""
+        """Return the 4x4 placement of each part at a time.
+
+        Subclasses for moving scenes override this method. The default returns constant placements.
+        """
         return self.stack_from_parts
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect:
@@ -278,7 +306,7 @@ class TriangleSource(CanvasSource):
             corners.append(part.corners_m @ matrix[:3, :3].T + matrix[:3, 3])
             is_few = part.is_projected
             points.append(part.positions @ matrix[:3, :3].T + matrix[:3, 3] if is_few else corners[-1])
-        # Nearest first, so that hidden pixels need not be shaded.
+        # Drawing the nearest part first saves the shading of hidden pixels.
         order = np.argsort([-box[:, 0].mean() for box in corners], kind="stable")
         found = _Arrangement([shared[id(m)] for m in matrices], np.concatenate(points), np.stack(corners), order)
         if is_still:
@@ -286,7 +314,7 @@ class TriangleSource(CanvasSource):
         return found
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
-        """Draw the picture of a view. The same view and time give the same bytes."""
+        """Draw the picture of a view. Drawing the same view at the same time gives identical pixels."""
         arranged = self._arranged(time_ns)
         corners_m = arranged.corners_m.reshape(-1, 3)
         area = camera.covered_box(view, corners_m)
@@ -313,11 +341,14 @@ class TriangleSource(CanvasSource):
         return picture
 
     def _draw_translucent(self, placed: list[tuple[DrawnPart, _Look]]) -> None:
-        """Blend translucent parts over the opaque ones: farthest part first, back faces before front faces."""
+        """Blend translucent parts over opaque parts, from the farthest part to the nearest.
+
+        The back faces of each part are drawn before the front faces.
+        """
         context, framebuffer = self.context, self.context.fbo
         context.enable_only(context.DEPTH_TEST | context.BLEND | context.CULL_FACE)
         context.blend_func = OVER
-        context.front_face = "cw"  # the raster's rows run along GL's y
+        context.front_face = "cw"  # rows of the raster run along y in OpenGL, which mirrors triangles
         framebuffer.depth_mask = False
         for part, look in reversed(placed):
             if part.is_blended:
@@ -338,7 +369,7 @@ class TriangleSource(CanvasSource):
         return self._programs[features]
 
     def _outline(self, features: tuple[str, ...]) -> Any:
-        """Return the vertex array with which outlines of parts with these features are drawn."""
+        """Return the vertex array that draws the outlines of parts with the given features."""
         if features not in self._outlines:
             program = self._program((*features, "OUTLINE"))
             names = ("in_clip", "in_coverage", *ATTRIBUTES)
@@ -359,7 +390,7 @@ class TriangleSource(CanvasSource):
         return self._textures[key]
 
     def _draw_outlines(self, looks: list[_Look], nearest_first: NDArray[np.intp], view: View) -> None:
-        """Draw ramps along the outlines of all parts, farthest part first."""
+        """Draw ramps along the outlines of all parts, from the farthest part to the nearest."""
         eyes = [looks[n].eye for n, _, _ in self._outlined]
         seen, of_part = self._edges.seen(eyes)
         rank = np.argsort(nearest_first)[[n for n, _, _ in self._outlined]]
@@ -387,14 +418,14 @@ class TriangleSource(CanvasSource):
 
 
 def _set_uniforms(program: Any, **values: Any) -> None:
-    """Set the uniforms that the compiler has kept."""
+    """Set uniforms of a program. Those that the compiler has removed are ignored."""
     for name, value in values.items():
-        if (uniform := program.get(name, None)) is not None:  # `in` would try all names in turn
+        if (uniform := program.get(name, None)) is not None:  # the operator `in` would try all names in turn
             uniform.value = value
 
 
 def _uploaded(context: Any, array: Any) -> Any:
-    """Upload a buffer in pieces, because uploading holds Python's lock."""
+    """Upload an array to a new buffer, in pieces because each upload holds Python's lock."""
     data = memoryview(array).cast("B")
     buffer = context.buffer(reserve=data.nbytes)
     for first in range(0, data.nbytes, UPLOADED_AT_ONCE):
@@ -403,12 +434,19 @@ def _uploaded(context: Any, array: Any) -> Any:
 
 
 def _gl(matrix: F64) -> F32:
-    """Return a matrix in column-major order, for OpenGL."""
+    """Return a matrix in the column-major order that OpenGL expects."""
     return np.ascontiguousarray(matrix.T, np.float32)
 
 
 def _layout(program: Any, buffer: Any, names: tuple[str, ...], sizes: tuple[int, ...]) -> tuple[Any, ...]:
-    """Return the description of a buffer for a program, without attributes that the compiler removed."""
+    """Describe a buffer for a vertex array of moderngl.
+
+    Args:
+        program: Program that reads the buffer. Attributes that the compiler has removed are skipped.
+        buffer: Buffer with the attributes of consecutive vertices.
+        names: Names of the attributes.
+        sizes: Number of floats of each attribute.
+    """
     used = [name for name in names if name in program]
     formats = [f"{size}f" if name in used else f"{size * 4}x" for name, size in zip(names, sizes, strict=True)]
     return (buffer, " ".join(formats), *used)
