@@ -164,7 +164,7 @@ class ForwardingSource(ContentSource):
 
     @abstractmethod
     def forwarded(self, view: View, time_ns: int) -> tuple[ContentSource, View, int]:
-        """Return the source to which a request is forwarded, and the view and time to request there."""
+        """Return the source that serves a request, and the view and the time to pass to this source."""
 
     @property
     def problem(self) -> str:

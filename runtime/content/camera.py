@@ -51,12 +51,12 @@ def project(pixels_from_stack: F64, points_m: F64) -> tuple[F64, F64]:
 
 
 def covered_box(view: View, corners_m: F64, *, align_px: int = 32) -> PixelRect:
-    """Return a box of pixels that contains the projection of the convex hull of some points.
+    """Return a box of pixels that contains the projection of the convex hull of the given points.
 
     The box is empty if all points are behind the eye, and covers the whole raster if some of them are.
 
     Args:
-        view: View whose pixels are meant.
+        view: View to whose raster the box is clipped.
         corners_m: Points (n, 3) in frame `stack`.
         align_px: The box is enlarged to multiples of this number of pixels.
     """

@@ -156,7 +156,7 @@ class CanvasSource(ContentSource):
     def drawn(self, view: View, box: PixelRect, paint: Callable[[], None]) -> DrawnPicture:
         """Clear the framebuffer of a view, call `paint` to draw inside `box`, and return the picture.
 
-        The picture stays valid until the next one is drawn for the same side.
+        The picture stays valid until another picture is drawn for the same side.
         """
         raise_if_abandoned()
         self._bounds[view.side] = None

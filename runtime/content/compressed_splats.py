@@ -169,7 +169,7 @@ def _sog(path: Path) -> Gaussians:
 
 
 class _SogFiles:
-    """Reads the members of a SOG file, which is a folder or a ZIP archive."""
+    """Reads the pictures and metadata of a SOG scene, which is a folder or a ZIP archive."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

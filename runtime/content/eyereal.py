@@ -31,7 +31,7 @@ class Pair:
     number: int
     paths: tuple[Path, Path]  # left, right
     eyes_m: F64  # (2, 3) positions of the left and right eye, frame `stack`
-    looks_at_m: F64  # (3,) scene's origin, at which both eyes look, frame `stack`; it may be off the display
+    looks_at_m: F64  # (3,) scene's origin in frame `stack`, at which both eyes look; not always on the display
 
     def image_from_stack(self, side: int, *, width_px: int, height_px: int, fov_deg: float) -> F64:
         """Return the (3, 4) projection from `stack` to pixels of the left (`side` 0) or right (1) picture."""
@@ -89,7 +89,7 @@ def read_folder(folder: Path, preset: str) -> tuple[Pair, ...]:
 
 
 def prepare(file: SceneFile) -> Callable[..., ContentSource]:
-    """Read a folder of pairs, and return a function that creates its source.
+    """Read a folder of pairs, and return a function that creates the source.
 
     The preset is the chosen one or, by default, the preset whose name occurs in the folder's name. Raises InputError if
     no preset is known, or if the pairs cannot be read.
@@ -108,7 +108,7 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
 class EyeRealSource(ContentSource):
     """Source that shows the pair whose left eye is nearest to the viewer's.
 
-    Its pictures are warped to the viewer's eyes as if they were on the plane x = 0, at the centre of the display.
+    The pictures are warped to the viewer's eyes as if they were on the plane x = 0, at the centre of the display.
     """
 
     def __init__(

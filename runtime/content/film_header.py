@@ -1,6 +1,7 @@
 """Read the arrangement of views that a film file declares.
 
-MP4 files declare it in the boxes `st3d` and `sv3d` or in XML, and Matroska files in the element StereoMode.
+MP4 files contain this declaration in the boxes `st3d` and `sv3d` or in XML, and Matroska files in the element
+StereoMode.
 """
 
 from __future__ import annotations

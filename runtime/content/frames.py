@@ -75,7 +75,7 @@ class Frames(ABC):
 class PictureFiles(Frames):
     """Sequence of still pictures, each of which is a file.
 
-    If a file contains two views and both are shown, they are joined side by side.
+    If a file contains two views and both are shown, the views are joined side by side.
     """
 
     def __init__(self, paths: Sequence[Path], settings: ContentSettings, *, folder: Path | None = None) -> None:
@@ -197,7 +197,8 @@ def layout_in(header: Header, path: Path, settings: ContentSettings, folder: Pat
     """Return the layout of a picture.
 
     The layout of a file that contains two views is side by side, unless the settings request a single view or the
-    cross-eyed order. For other files, the settings, the header, or the name of the file or of `folder` determine it.
+    cross-eyed order. The layout of other files follows from the settings, the header, or the name of the file or of
+    `folder`.
     """
     layout = layout_of(path, settings, stated=header.layout)
     if header.is_around:

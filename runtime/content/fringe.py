@@ -68,7 +68,7 @@ class Outlines:
     """Edges of several parts, among which `seen` selects the outlines that are visible to an eye."""
 
     def __init__(self, each: Sequence[Edges], *, vertices: Sequence[int]) -> None:
-        """Combine the edges of all parts. Their vertices are numbered consecutively across the parts.
+        """Combine the edges of all parts. Vertices are numbered consecutively across the parts.
 
         Args:
             each: Edges of each part.

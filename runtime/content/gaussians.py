@@ -326,7 +326,7 @@ def nearest_blocks(splats: Splats, view: View, *, every: int, first: tuple[int, 
 def harmonic_basis(directions: F32, count: int) -> F32:
     """Return the first `count` real spherical harmonics (n, count) of unit directions (n, 3).
 
-    Their order and signs are those of the reference implementation.
+    The order and the signs of the harmonics are those of the reference implementation.
     """
     x, y, z = directions.T
     basis = [np.full_like(x, FLAT_HARMONIC)]

@@ -84,7 +84,7 @@ class GltfScene:
         return corners // 3 if primitive.get("mode", TRIANGLES) <= TRIANGLES else corners
 
     def _instances(self, node: Table) -> int:
-        """Return the number of instances of a node's mesh, which EXT_mesh_gpu_instancing may multiply."""
+        """Return the number of instances that EXT_mesh_gpu_instancing declares for a node, or 1."""
         own = node.get("extensions", {}).get(INSTANCES, {}).get("attributes", {})
         return min((self.file.count(index) for name, index in own.items() if name in PLACES), default=1)
 

@@ -46,7 +46,7 @@ ROUGH = 6.0  # standard deviation in 8-bit values; smoother halves always correl
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Arrangement of views in a picture, by which `views` splits a picture into its views."""
+    """Arrangement of views in a picture. The method `views` splits a picture accordingly."""
 
     kind: str  # mono, rgbd, quilt, side-by-side, top-bottom or anaglyph
     columns: int = 1
@@ -137,7 +137,7 @@ def of_film(layout: Layout, path: Path, *, width_px: int, height_px: int) -> Lay
 
     Args:
         layout: Layout that the film's name or header states.
-        path: File of the film. Views are not squeezed if its name says so.
+        path: File of the film. A mark such as `full` in the name means that views are not squeezed.
         width_px: Width of a frame.
         height_px: Height of a frame.
     """

@@ -17,7 +17,7 @@ BLACK: Colour = (0.0, 0.0, 0.0)
 UNCOLOURED: Colour = (0.70, 0.74, 0.80)  # colour of meshes from files without colours
 OPAQUE_FROM = 0.99  # alpha from which a pixel counts as opaque
 LARGEST_TEXTURE_PX = 4096
-OUTLINED_MAX = 200_000  # most triangles of a part or file with outlines; in larger ones, these cost more than drawing
+OUTLINED_MAX = 200_000  # parts and files with more triangles get no outlines, which would cost more than drawing
 Wrap = Literal["repeat", "clamp", "mirror"]
 
 

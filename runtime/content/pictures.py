@@ -97,7 +97,7 @@ class PicturesSource(ContentSource):
     def _view_for(self, view: View) -> int:
         """Return the index of the view that an eye sees.
 
-        The eye's side determines the view of a stereo picture. In a quilt, it is the view nearest in angle.
+        The eye's side determines the view of a stereo picture, and the eye's angle determines the view of a quilt.
         """
         if len(self._views) <= 2:
             return min(view.side, len(self._views) - 1)

@@ -88,7 +88,7 @@ def read_playlist(path: Path, settings: ContentSettings) -> Playlist:
 
 
 class PlaylistSource(ForwardingSource):
-    """Source that plays a list of scenes one after another, starting with the first request."""
+    """Source that plays a list of scenes one after another. The first request starts the playlist."""
 
     def __init__(self, playlist: Playlist, openers: list[Callable[..., ContentSource]], *, context: Any) -> None:
         """Create the sources of all entries.

@@ -100,9 +100,10 @@ class _Frame:
 
 
 class Programs:
-    """Server to which drawing programs connect to receive requests and to send pictures. Thread-safe.
+    """Server to which drawing programs connect, to receive requests and to send pictures.
 
-    The program that connected last draws. Programs that only listen receive the same requests.
+    The program that connected last draws. Programs that only listen receive the same requests. All methods are
+    thread-safe.
     """
 
     def __init__(self, port: int, *, most_bytes: int) -> None:

@@ -94,7 +94,7 @@ def surfaces(colour: U8, depth: F32, *, stack: PanelStack, depth_m: tuple[float,
 def sharpened(depth: F32) -> F32:
     """Sharpen the edges of a depth map (h, w).
 
-    The depth of a pixel in a blurred edge is replaced by the depth of one side, whichever is closer to the pixel's.
+    A pixel in a blurred edge takes the depth of the near or the far side, depending on which depth is closer.
     """
     kernel = np.ones((BLURRED_PX, BLURRED_PX), np.uint8)
     high, low = cv2.dilate(depth, kernel), cv2.erode(depth, kernel)

@@ -215,7 +215,7 @@ class _Look:
 
     def __init__(self, place: _Place, clip_from_stack: F64, view: View) -> None:
         inverse = place.part_from_stack
-        self.eye = None if inverse is None else inverse[:3, :3] @ view.eye_m + inverse[:3, 3]  # in the part's frame
+        self.eye = None if inverse is None else inverse[:3, :3] @ view.eye_m + inverse[:3, 3]  # None if flattened
         turned = place.normals if view.display_from_view is None else view.display_from_view @ place.normals
         self.clip_from_part = clip_from_stack @ place.stack_from_part
         self._clip, self._normals = _gl(self.clip_from_part), _gl(turned)
