@@ -1,7 +1,8 @@
-"""Entry point of the script `phasestack`, imported first so that Ctrl-C exits silently with 130.
+"""Entry point of the `phasestack` command, which installs an early handler for Ctrl-C.
 
-While commands are imported, no file is open, so an interrupt can simply exit the process. An exception would print a
-traceback, or be lost where Python ignores it. Later, `commands.guard` takes over.
+While the commands are being imported, Ctrl-C exits the process silently with code 130. This is safe because no file is
+open yet. An exception would print a traceback, or would be lost where Python ignores exceptions. Once the commands are
+imported, `commands.guard` handles interrupts.
 """
 
 # These modules are already loaded; importing `signal` would delay the handler by milliseconds.
@@ -18,7 +19,7 @@ if _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler:  # leave an
 
 
 def main() -> None:
-    """Run the command named by the arguments; never returns."""
+    """Run the command that the arguments name, then exit the process. Never returns."""
     from runtime.commands.guard import run_guarded
 
     run_guarded(interrupts_leave=_signal.getsignal(_signal.SIGINT) is _leave)

@@ -1,4 +1,8 @@
-"""Error classes. Transient errors hold, degrade and retry; fatal ones refuse to start (exit code 2)."""
+"""Exception classes, and functions that clean and classify errors.
+
+After a transient error, the daemon keeps the last good frame, degrades and retries. After a fatal error, the program
+exits with code 2.
+"""
 
 from __future__ import annotations
 
@@ -8,17 +12,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-PART_CHARACTERS_MAX = 300  # limit per part of a message: untrusted names must not fill the screen or forge log lines
-PROBLEM_CHARACTERS_MAX = 1500  # limit for all problems of a file together
-_USER_OF_ADDRESS = re.compile(r"""(:/{1,2})[^/\s'"]*@""")  # normalised paths have one slash
-# System errors for a lack of resources or a temporary hardware failure.
+PART_CHARACTERS_MAX = 300  # limit for each part of a message, because an untrusted name must not fill the screen
+PROBLEM_CHARACTERS_MAX = 1500  # limit for the description of all problems in a file
+_USER_OF_ADDRESS = re.compile(r"""(:/{1,2})[^/\s'"]*@""")  # a URL that was converted to a path has only one slash
+# System errors that indicate a lack of resources, a hardware failure that may be temporary, or an interrupted call.
 PASSING = frozenset(
     (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.ENOBUFS, errno.EINTR)
 )
 
 
 def without_secrets(text: str) -> str:
-    """Return the text with user names and passwords (before an `@`) removed from addresses.
+    """Return the text without the user names and passwords that precede an `@` in URLs.
 
     >>> without_secrets("rtsp://user:a@b@host/door"), without_secrets("/etc/rtsp:/user:a@host/door")
     ('rtsp://host/door', '/etc/rtsp:/host/door')
@@ -27,7 +31,9 @@ def without_secrets(text: str) -> str:
 
 
 def one_line(text: str, *, most: int = PART_CHARACTERS_MAX) -> str:
-    r"""Return the text as one printable line without secrets; `...` replaces the middle of a long one.
+    r"""Return the text as one printable line without secrets, to keep untrusted text from forging log lines.
+
+    Each unprintable character becomes `?`. In a text of more than `most` characters, `...` replaces the middle.
 
     >>> one_line("a\nb"), one_line("x" * 9, most=7)
     ('a?b', 'xx...xx')
@@ -40,15 +46,15 @@ def one_line(text: str, *, most: int = PART_CHARACTERS_MAX) -> str:
 
 
 class PhasestackError(Exception):
-    """Base of all errors that phasestack raises on purpose."""
+    """Base class of all errors that phasestack raises on purpose."""
 
 
 class FatalError(PhasestackError):
-    """A failure that retrying cannot fix; the CLI prints one line and exits with 2."""
+    """A failure that retrying cannot fix. The command line prints the message and exits with code 2."""
 
 
 class InputError(FatalError):
-    """Wrong input from a user. The message names the file (or option) and the field.
+    """Invalid input from a user. The message names the file or option, and the invalid field.
 
     >>> str(InputError("panels.toml", "x_m", "must ascend"))
     'panels.toml: x_m: must ascend'
@@ -64,37 +70,40 @@ class InputError(FatalError):
 
 
 class MissingPart(FatalError):
-    """A required optional package is not installed; the message names it."""
+    """A package or library that the requested function needs is not installed. The message names it."""
 
 
 class TransientError(PhasestackError):
-    """A failure that may pass. The daemon holds the last good frame, degrades and retries."""
+    """A failure that may be temporary. The daemon keeps the last good frame, degrades and retries."""
 
 
 class SensorLost(TransientError):
-    """The sensor is gone, hangs or delivers invalid data. It is closed, and reopened with back-off."""
+    """The sensor is disconnected, hangs or delivers invalid data.
+
+    The sensor thread closes the sensor and reopens it, with a delay that doubles up to a maximum.
+    """
 
 
 class SensorTimeout(TransientError):
-    """No new sample arrived in time; the sensor may still be working."""
+    """No new sample arrived in time, although the sensor may still be working."""
 
 
 class EndOfRecording(TransientError):
-    """A replayed source has no more samples."""
+    """The recording that is being replayed has no more samples."""
 
 
 class ContentFailure(TransientError):
-    """The content source could not draw this frame. The last good picture stays."""
+    """The content source could not draw this frame. The display keeps the last good picture."""
 
 
 class ModelFailure(TransientError):
-    """Inference failed or returned invalid layers. The last good layers stay."""
+    """Inference failed or returned invalid layers. The panels keep the last good layers."""
 
 
 class EyesNotServed(ModelFailure):
-    """The model does not support these eye positions.
+    """The model does not support the requested eye positions.
 
-    Positions of a moving viewer may become valid again; positions given as an option are refused.
+    A moving viewer may return to supported positions. Unsupported positions in a command's options are refused.
     """
 
 
@@ -103,7 +112,7 @@ class ContextLost(TransientError):
 
 
 class PanelLost(TransientError):
-    """A panel's window, monitor or GL context is lost. The loop continues and tries to rebuild it."""
+    """The window, monitor or GL context of a panel is lost. The loop continues and tries to rebuild the panel."""
 
 
 class Stopped(PhasestackError):
@@ -112,7 +121,10 @@ class Stopped(PhasestackError):
 
 @contextmanager
 def retry_advised() -> Iterator[None]:
-    """Convert errors that may be temporary to TransientError (exit code 75): another start may help."""
+    """Convert temporary failures of the machine to TransientError.
+
+    The exit code of a TransientError, 75, advises the caller to start the program again.
+    """
     try:
         yield
     except Exception as error:
@@ -122,9 +134,10 @@ def retry_advised() -> Iterator[None]:
 
 
 def is_retryable(error: BaseException | None) -> bool:
-    """Return True if an exception, or its context, is a temporary failure of the machine, not bad input.
+    """Return True if any exception in a chain is a temporary failure of the machine rather than bad input.
 
-    Readers convert a system error to an InputError that names the file; the system error remains its context.
+    Functions that read files convert a system error to an InputError that names the file. The system error stays in
+    the chain of causes and contexts.
     """
     while error is not None:
         if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno in PASSING):

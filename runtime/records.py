@@ -1,4 +1,7 @@
-"""Frozen records that stages pass to each other. Their arrays never change after construction."""
+"""Immutable records that the stages of the runtime pass to each other.
+
+The arrays in a record never change after the record has been constructed.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ Inference = Literal["ran", "reused", "skipped"]
 
 
 class State(StrEnum):
-    """State of the daemon. In DEGRADED, the reason names the missing parts."""
+    """State of the daemon. The reason reported with DEGRADED names the missing parts."""
 
     STARTING = "starting"
     TRACKING = "tracking"
@@ -34,7 +37,7 @@ class State(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Intrinsics:
-    """Intrinsic parameters of a pinhole camera. Pixel centres are at half-integers."""
+    """Intrinsic parameters of a pinhole camera. The centres of pixels have half-integer coordinates."""
 
     width_px: int
     height_px: int
@@ -45,9 +48,10 @@ class Intrinsics:
 
     @classmethod
     def centred(cls, width_px: int, height_px: int, *, fov_rad: float) -> Intrinsics:
-        """Return intrinsics of a camera with square pixels and a central axis.
+        """Return the intrinsics of a camera with square pixels and a centred principal point.
 
-        fov_rad: horizontal field of view.
+        Args:
+            fov_rad: Horizontal field of view.
         """
         focal_px = width_px / 2 / math.tan(fov_rad / 2)
         return cls(width_px, height_px, focal_px, focal_px, width_px / 2, height_px / 2)
@@ -55,150 +59,150 @@ class Intrinsics:
 
 @dataclass(frozen=True, slots=True)
 class EyePoints:
-    """Two eyes at one instant, measured by a sensor or an eye finder."""
+    """Positions of a viewer's two eyes at one instant, measured by a sensor or an eye finder."""
 
-    eyes_m: F64  # (2, 3) left and right eye in metres, frame `sensor` or `stack` according to context
-    confidence: F64  # (2,) in [0, 1], left, right
-    completed: Literal["", "left", "right"] = ""  # eye that was hidden and is filled in from the head's pose
-    covariance_m2: F64 | None = None  # (3, 3) covariance of the midpoint of the eyes, same frame; None: unknown
+    eyes_m: F64  # (2, 3) left and right eye in metres, frame `sensor` or `stack` depending on the context
+    confidence: F64  # (2,) confidence in the left and right eye, 0 to 1
+    completed: Literal["", "left", "right"] = ""  # hidden eye whose position was inferred from the head's pose
+    covariance_m2: F64 | None = None  # (3, 3) covariance of the eyes' midpoint in the frame of `eyes_m`; None: unknown
 
 
 @dataclass(frozen=True, slots=True)
 class SensorFrame:
-    """Sample of a sensor, with all its streams at one instant."""
+    """Sample of a sensor, which combines the data of all streams at one instant."""
 
-    sequence: int  # frame number of the device; gaps are lost frames
+    sequence: int  # frame number assigned by the device; a gap means lost frames
     capture_ns: int  # time of exposure, on the monotonic clock
-    eyes: EyePoints | None = None  # frame `sensor`; None: no face, or the sensor does not find eyes
+    eyes: EyePoints | None = None  # eyes in the frame `sensor`; None: no face, or the sensor does not find eyes
     colour: U8 | None = None  # (h, w, 3) RGB
     depth_mm: U16 | None = None  # (h, w), registered to the colour image where both exist; 0: no measurement
     intrinsics: Intrinsics | None = None  # intrinsics of the image to which depth and colour are registered
-    true_eyes_m: F64 | None = None  # (2, 3) true eyes, frame `stack`; only in recordings with ground truth
+    true_eyes_m: F64 | None = None  # (2, 3) true eyes in metres, frame `stack`; None: no ground truth
 
 
 @dataclass(frozen=True, slots=True)
 class EyesEstimate:
-    """Eyes estimated for one instant, with a label for their origin."""
+    """Estimated eye positions at one instant, with a label that says how they were obtained."""
 
     time_ns: int  # instant of the estimate
-    capture_ns: int  # capture time of the newest sample used; 0 with label none
-    eyes_m: F64 | None  # (2, 3) left, right; frame `stack`; None with label none
+    capture_ns: int  # capture time of the newest sample used; may be 0 with label `none`
+    eyes_m: F64 | None  # (2, 3) left and right eye in metres, frame `stack`; None with label `none`
     label: EyesLabel
-    sigma_m: float = 0.0  # standard deviation, per axis, of the midpoint of the eyes at that instant
+    sigma_m: float = 0.0  # standard deviation, along each axis, of the eyes' midpoint at `time_ns`
 
 
 @dataclass(frozen=True, slots=True)
 class Parallax:
-    """Motion of content on the panels when the eyes leave the position solved for (`optics.relief`).
+    """Motion of content on the panels as the eyes move away from the solution's eye positions (`optics.relief`).
 
-    Content of relief b that is now seen through pixel p of the middle panel was seen, by the eyes solved for, through
-    pixel p + b·(drift_px + growth·p).
+    The eyes now see content of relief b through pixel p of the middle panel. From the solution's eye positions, the
+    same content appeared at pixel p + b·(drift_px + growth·p).
     """
 
-    drift_px: tuple[float, float]  # right and down
-    growth: float  # relative growth as the head comes nearer or moves away
-    middle_from_shown: tuple[F64, ...]  # per panel (3, 3), scale and shift along rays from the present midpoint
-    weights: tuple[float, ...]  # for each panel, pixels per middle-panel pixel along rays from the old midpoint
+    drift_px: tuple[float, float]  # shift to the right and down
+    growth: float  # relative growth as the head moves towards or away from the display
+    middle_from_shown: tuple[F64, ...]  # (3, 3) for each panel: scale and shift along rays from the present midpoint
+    weights: tuple[float, ...]  # for each panel: pixels per middle-panel pixel along rays from the solution's midpoint
 
 
 @dataclass(frozen=True, slots=True)
 class PanelFrame:
-    """Layers of all panels at one refresh: an aligned solution, the flat picture or a mix of both."""
+    """Layers that the panels show at one refresh: an aligned solution, the flat picture or a mix of the two."""
 
     number: int  # number of the refresh, the same on all panels
-    solved: U8 | None  # (N, h, w, 4) RGBA layers for two eyes, rear to front, on any raster; None: no solution yet
+    solved: U8 | None  # (N, h, w, 4) RGBA layers of the solution, rear to front, on any raster; None: no solution yet
     solved_version: int  # changes whenever `solved` changes
-    solved_from_shown: tuple[F64, ...] = ()  # per panel (3, 3), in the panels' pixels; (): layers shown as solved
+    solved_from_shown: tuple[F64, ...] = ()  # (3, 3) alignment of each panel, in panel pixels; empty: no alignment
     flat: U8 | None = None  # (N, height_px, width_px, 4) flat picture, which is never aligned
     flat_version: int = 0
-    flatness: float = 0.0  # weight of `flat` in a linear mix of codes; 0: `solved` alone, 1: `flat` alone
-    size_px: tuple[int, int] | None = None  # columns and rows of the panels; None: those of `solved`
-    relief: F32 | None = None  # (h, w) relief of the solution's content, on the middle panel; None: unknown
+    flatness: float = 0.0  # weight of `flat` in a linear mix of 8-bit codes; 0: only `solved`, 1: only `flat`
+    size_px: tuple[int, int] | None = None  # columns and rows of the panels; None: the size of `solved`
+    relief: F32 | None = None  # (h, w) relief of the solution's content on the middle panel; None: unknown
     parallax: Parallax | None = None  # None: content does not move on the middle panel
 
 
 @dataclass(frozen=True, slots=True)
 class PresentReport:
-    """Result of presenting a PanelFrame."""
+    """Times at which the panels showed a PanelFrame."""
 
     number: int
     present_ns: int  # estimated time at which the last panel was lit
-    skew_ms: float  # time between the first and the last panel's swap
-    vblank_ns: int | None = None  # estimated vertical blank of the refresh; None: not applicable
+    skew_ms: float  # time between the buffer swaps of the first and the last panel
+    vblank_ns: int | None = None  # estimated time of the refresh's vertical blank; None: not applicable
 
 
 @dataclass(frozen=True, slots=True)
 class PlanItem:
-    """Saving of the plan: the omitted work, the reason, the time saved and the quality lost."""
+    """Work that the plan omits, with the reason, the time saved and the quality lost."""
 
-    what: str
+    what: str  # the omitted work
     why: str
     saves_ms: float | None  # None: not measured
-    costs_db: float | None
+    costs_db: float | None  # None: not measured
 
 
 @dataclass(frozen=True, slots=True)
 class FrameTiming:
-    """Predicted times, on the run's clock, at which a refresh wakes, presents and is displayed."""
+    """Predicted times of one refresh, on the run's clock."""
 
     id: int  # refresh number
-    wake_ns: int
+    wake_ns: int  # time at which the presenter wakes
     present_ns: int  # time of the vertical blank or, without one, of the end of presenting
     photon_ns: int  # middle of the display time
 
 
 @dataclass(frozen=True, slots=True)
 class SolveRequest:
-    """Request from the presenter to the solver. It replaces an older request that has not begun."""
+    """Request from the presenter to the solver. A new request replaces one that the solver has not begun."""
 
-    time_ns: int  # instant to solve for: middle of the solution's expected display time
-    eyes_m: F64 | None  # (2, 3) left, right; frame `stack`; predicted for `time_ns`; None: no viewer
+    time_ns: int  # instant to solve for, the middle of the solution's expected display time
+    eyes_m: F64 | None  # (2, 3) left and right eye in metres, frame `stack`, predicted for `time_ns`; None: no viewer
     eyes_label: EyesLabel
-    sigma_m: float  # standard deviation of these eyes per axis
-    flat_wanted: bool  # the flat picture is shown or will be needed
-    paused: bool = False  # True: no new solutions
-    effort: Effort | None = None  # effort for a new solution; None: full
-    refined_to: Effort | None = None  # effort to continue the newest solution with, if nothing has changed
+    sigma_m: float  # standard deviation of `eyes_m` along each axis
+    flat_wanted: bool  # True if the flat picture is shown or will be needed
+    paused: bool = False  # True if no new solutions are wanted
+    effort: Effort | None = None  # effort for a new solution; None: full effort
+    refined_to: Effort | None = None  # effort to which to refine the newest solution while nothing has changed
 
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """Work spent on a solution, as a raster and a number of updates of all panels."""
+    """Work spent on a solution, given by the resolution of the layers and the number of steps."""
 
-    reduction: int = 1  # divisor for the panels' rows and columns
-    steps: int = 0
-    continued_from: int | None = None  # steps that the continued solution had already done; None: a new one
+    reduction: int = 1  # divisor of the panels' rows and columns
+    steps: int = 0  # updates of all panels
+    continued_from: int | None = None  # number of steps in the solution that is continued; None: a new solution
 
     @property
     def name(self) -> str:
-        """Short name such as `1/2+1`, for half the rows and columns and one step."""
+        """Short name of the effort, such as `1/2+1` for half the rows and columns and one step."""
         return f"1/{self.reduction}+{self.steps}"
 
 
 @dataclass(frozen=True, slots=True)
 class Measures:
-    """Measurements of a solution, as squared errors of intensities in 0..1; None: not measured."""
+    """Measured squared errors of a solution, for intensities from 0 to 1. None means not measured."""
 
     residual: float | None = None  # error of sampled rays against the solution's targets
     detail: Mapping[int, float] = field(default_factory=dict)  # error of the pictures on coarser rasters, by reduction
-    contrast: float | None = None  # half the variance, the error between unrelated pictures
-    change: tuple[float, float, float] | None = None  # from the previous pictures: error, metres moved, seconds
+    contrast: float | None = None  # half the pictures' variance, which stands for the error of unrelated pictures
+    change: tuple[float, float, float] | None = None  # error of earlier pictures, metres the eyes moved, seconds since
 
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """Immutable layers for one pair of eyes, or of the flat picture."""
+    """Immutable layers that the solver computed for one pair of eye positions, or layers of the flat picture."""
 
     number: int  # counted from 1, for solutions and flat pictures together
-    layers: U8  # (N, h, w, 4) RGBA, rear to front; in the panels' pixels, or fewer (`effort.reduction`)
-    solved_for_m: F64 | None  # (2, 3) left, right; frame `stack`; None: a flat picture
-    solved_for_ns: int  # instant for which its eyes and content were predicted
-    seeing: tuple[bool, bool] = (True, True)  # left, right: False for an eye out of range, replaced by the other
+    layers: U8  # (N, h, w, 4) RGBA layers, rear to front; their raster is coarser by `effort.reduction`
+    solved_for_m: F64 | None  # (2, 3) left and right eye in metres, frame `stack`; None: a flat picture
+    solved_for_ns: int  # instant for which the eyes and the content were predicted
+    seeing: tuple[bool, bool] = (True, True)  # left and right; an eye out of range is False and replaced by the other
     eye_sigma_m: float | None = None  # tracking error that the solution allows for
     stage_ms: dict[str, float] = field(default_factory=dict)  # time of each of `SOLVING_STAGES`, on the run's clock
-    effort: Effort | None = None  # None: flat
+    effort: Effort | None = None  # None: a flat picture
     measures: Measures | None = None
-    relief: F32 | None = None  # (h, w) relief of its content, on the middle panel (`optics.relief`); None: unknown
+    relief: F32 | None = None  # (h, w) relief of the content on the middle panel (`optics.relief`); None: unknown
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,20 +210,20 @@ class RefreshAccount:
     """Record of one refresh, written as a line of frames.jsonl (docs/contracts.md)."""
 
     frame: int
-    capture_ns: int  # capture time of the newest sample used; 0: none
+    capture_ns: int  # capture time of the newest sample used; 0: no sample
     predicted_for_ns: int  # display time
     present_ns: int
-    eyes_m: F64 | None  # (2, 3) eyes to which the panels are aligned; frame `stack`
+    eyes_m: F64 | None  # (2, 3) eyes to which the panels are aligned, in metres, frame `stack`
     eyes_label: EyesLabel
-    eye_sigma_mm: float | None  # standard deviation of the eyes per axis; None without eyes
+    eye_sigma_mm: float | None  # standard deviation of the eyes along each axis; None: no eyes
     state: State
-    solution: int | None  # number of the solution that is shown; None: the flat picture alone
-    solved_for_m: F64 | None  # (2, 3)
-    solution_age_ms: float | None  # display time minus the solution's instant
-    inference: Inference  # ran: first refresh with its solution; reused: a later one; skipped: no solution
+    solution: int | None  # number of the solution that is shown; None: only the flat picture
+    solved_for_m: F64 | None  # (2, 3) eyes that the solution was computed for, in metres, frame `stack`
+    solution_age_ms: float | None  # display time minus the instant that the solution was computed for
+    inference: Inference  # ran: first refresh to show the solution; reused: a later refresh; skipped: no solution
     presented: bool
     skew_ms: float
     photon_ns: int = 0  # display time, computed from the actual present time
     true_eyes_m: F64 | None = None  # (2, 3) at the display time, from recordings with ground truth
-    stage_ms: dict[str, float] = field(default_factory=dict)  # on the run's clock
-    effort: str | None = None  # effort of the shown solution: 1/2+1 is half the raster and one step
+    stage_ms: dict[str, float] = field(default_factory=dict)  # time of each stage, on the run's clock
+    effort: str | None = None  # name of the shown solution's effort (`Effort.name`)
