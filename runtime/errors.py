@@ -31,9 +31,10 @@ def without_secrets(text: str) -> str:
 
 
 def one_line(text: str, *, most: int = PART_CHARACTERS_MAX) -> str:
-    r"""Return the text as one printable line without secrets, to keep untrusted text from forging log lines.
+    r"""Return the text as one printable line without secrets.
 
-    Each unprintable character becomes `?`. In a text of more than `most` characters, `...` replaces the middle.
+    Each unprintable character becomes `?`, which keeps untrusted text from forging log lines. In a text of more than
+    `most` characters, `...` replaces the middle.
 
     >>> one_line("a\nb"), one_line("x" * 9, most=7)
     ('a?b', 'xx...xx')
@@ -112,7 +113,10 @@ class ContextLost(TransientError):
 
 
 class PanelLost(TransientError):
-    """The window, monitor or GL context of a panel is lost. The loop continues and tries to rebuild the panel."""
+    """The window, monitor or GL context of a panel is lost.
+
+    The display loop continues and tries to rebuild the panels.
+    """
 
 
 class Stopped(PhasestackError):
@@ -134,7 +138,7 @@ def retry_advised() -> Iterator[None]:
 
 
 def is_retryable(error: BaseException | None) -> bool:
-    """Return True if any exception in a chain is a temporary failure of the machine rather than bad input.
+    """Return True if any exception in a chain is a temporary failure of the machine, not bad input.
 
     Functions that read files convert a system error to an InputError that names the file. The system error stays in
     the chain of causes and contexts.

@@ -93,9 +93,9 @@ class EyesEstimate:
 
 @dataclass(frozen=True, slots=True)
 class Parallax:
-    """Motion of content on the panels as the eyes move away from the solution's eye positions (`optics.relief`).
+    """Motion of content on the panels as the eyes move away from the solution's eye positions.
 
-    The eyes now see content of relief b through pixel p of the middle panel. From the solution's eye positions, the
+    `optics.relief` derives the motion. The eyes now see content of relief b through pixel p of the middle panel. From the solution's eye positions, the
     same content appeared at pixel p + b·(drift_px + growth·p).
     """
 
@@ -107,7 +107,7 @@ class Parallax:
 
 @dataclass(frozen=True, slots=True)
 class PanelFrame:
-    """Layers that the panels show at one refresh: an aligned solution, the flat picture or a mix of the two."""
+    """Layers that the panels show at one refresh: an aligned solution, the flat picture or a mix."""
 
     number: int  # number of the refresh, the same on all panels
     solved: U8 | None  # (N, h, w, 4) RGBA layers of the solution, rear to front, on any raster; None: no solution yet
@@ -191,7 +191,7 @@ class Measures:
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """Immutable layers that the solver computed for one pair of eye positions, or layers of the flat picture."""
+    """Immutable layers that were computed for one pair of eye positions, or for the flat picture."""
 
     number: int  # counted from 1, for solutions and flat pictures together
     layers: U8  # (N, h, w, 4) RGBA layers, rear to front; their raster is coarser by `effort.reduction`

@@ -1,1 +1,1 @@
-"""Eye finder, which locates eyes in pictures, and tracker, which predicts them in frame `stack`."""
+"""Eye finder, which locates eyes in pictures, and tracker, which predicts eye positions in `stack`."""

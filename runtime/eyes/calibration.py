@@ -1,8 +1,10 @@
-"""Calibration from the sensor frame to the stack frame: load, check and apply it, estimate its error.
+"""Load, check and apply the calibration that relates the sensor frame to the stack frame.
 
-It has seven parameters: a rotation vector (3, rad, about the axes of `stack`), a shift (3, m) and a log scale (1). They
-refer to a pivot w0 in `stack`, the centre of the calibration's point pairs, which makes them nearly uncorrelated. A
-small change d of the parameters moves a point w by d_rot × (w - w0) + d_shift + d_scale·(w - w0).
+A calibration has seven parameters: three of a rotation vector (rad, about the axes of `stack`), three of a shift (m)
+and a log scale. The parameters refer to a pivot w0 in `stack`, the centre of the point pairs used for calibration. This
+choice makes the parameters nearly uncorrelated. A small change d of the parameters moves a point w by
+
+    d_rot × (w - w0) + d_shift + d_scale·(w - w0).
 """
 
 from __future__ import annotations
@@ -21,10 +23,10 @@ from runtime.errors import InputError
 from runtime.records import F64, EyePoints
 
 DEMO_FILE = Path(__file__).parent / "data" / "demo-calibration.toml"
-SIMILARITY_TOLERANCE = 1e-3  # relative; accepts matrices rounded to four digits, but not sheared ones
+SIMILARITY_TOLERANCE = 1e-3  # relative; accepts a matrix that is rounded to four digits, but not a sheared matrix
 PLAUSIBLE_SCALE = (0.8, 1.25)  # scale between two frames in metres
-SCALE = (5e-4, 2e3)  # scales that may result from millimetres in one of the two point sets; others are errors
-NEAR_M, MAX_DISTANCE_M = 5.0, 20.0  # distances from the sensor to the display above which to warn and to refuse
+SCALE = (5e-4, 2e3)  # range of scales that millimetres in one of the point sets could explain; others are refused
+NEAR_M, MAX_DISTANCE_M = 5.0, 20.0  # sensor distances from the display above which to warn and to refuse, respectively
 
 Number = Annotated[float, Field(strict=True, ge=-MOST, le=MOST)]  # refuses "1.0" and true
 Row4 = tuple[Number, Number, Number, Number]
@@ -33,32 +35,32 @@ Row7 = tuple[Number, Number, Number, Number, Number, Number, Number]
 
 
 class Lenient(Section):
-    """Table that ignores unknown keys, because later versions may have written them."""
+    """Table that ignores unknown keys, because a later version of phasestack may have written the file."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
 
 class Residuals(Lenient):
-    """`[residuals]`: distances between the pairs after calibration, in metres of the stack frame."""
+    """Table `[residuals]`: distances that remain between paired points, in metres of the stack frame."""
 
     rms_m: Annotated[float, Field(ge=0)]
 
 
 class CovarianceTable(Lenient):
-    """`[covariance]`: covariance of the seven parameters."""
+    """Table `[covariance]`: covariance of the seven parameters, and the pivot to which they refer."""
 
     pivot_m: Vector3
     matrix: tuple[Row7, Row7, Row7, Row7, Row7, Row7, Row7]
 
 
 class CalibrationFile(Lenient):
-    """Tables of a calibration file, of which only `stack_from_sensor` is required."""
+    """Contents of a calibration file. Only the key `stack_from_sensor` is required."""
 
     stack_from_sensor: tuple[Row4, Row4, Row4, Row4]
     units: Literal["m"] = "m"
     method: str = ""
     date: str | datetime.date = ""
-    sensor_serial: str = ""  # empty: any device
+    sensor_serial: str = ""  # serial number of the calibrated sensor; empty: any sensor
     condition: Annotated[float, Field(ge=0)] | None = None
     residuals: Residuals | None = None
     covariance: CovarianceTable | None = None
@@ -66,12 +68,12 @@ class CalibrationFile(Lenient):
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """Similarity transform from the sensor frame to the stack frame, with its source and warnings."""
+    """Similarity transform that maps points from the sensor frame to the stack frame."""
 
-    stack_from_sensor: F64  # (4, 4) [sR t; 0 1]
+    stack_from_sensor: F64  # (4, 4) matrix [sR t; 0 1]
     file: CalibrationFile
-    source: str  # name of the file, for messages
-    warnings: tuple[str, ...]  # lines for the user
+    source: str  # name of the file in messages
+    warnings: tuple[str, ...]  # one line each, to show to the user
 
     @property
     def scale(self) -> float:
@@ -79,12 +81,15 @@ class Calibration:
         return float(np.cbrt(np.linalg.det(self.stack_from_sensor[:3, :3])))
 
     def points(self, sensor_m: ArrayLike) -> F64:
-        """Transform points (..., 3) in metres to the stack frame (EyeReal supplement, (28))."""
+        """Transform points (..., 3), in metres, from the sensor frame to the stack frame.
+
+        This is equation (28) of the EyeReal supplement.
+        """
         points = np.asarray(sensor_m, dtype=np.float64)
         return points @ self.stack_from_sensor[:3, :3].T + self.stack_from_sensor[:3, 3]
 
     def apply(self, eyes: EyePoints) -> EyePoints:
-        """Transform eyes to the stack frame."""
+        """Transform eye positions and their covariance from the sensor frame to the stack frame."""
         turn, covariance = self.stack_from_sensor[:3, :3], eyes.covariance_m2
         return replace(
             eyes,
@@ -93,9 +98,12 @@ class Calibration:
         )
 
     def position_error_m(self, stack_m: ArrayLike) -> F64 | None:
-        """Return the RMS error in metres due to the calibration at points (..., 3), frame `stack`.
+        """Return the RMS position error that the calibration causes at each point, in metres.
 
-        The result is None if the file states no covariance.
+        Returns None if the calibration file contains no covariance.
+
+        Args:
+            stack_m: Points (..., 3) in the frame `stack`.
         """
         if self.file.covariance is None:
             return None
@@ -105,7 +113,11 @@ class Calibration:
         return error_m
 
     def serial_warning(self, serial: str) -> str:
-        """Return a one-line warning if `serial` is not that of the calibrated sensor, otherwise ""."""
+        """Return a one-line warning if a sensor is not the calibrated one, otherwise an empty string.
+
+        Args:
+            serial: Serial number of the sensor in use, or an empty string if the sensor reports none.
+        """
         calibrated = self.file.sensor_serial
         if not calibrated or serial == calibrated:
             return ""
@@ -114,7 +126,10 @@ class Calibration:
 
 
 def position_jacobian(stack_m: ArrayLike, *, pivot_m: ArrayLike) -> F64:
-    """Return the derivative (..., 3, 7) of points (..., 3), frame `stack`, by the seven parameters."""
+    """Return the derivatives (..., 3, 7) of points (..., 3) with respect to the seven parameters.
+
+    Points and pivot are in the frame `stack`.
+    """
     arm = np.asarray(stack_m, dtype=np.float64) - np.asarray(pivot_m, dtype=np.float64)
     jacobian = np.zeros((*arm.shape, 7))
     jacobian[..., 0, 1], jacobian[..., 0, 2] = arm[..., 2], -arm[..., 1]
@@ -126,9 +141,10 @@ def position_jacobian(stack_m: ArrayLike, *, pivot_m: ArrayLike) -> F64:
 
 
 def similarity_defect(matrix: ArrayLike) -> float:
-    """Return how far a matrix's upper left 3x3 part A is from a scaled rotation: max |A^T A / s² - I|.
+    """Return the deviation of a matrix from a similarity: max |A^T A / s² - I|.
 
-    This is 0 for an exact similarity, even a reflected one, and infinite for a zero matrix.
+    A is the upper left 3x3 block, and s is its scale. The deviation of an exact similarity is 0, even if the similarity
+    includes a reflection. The deviation of a zero matrix is infinite.
     """
     linear = np.asarray(matrix, dtype=np.float64)[:3, :3]
     largest = float(np.abs(linear).max())
@@ -139,9 +155,14 @@ def similarity_defect(matrix: ArrayLike) -> float:
 
 
 def check_similarity(matrix: F64, *, source: str | Path) -> None:
-    """Raise InputError, which names the field, unless a 4x4 matrix is a plausible similarity.
+    """Check that a 4x4 matrix is a plausible calibration.
 
-    Its determinant must be positive, its scale in the range `SCALE`, and the sensor within `MAX_DISTANCE_M`.
+    Args:
+        source: Name of the file that contains the matrix, for the message of the error.
+
+    Raises:
+        InputError: The matrix is not a similarity, has a determinant that is not positive or a scale outside `SCALE`,
+            or places the sensor more than `MAX_DISTANCE_M` from the display.
     """
     name = "stack_from_sensor"
     if not np.abs(matrix).max() <= MOST:
@@ -183,11 +204,16 @@ def _warnings(matrix: F64, source: str) -> tuple[str, ...]:
 
 
 def load_calibration(path: Path | None) -> Calibration:
-    """Load and check a calibration file, or that of the demo recording if `path` is None.
+    """Load and check a calibration file.
 
-    Raises InputError, which names file and field, if the file is missing or malformed, or if its matrix has the wrong
-    shape, is not finite, is not a similarity or is mirrored. A scale far from 1 only adds a line to
-    `Calibration.warnings`.
+    A scale far from 1, or a sensor more than `NEAR_M` from the display, only adds a line to `Calibration.warnings`.
+
+    Args:
+        path: Calibration file. None selects the calibration of the demo recording.
+
+    Raises:
+        InputError: The file is missing or malformed, or its matrix has the wrong shape, is not finite or fails
+            `check_similarity`. The message names the file and the field.
     """
     file = DEMO_FILE if path is None else path
     table = read_table(file)

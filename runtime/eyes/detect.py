@@ -1,4 +1,4 @@
-"""Find eye positions and their covariance in pictures, from the viewer's pupils and distance."""
+"""Compute the viewer's eye positions and their covariance from camera pictures."""
 
 from __future__ import annotations
 
@@ -13,33 +13,40 @@ from runtime.eyes.face_depth import EyeDepths, FaceDepth
 from runtime.eyes.pupils import SIDES, PupilFinder, Pupils
 from runtime.records import F64, EyePoints, Intrinsics, SensorFrame
 
-# Standard deviation of the midpoint relative to that of one pupil. The sideways errors of the two pupils are nearly
-# independent, but their vertical errors are the same.
+# Standard deviation of the eyes' midpoint, relative to the standard deviation of one pupil. The sideways errors of the
+# two pupils are nearly independent, but the vertical errors are the same.
 MIDDLE_SIDEWAYS, MIDDLE_UP = 0.55, 1.1
-RANGE_MAX_M = 4.0  # faces farther away are not viewers
-LOCK_NS = NS_PER_S  # a viewer unseen for this long is replaced; another person who walks past hides them more briefly
-FILLED_IN_CONFIDENCE = 0.4  # confidence of a hidden eye that is filled in
+RANGE_MAX_M = 4.0  # a face at a greater distance is not a viewer
+LOCK_NS = NS_PER_S  # a viewer unseen for this long is replaced; a passer-by hides the viewer for less time
+FILLED_IN_CONFIDENCE = 0.4  # confidence in a hidden eye whose position is inferred
 
 log = logging.getLogger(__name__)
 
 
 class EyeFinder:
-    """Finder for the eyes of one viewer in pictures.
+    """Finder that locates the eyes of one viewer in camera pictures and ignores other people.
 
-    `choice`: how the viewer was chosen; `reason`: why the last frame gave no eyes.
+    Attributes:
+        choice: Description of how the viewer was chosen.
+        reason: Reason why no eyes were found in the last frame, or an empty string.
+        pupils: Pupils found in the last frame, even if their distance is unknown. None if no pupils were found.
     """
 
     def __init__(self, settings: Settings | None = None) -> None:
-        """Create a finder. `settings.calibration` gives the viewer's eye separation, if known."""
+        """Create a finder.
+
+        Args:
+            settings: Settings whose section `calibration` contains the viewer's eye separation, if that is known.
+        """
         settings = settings or Settings()
         self._new_depth = partial(FaceDepth, eye_distance_m=settings.calibration.ipd_m)
         self._finder = PupilFinder(lock_ns=LOCK_NS)
         self._depth, self._viewer = self._new_depth(), 0
         self.reason = ""
-        self.pupils: Pupils | None = None  # pupils in the last frame, even without a distance
+        self.pupils: Pupils | None = None
 
     def forget(self) -> None:
-        """Reset the finder, so that the next frame counts as the first."""
+        """Forget the viewer. The next frame is treated as the first one."""
         self._finder.forget()
 
     @property
@@ -47,9 +54,10 @@ class EyeFinder:
         return self._finder.choice
 
     def find(self, frame: SensorFrame) -> EyePoints | None:
-        """Return the viewer's eyes in the sensor frame, or None with the cause in `reason`.
+        """Return the viewer's eyes in the sensor frame, or None and store the cause in `reason`.
 
-        The frame must have colour and intrinsics. Depth is optional, but must be registered to colour.
+        Args:
+            frame: Sample that contains colour and intrinsics. Depth is optional and must be registered to colour.
         """
         self.pupils = None
         if frame.colour is None:
@@ -90,10 +98,14 @@ def _eye_points(pupils: Pupils, depths: EyeDepths, intrinsics: Intrinsics) -> Ey
 
 
 def covariance(point: F64, line: F64, sideways_m: float, up_m: float, along_m: float) -> F64:
-    """Return the covariance (3, 3), in m², of a point (3,) seen from the origin.
+    """Return the covariance (3, 3), in m², of the position of a point that is seen from the origin.
 
-    sideways_m, up_m, along_m: standard deviations across and along the line of sight. line: vector (3,) between the
-    eyes, whose component perpendicular to the line of sight defines sideways.
+    Args:
+        point: Point (3,) in metres.
+        line: Vector (3,) between the eyes. The component perpendicular to the line of sight defines sideways.
+        sideways_m: Standard deviation along the sideways direction.
+        up_m: Standard deviation perpendicular to the sideways direction and the line of sight.
+        along_m: Standard deviation along the line of sight.
     """
     sight = point / np.linalg.norm(point)
     sideways = line - (line @ sight) * sight
