@@ -95,8 +95,8 @@ class EyesEstimate:
 class Parallax:
     """Motion of content on the panels as the eyes move away from the solution's eye positions.
 
-    `optics.relief` derives the motion. The eyes now see content of relief b through pixel p of the middle panel. From the solution's eye positions, the
-    same content appeared at pixel p + b·(drift_px + growth·p).
+    The eyes now see content of relief b through pixel p of the middle panel. From the solution's eye positions, the
+    same content appeared at pixel p + b·(drift_px + growth·p). `optics.relief` derives this equation.
     """
 
     drift_px: tuple[float, float]  # shift to the right and down
