@@ -1,7 +1,7 @@
-"""Measure how a face moves between pictures, to 1/50 pixel, by the optical flow of its rigid parts.
+"""Measure the motion of a face between pictures with the optical flow of its rigid parts.
 
-The networks' errors are independent from picture to picture, while the optical flow between two pictures is far more
-precise. The pupils therefore follow the flow, and the networks correct them slowly.
+The errors of the face networks are independent from picture to picture. The optical flow between two pictures is far
+more precise, to 1/50 pixel. The pupils therefore follow the flow, and the networks only correct them slowly.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ RIGID = np.array([
     362, 130, 359,
 ])  # fmt: skip
 BRIDGE = 168  # mesh point on the bridge of the nose, between the eyes
-SIZE = 192  # side in pixels of the grey crop
-EYE_DISTANCE = 64.0  # distance between the eyes in the crop, pixels
-WINDOW = 17  # side, in pixels of the crop, of the window that is compared around a point
+SIZE = 192  # side of the grey crop, in pixels
+EYE_DISTANCE = 64.0  # distance between the eyes in the crop, in pixels
+WINDOW = 17  # side of the window that is compared around each point, in pixels of the crop
 RETURNS_WITHIN = 0.4  # forward-backward error in pixels above which a point is discarded
-POINTS_MIN, INLIERS_MIN = 10, 8
+POINTS_MIN, INLIERS_MIN = 10, 8  # minimum number of tracked points, and of inliers of their similarity
 
 
 class FaceFlow:
-    """Measurement of how a remembered face moves between pictures."""
+    """Optical flow that measures the motion of a face between a remembered picture and a new one."""
 
     def __init__(self) -> None:
         self._grey: Any = None
@@ -39,7 +39,9 @@ class FaceFlow:
     def remember(self, picture: U8, mesh: F64, eye_distance: float) -> None:
         """Remember the face in a picture.
 
-        mesh: (468, 3) in pixels; eye_distance: separation of the eyes in pixels.
+        Args:
+            mesh: (468, 3) points of the face mesh, in pixels.
+            eye_distance: Separation of the eyes in pixels.
         """
         scale = EYE_DISTANCE / eye_distance
         offset = SIZE / 2 - scale * mesh[BRIDGE, :2]
@@ -47,7 +49,13 @@ class FaceFlow:
         self._grey, self._mesh = self._crop(picture), mesh[RIGID, :2].copy()
 
     def moved(self, picture: U8, mesh: F64) -> F64 | None:
-        """Return the similarity (2, 3) from pixels of the remembered face to the new picture, or None."""
+        """Return the similarity (2, 3) that maps pixels of the remembered picture to those of a new one.
+
+        Returns None if too few points can be tracked or fit a similarity.
+
+        Args:
+            mesh: (468, 3) points of the face mesh in the new picture, in pixels.
+        """
         grey = self._crop(picture)
         matrix = self._crop_from_picture
         start = (transformed(matrix, self._mesh) - 0.5).astype(np.float32)
@@ -71,9 +79,14 @@ class FaceFlow:
 
 
 def _flow(before: Any, after: Any, start: Any, guess: Any) -> tuple[Any, Any]:
-    """Return the positions (n, 2) in `after` of the points `start` of `before`, and a mask of those found.
+    """Track points from one grey picture to another.
 
-    guess: first positions, which are overwritten.
+    Args:
+        start: Positions (n, 2) of the points in `before`.
+        guess: Initial estimates (n, 2) of the positions in `after`. They are overwritten.
+
+    Returns:
+        The positions (n, 2) in `after`, and a mask (n, 1) of the points that were found.
     """
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
     ends, is_found, _ = cv2.calcOpticalFlowPyrLK(
