@@ -1,11 +1,11 @@
-"""Interacting multiple models (Blom and Bar-Shalom 1988): Kalman filters that differ in agility.
+"""Interacting multiple models (Blom and Bar-Shalom 1988): Kalman filters of different agility.
 
-Each model uses Singer's acceleration (1970), which decays with a time constant and is driven by noise whose strength
-differs between models. A still head needs heavy filtering, a fast head needs light filtering, and one can become the
-other within a tenth of a second. Measurement noise is a covariance matrix, because a camera measures right and up
-twenty times as precisely as depth.
+Each model uses Singer's acceleration (1970), which decays with a time constant and is driven by noise. The strength of
+the noise differs between models: a still head needs heavy filtering, a fast head needs light filtering, and a still
+head can become a fast one within a tenth of a second. The measurement noise is a covariance matrix, because a camera
+measures positions to the right and up twenty times as precisely as depth.
 
-A state has nine numbers: position, velocity and acceleration, each along x, y and z, in metres and seconds.
+A state consists of nine numbers: position, velocity and acceleration along x, y and z, in metres and seconds.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ import numpy as np
 from runtime.records import F64
 
 FADE_S = 0.25  # time constant of an acceleration's decay
-ROUNDING = 1e-12  # share of a covariance's trace that is added: (10 nm)² for a head's (1 cm)²
+ROUNDING = 1e-12  # share of a covariance's trace that is added to its diagonal: (10 nm)² for a head's (1 cm)²
 WEIGHT_FLOOR = 1e-6  # minimum probability of a model, so that it can recover
 _NODES, _SHARES = np.polynomial.legendre.leggauss(10)
 _AXES = np.eye(3)
 
 
 class Belief(NamedTuple):
-    """State, covariance and probability of every motion model."""
+    """State estimate, covariance and probability of every motion model."""
 
     state: F64  # (models, 9)
     covariance: F64  # (models, 9, 9)
-    weight: F64  # (models,) probabilities; they add up to one
+    weight: F64  # (models,) probabilities, whose sum is 1
 
 
 def _response(times_s: F64) -> F64:
-    """Return position, velocity and acceleration (3, n) after an acceleration of 1 at time 0."""
+    """Return the position, velocity and acceleration (3, n) caused by a unit acceleration at time 0."""
     x = times_s / FADE_S
     gone = -np.expm1(-x)
     return np.array([FADE_S**2 * (x - gone), FADE_S * gone, 1 - gone])
@@ -48,7 +48,7 @@ def _of_each_axis(matrix: F64) -> F64:
 
 @lru_cache(maxsize=8)
 def _transition(dt_s: float) -> F64:
-    """Return the (9, 9) transition matrix to the state `dt_s` later."""
+    """Return the (9, 9) matrix that maps a state to the expected state `dt_s` later."""
     step = np.eye(3)
     step[0, 1] = dt_s
     step[:, 2] = _response(np.array([dt_s]))[:, 0]
@@ -57,19 +57,23 @@ def _transition(dt_s: float) -> F64:
 
 @lru_cache(maxsize=8)
 def _noise(dt_s: float) -> F64:
-    """Return the (9, 9) covariance that acceleration noise of 1 m/s² (standard deviation) adds in `dt_s`.
+    """Return the (9, 9) covariance that an acceleration noise of 1 m/s² adds to a state in `dt_s`.
 
-    It is integrated by Gauss-Legendre quadrature, because the closed form suffers from cancellation.
+    1 m/s² is the standard deviation of the noise. The covariance is integrated with Gauss-Legendre quadrature, because
+    the closed form suffers from cancellation.
     """
     response = _response(dt_s * (_NODES + 1) / 2)
     return _of_each_axis((response * (_SHARES * dt_s / FADE_S)) @ response.T)
 
 
 def started(place: F64, *, noise: F64, speed: float, acceleration: Sequence[float]) -> Belief:
-    """Return the belief after a first measurement `place` (3,), with a mean velocity of zero.
+    """Return the belief after a first measurement, with a mean velocity of zero.
 
-    noise: covariance (3, 3) of the measurement. speed (m/s) and acceleration (m/s², one value per model) are standard
-    deviations per axis.
+    Args:
+        place: Measured position (3,).
+        noise: Covariance (3, 3) of the measurement.
+        speed: Standard deviation of the velocity along each axis, in m/s.
+        acceleration: Standard deviation of each model's acceleration along each axis, in m/s².
     """
     count = len(acceleration)
     state, covariance = np.zeros((count, 9)), np.zeros((count, 9, 9))
@@ -81,9 +85,12 @@ def started(place: F64, *, noise: F64, speed: float, acceleration: Sequence[floa
 
 
 def predicted(belief: Belief, dt_s: float, *, acceleration: Sequence[float], stay_s: float) -> Belief:
-    """Return the belief `dt_s` >= 0 later: the models are mixed, then moved.
+    """Return the belief after a time step, in which the models are first mixed and then propagated.
 
-    acceleration: as for `started`; stay_s: mean time for which one model applies.
+    Args:
+        dt_s: Duration of the time step, which must not be negative.
+        acceleration: Standard deviation of each model's acceleration along each axis, in m/s².
+        stay_s: Mean time for which a model applies before the motion switches to another model.
     """
     count = len(belief.weight)
     leave = -math.expm1(-dt_s / stay_s) / count  # probability of a switch to each model, including this one
@@ -102,9 +109,12 @@ def predicted(belief: Belief, dt_s: float, *, acceleration: Sequence[float], sta
 
 
 def surprise(belief: Belief, measured: F64, *, noise: F64) -> float:
-    """Return the smallest squared Mahalanobis distance of a measurement (3,) from any model.
+    """Return the squared Mahalanobis distance of a measurement (3,) from the nearest model.
 
-    For a good measurement, it follows a chi² distribution with three degrees of freedom.
+    A good measurement's distance from the right model has a chi² distribution with three degrees of freedom.
+
+    Args:
+        noise: Covariance (3, 3) of the measurement.
     """
     return float(_chi2(measured - belief.state[:, :3], _total(belief, noise)).min())
 
@@ -123,7 +133,12 @@ def _chi2(off: F64, covariance: F64) -> F64:
 
 
 def corrected(belief: Belief, measured: F64, *, noise: F64) -> Belief:
-    """Return the belief updated with a measurement (3,). noise: its covariance (3, 3)."""
+    """Return the belief after a measurement.
+
+    Args:
+        measured: Measured position (3,).
+        noise: Covariance (3, 3) of the measurement.
+    """
     total = _total(belief, noise)
     gain = np.linalg.solve(total, belief.covariance[:, :3, :]).transpose(0, 2, 1)
     off = measured - belief.state[:, :3]
@@ -138,9 +153,9 @@ def corrected(belief: Belief, measured: F64, *, noise: F64) -> Belief:
 
 
 def _positive(covariance: F64) -> F64:
-    """Return covariances (n, 9, 9) with all eigenvalues made positive.
+    """Return covariances (n, 9, 9) after making all eigenvalues positive.
 
-    Rounding after a long jump can make some of them negative.
+    After a long jump, rounding can make an eigenvalue negative.
     """
     try:
         np.linalg.cholesky(covariance)
@@ -153,13 +168,19 @@ def _positive(covariance: F64) -> F64:
 
 
 def ahead(belief: Belief, dt_s: float) -> F64:
-    """Return the position (3,) `dt_s` later, as the mean over all models weighted by probability."""
+    """Return the expected position (3,) `dt_s` later, weighting the models by their probabilities."""
     position: F64 = _transition(dt_s)[:3] @ (belief.weight @ belief.state)
     return position
 
 
 def spread(belief: Belief, dt_s: float, *, acceleration: Sequence[float], about: F64) -> F64:
-    """Return the second moment (3, 3), in m², of the position `dt_s` later about a point `about` (3,)."""
+    """Return the second moment (3, 3), in m², of the position after a time step about a given point.
+
+    Args:
+        dt_s: Duration of the time step.
+        acceleration: Standard deviation of each model's acceleration along each axis, in m/s².
+        about: Point (3,).
+    """
     step = _transition(dt_s)[:3]
     added = np.square(acceleration)[:, None, None] * _noise(dt_s)[:3, :3]
     apart = belief.state @ step.T - about

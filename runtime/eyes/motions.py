@@ -1,4 +1,4 @@
-"""Simulated head motions, and simulated samples of a depth camera, for benchmarks and tests."""
+"""Simulated head motions, and samples that a simulated depth camera takes, for benchmarks and tests."""
 
 from __future__ import annotations
 
@@ -12,23 +12,31 @@ from runtime.records import F64, EyePoints
 
 IPD_M = 0.063
 DISTANCE_M = 0.6  # distance of the resting eyes from the panels
-DROPOUT_S = 0.2  # length of every dropout
+DROPOUT_S = 0.2  # duration of each dropout
 NECK_TO_EYES_M = np.array([-0.09, 0.0, 0.14])  # x (negative: towards the display), sideways, up
 
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """Sample as the tracker receives it."""
+    """Sample in the form in which the tracker receives it."""
 
     capture_ns: int
-    points: EyePoints | None  # frame `stack`
+    points: EyePoints | None  # eyes in the frame `stack`; None: dropout
 
 
-Motion = Callable[[F64], tuple[F64, F64]]  # from times (n,) s: neck (n, 3) m, frame `stack`, and pitch (n,) rad
+# Function that maps times (n,) in seconds to the neck's displacement (n, 3) in metres, frame `stack`, and pitch (n,) in
+# radians.
+Motion = Callable[[F64], tuple[F64, F64]]
 
 
 def minimum_jerk(times_s: F64, *, knots_s: F64, values: F64) -> F64:
-    """Interpolate values (k, ...) by minimum-jerk movements between stops (Flash and Hogan 1985)."""
+    """Interpolate between stops with minimum-jerk movements (Flash and Hogan 1985).
+
+    Args:
+        times_s: Times (n,) at which to interpolate.
+        knots_s: Times (k,) of the stops.
+        values: Values (k, ...) at the stops.
+    """
     index = np.clip(np.searchsorted(knots_s, times_s, side="right") - 1, 0, len(knots_s) - 2)
     s = np.clip((times_s - knots_s[index]) / (knots_s[index + 1] - knots_s[index]), 0, 1)
     blend = s**3 * (10 + s * (6 * s - 15))
@@ -36,20 +44,20 @@ def minimum_jerk(times_s: F64, *, knots_s: F64, values: F64) -> F64:
 
 
 def _still(times_s: F64) -> tuple[F64, F64]:
-    """Sit still, with breathing and a sway of a few millimetres."""
+    """Sit still, except for breathing and a sway of a few millimetres."""
     sway = [0.0015 * np.sin(1.7 * times_s), 0.002 * np.sin(0.9 * times_s + 1), 0.0015 * np.sin(1.6 * times_s)]
     return np.stack(sway, 1), np.zeros_like(times_s)
 
 
 def _lean(times_s: F64) -> tuple[F64, F64]:
-    """Lean from side to side by 30 cm without stopping, at up to 0.3 m/s."""
+    """Lean from side to side over 30 cm without stopping, at up to 0.3 m/s."""
     phase = 2 * np.pi * times_s / 3.2
     neck, pitch = _still(times_s)
     return neck + np.stack([0.03 * np.cos(phase), 0.15 * np.sin(phase), -0.03 * np.sin(phase) ** 2], 1), pitch
 
 
 def _nod(times_s: F64) -> tuple[F64, F64]:
-    """Nod three times by 12 degrees at 1 Hz, pause, and repeat."""
+    """Nod three times by 12 degrees at 1 Hz, pause and repeat."""
     neck, _ = _still(times_s)
     within = times_s % 5.0
     envelope = np.clip(np.minimum(within, 3.0 - within) / 0.5, 0, 1)
@@ -66,7 +74,7 @@ def _walk(times_s: F64) -> tuple[F64, F64]:
 
 
 def _stop_and_go(times_s: F64) -> tuple[F64, F64]:
-    """Move quickly by 10 to 30 cm in half a second to a second, with pauses of similar length."""
+    """Move by 10 to 30 cm within half a second to a second, with pauses of similar length."""
     random = np.random.default_rng(7)
     knots, places, place = [0.0], [np.zeros(3)], np.zeros(3)
     while knots[-1] <= times_s.max():
@@ -84,19 +92,19 @@ MOTIONS: dict[str, Motion] = {"still": _still, "lean": _lean, "nod": _nod, "walk
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """Variant of a motion, with its phase, speed, extent and initial direction."""
+    """Variation of a motion in phase, speed, extent and initial direction."""
 
-    start_s: float = 0.0
-    pace: float = 1.0
-    size: float = 1.0
-    side: float = 1.0  # -1: left and right exchanged
+    start_s: float = 0.0  # time within the motion at which the path starts
+    pace: float = 1.0  # factor on the speed
+    size: float = 1.0  # factor on the extent
+    side: float = 1.0  # -1: left and right are exchanged
 
 
 BENCHMARK_PATH = Path()
 
 
 def path_of(seed: int) -> Path:
-    """Return the random path for a seed. Seed 0 gives the benchmark's path."""
+    """Return the random path that belongs to a seed. Seed 0 gives the benchmark's path."""
     if seed == 0:
         return BENCHMARK_PATH
     random = np.random.default_rng([seed, 0x70617468])
@@ -106,7 +114,12 @@ def path_of(seed: int) -> Path:
 
 
 def true_eyes(motion: str, times_s: F64, *, path: Path = BENCHMARK_PATH) -> F64:
-    """Return the left and right eye (n, 2, 3) during a motion, in metres, frame `stack`."""
+    """Return the positions (n, 2, 3) of the left and right eye during a motion, in metres, frame `stack`.
+
+    Args:
+        motion: Name of a motion in `MOTIONS`.
+        times_s: Times (n,).
+    """
     neck, pitch = MOTIONS[motion](path.start_s + path.pace * times_s)
     neck, pitch = path.size * neck * [1.0, path.side, 1.0], path.size * pitch
     forward, _, up = NECK_TO_EYES_M
@@ -131,9 +144,15 @@ def observe(
     seed: int = 1,
     path: Path = BENCHMARK_PATH,
 ) -> list[Observation]:
-    """Simulate a sensor's samples of a motion. seed: selects the noise.
+    """Simulate the samples that a sensor takes of a motion.
 
-    Outliers displace one or both eyes by 4 to 20 cm. If `dropout_every_s` is 0, there are no dropouts.
+    Args:
+        motion: Name of a motion in `MOTIONS`.
+        noise_m: Standard deviation of the noise of each eye along each axis.
+        outliers: Share of samples that are outliers, in which one or both eyes are displaced by 4 to 20 cm.
+        dropout_every_s: Time between dropouts. 0 disables dropouts.
+        seed: Seed of the noise, the outliers and their displacements.
+        path: Variation of the motion.
     """
     random = np.random.default_rng([seed, *motion.encode(), round(rate_hz)])
     times_s = np.arange(round(seconds * rate_hz)) / rate_hz

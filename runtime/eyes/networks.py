@@ -1,7 +1,8 @@
-"""Run the three face networks on square crops of a picture.
+"""Run the three face networks, which find faces, face meshes and irises in pictures.
 
-Pixels are continuous: the centre of the first one is (0.5, 0.5). *Left* is the viewer's left, which is on the right of
-an unmirrored picture. It comes first unless stated otherwise. `docs/sensors.md` gives the origin of the models.
+Pixel coordinates are continuous: the centre of the first pixel is at (0.5, 0.5). *Left* means the viewer's left, which
+is on the right of an unmirrored picture. The left eye comes first unless stated otherwise. `docs/sensors.md` gives the
+origin of the models.
 """
 
 from __future__ import annotations
@@ -19,14 +20,17 @@ from runtime.support.onnx_runtime import onnxruntime
 
 MODELS = Path(str(files("runtime.eyes") / "models"))
 STRIDES = (8, 16, 32)  # pixels per cell of YuNet's three grids
-OVERLAP_MAX = 0.3  # intersection over union above which two of YuNet's boxes are the same face
-CROP_BLUR = 0.45  # standard deviation of the anti-aliasing filter, in the crop's pixels
+OVERLAP_MAX = 0.3  # intersection over union above which two of YuNet's boxes count as the same face
+CROP_BLUR = 0.45  # standard deviation of the anti-aliasing filter, in pixels of the crop
 
 
 def load_network(name: str) -> Any:
-    """Load a network as a single-threaded onnxruntime session and run it once, as first runs are slow.
+    """Load a network into a single-threaded onnxruntime session.
 
-    name: of a file in the folder `models`.
+    The network runs once during loading, because the first run is slow.
+
+    Args:
+        name: Name of a file in the folder `models`.
     """
     ort = onnxruntime()
     options = ort.SessionOptions()
@@ -51,9 +55,12 @@ def inverse(matrix: F64) -> F64:
 
 
 def resampled(picture: U8, size: tuple[int, int], crop_from_picture: F64) -> U8:
-    """Warp a picture by an affine matrix (2, 3) of continuous pixels, with anti-aliasing.
+    """Crop and warp a picture with anti-aliasing. Pixels outside the picture repeat its edge.
 
-    Outside the picture, the pixels of its edge are repeated. size: (width, height) of the result.
+    Args:
+        picture: RGB picture (h, w, 3).
+        size: Width and height of the result in pixels.
+        crop_from_picture: Affine matrix (2, 3) that maps continuous pixels of the picture to those of the result.
     """
     ratio = 1 / np.sqrt(abs(np.linalg.det(crop_from_picture[:, :2])))  # picture pixels per crop pixel
     corners = np.array([[0, 0], [size[0], 0], [0, size[1]], [size[0], size[1]]], np.float64)
@@ -72,20 +79,25 @@ def resampled(picture: U8, size: tuple[int, int], crop_from_picture: F64) -> U8:
 
 @dataclass(frozen=True, slots=True)
 class Square:
-    """Square region of a picture, rotated to align with the face in it."""
+    """Square region of a picture, rotated to align with a face."""
 
     centre: F64  # (2,) px
     side: float  # px
-    angle: float  # direction of its lower edge, radians clockwise on the screen
+    angle: float  # direction of the lower edge, in radians clockwise on the screen
 
     def picture_from_crop(self, size: int, *, mirrored: bool = False) -> F64:
-        """Return the matrix (2, 3) from continuous pixels of a crop, `size` pixels wide, to the picture's."""
+        """Return the matrix (2, 3) that maps continuous pixels of a crop to those of the picture.
+
+        Args:
+            size: Side of the crop in pixels.
+            mirrored: Mirror the crop horizontally.
+        """
         c, s = np.cos(self.angle) * self.side / size, np.sin(self.angle) * self.side / size
         matrix = np.array([[-c if mirrored else c, -s], [-s if mirrored else s, c]])
         return np.column_stack([matrix, self.centre - matrix @ [size / 2, size / 2]])
 
     def crop(self, picture: U8, size: int, *, mirrored: bool = False) -> tuple[F32, F64]:
-        """Return a crop (1, size, size, 3) with values in [0, 1], and its matrix `picture_from_crop`."""
+        """Return a crop (1, size, size, 3) with values from 0 to 1, and its matrix from `picture_from_crop`."""
         matrix = self.picture_from_crop(size, mirrored=mirrored)
         pixels = resampled(picture, (size, size), inverse(matrix))
         return np.divide(pixels[None], 255, dtype=np.float32), matrix
@@ -93,11 +105,11 @@ class Square:
 
 @dataclass(frozen=True, slots=True)
 class FoundFace:
-    """Face found by YuNet."""
+    """Face that YuNet found, with its bounding box and five points."""
 
     score: float  # 0 to 1
-    box: F64  # (4,) x, y, width, height, px
-    points: F64  # (5, 2) px: right eye, left eye, nose, right and left corner of the mouth
+    box: F64  # (4,) x, y, width and height in pixels
+    points: F64  # (5, 2) right eye, left eye, nose, right and left corner of the mouth, in pixels
 
     @property
     def size(self) -> float:
@@ -105,7 +117,7 @@ class FoundFace:
         return float(np.sqrt(self.box[2] * self.box[3]))
 
     def square(self) -> Square:
-        """Square region around the face, used as input for the mesh network."""
+        """Return the square region around the face that the mesh network takes as input."""
         eyes, mouth = self.points[:2].mean(axis=0), self.points[3:].mean(axis=0)
         line = self.points[1] - self.points[0]
         size = max(np.linalg.norm(line), 0.95 * np.linalg.norm(mouth - eyes))
@@ -113,15 +125,18 @@ class FoundFace:
 
 
 class FaceNetwork:
-    """YuNet, which finds faces anywhere in a picture."""
+    """YuNet, a network that finds faces anywhere in a picture."""
 
     def __init__(self) -> None:
         self._session = load_network("yunet.onnx")
 
     def find(self, picture: U8, *, longest_px: int, score_min: float) -> list[FoundFace]:
-        """Return the faces in an RGB picture (h, w, 3), best first.
+        """Return the faces in an RGB picture (h, w, 3), ordered from the highest score to the lowest.
 
-        longest_px: longer side to which a larger picture is reduced; score_min: minimum score of a face.
+        Args:
+            picture: RGB picture (h, w, 3).
+            longest_px: Length of the longer side to which a larger picture is reduced before the search.
+            score_min: Minimum score of a face.
         """
         height, width = picture.shape[:2]
         scale = min(1.0, longest_px / max(height, width))
@@ -138,7 +153,7 @@ class FaceNetwork:
 
     @staticmethod
     def _decoded(outputs: list[F32], width: int, score_min: float) -> list[FoundFace]:
-        """Decode the grid cells that contain a face. Of overlapping faces, keep the one with the best score."""
+        """Decode the grid cells that contain a face. Only the best of several overlapping faces is kept."""
         faces = []
         for level, stride in enumerate(STRIDES):
             classes, objects, boxes, points = (outputs[kind * len(STRIDES) + level][0] for kind in range(4))
@@ -163,7 +178,10 @@ class MeshNetwork:
         self._session = load_network("face_mesh.onnx")
 
     def points(self, picture: U8, square: Square) -> tuple[F64, float]:
-        """Return points (468, 3) in pixels, z away from the camera, and the probability that this is a face."""
+        """Return the face's points (468, 3) and the probability that the square contains a face.
+
+        The points are in pixels of the picture, with z pointing away from the camera.
+        """
         crop, matrix = square.crop(picture, self.SIZE)
         mesh, presence = self._session.run(None, {"input_1": crop})
         points = mesh.reshape(468, 3).astype(np.float64)
@@ -172,7 +190,7 @@ class MeshNetwork:
 
 
 class IrisNetwork:
-    """Network that finds the iris in a square around an eye. Its input is mirrored for right eyes."""
+    """Network that finds the iris and the lids in a square region around an eye."""
 
     SIZE = 64
 
@@ -180,7 +198,13 @@ class IrisNetwork:
         self._session = load_network("iris.onnx")
 
     def points(self, picture: U8, square: Square, *, is_left: bool) -> tuple[F64, F64]:
-        """Return centre and edge points of the iris (5, 2) and lid points (16, 2), lower lid first."""
+        """Return points on the iris (5, 2) and on the lids (16, 2), in pixels of the picture.
+
+        The centre of the iris precedes four points on its edge. The lower lid precedes the upper lid.
+
+        Args:
+            is_left: True for the viewer's left eye, for which the input of the network is mirrored.
+        """
         crop, matrix = square.crop(picture, self.SIZE, mirrored=is_left)
         names = ["output_iris", "output_eyes_contours_and_brows"]
         iris, lids = self._session.run(names, {"input_1": crop})
