@@ -1,6 +1,7 @@
-"""Checks for points that cannot be eyes: swapped, in millimetres, or behind the display.
+"""Detect points that cannot be eyes, because they are swapped, in millimetres or behind the display.
 
-Nothing here reads a clock. Eyes are in metres in frame `stack` (+x out of the screen, +y the viewer's right, +z up).
+No function in this module reads a clock. Eyes are in metres in the frame `stack`, whose axes point out of the screen
+(+x), to the viewer's right (+y) and up (+z).
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ TOO_DISTANT = "too far away for a viewer"
 EXCHANGED = "left and right swapped"
 
 IPD_MIN_M, IPD_MAX_M = 0.050, 0.078  # range of people's eye separations
-WINDOW = 30  # samples; one second of a typical depth camera
+WINDOW = 30  # number of recent samples that are examined: one second of a typical depth camera
 SAMPLES_MIN = 10  # minimum number of samples before a reason is reported
-WARNING_SHARE = 0.5  # share of samples refused for one reason above which to warn
+WARNING_SHARE = 0.5  # share of samples refused for the same reason above which to warn
 UNIT_SLACK = 1.25  # factor by which the limits are widened when checking for millimetres
 DISTANT_M = 20.0  # distance from the display beyond which no sensor sees a face
 UPSIDE_DOWN_COSINE = -0.5  # with a roll of more than 120 degrees, the eyes are swapped
@@ -39,9 +40,13 @@ _HINTS = {
 
 
 def reason_against(eyes_m: F64, *, in_front_m: float = 0.0) -> str:
-    """Return why points (2, 3) cannot be a viewer's left and right eye, or an empty string.
+    """Return the reason why two points cannot be a viewer's left and right eye, or an empty string.
 
-    in_front_m: minimum x. Eyes count as swapped if the vector from left to right points to the viewer's left.
+    The eyes count as swapped if the vector from the left to the right eye points to the viewer's left.
+
+    Args:
+        eyes_m: Left and right eye (2, 3) in the frame `stack`.
+        in_front_m: Value of x that both eyes must exceed.
     """
     (lx, ly, lz), (rx, ry, rz) = eyes_m.tolist()
     if not all(map(math.isfinite, (lx, ly, lz, rx, ry, rz))):
@@ -62,22 +67,23 @@ def reason_against(eyes_m: F64, *, in_front_m: float = 0.0) -> str:
 
 
 class RefusalWatch:
-    """Counter of refused samples by reason. It warns once if most are refused for the same reason."""
+    """Counter of refused samples, which warns once if most samples are refused for the same reason."""
 
     def __init__(self) -> None:
         self._last: deque[str] = deque(maxlen=WINDOW)
         self._counts: Counter[str] = Counter()
-        self.warning = ""  # current problem, or empty
+        self.warning = ""  # current warning, or an empty string
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Number of refused samples by reason."""
+        """Number of refused samples for each reason."""
         return self._counts
 
     def update(self, reason: str) -> str:
-        """Count a sample and return a line to log if the warning has changed, otherwise "".
+        """Count a sample. Return a line to log if the warning has changed, otherwise an empty string.
 
-        reason: why the sample was refused, or "" if it was accepted.
+        Args:
+            reason: Reason why the sample was refused, or an empty string if it was accepted.
         """
         self._last.append(reason if reason in MISTAKES else "")
         if reason:

@@ -1,4 +1,4 @@
-"""Finder that follows one viewer's pupils in pictures and ignores those of other people."""
+"""Follow one viewer's pupils from picture to picture and ignore other people."""
 
 from __future__ import annotations
 
@@ -17,52 +17,53 @@ Seen = Literal["found", "followed", "filled in"]
 Side = Literal["", "left", "right"]
 SIDES: tuple[Side, Side] = ("left", "right")
 
-LEVELS_PX = (320, 640)  # longer side of the picture that is searched; the second is used if the first shows no face
+LEVELS_PX = (320, 640)  # longer side of the searched picture; the second value is used if the first yields no face
 SCORE_MIN = 0.8  # minimum score of a face; people in the dark at 1.5 m score 0.85, most dogs less than 0.8
-PRESENCE_FOUND, PRESENCE_FOLLOWED = 0.9, 0.5  # minimum probability of a face in the mesh's crop
-CANDIDATES_MAX = 4  # maximum number of faces examined when looking for the viewer
-FARTHEST_OUT = 0.7  # relative penalty, when a viewer is chosen, for a face in the corner of the picture
+PRESENCE_FOUND, PRESENCE_FOLLOWED = 0.9, 0.5  # minimum probability of a face, in a new and in a known position
+CANDIDATES_MAX = 4  # maximum number of faces that are examined in a search for the viewer
+FARTHEST_OUT = 0.7  # relative penalty for a face in the corner of the picture in the choice of a viewer
 CORNERS = ((362, 263), (33, 133))  # mesh points at the corners of the left and right eye
 EYE_SQUARE = 2.7  # side of the iris network's input, in eye widths; the most accurate of values from 1.8 to 3.1
-FACE_SQUARE = 1.5  # side of the mesh network's input, in sizes of the face
+FACE_SQUARE = 1.5  # side of the mesh network's input, relative to the size of the face
 MOVED_FAR = 0.35  # movement in eye separations after which the mesh network runs again
 
-# A human iris measures 11.7 mm, and the eyes are 50 to 75 mm apart. This excludes dogs and monkeys.
-IRIS_RANGE = (0.12, 0.33)  # diameter in eye distances; turning the head shortens the distance
-IRIS_RATIO_MAX = 1.4  # maximum ratio of the two irises
-# The upper lid hides part of the iris, and the network returns the centre of the visible rest. This is too low by the
-# following share of the eye distance (0.6 mm), for any camera and distance. The share was fitted to all 51 faces
-# measured; when it is fitted to a random half of them, the error on the other half is 0.61 to 0.67 mm up to 1 m.
+# A human iris measures 11.7 mm, and human eyes are 50 to 75 mm apart. The following limits exclude dogs and monkeys.
+IRIS_RANGE = (0.12, 0.33)  # diameter in eye separations; the separation appears shorter when the head turns
+IRIS_RATIO_MAX = 1.4  # maximum ratio of the diameters of the two irises
+# The upper lid hides part of the iris, and the network returns the centre of the visible part. This centre is too low
+# by the following share of the eye separation (0.6 mm) for any camera and distance. The share was fitted to all 51
+# measured faces. With a fit to a random half of the faces, the error on the other half is 0.61 to 0.67 mm up to 1 m.
 TOO_LOW = 0.0093
-OPEN_MIN = 0.12  # minimum height of an open eye over its width; a blink hides the iris
+OPEN_MIN = 0.12  # minimum ratio of height to width of an open eye; a blink hides the iris
 
 PULL = 0.1  # share of the deviation from the networks' estimate that each picture corrects
 # When the gaze changes, the gain rises by up to GAZE_PULL as the deviation goes from GAZE_FROM to GAZE_FULL (in eye
-# distances).
+# separations).
 GAZE_FROM, GAZE_FULL, GAZE_PULL = 0.02, 0.06, 0.6
-# Eyes turn together. If one seems to turn alone by more than this (in eye separations), a hand or hair hides it, and
-# the network only guesses its position. It is then moved with the face for at most CARRIED_MAX pictures.
+# Eyes turn together. If only one eye seems to turn by more than APART_MAX (in eye separations), a hand or hair hides
+# the eye, and the network only guesses its position. The pupil is then moved with the face for at most CARRIED_MAX
+# pictures.
 APART_MAX, CARRIED_MAX = 0.06, 30
 
-SAME_LOOKS = 0.75  # minimum correlation of two views of one person; 19 in 20 other people have less
-SAME_LOOKS_FOLLOWED = 0.6  # the same for a face at the viewer's last position
+SAME_LOOKS = 0.75  # minimum correlation between two views of one person; 19 out of 20 other people have less
+SAME_LOOKS_FOLLOWED = 0.6  # minimum correlation for a face at the viewer's last position
 LOOKS_PULL = 0.05  # rate at which the stored appearance adapts to light and pose
 
-# Parts of the standard deviation of a pupil along an axis: people's spread about the networks' mean (in eye distances),
-# pixel noise (px), and the remaining share of an unexpected change in one picture.
+# Contributions to the standard deviation of a pupil along an axis: variation between people about the networks' mean
+# (in eye separations), pixel noise (px), and the share of an unexpected change that remains after one picture.
 SIGMA_PERSON, SIGMA_PICTURE_PX, SIGMA_SURPRISE = 0.0088, 0.14, 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Pupils:
-    """Pupils of one viewer in one picture."""
+    """Positions of one viewer's pupils in one picture, with the face mesh and the uncertainty."""
 
-    eyes_px: F64  # (2, 2) left, right; continuous pixels
+    eyes_px: F64  # (2, 2) left and right pupil in continuous pixels
     sigma_px: float  # standard deviation of one pupil along one axis
-    mesh_px: F64  # (468, 3) face points; z in pixels, away from the camera
-    iris_px: float  # mean diameter of the irises
+    mesh_px: F64  # (468, 3) points of the face mesh; z, also in pixels, points away from the camera
+    iris_px: float  # mean diameter of the two irises
     seen: Seen
-    hidden: Side  # eye that is hidden and is estimated from the rest of the face
+    hidden: Side  # hidden eye, whose position is estimated from the rest of the face; empty: none
     certainty: float  # probability that this is a face
 
     @property
@@ -72,21 +73,21 @@ class Pupils:
 
 @dataclass(frozen=True, slots=True)
 class _Look:
-    """Estimates by the networks for one face in one picture."""
+    """Estimates that the networks make of one face in one picture."""
 
-    mesh: F64  # (468, 3) px
-    presence: float
-    eyes: F64  # (2, 2) px
-    iris: F64  # (2,) diameters, px
-    openness: F64  # (2,) heights of the eyes over their widths
-    looks: F64  # (468,) grey values at the mesh's points, of mean 0 and length 1
+    mesh: F64  # (468, 3) points of the face mesh, px
+    presence: float  # probability of a face
+    eyes: F64  # (2, 2) left and right pupil, px
+    iris: F64  # (2,) diameters of the irises, px
+    openness: F64  # (2,) ratios of height to width of the eyes
+    looks: F64  # (468,) grey values at the mesh points, normalized to mean 0 and norm 1
 
     @property
     def eye_distance(self) -> float:
         return float(np.linalg.norm(self.eyes[0] - self.eyes[1]))
 
     def are_human(self) -> bool:
-        """Return True if both irises have a human size."""
+        """Return True if the irises have the size and similarity of human irises."""
         sizes = self.iris / self.eye_distance
         in_range = IRIS_RANGE[0] < sizes.min() and sizes.max() < IRIS_RANGE[1]
         return bool(in_range and sizes.max() < IRIS_RATIO_MAX * sizes.min())
@@ -95,27 +96,39 @@ class _Look:
 class PupilFinder:
     """Finder that follows one viewer's pupils from picture to picture.
 
-    `reason`: why the last picture gave no pupils; `choice`: how the viewer was chosen.
+    Attributes:
+        viewer: Number of the viewer, which increases with every new viewer.
+        reason: Reason why no pupils were found in the last picture, or an empty string.
+        choice: Description of how the viewer was chosen.
     """
 
     def __init__(self, *, lock_ns: int = 0) -> None:
-        """Create a finder. lock_ns: time after which another person may replace a viewer who is not seen."""
+        """Create a finder.
+
+        Args:
+            lock_ns: Time after which another person may replace a viewer who is no longer seen.
+        """
         self._faces, self._meshes, self._irises = FaceNetwork(), MeshNetwork(), IrisNetwork()
         self._flow, self._lock_ns = FaceFlow(), lock_ns
-        self.viewer = 0  # incremented with every new viewer
+        self.viewer = 0
         self.forget()
 
     def forget(self) -> None:
-        """Reset the finder, so that the next picture counts as the first."""
-        self._looks: F64 | None = None  # the viewer's face, kept while unseen
-        self._last: _Look | None = None  # the viewer in the previous picture
-        self._eyes = np.zeros((2, 2))  # px, returned for the previous picture
-        self._steps = self._carried = 0  # pictures averaged in `_eyes`; consecutive ones with a hidden eye
+        """Forget the viewer. The next picture is treated as the first one."""
+        self._looks: F64 | None = None  # appearance of the viewer's face, kept while the viewer is not seen
+        self._last: _Look | None = None  # estimates for the viewer in the previous picture
+        self._eyes = np.zeros((2, 2))  # pupils returned for the previous picture, px
+        self._steps = self._carried = 0  # pictures averaged in `_eyes`; consecutive pictures with a hidden eye
         self._seen_ns = 0
         self.reason, self.choice = "", "no viewer yet"
 
     def find(self, picture: U8, *, time_ns: int = 0) -> Pupils | None:
-        """Return the viewer's pupils in an RGB picture (h, w, 3), or None with the cause in `reason`."""
+        """Return the viewer's pupils in a picture, or None and store the cause in `reason`.
+
+        Args:
+            picture: RGB picture (h, w, 3).
+            time_ns: Capture time of the picture.
+        """
         if self._looks is not None and time_ns - self._seen_ns > self._lock_ns:
             self.forget()
             self.choice = "none: the viewer left"
@@ -130,7 +143,7 @@ class PupilFinder:
         return self._steadied(picture, look, "followed" if seen == "followed" else "found")
 
     def _follow(self, picture: U8) -> _Look | None:
-        """Look for the viewer at the position in the previous picture."""
+        """Look for the viewer at the face's position in the previous picture."""
         if self._last is None or self._looks is None:
             return None
         last = self._last
@@ -143,7 +156,7 @@ class PupilFinder:
         return look if look.looks @ self._looks > SAME_LOOKS_FOLLOWED else None
 
     def _search(self, picture: U8) -> _Look | None:
-        """Look for the viewer anywhere in the picture, or choose a new one if none is remembered."""
+        """Search the whole picture for the viewer, or choose a new viewer if none is remembered."""
         faces: list[FoundFace] = []
         for longest_px in LEVELS_PX:
             faces = faces or self._faces.find(picture, longest_px=longest_px, score_min=SCORE_MIN)
@@ -184,7 +197,10 @@ class PupilFinder:
         return _Look(mesh, presence, eyes, iris, openness, _looks(picture, mesh, float(np.linalg.norm(line))))
 
     def _steadied(self, picture: U8, look: _Look, seen: Seen) -> Pupils:
-        """Return the pupils with less jitter: the previous ones moved with the face, then corrected."""
+        """Return pupils with reduced jitter.
+
+        The pupils of the previous picture are moved with the face and then corrected towards the networks' estimates.
+        """
         eyes, surprise, hidden = look.eyes.copy(), np.zeros(2), np.zeros(2, bool)
         last = self._last if self._steps else None
         if last is not None:
@@ -220,13 +236,17 @@ class PupilFinder:
 
 
 def _worth(face: FoundFace, middle: F64) -> float:
-    """Return a face's score as a possible viewer: its size, reduced towards the picture's edges."""
+    """Return the score of a face as a viewer: its size, reduced away from the picture's centre.
+
+    Args:
+        middle: (2,) centre of the picture in pixels.
+    """
     away = np.abs(face.box[:2] + face.box[2:] / 2 - middle) / middle
     return face.size * (1 - FARTHEST_OUT * float(np.linalg.norm(away) / np.sqrt(2)))
 
 
 def _square_of(mesh: F64) -> Square:
-    """Return the square to which to apply the mesh network next, around the face of a previous mesh."""
+    """Return the square around a known face mesh, as the next input of the mesh network."""
     line = mesh[CORNERS[0][1], :2] - mesh[CORNERS[1][0], :2]
     angle = float(np.arctan2(line[1], line[0]))
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -236,7 +256,10 @@ def _square_of(mesh: F64) -> Square:
 
 
 def _looks(picture: U8, mesh: F64, eye_distance: float) -> F64:
-    """Return grey values (468,) at a face's points. Mean 0 and norm 1 make them independent of light."""
+    """Return the grey values (468,) at the points of a face mesh, which describe a person's appearance.
+
+    The values are normalized to mean 0 and norm 1, which makes them independent of brightness and contrast.
+    """
     margin = max(2, round(eye_distance / 4))
     height, width = picture.shape[:2]
     x0, y0 = np.clip(mesh[:, :2].min(axis=0).astype(int) - margin, 0, [width - 1, height - 1])
@@ -252,7 +275,7 @@ def _looks(picture: U8, mesh: F64, eye_distance: float) -> F64:
 
 
 def _similarity(last: F64, mesh: F64) -> F64:
-    """Return the similarity (2, 3) that maps the eye corners of a mesh `last` to those of `mesh`."""
+    """Return the similarity (2, 3) that maps the eye corners of the mesh `last` to those of `mesh`."""
     corners = np.ravel(CORNERS)
     matrix, _ = cv2.estimateAffinePartial2D(last[corners, :2], mesh[corners, :2], method=cv2.LMEDS)
     return np.eye(2, 3) if matrix is None else np.asarray(matrix, np.float64)
@@ -264,7 +287,7 @@ def _still_finder() -> PupilFinder:
 
 
 def find_eyes(picture: U8) -> Pupils | None:
-    """Return the nearest viewer's pupils in an RGB picture (h, w, 3), or None without a viewer."""
+    """Return the pupils of the foremost viewer in an RGB picture (h, w, 3), or None without a viewer."""
     finder = _still_finder()
     finder.forget()
     return finder.find(picture)

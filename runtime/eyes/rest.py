@@ -1,8 +1,8 @@
-"""Detect a head at rest from accepted samples.
+"""Detect a head at rest from the samples that the tracker accepts.
 
 The tracker's predictions jitter by several times the sensor's noise, because predicting ahead amplifies the noise in
-the estimated velocity. For a head at rest, the median of its samples is the best estimate of its position, and the
-picture can stand still.
+the estimated velocity. While the head is at rest, the median of the samples is the best estimate of the head's
+position, and the picture can stand still.
 """
 
 from __future__ import annotations
@@ -15,39 +15,48 @@ from runtime.records import F64
 REST_NS = NS_PER_S  # a head counts as at rest if it has not moved for this long
 LOST_NS = NS_PER_S  # a longer gap between samples resets the detector
 DRIFT_NS = 3 * NS_PER_S  # time span of the median that measures drift
-EVERY = 8  # samples between measurements of noise and drift, which change slowly
+EVERY = 8  # number of samples between measurements of noise and drift, which change slowly
 FEWEST = 8  # minimum number of samples for any conclusion
-KEPT = 256  # samples kept of a resting head
-GRACE_M = 0.0005  # added to every threshold, for sensors without noise
-NOISE_MAX_M = 0.005  # with more noise no head counts as resting, because a departure would go unnoticed
-# Thresholds in standard deviations of one sample. White noise at 60 samples a second exceeds each once in hours.
+KEPT = 256  # number of samples of a resting head that are kept
+GRACE_M = 0.0005  # addition to every threshold for sensors without noise
+NOISE_MAX_M = 0.005  # no head counts as at rest above this noise, because its departure would go unnoticed
+# Thresholds in standard deviations of one sample. White noise at 60 samples a second exceeds each of the thresholds
+# only once in hours.
 SINGLE = 4.5  # for two consecutive samples that deviate in the same direction
 MEDIAN_OF_FIVE = 2.6  # for the median of the newest five samples
-HALVES = 4.5  # for the difference between the means of two halves, divided by the root of their length
+HALVES = 4.5  # for the difference between two halves of the samples, in standard deviations of this difference
 MAD_TO_SIGMA = 1.4826  # standard deviation of normal noise, divided by its median absolute deviation
 MEDIAN_EFFICIENCY = 1.25  # standard deviation of a median, divided by that of a mean
-LEVER_M = 0.15  # RMS distance of a point from the centre of a display half a metre wide
+LEVER_M = 0.15  # RMS distance of points from the centre of a display that is half a metre wide
 NEAREST_M = 0.1  # smaller distances from the display are raised to this
 
 
 class RestWatch:
-    """Detector of a resting head and its position. Not thread-safe; reads no clock."""
+    """Detector that finds out whether a head is at rest, and where.
+
+    The detector is not thread-safe. It takes the time from the samples and reads no clock.
+    """
 
     def __init__(self, *, max_drift_m: float) -> None:
         """Create a detector.
 
-        max_drift_m: the position of a resting head is updated when it drifts by more than this beyond the noise.
+        Args:
+            max_drift_m: Drift beyond the noise above which the position of a resting head is updated.
         """
         self._max_drift_m = max_drift_m
         self._times = np.zeros(2 * KEPT, np.int64)
         self._eyes = np.zeros((2 * KEPT, 2, 3))
         self._count = 0
-        self.place: F64 | None = None  # (2, 3) the resting eyes, a new array for each rest; None while they move
+        self.place: F64 | None = None  # (2, 3) eyes at rest, a new array for each rest; None while the head moves
         self.noise_m = np.zeros(6)  # standard deviation of one sample, as `_shifts` measures it
         self.sigma_m = 0.0  # standard deviation of `place` along an axis, including undetected drift
 
     def update(self, eyes_m: F64, *, capture_ns: int) -> None:
-        """Add one sample (2, 3) in the stack frame."""
+        """Add a sample and update `place`.
+
+        Args:
+            eyes_m: Left and right eye (2, 3) in the frame `stack`.
+        """
         if self._count and not 0 < capture_ns - self._times[self._count - 1] < LOST_NS:
             self.forget()
         self._append(eyes_m, capture_ns)
@@ -62,14 +71,14 @@ class RestWatch:
             if self._stands():
                 self._settle(capture_ns - REST_NS)
         elif self._left(self.place):
-            # Samples from before a motion do not help to detect its end.
+            # Samples taken before a motion do not help to detect the end of the motion.
             self._keep_last(2)
             self.place = None
         elif slow_checks and self._drifted(self.place):
             self._settle(capture_ns - DRIFT_NS)
 
     def forget(self) -> None:
-        """Reset after the face was lost or the clock jumped."""
+        """Discard all samples, after the face was lost or the clock jumped."""
         self._count, self.place = 0, None
 
     def _append(self, eyes_m: F64, capture_ns: int) -> None:
@@ -85,7 +94,7 @@ class RestWatch:
         self._count = count
 
     def _since(self, time_ns: int) -> F64:
-        """Return samples (n, 2, 3) from `time_ns` on, plus earlier ones if there are fewer than `FEWEST`."""
+        """Return the samples (n, 2, 3) since `time_ns`, but at least the newest `FEWEST` samples."""
         first = min(int(np.searchsorted(self._times[: self._count], time_ns)), self._count - FEWEST)
         return self._eyes[first : self._count]
 
@@ -94,14 +103,14 @@ class RestWatch:
         self.place = np.median(recent, axis=0)
         noise_m = float(self.noise_m.max())
         median_sigma_m = MEDIAN_EFFICIENCY * noise_m / len(recent) ** 0.5
-        # Drift up to this goes uncorrected (`_drifted`).
+        # `_drifted` does not detect a drift up to this value.
         drift_m = self._max_drift_m + 2 * MEDIAN_EFFICIENCY * noise_m * (4 / max(len(recent), FEWEST)) ** 0.5
         self.sigma_m = float(np.hypot(median_sigma_m, drift_m / 2**0.5))  # drift is mostly in one direction
 
     def _measure_noise(self) -> None:
-        """Measure noise as the distance of samples from the line between their neighbours.
+        """Measure noise as the distance of each sample from the line between the neighbouring samples.
 
-        This excludes steady motion.
+        This measure is not affected by steady motion.
         """
         first = max(0, self._count - KEPT // 2)
         times, shifts = self._times[first : self._count], _shifts(self._eyes[first : self._count], self._eyes[first])
@@ -112,7 +121,7 @@ class RestWatch:
         self.noise_m = np.tile([max(right, up), max(right, up), deep], 2)
 
     def _stands(self) -> bool:
-        """Return True if the two halves of the last second agree with each other and with the newest samples."""
+        """Return True if the two halves of the last second agree with each other and the newest samples fit."""
         now_ns = int(self._times[self._count - 1])
         if now_ns - self._times[0] < REST_NS:
             return False
@@ -149,10 +158,10 @@ class RestWatch:
 
 
 def _shifts(eyes_m: F64, place: F64) -> F64:
-    """Return the displacements (n, 6), as seen on the display, of samples (n, 2, 3) from a place (2, 3).
+    """Return displacements (n, 6) of samples (n, 2, 3) from a place (2, 3), as seen on the display.
 
-    They are in metres. For each eye, two are right and up as seen from the display's centre, and one is the effect of
-    the eye's distance on off-centre points.
+    Each eye has three displacements in metres: to the right and up as seen from the display's centre, and the effect
+    that a change of the eye's distance has on points away from the centre.
     """
     away = eyes_m - place
     distance = np.maximum(place[:, :1], NEAREST_M)
