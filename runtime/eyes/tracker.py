@@ -1,4 +1,4 @@
-"""Track the eyes: refuse implausible samples, filter the others and predict."""
+"""Track the viewer's eyes: refuse implausible samples, filter the others and predict eye positions."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from runtime.eyes import imm
 from runtime.eyes.plausibility import NOT_NEWER, reason_against
 from runtime.records import F64, EyePoints, EyesEstimate, EyesLabel
 
-HISTORY = 256  # filtered samples kept: four seconds at 60 Hz
-CONFIDENCE_MIN = 0.3  # samples with less confidence (a blink) are refused
-CHI2_GATE = 21.1  # limit of chi² with three degrees of freedom; it refuses one good sample in 10,000
-CHI2_DOUBT = 11.3  # 1 % limit; a sample beyond it is undone if the next two fit better without it
+HISTORY = 256  # number of filtered samples kept: four seconds at 60 Hz
+CONFIDENCE_MIN = 0.3  # samples with less confidence, such as those of a blink, are refused
+CHI2_GATE = 21.1  # limit of chi² with three degrees of freedom; refuses one good sample in 10,000
+CHI2_DOUBT = 11.3  # 1 % limit; a sample beyond this limit is undone if the next two fit better without it
 ACCELERATION = (0.05, 0.4, 2.0)  # standard deviations in m/s² for a calm, a moving and a fast head
-STAY_S = 1.0  # mean time that a head stays calm, moving or fast
-# m/s², standard deviations for half the vector between the eyes: a head that hardly turns, and one that shakes
+STAY_S = 1.0  # mean time for which a head stays calm, moving or fast
+# Standard deviations in m/s² for half the vector between the eyes, of a head that hardly turns and of a shaking head.
 TURN_ACCELERATION = (0.03, 0.4)
-FIRST_SPEED = 0.3  # standard deviation in m/s for a head just found
+FIRST_SPEED = 0.3  # standard deviation of the velocity of a newly found head, in m/s
 REACH_SPEED, REACH_ACCELERATION = 2.0, 30.0  # limits of a head's motion in m/s and m/s²
-KEEP_S = 0.4  # after a longer gap, a head's motion is discarded
-ANOTHER_AFTER_S = 0.5  # another person replaces a viewer unseen for this long, or for hold_s if that is shorter
-LOSS_S = 0.2  # after this long without a sample, eyes are held instead of predicted
+KEEP_S = 0.4  # after a longer gap between samples, a head's estimated motion is discarded
+ANOTHER_AFTER_S = 0.5  # another person replaces a viewer who is unseen for this long, or for hold_s if that is shorter
+LOSS_S = 0.2  # time without a sample after which eyes are held instead of predicted
 HORIZON_S = 0.2  # longest prediction
-DECAY_S = 0.06  # time constant with which a lost head slows to rest
+DECAY_S = 0.06  # time constant with which the predicted motion of a lost head slows to rest
 REVIVE_S = 0.06  # duration of the blend when lost eyes are found again
 CLOCK_RESET_NS = NS_PER_S  # a capture time this far in the past means that the clock was set back
-COMPLETED_NOISE = 2.0  # factor on the standard deviation of a pair of eyes of which one is filled in
+COMPLETED_NOISE = 2.0  # factor on the standard deviation of a pair of eyes if the position of one eye is inferred
 NOISE_FLOOR_M = 2e-5  # smallest standard deviation accepted from a driver; no sensor measures a pupil better
 ESTABLISHED = 3  # a head with fewer samples may be a mistake
 SIGMA_AHEAD_S = 1.0  # uncertainty is not extrapolated beyond this horizon
-NEAREST_M = 0.1  # smaller distances from the display are raised to this when depth errors are weighed
-PANEL_M = (0.5184, 0.2916)  # default width and height
+NEAREST_M = 0.1  # minimum distance from the display that is used to weigh depth errors
+PANEL_M = (0.5184, 0.2916)  # default width and height of the panels
 NO_JUMP = np.zeros((2, 3))
 
 UNCERTAIN = "uncertain"
@@ -46,12 +46,12 @@ ELSEWHERE = "not where the viewer is"
 
 
 class _Head(NamedTuple):
-    """Estimated motion of one head, as of its newest sample."""
+    """Estimated motion of one head at the time of the head's newest sample."""
 
-    capture_ns: int
+    capture_ns: int  # capture time of the newest sample
     middle: imm.Belief  # midpoint of the eyes, frame `stack`
     half: imm.Belief  # vector from the midpoint to the right eye
-    samples: int  # number of samples processed
+    samples: int  # number of samples that the estimate is based on
     surprise: float  # chi² of the newest sample
 
     def age_s(self, time_ns: int) -> float:
@@ -67,18 +67,18 @@ class _Sample(NamedTuple):
     """Measurement that has passed the plausibility checks."""
 
     capture_ns: int
-    middle_m: F64  # (3,)
-    half_m: F64  # (3,)
-    noise_m2: F64  # (3, 3) covariance of the midpoint, and of `half_m`
+    middle_m: F64  # (3,) midpoint of the eyes, frame `stack`
+    half_m: F64  # (3,) vector from the midpoint to the right eye
+    noise_m2: F64  # (3, 3) covariance of `middle_m`, and also of `half_m`
 
     def begun(self) -> _Head:
-        """Return a new head from this sample alone."""
+        """Return a new head that is estimated from this sample alone."""
         middle = imm.started(self.middle_m, noise=self.noise_m2, speed=FIRST_SPEED, acceleration=ACCELERATION)
         half = imm.started(self.half_m, noise=self.noise_m2, speed=FIRST_SPEED / 3, acceleration=TURN_ACCELERATION)
         return _Head(self.capture_ns, middle, half, 1, 0.0)
 
     def continued(self, head: _Head) -> _Head | None:
-        """Return a head updated with this sample, or None if the sample cannot belong to it."""
+        """Return a head updated with this sample, or None if the sample cannot belong to that head."""
         age_s = head.age_s(self.capture_ns)
         if age_s > KEEP_S:
             return None
@@ -99,7 +99,7 @@ class _Sample(NamedTuple):
         )
 
     def is_within_reach_of(self, head: _Head) -> bool:
-        """Return True if a head could have moved here since its newest sample."""
+        """Return True if a head could have moved to this sample's position since the head's newest sample."""
         age_s = head.age_s(self.capture_ns)
         reach_m = min(REACH_SPEED * age_s, REACH_ACCELERATION * age_s**2 / 2)
         noise_m = math.sqrt(np.trace(self.noise_m2 + head.middle.covariance[0, :3, :3]))
@@ -109,14 +109,19 @@ class _Sample(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Shown:
-    """The viewer's head after a sample, with the jump that remains to be smoothed out."""
+    """State of the viewer's head after a sample, with a jump that remains to be smoothed out."""
 
     head: _Head
-    jump_m: F64  # (2, 3) from the measured eyes to those last shown, at `jump_ns`; it decays afterwards
+    jump_m: F64  # (2, 3) vectors from the measured to the last shown eyes at `jump_ns`, which decay afterwards
     jump_ns: int
 
     def eyes_m(self, ahead_s: float, time_ns: int) -> F64:
-        """Return the eyes (2, 3) to show at `time_ns`, predicted `ahead_s` seconds ahead."""
+        """Return the eyes (2, 3) to show at a given time.
+
+        Args:
+            ahead_s: Time after the newest sample for which to predict the eyes.
+            time_ns: Time at which the eyes are shown, which determines the rest of the jump.
+        """
         eyes = self.head.eyes_m(ahead_s)
         if self.jump_m is not NO_JUMP:
             fraction = min(max((time_ns - self.jump_ns) / NS_PER_S / REVIVE_S, 0.0), 1.0)
@@ -125,18 +130,19 @@ class _Shown:
 
 
 class _Other(NamedTuple):
-    """Head that was seen away from the viewer's."""
+    """Head that was seen at a different position than the viewer's head."""
 
     head: _Head
-    may_be_viewer: bool  # True if the viewer could have moved there
+    may_be_viewer: bool  # True if the viewer could have moved to this head's position
 
 
 class Tracker:
-    """Tracker of one viewer's eyes.
+    """Tracker that filters and predicts the eye positions of one viewer.
 
-    `update` takes samples as they arrive; `at` returns the eye positions for a given time. The first person seen
-    remains the viewer while visible. When eyes return after a loss, the output moves smoothly from the last position
-    shown to the measured one. When another person becomes the viewer, the output jumps to their eyes.
+    `update` takes samples as they arrive, and `at` returns the eye positions for a given time. The first person who is
+    seen remains the viewer while visible. When eyes return after a loss, the output moves smoothly from the last shown
+    position to the measured position. When another person becomes the viewer, the output jumps to the new viewer's
+    eyes.
     """
 
     def __init__(
@@ -148,7 +154,10 @@ class Tracker:
     ) -> None:
         """Create a tracker.
 
-        panel_m: (width, height), which determines the weight of depth errors. in_front_m: minimum x of an eye.
+        Args:
+            settings: Settings of the tracker. None selects the default settings.
+            panel_m: Width and height of the panels, which determine the weight of depth errors.
+            in_front_m: Value of x, in the frame `stack`, that both eyes must exceed.
         """
         self.settings = settings or TrackerSettings()
         self._panel_m, self._in_front_m = panel_m, in_front_m
@@ -156,14 +165,21 @@ class Tracker:
         self._other: _Other | None = None
         self._lost_ns: int | None = None
         self._newest_ns = -1
-        self._asked_ns = 0  # display time of the last picture: the latest argument of `at`
+        self._asked_ns = 0  # latest display time for which `at` has predicted eyes
 
     def update(self, points: EyePoints | None, *, capture_ns: int) -> str:
-        """Add a sample in the stack frame, or None if the sensor saw no face.
+        """Add a sample.
 
-        Returns the reason for a refusal, or an empty string. Samples are refused if they are old, uncertain (a blink),
-        implausible for a person, or away from the viewer. If two consecutive samples are at a position that the viewer
-        could have reached, the second is accepted. Another person's samples are accepted only once the viewer has left.
+        A sample is refused if it is not newer than the previous one, uncertain (as in a blink), implausible for a
+        person or away from the viewer. If two consecutive samples are at a position that the viewer could have
+        reached, the second sample is accepted. Another person's samples are accepted only after the viewer has left.
+
+        Args:
+            points: Eyes in the frame `stack`, or None if the sensor saw no face.
+            capture_ns: Capture time of the sample.
+
+        Returns:
+            The reason why the sample was refused, or an empty string.
         """
         if capture_ns <= self._newest_ns:
             if self._newest_ns - capture_ns < CLOCK_RESET_NS:
@@ -181,13 +197,16 @@ class Tracker:
         return self._take(_Sample(capture_ns, (left + right) / 2, (right - left) / 2, self._noise(points)))
 
     def forget(self) -> None:
-        """Reset to the initial state."""
+        """Reset the tracker to its initial state."""
         self._history.clear()
         self._other = self._lost_ns = None
         self._newest_ns, self._asked_ns = -1, 0
 
     def _noise(self, points: EyePoints) -> F64:
-        """Return the midpoint's covariance (3, 3), in m²: the driver's, with a floor, or the settings'."""
+        """Return the covariance (3, 3), in m², of the eyes' midpoint.
+
+        The covariance that the driver reports is raised to a minimum. Without it, the noise in the settings applies.
+        """
         noise: F64 = self.settings.noise_m**2 / 2 * np.eye(3)
         if points.covariance_m2 is not None and np.isfinite(points.covariance_m2).all():
             variances, axes = np.linalg.eigh((points.covariance_m2 + points.covariance_m2.T) / 2)
@@ -221,7 +240,7 @@ class Tracker:
             and len(self._history) > 1
             and (head := sample.continued(self._history[-2].head))
         ):
-            self._history.pop()  # the last two samples fit better without this one
+            self._history.pop()  # the last two samples fit better without this entry
             self._follow(head, is_return=True)
         elif age_s > min(ANOTHER_AFTER_S, self.settings.hold_s) or (is_second and last.head.samples < ESTABLISHED):
             self._history.clear()
@@ -232,9 +251,10 @@ class Tracker:
         return ""
 
     def _follow(self, head: _Head, *, is_return: bool = False) -> None:
-        """Make `head` the viewer's.
+        """Make `head` the viewer's head.
 
-        is_return: after a loss or a jump, blend from the last position shown.
+        Args:
+            is_return: Blend from the last shown position, because the eyes were lost or have jumped.
         """
         jump_m, jump_ns = (self._history[-1].jump_m, self._history[-1].jump_ns) if self._history else (NO_JUMP, 0)
         if is_return:
@@ -247,18 +267,28 @@ class Tracker:
             self._other = None
 
     def ahead(self, time_ns: int) -> EyesEstimate:
-        """Return an estimate like `at`, for a time that is not shown. Later calls of `at` are not affected."""
+        """Return the same estimate as `at`, for a time at which no picture is shown.
+
+        Later blends start from the last shown position, which this call does not change.
+        """
         asked_ns = self._asked_ns
         estimate = self.at(time_ns)
         self._asked_ns = asked_ns
         return estimate
 
     def at(self, time_ns: int) -> EyesEstimate:
-        """Return the eyes at a display time on the clock of the samples.
+        """Return the eyes at a display time.
 
-        Labels: `exact` at a sample; `interpolated` between two samples; `predicted` at most `HORIZON_S` after the
-        newest; `held` when the face is lost and the eyes slow to rest; `none` if they were never seen, were lost for
-        longer than `hold_s`, or were forgotten.
+        The label of the estimate is
+
+        * `exact` at the time of a sample,
+        * `interpolated` between two samples,
+        * `predicted` up to `LOSS_S` after the newest sample,
+        * `held` once the face is lost, when the predicted eyes slow to rest,
+        * `none` if the eyes were never seen, were lost for longer than `hold_s` or were forgotten.
+
+        Args:
+            time_ns: Display time on the clock of the samples.
         """
         if not self._history or time_ns < self._history[0].head.capture_ns:
             return EyesEstimate(time_ns, 0, None, "none")
@@ -302,11 +332,16 @@ class Tracker:
 
 
 def sideways_sigma_m(error_m2: F64, eye_m: F64, *, panel_m: tuple[float, float]) -> float:
-    """Return the sideways standard deviation whose effect equals that of a position covariance (3, 3).
+    """Return the sideways standard deviation that has the same effect on the display as a position error.
 
-    If an eye is nearer than its estimated distance x by d, the effect on a display point equals that of a sideways
-    displacement of d·u/x, where u is the distance from that point to the foot of the eye's perpendicular. The result is
-    the root mean square over the display.
+    If an eye is nearer than its estimated distance x by d, the effect on a point of the display equals that of a
+    sideways displacement of d·u/x. Here u is the distance from the point to the foot of the perpendicular from the eye
+    to the display. The result is the root mean square over the display.
+
+    Args:
+        error_m2: Covariance (3, 3) of the position error, in m².
+        eye_m: Position (3,) of the eyes' midpoint in the frame `stack`.
+        panel_m: Width and height of the panels.
     """
     x, y, z = max(float(eye_m[0]), NEAREST_M), float(eye_m[1]), float(eye_m[2])
     lever2 = (y * y + z * z + (panel_m[0] ** 2 + panel_m[1] ** 2) / 12) / (x * x)
