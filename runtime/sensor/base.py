@@ -1,4 +1,4 @@
-"""Interface of sensor drivers, and conversion of device time to the host's clock."""
+"""Interface of sensor drivers, and conversion of device timestamps to the host's clock."""
 
 from __future__ import annotations
 
@@ -14,60 +14,68 @@ from runtime.config import Section
 from runtime.errors import EndOfRecording, SensorLost, SensorTimeout
 from runtime.records import SensorFrame
 
-ARRIVED_MAX = 1024  # maximum number of samples returned per call
-WINDOW_NS = 5_000_000_000  # window over which a device clock's offset is estimated
+ARRIVED_MAX = 1024  # maximum number of samples that one call returns
+WINDOW_NS = 5_000_000_000  # duration of the windows over which a device clock's offset is estimated
 
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:
-    """The kinds of data that a sensor delivers."""
+    """Kinds of data that a sensor delivers, and how the data must be treated."""
 
     colour: bool = False
     depth: bool = False
-    eye_points: bool = False  # the sensor finds the eyes, so our detector is not used
-    in_stack_frame: bool = False  # eye points are in the stack frame and need no calibration
-    may_pause: bool = False  # gaps and constant samples are not faults, as in a recording
+    eye_points: bool = False  # the sensor finds the eyes itself, so the eye finder is not used
+    in_stack_frame: bool = False  # eye points are in the frame `stack` and need no calibration
+    may_pause: bool = False  # gaps and constant samples are no faults, for example in a recording
 
 
 class Sensor(ABC):
-    """Depth sensor, eye tracker or recording.
+    """Base class of drivers for depth cameras, eye trackers and recordings.
 
-    The constructor only stores settings. `open` acquires the device and cleans up if it fails. A driver is used by one
-    thread only, which may be abandoned if an SDK hangs.
+    The constructor only stores settings. `open` acquires the device, and cleans up if this fails. Only one thread uses
+    a driver. The thread may be abandoned if an SDK hangs.
 
-    A custom class is configured by `sensor.driver = "module:Class"` and constructed as `Class(options, clock=clock)`,
-    with `options` an `Options` validated from `[sensor.options]` and `clock` the run's clock, on which capture times
-    must be based.
+    A custom driver is configured by `sensor.driver = "module:Class"` and constructed as `Class(options, clock=clock)`.
+    `options` is an instance of the class's `Options`, validated from `[sensor.options]`. `clock` is the run's clock, on
+    which capture times must be based.
     """
 
     Options: ClassVar[type[BaseModel]] = Section  # schema of [sensor.options] for a custom class
 
     name: str
     capabilities: Capabilities
-    serial: str = ""  # set by `open`, "" if unknown; if set before, `open` accepts only that device
-    skipped: int = 0  # samples that `read_newest` dropped because newer ones had arrived
+    serial: str = ""  # serial number, set by `open` if known; if set earlier, `open` accepts only this device
+    skipped: int = 0  # number of samples that `read_newest` dropped because newer samples had arrived
 
     @abstractmethod
     def open(self) -> None:
-        """Acquire the device. Raises SensorLost if a retry may succeed, FatalError for a permanent failure."""
+        """Acquire the device.
+
+        Raises:
+            SensorLost: The device cannot be opened, but a retry may succeed.
+            FatalError: The device cannot be opened, and a retry would also fail.
+        """
 
     @abstractmethod
     def read_newest(self, timeout_s: float) -> SensorFrame:
-        """Return the newest unread frame. Waits up to `timeout_s` for one.
+        """Return the newest unread frame, after waiting up to `timeout_s` for a new frame to arrive.
 
-        Raises SensorTimeout (nothing new), SensorLost (close and reopen), EndOfRecording.
+        Raises:
+            SensorTimeout: No new frame arrived in time.
+            SensorLost: The device must be closed and reopened.
+            EndOfRecording: The recording has no more frames.
         """
 
     def read_arrived(self, timeout_s: float) -> list[SensorFrame]:
-        """Return all unread frames, oldest first. Waits up to `timeout_s` for the first one.
+        """Return all unread frames, oldest first, after waiting up to `timeout_s` for the first frame.
 
-        By default this is only the newest one. Raises the same exceptions as `read_newest`.
+        The default implementation returns only the newest frame. The exceptions are the same as for `read_newest`.
         """
         return [self.read_newest(timeout_s)]
 
     @abstractmethod
     def close(self) -> None:
-        """Release the device. Never raises. May be called twice or after a failed `open`."""
+        """Release the device without raising an exception. May be called twice or after a failed `open`."""
 
     def __enter__(self) -> Self:
         self.open()
@@ -80,13 +88,20 @@ class Sensor(ABC):
 class SteppedSensor(Sensor):
     """Driver that can also deliver samples without waiting, for runs on a simulated clock.
 
-    `open` passes the samples to `_begin`. `read_newest` and `read_arrived` return those that have arrived by its clock.
+    A subclass implements `open`, which passes an iterator of samples to `_begin`. `read_newest` and `read_arrived`
+    return the samples that have arrived according to the run's clock.
     """
 
     def __init__(self, source: str, clock: Clock, *, latency_ms: float = 0.0) -> None:
-        """source: name used in messages. latency_ms: delay of each sample from capture to arrival."""
+        """Store the settings.
+
+        Args:
+            source: Name of the source in messages.
+            clock: The run's clock, on which capture times must be based.
+            latency_ms: Delay of each sample from capture to arrival.
+        """
         self._source, self._clock, self._latency_ns = source, clock, round(latency_ms * NS_PER_MS)
-        self._frames: Iterator[SensorFrame] | None = None  # samples after the next one; None if not open
+        self._frames: Iterator[SensorFrame] | None = None  # samples that follow `_next`; None if not open
         self._next: SensorFrame | None = None
 
     def _begin(self, frames: Iterator[SensorFrame]) -> None:
@@ -96,7 +111,7 @@ class SteppedSensor(Sensor):
         self._frames = self._next = None
 
     def peek(self) -> SensorFrame | None:
-        """Return the sample that `next_sample` will deliver, or None at the end.
+        """Return the sample that `next_sample` will return, or None if there are no more samples.
 
         Raises SensorLost if the driver is not open.
         """
@@ -116,7 +131,7 @@ class SteppedSensor(Sensor):
         return frame
 
     def available_ns(self, frame: SensorFrame) -> int:
-        """Return when a sample arrives on the run's clock. The caller advances its clock to this time."""
+        """Return the time at which a sample arrives, on the run's clock."""
         return frame.capture_ns + self._latency_ns
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
@@ -136,10 +151,12 @@ class SteppedSensor(Sensor):
         return following is not None and self.available_ns(following) <= now_ns
 
     def _first_due(self, timeout_s: float) -> SensorFrame:
-        """Wait for the oldest unread sample.
+        """Wait for the oldest unread sample and return it.
 
-        Raises SensorTimeout if it does not arrive in time, EndOfRecording after the last sample, and SensorLost if the
-        driver is not open.
+        Raises:
+            SensorTimeout: The sample does not arrive in time.
+            EndOfRecording: The last sample has already been read.
+            SensorLost: The driver is not open.
         """
         following = self.peek()
         if following is None:
@@ -155,8 +172,8 @@ class SteppedSensor(Sensor):
 class DeviceClock:
     """Converter of device timestamps to the host's clock, based on the fastest recent delivery.
 
-    The delay of a delivery varies, but its minimum over a window is nearly constant. A new window every few seconds
-    follows the drift between both clocks.
+    The delay between a timestamp and the arrival of the sample varies, but the minimum delay over a few seconds is
+    nearly constant. A new window every few seconds follows the drift between the two clocks.
     """
 
     def __init__(self) -> None:
@@ -165,7 +182,12 @@ class DeviceClock:
         self._last_ns: int | None = None
 
     def host_ns(self, device_ns: int, *, arrival_ns: int) -> int:
-        """Convert a device timestamp to the host's clock, no later than its arrival."""
+        """Convert a device timestamp to the host's clock. The result is not later than the arrival.
+
+        Args:
+            device_ns: Timestamp on the device's clock.
+            arrival_ns: Time at which the sample arrived, on the host's clock.
+        """
         offset = arrival_ns - device_ns
         if self._last_ns is None or device_ns < self._last_ns:  # first sample or restarted device
             self._offsets, self._start_ns = [offset], arrival_ns

@@ -1,4 +1,4 @@
-"""Driver `browser`: a web page's pointer acts as the head, or its camera tracks the viewer."""
+"""Driver `browser`: the pointer in a web page moves a virtual head, or the page's camera sees the viewer."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from runtime.errors import SensorLost, SensorTimeout
 from runtime.records import EyePoints, Intrinsics, SensorFrame
 from runtime.sensor.base import Capabilities, DeviceClock, Sensor
 
-AGAIN_NS = NS_PER_S // 30  # period at which a position is repeated, because pages report only movements
+AGAIN_NS = NS_PER_S // 30  # period at which the last position is repeated, because a page reports only movements
 SILENT_NS = 5 * NS_PER_S  # time without a message from a page after which there is no viewer
 LEAST_SIGMA_M = 5e-5  # lower limit, so that noise-free samples have a regular covariance
 PICTURE_MAX_PX = 2048  # limit for the longer side of a page's camera picture
 
 
 class BrowserEyes(Sensor):
-    """Driver that delivers eye positions sent by pages and repeats the last one in between."""
+    """Driver that delivers the eye positions that a page sends, and repeats the last position in between."""
 
     name = "browser"
     capabilities = Capabilities(eye_points=True, in_stack_frame=True, may_pause=True)
@@ -30,7 +30,7 @@ class BrowserEyes(Sensor):
     def __init__(self, link: BrowserLink, clock: Clock) -> None:
         self._link, self._clock = link, clock
         self._random = np.random.default_rng(0)
-        self._waiting: deque[tuple[int, SensorFrame]] | None = None  # samples and their arrival times
+        self._waiting: deque[tuple[int, SensorFrame]] | None = None  # arrival times and samples
         self._times, self._heard_ns, self._sampled_ns, self._count = DeviceClock(), 0, 0, 0
         self._last, self._captured_ns = SeenEyes(None, 0.0), 0
 
@@ -84,9 +84,9 @@ class BrowserEyes(Sensor):
 
 
 class BrowserCamera(Sensor):
-    """Driver that delivers camera frames sent by a web page.
+    """Driver that delivers the camera pictures that a web page sends.
 
-    Without depth, the viewer's distance is estimated from the eye separation.
+    The camera measures no depth, so the viewer's distance is estimated from the eye separation.
     """
 
     name = "browser"
@@ -117,4 +117,4 @@ class BrowserCamera(Sensor):
         return SensorFrame(self._number, self._captured_ns, colour=colour, intrinsics=intrinsics)
 
     def close(self) -> None:
-        """Do nothing, because there is no device."""
+        """Do nothing, because there is no device to release."""

@@ -1,4 +1,4 @@
-"""Driver `fixed`: eyes at a configured position, which needs neither a sensor nor a calibration."""
+"""Driver `fixed`: eyes at a configured position, for runs without a sensor or a calibration."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ PERIOD_NS = NS_PER_S // 30
 
 
 class FixedDriver(SteppedSensor):
-    """Driver that delivers the same eyes in the stack frame thirty times a second."""
+    """Driver that delivers the configured eye positions thirty times a second, in the frame `stack`."""
 
     name = "fixed"
     capabilities = Capabilities(eye_points=True, in_stack_frame=True, may_pause=True)
 
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
-        """Raises InputError if the settings contain no eye positions."""
+        """Store the eye positions. Raises InputError if the settings contain no eye positions."""
         if settings.fixed_eyes_m is None:
             raise InputError("sensor", "fixed_eyes_m", "is required by the driver `fixed`")
         super().__init__(self.name, clock)
