@@ -1,4 +1,4 @@
-"""Driver `browser`: the pointer in a web page moves a virtual head, or the page's camera sees the viewer."""
+"""Driver `browser`: a web page's pointer moves a virtual head, or the page's camera sees the viewer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Driver `openni2`: any camera with an OpenNI2 driver, and `.oni` recordings."""
+"""Driver `openni2`: any camera that has an OpenNI2 driver, and `.oni` recordings."""
 
 from __future__ import annotations
 
@@ -24,37 +24,43 @@ from runtime.sensor.openni2_library import load
 
 SERIAL_PROPERTY = 3  # ONI_DEVICE_PROPERTY_SERIAL_NUMBER
 DEPTH_1_MM, DEPTH_100_UM, RGB888, GRAY8 = 100, 101, 200, 202
-PAIR_APART_US = 40_000  # largest difference within a pair of depth and colour: one period of an unsynchronised camera
-PAIR_WAIT_S = 0.02  # how long a depth picture waits for its colour
-THREADS_STOP_S = 0.5  # fifteen periods of a recording's threads; three led to crashes on a busy machine
-DRAIN_MAX = 32  # maximum number of frames skipped per call, so that a fast source cannot block it
+PAIR_APART_US = 40_000  # largest time between paired depth and colour: one period of an unsynchronised camera
+PAIR_WAIT_S = 0.02  # time for which a depth picture waits for the colour picture
+THREADS_STOP_S = 0.5  # fifteen periods of a recording's threads; three periods led to crashes on a busy machine
+DRAIN_MAX = 32  # maximum number of frames skipped per call, because a fast source could otherwise block the call
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
-_idle: list[_PersistentThread] = []  # threads for reuse; a hanging one is never returned
+_idle: list[_PersistentThread] = []  # threads for reuse; a thread that hangs is never returned to the list
 _lock = threading.Lock()
 
 
 class _Picture(NamedTuple):
-    number: int  # frame number from the device
-    time_us: int
+    number: int  # frame number assigned by the device
+    time_us: int  # timestamp on the device's clock
     pixels: Any  # U8 (h, w, 3) or U16 (h, w)
 
 
 class OpenNI2Driver(Sensor):
-    """Driver for OpenNI2 cameras. Delivers colour, and depth in millimetres.
+    """Driver for OpenNI2 cameras, which delivers colour, and depth in millimetres.
 
-    Depth is registered to colour if possible. Calls into the library run on a thread that outlives the calling one
-    (`_PersistentThread`).
+    Depth is registered to colour if the camera supports it. All calls into the library run on a `_PersistentThread`,
+    which outlives the calling thread.
     """
 
     name = "openni2"
     capabilities = Capabilities(colour=True, depth=True)
 
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
-        """settings.source: a serial number, a device URI, a .oni file, or empty or `demo` for the only camera."""
+        """Store the settings.
+
+        Args:
+            settings: Settings whose `source` is a serial number, a device URI or a `.oni` file. An empty source or
+                `demo` selects the only connected camera.
+            clock: The run's clock, on which capture times are based.
+        """
         self._settings, self._clock = settings, clock
-        self._thread: _PersistentThread | None = None  # only while open
+        self._thread: _PersistentThread | None = None  # None if not open
         self._openni: Any = None
         self._device: Any = None
         self._streams: dict[str, Any] = {}
@@ -83,7 +89,7 @@ class OpenNI2Driver(Sensor):
             self._start_streams()
         except SensorLost:
             raise
-        except Exception as error:  # the package raises its own errors, those of ctypes and AssertionError
+        except Exception as error:  # the package raises its own exceptions, those of ctypes and AssertionError
             raise SensorLost(f"OpenNI2: {_text(error)}") from None
 
     def _find_device(self) -> Any:
@@ -131,7 +137,10 @@ class OpenNI2Driver(Sensor):
         self._times, self._newest, self._index = DeviceClock(), {}, 0
 
     def _read_intrinsics(self, stream: Any) -> Intrinsics | None:
-        """Return a centred pinhole camera with the reported or configured field of view, or None if unknown."""
+        """Return the intrinsics of a centred camera with the reported or the configured field of view.
+
+        Returns None if the field of view is neither reported nor configured.
+        """
         try:  # recordings claim to support the property but fail to return it
             fov_x, fov_y = stream.get_horizontal_fov(), stream.get_vertical_fov()
         except Exception:
@@ -192,7 +201,7 @@ class OpenNI2Driver(Sensor):
         )
 
     def _take(self, timeout_s: float) -> bool:
-        """Copy one frame from any stream. Returns False if none arrived in time."""
+        """Copy one frame from any stream. Returns False if no frame arrived in time."""
         try:
             # With a timeout of 0 the library reports an error for some devices.
             stream = self._openni.wait_for_any_stream(list(self._streams.values()), max(timeout_s, 0.001))
@@ -226,7 +235,8 @@ class OpenNI2Driver(Sensor):
         for stream in streams.values():
             _quietly(stream.stop)
         if streams and self._settings.source.endswith(".oni"):
-            # The library does not wait until a recording's threads stop. Without a pause they write to freed memory.
+            # The library does not wait for the threads of a recording to stop. Without a pause, these threads would
+            # write to freed memory.
             time.sleep(THREADS_STOP_S)
         for handle in (*streams.values(), device):
             if handle is not None:
@@ -234,7 +244,7 @@ class OpenNI2Driver(Sensor):
 
 
 def _quietly(call: Callable[[], object]) -> None:
-    """Call a function and log its error, such as that of an unplugged camera."""
+    """Call a function and log its exception, for example that of an unplugged camera."""
     try:
         call()
     except Exception as error:
@@ -258,9 +268,9 @@ def _text(error: Exception) -> str:
 
 
 def _pixels(frame: Any) -> U8 | U16:
-    """Copy depth as (h, w) uint16 in millimetres, or colour as (h, w, 3) RGB.
+    """Copy a depth frame as (h, w) millimetres, or a colour frame as (h, w, 3) RGB.
 
-    Raises ValueError if the pixel format is not supported or the frame is too short.
+    Raises ValueError if the pixel format is not supported or the frame contains too few bytes.
     """
     pixel_format, height, width = frame.videoMode.pixelFormat.value, frame.height, frame.width
     data = np.frombuffer(frame.get_buffer_as_uint8(), np.uint8)
@@ -282,8 +292,9 @@ def _pixels(frame: Any) -> U8 | U16:
 class _PersistentThread:
     """Thread that lives as long as the process and runs calls one at a time. Callers wait for the result.
 
-    At exit OpenNI2 accesses every thread that ever called it and crashes if the stack of one was freed. A
-    `ThreadPoolExecutor` would not do, because Python ends its threads earlier and waits for one that hangs in a call.
+    At exit, OpenNI2 accesses every thread that has ever called the library, and crashes if the stack of such a thread
+    was freed. A `ThreadPoolExecutor` is not suitable, because Python ends the pool's threads earlier and waits for
+    threads that hang in a call.
     """
 
     def __init__(self, name: str) -> None:
@@ -303,4 +314,4 @@ class _PersistentThread:
                 outcome.set_result(call())
             except BaseException as error:  # raised again in the caller
                 outcome.set_exception(error)
-            del outcome, call  # else objects would stay alive until the next call
+            del outcome, call  # otherwise objects would stay alive until the next call

@@ -1,8 +1,8 @@
-"""Loader for libOpenNI2 and its drivers.
+"""Load the library libOpenNI2 and its drivers.
 
-The `openni` package expects a folder with `libOpenNI2.so` and `OpenNI2/Drivers/`. Distributions install them under
-other names, so a folder of links is created. Drivers stay in memory, because some leave threads running after closing a
-device and unloading their code would crash the process.
+The `openni` package expects a folder that contains `libOpenNI2.so` and `OpenNI2/Drivers/`. Because Linux distributions
+install these files under other names, this module creates a folder of links. Drivers stay in memory: some drivers leave
+threads running after closing a device, and unloading their code would crash the process.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ LIBRARY_FOLDERS = (
     "/usr/lib",
     "/usr/local/lib",
 )
-DUMMY = "DummyDevice"  # sample driver, which would add a fake device
+DUMMY = "DummyDevice"  # OpenNI2's sample driver, which would add a fake device
 INSTALL = "OpenNI2 was not found; install it (Debian: apt install libopenni2-0) or set sensor.openni2_folder"
 
 _lock = threading.Lock()
@@ -34,7 +34,14 @@ _loaded = False
 
 
 def find_library(folder: str = "") -> tuple[Path, Path]:
-    """Return the paths of the library and its driver folder. Raises MissingPart if they are not found."""
+    """Return the paths of the library and of the folder with its drivers.
+
+    Args:
+        folder: Folder in which to search. If empty, search the folders in `LIBRARY_FOLDERS`.
+
+    Raises:
+        MissingPart: No searched folder contains both the library and its drivers.
+    """
     for place in (folder,) if folder else LIBRARY_FOLDERS:
         drivers = Path(place) / "OpenNI2" / "Drivers"
         for library in sorted(Path(place).glob("libOpenNI2.so*")):
@@ -46,7 +53,12 @@ def find_library(folder: str = "") -> tuple[Path, Path]:
 def load(folder: str = "") -> Any:
     """Load the library and return the module `openni.openni2`.
 
-    Raises MissingPart if the package or the library is missing, and SensorLost if the library cannot be started.
+    Args:
+        folder: Folder with the library. If empty, search the folders in `LIBRARY_FOLDERS`.
+
+    Raises:
+        MissingPart: The package `openni` or the library is missing.
+        SensorLost: The library cannot be started.
     """
     global _loaded
     try:
@@ -63,7 +75,7 @@ def load(folder: str = "") -> Any:
         (links / "libOpenNI2.so").symlink_to(library)
         for file in sorted(drivers.glob("lib*.so*")):
             if DUMMY not in file.name:
-                # Debian's library looks for lib*.so.0, the original one for lib*.so.
+                # Debian's library looks for lib*.so.0, the original library for lib*.so.
                 for name in {file.name, f"{file.name.split('.so')[0]}.so", f"{file.name.split('.so')[0]}.so.0"}:
                     (links / "OpenNI2" / "Drivers" / name).symlink_to(file)
         try:

@@ -1,6 +1,7 @@
-"""Driver `realsense`: RealSense depth cameras, and recordings made with their SDK.
+"""Driver `realsense`: RealSense depth cameras, and recordings made with the RealSense SDK.
 
-Tested with recordings that the SDK plays (tests/sensor/test_realsense.py), but not yet with a camera.
+The driver has been tested with recordings that the SDK plays (tests/sensor/test_realsense.py), but not yet with a
+camera.
 """
 
 from __future__ import annotations
@@ -22,14 +23,14 @@ RATE_HZ = 30
 FILES = (".bag", ".db3")  # old and new recording formats of the SDK
 STAMP_AGE_NS = NS_PER_S  # host timestamps older than this, or in the future, are ignored
 DRAIN_MAX = 32  # maximum number of frames skipped per call
-# Indices of the R, G and B channels.
+# Indices of the R, G and B channels in each supported format.
 COLOURS = {"rgb8": [0, 1, 2], "bgr8": [2, 1, 0], "rgba8": [0, 1, 2], "bgra8": [2, 1, 0]}
 
 log = logging.getLogger(__name__)
 
 
 class RealSenseDriver(Sensor):
-    """Driver for RealSense cameras. Delivers colour, depth in millimetres and intrinsics.
+    """Driver for RealSense cameras, which delivers colour, depth in millimetres and intrinsics.
 
     The SDK aligns depth to colour.
     """
@@ -38,7 +39,13 @@ class RealSenseDriver(Sensor):
     capabilities = Capabilities(colour=True, depth=True)
 
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
-        """settings.source: a serial number, a recording (`FILES`), or empty or `demo` for the only camera."""
+        """Import the SDK and store the settings.
+
+        Args:
+            settings: Settings whose `source` is a serial number or a recording with a suffix in `FILES`. An empty
+                source or `demo` selects the only connected camera.
+            clock: The run's clock, on which capture times are based.
+        """
         import pyrealsense2
 
         self._rs, self._settings, self._clock = pyrealsense2, settings, clock
@@ -76,9 +83,9 @@ class RealSenseDriver(Sensor):
         self._times, self._number = DeviceClock(), -1
 
     def _serial_to_open(self) -> str:
-        """Return the serial number of the configured or only camera.
+        """Return the serial number of the configured camera or, without a configuration, of the only camera.
 
-        Raises SensorLost if no connected camera matches or if several do.
+        Raises SensorLost if no connected camera matches or if several cameras match.
         """
         source = self._settings.source
         configured = self.serial or ("" if source in ("", "demo", "any") else source)
@@ -113,9 +120,12 @@ class RealSenseDriver(Sensor):
             raise SensorLost(f"RealSense: {error}") from None
 
     def _next(self, deadline_ns: int) -> Any:
-        """Wait for an unread depth picture.
+        """Wait for frames with an unread depth picture and return these frames.
 
-        Raises SensorTimeout after the deadline, EndOfRecording at the end of a recording, and the SDK's RuntimeError.
+        Raises:
+            SensorTimeout: No new frames arrived before the deadline.
+            EndOfRecording: The recording has ended.
+            RuntimeError: The SDK reports an error.
         """
         while True:
             remaining_ms = max(1, (deadline_ns - self._clock.now_ns()) // NS_PER_MS)
@@ -132,7 +142,7 @@ class RealSenseDriver(Sensor):
         return self._playback is not None and not self._settings.loop and self._playback.current_status() != playing
 
     def _is_new(self, frames: Any) -> bool:
-        """Return True if the depth picture is new.
+        """Return True if frames contain a colour picture and a new depth picture.
 
         The SDK may deliver the same depth picture with several colour pictures.
         """
@@ -154,7 +164,10 @@ class RealSenseDriver(Sensor):
         )
 
     def _capture_ns(self, frame: Any) -> int:
-        """Return the capture time of the depth picture from the SDK's host timestamp or else the device's."""
+        """Return the capture time of a depth picture on the run's clock.
+
+        The time is based on the SDK's timestamp on the host's clock or, without a plausible one, on the device's clock.
+        """
         now_ns, stamp_ns = self._clock.now_ns(), round(frame.get_timestamp() * NS_PER_MS)
         age_ns: int = time.time_ns() - stamp_ns
         on_host = frame.get_frame_timestamp_domain() != self._rs.timestamp_domain.hardware_clock
@@ -180,7 +193,7 @@ def _rgb(frame: Any) -> U8:
 
 
 def _millimetres(frame: Any) -> U16:
-    """Copy a depth frame as (h, w) millimetres. 0 means not measured."""
+    """Copy a depth frame as (h, w) millimetres, in which 0 means not measured."""
     raw: U16 = np.asanyarray(frame.get_data())
     unit_mm = float(frame.get_units()) * 1e3
     if abs(unit_mm - 1) < 1e-4:
@@ -190,5 +203,8 @@ def _millimetres(frame: Any) -> U16:
 
 
 def _intrinsics(camera: Any) -> Intrinsics:
-    """Convert intrinsics from the SDK's pixel centres at integers to ours at half-integers."""
+    """Convert intrinsics from the SDK.
+
+    Pixel centres have integer coordinates in the SDK and half-integer coordinates in `Intrinsics`.
+    """
     return Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.ppx + 0.5, camera.ppy + 0.5)
