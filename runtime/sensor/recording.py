@@ -1,4 +1,7 @@
-"""Recordings as MCAP files. Small chunks keep every complete sample readable after a crash."""
+"""Write and read recordings as MCAP files.
+
+The chunks of a file are small, which keeps every complete sample readable after a crash.
+"""
 
 from __future__ import annotations
 
@@ -25,15 +28,15 @@ from runtime.support.artifacts import put_in_place
 from runtime.support.background import BackgroundJob
 from runtime.support.untrusted_input import LIMITS, MIB
 
-CHUNK_BYTES = 4096  # about 20 eye samples
-INDEX_SHARE = 1.1  # ratio of the size with chunk indices to that without
-SUMMARY_BYTES = 10_000  # including the schemas
+CHUNK_BYTES = 4096  # size of a chunk: about 20 samples of eye points
+INDEX_SHARE = 1.1  # ratio of a file's size with chunk indices to the size without them
+SUMMARY_BYTES = 10_000  # size of a file's summary, including the schemas
 MAX_S, MAX_BYTES = 600.0, 2 << 30  # limits of a recording
 MAGIC = b"\x89MCAP0\r\n"
-RECORD, CHUNK = struct.Struct("<BQ"), b"\x06"  # header of a record: kind and length; a chunk's kind
-CHUNK_HEAD = struct.Struct("<BQQQQII")  # times, size, checksum, and the length of the compression's name
+RECORD, CHUNK = struct.Struct("<BQ"), b"\x06"  # header of a record, with kind and length; kind of a chunk
+CHUNK_HEAD = struct.Struct("<BQQQQII")  # record header, times, size, checksum, length of the compression's name
 EXPANDED_MOST = 8  # assumed compression ratio of a truncated chunk
-WINDOW_BYTES = 1 << 27  # maximum window of zstandard
+WINDOW_BYTES = 1 << 27  # maximum window size of zstandard
 NEEDED = "replay requires it and the topic `/eyes` (docs/sensors.md); other recordings need a driver of your own"
 KINDS = {  # hints for other file types, by their first bytes
     b"#ROSBAG ": " (a ROS 1 bag; convert it with `mcap convert`)",
@@ -41,14 +44,14 @@ KINDS = {  # hints for other file types, by their first bytes
     b"version ": " (a Git LFS pointer; fetch the file with `git lfs pull`)",
 }
 
-SYNCED_WITHIN_S = 30.0  # time limit for a slow disk when a file is closed
-SYNC_EVERY_NS = 2 * NS_PER_S  # time that a power cut may lose, if the disk keeps up
+SYNCED_WITHIN_S = 30.0  # maximum wait for a slow disk when a recording is finished
+SYNC_EVERY_NS = 2 * NS_PER_S  # duration of the data that a power cut may lose, if the disk is fast enough
 
 log = logging.getLogger(__name__)
 
 
 class RecordingWriter:
-    """Writer of samples to an open binary file. At a limit `write` returns False."""
+    """Writer that appends samples to an open binary file, up to limits of duration and size."""
 
     def __init__(
         self,
@@ -58,7 +61,14 @@ class RecordingWriter:
         max_s: float = MAX_S,
         on_first: Callable[[], object] = lambda: None,
     ) -> None:
-        """on_first: called after the first sample has been written."""
+        """Write the beginning of the file.
+
+        Args:
+            file: Empty binary file. The caller closes it.
+            header: Properties of the recording. Pictures are written only if `colour` or `depth` is set.
+            max_s: Maximum time between the first and the last sample.
+            on_first: Function to call after the first sample has been written.
+        """
         from mcap.writer import CompressionType, IndexType, Writer
 
         self._file, self._max_ns, self._on_first = file, round(max_s * NS_PER_S), on_first
@@ -84,7 +94,10 @@ class RecordingWriter:
         return self._channels[topic]
 
     def write(self, frame: SensorFrame) -> bool:
-        """Append a sample, images first. Returns False and writes nothing if this would exceed a limit."""
+        """Append a sample, with its pictures before its eye points.
+
+        Returns False, and writes nothing, if the sample would exceed the maximum duration or size.
+        """
         at = frame.capture_ns
         messages: list[tuple[str, bytes]] = []
         if self._images and frame.intrinsics is not None and frame.intrinsics != self._intrinsics:
@@ -107,12 +120,12 @@ class RecordingWriter:
             self._on_first()
         if time.monotonic_ns() - self._synced_ns >= SYNC_EVERY_NS and (self._sync is None or self._sync.done):
             self._synced_ns = time.monotonic_ns()
-            # In the background, so that a slow disk does not cause lost samples.
+            # Synchronize in the background, because a slow disk would otherwise cause lost samples.
             self._sync = BackgroundJob("recording", lambda: os.fsync(self._file.fileno()))
         return True
 
     def finish(self) -> None:
-        """Write the last chunk and the summary, but leave the file open."""
+        """Write the last chunk and the summary. The file remains open."""
         self._writer.finish()
         self._file.flush()
         if self._sync is not None:
@@ -121,10 +134,17 @@ class RecordingWriter:
 
 @contextmanager
 def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -> Iterator[RecordingWriter]:
-    """Open a writer for a new recording. Its file replaces any older one at the first sample.
+    """Open a writer for a new recording, which replaces an older file once the first sample is written.
 
-    After a crash the file is readable up to its last complete sample. Only its owner can read a recording with
-    pictures. Raises InputError if the file cannot be written or another process is writing it.
+    After a crash, the file is readable up to the last complete sample. A recording with pictures is readable only by
+    the file's owner.
+
+    Args:
+        header: Properties of the recording.
+        max_s: Maximum time between the first and the last sample.
+
+    Raises:
+        InputError: The file cannot be written, or another process is writing it.
     """
     part, file = path.with_name(f".{path.name}.part"), None
     try:
@@ -160,15 +180,22 @@ def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -
 
 
 class Recording:
-    """Open recording, which reads one sample at a time so that images do not fill the memory."""
+    """Recording that is read one sample at a time, because its pictures could fill the memory.
+
+    Attributes:
+        path: Path of the file.
+        is_whole: True unless reading has found the file to be truncated or damaged.
+        header: Properties of the whole recording.
+        first: First sample.
+    """
 
     def __init__(self, path: Path) -> None:
         """Read the header and the first sample.
 
         Raises InputError if the file cannot be read, is not a recording or contains no complete sample.
         """
-        self.path, self.is_whole = path, True  # is_whole: no damage was found so far
-        self._written_by = ("", "")  # profile and library
+        self.path, self.is_whole = path, True
+        self._written_by = ("", "")  # profile and library in the header of the MCAP file
         self.header = self._read_header()
         first = next(self.samples(), None)
         if first is None:
@@ -180,7 +207,10 @@ class Recording:
         return untrusted_input.open_regular(self.path, most_bytes=LIMITS.file_bytes)
 
     def _read_header(self) -> RecordingHeader:
-        """Return the header from the metadata record, which repair tools move to the end of a file."""
+        """Return the header from the metadata record, which repair tools move to the end of a file.
+
+        Raises InputError if the file has no metadata record of phasestack, or if the record is not supported.
+        """
         foreign = ""
         for topic, record in self._records():
             if topic and topic not in fmt.SCHEMAS:
@@ -197,7 +227,7 @@ class Recording:
         raise InputError(self.path, fmt.METADATA_NAME, f"is missing from this MCAP recording ({by}): {NEEDED}")
 
     def _records(self) -> Iterator[tuple[str, Any]]:
-        """Yield each message with its topic, and metadata with an empty topic, up to a damaged record."""
+        """Yield messages with their topics, and metadata with an empty topic, up to the first damaged record."""
         from mcap.records import Channel, Header, Message, Metadata
 
         topics: dict[int, str] = {}
@@ -229,9 +259,9 @@ class Recording:
             self.is_whole = False
 
     def samples(self) -> Iterator[SensorFrame]:
-        """Yield all complete samples in order.
+        """Yield all complete samples in the order of the file.
 
-        A sample is complete once its eye points have been read. Raises InputError if the file cannot be read or a
+        A sample is complete once its eye points have been read. Raises InputError if the file cannot be read or if a
         message is malformed.
         """
         parts: dict[str, Any] = {}
@@ -252,10 +282,17 @@ class Recording:
 
 
 def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[Any]:
-    """Yield all records up to the footer, including those inside chunks.
+    """Yield all records up to the footer, including the records inside chunks.
 
-    max_bytes: size limit for a record and for an unpacked chunk. Raises InputError for a larger chunk. For a damaged
-    file, yields the complete records of a chunk that is cut off, then raises the error of mcap or a decompressor.
+    If the end of the file cuts off a chunk, the complete records of this chunk are yielded before the exception.
+
+    Args:
+        source: Name of the file in messages.
+        max_bytes: Maximum size of a record, and of a chunk after decompression.
+
+    Raises:
+        InputError: A chunk exceeds `max_bytes` after decompression.
+        Exception: The file is damaged. The exception is that of mcap or of a decompressor, or a ValueError.
     """
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader, breakup_chunk
@@ -286,7 +323,10 @@ def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[
 
 
 def _indexed_chunks(file: IO[bytes], *, max_bytes: int) -> set[int]:
-    """Return where chunks begin according to the file's summary; empty without a readable summary."""
+    """Return the byte offsets of the chunks that the file's summary lists.
+
+    Returns an empty set if the file has no readable summary.
+    """
     from mcap.reader import FOOTER_SIZE
     from mcap.records import ChunkIndex
     from mcap.stream_reader import StreamReader
@@ -304,7 +344,10 @@ def _indexed_chunks(file: IO[bytes], *, max_bytes: int) -> set[int]:
 
 
 def _cut_off_chunk(data: bytes) -> bytes:
-    """Return the complete records of a chunk that the end of the file cuts off, unpacked."""
+    """Return the decompressed complete records of a chunk that the end of the file cuts off.
+
+    Returns no bytes if the data do not begin with a chunk, or if the chunk is not cut off.
+    """
     if data[:1] != CHUNK or RECORD.unpack_from(data.ljust(RECORD.size, b"\0"))[1] <= len(data) - RECORD.size:
         return b""
     name = CHUNK_HEAD.unpack_from(data.ljust(CHUNK_HEAD.size, b"\0"))[-1]
@@ -320,7 +363,16 @@ def _cut_off_chunk(data: bytes) -> bytes:
 
 
 def _unpacked(chunk: Any, *, source: Path, max_bytes: int) -> bytes:
-    """Return the records of a chunk as bytes. Raises InputError for a large chunk."""
+    """Return the decompressed records of a chunk as bytes.
+
+    Args:
+        source: Name of the file in messages.
+        max_bytes: Maximum size after decompression.
+
+    Raises:
+        InputError: The chunk exceeds `max_bytes` after decompression.
+        ValueError: The chunk does not have its declared size after decompression.
+    """
     declared: int = chunk.uncompressed_size
     room = min(declared, max_bytes) + 1  # decompressors allocate up to their limit
     data = _expanded(chunk.compression, chunk.data, room=room)
@@ -333,7 +385,13 @@ def _unpacked(chunk: Any, *, source: Path, max_bytes: int) -> bytes:
 
 
 def _expanded(compression: str, data: bytes, *, room: int) -> bytes:
-    """Decompress at most `room` bytes from data that may be truncated."""
+    """Decompress data that may be truncated.
+
+    Args:
+        compression: Name of the compression in the chunk. Data with a name other than `lz4` and `zstd` are returned
+                unchanged.
+        room: Maximum number of decompressed bytes.
+    """
     if compression == "lz4":
         import lz4.frame
 

@@ -1,4 +1,4 @@
-"""Format of recordings: topics, messages and schemas, with functions that encode and decode them."""
+"""Define the topics, messages and schemas of recordings, and encode and decode the messages."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from runtime.support.picture_header import is_cut_off, picture_size
 SCHEMA_VERSION = 1
 METADATA_NAME = "phasestack.recording"
 EYES_TOPIC, COLOUR_TOPIC, DEPTH_TOPIC, CALIBRATION_TOPIC = "/eyes", "/colour", "/depth", "/camera"
-POSITION_DIGITS = 7  # 0.1 µm, far below any sensor's noise
-JPEG_QUALITY = 92  # for recorded colour pictures
-NUMBER_MAX = 1 << 62  # sums of two numbers fit in 64 bits; 146 years in nanoseconds
+POSITION_DIGITS = 7  # decimal places of a position in metres: 0.1 µm is far below any sensor's noise
+JPEG_QUALITY = 92  # quality of recorded colour pictures
+NUMBER_MAX = 1 << 62  # the sum of two such numbers fits in 64 bits; 146 years in nanoseconds
 COORDINATE_MAX_M = 1e6  # beyond any sensor's range in any unit; the tracker checks plausibility
-IMAGE_SIDE_MAX_PX = 1 << 15  # larger than any camera's pictures
+IMAGE_SIDE_MAX_PX = 1 << 15  # larger than the pictures of any camera
 
 Count = Annotated[int, Field(ge=0, le=NUMBER_MAX)]
 Unit = Annotated[float, Field(ge=0, le=1)]
@@ -37,7 +37,7 @@ M = TypeVar("M", bound=BaseModel)
 
 
 class Message(BaseModel):
-    """A message in which every number is a finite JSON number; strings and booleans are refused."""
+    """Base class of messages. Numbers must be finite JSON numbers, not strings or booleans."""
 
     model_config = ConfigDict(strict=True, allow_inf_nan=False)
 
@@ -61,14 +61,14 @@ class EyeSample(Message):
 
 
 class Stamp(Message):
-    """Capture time of a picture in a message."""
+    """Capture time of a picture, as seconds and nanoseconds on the monotonic clock."""
 
     sec: Annotated[int, Field(ge=0, le=NUMBER_MAX // NS_PER_S)]
     nsec: Annotated[int, Field(ge=0, lt=NS_PER_S)]
 
 
 class Stamped(Message):
-    """Common fields of picture messages, as in Foxglove's schemas."""
+    """Base class of messages with a capture time. The fields are those of Foxglove's schemas."""
 
     timestamp: Annotated[Stamp, WithJsonSchema({"type": "object"})]
     frame_id: str = "sensor"
@@ -120,23 +120,26 @@ SCHEMAS = {topic: message.model_json_schema() for topic, message in MESSAGES.ite
 
 @dataclass(frozen=True, slots=True)
 class RecordingHeader:
-    """Properties of a whole recording."""
+    """Properties of a whole recording, which are stored as metadata."""
 
-    driver: str  # name of the driver that delivered it
-    serial: str = ""
-    colour: bool = False
-    depth: bool = False
+    driver: str  # name of the driver that delivered the samples
+    serial: str = ""  # serial number of the sensor
+    colour: bool = False  # True if the recording contains colour pictures
+    depth: bool = False  # True if the recording contains depth pictures
 
     def metadata(self) -> dict[str, str]:
         """Return the header as MCAP metadata, which maps strings to strings."""
         flags = {name: str(int(value)) for name, value in asdict(self).items() if isinstance(value, bool)}
-        # `eye_points`: every sample contains the eyes or, without a face, null.
+        # `eye_points`: every sample contains the eyes, or null if there is no face.
         texts = {"schema_version": str(SCHEMA_VERSION), "driver": self.driver, "serial": self.serial, "eye_points": "1"}
         return texts | flags
 
     @classmethod
     def from_metadata(cls, metadata: dict[str, str]) -> RecordingHeader:
-        """Parse the result of `metadata`. Raises ValueError for another version."""
+        """Create a header from the result of `metadata`.
+
+        Raises ValueError if the schema version is missing or not supported.
+        """
         version = metadata.get("schema_version", "missing")
         if version != str(SCHEMA_VERSION):
             raise ValueError(f"schema version {version} is not supported; this program reads version {SCHEMA_VERSION}")
@@ -145,7 +148,10 @@ class RecordingHeader:
 
 
 def _read(kind: type[M], data: bytes) -> M:
-    """Parse a message. Raises ValueError with one line that names the invalid field."""
+    """Parse a JSON message.
+
+    Raises ValueError if the message is invalid. The text of the error is one line that names the first invalid field.
+    """
     try:
         return kind.model_validate_json(data)
     except ValidationError as error:
@@ -179,7 +185,7 @@ def eyes_message(frame: SensorFrame) -> bytes:
 
 
 def frame_from_eyes_message(data: bytes) -> SensorFrame:
-    """Decode the result of `eyes_message`. Raises ValueError if it is malformed."""
+    """Decode the result of `eyes_message`. Raises ValueError if the message is malformed."""
     sample = _read(EyeSample, data)
     eyes_m, covariance_m2 = _array(sample.eyes_m), sample.covariance_m2
     eyes = None
@@ -190,13 +196,16 @@ def frame_from_eyes_message(data: bytes) -> SensorFrame:
 
 
 def _stamped(capture_ns: int, **values: Any) -> bytes:
-    """Encode a picture message as JSON."""
+    """Encode values and their capture time as JSON."""
     seconds, nanoseconds = divmod(capture_ns, NS_PER_S)
     return json.dumps({"timestamp": {"sec": seconds, "nsec": nanoseconds}, "frame_id": "sensor"} | values).encode()
 
 
 def colour_message(colour: U8, *, capture_ns: int) -> bytes:
-    """Encode an (h, w, 3) RGB picture as a JPEG in JSON."""
+    """Encode an (h, w, 3) RGB picture as a JSON message that contains a JPEG.
+
+    Raises ValueError if OpenCV cannot encode the picture.
+    """
     done, jpeg = cv2.imencode(".jpg", colour[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not done:
         raise ValueError("OpenCV could not encode a picture as JPEG")
@@ -204,7 +213,7 @@ def colour_message(colour: U8, *, capture_ns: int) -> bytes:
 
 
 def colour_from_message(data: bytes, *, max_pixels: int = 1 << 26) -> U8:
-    """Decode the result of `colour_message` to an (h, w, 3) picture, with JPEG's losses.
+    """Decode the result of `colour_message` to an (h, w, 3) RGB picture, which has the losses of JPEG.
 
     Raises ValueError if the message is malformed, or if the picture is too large or cannot be decoded.
     """
@@ -219,16 +228,16 @@ def colour_from_message(data: bytes, *, max_pixels: int = 1 << 26) -> U8:
 
 
 def depth_message(depth_mm: U16, *, capture_ns: int) -> bytes:
-    """Encode an (h, w) depth picture as 16-bit little-endian numbers in JSON."""
+    """Encode an (h, w) depth picture in millimetres as a JSON message with 16-bit little-endian numbers."""
     height, width = depth_mm.shape
     raw = base64.b64encode(np.ascontiguousarray(depth_mm, dtype="<u2").tobytes()).decode()
     return _stamped(capture_ns, width=width, height=height, encoding="16UC1", step=2 * width, data=raw)
 
 
 def depth_from_message(data: bytes) -> U16:
-    """Decode the result of `depth_message` to (h, w) millimetres, without loss.
+    """Decode the result of `depth_message` to an (h, w) picture in millimetres, without loss.
 
-    Raises ValueError if the message is malformed or its data do not match its size.
+    Raises ValueError if the message is malformed or the amount of data does not match the picture's size.
     """
     image = _read(DepthImage, data)
     raw = base64.b64decode(image.data)
@@ -238,7 +247,10 @@ def depth_from_message(data: bytes) -> U16:
 
 
 def calibration_message(intrinsics: Intrinsics, *, capture_ns: int) -> bytes:
-    """Encode intrinsics. Pixel centres are integers in Foxglove's schema, and half-integers in ours."""
+    """Encode intrinsics as a JSON message that follows Foxglove's schema.
+
+    The centres of pixels have integer coordinates in this schema, and half-integer coordinates in `Intrinsics`.
+    """
     i = intrinsics
     matrix = [i.fx_px, 0.0, i.cx_px - 0.5, 0.0, i.fy_px, i.cy_px - 0.5, 0.0, 0.0, 1.0]
     projection = [*matrix[:3], 0.0, *matrix[3:6], 0.0, *matrix[6:], 0.0]
@@ -250,7 +262,7 @@ def calibration_message(intrinsics: Intrinsics, *, capture_ns: int) -> bytes:
 def intrinsics_from_message(data: bytes) -> Intrinsics:
     """Decode the result of `calibration_message`.
 
-    Raises ValueError if it is malformed or a focal length is not positive.
+    Raises ValueError if the message is malformed or a focal length is not positive.
     """
     camera = _read(Camera, data)
     k = camera.K
