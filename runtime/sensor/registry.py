@@ -1,4 +1,4 @@
-"""Registry of sensor drivers. A driver's module and its SDK are imported only when they are used."""
+"""Registry of sensor drivers. A driver's module and SDK are imported only when the driver is used."""
 
 from __future__ import annotations
 
@@ -20,10 +20,16 @@ DRIVERS = {  # included in phasestack
 
 
 def open_sensor(settings: SensorSettings, clock: Clock, *, latency_ms: float = 0.0) -> Sensor:
-    """Create the configured driver, built-in or custom (`module:Class`), without opening it.
+    """Create the configured driver without opening the device.
 
-    latency_ms: delay from capture to arrival of replayed samples. Raises InputError for an unknown name or options that
-    the class refuses, and MissingPart if an SDK is not installed.
+    Args:
+        settings: Settings whose `driver` is a name in `DRIVERS`, or `module:Class` for a custom driver.
+        clock: The run's clock, on which capture times are based.
+        latency_ms: Delay of replayed samples from capture to arrival. Other drivers ignore it.
+
+    Raises:
+        InputError: The name is unknown, or the driver refuses its options.
+        MissingPart: The SDK of the driver is not installed.
     """
     name = settings.driver
     if is_plugin(name):

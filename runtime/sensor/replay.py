@@ -1,4 +1,4 @@
-"""Driver `replay`: plays a recording in real time, or as fast as it is read."""
+"""Driver `replay`: recordings, played in real time or as fast as the caller reads samples."""
 
 from __future__ import annotations
 
@@ -19,27 +19,34 @@ log = logging.getLogger(__name__)
 
 
 def demo_recording_path() -> Path:
-    """Return the path of the built-in recording."""
+    """Return the path of the demo recording, which is part of the package."""
     return Path(str(files("runtime.sensor") / "data" / "demo.mcap"))
 
 
 class ReplayDriver(SteppedSensor):
-    """Driver that plays a recording with its original rate and gaps. The recording starts at `open`.
+    """Driver that plays a recording with the original rate and gaps, starting at `open`.
 
-    A sample arrives at its capture time plus the latency. Samples that are not later than their predecessor are
-    skipped. The first one is logged.
+    A sample arrives at its capture time plus the latency. A sample that is not later than its predecessor is skipped.
+    Only the first skipped sample is logged.
     """
 
     name = "replay"
 
     def __init__(self, source: str, clock: Clock, *, loop: bool = False, latency_ms: float = 0.0) -> None:
-        """source: path of a recording, or `demo`. latency_ms: delay of each sample from capture to arrival."""
+        """Store the settings.
+
+        Args:
+            source: Path of a recording, or `demo` for the demo recording.
+            clock: The run's clock, to which capture times are shifted.
+            loop: Start again at the end of the recording.
+            latency_ms: Delay of each sample from capture to arrival.
+        """
         self.path, self._loop = demo_recording_path() if source == "demo" else Path(source), loop
         super().__init__(str(self.path), clock, latency_ms=latency_ms)
         self.capabilities = Capabilities(eye_points=True, may_pause=True)
 
     def open(self) -> None:
-        """Open the recording. Raises InputError if the file is not a recording."""
+        """Open the recording. Raises InputError if the file cannot be read or is not a recording."""
         recording = Recording(self.path)
         header = recording.header
         self.serial = header.serial
@@ -47,7 +54,7 @@ class ReplayDriver(SteppedSensor):
         self._begin(self._shifted(recording))
 
     def _ordered(self, recording: Recording) -> Iterator[SensorFrame]:
-        """Yield samples in order of their capture times. Raises InputError if the recording is too long."""
+        """Yield samples with ascending capture times. Raises InputError if the recording is too long."""
         last_ns, is_logged = -1, False
         for number, frame in enumerate(recording.samples()):
             if frame.capture_ns <= last_ns:
@@ -65,7 +72,10 @@ class ReplayDriver(SteppedSensor):
             yield frame
 
     def _shifted(self, recording: Recording) -> Iterator[SensorFrame]:
-        """Yield samples with their times on the run's clock. A loop restarts one sample interval after the end."""
+        """Yield samples with capture times on the run's clock.
+
+        In a loop, the first sample follows the last one after the interval between the last two samples.
+        """
         last_ns = interval_ns = sequence_shift = last_sequence = shift_ns = 0
         is_first_round = True
         while True:

@@ -1,4 +1,4 @@
-"""Sources of samples: a sensor's thread in real time, or a recording on a simulated clock."""
+"""Sources of samples: the sensor thread in real time, or a recording on a simulated clock."""
 
 from __future__ import annotations
 
@@ -12,25 +12,33 @@ from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.base import Sensor, SteppedSensor
 
 FindEyes = Callable[[SensorFrame], EyePoints | None]
-AHEAD_NS = NS_PER_S // 10  # longer than the delay from a sample to the display of its refresh
+AHEAD_NS = NS_PER_S // 10  # longer than the time from a sample's capture to the display of the refresh that uses it
 
 
 class Samples(ABC):
-    """Interface between presenter and sensor. No method waits."""
+    """Interface through which the presenter takes samples from a sensor without waiting."""
 
-    stale_inputs: int  # samples replaced by a newer one before use
-    serial: str  # serial number of the sensor, if known
+    stale_inputs: int  # number of samples that were replaced by a newer sample before use
+    serial: str  # serial number of the sensor; empty: unknown
 
     @abstractmethod
     def arrived(self, now_ns: int) -> list[SensorFrame]:
-        """Return the samples that have arrived since the last call. Raises EndOfRecording, FatalError."""
+        """Return the samples that have arrived since the last call, oldest first.
+
+        Raises:
+            EndOfRecording: All samples of the recording have been returned.
+            FatalError: The sensor has failed permanently.
+        """
 
     def fault(self) -> str:
         """Return the reason why the sensor does not work, or an empty string."""
         return ""
 
     def recorded_ahead(self) -> list[SensorFrame]:
-        """Return the recorded samples shortly after the last refresh, for evaluation. Empty if live."""
+        """Return the recorded samples that follow shortly after the last refresh, for evaluation.
+
+        A live sensor returns an empty list.
+        """
         return []
 
     @abstractmethod
@@ -39,17 +47,25 @@ class Samples(ABC):
 
 
 def searched(frame: SensorFrame, find: FindEyes | None, *, keep_images: bool = False) -> SensorFrame:
-    """Find the eyes in the pictures of a sample. Drops the pictures unless `keep_images` is set."""
+    """Return a sample with the eyes found in its pictures, and without the pictures themselves.
+
+    Args:
+        find: Eye finder. None leaves the eyes of the sample unchanged.
+        keep_images: Keep the pictures in the sample.
+    """
     if find is not None:
         frame = replace(frame, eyes=find(frame))
     return frame if keep_images else replace(frame, colour=None, depth_mm=None)
 
 
 class RecordedSamples(Samples):
-    """Recording on the simulated clock. Each sample arrives at its capture time plus the latency."""
+    """Recording on a simulated clock. Each sample arrives at its capture time plus the latency."""
 
     def __init__(self, driver: Sensor) -> None:
-        """Raises InputError if the driver does not play a recording, or if the recording cannot be read."""
+        """Open the driver.
+
+        Raises InputError if the driver cannot deliver samples without waiting, or if the recording cannot be read.
+        """
         if not isinstance(driver, SteppedSensor):
             raise InputError("run", "--max-speed", f"requires a recording, not the sensor {driver.name}")
         self._driver = driver

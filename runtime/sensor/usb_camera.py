@@ -1,4 +1,7 @@
-"""Driver `usb-camera`: a webcam through V4L2. The viewer's distance follows from the eye separation."""
+"""Driver `usb-camera`: webcams through V4L2, video files and network streams.
+
+A webcam measures no depth, so the viewer's distance is estimated from the eye separation.
+"""
 
 from __future__ import annotations
 
@@ -17,22 +20,33 @@ from runtime.records import Intrinsics, SensorFrame
 from runtime.sensor.base import Capabilities, Sensor
 from runtime.support.film import open_film
 
-WAITED_NS = 3 * NS_PER_MS  # a picture that arrives sooner was queued, and newer ones may follow
+WAITED_NS = 3 * NS_PER_MS  # a picture that arrives sooner was queued, and newer pictures may follow
 QUEUE_MAX = 8  # maximum number of queued pictures skipped per read
 STAMP_AGE_NS = NS_PER_S  # timestamps older than this, or in the future, are ignored
-STREAMS = ("rtsp", "rtsps", "http", "https")  # FFmpeg's other protocols may open files or listen on ports
+STREAMS = ("rtsp", "rtsps", "http", "https")  # other protocols of FFmpeg may open files or listen on ports
 
 
 class UsbCameraDriver(Sensor):
-    """Driver that delivers the newest picture with the kernel's timestamp for the end of its exposure."""
+    """Driver that delivers the newest picture of a camera.
+
+    The capture time of a webcam's picture is the kernel's timestamp for the end of the exposure. Other pictures get
+    their arrival time.
+    """
 
     name = "usb-camera"
     capabilities = Capabilities(colour=True)
 
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
-        """settings.source: a number, a device, a file, a URL (`STREAMS`), or empty or `demo` for the first camera.
+        """Store the settings.
 
-        Raises InputError for other URLs, or if the field of view is not configured (webcams do not report it).
+        Args:
+            settings: Settings whose `source` is the number or path of a video device, a file, or a URL with a protocol
+                in `STREAMS`. An empty source or `demo` selects the first camera.
+            clock: The run's clock, on which capture times are based.
+
+        Raises:
+            InputError: The URL has another protocol, or the field of view is not configured. Webcams do not report
+                their field of view.
         """
         if not settings.fov_deg:
             raise InputError("sensor", "fov_deg", "is required: the camera's horizontal field of view in degrees")

@@ -1,4 +1,4 @@
-"""Known USB depth cameras, for `doctor`."""
+"""Find known USB depth cameras and the problems with their connection, for the command `doctor`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SUPER_SPEED = 4  # libusb's constant for USB 3
 
 
 class KnownDevice(NamedTuple):
-    """USB device that the driver `openni2` or `realsense` can open."""
+    """Model of a USB depth camera that the driver `openni2` or `realsense` can open."""
 
     vendor_id: int
     product_id: int
@@ -44,21 +44,21 @@ _BY_ID = {(device.vendor_id, device.product_id): device for device in KNOWN_DEVI
 
 @dataclass(frozen=True, slots=True)
 class UsbDevice:
-    """Known device that is connected."""
+    """Connected USB depth camera of a known model."""
 
     known: KnownDevice
     bus: int
     address: int
-    serial: str  # empty if unknown or not readable
-    speed: int  # constant of libusb; 0: unknown
-    is_accessible: bool
+    serial: str  # serial number; empty: unknown or not readable
+    speed: int  # speed constant of libusb; 0: unknown
+    is_accessible: bool  # True if this user may open the device
 
     def __str__(self) -> str:
         usb_id = f"{self.known.vendor_id:04x}:{self.known.product_id:04x}"
         return f"{self.known.name} ({usb_id}, {SPEEDS.get(self.speed, 'unknown')})"
 
     def problems(self) -> list[str]:
-        """Return the problems that prevent the use of this device, each with a remedy."""
+        """Return the problems that prevent the use of this device, and a remedy for each problem."""
         problems = []
         if self.known.needs_usb3 and 0 < self.speed < SUPER_SPEED:
             problems.append(f"connected at {SPEEDS[self.speed]}, needs USB 3; use a blue port and the original cable")
@@ -82,7 +82,15 @@ def _described(device: Any, known: KnownDevice) -> UsbDevice:
 
 
 def find_devices(backend: Any = None) -> list[UsbDevice]:
-    """Return all known devices, ordered by bus and address. Raises MissingPart if libusb is missing."""
+    """Return all connected USB depth cameras of known models, ordered by bus and address.
+
+    Args:
+        backend: Backend of pyusb. None selects the default backend.
+
+    Raises:
+        MissingPart: pyusb or libusb is not installed.
+        SensorLost: The USB devices cannot be listed.
+    """
     try:
         import usb.core
     except ImportError as error:

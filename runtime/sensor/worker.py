@@ -1,4 +1,7 @@
-"""The sensor thread, which queues samples, reopens lost sensors and abandons hanging SDK calls."""
+"""Poll a sensor driver in a thread, which queues the samples and reopens a lost sensor.
+
+A thread that hangs in a call into an SDK is abandoned and replaced.
+"""
 
 from __future__ import annotations
 
@@ -20,38 +23,45 @@ from runtime.support.background import begin, patience_s
 from runtime.support.extras import missing_extra
 
 TIMEOUTS_TO_REOPEN = 2  # consecutive timeouts after which the sensor is reopened
-REOPEN_AFTER_S, REOPEN_AFTER_MAX_S = 0.25, 0.5  # delay before reopening a lost sensor; doubles up to the maximum
+REOPEN_AFTER_S, REOPEN_AFTER_MAX_S = 0.25, 0.5  # delay before a lost sensor is reopened; doubles up to the maximum
 OPEN_TIMEOUT_S = 10.0  # a longer attempt to open the sensor is abandoned and repeated
-HANG_MARGIN_S = 0.5  # a read counts as hung this long after its timeout
+HANG_MARGIN_S = 0.5  # time after the timeout of a read at which the read counts as hung
 ABANDONED_MAX = 8  # maximum number of abandoned threads
 QUEUE_MAX = 1024  # maximum number of queued samples: four seconds of the fastest sensor
 PICTURES_MAX = 8  # maximum number of queued samples with pictures
-AHEAD_NS = NS_PER_S // 1000  # a capture time this long after its arrival is on another clock
-BEHIND_NS = 60 * NS_PER_S  # and so is one this long before its arrival
-FROZEN_NS = 2 * NS_PER_S  # data that stay identical for this long are a fault, because real data have noise
-COMPARED = slice(None, None, 4)  # rows and columns of a picture to compare
+AHEAD_NS = NS_PER_S // 1000  # a capture time that is later than the arrival by more than this is on another clock
+BEHIND_NS = 60 * NS_PER_S  # a capture time that is earlier than the arrival by more than this is on another clock
+FROZEN_NS = 2 * NS_PER_S  # data that stay identical for a longer time are a fault, because real data have noise
+COMPARED = slice(None, None, 4)  # rows and columns of a picture that are compared
 
 log = logging.getLogger(__name__)
 
 
 class SensorState(StrEnum):
-    """State of the sensor."""
+    """State of the connection to a sensor."""
 
     OPENING = "opening"
     RUNNING = "running"
     STALLED = "stalled"  # open, but delivers no samples
-    LOST = "lost"  # closed, will be reopened
+    LOST = "lost"  # closed, and will be reopened
     HUNG = "hung"  # a call into the SDK does not return; another attempt follows
     ENDED = "ended"  # the recording has ended
-    FAILED = "failed"  # permanent failure, no retry
+    FAILED = "failed"  # failed permanently; no retry follows
     STOPPED = "stopped"
 
 
 class _Attempt:
-    """Thread that runs one driver. Once it is `abandoned`, its results are ignored."""
+    """Thread that runs one driver. The results of the thread are ignored once `abandoned` is set."""
 
     def __init__(self, number: int, run: Callable[[_Attempt], None], *, wait_s: float, deadline_ns: int) -> None:
-        """Start the thread. Raises TransientError if the system cannot create one."""
+        """Start the thread. Raises TransientError if the system cannot create a thread.
+
+        Args:
+            number: Number of the attempt, for the name of the thread.
+            run: Function that the thread calls with this attempt.
+            wait_s: Time to wait before the sensor is opened.
+            deadline_ns: Time after which the thread counts as hung. Each step of the thread sets a new deadline.
+        """
         self.number, self.abandoned = number, threading.Event()
         self.wait_s, self.deadline_ns = wait_s, deadline_ns
         self.received = 0
@@ -59,7 +69,7 @@ class _Attempt:
 
 
 class SensorWorker(Samples):
-    """Runs a driver in a separate thread. Only `close` blocks, up to its timeout."""
+    """Source of samples that runs a driver in a separate thread. No method except `close` blocks."""
 
     def __init__(
         self,
@@ -70,7 +80,15 @@ class SensorWorker(Samples):
         *,
         keep_images: bool = False,
     ) -> None:
-        """make_driver: creates an unopened driver. make_find: creates the eye finder for drivers of cameras."""
+        """Store the arguments. `start` starts the thread.
+
+        Args:
+            make_driver: Function that creates a driver without opening it.
+            settings: Settings of the sensor, which contain the timeout of a read.
+            clock: The run's clock.
+            make_find: Function that creates the eye finder, for drivers that do not find eyes themselves.
+            keep_images: Keep the pictures in samples after the eyes have been found.
+        """
         self._make, self._settings, self._clock = make_driver, settings, clock
         self._make_find, self._keep_images = make_find, keep_images
         self._lock, self._watching = threading.Lock(), threading.Lock()
@@ -79,15 +97,15 @@ class SensorWorker(Samples):
         self._hung: list[_Attempt] = []
         self._state, self.reason = SensorState.STOPPED, ""
         self._was_well = False  # True after the first valid sample
-        self._delivered: dict[str, tuple[int, int]] = {}  # checksum of the data and time of their last change
-        self._untimely = ""  # what is wrong with the latest timestamp
-        self._skipped = 0  # samples replaced by newer ones, except those counted by the current driver
+        self._delivered: dict[str, tuple[int, int]] = {}  # checksum of the data, and time of the last change
+        self._untimely = ""  # description of the latest implausible capture time
+        self._skipped = 0  # number of samples replaced by newer ones, except those that the current driver counts
         self._driver: Sensor | None = None
-        self.serial = ""  # serial number of the opened device, to reopen the same one
+        self.serial = ""  # serial number of the opened device, used to reopen the same device
         self.error: FatalError | None = None
 
     def start(self) -> None:
-        """Start the sensor thread in the background."""
+        """Start the sensor thread and return immediately."""
         self._state = SensorState.OPENING
         self._begin(0.0)
 
@@ -122,7 +140,7 @@ class SensorWorker(Samples):
 
     @property
     def state(self) -> SensorState:
-        """State of the sensor, which `reason` explains."""
+        """State of the sensor. `reason` explains this state."""
         self._watch()
         return self._state
 
@@ -132,11 +150,11 @@ class SensorWorker(Samples):
 
     @property
     def capabilities(self) -> Capabilities | None:
-        """Capabilities of the driver, known once it is open."""
+        """Capabilities of the driver, or None while no driver is open."""
         return self._driver.capabilities if self._driver else None
 
     def close(self, timeout_s: float = 1.0) -> None:
-        """Close the driver, or abandon it after the timeout."""
+        """Tell the sensor thread to close the driver, and wait up to `timeout_s` for the thread to end."""
         attempt, self._attempt = self._attempt, None
         if attempt is not None:
             attempt.abandoned.set()
@@ -144,7 +162,7 @@ class SensorWorker(Samples):
         self._state, self.reason = SensorState.STOPPED, ""
 
     def _watch(self) -> None:
-        """Abandon a thread whose call takes too long and start another one."""
+        """If a call of the sensor thread takes too long, abandon the thread and start another one."""
         if not self._watching.acquire(blocking=False):
             return  # another thread is already doing this
         try:
@@ -175,7 +193,7 @@ class SensorWorker(Samples):
                 self._state, self.reason = state, reason
 
     def _account(self, driver: Sensor | None) -> None:
-        """Add the counts of a driver that is about to be discarded to the total."""
+        """Add the number of samples that a driver has skipped to the total, before the driver is discarded."""
         with self._lock:
             if driver is not None and driver is self._driver:
                 self._skipped += driver.skipped
@@ -234,7 +252,13 @@ class SensorWorker(Samples):
         self._account(driver)
 
     def _receive(self, attempt: _Attempt, driver: Sensor) -> None:
-        """Read until the driver fails or the worker stops."""
+        """Read and queue samples until the attempt is abandoned.
+
+        Raises:
+            SensorLost: The device has failed, no valid samples have arrived for too long, or the data no longer change.
+            FatalError: The first capture times are not on the run's clock.
+            EndOfRecording: The recording has ended.
+        """
         s = self._settings
         timeouts, well_ns = 0, self._clock.now_ns()
         if attempt.abandoned.is_set():
@@ -262,7 +286,7 @@ class SensorWorker(Samples):
             well_ns, self._was_well = now_ns, True
             if not driver.capabilities.may_pause:
                 self._check_changing(frames[-1], now_ns)
-            # Only in the newest frame, because finding eyes takes as long as the period of a camera.
+            # Find eyes only in the newest frame, because this takes as long as the period of a camera.
             overtaken = 0 if find is None else len(frames) - 1
             frames = [searched(frame, find, keep_images=self._keep_images) for frame in frames[overtaken:]]
             attempt.received += 1
@@ -276,7 +300,10 @@ class SensorWorker(Samples):
                 self._set(attempt, SensorState.RUNNING, "")
 
     def _timely(self, frames: list[SensorFrame], now_ns: int) -> list[SensorFrame]:
-        """Return the frames with plausible capture times. Raises FatalError if there has never been one."""
+        """Return the frames whose capture times are plausible.
+
+        Raises FatalError if a capture time is implausible before any valid sample has arrived.
+        """
         timely = [frame for frame in frames if -AHEAD_NS <= now_ns - frame.capture_ns <= BEHIND_NS]
         if len(timely) < len(frames):
             ahead_s = (frames[-1].capture_ns - now_ns) / NS_PER_S
@@ -288,9 +315,10 @@ class SensorWorker(Samples):
         return timely
 
     def _check_changing(self, frame: SensorFrame, now_ns: int) -> None:
-        """Raise SensorLost if pictures or eyes have stayed identical for `FROZEN_NS`.
+        """Check that the data of the sensor change.
 
-        Missing eye points and depth pictures without measurements are allowed to persist.
+        Missing eye points and depth pictures without any measurement are not a fault. Raises SensorLost if pictures or
+        eye points have stayed identical for more than `FROZEN_NS`.
         """
         compared = {
             "picture has": None if frame.colour is None else frame.colour[COMPARED, COMPARED],
@@ -306,7 +334,7 @@ class SensorWorker(Samples):
                 raise SensorLost(f"the {subject} not changed for {FROZEN_NS / NS_PER_S:g} s")
 
     def _keep(self, frame: SensorFrame) -> None:
-        """Queue a sample, dropping the oldest ones if the queue is full."""
+        """Add a sample to the queue. If the queue is full, drop the oldest samples."""
         most = QUEUE_MAX if frame.colour is None and frame.depth_mm is None else PICTURES_MAX
         while len(self._queue) >= most:
             self._queue.popleft()
