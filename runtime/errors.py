@@ -71,7 +71,7 @@ class InputError(FatalError):
 
 
 class MissingPart(FatalError):
-    """A package or library that the requested function needs is not installed. The message names it."""
+    """A package or library that the requested function needs is missing. The message names that part."""
 
 
 class TransientError(PhasestackError):

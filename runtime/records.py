@@ -112,7 +112,7 @@ class PanelFrame:
     number: int  # number of the refresh, the same on all panels
     solved: U8 | None  # (N, h, w, 4) RGBA layers of the solution, rear to front, on any raster; None: no solution yet
     solved_version: int  # changes whenever `solved` changes
-    solved_from_shown: tuple[F64, ...] = ()  # (3, 3) alignment of each panel, in panel pixels; empty: no alignment
+    solved_from_shown: tuple[F64, ...] = ()  # for each panel, (3, 3) map of panel pixels; empty: identity
     flat: U8 | None = None  # (N, height_px, width_px, 4) flat picture, which is never aligned
     flat_version: int = 0
     flatness: float = 0.0  # weight of `flat` in a linear mix of 8-bit codes; 0: only `solved`, 1: only `flat`
@@ -162,7 +162,7 @@ class SolveRequest:
     flat_wanted: bool  # True if the flat picture is shown or will be needed
     paused: bool = False  # True if no new solutions are wanted
     effort: Effort | None = None  # effort for a new solution; None: full effort
-    refined_to: Effort | None = None  # effort to which to refine the newest solution while nothing has changed
+    refined_to: Effort | None = None  # effort to which to refine an unchanged solution; None: do not refine
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,7 +197,7 @@ class Solution:
     layers: U8  # (N, h, w, 4) RGBA layers, rear to front; their raster is coarser by `effort.reduction`
     solved_for_m: F64 | None  # (2, 3) left and right eye in metres, frame `stack`; None: a flat picture
     solved_for_ns: int  # instant for which the eyes and the content were predicted
-    seeing: tuple[bool, bool] = (True, True)  # left and right; an eye out of range is False and replaced by the other
+    seeing: tuple[bool, bool] = (True, True)  # left, right; False: eye out of range, replaced by the other eye
     eye_sigma_m: float | None = None  # tracking error that the solution allows for
     stage_ms: dict[str, float] = field(default_factory=dict)  # time of each of `SOLVING_STAGES`, on the run's clock
     effort: Effort | None = None  # None: a flat picture
