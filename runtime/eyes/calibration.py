@@ -161,8 +161,9 @@ def check_similarity(matrix: F64, *, source: str | Path) -> None:
         source: Name of the file that contains the matrix, for the message of the error.
 
     Raises:
-        InputError: The matrix is not a similarity, has a determinant that is not positive or a scale outside `SCALE`,
-            or places the sensor more than `MAX_DISTANCE_M` from the display.
+        InputError: The matrix has an entry beyond `MOST` or a wrong last row, is not a similarity, mirrors space, has a
+            scale outside `SCALE` or places the sensor more than `MAX_DISTANCE_M` from the display. The message names
+            the field.
     """
     name = "stack_from_sensor"
     if not np.abs(matrix).max() <= MOST:

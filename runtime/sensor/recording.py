@@ -389,7 +389,7 @@ def _expanded(compression: str, data: bytes, *, room: int) -> bytes:
 
     Args:
         compression: Name of the compression in the chunk. Data with a name other than `lz4` and `zstd` are returned
-                unchanged.
+            unchanged.
         room: Maximum number of decompressed bytes.
     """
     if compression == "lz4":
