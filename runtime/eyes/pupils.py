@@ -236,7 +236,7 @@ class PupilFinder:
 
 
 def _worth(face: FoundFace, middle: F64) -> float:
-    """Return the score of a face as a viewer: its size, reduced away from the picture's centre.
+    """Return a face's score as a possible viewer: the size, reduced towards the edges of the picture.
 
     Args:
         middle: (2,) centre of the picture in pixels.

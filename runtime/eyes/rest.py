@@ -121,7 +121,7 @@ class RestWatch:
         self.noise_m = np.tile([max(right, up), max(right, up), deep], 2)
 
     def _stands(self) -> bool:
-        """Return True if the two halves of the last second agree with each other and the newest samples fit."""
+        """Return True if the two halves of the last second agree with each other and with the newest samples."""
         now_ns = int(self._times[self._count - 1])
         if now_ns - self._times[0] < REST_NS:
             return False
