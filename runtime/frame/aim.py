@@ -1,4 +1,4 @@
-"""Build solver requests: choose the effort, and predict the eyes for a solution's display time."""
+"""Build requests to the solver: choose the effort, and predict the eyes for the display time."""
 
 from __future__ import annotations
 
@@ -13,23 +13,33 @@ from runtime.frame.solver_host import SolverHost
 from runtime.frame.viewer import Viewer
 from runtime.records import F64, Effort, EyesEstimate, EyesLabel, FrameTiming, Solution, SolveRequest
 
-HORIZON_NS = NS_PER_S // 8  # longest prediction, counted from this refresh's display time
-SPEED_NS = NS_PER_S // 2  # time constant of the running mean of a head's squared speed
+HORIZON_NS = NS_PER_S // 8  # longest prediction of the eyes, counted from the display time of the present refresh
+SPEED_NS = NS_PER_S // 2  # time constant of the running mean of the head's squared speed
 REQUESTS_KEPT = 256
-CALM_M_S = 0.02  # a seated head sways more slowly than this, and moves faster on purpose
+CALM_M_S = 0.02  # a seated viewer's head sways more slowly than this; deliberate motion is faster
 WORTH = 0.995  # refine only if the expected error falls below this share of the current one
 
 
 class Aim:
-    """Builds the solver requests of one run. Single-threaded; never reads a clock."""
+    """Builds the requests to the solver during one run.
+
+    The class is not thread-safe. It never reads a clock.
+    """
 
     def __init__(self, viewer: Viewer, solver: SolverHost, *, period_ns: int, fixed: Effort | None = None) -> None:
-        """Create the aim of a run. fixed: every solution's effort under `model.effort = full`; None: chosen."""
+        """Create an aim for one run.
+
+        Args:
+            viewer: Source of the predicted eyes.
+            solver: Source of the measured costs of solutions.
+            period_ns: Refresh period of the display.
+            fixed: Effort of every solution if `model.effort` is `full`. None means all steps on the full raster.
+        """
         self._viewer, self._solver, self._period_ns, self._fixed = viewer, solver, period_ns, fixed
         self._chooser = EffortChooser()
         self._calm_ns: int | None = None  # time since which the head has been slower than CALM_M_S
-        self._expected: dict[int, float] = {}  # expected squared distance to the true eyes, m², by requested instant
-        self._speed2 = 0.0  # running mean, in (m/s)²
+        self._expected: dict[int, float] = {}  # expected squared distance in m² to the true eyes, by requested instant
+        self._speed2 = 0.0  # running mean of the squared speed in (m/s)²
         self._learned: int | None = None  # number of the newest solution whose measures have been used
 
     def request(
@@ -44,7 +54,13 @@ class Aim:
     ) -> SolveRequest:
         """Return the next request to the solver.
 
-        eyes: the eyes at this refresh's display time; shown: the newest solution.
+        Args:
+            timing: Predicted times of the present refresh.
+            eyes: Eyes at the display time of the present refresh.
+            shown: The newest solution.
+            state: State of the run.
+            flat_wanted: True if the flat picture is shown or will be needed soon.
+            paused: True if the operator paused the picture.
         """
         self._learn(shown, eyes)
         predictor, refined, costs = state.predictor, None, self._solver.costs
@@ -55,7 +71,7 @@ class Aim:
             horizon_s = self._horizon_s(timing, speed_m_s=outlook(0.0).speed_m_s)
             error = self._shown_error(eyes, shown, time_ns=timing.photon_ns)
             period_ms = self._period_ns / NS_PER_MS
-            timed = tuple(by for by in predictor.reductions if by in costs.stages)  # a new model may not be timed yet
+            timed = tuple(by for by in predictor.reductions if by in costs.stages)  # a new model may lack timings
             effort = self._chooser.choose(
                 candidates(timed, predictor.steps),
                 costs, outlook, shown_error=error, period_ms=period_ms, horizon_s=horizon_s,
@@ -70,11 +86,11 @@ class Aim:
         self._expected[then_ns] = expected_m2
         while len(self._expected) > REQUESTS_KEPT:
             self._expected.pop(next(iter(self._expected)))
-        # The solution is aligned to newer eyes when it is shown, so only the current eyes' uncertainty matters.
+        # The solution is aligned to newer eyes when it is shown, so only the uncertainty of the present eyes matters.
         return SolveRequest(then_ns, then_m, label, eyes.sigma_m, flat_wanted, paused, effort, refined)
 
     def _learn(self, shown: Solution | None, eyes: EyesEstimate) -> None:
-        """Learn from the newest solution's measures, and from how far the eyes are from those solved for."""
+        """Update the statistics with the newest solution's measures and its distance from the present eyes."""
         if shown is None or shown.solved_for_m is None:
             return
         expected_m2 = self._expected.get(shown.solved_for_ns, 0.0)
@@ -88,14 +104,15 @@ class Aim:
     def _middle_ns(self, timing: FrameTiming, cost_ns: int) -> int:
         """Return the middle of the time for which a solution that starts now will be shown.
 
-        It is complete after `cost_ns`, appears half a period later on average, and is shown until the next one appears.
+        The solution is complete after `cost_ns`, appears half a period later on average, and is shown until the next
+        solution appears.
         """
         return timing.photon_ns + cost_ns + (self._period_ns + max(cost_ns, self._period_ns)) // 2
 
     def _eyes_then(self, timing: FrameTiming, eyes: EyesEstimate, *, cost_ns: int) -> tuple[int, F64 | None, EyesLabel]:
-        """Return the instant to solve for, and the eyes (2, 3) predicted for it with their label.
+        """Return the instant to solve for, the eyes (2, 3) predicted for this instant, and the label of the eyes.
 
-        The eyes are predicted no further than `HORIZON_NS`.
+        The prediction reaches no further than `HORIZON_NS` beyond the display time.
         """
         middle_ns = self._middle_ns(timing, cost_ns)
         reach_ns = min(middle_ns, timing.photon_ns + HORIZON_NS)
@@ -124,9 +141,9 @@ class Aim:
         return outlook
 
     def _horizon_s(self, timing: FrameTiming, *, speed_m_s: float) -> float:
-        """Return for how long the head's motion is expected to continue.
+        """Return the time in seconds for which the head's motion is expected to continue.
 
-        A calm head is expected to stay calm for as long as it has been calm.
+        A calm head is expected to stay calm for as long as it has already been calm.
         """
         if speed_m_s > CALM_M_S:
             self._calm_ns = None
@@ -136,9 +153,9 @@ class Aim:
         return max(HORIZON_S, (timing.photon_ns - self._calm_ns) / NS_PER_S)
 
     def _usual_speed_m_s(self, moved_m: float, eyes: EyesEstimate) -> float:
-        """Return the head's speed or the RMS of its recent speed, whichever is larger.
+        """Return the head's present speed or the RMS of its recent speed, whichever is larger.
 
-        The RMS gives a useful value at turning points and while the eyes are lost.
+        The RMS remains useful at turning points, where the present speed is zero, and while the eyes are lost.
         """
         speed_m_s = moved_m * NS_PER_S / self._period_ns
         if eyes.label != "held":
@@ -147,7 +164,7 @@ class Aim:
         return float(max(speed_m_s if eyes.label != "held" else 0.0, self._speed2**0.5))
 
     def _shown_error(self, eyes: EyesEstimate, shown: Solution | None, *, time_ns: int) -> float:
-        """Return the expected squared error of the displayed picture at an instant."""
+        """Return the expected squared error of light of the newest solution at an instant."""
         pictures = self._chooser.pictures
         if shown is None or shown.effort is None or shown.solved_for_m is None or eyes.eyes_m is None:
             return pictures.contrast
@@ -157,7 +174,15 @@ class Aim:
     def _refined(
         self, shown: Solution, most: int, costs: Costs, *, shown_error: float, horizon_s: float
     ) -> Effort | None:
-        """Return the effort that refines a resting head's solution, or None if it is good enough."""
+        """Return the effort to which a resting head's solution is refined, or None to keep the solution.
+
+        Args:
+            shown: The solution to refine.
+            most: Largest number of steps up to which the solution can be continued.
+            costs: Costs of solutions.
+            shown_error: Expected squared error of the solution that is shown.
+            horizon_s: Time for which the head is expected to stay at rest.
+        """
         done, pictures = shown.effort, self._chooser.pictures
         if done is None:
             return None

@@ -1,4 +1,4 @@
-"""Keep the layers of every N-th refresh (`--keep-light`), with target pictures for comparison."""
+"""Save the layers and the target pictures of every N-th refresh to files (`--keep-light`)."""
 
 from __future__ import annotations
 
@@ -24,18 +24,27 @@ WRITTEN_WITHIN_S = 10.0  # timeout for writing the last refresh's layers
 
 
 class Output(Protocol):
-    """Destination of the files that a run writes."""
+    """Destination for the files that a run writes."""
 
     def refresh(self, line: dict[str, Any]) -> None:
-        """Add a line to frames.jsonl."""
+        """Append a line to frames.jsonl."""
 
     def light(self, frame: int, *, layers: U8) -> None:
-        """Write the layers that the panels showed at a refresh."""
+        """Write the layers that the panels showed at a refresh.
+
+        Args:
+            frame: Refresh number.
+            layers: (N, h, w, 4) RGBA layers, rear to front.
+        """
 
     def light_targets(self, frame: int, *, info: dict[str, Any], drawn: Pictures | None, true: Pictures | None) -> None:
-        """Write the target pictures of a refresh whose layers were kept.
+        """Write the target pictures of a refresh whose layers were saved.
 
-        drawn: for the eyes that the solution is for; true: for the true eyes.
+        Args:
+            frame: Refresh number.
+            info: Eye positions and field of view of the pictures.
+            drawn: Pictures for the eyes that the solution was computed for.
+            true: Pictures for the true eyes.
         """
 
 
@@ -43,11 +52,14 @@ class Output(Protocol):
 class _Kept:
     account: RefreshAccount
     solved_for_ns: int
-    content: object | None  # the run's content at this refresh
+    content: object | None  # content of the run at this refresh
 
 
 class KeptLight:
-    """Keeps the layers of every `every`-th refresh, or none if it is 0."""
+    """Writes the layers and the target pictures of every `every`-th refresh.
+
+    Nothing is written if `every` is 0.
+    """
 
     def __init__(self, every: int, output: Output, drawer: TargetDrawer, truth: TrueEyes, *, simulated: bool) -> None:
         self._every, self._output, self._drawer, self._truth = every, output, drawer, truth
@@ -56,7 +68,10 @@ class KeptLight:
         self._kept: list[_Kept] = []
 
     def refreshed(self, refresh: Refresh) -> None:
-        """Write the layers if this refresh is due; in real time, only one write runs at a time."""
+        """Write the layers of this refresh if it is due.
+
+        In real time, a background job writes the layers. A refresh that is due while the job is running is skipped.
+        """
         account = refresh.account
         if not self._every or account.frame % self._every != self._every - 1 or not account.presented:
             return
@@ -78,9 +93,11 @@ class KeptLight:
             self._draw(kept, lambda: None)
 
     def finish(self, stopped: Callable[[], bool]) -> None:
-        """Draw the target pictures of all kept refreshes.
+        """Draw the target pictures of the saved refreshes of a recording.
 
-        stopped: returns True after a stop request; the remaining refreshes are then written without pictures.
+        Args:
+            stopped: Function that returns True after a stop request. The remaining refreshes are then written without
+                target pictures.
         """
         if self._job is not None:
             self._job.wait(WRITTEN_WITHIN_S)

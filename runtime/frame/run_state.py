@@ -1,4 +1,4 @@
-"""Immutable state of a run. A reconfiguration replaces it as a whole."""
+"""Immutable state of a run, which a reconfiguration replaces as a whole."""
 
 from __future__ import annotations
 
@@ -18,9 +18,12 @@ LEFT_BEHIND = "content or model took too long to load, so the solver was restart
 
 @dataclass(frozen=True, slots=True)
 class RunState:
-    """Settings, calibration, content and model that belong together; the solver owns the last two."""
+    """Settings, calibration, content and model that are used together.
 
-    version: int  # a different number for each state
+    The solver owns the content and the model.
+    """
+
+    version: int  # number that differs for every state of a run
     settings: Settings
     calibration: Calibration
     content: ContentSource
@@ -28,7 +31,11 @@ class RunState:
 
 
 class RunCell:
-    """Holder of the newest RunState. Any thread may read `state`, which should be read once per use."""
+    """Holds the newest `RunState` and replaces it atomically.
+
+    Any thread may read `state`. Callers that need several fields should read `state` once, because it may be replaced
+    between two reads.
+    """
 
     def __init__(
         self, settings: Settings, *, calibration: Calibration, content: ContentSource, predictor: Predictor
@@ -39,20 +46,30 @@ class RunCell:
         self.state = RunState(0, settings, calibration, content, predictor)
 
     def next_number(self) -> int:
-        """Return the next number for a solution or flat picture. It is unique within the run."""
+        """Return a number for a new solution or flat picture, unique within the run."""
         with self._lock:
             return next(self._numbers)
 
     def begin(self) -> int:
-        """Begin a new solver generation and return its number. Older ones can no longer change the state."""
+        """Begin a new solver generation and return its number.
+
+        Solvers of older generations can no longer change the state.
+        """
         with self._lock:
             self.generation += 1
             return self.generation
 
     def replace(self, generation: int | None = None, **changes: Any) -> RunState:
-        """Replace fields of the state and return the old one, whose replaced parts the caller must close.
+        """Replace fields of the state and return the old state.
 
-        generation: number of the calling solver's. If a newer one has begun, raises Stopped and changes nothing.
+        The caller must close the parts that were replaced.
+
+        Args:
+            generation: Generation of the calling solver. None replaces the state in any generation.
+            changes: New values by field name.
+
+        Raises:
+            Stopped: A newer generation has begun. The state is not changed.
         """
         with self._lock:
             if generation not in (None, self.generation):

@@ -1,4 +1,4 @@
-"""Determine the daemon's state from observed conditions, and detect late refreshes."""
+"""Determine the daemon's state from the conditions at each refresh, and detect late refreshes."""
 
 from __future__ import annotations
 
@@ -19,17 +19,20 @@ class Conditions:
     """Conditions observed at one refresh."""
 
     eyes: EyesLabel
-    missing: dict[Part, str]  # failed parts, with a short reason
+    missing: dict[Part, str]  # a short reason for each part that has failed
     presented: bool  # True once any frame has been on the panels
-    flat_wanted: bool = False  # the operator asked for the 2D picture
-    stopping: str = ""  # reason for stopping; empty: not stopping
-    limited: str = ""  # why the alignment to the eyes is at its limit; empty if it is not
+    flat_wanted: bool = False  # True if the operator asked for the flat picture
+    stopping: str = ""  # reason why the run is stopping; empty while it is running
+    limited: str = ""  # reason why the alignment to the eyes is at its limit; empty if it is not at its limit
     late: str = ""  # message if there are fewer refreshes than the display's rate requires; otherwise empty
-    paused: bool = False  # the operator froze the picture; it is still aligned to the eyes
+    paused: bool = False  # True if the operator froze the picture, which is still aligned to the eyes
 
 
 def judge(conditions: Conditions) -> tuple[State, str]:
-    """Return the state and its reason. Priority: stopping, starting, missing parts, then the eyes."""
+    """Return the daemon's state and the reason for the state.
+
+    Stopping takes precedence over starting, starting over missing parts, and missing parts over the eyes.
+    """
     if conditions.stopping:
         return State.STOPPING, conditions.stopping
     missing = [part for part in PARTS if part in conditions.missing]
@@ -52,7 +55,7 @@ def judge(conditions: Conditions) -> tuple[State, str]:
 
 
 class StateMachine:
-    """Current state of the daemon, and the time spent in each state."""
+    """Tracks the current state of the daemon and the time spent in each state."""
 
     def __init__(self, *, now_ns: int) -> None:
         self.state = State.STARTING
@@ -63,36 +66,42 @@ class StateMachine:
 
     @property
     def name(self) -> str:
-        """Name of the state for people, such as `tracking` or `degraded: sensor, panel`."""
+        """Human-readable name of the state, such as `tracking` or `degraded: sensor, panel`."""
         return f"{self.state}: {', '.join(self.missing)}" if self.state is State.DEGRADED else str(self.state)
 
     def update(self, conditions: Conditions, *, now_ns: int) -> bool:
-        """Update the state. Return True if it or its missing parts have changed. Stopping is final."""
+        """Update the state, and return True if the state or the set of missing parts has changed.
+
+        The state no longer changes once it is STOPPING.
+        """
         self._held_ns[self.state] += now_ns - self._counted_ns
         self._counted_ns = now_ns
         if self.state is State.STOPPING:
             return False
         before = self.name
         self.state, reason = judge(conditions)
-        self.reason = without_secrets(reason)  # it may contain a camera's address, and many programs can read it
+        self.reason = without_secrets(reason)  # a reason may contain a camera's address, and is widely readable
         self.missing = tuple(part for part in PARTS if part in conditions.missing)
         return self.name != before
 
     def seconds(self, *, now_ns: int) -> dict[str, float]:
-        """Return the seconds spent so far in each state that has been entered."""
+        """Return the time in seconds spent so far in each state that has been entered."""
         durations_ns = dict(self._held_ns)
         durations_ns[self.state] += now_ns - self._counted_ns
         return {str(state): held_ns / NS_PER_S for state, held_ns in durations_ns.items() if held_ns > 0}
 
 
 WINDOW_NS = NS_PER_S
-LATE_SHARE = 0.9  # the display is late below this share of a second's refreshes
-WELL_SHARE = 0.95  # it is on time again from this share on
+LATE_SHARE = 0.9  # the display is late if it shows less than this share of a second's refreshes
+WELL_SHARE = 0.95  # a late display is on time again if it shows at least this share
 REFRESHES_MAX = 1024  # largest number of refreshes counted in the window
 
 
 class Lateness:
-    """Detector of late refreshes: too few in the last second, for a full second."""
+    """Detects a late display.
+
+    The display is late if the number of refreshes in the last second has been too small for at least one second.
+    """
 
     def __init__(self, period_ns: int) -> None:
         self._wanted = WINDOW_NS / period_ns
@@ -103,9 +112,9 @@ class Lateness:
         self._told_ns = 0
 
     def update(self, *, presented: bool, now_ns: int) -> str:
-        """Count a refresh. Return "" if on time, otherwise `late: 38 of 60 refreshes a second`.
+        """Count a refresh, and return a message if the display is late or "" if it is on time.
 
-        The message is updated once a second.
+        The message has the form `late: 38 of 60 refreshes a second` and is updated once per second.
         """
         if self._begun_ns is None:
             self._begun_ns = now_ns
