@@ -110,7 +110,7 @@ class Aim:
         return timing.photon_ns + cost_ns + (self._period_ns + max(cost_ns, self._period_ns)) // 2
 
     def _eyes_then(self, timing: FrameTiming, eyes: EyesEstimate, *, cost_ns: int) -> tuple[int, F64 | None, EyesLabel]:
-        """Return the instant to solve for, the eyes (2, 3) predicted for this instant, and the label of the eyes.
+        """Return the instant to solve for, and the predicted eyes (2, 3) with their label.
 
         The prediction reaches no further than `HORIZON_NS` beyond the display time.
         """

@@ -1,4 +1,7 @@
-"""Estimate solutions' error, lost detail and rate of change from samples, on the solver's thread."""
+"""Measure the error, the lost detail and the rate of change of solutions on a sample of their pixels.
+
+The measurements run on the solver's thread.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +20,13 @@ from runtime.records import F32, F64, U8, Effort, Measures
 from runtime.support.gl import DrawnPicture
 
 RAYS = 1024  # rays per eye
-SAMPLED = 54, 96  # rows and columns of the grid for comparing successive pictures
-BAND_ROWS = 64  # height of each of the two bands in which detail is measured
+SAMPLED = 54, 96  # rows and columns of the grid on which successive pictures are compared
+BAND_ROWS = 64  # height of each of the two bands in which lost detail is measured
 EVERY = 4  # residual and detail are measured for every 4th solution of an effort, change for every 4th solution
 
 
 class SolutionMeter:
-    """Meter that measures solutions, and compares each one's pictures with samples of the previous ones."""
+    """Measures the errors of solutions and the change between the pictures of successive solutions."""
 
     def __init__(self) -> None:
         self._before: tuple[tuple[int, ...], list[U8], Job, int] | None = None  # raster and window, pictures, job, time
@@ -32,7 +35,14 @@ class SolutionMeter:
         self._places = np.random.default_rng(1).random((2, RAYS, 2))
 
     def measure(self, job: Job, layers: U8, effort: Effort, *, time_ns: int) -> Measures | None:
-        """Measure one solution. Return None if its pictures exist only as textures."""
+        """Measure one solution, or return None if its pictures exist only as textures.
+
+        Args:
+            job: Job that was solved.
+            layers: (N, h, w, 4) layers of the solution.
+            effort: Effort of the solution.
+            time_ns: Instant for which the pictures were drawn.
+        """
         if any(isinstance(view.picture, DrawnPicture) for view in job.views):
             return None
         key = Effort(effort.reduction, effort.steps)
@@ -50,7 +60,10 @@ class SolutionMeter:
         )
 
     def _change(self, job: Job, *, time_ns: int) -> tuple[float, float, float] | None:
-        """Return `Measures.change`. Keep copies of one solution's pictures in `EVERY`, and compare the next one's."""
+        """Return `Measures.change`, or None if the change is not measured for this solution.
+
+        The pictures of one solution in `EVERY` are copied and compared with the pictures of the next solution.
+        """
         turn, self._solutions = self._solutions % EVERY, self._solutions + 1
         before, self._before = self._before, None
         if turn > 1 or (turn == 1 and before is None):
@@ -72,12 +85,18 @@ class SolutionMeter:
 
 
 def sampled_light(layers: U8, job: Job, places: F64, *, boxes: bool) -> float | None:
-    """Return the squared error of light at sampled pixels of both pictures, or None if no ray counts.
+    """Return the squared error of light at sampled pixels of the two pictures.
 
-    layers: (N, h, w, 4) of the job's stack. places: (2, K, 2) as fractions of the picture's size. The two rays of a
-    pair fall into the same pixel, so the mean product of their errors is unbiased (docs/contracts.md: light). Rays
-    that miss a panel are ignored. boxes: True if panel pixels are uniform boxes; False for a coarse solution, which is
-    enlarged bilinearly.
+    Two rays are traced through each sampled pixel. The mean product of their errors is unbiased because the two rays
+    fall into the same pixel (docs/contracts.md: light). Pairs with a ray that misses a panel are ignored. If no pair is
+    left, the result is None.
+
+    Args:
+        layers: (N, h, w, 4) layers on the raster of the job.
+        job: Job that was solved.
+        places: (2, K, 2) uniform random numbers in [0, 1). `places[0]` selects the K pixels by fractions of the width
+            and height of the picture. The remainders modulo 1/64 determine where the two rays lie within their pixel.
+        boxes: True to treat panel pixels as uniform squares. False for a coarse solution, which is enlarged bilinearly.
     """
     stack, middle = job.stack, job.stack.count // 2
     rasters = [stack.panel(n) for n in range(stack.count)]
@@ -101,7 +120,7 @@ def sampled_light(layers: U8, job: Job, places: F64, *, boxes: bool) -> float | 
 
 
 def lost_detail(picture: U8) -> Mapping[int, float]:
-    """Return, by reduction, the squared error of a picture (h, w, 3 or 4) that is reduced and enlarged."""
+    """Return the squared error of reducing and enlarging a picture (h, w, 3 or 4), by reduction."""
     height = picture.shape[0]
     bands = [picture[first : first + BAND_ROWS, :, :3] for first in (height // 3, 2 * height // 3)]
     return {
@@ -119,7 +138,7 @@ def _lost(band: U8, reduction: int) -> float:
 
 
 def _halved(picture: U8) -> U8:
-    """Average 2 x 2 pixels, which reduces the effect of the comparison's own interpolation."""
+    """Average blocks of 2 x 2 pixels to reduce the effect of interpolation on the comparison."""
     height, width = picture.shape[:2]
     if min(height, width) < 2:
         return picture.copy()
@@ -128,7 +147,7 @@ def _halved(picture: U8) -> U8:
 
 
 def _grid(picture: U8) -> F32:
-    """Sample a picture on the coarse grid `SAMPLED`; returns (rows, columns, 3) in 0..1."""
+    """Sample a picture on the coarse grid `SAMPLED`, and return (rows, columns, 3) values in 0..1."""
     rows, columns = _grid_lines(picture)
     return np.asarray(picture[rows][:, columns, :3] / np.float32(255), np.float32)
 
@@ -139,7 +158,13 @@ def _grid_lines(picture: U8) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def _moved_grid(pictures: Sequence[U8], job: Job, eyes_m: F64) -> list[F32]:
-    """Sample a job's pictures on the coarse grid as the panels show them to eyes (2, 3) that have moved."""
+    """Sample a job's pictures on the coarse grid, as the panels would show them to moved eyes.
+
+    Args:
+        pictures: Pictures of the job at half size, from `_halved`.
+        job: Job that was solved.
+        eyes_m: (2, 3) eyes after the motion.
+    """
     middle = job.stack.count // 2
     moved = displacement(
         job.relief, parallax(job.stack, old_m=job.eyes_m.mean(axis=0), new_m=eyes_m.mean(axis=0)), middle
@@ -156,9 +181,16 @@ def _moved_grid(pictures: Sequence[U8], job: Job, eyes_m: F64) -> list[F32]:
 
 
 def _sampled(layer: U8, x: F64, y: F64, *, boxes: bool) -> tuple[F32, NDArray[np.bool_]]:
-    """Sample a layer at K continuous pixels; return colours (K, 3) and a mask (K,) of pixels inside it.
+    """Sample a layer at K continuous pixel positions.
 
-    boxes: True to sample pixels as uniform boxes, False for bilinear samples clamped at the edge.
+    Args:
+        layer: (h, w, 4) layer.
+        x: (K,) columns.
+        y: (K,) rows.
+        boxes: True to treat pixels as uniform squares. False to interpolate bilinearly, clamped at the edge.
+
+    Returns:
+        Colours (K, 3) in 0..255, and a mask (K,) that is True for positions inside the layer.
     """
     height, width = layer.shape[:2]
     inside = (x >= 0) & (x <= width) & (y >= 0) & (y <= height)

@@ -1,4 +1,4 @@
-"""Pass each refresh on to the line writer, the quality sampler and the light keeper."""
+"""Pass each refresh on to the writers of its line and its layers and to the quality sampler."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ from runtime.records import RefreshAccount, SensorFrame
 
 
 class RunObserver:
-    """Observer of one run. It receives every sample and refresh; `finish` ends it."""
+    """Records and measures the refreshes of one run.
+
+    The presenter passes every sample and refresh to the observer. `finish` completes the records after the run.
+    """
 
     def __init__(
         self,
@@ -30,10 +33,17 @@ class RunObserver:
         on_account: Callable[[RefreshAccount], None] | None = None,
         simulated: bool = False,
     ) -> None:
-        """Create the observer of a run.
+        """Create an observer for one run.
 
-        evaluate_every: measure the quality of every N-th refresh and the last; 0: only of the last; None: of none.
-        keep_light: keep the layers of every N-th refresh; 0: of none.
+        Args:
+            stack: Panels of the display.
+            drawer: Drawer of target pictures.
+            evaluate_every: Measure the quality of every N-th refresh and the last refresh. If 0, measure only the last
+                refresh. If None, measure nothing.
+            keep_light: Save the layers of every N-th refresh. If 0, save no layers.
+            output: Destination for the files of the run. If None, no files are written.
+            on_account: Function that is called with the account of every refresh.
+            simulated: True if the run's clock is simulated.
         """
         self._measures, self._simulated, self._on_account = evaluate_every is not None, simulated, on_account
         self.last: Refresh | None = None
@@ -44,17 +54,17 @@ class RunObserver:
 
     @property
     def moment(self) -> Moment | None:
-        """Return the newest refresh whose quality was measured."""
+        """Newest refresh whose quality was measured."""
         return self._sampler.moment
 
     @property
     def measured(self) -> dict[str, list[float]]:
-        """Return the quality figures of the sampled refreshes, by name."""
+        """Quality figures of the sampled refreshes, by name."""
         return self._sampler.measured
 
     @property
     def live_errors(self) -> dict[int, float]:
-        """Return the mean squared error of light at the true eyes, by refresh number."""
+        """Mean squared errors of light at the true eyes, by refresh number."""
         return self._sampler.live
 
     def measure_only_live(self) -> None:
@@ -77,9 +87,13 @@ class RunObserver:
         self._sampler.advance()
 
     def finish(self, stopped: Callable[[], bool] = lambda: False) -> None:
-        """Write and measure what is queued, draw the kept refreshes' targets, and measure the last refresh.
+        """Complete the records of the run after its last refresh.
 
-        In real time, the last refresh is measured only if no other was. stopped: returns True after a stop request.
+        Queued refreshes are written and measured, and target pictures are drawn for the refreshes whose layers were
+        saved. The last refresh is also measured, but in real time only if no other refresh has been measured.
+
+        Args:
+            stopped: Function that returns True after a stop request. The remaining work is then skipped.
         """
         self.truth.end()
         self._lines.advance()
@@ -92,9 +106,9 @@ class RunObserver:
                 self._sampler.finish(last)
 
     def live(self) -> dict[str, Any]:
-        """Return the live figures (docs/contracts.md, Error) measured so far, for the status."""
+        """Return the live figures measured so far, for the daemon's status (docs/contracts.md, Error)."""
         return {"live_db": self._sampler.live_db, "view_error_mm": self._lines.view_error_mm.of("p50", "p95")}
 
     def summary(self) -> dict[str, Any]:
-        """Return the measured part of summary.json, where figures that were not measured are null."""
+        """Return the part of summary.json with quality figures. Figures that were not measured are null."""
         return {**self.live(), **self._sampler.summary()}

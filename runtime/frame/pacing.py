@@ -1,7 +1,8 @@
 """Predict the wake, present and display times of refreshes from vertical blanks.
 
-Callers pass in times and events; this module reads no clock. The scheme follows Monado's compositor pacing: it predicts
-a refresh, receives its events, and learns the phase of the blanks and the time that a refresh needs before one.
+The module never reads a clock. Its callers pass in all times and events. The scheme follows the compositor pacing of
+Monado: it predicts the times of a refresh, receives the actual times, and learns the phase of the vertical blanks and
+the time that a refresh needs before a blank.
 """
 
 from __future__ import annotations
@@ -9,25 +10,31 @@ from __future__ import annotations
 from runtime.clock import NS_PER_MS
 from runtime.records import FrameTiming
 
-PHASE_GAIN = 0.1  # share of the newest blank's prediction error by which the phase is corrected
-WORK_GAIN = 0.05  # decay of the work-time estimate (increases use gain 0.5)
+PHASE_GAIN = 0.1  # share of the prediction error of the newest blank by which the phase is corrected
+WORK_GAIN = 0.05  # gain of decreases of the estimated work time (increases have gain 0.5)
 LATE_SHARE = 0.5  # a refresh that is late by more than this share of a period moves to the next slot
 MARGIN_GROWTH = 1.5  # factor on the margin after a missed blank
-MARGIN_DECAY = 0.9995  # factor per met blank; if drawing exceeds the minimum margin, one blank in 800 is missed
+MARGIN_DECAY = 0.9995  # factor on the margin after a met blank; one blank in 800 is missed if MARGIN_MIN_NS is too low
 MARGIN_MIN_NS = NS_PER_MS
 
 
 class Pacer:
-    """Scheduler of refreshes on a grid of one period. Slots that cannot be met count as missed.
+    """Schedules refreshes in slots that are one refresh period apart.
 
-    A refresh that is skipped on purpose (unchanged picture) keeps its slot and does not count as missed.
+    Slots that cannot be met count as missed. A refresh that is skipped on purpose, because the picture has not changed,
+    keeps its slot and does not count as missed.
     """
 
     def __init__(self, *, period_ns: int, photon_ns: int, work_ns: int = 0) -> None:
-        """Create a pacer for a display with this refresh period.
+        """Create a pacer for a display.
 
-        photon_ns: time from presenting to the middle of the display time. work_ns: first estimate of the time from
-        waking to presenting.
+        Args:
+            period_ns: Refresh period of the display.
+            photon_ns: Time from presenting to the middle of the display time.
+            work_ns: Initial estimate of the time from waking to presenting.
+
+        Raises:
+            ValueError: The period is not positive.
         """
         if period_ns <= 0:
             raise ValueError("period_ns must be positive")
@@ -40,7 +47,7 @@ class Pacer:
         self.missed = 0
 
     def predict(self, now_ns: int) -> FrameTiming:
-        """Return the timing of the next refresh."""
+        """Schedule the next refresh and return its predicted times."""
         lead_ns = self._lead_ns()
         if self._target_ns is None:
             target_ns = now_ns + lead_ns
@@ -58,8 +65,12 @@ class Pacer:
     def presented(self, timing: FrameTiming, *, woke_ns: int, done_ns: int, blank_ns: int | None = None) -> int:
         """Record the outcome of a refresh, and return the best estimate of its display time.
 
-        woke_ns, done_ns: times at which it woke and had presented. blank_ns: time of its vertical blank; None if the
-        display driver does not know it or skipped the swap.
+        Args:
+            timing: Predicted times of the refresh.
+            woke_ns: Time at which the refresh woke.
+            done_ns: Time at which presenting was done.
+            blank_ns: Time of the vertical blank of the refresh. None if the display driver does not report the blank or
+                skipped the swap.
         """
         if blank_ns is None:
             self._learn_work(done_ns - woke_ns)
@@ -79,11 +90,11 @@ class Pacer:
         return blank_ns + self._photon_ns
 
     def _lead_ns(self) -> int:
-        """Return how long before presenting a refresh must wake."""
+        """Return the time in nanoseconds to allow between waking and presenting."""
         return round(self._work_ns + (self._margin_ns if self._has_blanks else 0.0))
 
     def _learn_work(self, work_ns: int) -> None:
-        # Increases have gain 0.5, so that a single long refresh does not make all later ones wake early.
+        # A gain below 1 for increases limits how early later refreshes wake after a single long refresh.
         gain = 0.5 if work_ns > self._work_ns else WORK_GAIN
         bounded = min(work_ns, self.period_ns // 2)
         self._work_ns += gain * (bounded - self._work_ns)

@@ -1,7 +1,8 @@
-"""Decide what to solve and show (flat, solved or reused), without a clock or I/O.
+"""Decide whether the solver computes a solution, draws the flat picture or does nothing.
 
-Only the rest watch (`eyes.rest`), which sees the sensor's samples, decides whether a head is still. Eyes labelled
-`rested` are solved for once; any other change of position requires a new solution.
+The module uses no clock and no I/O. Whether a head is at rest is decided only by the rest watch (`eyes.rest`), which
+receives the samples of the sensor. Eyes labelled `rested` are solved for once. Any other change of the eyes requires a
+new solution.
 """
 
 from __future__ import annotations
@@ -13,32 +14,35 @@ from runtime.clock import NS_PER_S
 from runtime.plan.savings import Plan, selected_eyes
 from runtime.records import F64, Effort, EyesEstimate, SolveRequest
 
-BLEND_S = 0.3  # duration of the blend to the flat picture and back
+BLEND_S = 0.3  # duration of the blend to or from the flat picture
 
 Kind = Literal["solve", "refine", "flat", "nothing"]
 
 
 @dataclass(frozen=True, slots=True)
 class SolutionKey:
-    """Inputs of the newest solution or flat picture, by which it is recognized as outdated."""
+    """Inputs of the newest solution or flat picture.
+
+    A result is outdated if the present inputs differ from the inputs in its key.
+    """
 
     state_version: int
-    revision: int  # the content's revision
-    eyes_m: F64 | None  # (2, 3) eyes that it was solved for; None: a flat picture
-    effort: Effort | None = None  # the solution's effort
-    episode: int = 0  # number of the flat episode, in which the flat picture keeps one viewpoint
+    revision: int  # revision of the content
+    eyes_m: F64 | None  # (2, 3) eyes that the solution is for; None for a flat picture
+    effort: Effort | None = None  # effort of the solution
+    episode: int = 0  # number of the flat episode, during which the viewpoint of the flat picture does not change
 
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """The solver's next action."""
+    """Next action of the solver."""
 
     kind: Kind
     eyes_m: F64 | None = None  # (2, 3) eyes to solve for
 
 
 class FramePolicy:
-    """Decides between solving, drawing the flat picture and doing nothing, given the existing pictures."""
+    """Decides the solver's next action from a request and the keys of the existing pictures."""
 
     def __init__(self) -> None:
         self.episode = 0  # number of the current or last flat episode
@@ -57,7 +61,13 @@ class FramePolicy:
     ) -> Decision:
         """Decide what the solver does next.
 
-        plan: savings in force; revision: the content's at `request.time_ns`; solved, flat: keys of the newest results.
+        Args:
+            request: The newest request.
+            plan: Savings to apply. None if no plan has been made.
+            state_version: Version of the present state of the run.
+            revision: Revision of the content at `request.time_ns`.
+            solved: Key of the newest solution.
+            flat: Key of the newest flat picture.
         """
         if request.flat_wanted and not self._flat_wanted:
             self.episode += 1
@@ -82,7 +92,10 @@ class FramePolicy:
     def _eyes_to_solve(
         self, request: SolveRequest, plan: Plan | None, *, state_version: int, revision: int, solved: SolutionKey | None
     ) -> F64 | None:
-        """Return the eyes (2, 3) to solve for; None if the newest solution is valid or no eyes are known."""
+        """Return the eyes (2, 3) to solve for.
+
+        The result is None if the newest solution is still valid or no eyes are known.
+        """
         if request.eyes_m is None:
             return None
         eyes_m = request.eyes_m if plan is None else selected_eyes(request.eyes_m, plan.eyes)
@@ -93,26 +106,32 @@ class FramePolicy:
 
 
 def _is_more(effort: Effort | None, done: Effort | None) -> bool:
-    """Return True if `effort` exceeds the effort already `done`, by a finer raster or more steps."""
+    """Return True if `effort` has a finer raster than `done`, or more steps on the same raster."""
     if effort is None or done is None:
         return False
     return (-effort.reduction, effort.steps) > (-done.reduction, done.steps)
 
 
 def wants_flat(eyes: EyesEstimate, *, flat_asked: bool, flatness: float) -> bool:
-    """Return True if the flat picture is shown or soon will be, so that it is ready in time."""
+    """Return True if the flat picture is shown or may be needed soon.
+
+    Args:
+        eyes: Eyes at the display time.
+        flat_asked: True if the operator asked for the flat picture.
+        flatness: Present weight of the flat picture in the blend.
+    """
     return flat_asked or flatness > 0.0 or eyes.label in ("held", "none")
 
 
 @dataclass(slots=True)
 class Flatness:
-    """Mixing weight of the flat picture, 0 to 1, which changes at a constant rate."""
+    """Fades the flat picture in and out by changing its mixing weight at a constant rate."""
 
-    value: float = 1.0
-    since_ns: int = -1
+    value: float = 1.0  # mixing weight, from 0 (solution alone) to 1 (flat picture alone)
+    since_ns: int = -1  # time of the last call of `toward`; -1 before the first call
 
     def toward(self, target: float, *, now_ns: int) -> float:
-        """Move `value` towards 0 or 1 according to the time since the last call, and return it."""
+        """Move `value` towards `target` according to the time since the last call, and return the new value."""
         elapsed_s = 0.0 if self.since_ns < 0 else (now_ns - self.since_ns) / NS_PER_S
         self.since_ns = now_ns
         step = elapsed_s / BLEND_S

@@ -1,4 +1,4 @@
-"""Solver: draw content and compute layers for the predicted eyes, on the thread of its GL context."""
+"""Draw content and compute layers for the predicted eyes, on the thread of the solver's GL context."""
 
 from __future__ import annotations
 
@@ -32,24 +32,30 @@ FLAT_EYE_M = (0.7, 0.0, 0.0)  # viewpoint of the flat picture before any viewer 
 
 @dataclass(frozen=True, slots=True)
 class SolverUpdate:
-    """Results of one request or, as `SolverHost.news`, the newest results so far."""
+    """Results of one request. In `SolverHost.news`, the newest results of all requests."""
 
     solution: Solution | None = None  # a new solution for two eyes
     flat: Solution | None = None  # a new flat picture
-    missing: dict[str, str] = field(default_factory=dict)  # failed parts (content, model), with the reason
+    missing: dict[str, str] = field(default_factory=dict)  # reason for each part (content, model) that has failed
 
 
 class Solver:
-    """Solver that computes one solution or flat picture per step, from the run's state when it begins."""
+    """Computes at most one solution or flat picture per step.
+
+    A step uses the state of the run at the beginning of the step.
+    """
 
     def __init__(self, run: RunCell, stack: PanelStack, *, timed: bool = True) -> None:
         """Create a solver for a run.
 
-        timed: True to apply `model.budget_ms`. It is False on a simulated clock, so that results do not depend on the
-        machine.
+        Args:
+            run: Holder of the run's state.
+            stack: Panels of the display.
+            timed: Apply `model.budget_ms`. False on a simulated clock, where results must not depend on the speed of
+                the machine.
         """
         self.run, self.stack, self._timed = run, stack, timed
-        self.measured = Measured()  # measured times and errors of the plan's items
+        self.measured = Measured()  # measured times and errors of the items of the plan
         self.plan: Plan | None = None
         self._planned_for: tuple[int, tuple[bool, bool]] | None = None
         self._seeing = (True, True)
@@ -57,16 +63,22 @@ class Solver:
         self._solved: SolutionKey | None = None
         self._flat: SolutionKey | None = None
         self._windows: dict[int, SolveWindow | None] = {}  # windows of the newest solutions, by reduction
-        self._kept: Job | None = None  # the last job with copies of its pictures; None: pictures must be drawn
+        self._kept: Job | None = None  # last job with copies of its pictures; None if pictures must be drawn again
         self._meter = SolutionMeter()
         self._middle_m: F64 = np.array(FLAT_EYE_M)
         self._missing: dict[str, str] = {}
 
     def step(self, request: SolveRequest, state: RunState | None = None) -> SolverUpdate:
-        """Carry out a request. Failed parts are named in the result; earlier results remain valid.
+        """Carry out a request and return its results.
 
-        state: state with which to draw and solve; None: the newest. Raises ContextLost if this solver has become
-        unusable.
+        If the content or the model fails, the result names the failed part, and earlier results remain valid.
+
+        Args:
+            request: Request to carry out.
+            state: State of the run with which to draw and solve. None means the newest state.
+
+        Raises:
+            ContextLost: The GL context was lost, so this solver has become unusable.
         """
         state = state or self.run.state
         self._replan(state, request.eyes_m)
@@ -87,7 +99,7 @@ class Solver:
             return self._draw_flat(state, revision=revision, time_ns=time_ns)
         if job.eyes_m is not None:
             wanted = request.refined_to if job.kind == "refine" else request.effort
-            if wanted is None or wanted.reduction not in state.predictor.reductions:  # chosen for the previous model
+            if wanted is None or wanted.reduction not in state.predictor.reductions:  # not offered by a new model
                 wanted = Effort(1, state.predictor.steps)
             return self._solve(state, request, job.eyes_m, wanted, revision=revision)
         if request.eyes_m is not None and not request.paused:
@@ -108,7 +120,7 @@ class Solver:
                 job = self._kept
             else:
                 job = self._drawn(state, request, eyes_m, effort.reduction)
-        except ContextLost:  # content and model live in the context, so the owner starts another solver
+        except ContextLost:  # content and model exist only in the context, so the owner must start another solver
             raise
         except (Exception, SystemExit) as error:
             return SolverUpdate(missing=self._failed("content", error, expected=ContentFailure))
@@ -141,7 +153,10 @@ class Solver:
         return SolverUpdate(solution=solution)
 
     def _drawn(self, state: RunState, request: SolveRequest, eyes_m: F64, reduction: int) -> Job:
-        """Draw the targets. Those of a resting head are kept, so that its solution can be refined."""
+        """Draw the target pictures of a solution.
+
+        The pictures for a resting head are also copied, because the solution may be refined later.
+        """
         job = drawn_job(
             state.predictor,
             state.content,
@@ -180,12 +195,18 @@ class Solver:
         return SolverUpdate(flat=flat, missing=missing)
 
     def plan_items(self, measured: Measured | None = None) -> tuple[PlanItem, ...]:
-        """Return the savings in force, with their times and errors if measured. Thread-safe."""
+        """Return the savings that the plan applies, with the times and errors that have been measured.
+
+        The method is thread-safe.
+
+        Args:
+            measured: Times and errors to report. None means the solver's own measurements.
+        """
         state = self.run.state
         return self._plan_of(state, self._seeing, measured or self.measured).items
 
     def _replan(self, state: RunState, eyes_m: F64 | None) -> None:
-        """Update the plan after a change of content, model, settings or visible eyes."""
+        """Update the plan if the state of the run or the set of eyes that can see the display has changed."""
         seeing = self._seeing if eyes_m is None else seeing_eyes(eyes_m, self._seeing)
         self._seeing = seeing
         made_for = (state.version, seeing)

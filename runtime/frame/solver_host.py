@@ -1,4 +1,4 @@
-"""Interface of the presenter to a solver, and its implementation for a simulated clock."""
+"""Interface between the presenter and a solver, with an implementation for a simulated clock."""
 
 from __future__ import annotations
 
@@ -12,41 +12,47 @@ from runtime.frame.effort import Costs
 from runtime.frame.solver import SolverUpdate
 from runtime.records import SolveRequest
 
-FIRST_REQUEST = SolveRequest(0, None, "none", 0.0, flat_wanted=True)  # before the first refresh: flat picture
+FIRST_REQUEST = SolveRequest(0, None, "none", 0.0, flat_wanted=True)  # asks for the flat picture, before any refresh
 
-SHOWN_STAGES = ("render", "prepare", "inference", "finish")  # stages in frames.jsonl, where steps belong to `finish`
+SHOWN_STAGES = ("render", "prepare", "inference", "finish")  # stages in frames.jsonl, where `finish` includes steps
 
 
 class SolverParts(Protocol):
     """A solver and the resources of its thread, such as a GL context."""
 
     def step(self, request: SolveRequest) -> SolverUpdate:
-        """Carry out one request."""
+        """Carry out one request and return its results."""
 
     def simulated_costs(self) -> Costs:
-        """Return the costs of solutions on a simulated clock, under the current settings."""
+        """Return the costs that solutions have on a simulated clock under the present settings."""
 
     def first_costs(self) -> Mapping[int, Mapping[str, float]]:
-        """Return the stage times in milliseconds, by reduction, measured while warming up."""
+        """Return the times in milliseconds that were measured while warming up, by reduction and stage."""
 
     def close(self) -> None:
-        """Release everything that no newer solver uses. Called on the thread that created it."""
+        """Release all resources that no newer solver uses.
+
+        This method is called on the thread that created the solver.
+        """
 
 
-Task = Callable[[SolverParts], bool]  # called between steps on the solver's thread until it returns True
+Task = Callable[[SolverParts], bool]  # function called between steps on the solver's thread until it returns True
 
 
 class SolverHost(ABC):
-    """Interface to a solver. The presenter posts requests and reads `news`, and never waits."""
+    """Base class of hosts, which run a solver for the presenter.
+
+    The presenter posts requests and reads results. Neither operation waits for the solver.
+    """
 
     @property
     @abstractmethod
     def costs(self) -> Costs:
-        """Return the current costs of solutions."""
+        """Present costs of solutions."""
 
     @abstractmethod
     def post(self, request: SolveRequest) -> None:
-        """Request a solution. The request replaces an earlier one that has not begun."""
+        """Request a solution. The request replaces an earlier request that has not begun."""
 
     @abstractmethod
     def news(self) -> SolverUpdate:
@@ -54,26 +60,30 @@ class SolverHost(ABC):
 
     @abstractmethod
     def do(self, task: Task) -> None:
-        """Run a task between steps, repeatedly until it returns True."""
+        """Run a task between steps of the solver, repeatedly until the task returns True."""
 
     @abstractmethod
     def close(self) -> None:
-        """Stop and release the solver's resources. May be called twice."""
+        """Stop the solver and release its resources. The method may be called twice."""
 
 
 def taken_in(news: SolverUpdate, step: SolverUpdate) -> SolverUpdate:
-    """Return `news` updated with the results and failures of a step."""
+    """Return `news` updated with the results of a step and with the parts that failed in the step."""
     return SolverUpdate(step.solution or news.solution, step.flat or news.flat, step.missing)
 
 
 class SimulatedSolver(SolverHost):
-    """Solver that computes at once and publishes a result when the simulated clock has passed its cost."""
+    """Host of a solver on a simulated clock.
+
+    A request is computed immediately. Its result is published once the simulated clock has advanced by the configured
+    cost of the solution.
+    """
 
     def __init__(self, parts: SolverParts, clock: Clock) -> None:
         self._parts, self._clock = parts, clock
         self._news = taken_in(SolverUpdate(), parts.step(FIRST_REQUEST))
         self._posted: tuple[int, SolveRequest] | None = None
-        self._under_way: tuple[int, SolverUpdate] | None = None  # completion time and result
+        self._under_way: tuple[int, SolverUpdate] | None = None  # completion time in nanoseconds, and result
         self._idle_since_ns = clock.now_ns()
         self._tasks: list[Task] = []
         self._closed = False
@@ -101,7 +111,7 @@ class SimulatedSolver(SolverHost):
             self._parts.close()
 
     def _advance(self) -> None:
-        """Process all events up to now, in order."""
+        """Publish results, run tasks and begin requests in order, up to the present time."""
         now_ns = self._clock.now_ns()
         while True:
             if self._under_way is not None:
@@ -119,7 +129,7 @@ class SimulatedSolver(SolverHost):
             self._under_way = begun_ns + cost_ns, step
 
     def _timed(self, step: SolverUpdate) -> tuple[SolverUpdate, int]:
-        """Return a result with the configured stage times, and their sum in nanoseconds."""
+        """Return the result with the configured stage times, and the cost of the step in nanoseconds."""
         solution, flat, costs = step.solution, step.flat, self.costs
         if solution is not None and solution.effort is not None:
             effort = solution.effort

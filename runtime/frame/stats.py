@@ -1,4 +1,7 @@
-"""Statistics of a run in bounded memory. Times are on the run's clock (`overhead_ms`: the machine's)."""
+"""Statistics of a run in bounded memory.
+
+All times are on the run's clock, except `overhead_ms`, which is on the machine's clock.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +17,18 @@ from runtime.frame.solver_host import SHOWN_STAGES
 from runtime.records import RefreshAccount, State
 
 WINDOW = 8192  # largest number of values kept for a quantile
-NOW_NS = NS_PER_S  # window of the present rates: the last second
-NOW_KEPT = 1024  # largest number of refreshes in that window
+NOW_NS = NS_PER_S  # time window over which the present rates are measured
+NOW_KEPT = 1024  # largest number of refreshes in the time window
 STAGES = ("sensor", "track", *SHOWN_STAGES, "present", "wait")
 OVERHEAD_STAGES = ("sensor", "track")
 
 
 class Quantiles:
-    """Quantiles over a run. If `size` values are kept, every second one is dropped; the maximum is exact."""
+    """Estimates quantiles of a stream of values in bounded memory.
+
+    At most `size` values are stored. When that many values are stored, every second stored value is dropped and the
+    sampling interval is doubled. The maximum is exact.
+    """
 
     def __init__(self, size: int = WINDOW) -> None:
         self._values = np.zeros(size)
@@ -39,7 +46,7 @@ class Quantiles:
         self._count += 1
 
     def of(self, *names: str) -> dict[str, float] | None:
-        """Return the named quantiles (`p50`, `p95`, `p99`, `max`, ...), or None before the first value."""
+        """Return the named quantiles (`p50`, `p95`, `p99`, `max`, ...), or None if no value has been added."""
         values = self._values[: -(-self._count // self._every)]
         if values.size == 0:
             return None
@@ -48,7 +55,7 @@ class Quantiles:
 
 
 class RunStats:
-    """Counters and quantiles of a run, updated once per refresh."""
+    """Counts refreshes and faults of a run, and collects quantiles of its times."""
 
     def __init__(self) -> None:
         self.frames = self.presented = self.dropped = self.solutions = self.missed_blanks = 0
@@ -60,13 +67,16 @@ class RunStats:
         self._overhead_run, self._skew, self._age, self._sigma = Quantiles(), Quantiles(), Quantiles(), Quantiles()
         self._view_error = Quantiles()
         self._efforts_ns: dict[str, int] = {}
-        self._effort: str | None = None  # effort shown since the last refresh
+        self._effort: str | None = None  # effort of the solution shown at the last refresh
         self._recent: deque[tuple[int, bool, bool]] = deque(maxlen=NOW_KEPT)  # time, presented, shows a new solution
 
     def add(self, account: RefreshAccount, *, overhead_ms: float, missed_blanks: int = 0) -> None:
         """Count a refresh.
 
-        overhead_ms: time that it took on the machine's clock, without presenting and waiting.
+        Args:
+            account: Account of the refresh.
+            overhead_ms: Time that the refresh took on the machine's clock, not counting presenting and waiting.
+            missed_blanks: Number of vertical blanks missed since the start of the run.
         """
         now_ns, ran = account.present_ns, account.inference == "ran"
         self._first_ns = now_ns if self._first_ns < 0 else self._first_ns
@@ -81,7 +91,7 @@ class RunStats:
         self._recent.append((now_ns, account.presented, ran))
         for stage, spent_ms in account.stage_ms.items():
             self._stages[stage].add(spent_ms)
-        if self.frames > 1:  # the first one allocates buffers
+        if self.frames > 1:  # the first refresh allocates buffers
             self._overhead.add(overhead_ms)
             self._overhead_run.add(sum(account.stage_ms.get(stage, 0.0) for stage in OVERHEAD_STAGES))
         if not account.presented:
@@ -101,17 +111,20 @@ class RunStats:
             self._view_error.add(view_error_mm(account.eyes_m, account.solved_for_m))
 
     def seconds(self) -> float:
-        """Return the seconds from the first refresh to the last."""
+        """Return the time in seconds from the first refresh to the last refresh."""
         return (self._last_ns - self._first_ns) / NS_PER_S if self.frames else 0.0
 
     def reuse_saves_ms(self) -> float | None:
-        """Return the solver time in ms saved by a refresh that reuses a solution; None before the first."""
+        """Return the solver time in ms saved by reusing a solution, or None if none has been reused."""
         medians = [self._stages[stage].of("p50") for stage in SHOWN_STAGES]
         known = [median["p50"] for median in medians if median is not None]
         return sum(known) if known and self.presented > self.solutions > 0 else None
 
     def rates_now(self) -> dict[str, float | None]:
-        """Return the present refreshes and solutions per second, or None with fewer than two refreshes."""
+        """Return the rates of refreshes and solutions per second over the last second.
+
+        A rate is None if there were fewer than two refreshes in the last second.
+        """
         newest_first = reversed(tuple(self._recent))
         recent = [*takewhile(lambda entry: entry[0] > self._last_ns - NOW_NS, newest_first)][::-1]
         if len(recent) < 2:
@@ -127,7 +140,14 @@ class RunStats:
         self.faults[part] = self.faults.get(part, 0) + 1
 
     def summary(self, *, stale_inputs: int, simulated: bool = False) -> dict[str, Any]:
-        """Return the counted part of summary.json (docs/contracts.md). Figures not measured are null."""
+        """Return the part of summary.json with counts and times (docs/contracts.md).
+
+        Figures that were not measured are null.
+
+        Args:
+            stale_inputs: Number of samples that were superseded by a newer one.
+            simulated: True if the run's clock is simulated. The overhead is then taken from the configured stage times.
+        """
         seconds = self.seconds()
         return {
             "frames": self.frames,

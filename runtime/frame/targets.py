@@ -1,4 +1,4 @@
-"""Draw target pictures for given eyes on the solver's thread, in its GL context."""
+"""Draw target pictures for given eyes on the solver's thread, in the GL context of the solver."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import retina_pictures
 from runtime.records import F64
 
-Wanted = Mapping[str, tuple[F64, int]]  # by field of `RefreshTargets`: eyes (2, 3), frame `stack`, and an instant
+Wanted = Mapping[str, tuple[F64, int]]  # eyes (2, 3) in frame `stack` and an instant, by field of `RefreshTargets`
 
 
 class TargetDrawer:
-    """Draws targets between the solver's steps."""
+    """Draws target pictures between the steps of the solver."""
 
     def __init__(
         self,
@@ -27,19 +27,26 @@ class TargetDrawer:
         fov_deg: Callable[[], float],
         shown_content: Callable[[], object | None] = lambda: None,
     ) -> None:
-        """Create a drawer of targets.
+        """Create a drawer of target pictures.
 
-        fov_deg: function that returns the targets' present field of view, which a reload may change. shown_content:
-        function that returns the run's present content, or None if it is never replaced.
+        Args:
+            solver: Solver on whose thread the pictures are drawn.
+            stack: Panels of the display.
+            fov_deg: Function that returns the present field of view of target pictures, which a reload may change.
+            shown_content: Function that returns the present content of the run, or None if the content is never
+                replaced.
         """
         self._solver, self._stack, self.fov_deg = solver, stack, fov_deg
         self.shown_content = shown_content
 
     def draw(self, wanted: Wanted, content: object | None, then: Callable[[RefreshTargets | None], None]) -> None:
-        """Draw the wanted pictures and pass them to `then`, on the solver's thread.
+        """Draw the wanted pictures on the solver's thread, and pass them to `then`.
 
-        content: the run's content at that refresh; None: the present one. `then` receives None if drawing failed (the
-        run's state gives the reason) or the content has been replaced.
+        Args:
+            wanted: Eyes and instant of each picture pair, by field of `RefreshTargets`.
+            content: Content of the run at the refresh to draw for. None means the present content.
+            then: Function that receives the pictures, on the solver's thread. It receives None if `content` has been
+                replaced or drawing failed. The state of the run gives the reason for the failure.
         """
 
         def task(parts: Any) -> bool:

@@ -1,4 +1,4 @@
-"""True eye positions at any instant, interpolated between a recording's samples."""
+"""True eye positions at any instant, interpolated between the samples of a recording."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from collections import deque
 from runtime.clock import NS_PER_S
 from runtime.records import F64
 
-GAP_NS = NS_PER_S // 5  # longer gaps are not interpolated
-KEPT = 512  # samples kept: eight seconds at 60 Hz
+GAP_NS = NS_PER_S // 5  # longest gap between samples that is interpolated
+KEPT = 512  # number of samples kept, which cover eight seconds at 60 Hz
 
 
 class TrueEyes:
-    """True eye positions from a recording, interpolated between capture times."""
+    """Stores the true eyes of recent samples and interpolates between their capture times."""
 
     def __init__(self) -> None:
         self._known: deque[tuple[int, F64]] = deque(maxlen=KEPT)
@@ -20,11 +20,16 @@ class TrueEyes:
 
     @property
     def is_recorded(self) -> bool:
-        """True once a sample has contained true eyes. Samples of live sensors never do."""
+        """True once a sample has contained true eyes, which only recordings contain."""
         return bool(self._known)
 
     def add(self, capture_ns: int, eyes_m: F64) -> None:
-        """Add a sample's true eyes, (2, 3), frame `stack`."""
+        """Add the true eyes of a sample.
+
+        Args:
+            capture_ns: Capture time of the sample.
+            eyes_m: (2, 3) true eyes in frame `stack`.
+        """
         if not self._known or capture_ns > self._known[-1][0]:
             self._known.append((capture_ns, eyes_m))
 
@@ -33,11 +38,11 @@ class TrueEyes:
         self._ended = True
 
     def may_come(self, time_ns: int) -> bool:
-        """Return True while the true eyes at an instant are unknown but later samples may determine them."""
+        """Return True if the true eyes at an instant are still unknown but later samples may determine them."""
         return bool(self._known) and time_ns > self._known[-1][0] and not self._ended
 
     def at(self, time_ns: int) -> F64 | None:
-        """Return the true eyes (2, 3) at an instant, or None if unknown."""
+        """Return the true eyes (2, 3) at an instant, or None if they are unknown."""
         if not self._known or time_ns > self._known[-1][0]:
             return None
         after_ns, after_m = self._known[-1]
