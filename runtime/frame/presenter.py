@@ -1,8 +1,8 @@
-"""Presenter: the loop that aligns the newest solution to the eyes at every refresh.
+"""Present the newest solution at every refresh, aligned to the eyes at the display time.
 
-At each refresh, the loop takes samples, predicts the eyes, aligns the newest solution to the eyes at the refresh's
-display time, presents it and records the result. It waits only for its slot. The solver (`solver_host`) runs in
-parallel and delivers complete solutions.
+At each refresh, the presenter takes the samples that have arrived, predicts the eyes, aligns the newest solution to the
+eyes at the display time, presents the solution and records the result. It waits only for the time slot of the refresh.
+The solver (`solver_host`) runs in parallel and delivers complete solutions.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ log = logging.getLogger("phasestack.presenter")
 class Supervisor:
     """Hooks through which the daemon controls the presenter.
 
-    They are called once per refresh and must not wait.
+    The presenter calls each hook once per refresh. The hooks must not wait.
     """
 
     def stop_reason(self) -> str:
@@ -57,33 +57,39 @@ class Supervisor:
         return ""
 
     def carry_out_commands(self, presenter: Presenter) -> None:
-        """Carry out the operator's commands received since the last refresh."""
+        """Carry out the operator's commands that have been received since the last refresh."""
 
     def refreshed(self, presenter: Presenter, account: RefreshAccount) -> None:
-        """Handle a complete refresh."""
+        """Handle the account of a completed refresh."""
 
 
 @dataclass(frozen=True, slots=True)
 class Refresh:
-    """All data of one refresh, for observers."""
+    """Data of one refresh that is passed to observers."""
 
     account: RefreshAccount
     frame: PanelFrame
-    solution: Solution | None
+    solution: Solution | None  # newest solution at this refresh
 
 
 class Observer(Protocol):
-    """Observer of refreshes. Its methods must return quickly."""
+    """Receiver of samples and refreshes.
+
+    The presenter calls the methods during each refresh, and they must return quickly.
+    """
 
     def sampled(self, sample: SensorFrame) -> None:
         """Handle a sample that has arrived."""
 
     def refreshed(self, refresh: Refresh) -> None:
-        """Handle a complete refresh."""
+        """Handle a completed refresh."""
 
 
 class RefreshTimes:
-    """Stage times of a refresh. On a simulated clock, each stage takes its configured time."""
+    """Measures the stage times of a refresh.
+
+    On a simulated clock, each stage takes its configured time and advances the clock by this time.
+    """
 
     def __init__(self, clock: Clock, simulated_ms: Mapping[str, float]) -> None:
         self._simulated = clock if isinstance(clock, SimulatedClock) else None
@@ -108,13 +114,19 @@ class RefreshTimes:
             self.stage_ms[stage] = cost_ms
 
     def overhead_ms(self) -> float:
-        """Return the time on the machine's clock that the refresh has taken, without presenting and waiting."""
+        """Return the time in milliseconds that the refresh has taken on the machine's clock.
+
+        The times of presenting and waiting are not included.
+        """
         whole_ms = (perf_counter_ns() - self._start_ns) / NS_PER_MS
         return max(0.0, whole_ms - sum(self._watch.stage_ms.get(stage, 0.0) for stage in ("present", "wait")))
 
 
 class Presenter:
-    """Presenter of one run. It owns only its counters; the caller owns the parts that are passed in."""
+    """Runs the refresh loop of one run.
+
+    The presenter does not close the parts that are passed to its constructor. They belong to the caller.
+    """
 
     def __init__(
         self,
@@ -134,7 +146,19 @@ class Presenter:
     ) -> None:
         """Create a presenter.
 
-        stage_ms: duration of each stage of a refresh on a simulated clock. fixed: as for `Aim`.
+        Args:
+            run: Holder of the run's state.
+            stack: Panels of the display.
+            clock: Clock of the run.
+            pacer: Scheduler of the refreshes.
+            samples: Source of samples.
+            viewer: Viewer whose eyes are estimated from the samples.
+            solver: Host of the solver.
+            panels: Panels to present on.
+            stage_ms: Duration in milliseconds of each stage of a refresh on a simulated clock.
+            supervisor: Hooks of the daemon.
+            observers: Receivers of all samples and refreshes.
+            fixed: Effort of every solution if `model.effort` is `full`. None means all steps on the full raster.
         """
         self.run_cell, self.stack, self.clock = run, stack, clock
         self.pacer, self.samples, self.viewer, self.solver, self.panels = pacer, samples, viewer, solver, panels
@@ -147,16 +171,19 @@ class Presenter:
         self._lateness = Lateness(pacer.period_ns)
         self.flat_asked = False
         self.paused = False
-        self.missing: dict[str, str] = {}  # failed parts, with the reason
+        self.missing: dict[str, str] = {}  # reason for each part that has failed
         self.last: Refresh | None = None
         self._flatness = Flatness()
         self._presented = False
         self._shown_solution: int | None = None  # number of the solution shown at the previous refresh
         self._drew_solution = False  # True once any solution has been on the panels
-        self._aligned: tuple[int, bytes, Alignment] | None = None  # solution number, eyes, and their alignment
+        self._aligned: tuple[int, bytes, Alignment] | None = None  # newest alignment, with its solution number and eyes
 
     def run(self, *, frames: int | None = None) -> str:
-        """Refresh until the recording ends, `frames` are done or a stop is requested. Return the reason."""
+        """Refresh the panels until the run ends, and return the reason for the end.
+
+        The run ends when the recording has ended, when `frames` refreshes are done, or when a stop is requested.
+        """
         reason = ""
         while not reason:
             try:
@@ -170,7 +197,12 @@ class Presenter:
         return reason
 
     def refresh(self) -> RefreshAccount:
-        """Run one refresh and return its account. Raises EndOfRecording and FatalError."""
+        """Run one refresh and return its account.
+
+        Raises:
+            EndOfRecording: The recording that serves as the sensor has ended.
+            FatalError: The sensor has failed permanently.
+        """
         times = RefreshTimes(self.clock, self._stage_ms)
         timing = self.pacer.predict(self.clock.now_ns())
         self.clock.sleep_until_ns(timing.wake_ns)
@@ -186,7 +218,7 @@ class Presenter:
         times.lap("track")
         report, lost = self._present(frame)
         times.lap("present")
-        if report is not None and times.simulated:  # only now has the clock advanced by the cost of presenting
+        if report is not None and times.simulated:  # the lap has advanced the clock by the cost of presenting
             report = replace(report, present_ns=self.clock.now_ns())
         photon_ns = self._presented_at(timing, report, woke_ns=woke_ns)
         request = self._aim.request(
@@ -218,7 +250,10 @@ class Presenter:
                 observer.sampled(sample)
 
     def _compose(self, timing: FrameTiming, eyes: EyesEstimate, news: SolverUpdate) -> tuple[PanelFrame, str]:
-        """Return the frame for the panels, and the reason if the alignment is at its limit."""
+        """Return the frame for the panels, and the reason if the alignment is at its limit.
+
+        The reason is "" if the alignment is within its limits.
+        """
         solution, flat = news.solution, news.flat
         target = 1.0 if eyes.eyes_m is None or self.flat_asked else 0.0
         if solution is None:
@@ -247,9 +282,10 @@ class Presenter:
         return frame, alignment.limited
 
     def _alignment(self, eyes: EyesEstimate, solution: Solution | None) -> Alignment:
-        """Return the solution's alignment to the eyes or, without eyes, the previous one.
+        """Return the alignment of the solution to the eyes.
 
-        It has no matrices if the layers can be shown as solved.
+        If no eyes are known, the previous alignment of the same solution is returned. The alignment has no matrices if
+        the layers are shown as solved.
         """
         plan = self.run_cell.state.settings.plan
         if solution is None or solution.solved_for_m is None or not plan.align:
@@ -265,7 +301,11 @@ class Presenter:
         return last[2]
 
     def _present(self, frame: PanelFrame) -> tuple[PresentReport | None, str]:
-        """Present a frame. Return (None, reason) if a panel is lost, (None, "") before the first picture."""
+        """Present a frame.
+
+        Returns:
+            The report and "". If a panel is lost, None and the reason. If there is no picture yet, None and "".
+        """
         if frame.solved is None and frame.flat is None:
             return None, ""
         unchanged = self.last is not None and self.last.account.presented and _same(frame, self.last.frame)
@@ -278,7 +318,7 @@ class Presenter:
         return report, ""
 
     def _presented_at(self, timing: FrameTiming, report: PresentReport | None, *, woke_ns: int) -> int:
-        """Report the outcome to the pacer and return the display time."""
+        """Report the outcome of a refresh to the pacer, and return the display time."""
         blank_ns = report.vblank_ns if report is not None else None
         return self.pacer.presented(timing, woke_ns=woke_ns, done_ns=self.clock.now_ns(), blank_ns=blank_ns)
 
@@ -321,7 +361,7 @@ class Presenter:
         state: State,
         times: RefreshTimes,
     ) -> RefreshAccount:
-        solution = news.solution if report is not None and frame.flatness < 1.0 else None  # only if it is visible
+        solution = news.solution if report is not None and frame.flatness < 1.0 else None  # None if it is not visible
         ran = solution is not None and solution.number != self._shown_solution
         stage_ms = dict(times.stage_ms)
         if solution is not None and ran:
@@ -359,9 +399,10 @@ class Presenter:
             observer.refreshed(self.last)
 
     def summary(self, *, simulated: bool = False) -> dict[str, Any]:
-        """Return the counted part of summary.json (docs/contracts.md).
+        """Return the part of summary.json with counts, times, model and states (docs/contracts.md).
 
-        simulated: True if the run's clock is simulated.
+        Args:
+            simulated: True if the run's clock is simulated.
         """
         predictor = self.run_cell.state.predictor
         return {

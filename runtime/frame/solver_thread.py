@@ -1,4 +1,4 @@
-"""Run a solver on a thread, which is abandoned and replaced if a call hangs."""
+"""Run a solver on its own thread, which is abandoned and replaced if a call hangs."""
 
 from __future__ import annotations
 
@@ -23,43 +23,49 @@ from runtime.support.untrusted_input import LIMITS
 
 log = logging.getLogger("phasestack.solver")
 
-LATE_S = 0.5  # a longer step is late; a single step that takes twice this is a fault
-ABANDON_S = 10.0  # a step that takes longer is abandoned, and a new solver is started
-# Starting a solver may take `LIMITS.start_s`, and a task, which loads content, `LIMITS.load_s`.
-IDLE_S = 0.02  # interval between checks for tasks while requests are absent
-USUAL_S = 0.2  # when stopping, a running step gets this long to finish
-LATE_STEPS = 3  # this many consecutive late steps raise a fault; this many on time clear it
+LATE_S = 0.5  # a step that takes longer is late; a step that takes twice as long is a fault by itself
+ABANDON_S = 10.0  # a thread whose step takes longer is abandoned, and a new solver is started
+# The limit is `LIMITS.start_s` for starting a solver, and `LIMITS.load_s` for a task, which may load content.
+IDLE_S = 0.02  # interval between checks for tasks while no requests arrive
+USUAL_S = 0.2  # time that a running step gets to finish when the host stops
+LATE_STEPS = 3  # number of consecutive late steps that cause a fault, and of punctual steps that clear the fault
 ANSWER_STEP_MS = 500  # resolution of the reported time without an answer
-ABANDONED_MAX = 4  # with this many hung threads, no new solver is started
+ABANDONED_MAX = 4  # number of hung threads at which no new solver is started
 
 
 class _Attempt:
-    """One thread with one solver. Once it is abandoned, its results are ignored."""
+    """State of one thread that runs one solver. The results of an abandoned thread are ignored."""
 
     def __init__(self, number: int) -> None:
         self.number, self.abandoned = number, threading.Event()
         self.ready = threading.Event()
-        self.busy_since_ns = 0  # 0: idle
+        self.busy_since_ns = 0  # start of the running step or task; 0 while idle
         self.is_at_task = False
         self.took_ns: deque[int] = deque(maxlen=LATE_STEPS)  # durations of the last steps
-        self.costs: CostBook | None = None  # measured on this machine and scene
-        self.error: BaseException | None = None
+        self.costs: CostBook | None = None  # costs of solutions measured on this machine and scene
+        self.error: BaseException | None = None  # error that ended the thread
         self.thread: threading.Thread | None = None
 
     def leave(self) -> None:
-        """Make the thread give up between two drawing calls, because drawing keeps taking the GIL."""
+        """Make the thread end between two drawing calls, because drawing repeatedly takes the GIL."""
         if self.thread is not None and self.thread is not threading.current_thread():
             abandon(self.thread)
 
 
 class SolverThread(SolverHost):
-    """Host that runs a solver in parallel with the presenter. `post`, `news` and `watch` never wait."""
+    """Runs a solver in parallel with the presenter.
+
+    If the solver hangs, its thread is abandoned and a new solver is started on another thread. `post` and `news` never
+    wait for the solver.
+    """
 
     def __init__(self, make: Callable[[], SolverParts], clock: Clock) -> None:
         """Start a solver on a new thread.
 
-        make: function that creates a solver, with its own GL context, on the thread that calls it. It is called again
-        after a hang.
+        Args:
+            make: Function that creates a solver and its GL context on the calling thread. It is called again after a
+                hang or an error.
+            clock: Clock of the run.
         """
         self._make, self._clock = make, clock
         self._late_ns, self._abandon_ns = round(LATE_S * NS_PER_S), round(ABANDON_S * NS_PER_S)
@@ -77,8 +83,13 @@ class SolverThread(SolverHost):
     def wait_ready(self, go_on: Callable[[], bool] = lambda: True, *, max_s: float = math.inf) -> None:
         """Wait until the solver accepts requests.
 
-        go_on: function that is polled and returns False to stop waiting. Raises the error that prevented the start,
-        or FatalError after `max_s`.
+        Args:
+            go_on: Function that is polled. Waiting ends without an error if it returns False.
+            max_s: Longest time to wait in seconds.
+
+        Raises:
+            FatalError: The solver is not ready after `max_s`.
+            BaseException: Any error that prevented the start of the solver.
         """
         begun_ns = self._clock.now_ns()
         while not self._attempt.ready.wait(0.1):
@@ -91,7 +102,7 @@ class SolverThread(SolverHost):
 
     @property
     def costs(self) -> Costs:
-        return self._costs or Costs(defaultdict(dict))  # needed once if a run is stopped while it starts
+        return self._costs or Costs(defaultdict(dict))  # no costs are known if a run is stopped while it starts
 
     def post(self, request: SolveRequest) -> None:
         with self._lock:
@@ -109,7 +120,13 @@ class SolverThread(SolverHost):
         self._tasks.put(task)
 
     def close(self, timeout_s: float = 1.0) -> None:
-        """Stop. A solver that is still starting is not waited for (`commands.guard` ends the process)."""
+        """Stop the solver and wait for its thread to end.
+
+        A solver that is still starting is not waited for, because `commands.guard` ends the process.
+
+        Args:
+            timeout_s: Longest time to wait in seconds.
+        """
         self._closing.set()
         with self._lock:
             self._lock.notify_all()
@@ -123,12 +140,15 @@ class SolverThread(SolverHost):
             thread.join(patience_s(timeout_s))
 
     def _late_reason(self) -> str:
-        """Return why the solver is unavailable or late, otherwise "". Replaces a hung thread."""
+        """Replace a hung thread, and return the reason why the solver is unavailable or late.
+
+        The reason is "" if the solver works in time.
+        """
         attempt = self._attempt
         busy_ns = self._clock.now_ns() - attempt.busy_since_ns if attempt.busy_since_ns else 0
         if attempt.error is not None:
             if busy_ns > self._abandon_ns:
-                with suppress(TransientError):  # no thread available
+                with suppress(TransientError):  # no thread is available, so the next refresh tries again
                     self._attempt = self._begin(attempt.number + 1)
             return f"the solver failed; restarting ({_line(attempt.error)})"
         if busy_ns <= 2 * self._late_ns:
@@ -144,7 +164,7 @@ class SolverThread(SolverHost):
         if busy_ns > abandon_ns:
             self._hung = [hung for hung in self._hung if hung.thread is not None and hung.thread.is_alive()]
         if busy_ns > abandon_ns and len(self._hung) < ABANDONED_MAX:
-            with suppress(TransientError):  # no thread available: retried at the next refresh
+            with suppress(TransientError):  # no thread is available, so the next refresh tries again
                 self._attempt = self._begin(attempt.number + 1)
                 with self._lock:
                     attempt.abandoned.set()
@@ -196,16 +216,16 @@ class SolverThread(SolverHost):
                 if request is not None:
                     self._step(attempt, parts, request)
         except (ContextLost, Stopped) as error:
-            log.error("solver: %s", _line(error))  # log only text, because the error's frames keep large objects alive
+            log.error("solver: %s", _line(error))  # log only text, because a traceback keeps large objects alive
             attempt.error, attempt.busy_since_ns = error.with_traceback(None), self._clock.now_ns()
         except ThreadAbandoned:
             raise
-        except BaseException as error:  # not an expected failure but a bug, here or in a library
+        except BaseException as error:  # an unexpected failure, caused by a bug in this program or a library
             log.exception("solver")
             attempt.error, attempt.busy_since_ns = error.with_traceback(None), self._clock.now_ns()
         finally:
             parts.close()
-            if attempt.abandoned.is_set():  # no longer needed, and its frames keep large objects alive
+            if attempt.abandoned.is_set():  # the error is no longer needed, and may keep large objects alive
                 attempt.error = None
 
     def _adopt_model(self, attempt: _Attempt, parts: SolverParts) -> None:
@@ -233,14 +253,14 @@ class SolverThread(SolverHost):
             self._costs = attempt.costs.costs()
 
     def _publish(self, attempt: _Attempt, step: SolverUpdate) -> bool:
-        """Add the results of a step to the news. Return False if this attempt has been abandoned."""
+        """Add the results of a step to the news, and return True unless this thread has been abandoned."""
         with self._lock:
             if not attempt.abandoned.is_set():
                 self._news = taken_in(self._news, step)
             return not attempt.abandoned.is_set()
 
     def _do_tasks(self, attempt: _Attempt, parts: SolverParts) -> None:
-        """Run each task once. Unfinished tasks are queued again, to run after the next step."""
+        """Run each queued task once. Unfinished tasks are queued again and run after the next step."""
         for _ in range(self._tasks.qsize()):
             if attempt.abandoned.is_set():
                 return

@@ -1,4 +1,4 @@
-"""Estimate the viewer's eyes at any instant: calibrate samples, track them and detect rest."""
+"""Estimate the viewer's eyes at any instant from calibrated and tracked samples of the sensor."""
 
 from __future__ import annotations
 
@@ -17,19 +17,27 @@ from runtime.records import EyesEstimate, SensorFrame
 
 log = logging.getLogger("phasestack.viewer")
 
-MAX_REST_DRIFT_M = 0.001  # drift of a resting head before its position is updated
-IN_FRONT_M = 0.01  # eyes nearer to the front panel than this, or behind it, are ignored
+MAX_REST_DRIFT_M = 0.001  # drift of a resting head beyond which its position is updated
+IN_FRONT_M = 0.01  # eyes behind the front panel, or less than this distance in front of it, are ignored
 
 
 class Viewer:
-    """Viewer, whose eyes are estimated in the `stack` frame. Single-threaded; never reads a clock."""
+    """Estimates the eyes of one viewer in frame `stack` from the samples of a sensor.
+
+    The class calibrates the samples, tracks the eyes and detects a head at rest. It is not thread-safe and never reads
+    a clock.
+    """
 
     def __init__(
         self, settings: Settings, calibration: Calibration, *, front_m: float, in_stack_frame: bool = False
     ) -> None:
-        """Create a viewer who has not been seen.
+        """Create a viewer who has not been seen yet.
 
-        front_m: x of the front panel. in_stack_frame: True if the sensor's points are already in frame `stack`.
+        Args:
+            settings: Settings of the run.
+            calibration: Calibration of the sensor.
+            front_m: x coordinate of the front panel, in frame `stack`.
+            in_stack_frame: True if the sensor already measures in frame `stack`.
         """
         self._settings, self._calibration = settings, calibration
         self._nearest_m, self._in_stack_frame = front_m + IN_FRONT_M, in_stack_frame
@@ -40,7 +48,10 @@ class Viewer:
         self._captures_ns: deque[int] = deque(maxlen=64)
 
     def adopt(self, settings: Settings, calibration: Calibration) -> None:
-        """Adopt new settings. The tracker is reset only if its own settings have changed."""
+        """Adopt new settings and a new calibration.
+
+        The tracker is reset only if the tracker settings have changed.
+        """
         before, self._settings, self._calibration = self._settings, settings, calibration
         if settings.tracker != before.tracker:
             self._tracker = self._new_tracker()
@@ -54,25 +65,27 @@ class Viewer:
 
     @property
     def warning(self) -> str:
-        """Reason why most recent samples are implausible (eyes swapped, millimetres, ...), or ""."""
+        """Reason why most of the recent samples are implausible, such as swapped eyes, or ""."""
         return self._refusals.warning
 
     @property
     def refused(self) -> Mapping[str, int]:
-        """Return the number of refused samples by reason."""
+        """Number of samples that the tracker has refused, by reason."""
         return self._refusals.counts
 
     @property
     def rate_hz(self) -> float | None:
-        """Return the number of samples per second, from recent capture times; None before there are two."""
+        """Recent number of samples per second, or None if fewer than two samples have been captured."""
         if len(self._captures_ns) < 2 or self._captures_ns[-1] <= self._captures_ns[0]:
             return None
         return round((len(self._captures_ns) - 1) * NS_PER_S / (self._captures_ns[-1] - self._captures_ns[0]), 2)
 
     def take(self, frame: SensorFrame, *, serial: str) -> None:
-        """Process a sample. If the tracker refuses it, it is only counted.
+        """Process a sample. A sample that the tracker refuses is only counted.
 
-        serial: serial number of the sensor.
+        Args:
+            frame: The sample.
+            serial: Serial number of the sensor, or "" if it is unknown.
         """
         self._captures_ns.append(frame.capture_ns)
         points = frame.eyes
@@ -90,15 +103,19 @@ class Viewer:
                 log.warning("%s", warning)
 
     def at(self, display_ns: int) -> EyesEstimate:
-        """Return the eyes at a refresh's display time, for aligning the next picture."""
+        """Return the eyes at the display time of a refresh, for aligning the solution that it shows."""
         return self._served(self._tracker.at(display_ns))
 
     def ahead(self, time_ns: int) -> EyesEstimate:
-        """Return the eyes at a future instant, for the solver."""
+        """Return the eyes at a later instant, for the solver to compute a solution for."""
         return self._served(self._tracker.ahead(time_ns))
 
     def _served(self, eyes: EyesEstimate) -> EyesEstimate:
-        """Return `eyes`, with the fixed position of a resting head, or without eyes inside the panels."""
+        """Return `eyes` after two corrections.
+
+        The eyes of a resting head are replaced by their fixed position. Eyes too close to the front panel or behind it
+        are removed.
+        """
         if eyes.eyes_m is None:
             return eyes
         if self._rest is not None and self._rest.place is not None:
@@ -110,5 +127,5 @@ class Viewer:
 
 
 def _rest_watch(settings: Settings) -> RestWatch | None:
-    """Create the rest watch, or return None if pictures must not be reused for nearly unchanged eyes."""
+    """Create the detector of a resting head, or return None if `plan.enabled` is off."""
     return RestWatch(max_drift_m=MAX_REST_DRIFT_M) if settings.plan.enabled else None
