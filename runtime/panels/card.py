@@ -16,10 +16,11 @@ FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def identity_card(width_px: int, height_px: int, *, title: str, lines: Sequence[str]) -> U8:
-    """Draw a card (height_px, width_px, 4) with text, an upward arrow, colour bars and grey steps.
+    """Draw a test card (height_px, width_px, 4) with text, an upward arrow, colour bars and grey steps.
 
-    A one-pixel line runs along every edge. If one is invisible, the panel is cropped or misaligned. Text keeps away
-    from the edges, because nearby viewers see the rim of the front panel without a lit panel behind it.
+    The card has a line one pixel wide along every edge. If one of these lines is invisible, the panel is cropped or
+    misaligned. The text is placed away from the edges, because nearby viewers see the rim of the front panel without a
+    lit panel behind it.
     """
     card = np.empty((height_px, width_px, 4), np.uint8)
     card[:] = PAPER
@@ -41,7 +42,7 @@ def identity_card(width_px: int, height_px: int, *, title: str, lines: Sequence[
 
 
 def alone(cards: Sequence[U8], index: int) -> U8:
-    """Return layers (N, H, W, 4) with the card on one panel while the others are clear."""
+    """Return layers (N, H, W, 4) that show the card of panel `index` alone and zero on all other panels."""
     layers = np.zeros((len(cards), *cards[index].shape), np.uint8)
     layers[..., 3] = 255
     layers[index] = cards[index]

@@ -1,4 +1,7 @@
-"""GLFW on X11: monitors, and windows that share GL objects. For the main thread only."""
+"""List monitors and open windows that share GL objects, with GLFW on X11.
+
+The module may be used only on the main thread.
+"""
 
 from __future__ import annotations
 
@@ -18,29 +21,33 @@ from runtime.support.gl import MINIMUM_VERSION
 
 log = logging.getLogger("phasestack.panels")
 
-glfw: Any = _glfw  # untyped, because its stubs are wrong about bytes, None and pointers
+glfw: Any = _glfw  # untyped, because the stubs of GLFW are wrong about bytes, None and pointers
 
-# The binding would otherwise turn errors into warnings.
+# By default, the binding turns errors into warnings.
 glfw.ERROR_REPORTING = "exception"
 
 
 @cache
 def gl_function(name: str) -> int:
-    """Return the address of an OpenGL function, or 0 if it is missing. It is the same in all contexts.
+    """Return the address of an OpenGL function, or 0 if the function is missing.
 
-    Cached, because moderngl keeps references to all functions, which take 20 KiB per context.
+    The address is the same in all contexts. Addresses are cached, because moderngl keeps references to all functions,
+    which would otherwise take 20 KiB per context.
     """
     return int(glfw.get_proc_address(name) or 0)
 
 
 class WindowContext:
-    """Adapter of a GLFW window for moderngl, which loads functions and makes the context current."""
+    """Gives moderngl access to the GL context of a GLFW window.
+
+    moderngl uses the adapter to load OpenGL functions and to make the context current.
+    """
 
     def __init__(self, window: Any) -> None:
         self._window = window
 
     def load_opengl_function(self, name: str) -> int:
-        """Return the address of an OpenGL function."""
+        """Return the address of an OpenGL function, or 0 if the function is missing."""
         return gl_function(name)
 
     load = load_opengl_function
@@ -61,22 +68,25 @@ class Window:
 
     handle: Any
     context: moderngl.Context
-    faults: list[str] = field(default_factory=list)  # faults reported by callbacks
+    faults: list[str] = field(default_factory=list)  # faults that callbacks have reported
 
     def make_current(self) -> None:
         """Make the window's context current on this thread."""
         glfw.make_context_current(self.handle)
 
 
-watch: xlib.ServerWatch | None = None  # watches the connection of this process
+watch: xlib.ServerWatch | None = None  # watch on the connection of this process to the X server
 
 
 def _connect() -> None:
-    """Connect GLFW to the X server until the process ends.
+    """Connect GLFW to the X server for the remaining life of the process.
 
-    The connection stays open because, when the panels lose their contexts, another thread may still use a context of
-    the same EGL display. If GLFW closed that display, Mesa would use freed memory.
-    Raises PanelLost if no X server can be reached, and MissingPart if GLFW does not use X11.
+    The connection stays open because another thread may still use a context of the same EGL display after the panels
+    have lost their contexts. If GLFW closed this EGL display, Mesa would access freed memory.
+
+    Raises:
+        PanelLost: No X server can be reached.
+        MissingPart: GLFW does not use X11.
     """
     global watch
     if watch is not None:
@@ -95,13 +105,19 @@ def _connect() -> None:
 
 
 class Display:
-    """Windows on the X server. A hidden root window owns the GL objects that all others share.
+    """Opens and closes windows on the X server, and lists its monitors.
 
-    `close` closes every window. If the X server dies, the process ends (see `xlib.take_over_errors`).
+    A hidden root window owns the GL objects that all other windows share. If the X server dies, the process ends (see
+    `xlib.take_over_errors`).
     """
 
     def __init__(self) -> None:
-        """Connect. Raises PanelLost if the X server cannot be used, and MissingPart without an X11 library."""
+        """Connect to the X server.
+
+        Raises:
+            PanelLost: No X server can be reached.
+            MissingPart: GLFW does not use X11, for example because an X11 library is missing.
+        """
         self.faults: list[str] = []
         self._windows: list[Window] = []
         self._outputs: dict[str, int] = {}
@@ -110,9 +126,12 @@ class Display:
 
     @property
     def root(self) -> Window:
-        """Hidden root window, created on first use because listing monitors needs no OpenGL.
+        """Hidden root window.
 
-        Raises PanelLost if the X server does not support OpenGL.
+        The window is created on first use, because listing monitors requires no OpenGL.
+
+        Raises:
+            PanelLost: The X server does not support OpenGL.
         """
         if not self._windows:
             _hints()
@@ -124,13 +143,14 @@ class Display:
         return self._windows[0]
 
     def monitors(self) -> tuple[Monitor, ...]:
-        """Return the active monitors, from left to right."""
+        """Return the active monitors from left to right."""
         return in_order([monitor for monitor, _ in self._pairs()])
 
     def fullscreen_window(self, monitor: Monitor, *, title: str) -> Window:
-        """Open a borderless window that fills a monitor, and make its context current.
+        """Open a borderless window that fills a monitor, and make the context of the window current.
 
-        Raises PanelLost if the monitor is no longer connected or the X server does not support OpenGL.
+        Raises:
+            PanelLost: The monitor is no longer connected, or the X server does not support OpenGL.
         """
         share = self.root.handle
         handles = {connected.connector: handle for connected, handle in self._pairs()}
@@ -141,20 +161,20 @@ class Display:
         return self._adopt(handle)
 
     def poll(self) -> str:
-        """Process X events. Returns faults that make the windows useless, or an empty string."""
+        """Process X events, and return the faults that make the windows unusable or an empty string."""
         glfw.poll_events()
         faults = self.faults + [fault for window in self._windows for fault in window.faults]
         return "; ".join(faults)
 
     def close_windows(self) -> None:
-        """Close all windows except the hidden root."""
+        """Close all windows except the hidden root window."""
         self._close_from(1)
         self.faults.clear()
         if self._windows:
             self._windows[0].make_current()
 
     def close(self) -> None:
-        """Close every window. May be called twice."""
+        """Close every window, including the hidden root window. The method may be called twice."""
         if self._windows:
             glfw.make_context_current(None)
         self._close_from(0)
@@ -179,12 +199,20 @@ class Display:
         return window
 
     def output_state(self, connector: str) -> xlib.OutputState | None:
-        """Return the mode and monitor of an output, or None if it is off or disconnected."""
+        """Return the mode and monitor of an output, or None if the output is off or disconnected.
+
+        Args:
+            connector: Name of the output, such as `DP-1`.
+        """
         output = self._outputs.get(connector)
         return xlib.output_state(_pointer(), output) if output else None
 
     def window_state(self, window: Window) -> tuple[bool, Rectangle] | None:
-        """Return whether a window is mapped and its position, or None if it was destroyed."""
+        """Return the state of a window, or None if another program has destroyed the window.
+
+        Returns:
+            True if the window is mapped, and the region of the X screen that the window covers.
+        """
         refused = xlib.refusals()
         place = Rectangle(*glfw.get_window_pos(window.handle), *glfw.get_window_size(window.handle))
         is_viewable = bool(glfw.get_window_attrib(window.handle, glfw.VISIBLE))
@@ -225,7 +253,12 @@ class Display:
 
 
 def connected_monitors() -> tuple[Monitor, ...]:
-    """Return the active monitors, left to right. Raises PanelLost without an X server or a monitor."""
+    """Return the active monitors from left to right.
+
+    Raises:
+        PanelLost: No X server can be reached, or no monitor is active.
+        MissingPart: GLFW does not use X11.
+    """
     display = Display()
     try:
         monitors = display.monitors()
@@ -243,7 +276,7 @@ def _attach(handle: Any) -> moderngl.Context:
 
 def _hints() -> None:
     glfw.default_window_hints()
-    # EGL, like the offscreen context, because a thread cannot switch between GLX and EGL contexts.
+    # The windows use EGL like the offscreen context, because a thread cannot switch between GLX and EGL contexts.
     glfw.window_hint(glfw.CONTEXT_CREATION_API, glfw.EGL_CONTEXT_API)
     glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, MINIMUM_VERSION // 100)
     glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, MINIMUM_VERSION // 10 % 10)

@@ -1,4 +1,4 @@
-"""Mapping from pixels of a monitor to pixels of a layer, with registration, mirroring and mounting."""
+"""Map pixels of a monitor to pixels of a layer, including registration, mirroring and rotation."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ def panel_size_px(*, screen_width_px: int, screen_height_px: int, rotation_deg: 
 
 
 def panel_from_screen(*, screen_width_px: int, screen_height_px: int, rotation_deg: int, mirror: str) -> F64:
-    """Return the 3x3 matrix from monitor pixels to panel pixels as seen by the viewer, both v down.
+    """Return the 3x3 matrix from monitor pixels to panel pixels as seen by the viewer.
 
-    The picture of a monitor that is mounted `rotation_deg` counter-clockwise, as seen from the front, is rotated
-    clockwise. Mirroring is applied to the viewer's picture before the rotation.
+    The v axis points down in both coordinate systems. If a monitor is mounted with a counter-clockwise rotation of
+    `rotation_deg`, as seen from the front, its picture is rotated clockwise. Mirroring is applied to the viewer's
+    picture before the rotation.
     """
     width, height = float(screen_width_px), float(screen_height_px)
     turned = {
@@ -54,8 +55,17 @@ def layer_from_screen(
 ) -> F64:
     """Return the 3x3 matrix from monitor pixels to layer pixels, up to scale.
 
-    homography: from ideal to actual pixels at the panel's resolution, which may differ from that of the layers. Raises
-    ValueError if it is singular.
+    Args:
+        screen_width_px: Width of the monitor.
+        screen_height_px: Height of the monitor.
+        layer_width_px: Width of the layers, which may differ from the width of the panel.
+        layer_height_px: Height of the layers, which may differ from the height of the panel.
+        rotation_deg: Counter-clockwise rotation of the mounted monitor, as seen from the front.
+        mirror: Mirroring of the viewer's picture, which is `none`, `horizontal` or `vertical`.
+        homography: 3x3 matrix from ideal to actual pixels, at the resolution of the panel.
+
+    Raises:
+        ValueError: The homography is singular or not finite.
     """
     columns, rows = panel_size_px(
         screen_width_px=screen_width_px, screen_height_px=screen_height_px, rotation_deg=rotation_deg
@@ -72,7 +82,10 @@ def layer_from_screen(
 
 
 def permutes_pixels(matrix: F64) -> bool:
-    """True if a 3x3 matrix maps pixel centres to pixel centres, so that no interpolation is needed."""
+    """Return True if a 3x3 matrix maps pixel centres to pixel centres.
+
+    Pictures mapped with such a matrix need no interpolation.
+    """
     if matrix[2, 2] == 0.0:
         return False
     m = matrix / matrix[2, 2]
@@ -90,7 +103,15 @@ DIRECTIONS: dict[Arrow, tuple[int, int]] = {"up": (0, -1), "down": (0, 1), "left
 
 
 def mounting_of(arrow: Arrow, *, mirrored: bool) -> tuple[int, str]:
-    """Return `rotation_deg` and `mirror` of a panel, given how its card's arrow and text appear."""
+    """Return `rotation_deg` and `mirror` of a panel from the appearance of its test card.
+
+    Args:
+        arrow: Direction in which the card's arrow points, as seen by the viewer.
+        mirrored: True if the card's text appears mirrored.
+
+    Raises:
+        ValueError: No mounting produces this direction.
+    """
     mirror = "horizontal" if mirrored else "none"
     for rotation_deg in ROTATIONS:
         seen = panel_from_screen(screen_width_px=1, screen_height_px=1, rotation_deg=rotation_deg, mirror=mirror)

@@ -1,4 +1,4 @@
-"""Grey curves, which give a panel's grey level for each phase."""
+"""Grey curves, which map the phase that a panel should produce to the grey level to display."""
 
 from __future__ import annotations
 
@@ -15,10 +15,17 @@ COLUMNS = ("phase", "red", "green", "blue")
 
 
 def measured_curve(path: Path) -> F32:
-    """Read a (256, 3) table of grey from a CSV file with phase, red, green, blue (or phase, grey).
+    """Read a measured grey curve from a CSV file.
 
-    All values are in [0, 1], and at least two rows must have ascending phases. The curve is linear between them and
-    constant beyond them. Raises InputError that names the file and the row or column.
+    The file has the columns phase, red, green and blue, or phase and grey. All values are in [0, 1]. There must be at
+    least two rows, with ascending phases. The curve is linear between the rows and constant beyond the first and the
+    last row.
+
+    Returns:
+        Grey levels (256, 3) in [0, 1] by 8-bit phase and colour channel.
+
+    Raises:
+        InputError: The file cannot be read or its content is invalid. The message names the file and the fault.
     """
     lines = [line for line in untrusted_input.read_text(path).splitlines() if line.strip() and line[0] != "#"]
     header = tuple(name.strip().lower() for name in lines[0].split(",")) if lines else ()
@@ -42,10 +49,14 @@ def measured_curve(path: Path) -> F32:
 
 
 def curve(*, lut: str, gamma: float) -> F32:
-    """Return grey (256, 3) in [0, 1] by 8-bit phase and channel.
+    """Return the grey levels (256, 3) in [0, 1] of a panel by 8-bit phase and colour channel.
 
-    The curve is read from the file `lut` or, if `lut` is empty, follows phase = grey^gamma. Raises InputError if the
-    file is invalid.
+    Args:
+        lut: CSV file with a measured curve. If empty, the curve follows phase = grey^gamma.
+        gamma: Exponent of the curve if there is no file.
+
+    Raises:
+        InputError: The file cannot be read or its content is invalid.
     """
     if lut:
         return measured_curve(Path(lut))

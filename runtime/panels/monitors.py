@@ -1,6 +1,6 @@
-"""Assignment of monitors to panels by EDID serial number or connector, and checks of their modes.
+"""Assign monitors to panels by EDID serial number or connector, and check the modes of the monitors.
 
-A monitor is never guessed and a picture never rescaled, because phases must reach the panels unchanged.
+The assignment never guesses a monitor, and pictures are never rescaled, because phases must reach the panels unchanged.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from runtime.config import PanelSettings
 from runtime.errors import InputError, PanelLost
 from runtime.panels.geometry import panel_size_px
 
-REFRESH_TOLERANCE_HZ = 0.05  # 59.94 and 60 Hz would drift apart by a frame in 17 s
+REFRESH_TOLERANCE_HZ = 0.05  # panels at 59.94 Hz and 60 Hz would drift apart by a frame in 17 s
 
 
 class Rectangle(NamedTuple):
-    """Region of the X screen, in pixels from its top left corner."""
+    """Region of the X screen, in pixels from the top left corner of the screen."""
 
     x_px: int
     y_px: int
@@ -30,16 +30,16 @@ class Rectangle(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Monitor:
-    """Active monitor of the X screen."""
+    """Active monitor on the X screen."""
 
     connector: str
-    serial: str  # from the EDID; empty if unknown
-    model: str
-    x_px: int  # top left corner on the X screen
-    y_px: int
+    serial: str  # serial number from the EDID; empty if unknown
+    model: str  # manufacturer and name from the EDID; empty if unknown
+    x_px: int  # column of the monitor's top left corner on the X screen
+    y_px: int  # row of the monitor's top left corner on the X screen
     width_px: int
     height_px: int
-    refresh_hz: float  # 0: unknown
+    refresh_hz: float  # 0 if the refresh rate is unknown
 
     @property
     def place(self) -> Rectangle:
@@ -48,7 +48,7 @@ class Monitor:
 
     @property
     def setting(self) -> str:
-        """Line for `[[output.panels]]` that identifies this monitor."""
+        """Line of the configuration that identifies this monitor in `[[output.panels]]`."""
         return f'edid_serial = "{self.serial}"' if self.serial else f'connector = "{self.connector}"'
 
     def __str__(self) -> str:
@@ -63,13 +63,18 @@ def in_order(monitors: Sequence[Monitor]) -> tuple[Monitor, ...]:
 
 
 def bind(panels: Sequence[PanelSettings], monitors: Sequence[Monitor]) -> tuple[Monitor, ...]:
-    """Return the monitor of each panel, rear to front.
+    """Return the monitor of each panel.
 
-    If a panel gives both serial number and connector, its monitor must match both. This distinguishes monitors with
-    equal serial numbers.
+    If the settings of a panel give a serial number and a connector, the monitor must match the two criteria. The
+    connector distinguishes monitors with equal serial numbers.
 
-    Raises InputError if a panel gives neither, and PanelLost if a monitor is missing, ambiguous or already assigned,
-    which may be temporary. The message names the panel, the criteria and the connected monitors.
+    Args:
+        panels: Settings of the panels, rear to front.
+        monitors: Connected monitors in any order.
+
+    Raises:
+        InputError: The settings of a panel give neither a serial number nor a connector.
+        PanelLost: The monitor of a panel is missing, ambiguous or already assigned. The failure may be temporary.
     """
     ordered = in_order(monitors)
     bound: list[Monitor] = []
@@ -121,7 +126,7 @@ def check_modes(panels: Sequence[PanelSettings], monitors: Sequence[Monitor], *,
 
 
 def refresh_difference(monitors: Sequence[Monitor]) -> str:
-    """Return a warning in one line if known refresh rates differ, otherwise an empty string."""
+    """Return a warning in one line if the known refresh rates differ, otherwise an empty string."""
     known = [monitor for monitor in monitors if monitor.refresh_hz > 0]
     rates = [monitor.refresh_hz for monitor in known]
     if not rates or max(rates) - min(rates) <= REFRESH_TOLERANCE_HZ:

@@ -1,4 +1,4 @@
-"""Presentation shader, which aligns a layer, mixes it with the flat picture and draws it to a panel."""
+"""Align a layer, mix it with the flat picture and draw it to a panel, with the presentation shader."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ void main() {
 """
 
 # The reference for `shown` is runtime.optics.alignment.shown_layers. Aligned layers are sampled with weights of full
-# precision (hardware filters have steps of 1/256) and have the rest value outside. Layers moved by a homography are
-# sampled once for registration and alignment together, with cubic weights; bilinear ones would cost 0.15 dB more.
-# Each case has a separate program, because a software rasteriser executes both branches of every `if`. One program
-# for all cases would take several times as long as the slowest of these.
+# precision, because hardware filters have steps of 1/256. Outside the layers, the samples have the rest value. Layers
+# moved by a homography are sampled once for registration and alignment together, with cubic weights. Bilinear weights
+# would lose another 0.15 dB. Each case has a separate program, because a software rasteriser executes both branches of
+# every `if`. A single program for all cases would take several times as long as the slowest of the separate programs.
 FRAGMENT = """
 uniform sampler2D solved;        // this panel's layer of the solution
 uniform sampler2D flat_picture;
@@ -148,37 +148,48 @@ CASES: tuple[Case, ...] = (
 
 
 class FrameTextures:
-    """Textures with the layers of the newest frame, uploaded whenever their version changes."""
+    """Uploads the layers of the newest frame to textures whenever the version of the layers changes."""
 
     def __init__(self, context: moderngl.Context, size_px: tuple[int, int], *, count: int) -> None:
-        """size_px: width and height of a panel."""
+        """Create an empty set of textures.
+
+        Args:
+            context: GL context that owns the textures.
+            size_px: Width and height of a panel.
+            count: Number of panels.
+        """
         self._context = context
         self.size_px, self.count = size_px, count
         self._textures: dict[tuple[str, tuple[int, int]], tuple[moderngl.Texture, ...]] = {}  # by kind and size
         self._solved: tuple[moderngl.Texture, ...] = ()
         self._flat: tuple[moderngl.Texture, ...] = ()
         self._reliefs: dict[tuple[int, int], moderngl.Texture] = {}  # by size
-        self._relief: moderngl.Texture | None = None  # relief of the current solution
+        self._relief: moderngl.Texture | None = None  # relief of the uploaded solution
         self._solved_version: int | None = None
         self._flat_version: int | None = None
 
     @property
     def solved_px(self) -> tuple[int, int]:
-        """Width and height of the solution in pixels."""
+        """Width and height of the uploaded solution, or of a panel if no solution has been uploaded."""
         return self._solved[0].size if self._solved else self.size_px
 
     def lacks(self, frame: PanelFrame) -> tuple[bool, bool]:
-        """Return two flags: whether the solution and the flat picture are visible but not yet uploaded."""
+        """Check which pictures of a frame must be uploaded before the frame can be drawn.
+
+        Returns:
+            Two flags, for the solution and the flat picture. A flag is True if the picture is visible in the frame but
+            has not been uploaded.
+        """
         return (
             shows_solved(frame) and frame.solved_version != self._solved_version,
             shows_flat(frame) and frame.flat_version != self._flat_version,
         )
 
     def upload(self, frame: PanelFrame) -> None:
-        """Upload the visible pictures of a frame unless this has been done already."""
+        """Upload the pictures that are visible in a frame and have not been uploaded yet."""
         lacks_solved, lacks_flat = self.lacks(frame)
         if lacks_solved and frame.solved is not None:
-            self._solved_version = None  # set again once it is completely uploaded
+            self._solved_version = None  # remains None if the upload fails
             self._solved = self._written("solved", frame.solved)
             self._relief = None if frame.relief is None else self._relief_of(frame.relief)
             self._solved_version = frame.solved_version
@@ -188,7 +199,7 @@ class FrameTextures:
             self._flat_version = frame.flat_version
 
     def use(self, index: int) -> None:
-        """Bind the textures of one panel in the current context to the units that `Painter` reads."""
+        """Bind the textures of one panel to the texture units that `Painter` reads, in the current context."""
         for unit, uploaded in enumerate((self._solved, self._flat)):
             if uploaded:
                 uploaded[index].use(unit)
@@ -213,7 +224,10 @@ class FrameTextures:
         return self._reliefs[key]
 
     def _written(self, kind: str, layers: U8) -> tuple[moderngl.Texture, ...]:
-        """Write layers to one texture per panel. Textures are created with the first layers of their size."""
+        """Write layers to textures, one per panel, and return the textures.
+
+        The textures are created when layers of their size are written for the first time.
+        """
         key = kind, (layers.shape[2], layers.shape[1])
         if key not in self._textures:
             self._textures[key] = tuple(self._context.texture(key[1], 4) for _ in range(self.count))
@@ -226,17 +240,20 @@ class FrameTextures:
 
 
 def shows_solved(frame: PanelFrame) -> bool:
-    """True if the solution is visible."""
+    """Return True if the solution is visible in a frame."""
     return frame.solved is not None and frame.flatness < 1.0
 
 
 def shows_flat(frame: PanelFrame) -> bool:
-    """True if the flat picture is visible."""
+    """Return True if the flat picture is visible in a frame."""
     return frame.solved is None or frame.flatness > 0.0
 
 
 class Painter:
-    """Presentation shader in one GL context, to which its vertex arrays and framebuffers belong."""
+    """Draws frames to one panel with the presentation shader.
+
+    Vertex arrays cannot be shared between GL contexts, so each window needs its own painter.
+    """
 
     def __init__(
         self,
@@ -246,9 +263,17 @@ class Painter:
         screen_px: tuple[int, int],
         layer_px: tuple[int, int],
     ) -> None:
-        """Prepare one panel.
+        """Compile the shader for one panel.
 
-        Raises InputError for an invalid grey curve, and ValueError for a singular homography.
+        Args:
+            context: GL context of the panel's window.
+            settings: Settings of the panel.
+            screen_px: Width and height of the monitor.
+            layer_px: Width and height of a panel of the stack.
+
+        Raises:
+            InputError: The file with the grey curve cannot be read or is invalid.
+            ValueError: The homography is singular or not finite.
         """
         matrix = layer_from_screen(
             screen_width_px=screen_px[0],
@@ -259,7 +284,7 @@ class Painter:
             mirror=settings.mirror,
             homography=settings.homography,
         )
-        # The sign of a homography is arbitrary; the shader requires a positive third coordinate in the panel's middle.
+        # The sign of a homography is arbitrary. The shader requires a positive third coordinate at the panel's centre.
         matrix = matrix / (matrix[2] @ np.array([screen_px[0] / 2, screen_px[1] / 2, 1.0]))
         mounting = ["EXACT"] * permutes_pixels(matrix) + ["CURVED"] * bool(settings.lut or settings.gamma != 1)
         table = np.ascontiguousarray(lut.curve(lut=settings.lut, gamma=settings.gamma).T)
@@ -273,7 +298,13 @@ class Painter:
         self._cases = {case: _compiled(context, (*mounting, *case), fixed) for case in CASES}
 
     def draw(self, textures: FrameTextures, frame: PanelFrame, index: int) -> None:
-        """Draw panel `index` of the uploaded frame on the whole bound framebuffer."""
+        """Draw one panel of an uploaded frame to the bound framebuffer.
+
+        Args:
+            textures: Textures that contain the pictures of the frame.
+            frame: Frame to draw.
+            index: Number of the panel, counted from the rear.
+        """
         matrix = frame.solved_from_shown[index] if frame.solved_from_shown else np.eye(3)
         (width, height), (solved_width, solved_height) = textures.size_px, textures.solved_px
         coarse = (width, height) != (solved_width, solved_height)
@@ -320,7 +351,7 @@ class Painter:
 def _compiled(
     context: moderngl.Context, names: Sequence[str], fixed: Mapping[str, Any]
 ) -> tuple[moderngl.Program, moderngl.VertexArray]:
-    """Compile the shader with these macros defined and these uniforms set."""
+    """Compile the shader with the macros `names` defined, and set the uniforms `fixed`."""
     head = "#version 330 core\n" + "".join(f"#define {name}\n" for name in names)
     program = context.program(vertex_shader=VERTEX, fragment_shader=head + FRAGMENT)
     _set(program, fixed)
@@ -328,7 +359,7 @@ def _compiled(
 
 
 def _set(program: moderngl.Program, values: Mapping[str, Any]) -> None:
-    """Set uniforms, except those that the compiler has removed."""
+    """Set uniforms, except for uniforms that the compiler has removed."""
     for name, value in values.items():
         uniform: Any = program.get(name, None)
         if uniform is not None:

@@ -1,4 +1,4 @@
-"""Functions that open the configured panels, and offscreen panels for replay and tests."""
+"""Open the configured output to the panels, or an offscreen output for replay and tests."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class OffscreenPanels(PanelSink):
-    """Panels without a screen, which accept frames but do not draw them."""
+    """Output without a screen, which accepts frames but does not draw them."""
 
     name = "offscreen"
 
@@ -27,11 +27,11 @@ class OffscreenPanels(PanelSink):
         return PresentReport(frame.number, self._clock.now_ns(), 0.0)
 
     def close(self) -> None:
-        """Do nothing, because nothing was opened."""
+        """Do nothing, because the output opens no windows or contexts."""
 
 
 class BrowserPanels(PanelSink):
-    """Panels in a web page, which aligns and draws them at its own rate."""
+    """Output to a web page, which aligns and draws the newest frame at its own rate."""
 
     name = "browser"
 
@@ -47,14 +47,22 @@ class BrowserPanels(PanelSink):
 
 
 def panel_settings(settings: OutputSettings, count: int) -> tuple[PanelSettings, ...]:
-    """Return the settings of each panel, or defaults if none are configured."""
+    """Return the settings of each panel, or default settings for `count` panels if none are configured."""
     return settings.panels or tuple(PanelSettings() for _ in range(count))
 
 
 def open_panels(settings: OutputSettings, stack: PanelStack, clock: Clock, context: moderngl.Context) -> PanelSink:
-    """Open the output of `[output]`. After each of its calls `context` is current again.
+    """Open the output that the section `[output]` of the settings describes.
 
-    Raises InputError for unsuitable settings, and PanelLost if a monitor is missing, which may be temporary.
+    Args:
+        settings: Section `[output]` of the settings.
+        stack: Panels of the display.
+        clock: Clock of the run.
+        context: GL context of the content. The output makes the context current again at the end of each call.
+
+    Raises:
+        InputError: The settings are unsuitable, for example because a panel names no monitor.
+        PanelLost: A monitor is missing or cannot be used. The failure may be temporary.
     """
     if settings.kind != "offscreen":
         from runtime.panels.window import WindowPanels

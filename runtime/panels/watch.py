@@ -1,8 +1,8 @@
-"""Checks that windows and monitors have not changed since the start, with one X query at a time.
+"""Check that windows and monitors have not changed since the start, with one X query at a time.
 
-GLFW reports monitors that are connected or disconnected and windows that are closed or resized. It does not report that
-another program destroyed, unmapped or moved a window, or that a monitor's position or mode changed. A picture is then
-on the wrong panel or on none, although every swap succeeds.
+GLFW reports connected or disconnected monitors and closed or resized windows. It does not report that another program
+has destroyed, unmapped or moved a window, or that the position or mode of a monitor has changed. After such a change, a
+picture is on the wrong panel or on no panel, although every buffer swap succeeds.
 """
 
 from __future__ import annotations
@@ -16,19 +16,28 @@ from runtime.panels.display import Display, Window
 from runtime.panels.monitors import Monitor
 
 EVERY_NS = NS_PER_S  # period in which each window and monitor is queried once
-REFRESH_TOLERANCE = 1e-3  # relative
+REFRESH_TOLERANCE = 1e-3  # relative tolerance of refresh rates
 
 
 class PlacementWatch:
-    """Watch that checks one window or monitor per call, and each of them once in EVERY_NS.
+    """Detects changes of the windows and monitors.
 
-    If the X server has refused a request since the last call, something has disappeared and all of them are checked.
+    Calls of `look` check one window or monitor at a time, and each window and monitor once in `EVERY_NS`. If the X
+    server has refused a request since the last call, a window or monitor has disappeared, so all windows and monitors
+    are checked in the same call.
     """
 
     def __init__(self, display: Display, monitors: Sequence[Monitor], windows: Sequence[Window], clock: Clock) -> None:
-        """monitors, windows: one per panel, as assigned at the start. The first query follows after EVERY_NS."""
+        """Begin to watch. The first query is made after `EVERY_NS`.
+
+        Args:
+            display: Connection to the X server.
+            monitors: Monitor of each panel, as assigned at the start.
+            windows: Window of each panel.
+            clock: Clock of the run.
+        """
         self._display, self._clock = display, clock
-        # Initial EDIDs. A changed position or mode shows as a difference from `monitors`.
+        # Only the EDIDs of these states are used. Positions and modes are compared with those in `monitors`.
         self._states = [display.output_state(monitor.connector) for monitor in monitors]
         self._monitors, self._windows = monitors, windows
         self._questions: list[Callable[[], str]] = [
@@ -40,10 +49,14 @@ class PlacementWatch:
         self._refusals = xlib.refusals()
 
     def look(self) -> str:
-        """Return the faults found, which name the panel, or an empty string."""
+        """Check a window or monitor if a check is due.
+
+        Returns:
+            The faults that were found, with the number of the panel, or an empty string.
+        """
         if xlib.refusals() != self._refusals:
             faults = [fault for fault in (question() for question in self._questions) if fault]
-            self._refusals = xlib.refusals()  # read after the queries, which may be refused, too
+            self._refusals = xlib.refusals()  # read after the queries, because the server may refuse them too
             return "; ".join(faults)
         now_ns = self._clock.now_ns()
         if now_ns < self._due_ns:

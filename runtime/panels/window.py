@@ -1,4 +1,4 @@
-"""Panels on monitors, with a fullscreen window for each panel or a test card on every monitor."""
+"""Show the panels in fullscreen windows on monitors, or a test card on every monitor."""
 
 from __future__ import annotations
 
@@ -24,23 +24,26 @@ from runtime.support.gl import offscreen_context
 log = logging.getLogger("phasestack.panels")
 
 RETRY_NS = NS_PER_S // 2  # interval between attempts to reopen lost panels
-LOOK_NS = 5 * NS_PER_S  # interval between searches for monitors without a notification from X
+LOOK_NS = 5 * NS_PER_S  # interval between searches for monitors if X sends no notification
 
 
 class WindowPanels(PanelSink):
-    """Panels of the stack on X11 monitors.
+    """Output to X11 monitors, with one fullscreen window per panel.
 
-    `present` uploads a new solution once to textures shared by all windows. It draws all windows, waits for the GPU,
-    then swaps them in immediate succession, so a fault before the first swap leaves the old frame on all panels. Only
-    the first window waits for its vertical blank, because N waiting windows would divide the rate by N. `skew_ms` is
-    the time between the first and the last return from a swap. It does not include the phase between the vertical
-    blanks of the monitors.
+    `present` uploads a new solution once, to textures that all windows share. It draws all windows, waits for the GPU
+    and then swaps the buffers of all windows in immediate succession. A fault before the first swap leaves the old
+    frame on all panels. Only the first window waits for its vertical blank, because N waiting windows would divide the
+    refresh rate by N. `skew_ms` is the time between the first and the last return from a swap. It does not include the
+    phase between the vertical blanks of the monitors.
 
-    Every window and monitor is compared with its initial state once a second (one query per refresh, about 0.1 ms). If
-    a monitor, window or context is lost or has changed, all windows are closed and `present` raises PanelLost. A later
-    call reopens them, after half a second or when X reports a monitor. The shared context of the hidden window survives
-    unless it is lost, too. If the X server dies, the process ends with exit status 75 and must be restarted. GLFW
-    requires the main thread. After every call the context `content` is current again.
+    Every window and monitor is compared with its initial state once per second. A refresh makes at most one query,
+    which takes about 0.1 ms. If a monitor, window or context has changed or is lost, all windows are closed and
+    `present` raises PanelLost. A later call of `present` reopens the windows after half a second, or when X reports a
+    change of monitors. The hidden window keeps the shared context unless this context is also lost. If the X server
+    dies, the process ends with exit status 75 and must be restarted.
+
+    All methods must be called on the main thread, as GLFW requires. After every call, the context `content` is current
+    again.
     """
 
     name = "windows"
@@ -49,10 +52,19 @@ class WindowPanels(PanelSink):
         self, panels: tuple[PanelSettings, ...], stack: PanelStack, clock: Clock, content: moderngl.Context, *,
         any_shape: bool = False,
     ) -> None:  # fmt: skip
-        """any_shape: also accept and fill monitors with a resolution other than the stack's, for `identify`.
+        """Open a window for each panel.
 
-        Raises InputError for wrong settings, and PanelLost if a monitor or the X server is missing, which may be
-        temporary.
+        Args:
+            panels: Settings of the panels, rear to front.
+            stack: Panels of the display.
+            clock: Clock of the run.
+            content: GL context of the content.
+            any_shape: Accept and fill monitors whose resolution differs from that of the stack, for `identify`.
+
+        Raises:
+            InputError: A panel names no monitor, or its settings are invalid.
+            PanelLost: The X server or a monitor is missing or cannot be used. The failure may be temporary.
+            MissingPart: GLFW does not use X11.
         """
         self._any_shape = any_shape
         self._panels, self._stack = panels, stack
@@ -62,8 +74,8 @@ class WindowPanels(PanelSink):
         self._textures: FrameTextures | None = None
         self._watch: PlacementWatch | None = None
         self._retry_ns, self._lost = 0, ""
-        self._shown = False  # the windows show the previous frame
-        self._away = False  # a context other than `content` may be current
+        self._shown = False  # True while the windows show the previous frame
+        self._away = False  # True if a context other than `content` may be current
         self._context_lost = False
         self.monitors: tuple[Monitor, ...] = ()
         try:
@@ -76,7 +88,10 @@ class WindowPanels(PanelSink):
 
     @property
     def period_ns(self) -> int | None:
-        """Refresh period of the first panel's monitor, whose vertical blank paces the swaps."""
+        """Refresh period of the first panel's monitor, or None if the period is unknown.
+
+        The vertical blanks of this monitor pace the swaps.
+        """
         refresh_hz = self.monitors[0].refresh_hz if self.monitors else 0.0
         return round(NS_PER_S / refresh_hz) if refresh_hz else None
 
@@ -85,9 +100,10 @@ class WindowPanels(PanelSink):
         return [window.handle for window, _ in self._surfaces]
 
     def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
-        """Show a frame on all panels, unless it is unchanged and still shown.
+        """Show a frame on all panels, unless the frame is unchanged and still shown.
 
-        Raises PanelLost while a window, monitor or context is lost.
+        Raises:
+            PanelLost: A window, monitor or context has changed or is lost.
         """
         if not self._surfaces and not self._may_try():
             raise PanelLost(self._lost)
@@ -105,7 +121,7 @@ class WindowPanels(PanelSink):
             self._give_back()
 
     def close(self) -> None:
-        """Close windows and the display. May be called twice."""
+        """Close all windows and their contexts. The method may be called twice."""
         self._drop()
         self._give_back()
 
@@ -147,7 +163,7 @@ class WindowPanels(PanelSink):
         return self._clock.now_ns()
 
     def _may_try(self) -> bool:
-        """True if it is time to reopen the panels: after a delay or a change of connected monitors."""
+        """Return True if it is time to reopen the panels, after a delay or a change of connected monitors."""
         display = self._display
         if display is not None and display.poll():
             display.faults.clear()
@@ -174,7 +190,7 @@ class WindowPanels(PanelSink):
         self._watch = PlacementWatch(display, self.monitors, [window for window, _ in self._surfaces], self._clock)
 
     def _retreat(self) -> None:
-        """Close the windows after a failure. Keeps the connection and, if intact, the shared context."""
+        """Close the windows after a failure, but keep the shared context if it is intact."""
         if self._display is None or self._context_lost:
             self._drop()
         elif self._display.has_windows:
@@ -211,7 +227,7 @@ class WindowPanels(PanelSink):
                 log.exception("closing the display")
 
     def _forget(self) -> None:
-        """Clear the state of the closed windows and schedule reopening them."""
+        """Clear the state of the closed windows, and schedule their reopening."""
         self._surfaces, self._textures, self._watch, self._shown = [], None, None, False
         self._retry_ns = self._clock.now_ns() + RETRY_NS
 
@@ -228,16 +244,21 @@ def _error(context: moderngl.Context) -> str:
 
 
 def _reset_status() -> str:
-    """Return the driver's reason for a lost context (GPU reset), or an empty string if none is reported."""
+    """Return the driver's status if the GPU was reset and the context is lost, otherwise an empty string."""
     address = gl_function("glGetGraphicsResetStatus")
     status: int = ctypes.CFUNCTYPE(ctypes.c_uint)(address)() if address else 0
     return f"was reset (0x{status:x})" if status else ""
 
 
 def every_monitor() -> tuple[WindowPanels, list[U8], tuple[Monitor, ...]]:
-    """Open a window on every monitor. Returns the windows, their test cards and the monitors.
+    """Open a window on every monitor, and draw a test card for each window.
 
-    Raises PanelLost if there is no X server or active monitor, or if a window cannot be opened.
+    Returns:
+        The open windows, their test cards and their monitors.
+
+    Raises:
+        PanelLost: There is no X server or active monitor, or a window cannot be opened.
+        MissingPart: GLFW does not use X11, or EGL offers no OpenGL 3.3.
     """
     monitors = connected_monitors()
     width, height = max(m.width_px for m in monitors), max(m.height_px for m in monitors)

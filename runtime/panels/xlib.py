@@ -1,6 +1,7 @@
-"""Xlib and RandR functions missing from GLFW: the state of outputs, and handlers for X errors.
+"""Query the state of outputs and handle X errors, with Xlib and RandR functions that GLFW lacks.
 
-They are bound with ctypes from libraries that GLFW needs anyway. By default Xlib ends the process on any error.
+The functions are called through ctypes from libraries that GLFW loads anyway. By default, Xlib ends the process after
+any error.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class _Output(ctypes.Structure):
 
 
 class _Crtc(ctypes.Structure):
-    """The beginning of XRRCrtcInfo."""
+    """First fields of XRRCrtcInfo."""
 
     _fields_ = (
         ("timestamp", c_ulong),
@@ -76,11 +77,11 @@ class _Crtc(ctypes.Structure):
 
 @dataclass(frozen=True, slots=True)
 class OutputState:
-    """Mode and monitor of an output of the graphics card."""
+    """Mode and monitor of one output of the graphics card."""
 
-    place: Rectangle
-    refresh_hz: float  # 0: unknown
-    edid: bytes  # empty if there is none
+    place: Rectangle  # region of the X screen that the output shows
+    refresh_hz: float  # 0 if the refresh rate is unknown
+    edid: bytes  # empty if the monitor has no EDID
 
 
 @functools.cache
@@ -132,16 +133,17 @@ def _end(_display: int = 0) -> int:
     os._exit(SERVER_DIED)
 
 
-# Xlib keeps their addresses until the process ends.
+# Xlib keeps the addresses of these handlers until the process ends, so they must not be garbage-collected.
 _ERROR_HANDLER = ErrorHandler(_note_error)
 _IO_ERROR_HANDLER = IOErrorHandler(_end)
 
 
 def take_over_errors() -> None:
-    """Install error handlers so that a refused X request, as for an unplugged monitor, is only logged.
+    """Install handlers for X errors.
 
-    If the server dies, the process ends immediately with a line in the log. This may happen during a call, after which
-    Xlib, EGL and GLFW would hang or crash even when releasing objects.
+    A refused X request, for example for an unplugged monitor, is only logged and counted. If the X server dies, the
+    process logs a message and ends immediately, because Xlib, EGL and GLFW would hang or crash even while releasing
+    objects.
     """
     x11 = _libraries()[0]
     x11.XSetErrorHandler(_ERROR_HANDLER)
@@ -149,13 +151,18 @@ def take_over_errors() -> None:
 
 
 class ServerWatch:
-    """Watch that detects the death of the server while the main thread hangs in a call.
+    """Ends the process if the X server dies while the main thread hangs in a call.
 
-    When the connection breaks, Mesa's software renderer loops forever in a swap and Xlib does not notice.
+    Without the watch, a broken connection would make Mesa's software renderer loop endlessly in a buffer swap, and Xlib
+    would not notice.
     """
 
     def __init__(self, display: int) -> None:
-        """display: pointer to an open Display; call `stop` before closing it."""
+        """Start to watch a connection on a new thread.
+
+        Args:
+            display: Pointer to an open Xlib `Display`. Call `stop` before closing the display.
+        """
         x11 = _libraries()[0]
         x11.XConnectionNumber.argtypes = [c_void_p]
         self._connection: int = x11.XConnectionNumber(display)
@@ -164,7 +171,7 @@ class ServerWatch:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop watching. Call this before closing the connection on purpose."""
+        """Stop watching. Call this method before deliberately closing the connection."""
         os.write(self._stop_writing, b".")
         self._thread.join()
         os.close(self._stop_reading)
@@ -172,7 +179,7 @@ class ServerWatch:
 
     def _watch(self) -> None:
         poll = select.poll()
-        poll.register(self._connection, 0)  # only hang-ups, not input
+        poll.register(self._connection, 0)  # report only hang-ups and errors, not input
         poll.register(self._stop_reading, select.POLLIN)
         for file, _ in poll.poll():
             if file == self._connection:
@@ -180,7 +187,14 @@ class ServerWatch:
 
 
 def output_state(display: int, output: int) -> OutputState | None:
-    """Return the state of an output, or None if it is off or disconnected. Takes four round trips."""
+    """Return the state of an output, or None if the output is off or disconnected.
+
+    The query takes four round trips to the X server.
+
+    Args:
+        display: Pointer to an Xlib `Display`.
+        output: RandR identifier of the output.
+    """
     x11, randr = _libraries()
     resources = randr.XRRGetScreenResourcesCurrent(display, x11.XDefaultRootWindow(display))
     if not resources:
