@@ -1,4 +1,4 @@
-"""Link between the loop and live pages, which send eye positions and receive layers."""
+"""Exchange eye positions, camera pictures and layers between the refresh loop and live pages."""
 
 from __future__ import annotations
 
@@ -16,46 +16,58 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F64, EyePoints, PanelFrame, SensorFrame
 
 SAMPLES_MAX = 256  # maximum number of samples that wait for the sensor
-CAPTURES_MAX = 512  # number of captures whose page time is remembered
-OVERLAY_PX = 320  # width of camera pictures sent to pages
+CAPTURES_MAX = 512  # number of captures whose time on the page's clock is stored
+OVERLAY_PX = 320  # width of camera pictures that are sent to pages
 
 
 @dataclass(frozen=True, slots=True)
 class SeenEyes:
-    """Eye positions reported by a page."""
+    """Sample of eye positions that a page has sent."""
 
-    eyes_m: F64 | None  # (2, 3) in the stack frame; None without a viewer
-    page_ms: float  # on the page's clock
+    eyes_m: F64 | None  # (2, 3) eyes in frame `stack`; None if there is no viewer
+    page_ms: float  # time of the sample on the page's clock
 
 
 @dataclass(eq=False)
 class BrowserLink:
-    """Thread-safe link to the pages. One page is the viewer, and the others only watch."""
+    """Passes data between the refresh loop and the pages that show the display.
 
-    stack: PanelStack  # stack that is currently shown
-    fov_deg: float
-    is_sensor: bool = True  # True if the eyes come from the page, False if from a camera
-    noise_mm: float = 0.2  # simulated noise of the sensor, standard deviation per axis
-    latency_ms: float = 0.0
-    is_camera: bool = False  # the page of the viewer sends camera pictures
-    camera_fov_deg: float = 65.0  # horizontal field of view; 65 degrees is typical for webcams
-    wishes: dict[str, float] = field(default_factory=dict)  # choices that require a restart: gap_mm, camera
-    moment: Any = None  # layers and targets of the newest measured refresh
-    found: dict[str, Any] | None = None  # newest camera picture, with the pupils found in it
-    frame: PanelFrame | None = None  # newest frame given to the panels
-    shown: tuple[PanelFrame | None, dict[str, Any]] = (None, {})  # frame and record of the newest refresh
-    news: dict[object, Callable[[], None]] = field(default_factory=dict)  # called at each refresh, by page
+    The page that has been connected longest is the viewer, whose samples or camera pictures are used. All other pages
+    only watch. The link is thread-safe.
+    """
+
+    stack: PanelStack  # stack that is shown at present
+    fov_deg: float  # horizontal field of view of target pictures
+    is_sensor: bool = True  # True if the viewer's page sends eye positions, False if a camera measures the eyes
+    noise_mm: float = 0.2  # standard deviation per axis of the simulated noise of the sensor
+    latency_ms: float = 0.0  # simulated latency of the sensor
+    is_camera: bool = False  # True if the viewer's page sends camera pictures
+    camera_fov_deg: float = 65.0  # horizontal field of view of the page's camera; 65 degrees is typical for webcams
+    wishes: dict[str, float] = field(default_factory=dict)  # requested changes that require a restart: gap_mm, camera
+    moment: Any = None  # layers and target pictures of the newest measured refresh
+    found: dict[str, Any] | None = None  # newest camera picture, with the pupils that were found in the picture
+    frame: PanelFrame | None = None  # newest frame that was given to the panels
+    shown: tuple[PanelFrame | None, dict[str, Any]] = (None, {})  # frame and status of the newest refresh
+    news: dict[object, Callable[[], None]] = field(default_factory=dict)  # functions to call when data changes, by page
     _arrived: threading.Condition = field(default_factory=threading.Condition)
     _picture: tuple[bytes, float] | None = None  # encoded camera picture, and its time on the page's clock
     _samples: deque[SeenEyes] = field(default_factory=lambda: deque(maxlen=SAMPLES_MAX))
     _captures: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=CAPTURES_MAX))
 
     def is_viewer(self, page: object) -> bool:
-        """True if this page is the viewer, that is, has been connected longest."""
+        """Return True if `page` is the viewer's page, which has been connected longest."""
         return next(iter(self.news), None) is page
 
     def see(self, eyes_m: Any, page_ms: float) -> None:
-        """Add a sample. Raises ValueError unless it consists of two eyes in front of the panels."""
+        """Add a sample of eye positions.
+
+        Args:
+            eyes_m: (2, 3) eyes in frame `stack`, or None if there is no viewer.
+            page_ms: Time of the sample on the page's clock.
+
+        Raises:
+            ValueError: The sample does not consist of two eyes in front of the front panel.
+        """
         eyes = None
         if eyes_m is not None:
             eyes = np.array(eyes_m, np.float64)
@@ -66,7 +78,13 @@ class BrowserLink:
             self._arrived.notify()
 
     def seen(self, timeout_s: float) -> list[SeenEyes]:
-        """Take the unread samples, oldest first. Waits for the first one."""
+        """Remove the unread samples from the queue and return them, oldest first.
+
+        If there are no unread samples, wait for a sample.
+
+        Args:
+            timeout_s: Longest time to wait in seconds. The result is empty if no sample arrives.
+        """
         with self._arrived:
             if not self._samples:
                 self._arrived.wait(timeout_s)
@@ -75,13 +93,24 @@ class BrowserLink:
         return samples
 
     def send_picture(self, coded: bytes, page_ms: float) -> None:
-        """Store the newest camera picture. An unread one is dropped."""
+        """Store a camera picture in place of the previous picture, even if the previous picture is unread.
+
+        Args:
+            coded: Encoded picture.
+            page_ms: Time of the picture on the page's clock.
+        """
         with self._arrived:
             self._picture = coded, page_ms
             self._arrived.notify()
 
     def picture(self, timeout_s: float) -> tuple[bytes, float] | None:
-        """Take the newest unread picture. Waits for one."""
+        """Remove and return the newest unread camera picture and its time on the page's clock.
+
+        If there is no unread picture, wait for a picture.
+
+        Args:
+            timeout_s: Longest time to wait in seconds. The result is None if no picture arrives.
+        """
         with self._arrived:
             if self._picture is None:
                 self._arrived.wait(timeout_s)
@@ -89,7 +118,11 @@ class BrowserLink:
         return taken
 
     def reporting(self, finder: Any) -> Callable[[SensorFrame], EyePoints | None]:
-        """Wrap an eye finder for the page's camera so that the pages also receive its results."""
+        """Wrap an eye finder in a function that also sends its results to the pages.
+
+        Args:
+            finder: Eye finder for the pictures of a page's camera.
+        """
 
         def find(frame: SensorFrame) -> EyePoints | None:
             eyes: EyePoints | None = finder.find(frame)
@@ -108,15 +141,19 @@ class BrowserLink:
         return find
 
     def captured(self, capture_ns: int, page_ms: float) -> None:
-        """Remember the time of a capture on the page's clock."""
+        """Store the time of a capture on the page's clock."""
         self._captures.append((capture_ns, page_ms))
 
     def page_ms_of(self, capture_ns: int) -> float | None:
-        """Return the page's time for the newest sample captured no later than `capture_ns`."""
+        """Return the time of the newest sample captured no later than `capture_ns`, on the page's clock."""
         return next((page_ms for ns, page_ms in reversed(tuple(self._captures)) if ns <= capture_ns), None)
 
     def refreshed(self, account: dict[str, Any]) -> None:
-        """Publish a refresh of the newest frame. account: the status that pages show."""
+        """Publish a refresh of the newest frame to the pages.
+
+        Args:
+            account: Status of the refresh, which pages show.
+        """
         self.shown = self.frame, account
         self._notify()
 

@@ -1,1 +1,1 @@
-"""The operator's page, a separate process that talks to the running daemon over its socket."""
+"""The operator's page, served by a separate process that controls the daemon through a socket."""

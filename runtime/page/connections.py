@@ -1,4 +1,4 @@
-"""Limited uvicorn connections, so that idle ones do not block others."""
+"""Limit the connections of a uvicorn server, because idle connections must not block others."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ CONNECTIONS_MAX = 64  # simultaneous connections
 
 
 class LimitedConnection(H11Protocol):
-    """Connection that closes when idle. If there are too many, the one idle longest is closed."""
+    """HTTP connection that is closed if it waits for a request `REQUEST_S` after it was opened.
+
+    If there are more than `CONNECTIONS_MAX` connections, the oldest connection that waits for a request is closed.
+    """
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
@@ -25,7 +28,7 @@ class LimitedConnection(H11Protocol):
         self._timer: asyncio.TimerHandle = self.loop.call_later(REQUEST_S, self._let_go)
         if len(self.connections) > CONNECTIONS_MAX:
             waiting = [one for one in self.connections if isinstance(one, LimitedConnection) and one.waits]
-            min(waiting, key=lambda one: one.made_s).transport.abort()  # may be this one
+            min(waiting, key=lambda one: one.made_s).transport.abort()  # may be this connection
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._timer.cancel()
@@ -33,17 +36,25 @@ class LimitedConnection(H11Protocol):
 
     @property
     def waits(self) -> bool:
-        """True while the connection waits for a request."""
+        """True if the connection waits for a request."""
         cycle: Any = self.cycle  # None before the first request
         return cycle is None or bool(cycle.response_complete)
 
     def _let_go(self) -> None:
-        if self.waits and self in self.connections:  # not after an upgrade to another protocol
+        if self.waits and self in self.connections:  # a connection upgraded to another protocol is not in the set
             self.transport.abort()
 
 
 def listening(command: str, port: int) -> sockets.socket:
-    """Bind a socket on loopback. Raises InputError if the port is in use."""
+    """Return a socket that listens on a port of the loopback interface.
+
+    Args:
+        command: Name of the command for error messages.
+        port: Port number.
+
+    Raises:
+        InputError: The port cannot be used, for example because another program uses it.
+    """
     try:
         return sockets.create_server((LOOPBACK, port))
     except OSError as error:
@@ -51,7 +62,7 @@ def listening(command: str, port: int) -> sockets.socket:
 
 
 def server_of(application: Any) -> uvicorn.Server:
-    """Return a uvicorn server with the limits that all pages share."""
+    """Return a uvicorn server for an ASGI application, with the limits that all pages share."""
     return uvicorn.Server(
         uvicorn.Config(
             application,

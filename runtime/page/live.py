@@ -1,4 +1,4 @@
-"""WebSocket of a live page, which sends eye positions and receives layers and refreshes."""
+"""Serve the WebSocket of a live page, which sends eye positions and receives layers and refreshes."""
 
 from __future__ import annotations
 
@@ -18,13 +18,19 @@ from runtime.optics.retina import as_codes
 from runtime.records import F32, U8
 from runtime.support.artifacts import to_json
 
-PAGES_MAX = 8  # maximum number of live pages, because each receives pictures
+PAGES_MAX = 8  # maximum number of live pages, which is limited because every page receives pictures
 RANGES = {"noise_mm": (0.0, 50.0), "latency_ms": (0.0, 1000.0), "camera_fov_deg": (20.0, 150.0)}
-RANGES |= {"gap_mm": (1.0, 500.0), "camera": (0.0, 1.0)}  # changing these restarts the loop
+RANGES |= {"gap_mm": (1.0, 500.0), "camera": (0.0, 1.0)}  # a change of these values restarts the refresh loop
 
 
 async def live(socket: WebSocket, link: BrowserLink, *, protocol: str | None) -> None:
-    """Serve an authorised page until it disconnects."""
+    """Serve an authorised page until the page disconnects.
+
+    Args:
+        socket: WebSocket that has not been accepted yet.
+        link: Link to the refresh loop.
+        protocol: WebSocket subprotocol to confirm to the page, or None if the page has not offered it.
+    """
     if len(link.news) >= PAGES_MAX:
         await socket.close(1013, "too many pages are open")
         return
@@ -53,14 +59,17 @@ def _tell(loop: asyncio.AbstractEventLoop, news: asyncio.Event) -> None:
 
 
 class _Page:
-    """State of one page. It gets the next picture once it has drawn the previous one."""
+    """Sends data to one page and receives messages from the page.
+
+    The page receives new layers only after it has drawn the previous layers.
+    """
 
     def __init__(self, socket: WebSocket, link: BrowserLink) -> None:
         self._socket, self._link = socket, link
         self.news, self._sent = asyncio.Event(), {"solved": 0, "flat": 0}
-        self._under_way = False  # the page has not drawn the last layers yet
+        self._under_way = False  # True while the page has not drawn the last layers yet
         self._stack: Any = None
-        self._checks, self._moment = False, None  # checks: show the newest measured refresh instead of the live one
+        self._checks, self._moment = False, None  # _checks: True to send the newest measured refresh, not the live one
 
     async def send(self, me: object) -> None:
         sent: dict[str, Any] = {}
@@ -91,14 +100,21 @@ class _Page:
             self.news.clear()
 
     async def _send_layers(self, kind: str, layers: U8, relief: F32 | None, solved_for_m: Any) -> None:
-        """Send RGBA layers and, if known, the relief of their content as 16-bit floats."""
+        """Send RGBA layers and, if the relief of their content is known, the relief as 16-bit floats.
+
+        Args:
+            kind: `solved` for a solution, or `flat` for the flat picture.
+            layers: (N, h, w, 4) layers.
+            relief: (h, w) relief of the content.
+            solved_for_m: (2, 3) eyes that the layers were solved for, in frame `stack`.
+        """
         data = await asyncio.to_thread(lambda: layers.tobytes() + (b"" if relief is None else half_floats(relief)))
         message = {"layers": kind, "solved_for_m": solved_for_m, "size": layers.shape[2:0:-1]}
         await self._say(message if relief is None else message | {"relief": relief.shape[::-1]})
         await self._socket.send_bytes(data)
 
     async def _send_moment(self, moment: Any) -> None:
-        """Send layers and the targets of both eyes, all as RGBA."""
+        """Send the layers of a measured refresh and the target pictures of the two eyes, all as RGBA."""
         views = moment.eye_views
 
         def packed() -> bytes:

@@ -1,4 +1,4 @@
-"""Figures of the status in the text format of Prometheus, under their JSON names."""
+"""Format the figures of the daemon's status as text for Prometheus, under their JSON names."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ from typing import Any
 
 PREFIX = "phasestack_"
 COUNTERS = ("presented", "dropped", "stale_inputs", "inferences", "missed_blanks")
-TABLES = {"efforts": "effort", "faults": "part", "rejected_samples": "reason"}  # field: label
+TABLES = {"efforts": "effort", "faults": "part", "rejected_samples": "reason"}  # name of the label, by field
 TEXTS = ("state", "effort", "model", "scene")
 
 
 def exposition(status: Mapping[str, Any]) -> str:
-    """Format all numbers of a status, with labels for quantiles, tables and texts. Skips nulls."""
+    """Format the numbers and the known texts of a status in the text format of Prometheus.
+
+    Quantiles, the entries of tables, and texts become labels. Null values are skipped.
+    """
     return "".join(f"{line}\n" for line in _lines(status))
 
 
@@ -33,7 +36,10 @@ def _lines(status: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _key(field: str, key: str) -> str:
-    """Return the label of an entry. `p95` is the quantile 0.95, and `max` the quantile 1."""
+    """Return the label of an entry of a dictionary in the status.
+
+    The key `p95` stands for the quantile 0.95, and `max` for the quantile 1.
+    """
     if field in TABLES:
         return _label(TABLES[field], key)
     if key[:1] == "p" and key[1:].isdigit():

@@ -1,7 +1,7 @@
-"""Web application of the operator's page. All access to the daemon requires the token.
+"""Web application of the operator's page.
 
-The script stores the token (`session.js`) and sends it with every request. Other sites and ports cannot read it and,
-because it is no cookie, their requests cannot carry it.
+All access to the daemon requires a token, which the script of the page stores (`session.js`) and sends with every
+request. Other sites and ports cannot read the token. Their requests cannot carry the token, because it is not a cookie.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from runtime.support.untrusted_input import parsed_json
 
 SCRIPT, STYLE = "text/javascript", "text/css"
 PROTOCOL = "phasestack"  # WebSocket subprotocol
-METRICS = "text/plain; version=0.0.4; charset=utf-8"  # Prometheus
+METRICS = "text/plain; version=0.0.4; charset=utf-8"  # media type of the text format of Prometheus
 ASSETS = {"page.css": STYLE, "look.css": STYLE}
 ASSETS |= dict.fromkeys(("session.js", "page.js", "display.js", "look.js", "try.js"), SCRIPT)
 HEADERS = {
@@ -51,20 +51,23 @@ Handler = Callable[[Request], Awaitable[Response]]
 
 
 class JsonAnswer(JSONResponse):
-    """JSON response in ASCII, because file names may not be UTF-8."""
+    """JSON response in pure ASCII, because file names in the response may not be valid UTF-8."""
 
     def render(self, content: Any) -> bytes:
         return to_json(content).encode()
 
 
 class TooLong(ValueError):
-    """The body of a request is too long."""
+    """Raised if the body of a request is longer than `REQUEST_MAX_BYTES`."""
 
 
 def application(daemon: DaemonClient, token: str, *, link: BrowserLink | None = None) -> Starlette:
-    """Create the application, which must listen on loopback only.
+    """Create the web application, whose server must listen on loopback only.
 
-    link: makes the page the display itself. Its address contains the token.
+    Args:
+        daemon: Client that connects to the daemon.
+        token: Token that requests must carry.
+        link: Link to the refresh loop if the page itself is the display. None for the operator's page alone.
     """
 
     def permitted(request: HTTPConnection) -> bool:
@@ -86,7 +89,7 @@ def application(daemon: DaemonClient, token: str, *, link: BrowserLink | None = 
         return HTMLResponse(_asset("page.html"))
 
     async def connected(socket: WebSocket) -> None:
-        # A browser's script can set only one header of a WebSocket, the list of protocols.
+        # The list of protocols is the only header of a WebSocket request that a script can set in a browser.
         offered = [one.strip() for one in socket.headers.get("sec-websocket-protocol", "").split(",")]
         if link is None or not (permitted(socket) or any(same(one, token) for one in offered)):
             await socket.close(1008)
@@ -139,14 +142,19 @@ def application(daemon: DaemonClient, token: str, *, link: BrowserLink | None = 
 
 
 async def _guard(request: Request, handler: Handler) -> Response:
-    """Add security headers to every answer."""
+    """Add security headers to the answer of a request."""
     answer = await handler(request)
     answer.headers.update(HEADERS)
     return answer
 
 
 async def _body(request: Request) -> bytes:
-    """Return the body of a request. Raises TooLong, or ValueError if it does not arrive in time."""
+    """Return the body of a request.
+
+    Raises:
+        TooLong: The body is longer than `REQUEST_MAX_BYTES`.
+        ValueError: The client disconnects or the body does not arrive within `REQUEST_S`.
+    """
     received = b""
     try:
         async with asyncio.timeout(REQUEST_S):

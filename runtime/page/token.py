@@ -1,4 +1,4 @@
-"""The page's token, stored in a file that only its owner can read."""
+"""Store the token of the operator's page in a file that only the owner of the file can read."""
 
 from __future__ import annotations
 
@@ -12,12 +12,16 @@ from pathlib import Path
 from runtime.errors import InputError
 
 TOKEN_BYTES = 32  # length of a new token
-LEAST_CHARACTERS = 16  # minimum length of a token; a shorter one could be guessed
-MOST_BYTES = 4096  # maximum number of bytes read from the file
+LEAST_CHARACTERS = 16  # minimum length of a token; shorter tokens could be guessed
+MOST_BYTES = 4096  # maximum number of bytes that are read from the file
 
 
 def token_of(path: Path) -> str:
-    """Read the token from a file, or create the file. Raises InputError if either fails."""
+    """Read the token from a file, or create the file with a new token if the file does not exist.
+
+    Raises:
+        InputError: The file cannot be created or read, is accessible to other users, or contains no valid token.
+    """
     token, name = secrets.token_urlsafe(TOKEN_BYTES), ""
     try:
         if not os.path.lexists(path):
@@ -28,7 +32,7 @@ def token_of(path: Path) -> str:
             os.link(name, path)  # atomic
             return token
     except FileExistsError:
-        pass  # another process was faster
+        pass  # another process has created the file in the meantime
     except OSError as error:
         raise InputError(path, "", f"cannot be created ({error.strerror})") from None
     finally:
