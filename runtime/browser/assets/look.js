@@ -1,4 +1,5 @@
-// The page around a display: head control by pointer and keys, viewing modes, and figures.
+// User interface of a page that shows a display, with control of the head by pointer and keys, viewing modes and
+// figures.
 import { Display, alignment, unaligned, drawPlan, middle, moved, reach } from "/display.js";
 
 const MODES = [ // key, name, group, hint
@@ -14,10 +15,13 @@ const MODES = [ // key, name, group, hint
   ["difference", "Difference × 8", "Check", "What each eye sees minus what it should see; black is perfect. For the head position the layers were solved for."],
 ];
 const KEYS = { ArrowLeft: [0, -1, 0], ArrowRight: [0, 1, 0], ArrowUp: [0, 0, 1], ArrowDown: [0, 0, -1], "+": [-2, 0, 0], "-": [2, 0, 0] };
-// Without a GPU, drawing takes processor time from the solver, so pictures are fewer and smaller while the head moves.
+// Without a GPU, drawing takes processor time from the solver, so fewer and smaller pictures are drawn while the head
+// moves.
 const SOFTWARE = { rays: 1, coarse: 0.5, frame_ms: 60 };
-const STEP_M = 0.005, REACH_M = [0.5, 0.3]; // head movement per key press; across the picture's whole width and height
-const REST_MS = 200, REST_RAYS = 5, STRIPS = 12, WIGGLE_MS = 280, REPORT_MS = 120, SAMPLED = 12; // light is measured on every SAMPLED-th pixel in each direction
+// STEP_M: movement of the head per key press. REACH_M: movement for a pointer movement across the whole picture.
+const STEP_M = 0.005, REACH_M = [0.5, 0.3];
+// SAMPLED: light is measured at every SAMPLED-th pixel in each direction.
+const REST_MS = 200, REST_RAYS = 5, STRIPS = 12, WIGGLE_MS = 280, REPORT_MS = 120, SAMPLED = 12;
 const PAGE = `
 <div class="stage"><canvas tabindex="0" aria-label="What the eyes see. Arrow keys move the head, + and - bring it nearer and farther."></canvas>
 <svg class="over" aria-hidden="true"></svg><div class="names" aria-hidden="true"></div><p class="notice" role="status" hidden></p></div>
@@ -33,8 +37,9 @@ const node = (name, text = "", kind = "") => Object.assign(document.createElemen
 const mm = (metres) => Math.round(Math.abs(metres) * 1000);
 
 export class Look {
-  // scene: stack, fov_deg, and the eyes_m that the layers were solved for; eyesAt: both eyes for a head's displacement;
-  // onTheWay: where the head is now on its way to a displacement.
+  // scene: `stack`, `fov_deg`, and `eyes_m`, for which the layers were solved.
+  // eyesAt: function that returns the two eyes for a displacement of the head.
+  // onTheWay: function that returns the present displacement of a head that is moving to a given displacement.
   constructor(root, scene, { title, eyesAt = (head) => moved(scene.eyes_m, head), onTheWay = (head) => head }) {
     root.innerHTML = PAGE;
     this.$ = (query) => root.querySelector(query);
@@ -44,11 +49,11 @@ export class Look {
     Object.assign(this, { mode: "parallel", head: [0, 0, 0], aligned: true, pupil: false, point: [0, 0], rays: 3, coarse: 1, frame_ms: 0, painted_ms: 0, reported_ms: 0, frames: 0 });
     if (this.display.software) Object.assign(this, SOFTWARE);
     this.flatness = 0;
-    this.used = null; // eyes that the panels are aligned to, if not the true ones
-    this.state = ""; // reason why the picture is not what the two eyes should see
-    this.onhead = () => {}; // called after the head was moved
-    this.onframe = () => {};
-    this.onmode = () => {}; // called when a mode is chosen; true: it needs the targets
+    this.used = null; // eyes that the panels are aligned to; null if these are the true eyes
+    this.state = ""; // reason why the picture differs from the picture that the two eyes should see
+    this.onhead = () => {}; // called after the head has been moved
+    this.onframe = () => {}; // called after a picture has been drawn
+    this.onmode = () => {}; // called when a mode is chosen, with true if the mode needs target pictures
     this.$("h1").textContent = title;
     this.$(".stage").style.setProperty("--aspect", this.stack.width_m / this.stack.height_m);
     this.#modes();
@@ -66,7 +71,7 @@ export class Look {
     return alignment(this.stack, this.scene.eyes_m, this.used ?? this.eyes);
   }
 
-  // Change the panels' positions; layers for them follow later.
+  // Change the positions of the panels. Layers for the new positions are loaded later.
   turnTo(stack) {
     this.stack = this.scene.stack = this.display.stack = stack;
     this.scene.eyes_m = null;
@@ -78,14 +83,14 @@ export class Look {
     this.draw();
   }
 
-  // Show a message over the picture; empty: hide it.
+  // Show a message over the picture, or hide the message if `text` is empty.
   notice(text) {
     const box = this.$(".notice");
     if (box.textContent !== text) box.textContent = text;
     box.hidden = !text;
   }
 
-  // Redraw at the next frame, and with more rays after a rest of REST_MS.
+  // Redraw at the next frame, and again with more rays if nothing changes for REST_MS.
   draw() {
     this.moving = performance.now();
     this.fresh = true;
@@ -97,7 +102,7 @@ export class Look {
   #frame(now) {
     this.next = null;
     clearTimeout(this.turn);
-    if (this.before !== undefined) { // consecutive frames: adapt rays and resolution to this machine's speed
+    if (this.before !== undefined) { // between consecutive frames, adapt rays and resolution to the machine's speed
       this.pace = 0.8 * (this.pace ?? 30) + 0.2 * (now - this.before);
       if (this.pace > 50 && this.rays > 1) [this.rays, this.pace] = [this.rays - 1, 30];
       else if (this.pace > 50 && this.coarse > 0.6) [this.coarse, this.pace] = [this.coarse * 0.7, 30];
@@ -151,7 +156,7 @@ export class Look {
     return { width, height, resized };
   }
 
-  // Picture whose field of view fits all that the eyes solved for can see through every panel.
+  // Return a picture whose field of view contains everything that the eyes solved for can see through all panels.
   #picture(width, height) {
     const [across, up] = reach(this.stack, this.scene.eyes_m ?? this.eyes);
     const focal = 0.48 * Math.min(width / across, height / up);
@@ -170,7 +175,7 @@ export class Look {
     if (mode === "apart") return this.#apart(width, height);
     if (checks) {
       g.clear(g.COLOR_BUFFER_BIT);
-      if (!display.targets[0]) return; // until the targets have arrived
+      if (!display.targets[0]) return; // the target pictures have not arrived yet
       const { width: pw, height: ph } = this.scene.picture, fit = 0.97 * Math.min(w / pw, h / ph), pic = { width: Math.floor(pw * fit), height: Math.floor(ph * fit) };
       sides.forEach((side, k) => {
         const left = (k % across) * w + ((w - pic.width) >> 1), below = height - (Math.floor(k / across) + 1) * h + ((h - pic.height) >> 1);
@@ -190,7 +195,7 @@ export class Look {
     this.#names(mode === "anaglyph" ? [] : sides.map((side, k) => [`${side ? "right" : "left"} eye`, ((k % across) + 0.5) / across, (Math.floor(k / across) + 1) / down]));
   }
 
-  // True if two pictures are larger side by side than one above the other.
+  // Return true if two target pictures can be drawn larger side by side than one above the other.
   #fitsSideBySide(width, height) {
     const { width: pw, height: ph } = this.scene.picture;
     return Math.min(width / 2 / pw, height / ph) >= Math.min(width / pw, height / 2 / ph);
@@ -220,7 +225,8 @@ export class Look {
     this.#names(names);
   }
 
-  // Exploded view of the panels from the upper left; two rays cross at a point of the centre panel.
+  // Return the projection for an exploded view of the panels from the upper left, in which two rays cross at a point of
+  // the centre panel.
   #drawnApart(width, height) {
     const { x_m, width_m, height_m } = this.stack, deep = x_m.at(-1) - x_m[0], scale = Math.min((0.56 * width) / width_m, (0.6 * height) / height_m);
     const toViewer = [(0.26 * width) / deep, (0.2 * height) / deep], origin = [0.47 * width, 0.47 * height], half = (x_m.at(-1) + x_m[0]) / 2;
@@ -258,7 +264,7 @@ export class Look {
     this.#names(x_m.map((x, n) => [panelName(n, count), ...at(x, -0.36 * width_m, height_m / 2).map((p, k) => p / (k ? height : width))]));
   }
 
-  // Line of text: the codes along a ray and the light they add up to.
+  // Return a line of text with the panel values along a ray and the resulting light.
   #sum(kind, codes) {
     const line = node("p", `${kind} eye: `, kind);
     if (codes.includes(null)) return line.append("misses a panel"), line;
@@ -287,7 +293,8 @@ export class Look {
     this.$(".head").textContent = `${where}${limit}.`;
   }
 
-  // PSNR of the light at both eyes on sampled pixels; the targets move with the centre panel.
+  // Measure and show the PSNR of the light at the two eyes on sampled pixels. Target pictures are treated as painted on
+  // the centre panel.
   #measure() {
     const { display, scene } = this;
     this.isMeasured = true;
@@ -306,7 +313,8 @@ export class Look {
       }
     }
     if (!counted) return void (this.$(".light").textContent = "No ray from here crosses all panels.");
-    this.light_db = -10 * Math.log10(Math.max(error / counted - (scene.target_error ?? 0), 1e-9)); // without the error of the targets' compression
+    // The error of compressed target pictures is subtracted.
+    this.light_db = -10 * Math.log10(Math.max(error / counted - (scene.target_error ?? 0), 1e-9));
     const words = this.light_db > 33 ? "hard to distinguish from the target" : this.light_db > 27 ? "a good picture with faint traces of the other layers" :
       this.light_db > 21 ? "obvious ghosts and coloured edges" : "the layers fall apart";
     this.$(".light").textContent = `Light reaching both eyes here: ${this.light_db.toFixed(1)} dB against the target: ${words}.`;
@@ -385,7 +393,7 @@ export class Look {
     this.moveTo([Math.max(least, Math.min(1.5, this.head[0] + metres)), this.head[1], this.head[2]]);
   }
 
-  // Functions that every page offers to scripts (docs/contracts.md).
+  // Functions that every page provides to scripts (docs/contracts.md).
   get doors() {
     return {
       setHead: (head) => this.moveTo([...head]),

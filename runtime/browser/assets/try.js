@@ -1,10 +1,13 @@
-// Live display: the pointer acts as the head that the daemon's sensor sees, and the page shows the panels.
+// Script of the live display, which shows the panels. The pointer acts as the head that the daemon's sensor sees.
 import { Look } from "/look.js";
 import { ask, token } from "/session.js";
 
-const AGAIN_MS = 500, STATUS_MS = 500, RETRY_MS = 1000, KEPT = 600; // AGAIN_MS: a resting head is sent again; KEPT: latencies in the statistics
+// AGAIN_MS: interval at which the position of a resting head is sent again.
+// KEPT: number of latencies in the statistics.
+const AGAIN_MS = 500, STATUS_MS = 500, RETRY_MS = 1000, KEPT = 600;
 const PLACE_M = [0.6, 0, 0];
-const PEAK_M_S2 = 12, LEAST_S = 0.1, STEP_MS = 12; // acceleration of a quick head, its shortest movement, and the time between samples
+// Peak acceleration of a quick head, duration of its shortest movement, and time between samples.
+const PEAK_M_S2 = 12, LEAST_S = 0.1, STEP_MS = 12;
 const CONTROLS = `
 <dl class="figures"></dl>
 <form><label>Scene <input type="text" name="scene" list="scenes" autocomplete="off"></label><datalist id="scenes"></datalist>
@@ -23,26 +26,28 @@ const CONTROLS = `
 
 let look = null, socket = null, viewer = false, sensor = true, lastSent = 0, follows = null, ipd_m = 0.063, newest = null, pending = null;
 let checks = false, camera = null, lookedAt = null;
-let layersSeen = { solved: false, flat: false }, first = null, wishes = 0, answered_ms = 0; // wishes: commands in progress; answered_ms: when the last one ended
+// wishes: number of commands in progress. answered_ms: time at which the last command ended.
+let layersSeen = { solved: false, flat: false }, first = null, wishes = 0, answered_ms = 0;
 const latencies = [], drawn = [];
 const main = document.querySelector("main");
 
-// Both eyes of a head that faces the centre of the display.
+// Positions of the two eyes of a head that faces the centre of the display.
 function eyesOf(head) {
   const at = PLACE_M.map((v, k) => v + head[k]), norm = Math.hypot(at[0], at[1]);
   const right = [-at[1] / norm, at[0] / norm, 0];
   return [-0.5, 0.5].map((side) => at.map((v, k) => v + side * ipd_m * right[k]));
 }
 
-// True eyes under this page's pointer; otherwise the newest that the daemon measured for another page or a camera.
+// True eyes if this page's pointer is the head. Otherwise, the newest eyes that the daemon measured for another page or
+// a camera.
 const eyesNow = (head) => (viewer && sensor ? eyesOf(head) : newest?.eyes_m ?? follows ?? eyesOf([0, 0, 0]));
 const say = (message) => { if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message)); };
 
-// The head follows the pointer along a minimum-jerk path, which is replanned when the pointer moves. Without it, the
-// tracker would mistake a jump of the pointer for another person.
+// The head follows the pointer along a minimum-jerk path, which is replanned when the pointer moves. Without this path,
+// the tracker would mistake a jump of the pointer for another person.
 let way = { begin_ms: 0, seconds: 0, curves: [0, 1, 2].map(() => [0, 0, 0, 0, 0, 0]) }, step = null;
 
-// Position, velocity and acceleration, for each axis.
+// Position, velocity and acceleration of the head along each axis.
 function motion(ms) {
   const t = Math.min((ms - way.begin_ms) / 1000, way.seconds);
   return way.curves.map(([a, b, c, d, e, f]) => [a + t * (b + t * (c + t * (d + t * (e + t * f)))),
@@ -52,7 +57,8 @@ const head = () => motion(performance.now()).map(([place]) => place);
 
 function follow() {
   const now = performance.now(), moving = motion(now), away = Math.hypot(...moving.map(([place], k) => look.head[k] - place));
-  const T = Math.max(LEAST_S, Math.sqrt((5.77 * away) / PEAK_M_S2)); // least jerk peaks at 5.77 times away / T²
+  // The peak acceleration of a minimum-jerk movement is 5.77 times away / T².
+  const T = Math.max(LEAST_S, Math.sqrt((5.77 * away) / PEAK_M_S2));
   way = { begin_ms: now, seconds: T, curves: moving.map(([p, v, a], k) => {
     const rest = look.head[k] - p - v * T - (a * T * T) / 2, speed = -v - a * T;
     return [p, v, a / 2, (10 * rest) / T ** 3 - (4 * speed) / T ** 2 - a / (2 * T), (-15 * rest) / T ** 4 + (7 * speed) / T ** 3 + a / T ** 2,
@@ -117,7 +123,8 @@ function build({ stack, fov_deg }) {
   about();
 }
 
-// Targets exist only for measured moments, so checking modes show the newest of these instead of the live picture.
+// Target pictures exist only for measured refreshes. The modes that need target pictures show the newest measured
+// refresh instead of the live picture.
 function check(on) {
   if (on === checks) return;
   checks = on;
@@ -127,7 +134,8 @@ function check(on) {
   say({ checks });
 }
 
-// Send this browser's camera, if permitted, one picture at a time: the next one follows the daemon's answer.
+// Send the pictures of this browser's camera if the user permits the camera. Each picture is sent after the daemon has
+// answered the previous picture, or after 250 ms.
 async function film(on) {
   camera?.getTracks().forEach((track) => track.stop());
   camera = null;
@@ -146,7 +154,7 @@ async function film(on) {
   while (camera === mine) {
     const taken_ms = performance.now();
     plain.drawImage(video, 0, 0, canvas.width, canvas.height);
-    const coded = await [0.85, 0.6, 0.3].reduce(async (before, quality) => { // the best quality that fits a message
+    const coded = await [0.85, 0.6, 0.3].reduce(async (before, quality) => { // use the best quality that fits a message
       const blob = await before;
       return blob?.size < 60000 ? blob : canvas.convertToBlob({ type: "image/jpeg", quality });
     }, null);
@@ -197,7 +205,7 @@ function take({ refresh, viewer: mine }) {
   if (layersSeen.solved && flatness < 1) first?.();
 }
 
-// Reason why the picture is not what the two eyes should see.
+// Message that explains why the picture differs from the picture that the two eyes should see.
 function explained({ state, reason }) {
   const late = /solutions take (\d+) ms|has not answered for (\d+) ms/.exec(reason);
   if (!late) return `${state.split(":")[0]}: ${reason}`;
@@ -267,7 +275,8 @@ async function about() {
   }
 }
 
-// asked_ms: time of the request; a status requested before the last command ended does not update the controls.
+// Show the figures of a status. asked_ms: time at which the status was requested. The controls are updated only if the
+// status was requested after the last command had ended.
 function figures(now, asked_ms) {
   const at = (share) => [...latencies].sort((a, b) => a - b)[Math.floor(share * (latencies.length - 1))];
   const rests = now.eyes_label === "rested", solves = now.solutions_per_s_now > 0;
@@ -299,7 +308,7 @@ async function report() {
     if (starting && now.reason) starting.textContent = `Starting: ${now.reason}. The first start on a machine takes about ten seconds longer.`;
     if (look && now.ok) figures(now, asked_ms);
   } catch {
-    // the closed connection reports this
+    // The handler of the closed connection reports the failure.
   }
   setTimeout(report, document.hidden ? 4 * STATUS_MS : STATUS_MS);
 }

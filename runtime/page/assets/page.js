@@ -1,12 +1,13 @@
-// The operator's page: polls the daemon, draws its state, and posts commands. It loads only from this server.
+// Script of the operator's page, which polls the daemon, draws the daemon's state and posts commands. The page loads
+// data only from the server that delivered the page.
 import { drawPlan } from "/display.js";
 import { ask, keep, token } from "/session.js";
 
 const $ = (id) => document.getElementById(id);
 const SVG = "http://www.w3.org/2000/svg";
-const KEPT = 240; // number of points in a plot: two minutes
+const KEPT = 240; // number of points in a plot, which cover two minutes
 const STATUS_MS = 500, PICTURES_MS = 400, LOG_MS = 1000, ABOUT_MS = 5000, RETRY_MS = 1000;
-const ZOOMED_SIGMAS = 20; // two standard deviations, ten times as large
+const ZOOMED_SIGMAS = 20; // radius of the drawn uncertainty: two standard deviations, enlarged ten times
 
 let about = null;
 let running = false;
@@ -29,7 +30,7 @@ function setText(node, text) {
   if (node.textContent !== text) node.textContent = text;
 }
 
-// A solution for an instant after this display time has no age yet.
+// Age of a solution, which is 0 if the solution is for an instant after the display time.
 const age = (value) => (typeof value === "number" ? Math.max(0, value) : value);
 const number = (value, digits = 1) => (value === null || value === undefined ? "–" : Number(value).toFixed(digits));
 const clock = (seconds) => new Date(seconds * 1000).toLocaleTimeString([], { hour12: false });
@@ -69,13 +70,13 @@ function plot(status) {
     const least = Math.min(0, ...known);
     const begin = KEPT - p.values.length;
     const height = (v) => (54 - (52 * (v - least)) / (most - least)).toFixed(1);
-    // Gaps for unknown values.
+    // The curve has gaps where values are unknown.
     const steps = p.values.map((v, i) => v === null ? "" : `${i && p.values[i - 1] !== null ? "L" : "M"}${begin + i},${height(v)}`);
     p.curve.setAttribute("d", steps.join(""));
   }
 }
 
-// The eyes from above and from the side.
+// Plans of the eyes and panels from above and from the side.
 
 function view(svg, status, axis, range) {
   const sigma_m = ((status.eye_sigma_now_mm ?? 0) / 1000) * ZOOMED_SIGMAS;
@@ -101,7 +102,7 @@ function drawEyes(status) {
   view($("side"), status, 2, sector(...about.viewing_up_deg));
 }
 
-// Figures, savings, faults.
+// Figures, savings and faults.
 
 function figures(status) {
   const rows = {
@@ -201,7 +202,7 @@ function playlist(told) {
   $("next").hidden = !told;
 }
 
-// Placement of the scene, sent on every change.
+// Placement of the scene, which is sent after every change.
 
 const PLACE = [
   ["p-scale", "scale", null, 1], ["p-turntable", "turntable_per_min", null, 1],
@@ -215,7 +216,7 @@ function placing(told) {
   placed = told;
   for (const [id, name, part, units] of PLACE) {
     const value = (part === null ? told[name] : told[name][part]) * units;
-    // Keep values that are being typed or not sent yet.
+    // Do not overwrite values that are being typed or have not been sent yet.
     if (document.activeElement !== $(id) && !waiting && !sending) $(id).value = Number(value.toFixed(4));
   }
 }
@@ -246,7 +247,7 @@ $("place-reset").addEventListener("click", () => tell($("place-reset"), "place",
 
 // Polling.
 
-let loggedIn = Promise.resolve(); // resolved once the token is right
+let loggedIn = Promise.resolve(); // resolved when the user has entered a token
 
 function logIn() {
   if ($("login").open) return;
@@ -285,7 +286,7 @@ function gone(why, hangs = false) {
 }
 
 function show(status) {
-  if (!running) { // clear errors about a missing daemon
+  if (!running) { // the daemon has been missing, so clear the error messages
     for (const told of document.querySelectorAll('[data-kind="bad"]')) setText(told, "");
   }
   running = true;
@@ -297,7 +298,7 @@ function show(status) {
   setText($("state"), hangs ? "hangs" : late ? "late" : status.state ?? "starting");
   $("state").dataset.state = hangs ? "gone" : late ? "holding" : (status.state ?? "starting").split(":")[0];
   setText($("reason"), late ? `${reason}: use the model "fast" or fewer pixels (the panels still follow the eyes)` : reason);
-  if (status.state === undefined) return; // before the first refresh
+  if (status.state === undefined) return; // there has been no refresh yet
   document.querySelector('[data-command="pause"]').setAttribute("aria-pressed", String(status.paused));
   document.querySelector('[data-command="flat"]').setAttribute("aria-pressed", String(status.flat_asked));
   for (const [id, value] of [["scene", status.scene], ["model", status.model_asked]]) {

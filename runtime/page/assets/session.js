@@ -1,4 +1,4 @@
-// The browser stores the token for this address and port only, so no other server gets it.
+// The browser stores the token for this address and port only, so no other server receives the token.
 const key = new URL(location.href).searchParams.get("token");
 if (key) {
   localStorage.setItem("token", key);
