@@ -1,1 +1,1 @@
-"""The browser as viewer and display: its scripts, and pages that show one solution."""
+"""Scripts that make a web browser the viewer and the display, and pages that show one solution."""

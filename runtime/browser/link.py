@@ -145,7 +145,10 @@ class BrowserLink:
         self._captures.append((capture_ns, page_ms))
 
     def page_ms_of(self, capture_ns: int) -> float | None:
-        """Return the time of the newest sample captured no later than `capture_ns`, on the page's clock."""
+        """Return the page time of the newest sample captured no later than `capture_ns`.
+
+        The time is on the page's clock. The result is None if no such sample is stored.
+        """
         return next((page_ms for ns, page_ms in reversed(tuple(self._captures)) if ns <= capture_ns), None)
 
     def refreshed(self, account: dict[str, Any]) -> None:

@@ -124,7 +124,7 @@ def _exact(layer: U8, *, quick: bool) -> str:
 
 
 def _stored(pictures: Sequence[U8], room: int, *, qualities: Sequence[int] = QUALITIES) -> tuple[list[str], float]:
-    """Encode pictures as AVIF with the first of `qualities` at which they fit.
+    """Encode pictures as AVIF at the first quality at which they fit into `room` bytes.
 
     Args:
         pictures: Pictures (h, w, 3 or 4).

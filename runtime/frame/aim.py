@@ -90,7 +90,7 @@ class Aim:
         return SolveRequest(then_ns, then_m, label, eyes.sigma_m, flat_wanted, paused, effort, refined)
 
     def _learn(self, shown: Solution | None, eyes: EyesEstimate) -> None:
-        """Update the statistics with the newest solution's measures and its distance from the present eyes."""
+        """Update the statistics with the newest solution's measures and the motion of the eyes."""
         if shown is None or shown.solved_for_m is None:
             return
         expected_m2 = self._expected.get(shown.solved_for_ns, 0.0)

@@ -8,8 +8,8 @@ error Q for a still viewer plus the error D of an outdated view (docs/mathematic
     D(d, t) = y / (1 + y/D_max),    y = a·d²/(d + d0) + b·t²
 
 The symbol sigma is the tracking error per axis at the middle of the interval, v is the speed of the head, and l is the
-distance that the head moves beyond the tracker's prediction horizon. A common factor scales sigma, v and l until
-predicted displacements match observed displacements. The rates a and b describe how the picture changes with the
+distance that the head moves beyond the tracker's prediction horizon. A common factor scales sigma, v and l to
+make predicted displacements match observed displacements. The rates a and b describe how the picture changes with the
 position of the head and with time. D_max is half the variance of the picture. The values of a, b and D_max are
 measured on successive target pictures.
 
@@ -28,7 +28,7 @@ from runtime.records import Effort, Measures
 SOLVING_STAGES = ("render", "prepare", "inference", "finish", "step")
 HORIZON_S = 1.0  # time for which head and content are assumed to continue unchanged
 EQUAL = 1.03  # the fastest effort is chosen among efforts whose mean errors are within this factor of the lowest
-PREFERRED = 0.93  # the effort is changed only if the mean error falls below this share of the present effort's
+PREFERRED = 0.93  # share of the present effort's mean error below which another effort is chosen
 GAIN = 0.2  # weight of the newest measurement in a running mean
 KEPT_SOLUTIONS = 100  # times of a raster are discarded after this many solutions on other rasters
 # Squared error of light after k steps, relative to no steps: solver `best`, mean over the scenes demo and texture at

@@ -74,7 +74,7 @@ class Pacer:
         """
         if blank_ns is None:
             self._learn_work(done_ns - woke_ns)
-            # With known blanks, a skipped swap keeps the old picture on screen until its slot.
+            # If blanks are known, a skipped swap keeps the old picture on screen until the slot of the refresh.
             return (timing.present_ns if self._has_blanks else done_ns) + self._photon_ns
         self._has_blanks = True
         error_ns = blank_ns - timing.present_ns

@@ -1,7 +1,8 @@
 """Present the newest solution at every refresh, aligned to the eyes at the display time.
 
 At each refresh, the presenter takes the samples that have arrived, predicts the eyes, aligns the newest solution to the
-eyes at the display time, presents the solution and records the result. It waits only for the time slot of the refresh.
+eyes at the display time, presents the solution and records the result. The loop waits only for the time slot of the
+next refresh.
 The solver (`solver_host`) runs in parallel and delivers complete solutions.
 """
 
@@ -125,7 +126,7 @@ class RefreshTimes:
 class Presenter:
     """Runs the refresh loop of one run.
 
-    The presenter does not close the parts that are passed to its constructor. They belong to the caller.
+    The caller owns the parts that are passed to the constructor, and must close them.
     """
 
     def __init__(

@@ -48,7 +48,7 @@ class SolverHost(ABC):
     @property
     @abstractmethod
     def costs(self) -> Costs:
-        """Present costs of solutions."""
+        """Current costs of solutions."""
 
     @abstractmethod
     def post(self, request: SolveRequest) -> None:
@@ -73,7 +73,7 @@ def taken_in(news: SolverUpdate, step: SolverUpdate) -> SolverUpdate:
 
 
 class SimulatedSolver(SolverHost):
-    """Host of a solver on a simulated clock.
+    """Runs a solver on a simulated clock.
 
     A request is computed immediately. Its result is published once the simulated clock has advanced by the configured
     cost of the solution.

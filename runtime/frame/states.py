@@ -100,7 +100,7 @@ REFRESHES_MAX = 1024  # largest number of refreshes counted in the window
 class Lateness:
     """Detects a late display.
 
-    The display is late if the number of refreshes in the last second has been too small for at least one second.
+    The display is late if the number of refreshes in the last second has been too small for more than one second.
     """
 
     def __init__(self, period_ns: int) -> None:

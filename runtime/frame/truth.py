@@ -24,12 +24,7 @@ class TrueEyes:
         return bool(self._known)
 
     def add(self, capture_ns: int, eyes_m: F64) -> None:
-        """Add the true eyes of a sample.
-
-        Args:
-            capture_ns: Capture time of the sample.
-            eyes_m: (2, 3) true eyes in frame `stack`.
-        """
+        """Add the true eyes (2, 3) of a sample, in frame `stack`."""
         if not self._known or capture_ns > self._known[-1][0]:
             self._known.append((capture_ns, eyes_m))
 

@@ -13,7 +13,7 @@ from runtime.daemon.client import REQUEST_MAX_BYTES, REQUEST_S
 from runtime.errors import InputError
 
 LOOPBACK = "127.0.0.1"
-CONNECTIONS_MAX = 64  # simultaneous connections
+CONNECTIONS_MAX = 64  # maximum number of simultaneous connections
 
 
 class LimitedConnection(H11Protocol):

@@ -248,7 +248,7 @@ class Display:
 
     @property
     def has_windows(self) -> bool:
-        """True if there are windows other than the hidden root."""
+        """True if there are windows other than the hidden root window."""
         return len(self._windows) > 1
 
 

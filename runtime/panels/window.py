@@ -244,7 +244,7 @@ def _error(context: moderngl.Context) -> str:
 
 
 def _reset_status() -> str:
-    """Return the driver's status if the GPU was reset and the context is lost, otherwise an empty string."""
+    """Return the status that the driver reports after a GPU reset, or "" if the GPU was not reset."""
     address = gl_function("glGetGraphicsResetStatus")
     status: int = ctypes.CFUNCTYPE(ctypes.c_uint)(address)() if address else 0
     return f"was reset (0x{status:x})" if status else ""
