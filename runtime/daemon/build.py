@@ -1,4 +1,4 @@
-"""Composition root: builds a run from its settings."""
+"""Composition root, which creates all parts of a run from the settings."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ from runtime.support.untrusted_input import LIMITS
 
 log = logging.getLogger("phasestack.build")
 
-SWITCH_INTERVAL_S = 0.0005  # Python's thread switching interval, short so that the presenter never waits long
+SWITCH_INTERVAL_S = 0.0005  # Python's thread switch interval; a short one lets the presenter resume quickly
 
-# Figures in summary.json that are configured rather than measured on a simulated clock.
+# Figures in summary.json that follow from the configuration if the clock is simulated.
 SIMULATED_FIGURES = (
     "seconds", "fps", "solutions_per_s", "interval_ms", "photon_ms", "stage_ms", "overhead_ms", "skew_ms",
     "solution_age_ms", "efforts",
@@ -57,20 +57,20 @@ SIMULATED_FIGURES = (
 class RunOptions:
     """Options of a run that are set only on the command line."""
 
-    max_speed: bool = False
-    measure: bool = False
-    scale: float = 1.0
-    keep_light: int = 0
+    max_speed: bool = False  # play a recording on a simulated clock, without waiting
+    measure: bool = False  # measure the quality of some refreshes
+    scale: float = 1.0  # factor applied to the panels' size in pixels
+    keep_light: int = 0  # write the layers of every N-th refresh; 0: never
     frames: int | None = None  # stop after this many refreshes; None: run to the end
     out: Path | None = None  # folder for the files of the run
-    browser: BrowserLink | None = None  # page that shows the panels and may be the sensor
-    until: Callable[[], str] = str  # returns a reason to stop, or ""
-    fixed: Effort | None = None  # effort with model.effort = "full"; None: all steps of the model
+    browser: BrowserLink | None = None  # link to the page that shows the panels and may act as the sensor
+    until: Callable[[], str] = str  # returns the reason to stop, or "" to continue
+    fixed: Effort | None = None  # effort of every solution if model.effort is "full"; None: all steps of the model
 
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """A run built from its settings."""
+    """A run as built by `build_run`, with access to its solver, savings and summary."""
 
     presenter: Presenter
     observer: RunObserver
@@ -79,12 +79,12 @@ class Run:
 
     @property
     def parts(self) -> RunningSolver:
-        """Parts of the current solver."""
+        """Newest solver, with its OpenGL context and backend."""
         assert self.maker.parts is not None
         return self.maker.parts
 
     def plan_items(self) -> list[dict[str, Any]]:
-        """Return the savings in use. A time or cost that was not measured is None."""
+        """Return the savings in use as dictionaries. Times and costs that were not measured are None."""
         solver = self.parts.solver
         known = replace(solver.measured, reuse=Saving(saves_ms=self.presenter.stats.reuse_saves_ms()))
         return [asdict(item) for item in solver.plan_items(known)]
@@ -93,7 +93,7 @@ class Run:
         """Return the content of summary.json (docs/contracts.md)."""
         return {
             "clock": "simulated" if self.simulated else "real",
-            "configured": list(SIMULATED_FIGURES) if self.simulated else [],  # not measured
+            "configured": list(SIMULATED_FIGURES) if self.simulated else [],  # figures that were not measured
             **self.presenter.summary(simulated=self.simulated),
             **self.observer.summary(),
             "backend": self.presenter.run_cell.state.predictor.backend,
@@ -113,16 +113,23 @@ def scaled_stack(settings: Settings, scale: float) -> PanelStack:
 
 
 class Host(Supervisor):
-    """Callbacks for the start of a run. This base class does nothing."""
+    """Callbacks that `build_run` calls while a run starts. This base class does nothing."""
 
-    recorder: Any = None  # additional observer, informed before the first refresh through `watches`
+    recorder: Any = None  # additional observer, whose `watches` is called before the first refresh
 
     def starting(self, doing: str) -> bool:
-        """Called before each long step of the start. Returns False to cancel the start."""
+        """Called before each long step of the start, and repeatedly while content and model load.
+
+        Args:
+            doing: Description of the step, such as "opening panels".
+
+        Returns:
+            False to cancel the start. This takes effect only while content and model load.
+        """
         return True
 
     def wait_for_panel(self, why: str) -> bool:
-        """Called when a panel is missing. Waits and returns True to try again."""
+        """Called when a panel is missing. Returns True, after a pause, to try again, or False to give up."""
         return False
 
     def watches(self, run: Run) -> None:
@@ -138,10 +145,20 @@ def build_run(
     output: Output | None = None,
     on_account: Callable[[RefreshAccount], None] | None = None,
 ) -> Run:
-    """Build a run that is ready for its first refresh. Closing `cleanup` closes all its parts.
+    """Build a run that is ready for its first refresh.
 
-    Raises FatalError for unusable settings or files, PanelLost if a panel is missing and the host does not wait for it,
-    and Stopped if the host cancels the start.
+    Args:
+        settings: Settings of the run.
+        options: Options that are set only on the command line.
+        cleanup: Stack that closes all parts of the run when it is closed.
+        host: Callbacks for the start and, as the presenter's supervisor, for each refresh. None: no callbacks.
+        output: Destination of the run's files. None: write no files.
+        on_account: Function that is called with the account of each refresh.
+
+    Raises:
+        FatalError: A setting or a file cannot be used.
+        PanelLost: A panel is missing, and the host does not wait for it.
+        Stopped: The host has cancelled the start.
     """
     host = host or Host()
     if options.scale != 1.0 and settings.output.kind != "offscreen":
@@ -235,7 +252,7 @@ def build_run(
         gc.collect()
         gc.freeze()
         cleanup.callback(gc.unfreeze)
-        cleanup.enter_context(before_all_others())  # for this thread only, after all others have started
+        cleanup.enter_context(before_all_others())  # applies to this thread only; all others have already started
     run = Run(presenter, observer, maker, simulated)
     host.watches(run)
     return run

@@ -1,4 +1,4 @@
-"""Changes made by operators: choices that override the configuration, and the change being loaded."""
+"""Changes that operators make to a run's settings, which are loaded one at a time."""
 
 from __future__ import annotations
 
@@ -28,36 +28,37 @@ NEEDS_RESTART = (
     "loop",
     "model.backend",
     "calibration.ipd_m",
-)  # used only at the start
+)  # settings that are read only when a run starts
 
 
 @dataclass(frozen=True, slots=True)
 class Choices:
-    """The configuration as last read, and the operator's choices that override it."""
+    """Configuration as last read, together with the settings that the operator has overridden."""
 
     configured: Settings
-    chosen: dict[tuple[str, str], Any] = field(default_factory=dict)  # by section and key
+    chosen: dict[tuple[str, str], Any] = field(default_factory=dict)  # chosen value by (section, key)
 
     def settings(self) -> Settings:
-        """Return the settings with all choices applied. Raises InputError if they are invalid."""
+        """Return the settings with all choices applied. Raises InputError if the result is invalid."""
         settings = self.configured
         for (section, key), value in self.chosen.items():
             settings = changed(settings, section, {key: value}, source="ctl")
         return settings
 
     def choosing(self, section: str, **values: Any) -> Choices:
-        """Return the choices with these values of one section added."""
+        """Return a copy that also overrides the given settings of one section."""
         return replace(self, chosen=self.chosen | {(section, key): value for key, value in values.items()})
 
     def another_scene(self, scene: str) -> Choices:
-        """Return the choices with another scene, which starts in its configured placement."""
+        """Return a copy with another scene, which starts in its configured placement."""
         kept = {setting: value for setting, value in self.chosen.items() if setting[1] not in PLACING}
         return replace(self, chosen=kept).choosing("content", scene=scene)
 
     def reloaded(self, read: Callable[[], Settings]) -> Choices:
-        """Return the new configuration, with the choices whose settings it has not changed.
+        """Return a copy with the configuration that `read` returns.
 
-        Raises InputError if the configuration is invalid or changes a setting that requires a restart.
+        A choice is kept only if the new configuration does not change that setting. Raises InputError if the new
+        configuration is invalid or changes a setting that requires a restart.
         """
         settings, before = read(), self.configured
         frozen = [name for name in NEEDS_RESTART if attrgetter(name)(settings) != attrgetter(name)(before)]
@@ -73,24 +74,28 @@ def _value(settings: Settings, at: tuple[str, str]) -> Any:
 
 @dataclass(slots=True)
 class _Change:
-    """A change of settings that a command asks for."""
+    """A change of settings that a command requests."""
 
     command: Command
-    choose: Callable[[Choices], Choices]  # runs on the loading thread; raises InputError
+    choose: Callable[[Choices], Choices]  # computes the new choices on the loading thread; may raise InputError
     reload_content: bool = False
     choices: Choices | None = None  # set by the loading thread before its job ends
 
     def settings(self, before: Choices) -> Settings:
-        """Apply the operator's choice and return the new settings. Raises InputError if they are invalid."""
+        """Apply the change to the choices made before, and return the new settings.
+
+        Raises InputError if the new settings are invalid.
+        """
         self.choices = self.choose(before)
         return self.choices.settings()
 
 
 class Changes:
-    """Changes to a run, loaded one at a time.
+    """Executor of operators' changes to a run, which loads one change at a time.
 
-    Only the presenter's thread uses this object. A job reads and loads settings (`Reconfiguration`) and the solver's
-    thread moves the scene. Both get copies of their inputs and return their outcome through a queue.
+    Only the presenter's thread uses this object. A background job reads the settings and loads new parts (see
+    `Reconfiguration`), and the solver's thread moves the scene. Both work on copies of their inputs. `carry_on` polls
+    the job and collects the outcomes of the solver's work, and never waits.
     """
 
     def __init__(self, presenter: Presenter) -> None:
@@ -103,13 +108,13 @@ class Changes:
 
     @property
     def loading(self) -> Reconfiguration | None:
-        """Return the change being loaded, if any."""
+        """Return the change that is being loaded, or None."""
         return None if self._loading is None else self._loading[1]
 
     def carry_on(self) -> None:
-        """Process results of other threads and start the next change. Called once per refresh."""
+        """Process the results of other threads and start a waiting change. Called once per refresh."""
         finished = self._loading is not None and self._loading[1].finished
-        while not self._outcomes.empty():  # first, because they may concern the scene that a change replaces
+        while not self._outcomes.empty():  # first, because an outcome may concern the scene that the change replaces
             self._outcomes.get()()
         if self._loading is not None and finished:
             (change, loading), self._loading = self._loading, None
@@ -120,10 +125,12 @@ class Changes:
             self.attempt(change.command, partial(self._load, change))
 
     def begin(self, command: Command, choose: Callable[[Choices], Choices], *, reload_content: bool = False) -> None:
-        """Start a change. A change that is still loading is abandoned first.
+        """Start a change, or replace the change that is still loading.
 
-        choose: computes the new choices on the loading thread.
-        reload_content: reload the content even if its settings have not changed.
+        Args:
+            command: Command to answer when the change has ended.
+            choose: Function that computes the new choices from the current ones, on the loading thread.
+            reload_content: Reload the content even if the content settings have not changed.
         """
         change = _Change(command, choose, reload_content)
         if self._loading is None:
@@ -137,9 +144,9 @@ class Changes:
         self._next = change
 
     def place(self, command: Command) -> None:
-        """Move the scene. Raises InputError if the placement is invalid.
+        """Move the scene as the command asks. Raises InputError if the placement is invalid.
 
-        This happens on the solver's thread, so that settings and content agree.
+        The solver's thread replaces the settings and the content together, between two solutions.
         """
         values = command.value or status.placing_in(self.choices.configured)
         changed(self._presenter.run_cell.state.settings, "content", values, source="place")
@@ -157,7 +164,7 @@ class Changes:
         self._between_steps(command, move, moved)
 
     def skip(self, command: Command) -> None:
-        """Advance the playlist to its next entry, on the solver's thread."""
+        """Advance the playlist to its next entry. The solver's thread does this between two solutions."""
 
         def skip(parts: Any) -> str:
             skipped = parts.run.state.content.skip(time_ns=self._presenter.clock.now_ns())
@@ -166,12 +173,17 @@ class Changes:
         self._between_steps(command, skip)
 
     def attempt(self, command: Command, work: Callable[[], None]) -> None:
-        """Run `work`. If it raises, refuse the command and let the run continue."""
+        """Run `work`. If an exception is raised, refuse the command; the run continues."""
         if problem := _problem_of(command, work):
             self.answer(command, problem)
 
     def answer(self, command: Command, problem: str) -> None:
-        """Report a change's outcome to client, log and status. problem: reason for a refusal, or ""."""
+        """Report the outcome of a command to its client and in the status. Refusals are also logged.
+
+        Args:
+            command: Command to answer.
+            problem: Reason for a refusal, or an empty string if the command succeeded.
+        """
         self.refused = problem
         if problem:
             log.error("change refused: %s", problem)
@@ -187,10 +199,10 @@ class Changes:
         self._presenter.solver.do(loading.advance)
 
     def _finish(self, change: _Change, loading: Reconfiguration) -> None:
-        """Adopt the choices of a change that has taken effect and answer its command."""
+        """Answer the command of a finished change. If the change took effect, adopt its choices."""
         if not loading.problem and change.choices is not None:
             state = self._presenter.run_cell.state
-            moved = moved_since(loading.settings.content, state.settings.content)  # while it was loading
+            moved = moved_since(loading.settings.content, state.settings.content)  # placed during loading
             self.choices = change.choices.choosing("content", **moved)
             log.info("changed: scene %s, model %s", state.content.info.name, state.predictor.name)
         self.answer(change.command, loading.problem)
@@ -200,7 +212,10 @@ class Changes:
     ) -> None:
         """Run `work` on the solver's thread between two solutions, then answer the command on this thread.
 
-        work: returns the reason for a refusal, or an empty string. succeeded: runs on the presenter's thread.
+        Args:
+            command: Command to answer.
+            work: Function of the solver's parts that returns the reason for a refusal, or an empty string.
+            succeeded: Function that the presenter's thread calls after a success, before the answer.
         """
 
         def finish(problem: str) -> None:
@@ -218,7 +233,7 @@ class Changes:
 
 
 def _problem_of(command: Command, work: Callable[[], None]) -> str:
-    """Run `work` and return its problem, or an empty string. Logs unexpected errors."""
+    """Run `work` and return an error message, or an empty string on success. Logs unexpected errors."""
     try:
         work()
     except PhasestackError as error:

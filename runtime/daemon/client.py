@@ -1,4 +1,4 @@
-"""Client for the running daemon. Finds its socket, sends one JSON line and reads the answer."""
+"""Client of the running daemon, which finds the socket, sends one JSON line and reads the answer."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ DEFAULT_SOCKET = "/run/phasestack/status.sock"
 UNIT = "phasestack"
 REQUEST_MAX_BYTES = 65536  # maximum length of a request, which bounds the memory that a client can occupy
 REQUEST_S = 5.0  # time limit for receiving a request, and for sending its answer
+# Seconds for which the answer to each request is cached.
 LOOKED_UP_AGAIN_S = {"status": 0.2, "pictures": 0.3, "log": 0.5, "about": 2.0}
-LOOKED_UP_WITHIN_S = 3.0  # time limit for answers that do not involve the loop; then the page reports a hang
+LOOKED_UP_WITHIN_S = 3.0  # time limit for answers that do not involve the loop, after which the page reports a hang
 LOADED_WITHIN_S = 60.0  # after this time a command is answered even if its scene or model is still loading
-ANSWERED_WITHIN_S = LOADED_WITHIN_S + 10.0  # time limit for the client
+ANSWERED_WITHIN_S = LOADED_WITHIN_S + 10.0  # time limit for a client that waits for a command
 HUNG_AFTER_S = 5.0  # time without a completed turn after which the loop counts as hung
 
 
@@ -34,30 +35,39 @@ def user_socket() -> Path | None:
 
 
 def candidates(configured: str) -> tuple[Path, ...]:
-    """Return the sockets to try in this order: the configured one, then the one of the user's session."""
+    """Return the configured socket, followed by the session's socket inside a user's session."""
     own = user_socket()
     return (Path(configured),) if own is None else (Path(configured), own)
 
 
 def sockets(config: Path | None) -> tuple[Path, ...]:
-    """Return the sockets to try for a configuration file. Raises InputError if the file is invalid."""
+    """Return the sockets to try for a configuration file, or the default sockets if `config` is None.
+
+    Raises InputError if the file is invalid.
+    """
     if config is None:
-        return candidates(DEFAULT_SOCKET)  # avoids loading the settings, so that clients start quickly
+        return candidates(DEFAULT_SOCKET)  # without loading the settings, which would slow down clients
     from runtime.config import load_settings
 
     return candidates(load_settings(config).service.socket)
 
 
 class NotRunning(TransientError):
-    """No daemon answers. The message gives the reason and a remedy for each socket."""
+    """Raised when no daemon answers. The message gives the problem with each socket and often a remedy."""
 
     hangs = False  # True if a daemon accepted the connection but did not answer
 
 
 def ask(paths: Iterable[Path], request: dict[str, Any], *, timeout_s: float = 10.0) -> dict[str, Any]:
-    """Send a request and return the answer. Raises NotRunning if no daemon answers.
+    """Send a request to the first socket at which a daemon answers, and return the answer.
 
-    timeout_s: limit per socket operation
+    Args:
+        paths: Sockets to try, in this order.
+        request: Content of the request, which is sent as JSON.
+        timeout_s: Time limit for each socket operation.
+
+    Raises:
+        NotRunning: No daemon answers at any of the sockets.
     """
     problems, hangs = [], False
     for path in paths:
@@ -72,13 +82,13 @@ def ask(paths: Iterable[Path], request: dict[str, Any], *, timeout_s: float = 10
 
 
 def _exchanged(path: Path, request: dict[str, Any], timeout_s: float) -> dict[str, Any]:
-    """Send one line and return the answer."""
+    """Send a request as one JSON line and return the decoded answer."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as channel:
         channel.settimeout(timeout_s)
         channel.connect(str(path))
         with contextlib.suppress(
             BrokenPipeError, ConnectionResetError
-        ):  # a refused request; the answer gives the reason
+        ):  # the daemon has refused the request; the answer gives the reason
             channel.sendall(json.dumps(request).encode() + b"\n")
         with channel.makefile("rb") as answers:
             line = answers.readline()
@@ -102,7 +112,7 @@ def _advice(error: Exception) -> str:
 
 
 def unit_properties(*names: str) -> dict[str, str]:
-    """Return properties of the systemd unit, or an empty dictionary if it is not installed."""
+    """Return properties of the systemd unit, or an empty dictionary if the unit is not installed."""
     command = ["systemctl", "show", UNIT, f"--property=LoadState,{','.join(names)}"]
     try:
         shown = subprocess.run(command, capture_output=True, text=True, timeout=5.0).stdout
@@ -113,7 +123,7 @@ def unit_properties(*names: str) -> dict[str, str]:
 
 
 def unit_advice() -> str:
-    """Describe the systemd unit's state, last error and remedy; empty if the unit is not installed."""
+    """Return the systemd unit's state, last error and a remedy, or "" if the unit is not installed."""
     unit = unit_properties("ActiveState", "Result", "ExecMainStatus", "StatusText")
     if not unit:
         return ""
@@ -131,16 +141,19 @@ def unit_advice() -> str:
 
 
 class DaemonClient:
-    """The page's connection to the daemon. Caches answers for all browsers. Thread-safe."""
+    """Thread-safe client of the daemon for the operator's page. All browsers share the cached answers."""
 
     def __init__(self, sockets: tuple[Path, ...]) -> None:
-        """sockets: paths to try."""
+        """Create a client that tries the given sockets in order."""
         self._sockets = sockets
         self._locks = {name: threading.Lock() for name in LOOKED_UP_AGAIN_S}
         self._answers: dict[str, tuple[float, dict[str, Any]]] = {}
 
     def look_up(self, name: str) -> dict[str, Any]:
-        """Return the answer to `status`, `pictures`, `log` or `about`. `ok` is False if no daemon answers."""
+        """Return the answer to the request `status`, `pictures`, `log` or `about`, which may be cached.
+
+        The answer's `ok` is False if no daemon answers.
+        """
         with self._locks[name]:
             asked_s, answer = self._answers.get(name, (float("-inf"), {}))
             if time.monotonic() - asked_s < LOOKED_UP_AGAIN_S[name]:
@@ -150,7 +163,7 @@ class DaemonClient:
         return answer
 
     def tell(self, command: str, value: Any) -> dict[str, Any]:
-        """Send a command and return its outcome."""
+        """Send a command and return the answer, whose `ok` is False if no daemon answers."""
         return self._asked({"command": command, "value": value}, timeout_s=ANSWERED_WITHIN_S)
 
     def _asked(self, request: dict[str, Any], *, timeout_s: float) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Operators' commands to the running daemon, which are checked before they reach the loop."""
+"""Commands that operators send to the running daemon. Each is checked before the loop receives it."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ PLACING = ("scale", "offset_m", "rotation_deg", "turntable_per_min")  # settings
 class Command:
     """A command that the loop starts between two refreshes and answers exactly once.
 
-    Run it only after `take` has returned True, because its client may have given up.
+    Carry out a command only after `take` has returned True, because the client may have given up.
     """
 
     name: Name
-    value: Any = None  # scene, model: str; place: settings, {} for the configured ones
+    value: Any = None  # scene or model: a name; place: settings, or {} for the configured placement
     answer: Future[dict[str, Any]] = field(default_factory=Future)
 
     def take(self) -> bool:
-        """Claim the command for execution. Returns False if its client has given up."""
+        """Claim the command for execution. Returns False if the client has given up."""
         return self.answer.set_running_or_notify_cancel()
 
     def done(self, **state: Any) -> None:
@@ -33,12 +33,15 @@ class Command:
         self.answer.set_result({"ok": True, **state})
 
     def refuse(self, why: str) -> None:
-        """Report to the client that the command was refused and nothing has changed."""
+        """Report to the client that the command was refused and that nothing has changed."""
         self.answer.set_result({"ok": False, "error": why or "refused"})
 
 
 def parse(request: Any) -> Command:
-    """Return the command in a request from the socket. Raises ValueError with a one-line message."""
+    """Return the command in a request from the socket.
+
+    Raises ValueError with a one-line message if the request is not a valid command.
+    """
     if not isinstance(request, dict):
         raise ValueError("a request must be one JSON object")
     name, value = request.get("command"), request.get("value")

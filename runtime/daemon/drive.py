@@ -1,4 +1,4 @@
-"""Shared part of `demo` and `run`: run the loop, show progress, and write the files and the summary."""
+"""Common part of `demo` and `run`, which runs the loop, shows progress and writes the files and summary."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from runtime.support import progress
 from runtime.support.background import wait_for_all
 from runtime.support.figures import lines_of
 
-JOBS_END_WITHIN_S = 0.5  # time limit for background jobs at the end
-USUAL_M, IPD_M = 0.6, 0.063  # distance and eye separation of a typical viewer, used if none was seen
+JOBS_END_WITHIN_S = 0.5  # time limit for background jobs at the end of a run
+USUAL_M, IPD_M = 0.6, 0.063  # distance and eye separation of a typical viewer, used if no viewer was seen
 
 
 def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> dict[str, Any]:
-    """Build a run, run it to its end and return its summary."""
+    """Build a run, run the display loop to its end, write the output files and return the summary."""
     done = 0
 
     def advance(account: RefreshAccount) -> None:
@@ -59,7 +59,7 @@ def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> 
 
 
 def _unseen(layers: U8, account: RefreshAccount, run: Run, settings: Settings) -> str:
-    """Return a viewer page with the last refresh, for a run in which nothing was measured."""
+    """Return the HTML of a viewer with the last refresh, for a run in which no refresh was measured."""
     stack, is_flat = run.presenter.stack, account.solved_for_m is None
     away_m = max(USUAL_M, stack.x_m[-1] + USUAL_M / 2)
     eyes_m = np.array([[away_m, -IPD_M / 2, 0.0], [away_m, IPD_M / 2, 0.0]])
@@ -70,7 +70,7 @@ def _unseen(layers: U8, account: RefreshAccount, run: Run, settings: Settings) -
 
 
 def print_summary(summary: dict[str, Any], out: Path | None) -> None:
-    """Print a readable summary, which ends with the figure to quote."""
+    """Print a readable summary, the figures to quote and where to look at the result."""
     configured = summary["configured"]
     for line in lines_of({name: value for name, value in summary.items() if name not in (*configured, "configured")}):
         print(line)

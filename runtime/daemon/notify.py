@@ -10,18 +10,23 @@ from runtime.clock import Clock
 from runtime.records import State
 
 NS_PER_US = 1000
-START_STEP_S = 60.0  # longest step of a start, on the slowest machine
-SETTLED_AFTER = 100  # presented refreshes; the first ones compile shaders, which may take seconds
+START_STEP_S = 60.0  # longest time that a step of the start takes on the slowest machine
+SETTLED_AFTER = 100  # refreshes with a longer watchdog period, because the first ones compile shaders for seconds
 
 
 class Notifier:
-    """Sender of the daemon's messages to systemd. Its methods never block or raise."""
+    """Sender of the daemon's status and watchdog messages to systemd. No method blocks or raises."""
 
     def __init__(self, clock: Clock, environment: Mapping[str, str] = os.environ) -> None:
-        """environment: variables that give the watchdog's period (see sd_watchdog_enabled)."""
+        """Connect to systemd, if this process runs under it.
+
+        Args:
+            clock: Clock of the run.
+            environment: Environment variables that give the watchdog's period (see sd_watchdog_enabled).
+        """
         self._clock = clock
         self._channel: Any = None
-        if "NOTIFY_SOCKET" in os.environ:  # without it, sdnotify would leave a socket open
+        if "NOTIFY_SOCKET" in os.environ:  # without this variable, sdnotify would leave a socket open
             import sdnotify
 
             self._channel = sdnotify.SystemdNotifier()
@@ -46,7 +51,7 @@ class Notifier:
             self.starting()
 
     def status(self, text: str) -> None:
-        """Set the line that `systemctl status` shows. Sends it only if it has changed."""
+        """Set the line that `systemctl status` shows. An unchanged line is not sent again."""
         line = " ".join(text.split())
         if line != self._status:
             self._status = line
@@ -64,9 +69,14 @@ class Notifier:
     def refreshed(self, state: State, missing: tuple[str, ...], *, presented: bool) -> None:
         """Reset the watchdog after a refresh, at most four times per period.
 
-        The solver has no part in this: while it fails or restarts, the last solution stays on the panels, aligned to
-        the eyes. A refresh counts even if a panel is missing. Before READY the timeout of the start applies, and for
-        the first hundred refreshes a longer watchdog period.
+        A refresh counts if the panels showed it or if a panel is missing. The solver's state does not matter, because
+        the last solution stays on the panels, aligned to the eyes, while the solver fails or restarts. Before READY,
+        the timeout of the start applies. The first hundred refreshes have a longer watchdog period.
+
+        Args:
+            state: State of the presenter.
+            missing: Names of the missing parts.
+            presented: True if the panels showed the refresh.
         """
         alive = presented or (state is State.DEGRADED and "panel" in missing)
         if not (alive and self._watchdog_ns):
@@ -86,7 +96,7 @@ class Notifier:
             self._send(f"RELOADING=1\nMONOTONIC_USEC={self._clock.now_ns() // NS_PER_US}")
 
     def reloaded(self) -> None:
-        """Report that reloading has ended, with either outcome."""
+        """Report that reloading has ended, whether or not it succeeded."""
         if self._ready:
             self._send("READY=1")
 
