@@ -1,4 +1,4 @@
-"""Common part of `demo` and `run`, which runs the loop, shows progress and writes the files and summary."""
+"""Common part of `demo` and `run`, which runs the loop, shows progress and writes the results."""
 
 from __future__ import annotations
 

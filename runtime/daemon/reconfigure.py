@@ -25,22 +25,27 @@ from runtime.support.memory import give_back
 from runtime.support.progress import listening
 from runtime.support.untrusted_input import LIMITS
 
-MODEL_S = 30.0  # enough to load a model and solve twice at 1920x1080 on a slow PC
-Ready = tuple[Opener | None, Predictor | None]  # None: unchanged
+MODEL_S = 30.0  # enough time to load a model and solve twice at 1920x1080 on a slow PC
+Ready = tuple[Opener | None, Predictor | None]  # new content and model; None: unchanged
 
 
 class Reconfiguration:
-    """A change of settings that takes effect once everything is loaded, as a whole or not at all.
+    """Change of settings that takes effect as a whole once everything is loaded, or not at all.
 
-    A background job loads the parts, then `advance` adopts them on the solver's thread. The presenter's thread polls
-    `finished` and then reads `problem`.
+    A background job loads the new content and model, which `advance` then adopts on the solver's thread. The
+    presenter's thread polls `finished` and then reads `problem`.
     """
 
     def __init__(
         self, read: Callable[[], Settings], old: Settings, stack: PanelStack, *, reload_content: bool = False
     ) -> None:
-        """Start loading. read: returns the new settings; called by the job; may raise InputError.
-        reload_content: reload the content even if its settings have not changed.
+        """Start loading.
+
+        Args:
+            read: Function that returns the new settings. The background job calls it. May raise InputError.
+            old: Current settings.
+            stack: Panels of the run.
+            reload_content: Reload the content even if the content settings have not changed.
         """
         self._read, self._old, self._stack, self._reload_content = read, old, stack, reload_content
         self.settings = old
@@ -48,7 +53,7 @@ class Reconfiguration:
         self.abandoned = False
         self._begun_s = time.monotonic()
         self.progress = ""  # stage of loading, for the status
-        self.problem = ""  # reason for a refusal, in one line
+        self.problem = ""  # one-line reason if the change was refused
         self._adopter: RunningSolver | None = None  # solver that will adopt the change
         self._finished = False
         self._job = BackgroundJob("reconfiguration", self._make_ready)
@@ -58,7 +63,11 @@ class Reconfiguration:
         self.abandoned = True
 
     def advance(self, parts: Any) -> bool:
-        """Adopt the loaded parts on the solver's thread. Returns True once the change has any outcome."""
+        """Adopt the loaded parts. The solver's thread calls this between steps until it returns True.
+
+        Returns:
+            True once the change has been adopted, refused or discarded.
+        """
         assert isinstance(parts, RunningSolver)
         if not self._job.done:
             return False
@@ -72,20 +81,23 @@ class Reconfiguration:
             else:
                 self._adopter = parts
                 self._take_over(parts, opener, predictor)
-        BackgroundJob("memory", give_back)  # return the memory of the replaced parts, which may be large
+        BackgroundJob("memory", give_back)  # return the memory of the replaced parts to the system
         self._finished = True
         return True
 
     @property
     def finished(self) -> bool:
-        """Return True once the change is adopted or refused, or if the thread that it waits for hangs."""
+        """Return True once the change is adopted, refused or discarded.
+
+        Also returns True if the solver was replaced during the adoption, or if an abandoned change loads for too long.
+        """
         if not self._finished and self._adopter is not None and not self._adopter.is_newest:
             self.problem, self._finished = LEFT_BEHIND, True
         is_stuck = self.abandoned and time.monotonic() - self._begun_s > LIMITS.load_s
         return self._finished or is_stuck
 
     def _make_ready(self) -> Ready:
-        """Load everything that takes long, on the job's thread."""
+        """Read the settings and load new content and a new model if required, on the job's thread."""
         opener = predictor = None
         self.settings = settings = self._read()
         file = settings.calibration.file
@@ -112,7 +124,10 @@ class Reconfiguration:
             self.progress = f"{what}: {done} of {total}" if total else f"{what}: {done}" if done else what
 
     def _take_over(self, parts: RunningSolver, opener: Opener | None, predictor: Predictor | None) -> None:
-        """Replace the run's state and close the old parts. If the upload fails, keep the old state."""
+        """Replace the run's state and close the replaced parts.
+
+        If the new content or model fails, keep the old state and set `problem`.
+        """
         now, moved = parts.run.state.settings.content, {}
         if now.scene == self.settings.content.scene:  # another scene starts in its configured placement
             moved = moved_since(self._old.content, now)
@@ -146,7 +161,10 @@ class Reconfiguration:
 
 
 def _tried(settings: Settings) -> None:
-    """Load an untrusted model and solve with it in a child process, where a crash cannot harm the daemon."""
+    """Load an untrusted model and solve with it.
+
+    This runs in a child process, where a crash cannot harm the daemon.
+    """
     ready_predictor(settings, settings.stack.stack()).close()
 
 
@@ -156,5 +174,5 @@ def moved_since(before: ContentSettings, now: ContentSettings) -> dict[str, Any]
 
 
 def _model_part(settings: Settings) -> Any:
-    """Return the model settings whose change requires a new predictor."""
+    """Return the model settings with fixed values where a change does not require a new predictor."""
     return settings.model.model_copy(update={"budget_ms": 0.0, "eye_sigma_mm": "auto"})

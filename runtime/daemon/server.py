@@ -1,7 +1,7 @@
-"""Status and control socket, which exchanges JSON lines and runs on a separate thread.
+"""Server of the status and control socket, which exchanges JSON lines on a separate thread.
 
-Slow, hanging or numerous clients cannot block it, because requests and answers have time limits. If all connections
-are in use, a new client replaces the client whose request has been incomplete longest.
+Slow, hanging or numerous clients cannot block the server, because requests and answers have time limits. If all
+connections are in use, a new client replaces the client whose request has been incomplete for the longest time.
 """
 
 from __future__ import annotations
@@ -37,30 +37,36 @@ LOOKED_AGAIN_S = 0.1  # interval between checks that the client is still connect
 
 
 class Refusal(Exception):
-    """Reason for disconnecting a client."""
+    """Raised to disconnect a client. The message is the reason that the client receives."""
 
 
 class StatusServer:
     """Server that answers `status` from the last published snapshot and queues commands for the loop.
 
-    The presenter's loop calls `publish`, takes `commands` and never waits for a client. `status` is answered even if
-    the loop hangs, and gives the age of its last turn.
+    The presenter's loop calls `publish`, takes `commands` and never waits for a client. Requests for the status are
+    answered even if the loop hangs. Such an answer contains the time since the loop's last turn.
     """
 
     def __init__(self, path: Path, *, clock: Clock) -> None:
-        """Start serving.
+        """Create the socket and start serving.
 
-        Raises SocketInUse if another phasestack owns the socket, InputError if the socket cannot be created, and
-        TransientError if the thread cannot be started.
+        Args:
+            path: Path of the socket.
+            clock: Clock of the run.
+
+        Raises:
+            SocketInUse: Another phasestack process owns the socket.
+            InputError: The socket cannot be created.
+            TransientError: The thread cannot be started.
         """
         self.path = path
         self.commands: queue.SimpleQueue[Command] = queue.SimpleQueue()
-        self.lookups: dict[str, Callable[[], dict[str, Any]]] = {}  # called on the server's thread
+        self.lookups: dict[str, Callable[[], dict[str, Any]]] = {}  # answers by request, called on the server's thread
         self._clock = clock
         self._started_ns = clock.now_ns()
         self._snapshot: tuple[int, Callable[[], dict[str, Any]]] = (self._started_ns, dict)
         self._clients: set[asyncio.Task[None]] = set()
-        self._reading: dict[asyncio.Task[None], None] = {}  # clients with an incomplete request, longest first
+        self._reading: dict[asyncio.Task[None], None] = {}  # clients with an incomplete request, oldest first
         listening = listening_socket(path)
         self._own = path.lstat().st_ino
         self._loop = asyncio.new_event_loop()
@@ -72,24 +78,24 @@ class StatusServer:
     def publish(self, snapshot: Callable[[], dict[str, Any]]) -> None:
         """Set the function that creates the status. Called once per turn of the loop.
 
-        The function runs on the server's thread when a client asks, so turns without clients cost nothing. It may only
-        read values that no longer change.
+        The server's thread calls the function only when a client asks for the status, which saves time in turns
+        without requests. The function may only read values that no longer change.
         """
         self._snapshot = (self._clock.now_ns(), snapshot)
 
     def close(self) -> None:
-        """Answer pending requests, stop and remove the socket. May be called twice."""
+        """Answer the connected clients, stop the server and remove the socket. May be called twice."""
         thread, self._thread = self._thread, None
         if thread is None:
             return
         self._loop.call_soon_threadsafe(self._loop.stop)
         thread.join(patience_s(2.0))
         with contextlib.suppress(OSError):
-            if self.path.lstat().st_ino == self._own:  # else it belongs to another daemon
+            if self.path.lstat().st_ino == self._own:  # otherwise the file belongs to another daemon
                 self.path.unlink()
 
     def answer(self, line: bytes) -> dict[str, Any] | Command:
-        """Return the answer to a request, or the command for the loop."""
+        """Return the answer to a request, or the command that the loop must carry out."""
         try:
             request = json.loads(line)
         except (ValueError, RecursionError):
@@ -125,13 +131,13 @@ class StatusServer:
 
     async def _end(self) -> None:
         self._server.close()
-        for _ in range(16):  # so that clients that have just connected are answered, too
+        for _ in range(16):  # also answer clients that have just connected
             await asyncio.sleep(0)
         clients = asyncio.all_tasks() - {asyncio.current_task()}
         for client in clients:
             client.cancel("the daemon is stopping")
         await asyncio.gather(*clients, return_exceptions=True)
-        await asyncio.sleep(0)  # closes their connections
+        await asyncio.sleep(0)  # lets asyncio close the connections
 
     async def _serve(self, reader: StreamReader, writer: StreamWriter) -> None:
         """Answer a client's requests until it disconnects."""
@@ -156,7 +162,10 @@ class StatusServer:
             writer.close()
 
     def _make_room(self) -> None:
-        """Disconnect the client whose request has been incomplete longest. Raises Refusal if there is none."""
+        """Disconnect the client with the oldest incomplete request if all connections are in use.
+
+        Raises Refusal if no client has an incomplete request.
+        """
         if len(self._clients) >= CLIENTS_MAX:
             longest = next(iter(self._reading), None)
             if longest is None:
@@ -166,7 +175,7 @@ class StatusServer:
             longest.cancel("too many clients")
 
     async def _request(self, reader: StreamReader, task: asyncio.Task[None]) -> bytes:
-        """Return the next request with its newline, or the incomplete rest of the input.
+        """Return the next request with its newline or, at the end of the input, an incomplete request.
 
         Raises Refusal if the request is too long or does not arrive in time.
         """
@@ -199,7 +208,7 @@ class StatusServer:
 
 
 def _log_error(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Log an error such as a lack of file descriptors, after which asyncio retries."""
+    """Log an error of the event loop, such as a lack of file descriptors. Asyncio then tries again."""
     log.warning("status: %s", one_line(f"{context.get('message')} ({context.get('exception')})"))
 
 
@@ -208,7 +217,7 @@ def _line(answer: dict[str, Any]) -> bytes:
 
 
 def _is_gone(writer: StreamWriter) -> bool:
-    """Return True if a client has disconnected, rather than only stopped sending."""
+    """Return True if a client has disconnected, and False if it has only stopped sending."""
     if writer.is_closing():
         return True
     hung_up = select.poll()
@@ -217,7 +226,11 @@ def _is_gone(writer: StreamWriter) -> bool:
 
 
 async def _outcome(command: Command, writer: StreamWriter) -> dict[str, Any]:
-    """Wait for the outcome of a command. Cancel it if the loop does not start it in time or the client is gone."""
+    """Wait for the outcome of a command and return the answer.
+
+    The command is cancelled if the loop does not start it in time or if the client disconnects. Raises Refusal if the
+    server stops.
+    """
     answer = asyncio.wrap_future(command.answer)
     until_s = time.monotonic() + LOOP_ANSWERS_WITHIN_S
     try:
@@ -236,10 +249,22 @@ async def _outcome(command: Command, writer: StreamWriter) -> dict[str, Any]:
 
 
 def open_status_server(settings: ServiceSettings, *, clock: Clock, supervised: bool) -> StatusServer | None:
-    """Open the configured socket or, if only the user's session folder is writable, the one there.
+    """Open the configured socket and start the server.
 
-    If the socket cannot be opened, a run by hand logs a warning and continues without one. A supervised run raises
-    SocketInUse if another phasestack owns it, or InputError.
+    If the default socket is configured but its folder is not writable, the socket of the user's session is opened
+    instead. If no socket can be opened, an unsupervised run logs a warning and continues without a server.
+
+    Args:
+        settings: Settings that give the path of the socket.
+        clock: Clock of the run.
+        supervised: True if systemd started the run.
+
+    Returns:
+        The server, or None if an unsupervised run cannot open a socket.
+
+    Raises:
+        SocketInUse: Another phasestack process owns the socket of a supervised run.
+        InputError: The socket of a supervised run cannot be created.
     """
     path = Path(settings.socket)
     own = user_socket()

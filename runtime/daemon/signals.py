@@ -1,4 +1,4 @@
-"""Signals as flags that the loop polls."""
+"""Signal handlers, which set flags that the loop polls."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from runtime.support.background import STOPS_WITHIN_S, ends_by
 
 
 class Signals:
-    """Flags set by SIGTERM, SIGINT (stop) and SIGHUP (reload). A second SIGINT raises KeyboardInterrupt.
+    """Context manager that handles SIGTERM and SIGINT (stop) and SIGHUP (reload) by setting flags.
 
-    Context manager for the main thread. Restores the previous handlers on exit.
+    If a stop has already been requested, SIGINT raises KeyboardInterrupt. Use the context manager on the main thread.
+    The previous handlers are restored on exit.
     """
 
     def __init__(self) -> None:
-        self.stop = ""  # name of the signal that asked to stop
+        self.stop = ""  # name of the signal that requested the stop; empty if none has
         self._reload = False
         self._previous: dict[signal.Signals, Any] = {}
 
@@ -34,7 +35,7 @@ class Signals:
         ends_by(math.inf)
 
     def take_reload(self) -> bool:
-        """Return True once after one or more reload signals."""
+        """Return True if a reload signal has arrived since the last call."""
         asked, self._reload = self._reload, False
         return asked
 

@@ -1,4 +1,4 @@
-"""The status socket's file (mode 0660). One daemon owns it. A crashed daemon's file is replaced."""
+"""Creation of the status socket's file (mode 0660), which replaces the file of a crashed daemon."""
 
 from __future__ import annotations
 
@@ -18,26 +18,28 @@ from runtime.errors import InputError, TransientError
 
 log = logging.getLogger("phasestack.service")
 
-GROUP = "phasestack"  # members may use the socket
+GROUP = "phasestack"  # group whose members may use the socket
 BACKLOG = 64  # maximum number of connections not yet accepted
-LOCKED_WITHIN_S = 2.0  # time limit for the folder's lock, which is held only briefly
+LOCKED_WITHIN_S = 2.0  # time limit for locking the folder; daemons hold the lock only briefly
 
 
 class SocketInUse(TransientError):
-    """Another phasestack owns the socket. The message names that process."""
+    """Raised when another phasestack process owns the socket. The message gives the process ID, if known."""
 
 
 def listening_socket(path: Path) -> socket.socket:
-    """Create a listening socket.
+    """Create a socket that listens at `path`.
 
-    Raises SocketInUse if another phasestack owns it, and InputError if it cannot be created.
+    Raises:
+        SocketInUse: Another phasestack process owns the socket.
+        InputError: The socket cannot be created.
     """
     made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with _locked(path.parent):
             _remove_dead(path)
-            # umask rather than chmod, so that the file never has another mode.
+            # Set the mode by umask, because before a chmod the file would have another mode.
             mask = os.umask(0o117)
             try:
                 made.bind(str(path))
@@ -61,11 +63,11 @@ def listening_socket(path: Path) -> socket.socket:
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Lock a folder so that only one daemon at a time replaces a dead socket."""
+    """Lock a folder to prevent two daemons from replacing a dead socket at the same time."""
     opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         until_s = time.monotonic() + LOCKED_WITHIN_S
-        while time.monotonic() < until_s:  # not forever, because another program may never release it
+        while time.monotonic() < until_s:  # limited, because another program may never release the lock
             with contextlib.suppress(BlockingIOError):
                 fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
@@ -78,7 +80,9 @@ def _locked(folder: Path) -> Iterator[None]:
 def _remove_dead(path: Path) -> None:
     """Remove the socket of a dead daemon.
 
-    Raises SocketInUse if a daemon is listening, and InputError if the file is not a socket.
+    Raises:
+        SocketInUse: A daemon is listening at the socket.
+        InputError: The file is not a socket.
     """
     if not os.path.lexists(path):
         return
@@ -93,7 +97,7 @@ def _remove_dead(path: Path) -> None:
             path.unlink()
             return
         except BlockingIOError:
-            pass  # its backlog is full, so a daemon listens
+            pass  # the backlog is full, which means that a daemon is listening
         else:
             pid, _, _ = struct.unpack("3i", probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
             owner = f" (pid {pid})"

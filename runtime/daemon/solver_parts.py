@@ -1,4 +1,4 @@
-"""The solver with its GL context, content and model. One thread creates, uses and releases them."""
+"""Solver with its GL context, content and model, all created, used and released on one thread."""
 
 from __future__ import annotations
 
@@ -29,27 +29,30 @@ log = logging.getLogger("phasestack.solver")
 
 @dataclass(eq=False)
 class RunningSolver:
-    """`SolverParts` of a real run. Created and used on one thread."""
+    """Implementation of `SolverParts` for a run. Created and used on one thread."""
 
     run: RunCell
     solver: Solver
-    backend: Choice  # device that all models use
+    backend: Choice  # device on which the solver runs, with any model
     context: Any  # GL context, current on this thread
-    owns_context: bool  # release the context with the other parts
-    contexts_lost: Callable[[], int]
-    generation: int
-    _owned: RunState = field(init=False)  # state whose content and model this solver closes
+    owns_context: bool  # True if `close` also releases the context
+    contexts_lost: Callable[[], int]  # returns the number of contexts that the panels have lost
+    generation: int  # number of this solver within the run
+    _owned: RunState = field(init=False)  # state whose parts `close` releases if another solver has started
 
     def __post_init__(self) -> None:
         self._owned, self._lost_before = self.run.state, self.contexts_lost()
 
     @property
     def is_newest(self) -> bool:
-        """True until another solver starts. After that, this one must not change anything."""
+        """True until another solver starts. After that, this solver must not change the run."""
         return self.run.generation == self.generation
 
     def replace(self, **changes: Any) -> RunState:
-        """Replace parts of the run's state (`RunCell.replace`). Raises Stopped if another solver has started."""
+        """Replace parts of the run's state and return the old state, as `RunCell.replace` does.
+
+        Raises Stopped if another solver has started.
+        """
         before = self.run.replace(self.generation, **changes)
         self._owned = replace(before, **changes)
         return before
@@ -62,7 +65,7 @@ class RunningSolver:
     def step(self, request: SolveRequest) -> SolverUpdate:
         if self.contexts_lost() != self._lost_before:
             raise ContextLost("the panels have lost their OpenGL context")
-        state = self.run.state  # read first, then check whether another solver has begun
+        state = self.run.state  # read the state before checking whether another solver has started
         if not self.is_newest:
             raise Stopped("this solver was abandoned")
         self._owned = state
@@ -85,7 +88,7 @@ class RunningSolver:
 
 
 class SolverMaker:
-    """Factory for solvers, called on the solver's thread and again after a hang."""
+    """Factory for solvers. Each solver's thread calls it, first at the start and again after a hang."""
 
     def __init__(
         self,
@@ -95,19 +98,31 @@ class SolverMaker:
         *,
         contexts_lost: Callable[[], int] = lambda: 0,
     ) -> None:
-        """contexts_lost: returns the number of GL contexts that the panels have lost. May be called on any thread."""
+        """Create a factory for the solvers of one run.
+
+        Args:
+            settings: Settings of the first solver. Later solvers use the run's current settings.
+            stack: Panels of the run.
+            calibration: Calibration of the run.
+            contexts_lost: Function that returns the number of GL contexts that the panels have lost. It may be called
+                on any thread.
+        """
         self._settings, self._stack, self._calibration = settings, stack, calibration
         self.run: RunCell | None = None  # set when the first solver is made
-        self.parts: RunningSolver | None = None  # of the newest solver
+        self.parts: RunningSolver | None = None  # newest solver
         self._device: Wanted = settings.model.backend
         self._contexts_lost = contexts_lost
-        self._prepared: tuple[ContentSettings, Opener] | None = None  # content that was read but not opened
+        self._prepared: tuple[ContentSettings, Opener] | None = None  # content that was read but not yet opened
 
     def __call__(self, *, context: Any = None, simulated: bool = False) -> RunningSolver:
-        """Create a solver with the current settings. After an error nothing stays open.
+        """Create a solver with the current settings. An error leaves nothing open.
 
-        context: the context to share with the panels; None creates a new one. Raises FatalError if the content or the
-        model cannot be used.
+        Args:
+            context: GL context that the solver shares with the panels. None: create a new context.
+            simulated: True if the run's clock is simulated.
+
+        Raises:
+            FatalError: The content or the model cannot be used.
         """
         own = context is None
         generation = self.run.begin() if self.run is not None else 0
@@ -144,16 +159,16 @@ class SolverMaker:
         return parts
 
     def _opener(self, content: ContentSettings) -> Opener:
-        """Read the content, or reuse what the previous solver read but never opened."""
+        """Return the opener of the content. Content that a previous solver read but never opened is reused."""
         prepared = self._prepared
         if prepared is None or prepared[0] != content:
             prepared = self._prepared = content, prepare_content(content, self._stack)
         return prepared[1]
 
     def _chosen(self, predictor: Predictor, context: Any, *, simulated: bool) -> Choice:
-        """Choose the device. After a restart the new solver uses the same device as the first.
+        """Choose the device on which the solver runs. After a restart, the device stays the same.
 
-        On a simulated clock the choice is fixed, because runs must be byte-for-byte identical.
+        On a simulated clock, `auto` always selects the CPU, because two runs must be identical to the byte.
         """
         device = "cpu" if simulated and self._device == "auto" else self._device
         choice = choose(device, predictor, lambda: context)
@@ -162,9 +177,11 @@ class SolverMaker:
 
 
 def ready_predictor(settings: Settings, stack: PanelStack) -> Predictor:
-    """Load and warm up the configured model.
+    """Load the configured model and warm it up.
 
-    Raises InputError if the model cannot be used, and MissingPart if a package that it requires is missing.
+    Raises:
+        InputError: The model cannot be used.
+        MissingPart: A package that the model requires is not installed.
     """
     predictor = load_predictor(settings.model.name, stack, settings.model)
     try:

@@ -1,4 +1,4 @@
-"""Answers of the socket about a run: its status, its constant facts and its pictures."""
+"""Answers of the status socket about a run: status, constant facts and pictures."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from runtime.records import U8, RefreshAccount
 from runtime.support.film import VIDEOS
 from runtime.support.version import version
 
-LIBRARY_MOST, LIBRARY_LOOKED_AT = 200, 2000
-IN_LIBRARY = {*PICTURES, *VIDEOS, *MESHES, *PLAYLISTS, *SPLATS}
+LIBRARY_MOST, LIBRARY_LOOKED_AT = 200, 2000  # limits for listed scenes and for examined folder entries
+IN_LIBRARY = {*PICTURES, *VIDEOS, *MESHES, *PLAYLISTS, *SPLATS}  # suffixes of files that can be scenes
 
 
 def placing_in(settings: Settings) -> dict[str, Any]:
-    """Return the settings that `ctl place` can change."""
+    """Return the current values of the settings that `ctl place` can change."""
     return settings.content.model_dump(include=set(PLACING))
 
 
 def holds(presenter: Presenter) -> dict[str, Any]:
-    """Return the operator's current choices, which are part of every answer to a command."""
+    """Return the current scene, model and placement, which successful answers to commands contain."""
     state = presenter.run_cell.state
     return {
         "scene": state.settings.content.scene,
@@ -51,7 +51,7 @@ def holds(presenter: Presenter) -> dict[str, Any]:
 
 
 def shown(presenter: Presenter, account: RefreshAccount, link: BrowserLink) -> dict[str, Any]:
-    """Return the figures of one refresh for a page that shows the panels."""
+    """Return the figures of the newest refresh for a page that shows the panels."""
     assert presenter.last is not None
     frame, solution = presenter.last.frame, presenter.last.solution
     return {
@@ -70,7 +70,7 @@ def shown(presenter: Presenter, account: RefreshAccount, link: BrowserLink) -> d
 
 
 def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
-    """Return the answer to `status`."""
+    """Return the answer to a `status` request after a refresh."""
     presenter = run.presenter
     machine, stats, state = presenter.machine, presenter.stats, presenter.run_cell.state
     return {
@@ -92,7 +92,7 @@ def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
         "eyes_label": account.eyes_label,
         "eye_sigma_now_mm": account.eye_sigma_mm,
         "solution": account.solution,
-        # A solution for a later time than this display time has no age yet.
+        # A solution for a time after this display time has no age yet.
         "solution_age_now_ms": None if account.solution_age_ms is None else max(0.0, account.solution_age_ms),
         "effort": account.effort,
         "light_db": None if run.observer.moment is None else run.observer.moment.light_db,
@@ -107,14 +107,14 @@ def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
 
 
 def _view_error_now_mm(account: RefreshAccount) -> float | None:
-    """Return the distance between the tracked eyes and the eyes solved for, or None if either is missing."""
+    """Return the view error of the tracked eyes in mm, or None without a viewer or a solution."""
     if account.eyes_m is None or account.solved_for_m is None:
         return None
     return round(view_error_mm(account.eyes_m, account.solved_for_m), 2)
 
 
 def about(run: Run) -> dict[str, Any]:
-    """Return the constant facts of a run and the available scenes, for the page."""
+    """Return the constant facts of a run and the available models and scenes, for the page."""
     settings, stack = run.presenter.run_cell.state.settings, run.presenter.stack
     return {
         "version": version(),
@@ -128,9 +128,9 @@ def about(run: Run) -> dict[str, Any]:
 
 
 def library_scenes(settings: ContentSettings) -> tuple[str, ...]:
-    """Return the paths of the scenes in the library folder, up to the page's limit.
+    """Return the paths of up to `LIBRARY_MOST` scenes in the library folder.
 
-    Skips names that are not printable UTF-8, because settings cannot contain them.
+    Names that are not printable UTF-8 are skipped, because settings cannot contain such names.
     """
     if not settings.library:
         return ()
@@ -144,7 +144,7 @@ def library_scenes(settings: ContentSettings) -> tuple[str, ...]:
 
 
 def pictures(run: Run) -> dict[str, Any]:
-    """Return the current pictures for the page, as JPEGs in base64."""
+    """Return thumbnails of the newest refresh for the page, as JPEG files in base64."""
     refresh = run.presenter.last
     if refresh is None:
         return {"frame": None, "jpegs": {}}
@@ -158,9 +158,10 @@ JPEG_QUALITY = 80
 
 
 def pictures_of(refresh: Refresh, stack: PanelStack, *, fov_deg: float) -> dict[str, bytes]:
-    """Return thumbnails of a refresh as JPEGs: `layer-0` (rear) onwards, `seen-left` and `seen-right`.
+    """Return thumbnails of a refresh as JPEG files, by name.
 
-    The views are computed from reduced layers at the eyes solved for. Exact ones would take longer than a refresh.
+    The layers are named `layer-0` (rear panel), `layer-1` and so on. The eyes' views, `seen-left` and `seen-right`, are
+    computed from reduced layers at the eyes solved for, because exact views would take longer than a refresh.
     """
     frame, account = refresh.frame, refresh.account
     is_flat = frame.solved is None or (frame.flat is not None and frame.flatness > 0.5)

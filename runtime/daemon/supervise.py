@@ -1,4 +1,4 @@
-"""Supervision of a run, which handles signals, systemd, the status socket and operators' commands."""
+"""Supervisor of a run, which handles signals, systemd, the status socket and operators' commands."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ PANEL_RETRY_S = 1.0  # interval between attempts to find a missing panel
 
 
 class Daemon(Host):
-    """Supervisor of a run. Handles signals and commands and publishes the status between refreshes.
+    """Supervisor that handles signals and commands and publishes the status between refreshes.
 
-    Only the presenter's thread may use it. The status server's thread calls the functions in `lookups` and the last
-    published snapshot, which read only frozen values and thread-safe counters.
+    Only the presenter's thread may call the methods. The status server's thread calls the last published snapshot and
+    the functions in the server's `lookups`, which read only frozen values and thread-safe counters.
     """
 
     def __init__(
@@ -51,13 +51,22 @@ class Daemon(Host):
         recorder: Recorder | None = None,
         options: RunOptions | None = None,
     ) -> None:
-        """read_settings: reads the current configuration on the loading thread; raises InputError."""
+        """Create a supervisor for one run.
+
+        Args:
+            read_settings: Function that reads the configuration, called on the loading thread. May raise InputError.
+            signals: Handled signals.
+            notifier: Sender of messages to systemd.
+            server: Status server. None: no status socket.
+            recorder: Black box. None: no black box.
+            options: Options of the run.
+        """
         self._until = (options or RunOptions()).until
         self._link = (options or RunOptions()).browser
         self._read_settings = read_settings
         self._signals, self._notifier, self._server = signals, notifier, server
         self.recorder = recorder
-        self.run: Run | None = None  # set with the changes when the run is complete
+        self.run: Run | None = None  # set together with `changes` once the run is built
         self.changes: Changes | None = None
         self._waits_for = ""  # reason for waiting for a panel before the first refresh
 
@@ -74,7 +83,7 @@ class Daemon(Host):
             changes.attempt(command, partial(self._carry_out, presenter, changes, command))
         while self._server is not None and not self._server.commands.empty():
             command = self._server.commands.get()
-            if command.take():  # else its client has given up
+            if command.take():  # otherwise the client has given up
                 changes.attempt(command, partial(self._carry_out, presenter, changes, command))
         changes.carry_on()
 
@@ -98,7 +107,10 @@ class Daemon(Host):
             self._server.lookups |= {"log": self.recorder.look_at_log} if self.recorder is not None else {}
 
     def wait_for_panel(self, why: str) -> bool:
-        """Report a missing panel. Then wait a second (as a service) or refuse to start."""
+        """Report a missing panel and wait a second before the next attempt.
+
+        Returns False, which ends the start, without systemd or after a stop signal.
+        """
         if not self._notifier.supervised or self._signals.stop:
             return False
         if why != self._waits_for:
@@ -112,7 +124,10 @@ class Daemon(Host):
         return not self._signals.stop
 
     def starting(self, doing: str) -> bool:
-        """Report the current step of the start and ask systemd for more time."""
+        """Report the current step of the start and ask systemd for more time.
+
+        Returns False after a stop signal.
+        """
         self._notifier.starting()
         self._notifier.status(f"starting ({doing})")
         if self._server is not None:
@@ -171,7 +186,13 @@ def _news(loading: Reconfiguration | None, refused: str, recorder: Recorder | No
 def run_daemon(read_settings: Callable[[], Settings], options: RunOptions) -> dict[str, Any]:
     """Run the daemon from start to stop and return its summary.
 
-    Raises FatalError for an invalid configuration or file, and TransientError if another start may help.
+    Args:
+        read_settings: Function that reads the configuration, called at the start and at each reload.
+        options: Options of the run.
+
+    Raises:
+        FatalError: The configuration or a file cannot be used.
+        TransientError: The run failed, but another start may succeed.
     """
     keep_freed_memory()  # must precede the start of any thread
     settings = read_settings()
