@@ -1,10 +1,10 @@
-"""Black box, which keeps a run's last minutes and writes them to MCAP on request or after a fault.
+"""Black box that writes the last minutes of a run to an MCAP file, on request or after a fault.
 
 Every few seconds, new messages are appended to a journal on disk, which is deleted when the run ends normally. After a
 power cut or a kill, the next run finds the journal and renames it to a file of the kind `cut`.
 
-The file is also a recording, whose samples `run --replay` plays through the same code. Messages are serialised when
-they arrive, so that the garbage collector never visits them. A background job writes the files.
+The files are also recordings, whose samples `run --replay` plays through the same code. Messages are serialised when
+they arrive, because the garbage collector then never visits them. A background job writes the files.
 """
 
 from __future__ import annotations
@@ -42,23 +42,23 @@ from runtime.support.version import version
 
 log = logging.getLogger("phasestack.blackbox")
 
-Saved = Callable[[str, Path | None], None]  # arguments: the problem (empty without one) and the file
+Saved = Callable[[str, Path | None], None]  # callback with the error message (empty on success) and the file
 
-BYTES_MAX = 32 << 20  # limit for the messages in memory
+BYTES_MAX = 32 << 20  # limit for all messages in memory
 OVERHEAD_BYTES = 150  # memory that a message needs in addition to its data
 AFTER_FAULT_NS = 5 * NS_PER_S  # time recorded after a fault before its file is written
-FAULTS_APART_NS = 60 * NS_PER_S  # shortest time between files of one kind, so that repeated faults do not fill the disk
-STATE_EVERY_NS = NS_PER_S
-WRITTEN_WITHIN_S = 5.0  # the end of a run waits this long for a file to be written
-JOURNAL_EVERY_NS = 3 * NS_PER_S  # a power cut loses at most this much, plus one chunk
+FAULTS_APART_NS = 60 * NS_PER_S  # minimum time between files of one kind; keeps repeated faults from filling the disk
+STATE_EVERY_NS = NS_PER_S  # interval between state messages while the state does not change
+WRITTEN_WITHIN_S = 5.0  # time limit for writing the last file at the end of a run
+JOURNAL_EVERY_NS = 3 * NS_PER_S  # a power cut loses at most this much time, plus one chunk
 CHUNK_BYTES = 16384  # chunk size of the journal
-CUT = "cut"
-LINES_KEPT, STATES_KEPT = 200, 50  # kept for the operator's page
-FILES_MAX = 20  # files in the folder
+CUT = "cut"  # kind of a file recovered from a journal
+LINES_KEPT, STATES_KEPT = 200, 50  # log lines and states kept for the operator's page
+FILES_MAX = 20  # maximum number of files in the folder
 PREFIX = "blackbox-"
-ASKED = "asked"
+ASKED = "asked"  # kind of a file that an operator has requested
 JOURNAL = "journal"
-PART = ".part"
+PART = ".part"  # suffix of an unfinished file
 
 LOG, REFRESH, STATE = "/log", "/refresh", "/state"
 # Viewers can plot any number. Only the topics that they display in a special way need a schema with field names.
@@ -80,7 +80,7 @@ SCHEMAS: dict[str, dict[str, Any]] = {
 
 
 def refresh_message(account: RefreshAccount) -> bytes:
-    """Return a refresh as in `frames.jsonl`, with its latency."""
+    """Return a refresh as JSON: the line in `frames.jsonl`, with the display time and the latency."""
     latency_ms = None
     if account.eyes_m is not None and account.capture_ns:
         latency_ms = round((account.photon_ns - account.capture_ns) / NS_PER_MS, 4)
@@ -88,18 +88,18 @@ def refresh_message(account: RefreshAccount) -> bytes:
 
 
 def state_message(name: str, reason: str, *, monotonic_ns: int) -> bytes:
-    """Return a displayed state (`degraded: sensor, panel`), split into its parts."""
+    """Return a state as JSON, with the missing parts of a name such as `degraded: sensor, panel`."""
     plain, _, missing = name.partition(": ")
     parts = missing.split(", ") if missing else []
     return to_json({"monotonic_ns": monotonic_ns, "state": plain, "missing": parts, "reason": reason}).encode()
 
 
 def log_message(record: logging.LogRecord) -> bytes:
-    """Return a log record as Foxglove's log message."""
+    """Return a log record as JSON, in the format of Foxglove's log messages."""
     seconds, nanoseconds = divmod(round(record.created * NS_PER_S), NS_PER_S)
     line = {
         "timestamp": {"sec": seconds, "nsec": nanoseconds},
-        "level": record.levelno // 10,  # Foxglove's levels are Python's by ten
+        "level": record.levelno // 10,  # Foxglove's levels are Python's divided by ten
         "message": text_of(record),
         "name": record.name,
     }
@@ -107,7 +107,7 @@ def log_message(record: logging.LogRecord) -> bytes:
 
 
 def text_of(record: logging.LogRecord) -> str:
-    """Return a log record's message on one line, with its exception."""
+    """Return a log record's message and exception on one line."""
     text = record.getMessage()
     if record.exc_info and record.exc_info[1] is not None:
         text += f": {type(record.exc_info[1]).__name__}: {record.exc_info[1]}"
@@ -115,23 +115,28 @@ def text_of(record: logging.LogRecord) -> str:
 
 
 class BlackBoxMessage(NamedTuple):
-    """An event, serialised for the file."""
+    """Message for the black box, serialised for the file."""
 
     at_ns: int  # time on the run's clock, because the wall clock may be set back
     wall_ns: int  # wall-clock time since 1970
     topic: str
     data: bytes  # JSON
-    sequence: int
+    sequence: int  # number of the sample or refresh, modulo 2^32; 0 for other messages
 
 
 class Recorder(logging.Handler):
-    """Observer of a run and of its log, from `watches` to `close`.
+    """Recorder of a run's samples, refreshes, states and log, from `watches` to `close`.
 
-    The presenter's thread drives it; any thread may log, and a job writes each file.
+    The presenter's thread calls the methods of an observer. Any thread may log. A background job writes each file.
     """
 
     def __init__(self, folder: Path, *, minutes: float) -> None:
-        """folder: where files are written; minutes: time kept in memory; 0: neither keep nor write anything."""
+        """Prepare the folder and recover the journal of a killed run.
+
+        Args:
+            folder: Folder for the black box's files.
+            minutes: Length of the history in memory. 0: neither keep nor write any messages.
+        """
         super().__init__()
         self._folder, self._most_ns = folder, round(60 * minutes * NS_PER_S)
         self._kept_lock = threading.Lock()
@@ -152,14 +157,19 @@ class Recorder(logging.Handler):
         self._journal, self._journaled_ns = _Journal(folder), 0
         self._journaling: BackgroundJob[None] | None = None
         if self._most_ns:
-            import mcap.writer  # noqa: F401 - where it is not installed, the start says so
+            import mcap.writer  # noqa: F401 - fails at the start if mcap is not installed
 
             _find_cut(folder)
             make_room(folder)
         _sweep(folder)
 
     def watches(self, presenter: Presenter, *, in_stack_frame: bool) -> None:
-        """Start recording. in_stack_frame: points arrive in frame `stack` and are converted to `sensor`."""
+        """Start recording.
+
+        Args:
+            presenter: Presenter of the run.
+            in_stack_frame: True if samples arrive in the frame `stack`. They are recorded in the frame `sensor`.
+        """
         self._presenter = presenter
         if in_stack_frame:
             self._sensor_from_stack = np.asarray(np.linalg.inv(presenter.run_cell.state.calibration.stack_from_sensor))
@@ -189,8 +199,9 @@ class Recorder(logging.Handler):
             with self._kept_lock:
                 fresh = list(islice(reversed(self._kept), self._fresh))[::-1]
                 self._fresh = 0
+            # A background job writes the journal, because a refresh must not wait for the disk.
             work = partial(self._journal.add, fresh, *_head(self._presenter), most_ns=self._most_ns)
-            self._journaling = BackgroundJob("black box's journal", work)  # no refresh waits for the disk
+            self._journaling = BackgroundJob("black box's journal", work)
         if self._fault is not None and at_ns - self._fault[0] >= AFTER_FAULT_NS:
             kind, self._fault = self._fault[1], None
             self.save(kind)
@@ -205,7 +216,7 @@ class Recorder(logging.Handler):
             self._fault, self._faults_ns[kind] = (at_ns, kind), at_ns
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Keep a log record; called on the thread that logs."""
+        """Keep a log record. Called on the thread that logs."""
         line = {"time_s": round(record.created, 3), "level": record.levelname.lower()}
         self._lines.append(line | {"text": text_of(record)})
         self._keep(LOG, log_message(record))
@@ -224,7 +235,11 @@ class Recorder(logging.Handler):
     def save(self, kind: str, saved: Saved = lambda problem, path: None) -> None:
         """Write the kept messages to a file in the background, then call `saved`.
 
-        kind: `asked` or a fault. All requests of a kind that arrive before its file is started share that file.
+        All requests of one kind that arrive before the file is begun share that file.
+
+        Args:
+            kind: `asked`, or the name of a fault. Becomes part of the file name.
+            saved: Callback with the error message (empty on success) and the file.
         """
         if not self._most_ns or self._presenter is None:
             saved("the black box is switched off (service.blackbox_minutes is 0)", None)
@@ -263,11 +278,11 @@ class Recorder(logging.Handler):
                 saved(problem, None if problem else self._last_file)
 
     def look_at_log(self) -> dict[str, Any]:
-        """Return the newest log lines and states, oldest first, with times since 1970."""
+        """Return the newest log lines and states, oldest first, with times in seconds since 1970."""
         return {"lines": list(self._lines), "states": list(self._passed)}
 
     def describe(self) -> dict[str, Any]:
-        """Return the black box's entry in the status."""
+        """Return the entry for the black box in the daemon's status."""
         with self._kept_lock:
             kept_ns = self._kept[-1].at_ns - self._kept[0].at_ns if self._kept else 0
             kept_bytes = self._bytes
@@ -306,17 +321,17 @@ class Recorder(logging.Handler):
 
 
 def _head(presenter: Presenter) -> tuple[RecordingHeader, str]:
-    """Return the header and the settings that precede a file's messages."""
+    """Return the recording header and the settings as JSON, which precede the messages of a file."""
     settings = presenter.run_cell.state.settings
     header = RecordingHeader(settings.sensor.driver, presenter.samples.serial)
     return header, without_secrets(settings.model_dump_json())
 
 
 def write_file(folder: Path, kind: str, kept: list[BlackBoxMessage], header: RecordingHeader, settings: str) -> Path:
-    """Write a new file atomically and return its path. Raises OSError if it cannot be written.
+    """Write messages to a new file, atomically, and return the path.
 
-    Only the owner can read it, because it shows viewers' movements. Its number is higher than all others in the folder,
-    because the wall clock may be set back.
+    Only the owner can read the file, because it shows viewers' movements. The number in the name is higher than
+    all others in the folder, because the wall clock may be set back. Raises OSError if the file cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = _next_name(folder, kind, datetime.now(UTC))
@@ -347,7 +362,7 @@ def _opened(part: Path) -> IO[bytes]:
 
 
 class _Written:
-    """An open MCAP file."""
+    """Writer of messages to an open MCAP file."""
 
     def __init__(self, file: IO[bytes], header: RecordingHeader, settings: str) -> None:
         from mcap.writer import CompressionType, Writer
@@ -370,7 +385,10 @@ class _Written:
 
 
 class _Journal:
-    """Recent messages on disk, in two alternating files with at most half the kept time and bytes each."""
+    """Journal on disk with the most recent messages, in two files that are used alternately.
+
+    Each file holds at most half of the time and half of the bytes that the black box keeps.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._current, self._begun_ns = folder, 0, 0
@@ -378,7 +396,7 @@ class _Journal:
         self._written: _Written | None = None
 
     def add(self, fresh: list[BlackBoxMessage], header: RecordingHeader, settings: str, *, most_ns: int) -> None:
-        """Write messages to the disk immediately. If that fails, the journal ends and the run continues."""
+        """Write messages to the disk immediately. If writing fails, the journal ends and the run continues."""
         now_ns = time.monotonic_ns()
         try:
             if self._file is None or now_ns - self._begun_ns > most_ns // 2 or self._file.tell() > BYTES_MAX // 2:
@@ -402,7 +420,11 @@ class _Journal:
         return self._folder / f".{PREFIX}{JOURNAL}{self._current}{PART}"
 
     def close(self, *, in_use: bool = False) -> None:
-        """Delete the journal after a normal end. in_use: another thread is still writing."""
+        """Delete the journal after a normal end of the run.
+
+        Args:
+            in_use: True if another thread is still writing. The current file then stays open, but is still deleted.
+        """
         if self._file is not None and not in_use:
             with suppress(OSError):
                 self._file.close()
@@ -423,7 +445,10 @@ def _find_cut(folder: Path) -> None:
 
 
 def make_room(folder: Path) -> None:
-    """Delete surplus files of the most frequent kind, but never the first or newest file of a kind."""
+    """Delete files of the most frequent kind until the folder contains at most `FILES_MAX` files.
+
+    The newest file in the folder is kept. The first file of a kind is deleted only after the others of that kind.
+    """
     kinds: dict[str, list[Path]] = {}
     *earlier, _ = sorted(folder.glob(f"{PREFIX}*.mcap"), key=lambda path: (_number(path), path.name)) or [folder]
     for file in earlier:
@@ -441,7 +466,7 @@ def _number(path: Path) -> int:
 
 
 def _sweep(folder: Path) -> None:
-    """Delete the unfinished files of killed processes."""
+    """Delete unfinished files, which killed processes have left."""
     for part in folder.glob(f".{PREFIX}*{PART}"):
         with suppress(OSError), part.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

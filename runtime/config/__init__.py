@@ -1,4 +1,4 @@
-"""Validated, immutable settings from a TOML file. `settings.py` has their defaults and descriptions."""
+"""Validated, immutable settings from TOML files. `settings.py` contains defaults and descriptions."""
 
 from runtime.config.files import changed, load_settings, load_stack, with_options
 from runtime.config.settings import (

@@ -1,4 +1,4 @@
-"""Load settings files and panels files, and override settings by options or an operator's choices."""
+"""Load settings files and panels files, and override settings with options or operators' choices."""
 
 from __future__ import annotations
 
@@ -12,16 +12,25 @@ from runtime.support.sections import Section, read_table, validated
 
 
 def load_settings(path: Path | None) -> Settings:
-    """Read the settings from a file, or return the defaults if `path` is None. Raises InputError."""
+    """Read the settings from a file, or return the defaults if `path` is None.
+
+    Raises InputError if the file cannot be read or contains an invalid setting.
+    """
     if path is None:
         return Settings()
     return validated(Settings, read_table(path), source=path, folder=path.absolute().parent)
 
 
 def load_stack(path: Path, *, width_px: int, height_px: int) -> PanelStack:
-    """Read the panels from `--panels FILE`. Raises InputError.
+    """Read the geometry of the stack from a file for `--panels`.
 
-    width_px, height_px: size of the panels, used if the file states none.
+    Args:
+        path: TOML or JSON file.
+        width_px: Width of the panels in pixels, used if the file does not contain a width.
+        height_px: Height of the panels in pixels, used if the file does not contain a height.
+
+    Raises:
+        InputError: The file cannot be read, lacks a field or contains an invalid value.
     """
     table = {"width_px": width_px, "height_px": height_px} | read_table(path)
     for name in ("width_m", "height_m", "x_m"):
@@ -44,9 +53,10 @@ def with_options(
     model: str | None = None,
     backend: str | None = None,
 ) -> Settings:
-    """Return the settings with command-line options applied. Raises InputError, which names the option.
+    """Return the settings with command-line options applied.
 
-    loop: restart the recording when it ends.
+    An option that is None or False changes nothing. `loop` makes the recording restart when it ends. Raises InputError,
+    which names the option, if a value is invalid.
     """
     overrides: tuple[tuple[str, str, dict[str, Any] | None], ...] = (
         ("--replay", "sensor", None if replay is None else {"driver": "replay", "source": replay}),
@@ -64,7 +74,10 @@ def with_options(
 
 
 def changed(settings: Settings, section: str, values: dict[str, Any], *, source: str) -> Settings:
-    """Return the settings with `values` of one section replaced. Raises InputError, which names `source`."""
+    """Return the settings with some values of one section replaced.
+
+    Raises InputError, which names `source`, if a value is invalid.
+    """
     old: Section = getattr(settings, section)
     new = validated(type(old), old.model_dump() | values, source=source)
     return settings.model_copy(update={section: new})

@@ -1,6 +1,7 @@
-"""Settings, each with its type, range, default and description.
+"""Definitions of all settings, with types, ranges, defaults and descriptions.
 
-The ranges cover every display that can be built. A value in a wrong unit is therefore refused, with a suggestion.
+The ranges allow every display that can be built. They exclude values in a wrong unit, for which the error message
+suggests the right one.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG
 from runtime.support.sections import Section
 
 MOST = 1e9  # limit for numbers without a narrower range
-PIXEL_ASPECT_TOLERANCE = 0.03  # relative; allows for data sheets that round the active area
+PIXEL_ASPECT_TOLERANCE = 0.03  # relative, because data sheets round the size of the active area
 LEAST_GAP_M = 1e-5  # minimum distance between panels; any real panel is thicker
 PANELS_MOST = 8  # largest number of panels in a stack
 
@@ -27,7 +28,7 @@ Slope = Annotated[float, Field(ge=-0.2, le=0.2)]  # slope of a panel that is mea
 Coordinate = Annotated[float, within(-EYE_MOST_M, EYE_MOST_M, "m")]  # coordinate of an eye
 Point = tuple[Coordinate, Coordinate, Coordinate]
 Offset = Annotated[float, within(-10.0, 10.0, "m")]  # displacement of a scene
-Turn = Annotated[float, within(-360.0, 360.0, "degrees")]
+Turn = Annotated[float, within(-360.0, 360.0, "degrees")]  # rotation of a scene
 
 
 class StackGeometry(Section):

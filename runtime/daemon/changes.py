@@ -91,7 +91,7 @@ class _Change:
 
 
 class Changes:
-    """Executor of operators' changes to a run, which loads one change at a time.
+    """Manager of operators' changes to a run, which loads one change at a time.
 
     Only the presenter's thread uses this object. A background job reads the settings and loads new parts (see
     `Reconfiguration`), and the solver's thread moves the scene. Both work on copies of their inputs. `carry_on` polls

@@ -78,8 +78,8 @@ class StatusServer:
     def publish(self, snapshot: Callable[[], dict[str, Any]]) -> None:
         """Set the function that creates the status. Called once per turn of the loop.
 
-        The server's thread calls the function only when a client asks for the status, which saves time in turns
-        without requests. The function may only read values that no longer change.
+        The function runs on the server's thread, and only when a client asks for the status. A turn without requests
+        therefore costs nothing. The function may only read values that no longer change.
         """
         self._snapshot = (self._clock.now_ns(), snapshot)
 

@@ -88,7 +88,7 @@ class RunningSolver:
 
 
 class SolverMaker:
-    """Factory for solvers. Each solver's thread calls it, first at the start and again after a hang."""
+    """Factory for solvers, called on the thread of each new solver, at the start and after a hang."""
 
     def __init__(
         self,
@@ -115,7 +115,7 @@ class SolverMaker:
         self._prepared: tuple[ContentSettings, Opener] | None = None  # content that was read but not yet opened
 
     def __call__(self, *, context: Any = None, simulated: bool = False) -> RunningSolver:
-        """Create a solver with the current settings. An error leaves nothing open.
+        """Create a solver with the current settings. After an error, everything opened so far is closed.
 
         Args:
             context: GL context that the solver shares with the panels. None: create a new context.

@@ -38,7 +38,7 @@ def placing_in(settings: Settings) -> dict[str, Any]:
 
 
 def holds(presenter: Presenter) -> dict[str, Any]:
-    """Return the current scene, model and placement, which successful answers to commands contain."""
+    """Return the scene, model, placement and pause in effect, which answers to commands contain."""
     state = presenter.run_cell.state
     return {
         "scene": state.settings.content.scene,

@@ -55,7 +55,7 @@ class Daemon(Host):
 
         Args:
             read_settings: Function that reads the configuration, called on the loading thread. May raise InputError.
-            signals: Handled signals.
+            signals: Flags that are set by signals.
             notifier: Sender of messages to systemd.
             server: Status server. None: no status socket.
             recorder: Black box. None: no black box.
