@@ -1,4 +1,4 @@
-"""The typer app with all commands. Each command imports its dependencies only when it runs."""
+"""Typer app with all commands. A command imports what it needs only when it runs."""
 
 from __future__ import annotations
 

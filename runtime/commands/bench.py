@@ -45,9 +45,9 @@ def compare(
     new: Annotated[Path, typer.Argument(help="JSON file of the later measurement")],
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
-    """List every figure that changed by more than the noise. Exits with 1 if any got worse.
+    """List every figure that changed by more than the noise. Exits with 1 if a figure got worse.
 
-    Times are left out if the machine was too busy during either measurement.
+    Times are not compared if the machine was too busy during either measurement.
 
     Example: phasestack bench compare old.json new.json
     """

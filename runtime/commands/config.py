@@ -4,9 +4,10 @@ from __future__ import annotations
 
 
 def config() -> None:
-    """Print a complete configuration in TOML: every setting with its default and description.
+    """Print a complete configuration in TOML, which lists every setting with its default and description.
 
-    Relative paths start at the configuration file's folder. `phasestack doctor --config FILE` checks a configuration.
+    Relative paths are resolved against the configuration file's folder. `phasestack doctor --config FILE` checks a
+    configuration.
 
     Example: phasestack config > phasestack.toml
     """

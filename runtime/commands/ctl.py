@@ -25,7 +25,8 @@ def scene(
 ) -> None:
     """Show another scene: a built-in one such as `demo`, or a file or folder on this PC (`./NAME`).
 
-    The current scene stays until the new one has loaded. If loading fails, it remains and the exit code is 2.
+    The current scene stays until the new one has loaded. If loading fails, the scene does not change and the exit code
+    is 2.
 
     Example: phasestack ctl scene demo
     """
@@ -74,7 +75,8 @@ def model(
 ) -> None:
     """Switch to another model.
 
-    The current model runs until the new one has loaded, and keeps running if loading fails.
+    The current model runs until the new one has loaded, and stays in use if loading fails.
+
     Example: phasestack ctl model best
     """
     from runtime.support.plugins import located
@@ -103,7 +105,10 @@ for _name, _meaning in PLAIN.items():
 
 
 def tell(request: dict[str, Any], config: Path | None) -> None:
-    """Send one request and print the new state. Exits with 1 if no daemon answers, or 2 if it refuses."""
+    """Send a request and print the new state. Exits with 1 if no daemon answers.
+
+    Raises InputError, for which the exit code is 2, if the daemon refuses the request.
+    """
     from runtime.daemon.client import ANSWERED_WITHIN_S, NotRunning, ask, sockets
     from runtime.errors import InputError
     from runtime.support.figures import lines_of
@@ -120,7 +125,7 @@ def tell(request: dict[str, Any], config: Path | None) -> None:
 
 
 def _advised(error: Exception) -> str:
-    """Return the text for a request that got no answer, with advice for the user."""
+    """Return the message for a request that got no answer, with advice for the user."""
     from runtime.daemon.client import unit_advice
 
     advice = unit_advice()
@@ -133,7 +138,7 @@ def status(
     config: Config = None,
     as_json: Annotated[bool, typer.Option("--json", help="print the status as one JSON object")] = False,
 ) -> None:
-    """Show the daemon's state and its reason, rates, eye positions, uncertainty, times and faults.
+    """Show the daemon's state, the reason for it, rates, eye positions, uncertainty, times and faults.
 
     Exits with 1 if no daemon answers or if its loop has hung for five seconds.
 

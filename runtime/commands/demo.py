@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-FRAMES, MEASURED_EVERY = 42, 14  # refreshes: 0.7 s, long enough for the head to start moving
-LONGEST_S, LEAST = 45.0, 15  # seconds, after which the demo ends; least number of refreshes
+FRAMES, MEASURED_EVERY = 42, 14  # refreshes; 0.7 s is long enough for the head to start moving
+LONGEST_S, LEAST = 45.0, 15  # time limit of the demo; minimum number of refreshes
 
 
 def demo(
@@ -35,7 +35,7 @@ def demo(
 
         def __init__(self) -> None:
             self._ends_s = time.monotonic() + LONGEST_S if frames <= FRAMES else float("inf")
-            self._asked = 0  # number of calls, one per refresh
+            self._asked = 0  # number of calls of `stop_reason`, one per refresh
 
         def stop_reason(self) -> str:
             self._asked += 1

@@ -1,4 +1,4 @@
-"""`phasestack doctor`: check everything the configuration needs and suggest a remedy for each fault.
+"""`phasestack doctor`: check everything that the configuration needs and suggest remedies for faults.
 
 Each check is a small function that takes the settings and yields rows of the table.
 """
@@ -39,7 +39,7 @@ class Row:
     name: str
     state: Verdict
     detail: str  # what was found
-    remedy: str = ""  # what to do about it; empty if nothing
+    remedy: str = ""  # advice for the user; empty if there is nothing to do
 
 
 def doctor(
@@ -78,9 +78,9 @@ def doctor(
 
 
 def _become_service() -> None:
-    """Switch to the service's user, groups and environment, but not its sandbox.
+    """Switch to the user, groups and environment of the service, but not to its sandbox.
 
-    Raises InputError if the service is not installed or this user may not switch.
+    Raises InputError if the service is not installed or this user is not allowed to switch.
     """
     import grp
     import pwd
@@ -107,7 +107,10 @@ Check = Callable[["Settings"], Iterator[Row]]
 
 
 def examine(settings: Settings) -> list[Row]:
-    """Run all checks. An unexpected exception becomes a failed row, so that the other checks still run."""
+    """Run all checks and return the rows of the table.
+
+    An unexpected exception becomes a failed row and does not prevent the other checks.
+    """
     rows: list[Row] = []
     for name, check in CHECKS.items():
         try:
@@ -177,7 +180,7 @@ def usb(settings: Settings) -> Iterator[Row]:
 
 
 def opengl(settings: Settings) -> Iterator[Row]:
-    """Check OpenGL without a screen, which content and offscreen panels use."""
+    """Check that OpenGL works without a screen, which content and offscreen panels require."""
     from runtime.support.gl import describe, offscreen_context
 
     context = offscreen_context()
@@ -242,7 +245,7 @@ def content(settings: Settings) -> Iterator[Row]:
 
 
 def model(settings: Settings) -> Iterator[Row]:
-    """Check that the network loads, fits the stack and finds its execution provider. Times a solution."""
+    """Check that the network loads, fits the stack and finds its execution provider. Time a solution."""
     import cv2
 
     from runtime.model.backends import choose
@@ -292,7 +295,7 @@ def _rate(predictor: Predictor, backend: SolverBackend, settings: Settings) -> R
 
 
 def calibration(settings: Settings) -> Iterator[Row]:
-    """Check that the calibration is a similarity and that a real sensor does not use the demo's."""
+    """Check that the calibration is a similarity. A real sensor must not use the demo's calibration."""
     from runtime.eyes.calibration import load_calibration
     from runtime.sensor.base import Sensor
 
@@ -318,7 +321,7 @@ def calibration(settings: Settings) -> Iterator[Row]:
 
 
 def service(settings: Settings) -> Iterator[Row]:
-    """Check the running daemon, if there is one."""
+    """Check that the running daemon, if there is one, is healthy."""
     from runtime.daemon.client import HUNG_AFTER_S
 
     answer = _daemon(settings)

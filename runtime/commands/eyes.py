@@ -9,7 +9,7 @@ import typer
 
 from runtime.support.options import number
 
-JSON_S = 2.0  # how long a live sensor is watched with --json
+JSON_S = 2.0  # time for which a live sensor is watched with --json
 
 
 def eyes(

@@ -33,10 +33,10 @@ Row = dict[str, Any]
 
 
 class Watcher:
-    """Eye finder that returns one row for every frame."""
+    """Eye finder that reports the result for each frame as a row of values."""
 
     def __init__(self, settings: Settings) -> None:
-        cv2.setNumThreads(1)  # as in the display's loop
+        cv2.setNumThreads(1)  # as in the display loop
         self._finder = EyeFinder(settings)
         self.forget = self._finder.forget
 
@@ -46,7 +46,7 @@ class Watcher:
         ms = 1e3 * (time.perf_counter() - begin)
         pupils, reason = self._finder.pupils, self._finder.reason
         if pupils is not None and frame.intrinsics is None:
-            reason = ""  # a picture without intrinsics has no distances
+            reason = ""  # without intrinsics, distances cannot be measured
         if frame.colour is None:
             pupils, reason = (
                 None,
@@ -68,9 +68,17 @@ class Watcher:
 def look_at_files(
     files: list[Path], settings: Settings, *, sequence: bool, rate_hz: float, out: Path | None
 ) -> list[Row]:
-    """Return a row for each frame of each file, in order.
+    """Find the eyes in every frame of the files and return a row for each frame.
 
-    Raises InputError if a file cannot be read or decoded, and then leaves `out` unchanged.
+    Args:
+        files: Pictures, films or recordings, in the order of the rows.
+        settings: Settings of the eye finder.
+        sequence: Follow the viewer from one still picture to the next.
+        rate_hz: Frame rate of still pictures, and of films that do not give a rate.
+        out: Folder for overlays, which show the eyes that were found. None: draw no overlays.
+
+    Raises:
+        InputError: A file cannot be read or decoded. `out` is then unchanged.
     """
     watcher, rows, follows = Watcher(settings), [], False
     with OutputFolder(out) if out is not None else nullcontext() as folder:
@@ -89,9 +97,15 @@ def look_at_files(
 
 
 def _frames(path: Path, place: int, rate_hz: float) -> Iterator[SensorFrame]:
-    """Yield a file's pictures. Raises InputError if the file cannot be read or decoded.
+    """Yield the frames of a file.
 
-    place: index of a still picture in a sequence
+    Args:
+        path: Picture, film or recording.
+        place: Index of a still picture in a sequence, which determines its time.
+        rate_hz: Frame rate of still pictures, and of films that do not give a rate.
+
+    Raises:
+        InputError: The file cannot be read or decoded.
     """
     kind = path.suffix.lower()
     if kind == RECORDING:
@@ -105,8 +119,8 @@ def _frames(path: Path, place: int, rate_hz: float) -> Iterator[SensorFrame]:
 
 
 def _filmed(path: Path, rate_hz: float) -> Iterator[SensorFrame]:
-    """Yield a film's pictures. Raises InputError if it cannot be decoded."""
-    with held_back():  # FFmpeg's and OpenCV's messages become one error
+    """Yield the frames of a film. Raises InputError if the film cannot be decoded."""
+    with held_back():  # hides the messages of FFmpeg and OpenCV, which become one error
         capture = open_film(path)
     try:
         rate = capture.get(cv2.CAP_PROP_FPS)
@@ -125,7 +139,7 @@ def _filmed(path: Path, rate_hz: float) -> Iterator[SensorFrame]:
 
 
 class _Overlays:
-    """Writer of overlays as a private picture or film. Does nothing without a target."""
+    """Writer of overlays to a picture or film that only the owner can read. Does nothing without a path."""
 
     def __init__(self, target: Path | None, is_still: bool, rate_hz: float) -> None:
         self._target, self._is_still, self._rate_hz = target, is_still, rate_hz
@@ -155,7 +169,7 @@ class _Overlays:
 
 
 def drawn(picture: U8, pupils: Pupils | None, row: Row) -> U8:
-    """Draw the pupils, the face and their figures on a picture."""
+    """Return a copy of a picture, enlarged if it is small, with the pupils, face and figures drawn on it."""
     scale = max(1.0, OVERLAY_MIN_PX / max(picture.shape[:2]))
     canvas = np.asarray(cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC), np.uint8)
     bits = 4  # fractional bits of a coordinate
@@ -183,9 +197,17 @@ def drawn(picture: U8, pupils: Pupils | None, row: Row) -> U8:
 def look_at_sensor(
     settings: Settings, report: Callable[[Row], None], *, out: Path | None, seconds: float = np.inf
 ) -> None:
-    """Report every frame of the sensor until the time is up, its recording ends or Ctrl-C is pressed.
+    """Find the eyes in the sensor's frames until the time is up, a recording ends or Ctrl-C is pressed.
 
-    `out` keeps only the newest overlay. Raises InputError, SensorLost.
+    Args:
+        settings: Settings of the sensor and the eye finder.
+        report: Function that is called with the row of each frame.
+        out: Folder for the newest overlay. None: draw no overlays.
+        seconds: Time limit in seconds.
+
+    Raises:
+        InputError: The sensor's settings cannot be used.
+        SensorLost: The sensor is missing or has failed.
     """
     watcher, driver = Watcher(settings), open_sensor(settings.sensor, MonotonicClock())
     end = time.monotonic() + seconds

@@ -1,7 +1,7 @@
-"""Guard around every command: turns any failure into an exit code and at most one line on stderr.
+"""Guard around every command. Turns any failure into an exit code and at most one line on stderr.
 
-0: success, 1: a check failed, 2: wrong usage or input, 70: a bug (the line names a file with the traceback), 75: a
-failure that may be temporary, 130: Ctrl-C, 141: stdout was closed.
+The exit codes are 0 (success), 1 (a check failed), 2 (wrong usage or input), 70 (a bug; the line names a file with the
+traceback), 75 (a failure that may be temporary), 130 (Ctrl-C) and 141 (stdout was closed).
 """
 
 from __future__ import annotations
@@ -20,9 +20,11 @@ INTERRUPTED, BAD_INPUT, OWN_ERROR, MAY_PASS, STDOUT_CLOSED = 130, 2, 70, 75, 141
 
 
 def run_guarded(*, interrupts_leave: bool) -> None:
-    """Run the command named by the arguments; never returns.
+    """Run the command that is named on the command line, then exit the process.
 
-    interrupts_leave: Ctrl-C still exits the process at once; make it raise KeyboardInterrupt from here on.
+    Args:
+        interrupts_leave: True if Ctrl-C has so far ended the process immediately. It then raises KeyboardInterrupt
+            while the command runs. False leaves the handling of Ctrl-C unchanged.
     """
     _fill_standard_descriptors()
     try:
@@ -46,12 +48,12 @@ def run_guarded(*, interrupts_leave: bool) -> None:
         logs.flush()
     else:
         atexit._run_exitfuncs()
-    # Skip Python's teardown: it takes time, and aborts the process if a library's thread is still running.
+    # Skip Python's teardown, which takes time and aborts the process if a library's thread is still running.
     os._exit(code)
 
 
 def _interrupted(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt, or exit during an import, where Python would swallow the exception."""
+    """Raise KeyboardInterrupt, or exit during an import, in which Python would swallow the exception."""
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
             os._exit(INTERRUPTED)
@@ -68,7 +70,7 @@ def _code_of(app: Any) -> int:
     try:
         app()
     except SystemExit as error:
-        if isinstance(error.__context__, BrokenPipeError):  # typer turns it into this
+        if isinstance(error.__context__, BrokenPipeError):  # typer converts a closed stdout to SystemExit
             return STDOUT_CLOSED
         return int(error.code or 0)
     return 0
@@ -102,7 +104,7 @@ def _reported(error: BaseException) -> int:
 def _say(line: str) -> None:
     with contextlib.suppress(OSError, ValueError):  # if stderr is closed, only the exit code remains
         print(line, file=sys.stderr, flush=True)
-    if "NOTIFY_SOCKET" in os.environ:  # lets `phasestack status` show it after the service has failed
+    if "NOTIFY_SOCKET" in os.environ:  # lets `phasestack status` show the error after the service has failed
         with contextlib.suppress(ImportError):
             import sdnotify
 
@@ -110,7 +112,10 @@ def _say(line: str) -> None:
 
 
 def _flushed(code: int) -> int:
-    """Flush stdout and return the exit code. (If Python's own final flush fails, it prints a traceback.)"""
+    """Flush stdout and return the exit code, which is an error code if the flush fails.
+
+    Without this, a failure of Python's final flush would print a traceback.
+    """
     try:
         sys.stdout.flush()
     except OSError as error:
@@ -120,7 +125,7 @@ def _flushed(code: int) -> int:
 
 
 def _fill_standard_descriptors() -> None:
-    """Open /dev/null for any closed standard stream, so that no later file takes its descriptor."""
+    """Open /dev/null in place of each closed standard stream, which reserves the descriptor."""
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(number, True)
     for name in ("stdout", "stderr"):

@@ -21,11 +21,12 @@ def identify(
         Path | None, typer.Option(help="configuration file; without it, every monitor shows a card")
     ] = None,
 ) -> None:
-    """Show a test card on each panel: index, monitor, colour bars, an arrow that should point up.
+    """Show a test card on each panel, with index, monitor, colour bars and an arrow that should point up.
 
     One panel at a time shows its card while the others are clear. Press Enter or n for the next panel, p for the
     previous one and q to quit. Configured panels are rotated, mirrored and registered as in a run. If no panel is
-    configured, every monitor shows the line that identifies it in a configuration. (`phasestack setup` writes it.)
+    configured, every monitor shows the line that identifies it in a configuration. (`phasestack setup` writes this
+    line.)
 
     Exits with 75 if the X server dies.
 
@@ -56,7 +57,12 @@ def identify(
 
 
 def _bound(settings: Settings) -> tuple[PanelSink, list[U8]]:
-    """Open the configured panels and return them with their cards. Raises InputError, PanelLost."""
+    """Open the configured panels and return them with a test card for each panel.
+
+    Raises:
+        InputError: The settings of a panel cannot be used.
+        PanelLost: A monitor or the X server is missing.
+    """
     from runtime.clock import MonotonicClock
     from runtime.panels.card import identity_card
     from runtime.panels.window import WindowPanels
@@ -78,7 +84,7 @@ def _bound(settings: Settings) -> tuple[PanelSink, list[U8]]:
 
 
 def _hold(panels: PanelSink, cards: list[U8], poll: Callable[[], Key | None]) -> None:
-    """Show one card at a time until q is pressed. Reopens closed windows and lost monitors."""
+    """Show one card at a time until q is pressed. Closed windows and lost monitors are opened again."""
     import time
 
     from calib.keys import Key

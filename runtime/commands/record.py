@@ -46,7 +46,8 @@ def record(
 ) -> None:
     """Record eye positions and their times and, with --images, pictures. Ctrl-C ends the recording.
 
-    --motion records a simulated head from the tracker's benchmark: noise, outliers, dropouts and the true eyes.
+    With --motion, the head is simulated as in the tracker's benchmark. The recording then contains noise, outliers,
+    dropouts and the true eyes.
 
     Example: phasestack record --out lean.mcap --seconds 20
 
@@ -77,9 +78,9 @@ def record(
 
 
 def _refuse_target(out: Path, *, motion: bool) -> None:
-    """Raise InputError if the file name has the wrong suffix or the file exists.
+    """Raise InputError if the file name has the wrong suffix, or the file exists or cannot be written.
 
-    A simulated motion may be overwritten, because its seed reproduces it.
+    The recording of a simulated motion may be overwritten, because the seed reproduces that motion.
     """
     from runtime.sensor.recording import Recording
     from runtime.support.untrusted_input import checked_path
@@ -87,7 +88,7 @@ def _refuse_target(out: Path, *, motion: bool) -> None:
     checked_path(out, source="record", field="--out")
     if out.suffix.lower() != SUFFIX:
         raise InputError(out, "--out", f"must end in {SUFFIX}, because recordings are MCAP files")
-    if os.path.isdir(out):  # noqa: PTH112 - a Path raises where a folder above it is forbidden
+    if os.path.isdir(out):  # noqa: PTH112 - Path.is_dir raises if a parent folder is not accessible
         raise InputError(out, "--out", "is a folder")
     if not os.path.lexists(out):
         folder = next(folder for folder in out.absolute().parents if os.path.lexists(folder))
@@ -103,7 +104,18 @@ def _refuse_target(out: Path, *, motion: bool) -> None:
 
 
 def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | None) -> dict[str, Any]:
-    """Record until Ctrl-C, a time or size limit, or the end of the source. Raises FatalError, InputError."""
+    """Record until Ctrl-C, a time or size limit, or the end of the source, and return a summary.
+
+    Args:
+        out: File to write.
+        settings: Settings of the sensor and the eye finder.
+        images: Also record colour and depth pictures.
+        seconds: Length of the recording in seconds. None: ten minutes.
+
+    Raises:
+        FatalError: The sensor cannot be used or delivers no sample.
+        InputError: The file cannot be written.
+    """
     from runtime.clock import NS_PER_S, MonotonicClock
     from runtime.eyes.detect import EyeFinder
     from runtime.sensor.recording import MAX_S, recording_to
@@ -155,18 +167,18 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
 
 
 def _streams(frame: SensorFrame) -> list[str]:
-    """Return the names of the kinds of data in a sample."""
+    """Return the kinds of data in a sample, such as `eyes` or `depth`."""
     parts = {"eyes": frame.eyes, "true eyes": frame.true_eyes_m, "colour": frame.colour, "depth": frame.depth_mm}
     return [name for name, value in parts.items() if value is not None]
 
 
 def _samples(worker: SensorWorker, limit_s: float) -> Iterator[SensorFrame]:
-    """Yield samples for the given time after the first one, or until the source ends."""
+    """Yield samples until the source ends, or for `limit_s` seconds after the first sample."""
     import time
 
     deadline_ns, begun = time.monotonic_ns() + round(FIRST_SAMPLE_S * 1e9), False
     while True:
-        is_over = worker.state in OVER  # read before `take`: the last samples precede the change of state
+        is_over = worker.state in OVER  # read before `take`, because the last samples arrive before this state
         frames = worker.take()
         if frames and not begun:
             deadline_ns, begun = frames[0].capture_ns + round(limit_s * 1e9), True

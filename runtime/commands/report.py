@@ -20,7 +20,7 @@ def report(
 ) -> None:
     """Measure light PSNR and run time of every method on this machine and write them to a page.
 
-    This takes minutes. The page appears with the first figure and grows from then on; Ctrl-C keeps what it shows.
+    This takes minutes. The page appears with the first result and grows with each further one. Ctrl-C keeps the page.
     To include the published network, convert its checkpoint with `phasestack export` and pass the result with --model.
 
     Example: phasestack report --pairs my-pairs --out report

@@ -38,12 +38,12 @@ MEASURED_FROM = 10  # with fewer runs, timing both backends takes longer than it
 
 @dataclass(frozen=True, slots=True)
 class Eyes:
-    """Cameras of the pictures, as given by the options."""
+    """Eyes or cameras that took the pictures, as given by the options."""
 
-    left: tuple[float, ...] | None
+    left: tuple[float, ...] | None  # position in metres in the stack frame; None if `cameras` gives it
     right: tuple[float, ...] | None
-    fov_deg: float
-    cameras: Path | None
+    fov_deg: float  # horizontal field of view of the pictures
+    cameras: Path | None  # file with the cameras' matrices
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class Files:
     def read(self) -> list[Any]:
         """Read the pictures for the left and the right eye.
 
-        Raises InputError if they cannot be read or differ in size.
+        Raises InputError if the pictures cannot be read or differ in size.
         """
         if self.right is None:
             return list(read_pair(self.left, with_options(Settings(), layout=self.layout).content))
@@ -86,7 +86,7 @@ def solve_pair(
     backend: str | None,
     plan: bool,
 ) -> dict[str, Any]:
-    """Solve a pair, write layers and pictures, and return the content of solve.json.
+    """Solve a stereo pair, write the layers and pictures, and return the content of solve.json.
 
     Raises InputError if a file, an option or the eye positions cannot be used.
     """
@@ -131,7 +131,7 @@ def solve_pair(
 
         try:
             done = timed(solve, runs=repeat)
-        except EyesNotServed as error:  # cannot pass, because a still pair's eyes do not move
+        except EyesNotServed as error:  # a lasting failure, because the eyes of a still pair do not move
             why = f"{error}: {predictor.name} does not support these eye positions; try --model sart"
             raise InputError("solve", "--left-eye, --right-eye", why) from None
         watch.lap("solve, warm-up included")
@@ -170,9 +170,20 @@ def solve_pair(
 
 
 def taken(pictures: list[Any], eyes: Eyes, stack: PanelStack) -> tuple[list[Any], F64, float]:
-    """Return the pictures for eyes that look at the stack's origin, the eyes and the field of view.
+    """Return the pictures as taken by eyes that look at the stack's origin.
 
     Pictures from other cameras (--camera) are resampled.
+
+    Args:
+        pictures: Pictures for the left and the right eye.
+        eyes: Eyes or cameras that took the pictures.
+        stack: Panels to solve for.
+
+    Returns:
+        The pictures, the eyes (2, 3) in metres in the stack frame, and the horizontal field of view in degrees.
+
+    Raises:
+        InputError: The eyes or cameras are missing, given twice or invalid.
     """
     if eyes.cameras is None:
         if eyes.left is None or eyes.right is None:
@@ -191,7 +202,10 @@ def taken(pictures: list[Any], eyes: Eyes, stack: PanelStack) -> tuple[list[Any]
 
 
 def checked_eyes(left_eye: tuple[float, ...], right_eye: tuple[float, ...], stack: PanelStack) -> F64:
-    """Return the eyes as a (2, 3) array in metres. Raises InputError if the display cannot serve them."""
+    """Return the eyes as an array (2, 3), in metres in the stack frame.
+
+    Raises InputError if an eye is not in front of the panels or if the eyes are too close to each other.
+    """
     for option, eye in (("--left-eye", left_eye), ("--right-eye", right_eye)):
         if eye[0] <= max(stack.x_m):
             raise InputError(

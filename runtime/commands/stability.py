@@ -62,7 +62,7 @@ def stability(
 
 
 def _fits() -> dict[str, Fit]:
-    """Return the solver of each calibration method, by name."""
+    """Return a function for each calibration method, which fits a 4x4 matrix to pairs of points."""
     from functools import partial
 
     from calib.solution import METHODS, Method, solve
