@@ -115,7 +115,7 @@ def text_of(record: logging.LogRecord) -> str:
 
 
 class BlackBoxMessage(NamedTuple):
-    """Message for the black box, serialised for the file."""
+    """Message that the black box keeps, serialised as in the file."""
 
     at_ns: int  # time on the run's clock, because the wall clock may be set back
     wall_ns: int  # wall-clock time since 1970
@@ -466,7 +466,7 @@ def _number(path: Path) -> int:
 
 
 def _sweep(folder: Path) -> None:
-    """Delete unfinished files, which killed processes have left."""
+    """Delete the unfinished files of killed processes."""
     for part in folder.glob(f".{PREFIX}*{PART}"):
         with suppress(OSError), part.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,4 +1,4 @@
-"""Typer app with all commands. A command imports what it needs only when it runs."""
+"""Typer app with all commands. Each command imports its dependencies when it runs."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ def demo(
 ) -> None:
     """Play a built-in recording of a moving head through the whole pipeline, without a screen.
 
-    By default the demo ends after 42 refreshes, or after 45 s on a slow machine (but at least 15 refreshes).
+    By default the demo ends after 42 refreshes. On a slow machine it ends after 45 s and at least 15 refreshes.
 
     Example: phasestack demo --out out/demo
     """

@@ -114,7 +114,7 @@ def _say(line: str) -> None:
 def _flushed(code: int) -> int:
     """Flush stdout and return the exit code, which is an error code if the flush fails.
 
-    Without this, a failure of Python's final flush would print a traceback.
+    If the flush were left to Python's shutdown, a failure would print a traceback.
     """
     try:
         sys.stdout.flush()

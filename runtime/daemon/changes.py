@@ -173,7 +173,7 @@ class Changes:
         self._between_steps(command, skip)
 
     def attempt(self, command: Command, work: Callable[[], None]) -> None:
-        """Run `work`. If an exception is raised, refuse the command; the run continues."""
+        """Run `work`. If an exception is raised, refuse the command and let the run continue."""
         if problem := _problem_of(command, work):
             self.answer(command, problem)
 

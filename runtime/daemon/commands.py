@@ -1,4 +1,4 @@
-"""Commands that operators send to the running daemon. Each is checked before the loop receives it."""
+"""Commands that operators send to the running daemon. They are checked before the loop starts them."""
 
 from __future__ import annotations
 

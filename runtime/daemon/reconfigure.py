@@ -169,10 +169,10 @@ def _tried(settings: Settings) -> None:
 
 
 def moved_since(before: ContentSettings, now: ContentSettings) -> dict[str, Any]:
-    """Return the placement settings that have changed, with their new values."""
+    """Return the placement settings in `now` that differ from those in `before`."""
     return {key: getattr(now, key) for key in PLACING if getattr(now, key) != getattr(before, key)}
 
 
 def _model_part(settings: Settings) -> Any:
-    """Return the model settings with fixed values where a change does not require a new predictor."""
+    """Return the model settings to compare, with constants for those that require no new predictor."""
     return settings.model.model_copy(update={"budget_ms": 0.0, "eye_sigma_mm": "auto"})

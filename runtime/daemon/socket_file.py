@@ -63,7 +63,10 @@ def listening_socket(path: Path) -> socket.socket:
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Lock a folder to prevent two daemons from replacing a dead socket at the same time."""
+    """Lock a folder to prevent two daemons from replacing a dead socket at the same time.
+
+    If the lock is not available within `LOCKED_WITHIN_S`, continue without it.
+    """
     opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         until_s = time.monotonic() + LOCKED_WITHIN_S
