@@ -113,7 +113,7 @@ def scaled_stack(settings: Settings, scale: float) -> PanelStack:
 
 
 class Host(Supervisor):
-    """Callbacks for the start of a run, in addition to those of `Supervisor`. By default, they do nothing."""
+    """Callbacks for the start of a run, in addition to those of `Supervisor`. The defaults do nothing."""
 
     recorder: Any = None  # additional observer, whose `watches` is called before the first refresh
 
