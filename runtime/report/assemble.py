@@ -1,4 +1,4 @@
-"""The whole report, which runs the measurements in order and rewrites page and record after each."""
+"""Run all measurements of the report in order, and rewrite its page and record after every result."""
 
 from __future__ import annotations
 
@@ -25,7 +25,10 @@ Progress = Callable[[str], None]
 
 
 class GrowingPage:
-    """index.html, report.json and plots, rewritten with every result so that a stopped report is usable."""
+    """Report that writes index.html, report.json and the plots again after every new result.
+
+    A report that is stopped early is still usable, because its files contain all results up to that moment.
+    """
 
     def __init__(self, out: Path, command: str, progress: Progress) -> None:
         self.out, self._command, self._progress = out, command, progress
@@ -34,23 +37,23 @@ class GrowingPage:
         self.record["yardsticks_ms"] = [yardstick_ms()]
 
     def doing(self, what: str) -> None:
-        """Record which measurement is in progress."""
+        """Announce a measurement that is about to start, and note it in the record as the last known step."""
         self._progress(what)
         self.record["measuring"] = what
 
     def put(self, name: str, section: PageSection) -> None:
-        """Add a section or replace the one of the same name."""
+        """Add a section under a name, or replace the section of that name, and write the files."""
         self._sections[name] = section
         self.write()
 
     def finished(self) -> None:
-        """Mark the report as complete."""
+        """Mark the report as complete and write the files."""
         del self.record["measuring"]
         self.record["complete"] = True
         self.write()
 
     def write(self) -> None:
-        """Write everything measured so far. Raises InputError if the files cannot be written."""
+        """Write all results measured so far. Raises InputError if the files cannot be written."""
         doing = self.record.get("measuring")
         notes = [f"Not finished: this page grows as figures come in. Last known step: {doing}."] if doing else []
         if busy := too_busy(self.record["yardsticks_ms"]):
@@ -71,17 +74,30 @@ def whole_report(
     command: str = "phasestack report",
     progress: Progress = lambda name: None,
 ) -> dict[str, Any]:
-    """Run all measurements, write them to a folder and return the contents of report.json.
+    """Run all measurements, write the results to a folder and return the contents of report.json.
 
-    quick: at a quarter of the size, with fewer references. Raises InputError for invalid case files and models, before
-    measuring.
+    Case files and models are checked before the first measurement.
+
+    Args:
+        out: Folder for the page, the plots and report.json.
+        pairs: Folder with case files, which are measured before the built-in scenes.
+        with_focal: Also measure the focal parallax.
+        models: Model names or ONNX files to measure in addition to the shipped models.
+        quick: Draw built-in scenes with a quarter of the pixels, omit the slowest reference, and shorten the motions.
+        command: Command that reproduces the report, shown on the page.
+        progress: Function that is called with the name of each step.
+
+    Raises:
+        InputError: A case file or a model is invalid, or the results cannot be written.
+        FatalError: A measuring process failed.
     """
     cases = read_pairs(pairs) if pairs is not None else []
     stack = StackGeometry().stack()
     if quick:
         stack = replace(stack, width_px=960, height_px=540)
     for name in models:
-        for each in dict.fromkeys([*(pair.stack for pair in cases), stack]):  # refuse it now instead of minutes later
+        # Reject an invalid model now instead of after minutes of measuring.
+        for each in dict.fromkeys([*(pair.stack for pair in cases), stack]):
             load_predictor(name, each, ModelSettings(threads=1)).close()
     page = GrowingPage(out, command, progress)
     methods = shipped_and_references(models, quick=quick)
@@ -107,7 +123,7 @@ def _by_size(cases: Sequence[StillPair]) -> dict[str, list[StillPair]]:
 def _frontier(
     page: GrowingPage, methods: Sequence[Method], pairs: Iterable[StillPair], *, title: str, name: str, key: str
 ) -> None:
-    """Measure pairs of one resolution. key: list in the record to which the methods are added."""
+    """Measure pairs of one resolution, and update the section `name` and the list `key` of the record."""
     title = f"Light against run time: {title}"
     page.doing(f"{title}: drawing")
     before, results = page.record.get(key, []), dict[str, MethodResult]()
@@ -120,7 +136,7 @@ def _frontier(
 
 
 def _moving(page: GrowingPage, *, quick: bool) -> None:
-    """Measure all motions. Runs on a simulated clock may run in parallel."""
+    """Measure all motions in parallel. The clock is simulated, so load does not affect the results."""
     fixed = (moving.FULL, Effort(2, 0)) if quick else moving.FIXED
     runs = [(motion, effort) for motion in moving.SCENES for effort in (None, *fixed)]
     small = partial(moving.moving_run, scale=0.15, seconds=2.5)

@@ -1,4 +1,7 @@
-"""Regression file with time, light and memory of the shipped models, and a reference time."""
+"""Measure and compare regression files, which record time, light PSNR and memory of shipped models.
+
+Run times of different machines are comparable relative to the yardstick, the time of a fixed workload.
+"""
 
 from __future__ import annotations
 
@@ -18,15 +21,15 @@ from runtime.report.page import describe
 from runtime.report.pairs import FOV_DEG, PairPainter, eyes_at
 
 SIZES = ((960, 540), (1920, 1080))
-WORSE_DB = 0.1  # larger than changes caused by rounding and thread order
-SLOWER = 0.15  # minimum relative change that is reported; more if the runs scatter
-MORE_MEMORY = 0.15  # minimum relative change that is reported
-UNSTEADY = 1.3  # maximum ratio of yardsticks for which times are compared
-SCATTERS = 3.0  # a difference must exceed this many times the medians' scatter
+WORSE_DB = 0.1  # minimum change that is reported; rounding and thread order cause smaller changes
+SLOWER = 0.15  # minimum relative change of a time that is reported; larger if the runs scatter
+MORE_MEMORY = 0.15  # minimum relative change of the memory that is reported
+UNSTEADY = 1.3  # maximum ratio between a measurement's yardsticks for which its times are compared
+SCATTERS = 3.0  # number of standard errors of the medians that a difference of times must exceed
 
 
 class BenchEntry(BaseModel):
-    """Figures of one method at one size that are compared."""
+    """Results of one method at one panel size, as far as a comparison needs them."""
 
     name: str
     width_px: int
@@ -44,16 +47,16 @@ class BenchEntry(BaseModel):
 
 
 class RegressionFile(BaseModel):
-    """Part of a regression file that is compared."""
+    """Contents of a regression file, as far as a comparison needs them."""
 
     version: Literal[2]
     yardstick_ms: PositiveFloat
-    yardsticks_ms: Annotated[list[PositiveFloat], Field(min_length=1)]  # yardsticks over the whole measurement
+    yardsticks_ms: Annotated[list[PositiveFloat], Field(min_length=1)]  # all yardsticks of the measurement
     methods: list[BenchEntry]
 
 
 def too_busy(yardsticks_ms: Sequence[float]) -> str:
-    """Reason why times cannot be compared (other load on the machine), or empty."""
+    """Return why times cannot be compared because of other load on the machine, or an empty string."""
     least, most = min(yardsticks_ms), max(yardsticks_ms)
     if most > UNSTEADY * least:
         return f"the same work took {least:.1f} to {most:.1f} ms during the measurement"
@@ -61,12 +64,12 @@ def too_busy(yardsticks_ms: Sequence[float]) -> str:
 
 
 def read(path: Path) -> RegressionFile:
-    """Read a regression file. Raises InputError that names file and field."""
+    """Read a regression file. Raises InputError, which names the file and the field, if it is invalid."""
     return validated(RegressionFile, read_table(path), source=path)
 
 
 def yardstick_ms() -> float:
-    """Return the median time of nine runs of a fixed workload: warp, look-up table, matrix product."""
+    """Return the median time of nine runs of a fixed workload: image warp, table look-up, matrix product."""
     picture = np.random.default_rng(0).integers(0, 256, (1080, 1920, 4), dtype=np.uint8)
     left = np.random.default_rng(1).random((1080, 240), dtype=np.float32)
     right = np.random.default_rng(2).random((240, 1920), dtype=np.float32)
@@ -81,7 +84,10 @@ def yardstick_ms() -> float:
 
 
 def scatter(values: Sequence[float]) -> float:
-    """Return the relative standard error of the median: 1.4826·MAD·1.25/sqrt(n)."""
+    """Return the relative standard error of the median.
+
+    The error is estimated as 1.4826·MAD·1.2533/sqrt(n), divided by the median.
+    """
     middle = float(np.median(values))
     deviation = float(np.median(np.abs(np.asarray(values) - middle)))
     relative: float = 1.4826 * 1.2533 * deviation / middle / len(values) ** 0.5
@@ -94,7 +100,13 @@ def measured(
     sizes: Sequence[tuple[int, int]] = SIZES,
     progress: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
-    """Measure the content of a regression file. Takes about a minute."""
+    """Measure the shipped models and return the contents of a regression file. This takes about a minute.
+
+    Args:
+        models: Names of the models.
+        sizes: Width and height of the panels, in pixels.
+        progress: Function that is called after each measurement with a text that names it.
+    """
     yardsticks, entries = [yardstick_ms()], []
     methods = [Method(name, "network", name) for name in models]
     for width, height in sizes:
@@ -122,7 +134,7 @@ def _entry(result: MethodResult) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Difference between two files that exceeds the noise."""
+    """Difference between two regression files that exceeds the noise."""
 
     what: str
     worse: bool
@@ -130,9 +142,10 @@ class Change:
 
 
 def compare(old: RegressionFile, new: RegressionFile) -> list[Change]:
-    """Return the changes between two regression files, with times relative to the yardstick of each.
+    """Return the changes between two regression files that exceed the noise.
 
-    Times are not compared if the machine was too busy during either measurement (`too_busy`).
+    Times are divided by the yardstick of their file before the comparison. They are not compared if the machine was
+    too busy during one of the measurements (`too_busy`).
     """
     later = {entry.title: entry for entry in new.methods}
     machine = new.yardstick_ms / old.yardstick_ms

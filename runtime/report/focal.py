@@ -1,8 +1,8 @@
-"""Focal parallax (supplement, 1.4), where an eye with a finite pupil focuses through the layers.
+"""Measure focal parallax (supplement, 1.4), with which a finite pupil can focus through the layers.
 
-The eye sees the mean of the pictures through all points of its pupil. Focusing at a distance f along the gaze shifts
-these pictures so that they agree there: the pinhole picture through the pupil's point (right, up) is shifted by
-focal_px·right/f to the right and focal_px·up/f up.
+The eye sees the mean of the pinhole pictures through all points of its pupil. To focus at a distance f along the gaze,
+these pictures are shifted until they coincide for points at that distance: the picture through the pupil's point
+(right, up) is shifted by focal_px·right/f to the right and by focal_px·up/f upwards.
 """
 
 from __future__ import annotations
@@ -29,52 +29,57 @@ from runtime.report.pairs import PairPainter, eyes_at
 WIDTH_PX, HEIGHT_PX, FOV_DEG = 720, 300, 18.0
 PUPIL_M = PUPIL_MM / 1e3
 DISTANCE_M = 0.4
-CARDS_M = (-0.05, 0.0, 0.045)  # x of three cards, frame `stack`
-OFFSETS_M = (-0.043, 0.0, 0.040)  # y of the cards
-PLANES_M = (-0.11, -0.08, -0.05, -0.025, 0.0, 0.022, 0.045, 0.07, 0.095)  # x of the planes in focus
+CARDS_M = (-0.05, 0.0, 0.045)  # x of the three cards, frame `stack`
+OFFSETS_M = (-0.043, 0.0, 0.040)  # y of the three cards, frame `stack`
+PLANES_M = (-0.11, -0.08, -0.05, -0.025, 0.0, 0.022, 0.045, 0.07, 0.095)  # x of the planes in focus, frame `stack`
 
 
 @dataclass(frozen=True, slots=True)
 class Slice:
-    """View with one setting of the eye's lens."""
+    """Pictures that an eye sees while it focuses on one plane."""
 
-    plane_m: float  # x of the plane in focus
+    plane_m: float  # x of the plane in focus, frame `stack`
     shown: F32  # (h, w, 3) view through the layers
     true: F32  # (h, w, 3) view of the scene itself
 
 
 @dataclass(frozen=True, slots=True)
 class Accommodation:
-    """Distances at which the eyes converge on a card and at which its picture is sharpest, in metres."""
+    """Distances from an eye to the point of convergence on a card and to the sharpest focus, in metres."""
 
-    card_m: float  # distance from the eye to the point where the lines of sight meet
-    sharpest_shown_m: float
-    sharpest_true_m: float
+    card_m: float  # distance to the point where the lines of sight meet
+    sharpest_shown_m: float  # focus at which the card is sharpest through the layers
+    sharpest_true_m: float  # focus at which the card is sharpest in the scene itself
 
 
 @dataclass(frozen=True, slots=True)
 class FocalStack:
-    """Focal stack of one eye through the layers of a model."""
+    """Pictures of the right eye at several focal distances, and the accommodation for each card."""
 
     model: str
-    slices: tuple[Slice, ...]
-    cards: tuple[Accommodation, ...]
+    slices: tuple[Slice, ...]  # one per plane of PLANES_M
+    cards: tuple[Accommodation, ...]  # one per card of CARDS_M
 
 
 def projection(eye_m: F64, point: F64, *, focus_m: float) -> F64:
-    """Return the 3x4 projection through a point of the pupil (right, up), focused on a plane.
+    """Return the 3x4 projection to the picture through a point of the pupil, shifted for a focus.
 
-    Its third coordinate is the distance from the eye along the gaze.
+    The third homogeneous coordinate of a projected point is its distance from the eye along the gaze, in metres.
+
+    Args:
+        eye_m: Centre of the pupil, shape (3,), frame `stack`.
+        point: Offset from the centre of the pupil to the right and up, shape (2,), in metres.
+        focus_m: Distance along the gaze at which the pictures through all points coincide.
     """
     centre = image_from_stack(eye_m, width_px=WIDTH_PX, height_px=HEIGHT_PX, fov_deg=FOV_DEG)
-    # Points in front of the plane in focus move opposite to the pupil's point, points behind it move with it.
+    # Points in front of the plane in focus move against the pupil's point, and points behind the plane move with it.
     focal_px = WIDTH_PX / 2 / math.tan(math.radians(FOV_DEG / 2))
     out_of_focus = centre[2] / focus_m - [0.0, 0.0, 0.0, 1.0]
     return centre + np.outer([focal_px * point[0], -focal_px * point[1], 0.0], out_of_focus)
 
 
 def card_windows(eye_m: F64) -> list[tuple[slice, slice]]:
-    """Return the rows and columns of the cards in the eye's picture, slightly inside their edges."""
+    """Return the rows and columns of each card in the eye's picture, slightly inside the card's edges."""
     windows = []
     matrix = projection(eye_m, np.zeros(2), focus_m=DISTANCE_M)
     for x, y in zip(CARDS_M, OFFSETS_M, strict=True):
@@ -86,13 +91,13 @@ def card_windows(eye_m: F64) -> list[tuple[slice, slice]]:
 
 
 def contrast(image: F32, window: tuple[slice, slice]) -> float:
-    """Return the RMS brightness gradient in a window, which is largest for a sharp picture."""
+    """Return the RMS gradient of the brightness in a window. Sharper pictures have a larger gradient."""
     grey = image[window].mean(axis=2)
     return float(np.sqrt((np.diff(grey, axis=1) ** 2).mean() + (np.diff(grey, axis=0) ** 2).mean()))
 
 
 def sharpest(distances_m: Sequence[float], values: Sequence[float]) -> float:
-    """Return the distance at the maximum of a parabola through the largest value and its neighbours."""
+    """Return the distance of the largest value, refined by a parabola through its two neighbours."""
     best = int(np.argmax(values))
     if not 0 < best < len(values) - 1:
         return distances_m[best]
@@ -103,7 +108,14 @@ def sharpest(distances_m: Sequence[float], values: Sequence[float]) -> float:
 def focal_stack(
     painter: PairPainter, stack: PanelStack, *, model: str, progress: Callable[[int, int], None] = lambda done, of: None
 ) -> FocalStack:
-    """Solve for two pinhole eyes, then focus the right one at every plane."""
+    """Solve for two pinhole eyes, then focus the right eye at every plane of PLANES_M.
+
+    Args:
+        painter: Painter of the cards (`cards_painter`).
+        stack: Geometry of the panels.
+        model: Name of the model or path of an ONNX file.
+        progress: Function that is called after each plane with the number of finished planes and of all planes.
+    """
     eyes = eyes_at(distance_m=DISTANCE_M)
     predictor = load_predictor(model, stack, ModelSettings())
     raster = stack.panel(stack.count // 2)
@@ -134,7 +146,7 @@ def focal_stack(
 
 
 def seen_through(matrix: F64, layers: U8, stack: PanelStack) -> Retina:
-    """Return the picture of the layers through a projection, and a mask of rays that cross every panel."""
+    """Compute the picture of the layers through a projection. Its mask marks rays that cross all panels."""
     rays = Rays(matrix, np.arange(WIDTH_PX) + np.float64(0.5), (np.arange(HEIGHT_PX) + np.float64(0.5))[:, None])
     panels = [stack.panel(index) for index in range(stack.count)]
     return through_layers(layers, lambda rows: (rays.on(panel, rows) for panel in panels), rays.toward_panels(), stack)
