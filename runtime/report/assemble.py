@@ -1,4 +1,4 @@
-"""Run all measurements of the report in order, and rewrite its page and record after every result."""
+"""Run all measurements of the report in order, and rewrite page and record after every result."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ def too_busy(yardsticks_ms: Sequence[float]) -> str:
 
 
 def read(path: Path) -> RegressionFile:
-    """Read a regression file. Raises InputError, which names the file and the field, if it is invalid."""
+    """Read a regression file. Raises InputError if the file cannot be read or a field is invalid."""
     return validated(RegressionFile, read_table(path), source=path)
 
 

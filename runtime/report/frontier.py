@@ -1,4 +1,4 @@
-"""Light against run time of every method on every pair, with each method in a separate process."""
+"""Measure the light PSNR and run time of every method on every pair, each in a separate process."""
 
 from __future__ import annotations
 
@@ -34,26 +34,31 @@ P = ParamSpec("P")
 T = TypeVar("T")
 Kind = Literal["network", "iterative"]
 SHIPPED = ("balanced", "fast", "best")  # the default model comes first in a report
-SART = (1, 3, 10, 30)
-ENOUGH_S = 2.0  # seconds of timed runs per pair; slow methods run once
+SART = (1, 3, 10, 30)  # iterations of the reference methods
+ENOUGH_S = 2.0  # total time after which no further run of a method on a pair is timed
 MOST_RUNS = 25  # maximum number of timed runs of one method on one pair
-FEWEST_RUNS = 3  # minimum number of timed runs, unless the first is slow
-SLOW_S = 4.0  # if the first run takes longer than this, it counts and is the only one
-OFF_STEP = 3  # for displaced eyes, every third ray of every third row is enough
-QUOTED = "1"  # key of `light_db`: tracking error 1 mm
+FEWEST_RUNS = 3  # minimum number of timed runs of one method on one pair, unless the method is slow
+SLOW_S = 4.0  # a method whose first run takes at least this long runs only once
+OFF_STEP = 3  # for displaced eyes, every third ray of every third row is traced
+QUOTED = "1"  # key of `light_db` for the figure to quote, at a tracking error of 1 mm
 
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """Method that computes layers."""
+    """Way to compute layers that the report compares: a network, or SART as an iterative reference."""
 
     name: str
     kind: Kind
-    source: str  # argument of `load_predictor`
-    iterations: int = 0  # iterations of SART
+    source: str  # name of the model or path of its ONNX file, as for `load_predictor`
+    iterations: int = 0  # iterations of SART; 0 for a network
 
     def opened(self, stack: PanelStack, *, threads: int) -> Predictor:
-        """Load a predictor for a stack. Raises InputError, MissingPart."""
+        """Load the method's predictor for a stack.
+
+        Raises:
+            InputError: The model is unknown, invalid or unsuitable for the stack.
+            MissingPart: A package or the compiled library that the model needs is not installed.
+        """
         from runtime.config import ModelSettings
         from runtime.model.predictor import load_predictor
         from runtime.model.sart import SartPredictor
@@ -64,7 +69,12 @@ class Method:
 
 
 def shipped_and_references(models: Sequence[str] = (), *, quick: bool = False) -> list[Method]:
-    """Return the shipped models, further ONNX files and the iterative reference. quick: omit the slowest."""
+    """Return the methods of a report: shipped models, further models and SART with increasing iterations.
+
+    Args:
+        models: Names or ONNX files of the further models.
+        quick: Omit the slowest reference, which is SART with the most iterations.
+    """
     methods = [Method(name, "network", name) for name in SHIPPED]
     methods += [Method(Path(name).stem, "network", name) for name in models]
     return methods + [Method(f"SART-{n}", "iterative", "sart", n) for n in (SART[:-1] if quick else SART)]
@@ -72,10 +82,10 @@ def shipped_and_references(models: Sequence[str] = (), *, quick: bool = False) -
 
 @dataclass(frozen=True, slots=True)
 class MethodRun:
-    """Measurements of one method on one pair, in a separate process."""
+    """Layers that one method computed for one pair in a separate process, with run times and peak memory."""
 
-    layers: U8
-    run_ms: tuple[float, ...]  # times of whole solutions, from two decoded images to N 8-bit layers
+    layers: U8  # (N, h, w, 3), rear to front
+    run_ms: tuple[float, ...]  # times of complete solutions, from two decoded images to N 8-bit layers
     memory_mib: float  # peak memory of the process
     parameters: int
     precision: str
@@ -83,19 +93,19 @@ class MethodRun:
 
 @dataclass(frozen=True, slots=True)
 class PairResult:
-    """Quality of one method on one pair."""
+    """Quality, run times and memory of one method on one pair."""
 
-    pair: str
+    pair: str  # name of the pair
     run_ms: tuple[float, ...]
     memory_mib: float
     quality: PairQuality
-    psnr_db_off_eye: dict[str, float]
-    viewer: str = ""  # file name of the viewer of its layers, if written
+    psnr_db_off_eye: dict[str, float]  # mean PSNR at displaced eyes, by displacement: "2mm", "4mm", "6mm"
+    viewer: str = ""  # name of the viewer page that shows the layers; empty: not written
 
 
 @dataclass(frozen=True, slots=True)
 class MethodResult:
-    """Means of a method over the pairs of one resolution: an entry of `methods` in report.json."""
+    """Means of a method over all pairs of one resolution, an entry of `methods` in report.json."""
 
     name: str
     kind: Kind
@@ -106,34 +116,46 @@ class MethodResult:
     ms_p99: float
     memory_mib: float
     parameters: int
-    light_db: dict[str, float]  # by tracking error, millimetres: "0", "1", "2"
-    expected_db: dict[str, float]  # the same with one ray per pixel
+    light_db: dict[str, float]  # by tracking error in mm: "0", "1", "2"
+    expected_db: dict[str, float]  # by tracking error in mm, with one ray per pixel
     psnr_db: float
     ssim: float
     worst_eye_psnr_db: float  # worst of all eyes and pairs
-    psnr_db_off_eye: dict[str, float]
+    psnr_db_off_eye: dict[str, float]  # by displacement of the eye: "2mm", "4mm", "6mm"
     pairs: list[PairResult] = field(default_factory=list)
 
     @property
     def spread_ms(self) -> tuple[float, float]:
-        """10th and 90th percentiles of run times, relative to each pair's median, times `ms_p50`."""
+        """10th and 90th percentiles of the run times in ms.
+
+        The percentiles are taken over the ratios of each time to the median of its pair, and scaled by `ms_p50`.
+        """
         ratios = np.concatenate([np.asarray(pair.run_ms) / np.median(pair.run_ms) for pair in self.pairs])
         low, high = np.percentile(ratios, (10, 90))
         return float(low) * self.ms_p50, float(high) * self.ms_p50
 
     @property
     def quoted_db(self) -> float:
-        """Figure to quote, or NaN if displaced eyes see no part of the panels."""
+        """Light PSNR at a tracking error of 1 mm, or NaN if displaced eyes see no part of the panels."""
         return self.light_db.get(QUOTED, math.nan)
 
 
 def measure(
     methods: Sequence[Method], pairs: Iterable[StillPair], *, threads: int = 2, viewers: Path | None = None
 ) -> Iterator[tuple[str, MethodResult]]:
-    """Measure every method, pair by pair, at one resolution.
+    """Measure every method on every pair, pair by pair.
 
-    viewers: folder for viewers of the first method. After each measurement, yields its name and the result of the
-    method so far. Raises FatalError if one fails.
+    Args:
+        methods: Methods to measure. Viewer pages are written for the first method only.
+        pairs: Pairs of one resolution.
+        threads: Number of threads of a method.
+        viewers: Folder for the viewer pages, or None to write no pages.
+
+    Yields:
+        After each measurement, the names of method and pair, and the method's result over the pairs so far.
+
+    Raises:
+        FatalError: A measurement failed or its process died.
     """
     results: dict[str, list[PairResult]] = {method.name: [] for method in methods}
     for pair in pairs:
@@ -145,8 +167,11 @@ def measure(
 
 
 def apart(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-    """Call an importable function in a new process. Raises FatalError if the process dies."""
-    # Its stdout goes to stderr, because ours may be JSON.
+    """Call an importable function in a new process and return its result.
+
+    Raises FatalError if the process dies or the function raises one of the project's errors.
+    """
+    # Redirect the new process's stdout to stderr, because the stdout of this process may be JSON.
     with ProcessPoolExecutor(1, get_context("spawn"), initializer=os.dup2, initargs=(2, 1)) as pool:
         try:
             return pool.submit(_called, function, args, kwargs).result()
@@ -157,19 +182,23 @@ def apart(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
 def _called(function: Callable[..., T], args: Any, kwargs: Any) -> T:
     try:
         return function(*args, **kwargs)
-    except PhasestackError as error:  # not every error class can be pickled
+    except PhasestackError as error:  # some error classes cannot be pickled
         raise FatalError(str(error)) from None
 
 
 def run_method(method: Method, pair: StillPair, threads: int) -> MethodRun:
-    """Load, warm up and time a method, and record its peak memory. Runs in a separate process."""
+    """Load, warm up and time a method on a pair, and measure the peak memory of this process.
+
+    The function runs in a process that is started for this measurement alone.
+    """
     import cv2
 
     from runtime.model.still import solve_still
 
     cv2.setNumThreads(threads)
     predictor = method.opened(pair.stack, threads=threads)
-    with contextlib.suppress(OSError):  # on older kernels the peak includes the interpreter's start, which needs less
+    # Reset the peak. Older kernels refuse; the peak then includes the interpreter's start, which needs less memory.
+    with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
     done = timed(
         lambda: solve_still(*pair.images, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, predictor=predictor).layers,
@@ -188,9 +217,12 @@ def _peak_mib() -> float:
 
 
 def pair_result(pair: StillPair, run: MethodRun, *, viewer: Path | None = None) -> PairResult:
-    """Measure quality (docs/contracts.md, Error) at the eyes, expected, and at displaced eyes.
+    """Measure the quality of layers at the pair's eyes and at displaced eyes (docs/contracts.md, Error).
 
-    viewer: folder for a viewer of the layers.
+    Args:
+        pair: Pictures, eyes and targets for displaced eyes.
+        run: Layers to evaluate, and their run times.
+        viewer: Folder for a viewer page that shows the layers, or None to write no page.
     """
     at_eyes = SolvedPair(run.layers, pair.images, pair.stack, pair.eyes_m, pair.fov_deg)
     off: dict[str, list[float]] = {}
@@ -198,7 +230,7 @@ def pair_result(pair: StillPair, run: MethodRun, *, viewer: Path | None = None) 
     for view in pair.off:
         place = view.eye_m[None]
         where: Any = {"solved_for_m": place, "eyes_m": place, "fov_deg": pair.fov_deg, "sampling": sampling}
-        with contextlib.suppress(ValueError):  # raised if that eye sees no part of the panels
+        with contextlib.suppress(ValueError):  # raised if the displaced eye sees no part of the panels
             errors = squared_errors(run.layers, [intensities(view.image)], pair.stack, **where)
             off.setdefault(f"{view.mm:g}mm", []).append(psnr_db(errors[0]))
     beside = {name: float(np.mean(values)) for name, values in off.items()}
@@ -233,7 +265,7 @@ def _together(method: Method, pair: StillPair, run: MethodRun, pairs: list[PairR
 
 
 def _means(tables: Sequence[Any]) -> dict[str, float]:
-    """Return the mean for each key over the tables that have a finite value for it."""
+    """Return the mean of the finite values of each key. Keys without a finite value are omitted."""
     keys = dict.fromkeys(key for table in tables for key in table)
     values_of = {key: [table[key] for table in tables if math.isfinite(table.get(key, math.nan))] for key in keys}
     return {key: float(np.mean(values)) for key, values in values_of.items() if values}

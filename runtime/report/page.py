@@ -1,4 +1,4 @@
-"""Self-contained HTML pages of reports, the style of their plots, and a description of the machine."""
+"""Self-contained HTML pages of reports, the style of plots, and a description of the machine."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PACKAGES = (
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """Picture and its caption."""
+    """PNG picture with a caption, for a page."""
 
     name: str  # file name without .png
     png: bytes
@@ -32,13 +32,13 @@ class Figure:
 
     @property
     def source(self) -> str:
-        """Return the picture as a data URI, so that the page needs no other file."""
+        """Data URI of the picture, which keeps the page independent of other files."""
         return "data:image/png;base64," + base64.b64encode(self.png).decode()
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Table of text under headings."""
+    """Table of text with a heading for each column."""
 
     headings: Sequence[str]
     rows: Sequence[Sequence[str]]
@@ -47,28 +47,28 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class PageSection:
-    """Section of a page."""
+    """Section of a page, shown as paragraphs, figures, tables and links under a title."""
 
     title: str
-    text: Sequence[str] = ()  # paragraphs, plain text
+    text: Sequence[str] = ()  # paragraphs of plain text
     figures: Sequence[Figure] = ()
     tables: Sequence[Table] = ()
-    links: Sequence[tuple[str, str]] = ()  # pairs of a text and a file next to the page
+    links: Sequence[tuple[str, str]] = ()  # pairs of link text and file name, relative to the page's folder
 
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """Complete report page."""
+    """Complete report page, which can be written to a folder with its pictures and data."""
 
     title: str
-    lead: str  # the main result in a sentence
+    lead: str  # one sentence below the title with the main result
     sections: Sequence[PageSection]
-    machine: Mapping[str, str] = field(default_factory=dict)
-    command: str = ""  # command that reproduces this page; empty: not shown
+    machine: Mapping[str, str] = field(default_factory=dict)  # facts about the machine by name (`describe`)
+    command: str = ""  # command that reproduces the page; empty: not shown
     notes: Sequence[str] = ()  # caveats
 
     def html(self) -> str:
-        """Return the page as HTML, with all text escaped and no external requests."""
+        """Return the page as HTML. All text is escaped, and the page makes no external requests."""
         from jinja2 import Environment, StrictUndefined
 
         template = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
@@ -76,13 +76,21 @@ class Page:
         return environment.from_string(template).render(page=self)
 
     def figures(self) -> list[Figure]:
-        """Return all pictures of the page, in order."""
+        """Return all figures of the page in the order in which they appear."""
         return [figure for section in self.sections for figure in section.figures]
 
     def write(self, out: Path, *, record: str, data: Any) -> None:
-        """Write index.html, its PNGs and `data` (to the file `record`) into the folder `out`.
+        """Write index.html, the pictures and the data into a folder.
 
-        All files appear together or not at all. Raises InputError if they cannot be written.
+        Either all files appear in the folder or none.
+
+        Args:
+            out: Folder, created if necessary.
+            record: Name of the JSON file for the data.
+            data: Content of the JSON file.
+
+        Raises:
+            InputError: The files cannot be written.
         """
         with OutputFolder(out) as folder:
             write_json(folder.staging / record, data)
@@ -92,13 +100,13 @@ class Page:
 
 
 def section_of(title: str, rows: Sequence[Sequence[str]]) -> PageSection:
-    """Create a section with one table, whose headings are in the first row."""
+    """Create a section with one table. The first row contains the headings."""
     return PageSection(title, tables=[Table(rows[0], rows[1:])])
 
 
 @contextmanager
 def drawing(width_in: float, height_in: float) -> Iterator[Any]:
-    """Yield a matplotlib figure in the reports' style, without pyplot's global state."""
+    """Yield an empty matplotlib figure in the reports' style, without using pyplot's global state."""
     from matplotlib import style
     from matplotlib.figure import Figure as Drawing
 
@@ -107,21 +115,21 @@ def drawing(width_in: float, height_in: float) -> Iterator[Any]:
 
 
 def png(figure: Any) -> bytes:
-    """Return a figure as PNG without time stamps, so that equal data give equal bytes."""
+    """Return a matplotlib figure as PNG without time stamps, which makes the bytes reproducible."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})
     return buffer.getvalue()
 
 
 def describe() -> dict[str, str]:
-    """Return facts about the machine and the versions of installed packages, in a page's order."""
+    """Return facts about the machine and versions of installed packages, by name, for a report page."""
     facts = {
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "processor": _processor(),
         "cores": str(len(os.sched_getaffinity(0))),
         "memory": f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.1f} GiB",
         "system": f"{platform.system()} {platform.release()}",
-        "seed": "0",  # seed of all random numbers
+        "seed": "0",  # seed of all random numbers of a report
         "Python": platform.python_version(),
     }
     for name in PACKAGES:

@@ -1,4 +1,4 @@
-"""Stereo pairs with geometry and pictures for displaced eyes, from case files and built-in scenes."""
+"""Stereo pairs with their viewing geometry, read from case files or drawn from built-in scenes."""
 
 from __future__ import annotations
 
@@ -25,33 +25,33 @@ if TYPE_CHECKING:
 
 Metres = Annotated[float, Field(strict=True, ge=-EYE_MOST_M, le=EYE_MOST_M)]
 Place = tuple[Metres, Metres, Metres]  # frame `stack`
-OFF_MM = (2, 4, 6)
-FOV_DEG = 40.0
+OFF_MM = (2, 4, 6)  # displacements of the eyes for which targets are drawn
+FOV_DEG = 40.0  # horizontal field of view of the drawn pictures
 
 
 @dataclass(frozen=True, slots=True)
 class OffView:
-    """Target for an eye that is displaced from its nominal position."""
+    """Target picture for an eye that is displaced from its nominal position."""
 
-    mm: float
-    eye_m: F64  # (3,) frame `stack`
+    mm: float  # displacement
+    eye_m: F64  # (3,) displaced position, frame `stack`
     image: U8  # (h, w, 3)
 
 
 @dataclass(frozen=True, slots=True)
 class StillPair:
-    """Pair of pictures, the eye positions that they fit, and the panels."""
+    """Target pictures for two eyes, the positions of the eyes, and the panels to show the pictures on."""
 
     name: str
     stack: PanelStack
-    eyes_m: F64  # (2, 3) left, right; frame `stack`
-    images: tuple[U8, U8]  # (h, w, 3)
-    fov_deg: float  # horizontal
-    off: tuple[OffView, ...] = ()
+    eyes_m: F64  # (2, 3) left and right eye, frame `stack`
+    images: tuple[U8, U8]  # (h, w, 3) pictures of the left and right eye
+    fov_deg: float  # horizontal field of view
+    off: tuple[OffView, ...] = ()  # further targets, for displaced eyes
 
 
 class OffEntry(BaseModel):
-    """Target for a displaced eye in a case file."""
+    """Entry of a case file that describes the target picture for a displaced eye."""
 
     mm: Annotated[float, Field(strict=True, ge=0, le=1000 * EYE_MOST_M)]
     eye: Place
@@ -59,19 +59,19 @@ class OffEntry(BaseModel):
 
 
 class CaseFile(BaseModel):
-    """Content of a case file (docs/contracts.md)."""
+    """Validated contents of a case file (docs/contracts.md)."""
 
-    panels: dict[str, Any]
-    eyes: tuple[Place, Place]  # left, right
-    images: tuple[str, str]
+    panels: dict[str, Any]  # fields of StackGeometry
+    eyes: tuple[Place, Place]  # left and right eye
+    images: tuple[str, str]  # file names, relative to the case file
     fov: Annotated[float, Field(strict=True, ge=FOV_RANGE_DEG[0], le=FOV_RANGE_DEG[1])]
     off: tuple[OffEntry, ...] = ()
 
 
 def read_pairs(folder: Path) -> list[StillPair]:
-    """Read every case file in a folder, in order of names, and ignore other JSON.
+    """Read all case files of a folder in the order of their names. Other JSON files are ignored.
 
-    Raises InputError, naming file and field, for an invalid case or a folder without cases.
+    Raises InputError if a case file is invalid or the folder contains no case file.
     """
     if not folder.is_dir():
         raise InputError(folder, "", "is not a folder")
@@ -105,7 +105,14 @@ def _case(path: Path, table: dict[str, Any]) -> StillPair:
 
 
 def eyes_at(*, distance_m: float, angle_deg: float = 0.0, height_m: float = 0.0, ipd_m: float = 0.063) -> F64:
-    """Return eyes (2, 3) that face the origin, at a distance and at an angle from +x towards +y."""
+    """Return the left and right eye of a viewer who faces the origin, shape (2, 3), frame `stack`.
+
+    Args:
+        distance_m: Distance of the midpoint between the eyes from the origin.
+        angle_deg: Angle of the midpoint from the x axis towards +y.
+        height_m: Height of the midpoint above the origin.
+        ipd_m: Distance between the eyes.
+    """
     angle = math.radians(angle_deg)
     level = math.sqrt(max(distance_m**2 - height_m**2, 0.0))
     middle = np.array([level * math.cos(angle), level * math.sin(angle), height_m])
@@ -114,17 +121,28 @@ def eyes_at(*, distance_m: float, angle_deg: float = 0.0, height_m: float = 0.0,
 
 
 def beside(eye_m: ArrayLike, mm: float) -> list[F64]:
-    """Return positions (3,) `mm` away from an eye: right, up, left and down in its frame."""
+    """Return four positions to the right of an eye, above, to the left and below, in frame `stack`.
+
+    Args:
+        eye_m: Position of the eye, shape (3,), frame `stack`. The directions are the axes of the eye's pose.
+        mm: Distance of each returned position from the eye.
+    """
     pose = stack_from_eye(eye_m)
     directions = ((1, 0), (0, 1), (-1, 0), (0, -1))
     return [pose[:3, 3] + mm / 1000 * (right * pose[:3, 0] + up * pose[:3, 1]) for right, up in directions]
 
 
 class PairPainter:
-    """Painter of a built-in scene, from anywhere. Owns a GL context: use it on one thread and close it."""
+    """Painter that draws a scene from any position.
+
+    The painter owns an OpenGL context. Use it as a context manager and on one thread only.
+    """
 
     def __init__(self, scene: str | Scene, stack: PanelStack) -> None:
-        """Open a scene. Raises InputError for an unknown one, MissingPart without OpenGL."""
+        """Open a scene, given by an object or the name of a built-in scene.
+
+        Raises MissingPart if OpenGL or its Python package is not installed.
+        """
         from runtime.content.procedural import ProceduralSource
         from runtime.support.gl import offscreen_context
 
@@ -139,21 +157,36 @@ class PairPainter:
         self.context.release()
 
     def draw(self, eye_m: ArrayLike, pixels_from_stack: F64, *, width_px: int, height_px: int) -> U8:
-        """Draw a picture (h, w, 4) of the scene through any projection."""
+        """Draw the scene through any projection, and return the picture, shape (h, w, 4).
+
+        Args:
+            eye_m: Position of the eye, shape (3,), frame `stack`.
+            pixels_from_stack: 3x4 projection of points in frame `stack` to the picture's pixels.
+            width_px: Width of the picture.
+            height_px: Height of the picture.
+        """
         from runtime.content.base import View
 
         eye = np.asarray(eye_m, dtype=np.float64)
         return self.content.render(View(eye, 0, pixels_from_stack, width_px, height_px), time_ns=0).copy()
 
     def image(self, eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg: float = FOV_DEG) -> U8:
-        """Draw the retina picture (h, w, 3) of an eye that looks at the stack's origin."""
+        """Draw the picture, shape (h, w, 3), that an eye sees when it looks at the stack's origin."""
         projection = image_from_stack(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
         return np.ascontiguousarray(self.draw(eye_m, projection, width_px=width_px, height_px=height_px)[..., :3])
 
     def pair(
         self, name: str, eyes_m: F64, stack: PanelStack, *, fov_deg: float = FOV_DEG, off_mm: Sequence[float] = OFF_MM
     ) -> StillPair:
-        """Draw a pair at the resolution of the stack, with pictures for positions around both eyes."""
+        """Draw a pair at the resolution of a stack, with targets for displaced eyes.
+
+        Args:
+            name: Name of the pair.
+            eyes_m: Left and right eye, shape (2, 3), frame `stack`.
+            stack: Geometry and resolution of the panels.
+            fov_deg: Horizontal field of view of the pictures.
+            off_mm: Displacements. For each displacement, both eyes are moved right, up, left and down.
+        """
         size = {"width_px": stack.width_px, "height_px": stack.height_px}
         left, right = (self.image(eye, **size, fov_deg=fov_deg) for eye in eyes_m)
         off = tuple(
@@ -173,7 +206,7 @@ PROCEDURAL = (
 
 
 def procedural_pairs(stack: PanelStack) -> Iterator[StillPair]:
-    """Draw the report's pairs: built-in scenes from three positions, with pictures for displaced eyes."""
+    """Draw the built-in pairs of the report, which show two scenes from three positions in total."""
     for scene, name, place in PROCEDURAL:
         with PairPainter(scene, stack) as painter:
             pair = painter.pair(name, eyes_at(**place), stack)

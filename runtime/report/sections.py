@@ -1,4 +1,4 @@
-"""Sections of the report: light against run time, live quality in motion, and focal parallax."""
+"""Sections of the report page: light against run time, live quality in motion, and focal parallax."""
 
 from __future__ import annotations
 
@@ -17,7 +17,13 @@ NAMES = ("behind the panels", "in the middle panel", "in front of the panels")
 
 
 def frontier_section(results: Sequence[MethodResult], *, title: str, name: str) -> PageSection:
-    """Return plot and table of the methods measured so far at one resolution."""
+    """Return a section with a plot and a table of the methods measured so far at one resolution.
+
+    Args:
+        results: Result of each method.
+        title: Heading of the section.
+        name: Suffix of the plot's file name.
+    """
     pairs = "; ".join(pair.pair for pair in results[0].pairs)
     text = [
         f"Every method on {pairs}, in one run. Light is the figure to quote: panel pixels are squares, pupils 4 mm "
@@ -30,10 +36,11 @@ def frontier_section(results: Sequence[MethodResult], *, title: str, name: str) 
 
 
 def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
-    """Plot one curve for the shipped models, one for the reference, and added models as single points.
+    """Plot light against median run time, as a file `name`.png.
 
-    More steps are to the right. A curve omits slower points that are no better. Bars: eight runs in ten; small dots:
-    single pairs.
+    Shipped models form one curve and the iterative references another. Added models are single points. A curve skips
+    methods that are slower than another method of the curve without being better. Bars span the 10th to 90th
+    percentiles of the run times, and small dots are single pairs.
     """
     beside: Any = {"textcoords": "offset points", "fontsize": 8.5}
     with drawing(9.6, 5.0) as figure:
@@ -52,10 +59,10 @@ def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
             if len(of_pairs) > len(dots):
                 seen = [(ms, light_db.get(QUOTED, np.nan)) for ms, light_db in of_pairs]
                 axes.scatter(*zip(*seen, strict=True), s=9, color=colour, alpha=0.5, linewidths=0)
-            for result in dots:  # the region above and to the left of a rising curve
+            for result in dots:  # names are above and to the left of the points, a region that a rising curve avoids
                 axes.annotate(result.name, (result.ms_p50, result.quoted_db), xytext=(-5, 6), ha="right", **beside)
         axes.set(xscale="log", xlabel="median time of a whole solution, ms", ylabel="light, dB (tracking error 1 mm)")
-        axes.use_sticky_edges = False  # which bars have
+        axes.use_sticky_edges = False  # bars have sticky edges, which would suppress the margins
         axes.margins(x=0.1, y=0.15)
         axes.set_title("Light against run time: up and to the left is better")
         axes.xaxis.get_major_locator().set_params(subs=(1.0, 2.0, 5.0))
@@ -67,7 +74,7 @@ def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
 
 
 def rising(places: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Return the (time, dB) points that are better than all faster ones."""
+    """Return the points (time, dB) with a higher quality than all faster points, fastest first."""
     found: list[tuple[float, float]] = []
     for place in sorted(places):
         if not found or place[1] > found[-1][1]:
@@ -76,12 +83,12 @@ def rising(places: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
 
 
 def kind_of(result: MethodResult) -> str:
-    """Return the curve that a result belongs to; an added model belongs to none."""
+    """Return the key in KINDS that determines the curve and style of a result."""
     return "shipped" if result.name in SHIPPED else "added" if result.kind == "network" else result.kind
 
 
 def method_table(results: Sequence[MethodResult]) -> Table:
-    """Return a table of all figures, fastest first, with times also as multiples of the fastest."""
+    """Return a table of all results, fastest method first. Times are also given as multiples of the fastest."""
     ordered = sorted(results, key=lambda r: r.ms_p50)
     beside = list(dict.fromkeys(key for result in results for key in result.psnr_db_off_eye))
     headings = ["method", "× fastest", "p50 ms", "p99 ms", "MiB", "parameters", "light 1 mm dB", "0 mm", "2 mm"]
@@ -100,7 +107,7 @@ def method_table(results: Sequence[MethodResult]) -> Table:
 
 
 def moving_section(found: Sequence[Moving]) -> PageSection:
-    """Return live quality and view error for every motion and effort measured so far."""
+    """Return a section with live quality and view error for each motion and effort measured so far."""
     costs = ", ".join(f"{stage} {ms}" for stage, ms in COSTS_MS.items())
     text = [
         "A solution takes longer than a refresh, and the head keeps moving. At every refresh the outer panels are "
@@ -122,14 +129,14 @@ def moving_section(found: Sequence[Moving]) -> PageSection:
 
 
 def most_used(one: Moving) -> str:
-    """List the efforts shown for at least a tenth of the time, longest first."""
+    """Return the efforts shown for at least a tenth of the time with their percentages, longest first."""
     seconds = sorted(one.efforts.items(), key=lambda item: -item[1])
     total_s = sum(one.efforts.values())
     return ", ".join(f"{name} {100 * s / total_s:.0f}%" for name, s in seconds if s >= total_s / 10)
 
 
 def moving_plot(found: Sequence[Moving]) -> Figure:
-    """Plot live quality and view error for every motion: lines for the fixed efforts, stars for `auto`."""
+    """Plot live quality and view error of each motion, with lines for fixed efforts and stars for `auto`."""
     motions = list(dict.fromkeys(one.motion for one in found))
     efforts = [*(effort.name for effort in FIXED), "auto"]
     with drawing(9.6, 6.4) as figure:
@@ -140,7 +147,7 @@ def moving_plot(found: Sequence[Moving]) -> Figure:
                 if fixed := [(x, own[name]) for x, name in enumerate(efforts) if name in own and name != "auto"]:
                     axes.plot(*zip(*fixed, strict=True), "o-", color=f"C{number}", markersize=5, label=motion)
                 if "auto" in own:
-                    label = None if fixed else motion  # the page grows: no fixed effort may be measured yet
+                    label = None if fixed else motion  # while the page grows, fixed efforts may not be measured yet
                     axes.plot(len(FIXED), own["auto"], "*", color=f"C{number}", markersize=13, label=label)
                     axes.axhline(own["auto"], color=f"C{number}", linewidth=0.8, linestyle=":")
         above.set(ylabel="live quality, dB")
@@ -157,7 +164,7 @@ def moving_plot(found: Sequence[Moving]) -> Figure:
 
 
 def focal_section(stack: FocalStack) -> PageSection:
-    """Return the table of distances and the focal slices."""
+    """Return a section with a table of convergence and focal distances, and pictures at three focal distances."""
     headings = ["card", "lines of sight meet at, mm", "sharpest through the layers, mm", "sharpest in truth, mm"]
     rows = []
     for name, card in zip(NAMES, stack.cards, strict=True):
@@ -175,7 +182,7 @@ def focal_section(stack: FocalStack) -> PageSection:
 
 
 def slice_picture(stack: FocalStack) -> Figure:
-    """Draw the pictures through the layers above the true ones, focused on each card."""
+    """Draw pictures focused on each card: views through the layers in the upper row, true views below."""
     chosen = [min(stack.slices, key=lambda s: abs(s.plane_m - x)) for x in CARDS_M]
     with drawing(9.6, 3.1) as figure:
         axes = figure.subplots(2, 3)
