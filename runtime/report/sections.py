@@ -36,7 +36,7 @@ def frontier_section(results: Sequence[MethodResult], *, title: str, name: str) 
 
 
 def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
-    """Plot light against median run time, as a file `name`.png.
+    """Plot light against median run time for all methods, in a figure called `name`.
 
     Shipped models form one curve and the iterative references another. Added models are single points. A curve skips
     methods that are slower than another method of the curve without being better. Bars span the 10th to 90th
@@ -88,7 +88,7 @@ def kind_of(result: MethodResult) -> str:
 
 
 def method_table(results: Sequence[MethodResult]) -> Table:
-    """Return a table of all results, fastest method first. Times are also given as multiples of the fastest."""
+    """Return a table of all results, fastest first. It also lists times as multiples of the fastest."""
     ordered = sorted(results, key=lambda r: r.ms_p50)
     beside = list(dict.fromkeys(key for result in results for key in result.psnr_db_off_eye))
     headings = ["method", "× fastest", "p50 ms", "p99 ms", "MiB", "parameters", "light 1 mm dB", "0 mm", "2 mm"]
@@ -164,7 +164,7 @@ def moving_plot(found: Sequence[Moving]) -> Figure:
 
 
 def focal_section(stack: FocalStack) -> PageSection:
-    """Return a section with a table of convergence and focal distances, and pictures at three focal distances."""
+    """Return a section with a table of distances of convergence and focus, and with focused pictures."""
     headings = ["card", "lines of sight meet at, mm", "sharpest through the layers, mm", "sharpest in truth, mm"]
     rows = []
     for name, card in zip(NAMES, stack.cards, strict=True):

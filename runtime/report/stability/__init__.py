@@ -1,1 +1,1 @@
-"""Stiff and extreme cases of all numerical methods, checked to 50 digits or against a closed form."""
+"""Stiff and extreme cases of all numerical methods, compared with independent references."""

@@ -1,7 +1,7 @@
-"""Cases of poses, projections and Malus' law at singularities (supplement, (1)-(14), (40)-(47)).
+"""Cases for poses, projections and Malus' law at singularities (supplement, (1)-(14), (40)-(47)).
 
-References are other formulas in extended precision: `np.longdouble` has 64 bits or more here, where the tolerances
-are multiples of a double's rounding.
+The references are different formulas, evaluated in extended precision (`np.longdouble`, whose significand has 64 bits
+or more on the supported machines). The tolerances are multiples of the rounding error of a double.
 """
 
 from __future__ import annotations
@@ -40,12 +40,15 @@ PI = 4 * np.arctan(extended(1))
 
 
 def farthest(values: Any, reference: Any) -> float:
-    """Return the largest absolute difference from a reference."""
+    """Return the largest absolute difference between values and a reference, in extended precision."""
     return float(np.abs(extended(values) - reference).max())
 
 
 def axes(eye: Any) -> Any:
-    """Return right, up and back of an eye as rows ((10)-(13)); on the vertical axis the limit from +x."""
+    """Return the right, up and back axes of an eye's pose as rows, in extended precision ((10)-(13)).
+
+    For an eye on the vertical axis, the result is the limit from +x.
+    """
     back = eye / np.abs(eye).max()
     back = back / np.sqrt(back @ back)
     ground = extended([-eye[1], eye[0], 0]) / max(abs(eye[0]), abs(eye[1]), np.finfo(np.longdouble).tiny)
@@ -54,18 +57,18 @@ def axes(eye: Any) -> Any:
 
 
 def focal_px(width_px: int) -> Any:
-    """Return the focal length of an eye's image."""
+    """Return the focal length of an eye's image in pixels, in extended precision."""
     return width_px / 2 / np.tan(PI * FOV_DEG / 360)
 
 
 def image_position(eye: Any, point: Any, stack: PanelStack) -> Any:
-    """Return the position of a point in the eye's image, pixels (u, v)."""
+    """Return the pixel position (u, v) of a point in an eye's image. Eye and point are in frame `stack`."""
     right, up, back = axes(eye) @ (point - eye)
     return focal_px(stack.width_px) / -back * extended([right, -up]) + extended([stack.width_px, stack.height_px]) / 2
 
 
 def panel_position(eye: Any, image: Any, stack: PanelStack, index: int) -> Any:
-    """Trace the ray through an image position; return where it crosses a panel, pixels (u, v)."""
+    """Trace the ray through a pixel position of an eye's image to its pixel position (u, v) on a panel."""
     u, v = (image - extended([stack.width_px, stack.height_px]) / 2) / focal_px(stack.width_px)
     direction = extended([u, -v, -1]) @ axes(eye)
     _, right, up = eye + (stack.x_m[index] - eye[0]) / direction[0] * direction
@@ -73,7 +76,10 @@ def panel_position(eye: Any, image: Any, stack: PanelStack, index: int) -> Any:
 
 
 def pose(eye: Sequence[float]) -> Answer:
-    """Compare an eye's rotation; its condition grows as the eye approaches the vertical axis."""
+    """Compare the rotation of an eye's pose with the reference.
+
+    The condition number grows as the eye approaches the vertical axis.
+    """
     error = farthest(stack_from_eye(eye)[:3, :3].T, axes(extended(eye)))
     scale = max(map(abs, eye))
     ground = math.hypot(eye[0] / scale, eye[1] / scale)
@@ -82,7 +88,7 @@ def pose(eye: Sequence[float]) -> Answer:
 
 
 def gaze(eye: Sequence[float]) -> Answer:
-    """Compare where the stack's origin and a nearby point appear in the picture."""
+    """Compare the image positions of the stack's origin and of a nearby point with the reference."""
     projection = image_from_stack(eye, width_px=STACK.width_px, height_px=STACK.height_px, fov_deg=FOV_DEG)
     size, error = max(map(abs, eye)), 0.0
     for point in ((0.0, 0.0, 0.0), (0.125 * size, -0.25 * size, 0.0625 * size)):
@@ -92,7 +98,7 @@ def gaze(eye: Sequence[float]) -> Answer:
 
 
 def scale_shift(eye: Sequence[float], to_x_m: float) -> Answer:
-    """Compare the mapping from the centre panel to another one along an eye's ray."""
+    """Compare the mapping along rays from the centre panel to a parallel plane with the reference."""
     scale, shift = relative_scale_shift(eye, from_x_m=0.0, to_x_m=to_x_m)
     e, point = extended(eye), extended([0, 0.125, -0.0625])
     truth = (point + to_x_m / e[0] * (e - point))[1:]
@@ -103,10 +109,10 @@ def scale_shift(eye: Sequence[float], to_x_m: float) -> Answer:
 
 
 def followed(eye: Sequence[float], *, index: int = 2, stack: PanelStack = STACK) -> Answer:
-    """Compare M_RPU with ray tracing, at image positions whose rays meet the panel.
+    """Compare M_RPU with ray tracing, at image positions whose rays cross the panel.
 
-    The condition is that of the mapping: how far a relative change of 1 of an image position, or of the eye's own,
-    moves the position on the panel, in panel widths.
+    The condition number is the rate, in panel widths, at which the position on the panel changes with relative changes
+    of the image position or of the eye's position.
     """
     view: Any = {"width_px": stack.width_px, "height_px": stack.height_px, "fov_deg": FOV_DEG}
     m = panel_from_image(image_from_stack(eye, **view), stack.panel(index))
@@ -125,11 +131,14 @@ def followed(eye: Sequence[float], *, index: int = 2, stack: PanelStack = STACK)
 
 
 def of_intensity(intensity: float, branch: Literal[1, 2]) -> Answer:
-    """Compare the phase of an intensity; the condition goes to infinity as the intensity approaches 1."""
+    """Compare the phase computed from an intensity with the reference.
+
+    The condition number goes to infinity as the intensity approaches 1.
+    """
     root = np.arcsin(np.sqrt(extended(intensity))) * 2 / PI
     truth = root if branch == 1 else 2 - root
     phase = phase_from_intensity(np.array(intensity), branch)
-    # Relative condition of asin(sqrt(I)), bounded at 1 by the spacing of doubles.
+    # Relative condition number of asin(sqrt(I)). Near an intensity of 1, the spacing of doubles bounds the number.
     away = max(1 - intensity, EPS64)
     condition = max(1.0, math.sqrt(intensity / away) / math.pi / max(float(truth), 1e-30))
     back = abs(float(intensity_from_phase(phase)) - intensity)
@@ -137,7 +146,7 @@ def of_intensity(intensity: float, branch: Literal[1, 2]) -> Answer:
 
 
 def jones_intensity(angles_rad: Sequence[float]) -> float:
-    """Return the intensity through rotators between crossed polarizers, by Jones matrices ((5), (7))."""
+    """Return the intensity behind rotators between crossed polarizers, from Jones matrices ((5), (7))."""
     field = np.array([1.0, 0.0])
     for angle_rad in angles_rad:
         c, s = math.cos(angle_rad), math.sin(angle_rad)
@@ -146,7 +155,11 @@ def jones_intensity(angles_rad: Sequence[float]) -> float:
 
 
 def product(values: Sequence[float]) -> Answer:
-    """Compare sin² of the summed phase with the product of the panels' Jones matrices."""
+    """Compare two formulas for the intensity with the reference: sin² of the phase, and Jones matrices.
+
+    Args:
+        values: Panel values along a ray, in [0, 1].
+    """
     truth = np.sin(PI / 2 * extended(values).sum()) ** 2
     by_sum = float(intensity_from_phase(np.array(math.fsum(values))))
     by_product = jones_intensity([value * math.pi / 2 for value in values])
@@ -154,7 +167,7 @@ def product(values: Sequence[float]) -> Answer:
 
 
 def trials() -> Iterator[Trial]:
-    """Yield every case of the optics."""
+    """Yield all trials of the optics."""
     for power in [*range(1, 13), 100, 300]:
         angle = 10.0**-power
         eye = [0.6 * math.sin(angle) * math.cos(0.7), 0.6 * math.sin(angle) * math.sin(0.7), 0.6 * math.cos(angle)]
@@ -170,7 +183,7 @@ def trials() -> Iterator[Trial]:
             yield Trial(POSE, f"panel to panel from {distance_m:g} m", partial(scale_shift, eye, -0.06))
     yield Trial(POSE, "panel to panel, 1e-9 m before it", partial(scale_shift, [0.06 + 1e-9, 0.2, 0.1], 0.06))
 
-    # At 1 km the eye is still in front of the front panel; the panel's near edge may be behind the image plane.
+    # At 1 km, the eye is still in front of the front panel. The panel's near edge may be behind the image plane.
     eyes: dict[str, list[float]] = {
         f"{degrees:g} degrees off axis" + " at 1 km" * (distance_m > 1):
             [distance_m * math.cos(math.radians(degrees)), distance_m * math.sin(math.radians(degrees)), 0.0]

@@ -1,8 +1,8 @@
-"""The complete suite: all trials of all stages.
+"""Complete suite of the trials of all stages.
 
-Cases of the models and the tracker without a closed form are compared with the errors recorded in `limits.json`. After
-a change to either, record them again with `phasestack stability --full --record FILE`, and explain in the commit what
-became worse.
+The models and the tracker have cases without a closed form, whose errors are compared with the errors recorded in
+`limits.json`. After a change of the models or the tracker, record the errors again with
+`phasestack stability --full --record FILE`, and explain in the commit what became worse.
 """
 
 from __future__ import annotations
@@ -17,11 +17,16 @@ from runtime.report.stability.calibration import Fit
 from runtime.report.stability.trial import Case, Trial, settle
 from runtime.support.artifacts import write_text
 
-LIMITS = Path(__file__).with_name("limits.json")  # forward errors by `stage: case`
+LIMITS = Path(__file__).with_name("limits.json")  # recorded forward errors by `Trial.key`
 
 
 def every_trial(fits: Mapping[str, Fit], *, full: bool) -> Iterator[Trial]:
-    """Yield all trials. fits: the calibration's solvers by method name."""
+    """Yield the trials of all stages.
+
+    Args:
+        fits: Solvers of the calibration by method name.
+        full: Include the trials that take long.
+    """
     yield from optics.trials()
     yield from models.trials(full=full)
     yield from tracking.trials(full=full)
@@ -31,7 +36,13 @@ def every_trial(fits: Mapping[str, Fit], *, full: bool) -> Iterator[Trial]:
 def run(
     trials: list[Trial], *, record: Path | None = None, progress: Callable[[int, int], None] = lambda done, of: None
 ) -> list[Case]:
-    """Run every trial. record: overwrite the limits file with the errors measured."""
+    """Run all trials and return their cases.
+
+    Args:
+        trials: Trials to run.
+        record: File to which the recorded errors are written, updated by the measured errors. None: write no file.
+        progress: Function that is called after each trial with the number of finished trials and of all trials.
+    """
     limits: dict[str, float] = json.loads(LIMITS.read_text(encoding="utf-8"))
     cases = []
     for number, trial in enumerate(trials, 1):

@@ -1,4 +1,4 @@
-"""Cases of the tracker at extreme time steps, for a head whose positions are known exactly."""
+"""Cases that test the tracker at extreme time steps, with a head whose positions are known exactly."""
 
 from __future__ import annotations
 
@@ -16,19 +16,24 @@ from runtime.report.stability.trial import Answer, Trial
 STAGE = "tracker"
 EYES_M = np.array([[0.6, -0.031, 0.05], [0.6, 0.032, 0.05]])
 FRAME_NS = NS_PER_S // 30
-TRAVEL_M = np.array([0.02, 0.09, -0.04])  # movement of the head during a case, at no more than FASTEST
-FASTEST = 0.3  # m/s
-FLOOR_M = 1e-6
+TRAVEL_M = np.array([0.02, 0.09, -0.04])  # movement of the head during a case, reduced to keep below FASTEST
+FASTEST = 0.3  # maximum speed of the head, m/s
+FLOOR_M = 1e-6  # difference that another machine's rounding may cause
 
 
 def head_m(time_ns: int, *, span_ns: int) -> F64:
-    """Return left and right eye (2, 3), frame `stack`, of a head that moves TRAVEL_M in a span."""
+    """Return the left and right eye, shape (2, 3), frame `stack`, of a head in uniform motion.
+
+    Args:
+        time_ns: Time since the start of the motion.
+        span_ns: Time in which the head moves by TRAVEL_M, or by less if it would be faster than FASTEST.
+    """
     share = min(1.0, FASTEST * span_ns / NS_PER_S / float(np.linalg.norm(TRAVEL_M)))
     return EYES_M + TRAVEL_M * share * (time_ns / max(span_ns, 1))
 
 
 def still(updates: int) -> Answer:
-    """Measure the drift of a head that has come to rest."""
+    """Measure the error of the tracked eyes after a number of updates, most of them from a head at rest."""
     tracker, span_ns = Tracker(), 30 * FRAME_NS
     for index in range(updates):
         eyes = head_m(min(index * FRAME_NS, span_ns), span_ns=span_ns)
@@ -39,9 +44,12 @@ def still(updates: int) -> Answer:
 
 
 def after(steps_ns: list[int], ahead_ns: int, *, lost: bool = False) -> Answer:
-    """Measure the predicted position of a head that was sampled at odd intervals.
+    """Measure the error of the predicted eyes of a head that was sampled at irregular intervals.
 
-    lost: the last sample is too old for a prediction, and an answer would be the error.
+    Args:
+        steps_ns: Intervals between the samples.
+        ahead_ns: Time from the last sample to the predicted instant.
+        lost: The last sample is too old for a prediction. The tracker must give no position.
     """
     tracker, now_ns, span_ns = Tracker(), 0, sum(map(abs, steps_ns)) + ahead_ns
     for step_ns in (0, *steps_ns):
@@ -56,7 +64,11 @@ def after(steps_ns: list[int], ahead_ns: int, *, lost: bool = False) -> Answer:
 
 
 def trials(*, full: bool = False) -> Iterator[Trial]:
-    """Yield every case of the tracker; `full` adds the long one."""
+    """Yield all trials of the tracker.
+
+    Args:
+        full: Include a trial with a million updates.
+    """
     for updates in (10_000, *((1_000_000,) if full else ())):
         yield Trial(STAGE, f"{updates} updates of a still head", partial(still, updates), measure="m")
     hour, usual = 3600 * NS_PER_S, [FRAME_NS] * 30

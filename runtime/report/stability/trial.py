@@ -1,4 +1,7 @@
-"""Trials, extreme cases that have not been run yet. Running one gives a Case even if the code raises."""
+"""Trials, which are extreme cases to be run, and their outcomes.
+
+Running a trial gives an outcome (`Case`) even if the tested code raises an exception.
+"""
 
 from __future__ import annotations
 
@@ -12,41 +15,42 @@ from runtime.errors import PhasestackError
 
 Behaviour = Literal["answers", "refuses"]
 EPS64 = 2.0**-52
-WORSE = 1.05  # maximum accepted ratio of an error to the recorded one
+WORSE = 1.05  # maximum accepted ratio of an error to the recorded error
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """Result compared with the reference."""
+    """Error of a computed result compared with the reference, and the error that is acceptable."""
 
     forward_error: float  # error of the result, in the trial's measure
     tolerance: float  # maximum forward error that passes, fixed before the trial is run
     condition: float = 1.0  # factor by which the problem itself amplifies a relative error of its input
-    backward_error: float | None = None  # change of the input that explains the result; None: as the forward error
+    backward_error: float | None = None  # change of the input that explains the result; None: equal to forward_error
     note: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """Extreme case that has not been run yet."""
+    """Extreme case that has not been run yet, with the criterion for passing."""
 
     stage: str
     name: str
     run: Callable[[], Answer]
     expected: Behaviour = "answers"
     measure: str = "relative"  # unit of the forward error
-    # Set: the recorded error limits the forward error, too. What another machine's rounding may add, in the measure.
+    # If set, the recorded error also limits the forward error. The value is the part of the forward error, in the
+    # trial's measure, that may come from another machine's rounding.
     floor: float | None = None
 
     @property
     def key(self) -> str:
-        """Key of the case in the file of recorded errors."""
+        """Key of the trial in the file of recorded errors."""
         return f"{self.stage}: {self.name}"
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """Extreme case with its outcome, an entry of `stability.json`."""
+    """Outcome of a trial, an entry of `stability.json`."""
 
     name: str
     stage: str
@@ -61,13 +65,18 @@ class Case:
 
 
 def settle(trial: Trial, *, limit: float | None = None) -> Case:
-    """Run a trial. No exception escapes, and only the project's own errors count as a refusal.
+    """Run a trial and return the outcome. An exception of the tested code is part of the outcome.
 
-    limit: the recorded forward error; a trial with a floor fails without it.
+    A trial that expects a refusal passes if the code raises an error of the project or a ValueError. Every other
+    exception fails the trial.
+
+    Args:
+        trial: Trial to run.
+        limit: Recorded forward error. A trial with a floor fails if no error is recorded.
     """
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # about inf and NaN, because the result is checked anyway
+            warnings.simplefilter("ignore", RuntimeWarning)  # about inf and NaN; the result is checked below
             answer = trial.run()
     except Exception as error:
         is_refusal = isinstance(error, PhasestackError | ValueError)
