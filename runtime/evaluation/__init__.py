@@ -1,1 +1,1 @@
-"""Results of a run or a solution: displayed quality, files and the contact sheet."""
+"""Evaluation of runs and solutions: displayed quality, output files and the contact sheet."""

@@ -1,4 +1,4 @@
-"""Draw the contact sheet of a run: the layers and, for each eye, target, retina image and error."""
+"""Draw contact sheets, which show the layers and each eye's target, retina image and error."""
 
 from __future__ import annotations
 
@@ -18,31 +18,40 @@ from runtime.records import F32, F64, U8
 
 TILE_WIDTH = 640  # pixels
 MARGIN = 12  # pixels
-LINE_LETTERS = 58  # letters that fit below one tile in a line under the headline
-HEADLINE, TITLE = 52, 34
-ERROR_GAIN = 8  # amplification of the difference
-INK = (40, 40, 40)
-PAPER = 246
+LINE_LETTERS = 58  # number of letters in a line under the headline, per tile of the sheet's width
+HEADLINE, TITLE = 52, 34  # heights in pixels
+ERROR_GAIN = 8  # amplification of the error pictures
+INK = (40, 40, 40)  # colour of text
+PAPER = 246  # grey level of the background
 
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """A refresh of a run for the contact sheet, and its solution before alignment for the viewer page."""
+    """Measured refresh of a run, with the pictures for the contact sheet and the viewer page.
 
-    layers: U8  # (N, h, w, 3 or 4), aligned as the panels showed them
+    The contact sheet shows the layers after alignment, and the viewer page shows the solution before alignment.
+    """
+
+    layers: U8  # (N, h, w, 3 or 4) layers as the panels showed them, after alignment
     eye_views: EyeViews
     light_db: float  # light PSNR for a tracking error of 1 mm
-    lines: tuple[str, ...]  # lines that state the refresh and how far the eyes had moved
-    solution: U8  # (N, h, w, 3 or 4), before alignment
-    solved_for_m: F64  # (2, 3) eyes, frame `stack`
+    lines: tuple[str, ...]  # text that states the number of the refresh and how far the eyes had moved
+    solution: U8  # (N, h, w, 3 or 4) layers before alignment
+    solved_for_m: F64  # (2, 3) eyes that the solution was computed for, frame `stack`
     asked_for: tuple[U8, ...]  # (h, w, 3) targets of the solution
-    relief: F32 | None = None  # (h, w) of the solution's content (`optics.relief`)
+    relief: F32 | None = None  # (h, w) relief of the solution's content (`optics.relief`)
 
 
 def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, lines: Sequence[str] = ()) -> U8:
-    """Draw an (h, w, 3) RGB sheet: a row of layers, then a row per eye: target, retina image and error.
+    """Draw a contact sheet, and return the RGB picture, shape (h, w, 3).
 
-    headline: sentence with the figure to quote; lines: text below it.
+    The first row shows the layers. Then follows a row for each eye with the target, the retina image and the error.
+
+    Args:
+        layers: Layers from rear to front, shape (N, H, W, 3 or 4).
+        eye_views: Retina images and targets, or None for a sheet without rows for the eyes.
+        headline: Sentence at the top, which states the figure to quote.
+        lines: Lines of text below the headline. Long lines are wrapped.
     """
     height, width = layers.shape[1:3]
     tile = (TILE_WIDTH, round(TILE_WIDTH * height / width))
@@ -79,7 +88,11 @@ def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, line
 
 
 def headline(light_db: float | None) -> str:
-    """Return a sentence that states the figure to quote, `light_db`."""
+    """Return the headline of a contact sheet, which states the light PSNR and its conditions.
+
+    Args:
+        light_db: Light PSNR for a tracking error of 1 mm, or None or NaN if it was not measured.
+    """
     if light_db is None or math.isnan(light_db):
         return "light PSNR at these eyes was not measured"
     conditions = f"pixels as squares, pupil {PUPIL_MM:g} mm, tracking error {TRACKING_SIGMA_MM:g} mm"

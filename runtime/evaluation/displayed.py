@@ -1,4 +1,4 @@
-"""Measure the displayed quality of layers against target pictures (docs/contracts.md)."""
+"""Measure the displayed quality of layers against target pictures (docs/contracts.md, Error)."""
 
 from __future__ import annotations
 
@@ -21,28 +21,34 @@ from runtime.records import F32, F64, U8
 from runtime.support.artifacts import write_png
 from runtime.support.threads import parallel_map
 
-Picture = U8 | F32  # (h, w, 3): code values, or intensities in [0, 1]
-SIGMAS_MM = (0.0, 1.0, 2.0)  # standard deviations: none, a good tracker's, twice that
+Picture = U8 | F32  # (h, w, 3), code values or intensities in [0, 1]
+SIGMAS_MM = (0.0, 1.0, 2.0)  # tracking errors: none, that of a good tracker, and twice that of a good tracker
 
 
 @dataclass(frozen=True, slots=True)
 class EyeViews:
-    """Retina images of both eyes through the layers, and their targets."""
+    """Images that both eyes see through the layers, with the target pictures and the measured quality."""
 
-    seen: tuple[Retina, ...]
-    wanted: tuple[Picture, ...]
+    seen: tuple[Retina, ...]  # images of the left and right eye
+    wanted: tuple[Picture, ...]  # targets of the left and right eye
     quality: Quality  # measured exactly at the eyes that the layers were solved for or aligned to
     stack: PanelStack
-    eyes_m: F64  # (2, 3)
-    fov_deg: float
+    eyes_m: F64  # (2, 3) left and right eye, frame `stack`
+    fov_deg: float  # horizontal field of view of images and targets
 
     def viewer(self, layers: U8, text: Sequence[str], *, relief: F32 | None = None) -> str:
-        """Return an HTML page of the layers seen from these eyes. text: its title, then lines."""
+        """Return a viewer page in HTML for layers that were solved for the eyes `eyes_m`.
+
+        Args:
+            layers: Layers from rear to front, shape (N, h, w, 3 or 4).
+            text: Title of the page, followed by lines of text.
+            relief: Relief of the layers' content, shape (h, w) (`optics.relief`).
+        """
         wanted, eyes_m = [as_codes(intensities(picture)) for picture in self.wanted], np.asarray(self.eyes_m)
         return viewer_html(layers, wanted, self.stack, eyes_m=eyes_m, fov_deg=self.fov_deg, text=text, relief=relief)
 
     def write(self, folder: Path) -> None:
-        """Write seen-*.png and wanted-*.png."""
+        """Write the images and targets as `seen-left.png`, `wanted-left.png` and so on into a folder."""
 
         def write(side: int) -> None:
             eye = ("left", "right")[side]
@@ -55,12 +61,21 @@ class EyeViews:
 def displayed(
     layers: U8, wanted: Sequence[Picture], stack: PanelStack, *, eyes_m: F64, fov_deg: float, similarity: bool = True
 ) -> EyeViews:
-    """Compute the images that eyes (2, 3), frame `stack`, see through layers, and compare with targets.
+    """Compute the images that two eyes see through layers, and compare the images with targets.
 
-    layers: (N, H, W, 3 or 4), rear to front. wanted: one target per eye, `fov_deg` wide. If the targets have the
-    panels' aspect ratio, they are compared at the panels' resolution, otherwise at their own, but with at most as many
-    pixels as a panel. similarity: True to compute SSIM, which is otherwise NaN. Raises ValueError for eyes that are
-    behind a panel or see no part of the panels.
+    Targets with the aspect ratio of the panels are compared at the panels' resolution. Other targets keep their
+    resolution unless they have more pixels than a panel, in which case they are reduced.
+
+    Args:
+        layers: Layers from rear to front, shape (N, H, W, 3 or 4).
+        wanted: Target picture of each eye.
+        stack: Geometry of the panels.
+        eyes_m: Left and right eye, shape (2, 3), frame `stack`.
+        fov_deg: Horizontal field of view of the targets.
+        similarity: Compute SSIM. If False, SSIM is NaN.
+
+    Raises:
+        ValueError: An eye is behind a panel or sees no part of the panels.
     """
     wanted = [on_panels_raster(picture, stack) for picture in wanted]
     seen = tuple(
@@ -73,18 +88,22 @@ def displayed(
 
 
 class Expected(NamedTuple):
-    """Expected PSNR (docs/contracts.md, Error), keyed by the tracking error in mm: "0", "1", "2"."""
+    """Expected PSNR (docs/contracts.md, Error) by tracking error in mm, such as "0", "1" and "2"."""
 
-    db: dict[str, float]  # NaN if this error moves an eye so far that it sees no part of the panels
-    standard_error_db: dict[str, float]  # computed from groups of rows; empty without groups
+    db: dict[str, float]  # NaN if the tracking error moves an eye so far that the eye sees no part of the panels
+    standard_error_db: dict[str, float]  # estimated from groups of rows; empty if the sampling has no groups
 
 
 def expected_quality(
     eye_views: EyeViews, layers: U8, *, sampling: Sampling | None = None, sigmas_mm: Sequence[float] = SIGMAS_MM
 ) -> Expected:
-    """Measure the expected quality for several tracking errors.
+    """Measure the expected quality of layers for several tracking errors.
 
-    sampling: by default that of light, as in `expected_errors`.
+    Args:
+        eye_views: Targets, eyes and geometry.
+        layers: Layers from rear to front, shape (N, H, W, 3 or 4).
+        sampling: Rays to trace. By default, the measured quality is light (`expected_errors`).
+        sigmas_mm: Tracking errors.
     """
     groups = sampling.groups if sampling else 0
     errors = dict.fromkeys(sigmas_mm, np.full(1 + groups, np.nan))
@@ -104,9 +123,10 @@ def expected_quality(
 
 
 def on_panels_raster(picture: Picture, stack: PanelStack) -> Picture:
-    """Resample a picture to the panels' resolution. If its aspect ratio differs, only reduce it.
+    """Resample a picture to the panels' resolution.
 
-    Detail finer than the panels' pixels cannot be shown, and measuring it would take time and memory.
+    A picture with a different aspect ratio keeps its aspect ratio, and is reduced if it has more pixels than a panel.
+    Panels cannot show finer detail, and measuring finer detail would take time and memory.
     """
     height_px, width_px = picture.shape[:2]
     size = (stack.width_px, stack.height_px)

@@ -1,7 +1,7 @@
-"""Write a benchmark motion as a recording with its true eyes, for `phasestack record --motion`.
+"""Write recordings of benchmark motions that include the true eyes, for `phasestack record --motion`.
 
-With the true eyes, the summary of a run can state the quality at the true eyes. The sensor's pose is that of the demo's
-calibration, which is the default.
+The summary of a run that replays such a recording can state the quality at the true eyes. The pose of the simulated
+sensor agrees with the demo calibration, which a run uses by default.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
 
 SECONDS, RATE_HZ, NOISE_MM = 12.0, 30.0, 3.0
-SECONDS_MAX = 3600.0  # longest recording, because it is built in memory
+SECONDS_MAX = 3600.0  # maximum length of a recording, which is built in memory
 
 
 def write_motion(
@@ -32,10 +32,18 @@ def write_motion(
     rate_hz: float = RATE_HZ,
     noise_mm: float = NOISE_MM,
 ) -> dict[str, Any]:
-    """Write a recording of a motion, and return its description.
+    """Write a recording of a motion, and return a description of the recording.
 
-    seed: selects path and noise; 0: those of the benchmark. Raises InputError for an unknown motion, a length out of
-    range, or a file that cannot be written.
+    Args:
+        path: File to write.
+        motion: Name of the motion, a key of `MOTIONS`.
+        seed: Seed of the path and the noise. 0 selects those of the benchmark.
+        seconds: Length of the recording.
+        rate_hz: Number of samples per second.
+        noise_mm: Standard deviation of the noise of the sampled positions.
+
+    Raises:
+        InputError: The motion is unknown, the length is out of range, or the file cannot be written.
     """
     if motion not in MOTIONS:
         raise InputError("record", "--motion", f"unknown motion {motion!r}; choose from {', '.join(MOTIONS)}")

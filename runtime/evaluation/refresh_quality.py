@@ -1,4 +1,4 @@
-"""Measure a sampled refresh at the eyes that it was aligned to and, *live*, at the true eyes."""
+"""Measure the quality of a refresh at the eyes that it was aligned to and, live, at the true eyes."""
 
 from __future__ import annotations
 
@@ -17,42 +17,50 @@ from runtime.records import F64, U8, RefreshAccount
 
 log = logging.getLogger("phasestack.quality")
 
-# Sampling of light. A displaced view has its errors at edges: with a quarter of a small picture's pixels, the figure is
-# off by 0.6 dB.
+# Sampling of light. The errors of a displaced view are at edges. If only a quarter of a small picture's pixels are
+# sampled, the measured live quality is off by 0.6 dB.
 ALIGNED, LIVE = Sampling(step=2), Sampling(rays=4)
 ALIGNED_LARGE, LIVE_LARGE = Sampling(step=4), Sampling(step=2)  # for pictures with more values than `PLENTY`
 FIGURES = ("light_db", "psnr_db", "ssim", "carried_db", "psnr_db_true_eyes", "carried_db_true_eyes")
-Pictures = tuple[U8, U8]  # (h, w, 3) retina pictures of the left and right eye, as large as a panel
+Pictures = tuple[U8, U8]  # (h, w, 3) pictures for the left and right eye, at the resolution of a panel
 
 
 @dataclass(frozen=True, slots=True)
 class RefreshTargets:
-    """Target pictures of a refresh; None if they were not drawn."""
+    """Target pictures against which a refresh is measured. Pictures that were not drawn are None."""
 
-    fov_deg: float  # horizontal field of view of every picture
-    solved: Pictures | None = None  # for the eyes and the instant of the solution
-    used: Pictures | None = None  # for the eyes that the layers were aligned to, at the solution's instant
-    true: Pictures | None = None  # for the true eyes, at the display time
+    fov_deg: float  # horizontal field of view of all pictures
+    solved: Pictures | None = None  # content at the solution's instant, for the eyes that it was solved for
+    used: Pictures | None = None  # content at the solution's instant, for the eyes that the layers were aligned to
+    true: Pictures | None = None  # content at the display time, for the true eyes
 
 
 @dataclass(frozen=True, slots=True)
 class RefreshQuality:
-    """Measurements of one refresh."""
+    """Measurements of one refresh, and the pictures for its contact sheet."""
 
-    figures: dict[str, float] = field(default_factory=dict)  # by name in FIGURES
+    figures: dict[str, float] = field(default_factory=dict)  # measured values by name (FIGURES)
     live_error: float | None = None  # mean squared error of light at the true eyes
-    moment: Moment | None = None  # for stills, contact sheet and viewer page
+    moment: Moment | None = None  # pictures for the contact sheet and the viewer page
 
 
 def view_error_mm(eyes_m: F64, solved_for_m: F64) -> float:
-    """Return the distance in millimetres between the midpoints of two pairs of eyes (2, 3)."""
+    """Return the distance in millimetres between the midpoints of two pairs of eyes, shapes (2, 3)."""
     return 1000 * float(np.linalg.norm((eyes_m - solved_for_m).mean(axis=0)))
 
 
 def live_error(layers: U8, targets: Pictures, stack: PanelStack, *, eyes_m: F64, fov_deg: float) -> float:
-    """Return the mean squared error of light at eyes (2, 3) against target pictures for these eyes.
+    """Return the mean squared error of light at two eyes.
 
-    layers: (N, H, W, 3 or 4), as the panels show them. Raises ValueError if the eyes see no part of the panels.
+    Args:
+        layers: Layers as the panels show them, shape (N, H, W, 3 or 4).
+        targets: Pictures that the eyes should see.
+        stack: Geometry of the panels.
+        eyes_m: Left and right eye, shape (2, 3), frame `stack`.
+        fov_deg: Horizontal field of view of the targets.
+
+    Raises:
+        ValueError: The eyes see no part of the panels.
     """
     pictures = [intensities(picture) for picture in targets]
     sampling = LIVE_LARGE if pictures[0].size > PLENTY else LIVE
@@ -65,11 +73,17 @@ def live_error(layers: U8, targets: Pictures, stack: PanelStack, *, eyes_m: F64,
 def measure_refresh(
     account: RefreshAccount, layers: U8, carried: tuple[U8, U8] | None, targets: RefreshTargets, stack: PanelStack
 ) -> RefreshQuality:
-    """Measure a refresh as far as its targets were drawn. Skip eyes that see no part of the panels.
+    """Measure the quality of a refresh for all targets that were drawn.
 
-    account: includes the true eyes, if known. layers: (N, h, w, 4), as the panels showed them. carried: the layers
-    aligned as if all content were on the middle panel, and the layers before alignment. It is None unless the panels
-    show only a solution.
+    A measurement is omitted if the eyes see no part of the panels.
+
+    Args:
+        account: Record of the refresh. Live quality requires the true eyes in this record.
+        layers: Layers as the panels showed them, shape (N, h, w, 4).
+        carried: The layers aligned as if all content were on the middle panel, and the layers before alignment. None
+            if the panels did not show a solution alone.
+        targets: Target pictures.
+        stack: Geometry of the panels.
     """
     error = None
     if targets.true is not None and account.true_eyes_m is not None:
@@ -124,7 +138,7 @@ def _at_aligned_eyes(
 
 
 def _line(account: RefreshAccount) -> str:
-    """Return the line of the contact sheet that states the refresh and how far the eyes had moved."""
+    """Return the line of the contact sheet that states the number and the view error of the refresh."""
     assert account.eyes_m is not None and account.solved_for_m is not None
     moved_mm = view_error_mm(account.eyes_m, account.solved_for_m)
     return (

@@ -1,4 +1,4 @@
-"""Output files of a run (docs/contracts.md). A failure to write them does not stop the run."""
+"""Write the output files of a run (docs/contracts.md). A failed write does not stop the run."""
 
 from __future__ import annotations
 
@@ -21,35 +21,37 @@ from runtime.support.threads import fresh_threads, parallel_map
 log = logging.getLogger("phasestack.output")
 
 Work = Callable[[], object]
-WAITING = 4096  # jobs queued for the disk: a minute of lines
-WAITING_PICTURES = 4  # queued jobs with a refresh's pictures, which take 25 MB each at 1080p
+WAITING = 4096  # maximum number of queued jobs, which is a minute of lines
+WAITING_PICTURES = 4  # maximum number of queued jobs with a refresh's pictures, which take 25 MB each at 1080p
 
 
 class RunOutput:
-    """Writer of a run's files to a folder, where they appear together after a clean exit.
+    """Writer of a run's files to a folder, where all files appear together after a clean exit.
 
-    A background thread writes them, so that no refresh waits for the disk. If the disk fails during the run (full,
-    gone, permission lost), the files are abandoned and the run continues. `problem` gives the reason, and one line is
-    logged.
+    A background thread writes the files, which keeps refreshes from waiting for the disk. If the disk fails during the
+    run (full, gone, permission lost), the files are discarded and the run continues. The reason is logged once and
+    kept in `problem`.
     """
 
     def __init__(self, target: Path, *, every_one: bool = True) -> None:
-        """Create a writer of a run's files to the folder `target`.
+        """Create a writer, which has to be entered as a context manager before use.
 
-        every_one: True to wait for a slow disk, False to drop lines and pictures instead.
+        Args:
+            target: Folder for the files.
+            every_one: Wait for a slow disk. If False, drop lines and pictures that the disk is too slow for.
         """
         self._folder = OutputFolder(target)
         self._target, self._every_one = target, every_one
         self._lines: TextIO | None = None
-        # A job, and a cleanup that always runs.
+        # Each item is a job and a cleanup that always runs after the job. None ends the thread.
         self._work: queue.Queue[tuple[Work, Work] | None] = queue.Queue(WAITING)
         self._pictures = threading.BoundedSemaphore(WAITING_PICTURES)
         self._writer = threading.Thread(target=self._write, name="output", daemon=True)
-        self.problem = ""  # why the files were abandoned
+        self.problem = ""  # reason why the files were discarded; empty: the disk works
         self.left_out = 0  # lines and pictures dropped because the disk was too slow
 
     def __enter__(self) -> RunOutput:
-        """Create the folder. Raises InputError if it cannot be written."""
+        """Create the folder and start the writing thread. Raises InputError if the folder is not writable."""
         self._folder.__enter__()
         try:
             self._lines = (self._folder.staging / "frames.jsonl").open("w", encoding="utf-8")
@@ -71,13 +73,16 @@ class RunOutput:
         self._attempt(lambda: self._folder.__exit__(kind, error, trace))
 
     def refresh(self, line: Mapping[str, Any]) -> None:
-        """Write one line of frames.jsonl. The account's arrays must not be changed afterwards."""
+        """Queue a line for frames.jsonl. The caller must not change the arrays in the line afterwards."""
         self._later(lambda: self._line(line))
 
     def light(self, frame: int, *, layers: U8) -> None:
-        """Write the layers of `light/<frame>/`.
+        """Queue the layers of a refresh for the folder `light/<frame>/`.
 
-        layers: (N, h, w, 3 or 4), as the panels show them; they must not be changed afterwards.
+        Args:
+            frame: Number of the refresh.
+            layers: Layers as the panels show them, shape (N, h, w, 3 or 4). The caller must not change the array
+                afterwards.
         """
 
         def write() -> None:
@@ -89,9 +94,15 @@ class RunOutput:
     def light_targets(
         self, frame: int, *, info: Mapping[str, Any], drawn: Pictures | None, true: Pictures | None
     ) -> None:
-        """Write the other files of `light/<frame>/`: light.json with `info`, and retina pictures.
+        """Queue light.json and the target pictures of a refresh for the folder `light/<frame>/`.
 
-        drawn: targets of the eyes solved for; true: targets of the true eyes. Neither may be changed afterwards.
+        The caller must not change the pictures afterwards.
+
+        Args:
+            frame: Number of the refresh.
+            info: Content of light.json.
+            drawn: Targets for the eyes that the layers were solved for.
+            true: Targets for the true eyes.
         """
 
         def write() -> None:
@@ -106,17 +117,21 @@ class RunOutput:
         return self._folder.staging / "light" / str(frame)
 
     def run_is_over(self) -> None:
-        """Wait for disk writes from now on, and speed them up, because they can no longer delay a refresh."""
+        """Wait for a slow disk from now on, and write at normal priority, because no refresh can be delayed."""
         self._every_one = True
         set_niceness(0, self._writer)
-        fresh_threads()  # the solver's and the measurements' have a low priority
+        fresh_threads()  # replace the threads of the solver and of the measurements, which have a low priority
 
     def finish(
         self, summary: dict[str, Any], layers: U8 | None, moment: Moment | None = None, *, unseen: str = ""
     ) -> None:
-        """Write the last frame, the summary, and the pictures and pages of the newest measured refresh.
+        """Queue the files that are written at the end of a run.
 
-        unseen: viewer page to write if no refresh was measured.
+        Args:
+            summary: Content of summary.json.
+            layers: Layers of the last refresh, shape (N, h, w, 3 or 4). None: write only summary.json.
+            moment: Last measured refresh, for the contact sheet, the eye views and the viewer page.
+            unseen: Viewer page to write if no refresh was measured.
         """
 
         def write() -> None:
@@ -138,7 +153,7 @@ class RunOutput:
         self._work.put((write, lambda: None))
 
     def _pictures_later(self, work: Work) -> None:
-        """Queue a job with pictures, or drop it at the limit on their memory."""
+        """Queue a job with pictures. If WAITING_PICTURES jobs are queued, wait or drop the job."""
         if self.problem:
             return
         if not self._pictures.acquire(blocking=self._every_one):
@@ -148,7 +163,12 @@ class RunOutput:
             self._pictures.release()
 
     def _later(self, work: Work, *, then: Work = lambda: None) -> bool:
-        """Queue a job. Return False if it was dropped. then: called after the job in any case."""
+        """Queue a job and return True, or return False if the job was dropped.
+
+        Args:
+            work: Job, which runs on the writing thread.
+            then: Cleanup that runs after the job, even if the job failed or was skipped.
+        """
         if self.problem:
             return False
         try:
@@ -159,7 +179,7 @@ class RunOutput:
         return True
 
     def _write(self) -> None:
-        """Run queued jobs in order, on the writer's thread, until one is None."""
+        """Run queued jobs in their order on the writing thread, until an item of the queue is None."""
         set_niceness(MEASURING_NICENESS)
         while (queued := self._work.get()) is not None:
             work, then = queued
@@ -172,7 +192,7 @@ class RunOutput:
             work()
         except (OSError, InputError) as error:
             self._abandon(str(error), trace=False)
-        except Exception as error:  # not even a bug here may end the run
+        except Exception as error:  # a bug in a job must not end the run either
             self._abandon(f"{type(error).__name__}: {error}", trace=True)
 
     def _abandon(self, why: str, *, trace: bool) -> None:
@@ -180,7 +200,7 @@ class RunOutput:
             return
         self.problem = why
         log.warning("output abandoned; nothing new was written to %s: %s", self._target, why, exc_info=trace)
-        self._folder.discard()  # now, because these files may be filling the disk
+        self._folder.discard()  # immediately, because the files may be filling the disk
 
     def _line(self, line: Mapping[str, Any]) -> None:
         assert self._lines is not None
@@ -188,7 +208,7 @@ class RunOutput:
 
 
 def in_one_line(summary: dict[str, Any]) -> str:
-    """Return a line about a run for its contact sheet, with the one figure for its motion."""
+    """Return a line about a run for the contact sheet, with the live quality if the run measured it."""
     line = f"The run: {summary['presented']} of {summary['frames']} refreshes presented, model {summary['model']}"
     if summary.get("live_db") is not None:
         line += f"; while the head moved, PSNR {summary['live_db']:.1f} dB at the true eyes (live), delays included"

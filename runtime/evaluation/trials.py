@@ -1,4 +1,4 @@
-"""Time calls in repeated trials, after a warm-up and in turn, and take the median."""
+"""Time calls in repeated runs after a warm-up. Several calls can be timed alternately."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Timed(Generic[T]):
-    """Times of the runs of a call, and its last result."""
+    """Times of a call's runs, and the result of the last run."""
 
     answer: T
-    times_ms: tuple[float, ...]
+    times_ms: tuple[float, ...]  # in the order of the runs, without the warm-up
 
     @property
     def median_ms(self) -> float:
@@ -30,9 +30,14 @@ class Timed(Generic[T]):
 def timed(
     call: Callable[[], T], *, runs: int, most: int | None = None, enough_s: float = 0.0, slow_s: float = float("inf")
 ) -> Timed[T]:
-    """Time a call after a warm-up: at least `runs` times, then until `enough_s` or `most` runs.
+    """Time repeated runs of a call. The first run is a warm-up that does not count unless it is slow.
 
-    slow_s: if the first run takes at least this long, it counts and is the only one.
+    Args:
+        call: Function to time.
+        runs: Minimum number of timed runs.
+        most: Maximum number of timed runs. None: `runs`.
+        enough_s: Total time of the timed runs after which no further run is started.
+        slow_s: If the first run takes at least this long, it counts and no other run follows.
     """
     answer, took_ms = _timed(call)
     if took_ms >= slow_s * 1e3:
@@ -45,9 +50,14 @@ def timed(
 
 
 def timed_in_turn(ways: Mapping[str, Callable[[], U8]], *, runs: int) -> dict[str, Timed[U8]]:
-    """Time several calls alternately, so that other load on the machine affects all of them.
+    """Time several calls alternately. Other load on the machine then affects all calls alike.
 
-    Each call's first run is discarded. Results are copied, because a call may reuse its buffer.
+    Args:
+        ways: Calls by name. Their last results are copied, because a call may reuse the returned buffer.
+        runs: Number of timed runs of each call, after one run as a warm-up.
+
+    Returns:
+        Times and last result of each call, by name.
     """
     times: dict[str, list[float]] = {name: [] for name in ways}
     answers: dict[str, U8] = {}

@@ -1,1 +1,1 @@
-"""Shared utilities: atomic files, untrusted input, background jobs, GL contexts, logs."""
+"""Shared utilities: atomic output, untrusted input, background jobs, OpenGL contexts, logs."""

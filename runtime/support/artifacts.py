@@ -1,4 +1,4 @@
-"""Atomic output of files and pictures, which are written under a temporary name, synced and renamed."""
+"""Atomic output: files are written under a temporary name, synced to disk and renamed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ STAGING = ".phasestack-staging-"
 
 
 def sync(path: Path) -> None:
-    """Sync a file's data or a folder's entries to disk. Raises OSError if this fails."""
+    """Sync the data of a file or the entries of a folder to disk. Raises OSError if syncing fails."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -34,16 +34,22 @@ def sync(path: Path) -> None:
 
 
 def put_in_place(part: Path, path: Path) -> None:
-    """Sync a finished file, rename it and sync its folder. Raises OSError if any step fails."""
+    """Sync the finished file `part`, rename it to `path`, and sync the folder. Raises OSError on failure."""
     sync(part)
     part.replace(path)
     sync(path.parent)
 
 
 def write_bytes(path: Path, data: bytes, *, like: Path | None = None) -> None:
-    """Write a file atomically and create its folders. Raises InputError if it cannot be written.
+    """Write a file atomically and create missing folders.
 
-    like: file whose owner and mode are copied. By default it is the file that is replaced, if there is one.
+    Args:
+        path: File to create or replace.
+        data: Content of the file.
+        like: Existing file whose owner and mode are copied. By default, owner and mode of a replaced file are kept.
+
+    Raises:
+        InputError: The file cannot be written.
     """
     like = like or path
     try:
@@ -61,7 +67,7 @@ def write_bytes(path: Path, data: bytes, *, like: Path | None = None) -> None:
             with suppress(PermissionError):  # the replaced file may belong to another user
                 os.chown(name, before.st_uid, before.st_gid)
         Path(name).chmod(0o644 if before is None else stat.S_IMODE(before.st_mode))
-        if any(part.startswith(STAGING) for part in path.parts):  # OutputFolder syncs all files at its end
+        if any(part.startswith(STAGING) for part in path.parts):  # OutputFolder syncs its files when it exits
             Path(name).replace(path)
         else:
             put_in_place(Path(name), path)
@@ -73,12 +79,12 @@ def write_bytes(path: Path, data: bytes, *, like: Path | None = None) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write UTF-8 text atomically."""
+    """Write a UTF-8 text file atomically. Raises InputError if the file cannot be written."""
     write_bytes(path, text.encode())
 
 
 def to_json(value: Any) -> str:
-    """Format as JSON. Arrays become lists, and non-finite numbers become null."""
+    """Format a value as JSON on one line. Arrays become lists, and non-finite numbers become null."""
     try:
         return json.dumps(value, allow_nan=False, default=_listed)
     except (ValueError, TypeError):  # a non-finite number, or a key that is not a string
@@ -86,7 +92,7 @@ def to_json(value: Any) -> str:
 
 
 def _listed(item: Any) -> Any:
-    """Convert objects that the encoder does not know."""
+    """Convert NumPy arrays and scalars for the JSON encoder, which does not know them."""
     if isinstance(item, np.ndarray | np.generic):
         return item.tolist()
     raise TypeError(f"objects of type {type(item).__name__} cannot be written as JSON")
@@ -103,12 +109,16 @@ def _finite(item: Any) -> Any:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write an indented JSON file atomically."""
+    """Write an indented JSON file atomically. Raises InputError if the file cannot be written."""
     write_text(path, json.dumps(json.loads(to_json(value)), indent=1) + "\n")
 
 
 def png_bytes(image: U8) -> bytes:
-    """Encode an (h, w, 3 or 4) RGB(A) or (h, w) grey image as PNG, without alpha."""
+    """Encode an image as PNG. An alpha channel is dropped.
+
+    Args:
+        image: RGB or RGBA image, shape (h, w, 3 or 4), or grey image, shape (h, w).
+    """
     import cv2
 
     bgr = image if image.ndim == 2 else np.ascontiguousarray(image[..., 2::-1])
@@ -119,15 +129,16 @@ def png_bytes(image: U8) -> bytes:
 
 
 def write_png(path: Path, image: U8) -> None:
-    """Write a PNG atomically, without alpha."""
+    """Write an image as a PNG file atomically (`png_bytes`). Raises InputError if it cannot be written."""
     write_bytes(path, png_bytes(image))
 
 
 class OutputFolder:
-    """Folder whose new files appear all together at the end, or not at all.
+    """Output folder whose new files appear all at once at the end, or not at all.
 
-    Use it as a context manager and write to `staging`. On success all files are renamed into `target`, replacing files
-    of the same names. After an error no new file remains. The next writer removes staged files of a killed process.
+    Use the class as a context manager, and write the files to `staging`. On success, all files are moved to `target`
+    and replace files of the same names. If the block raises an exception, no new file remains. Staged files that a
+    killed process left are removed by the next process that writes to the folder.
     """
 
     def __init__(self, target: Path) -> None:
@@ -140,7 +151,7 @@ class OutputFolder:
             _sweep(self.target)
             self.staging = Path(tempfile.mkdtemp(prefix=STAGING, dir=self.target))
             self._held = os.open(self.staging, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-            fcntl.flock(self._held, fcntl.LOCK_EX)  # until this process ends
+            fcntl.flock(self._held, fcntl.LOCK_EX)  # released by `discard`, or by the system when this process ends
         except OSError as error:
             raise InputError(self.target, "", f"cannot be written ({error.strerror})") from None
         return self
@@ -158,14 +169,19 @@ class OutputFolder:
         for folder in self._made:
             if folder.is_dir() and not any(folder.iterdir()):
                 folder.rmdir()
-        if isinstance(error, InputError) and error.source.startswith(str(self.staging)):  # name the final file instead
+        # In messages, name the final file instead of the staged file.
+        if isinstance(error, InputError) and error.source.startswith(str(self.staging)):
             file = self.target / Path(error.source).relative_to(self.staging)
             raise InputError(file, error.field, error.problem) from None
         if isinstance(error, OSError) and str(error.filename or "").startswith(str(self.staging)):
             raise InputError(self.target, "", f"cannot be written ({error.strerror})") from None
 
     def _put_in_place(self) -> None:
-        """Rename all staged files. Raises InputError before replacing any if something is in the way."""
+        """Move all staged files to the target folder.
+
+        Raises InputError if a file cannot be moved. Before the first file is moved, all destinations are checked for
+        obstacles.
+        """
         files = sorted(path for path in self.staging.rglob("*") if path.is_file())
         places = {path: self.target / path.relative_to(self.staging) for path in files}
         for place in places.values():
@@ -182,7 +198,7 @@ class OutputFolder:
             raise InputError(self.target, "", f"cannot be written ({error.strerror})") from None
 
     def discard(self) -> None:
-        """Remove the staged files."""
+        """Remove the staged files and release the lock. Repeated calls have no effect."""
         shutil.rmtree(self.staging, ignore_errors=True)
         if self._held >= 0:
             os.close(self._held)
@@ -190,7 +206,10 @@ class OutputFolder:
 
 
 def _sweep(target: Path) -> None:
-    """Remove staging folders of killed processes, which hold no lock. This works across namespaces."""
+    """Remove the staging folders of killed processes.
+
+    The folder of a living process is locked. Unlike a check of process IDs, the lock also works across namespaces.
+    """
     for stale in target.glob(f"{STAGING}*"):
         with suppress(OSError):
             opened = os.open(stale, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
@@ -202,7 +221,12 @@ def _sweep(target: Path) -> None:
 
 
 def _check_free(place: Path, *, within: Path) -> None:
-    """Raise InputError if a folder exists where a file must go, or a file where a folder must go."""
+    """Raise InputError if a folder exists where a file must go, or a file where a folder must go.
+
+    Args:
+        place: Final path of a file.
+        within: Output folder, which contains `place` and is not checked.
+    """
     for folder in place.parents:
         if folder == within:
             break
@@ -214,9 +238,9 @@ def _check_free(place: Path, *, within: Path) -> None:
 
 @contextmanager
 def held_back() -> Iterator[None]:
-    """Suppress what libraries write to the file descriptor of stderr.
+    """Suppress output that libraries write to the file descriptor of stderr within the block.
 
-    Does nothing if other threads run, because the descriptor belongs to the whole process.
+    If other threads are running, nothing is suppressed, because the descriptor belongs to the whole process.
     """
     if threading.active_count() > 1:
         yield

@@ -1,4 +1,4 @@
-"""Background threads, with priorities (presenter, solver, then the rest), abandonment and jobs."""
+"""Background threads and jobs with priorities: first the presenter, then the solver, then the rest."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from runtime.errors import PhasestackError, TransientError, one_line
 
 log = logging.getLogger("phasestack.background")
 
-PRESENTER_NICENESS = -10  # where realtime priority is not allowed
-REALTIME_PRIORITY = 1  # the lowest, which still comes before every ordinary thread
+PRESENTER_NICENESS = -10  # used if realtime priority is not allowed
+REALTIME_PRIORITY = 1  # lowest realtime priority, which still precedes every ordinary thread
 SOLVER_NICENESS = 5
 BACKGROUND_NICENESS = 10
-MEASURING_NICENESS = 15  # for measurements and writing files, which are not urgent
-STOPS_WITHIN_S = 1.2  # time limit after a stop request; leaves time for calls without a timeout within two seconds
+MEASURING_NICENESS = 15  # for measurements and file output, which are not urgent
+# Time limit for waits after a stop request. The rest of two seconds is left for calls that have no timeout.
+STOPS_WITHIN_S = 1.2
 T = TypeVar("T")
 
 _ends_by_s = math.inf
@@ -29,18 +30,18 @@ _abandoned: set[threading.Thread] = set()
 
 
 def ends_by(at_s: float) -> None:
-    """Set the deadline, in `time.monotonic` seconds, for every wait that `patience_s` limits."""
+    """Set a deadline in seconds of `time.monotonic`, which limits all later results of `patience_s`."""
     global _ends_by_s
     _ends_by_s = at_s
 
 
 def patience_s(most_s: float) -> float:
-    """Return how long to wait for a thread that may be abandoned: `most_s` or until the deadline."""
+    """Return how long to wait for a thread that may be abandoned: `most_s`, but not past the deadline."""
     return max(0.0, min(most_s, _ends_by_s - time.monotonic()))
 
 
 def wait_for_all(timeout_s: float) -> int:
-    """Wait for running jobs and return how many have not finished after `timeout_s`."""
+    """Wait up to `timeout_s` for all running jobs, and return the number of unfinished jobs."""
     deadline_s = time.monotonic() + patience_s(timeout_s)
     for thread in tuple(_running):
         thread.join(max(0.0, deadline_s - time.monotonic()))
@@ -48,7 +49,7 @@ def wait_for_all(timeout_s: float) -> int:
 
 
 def begin(name: str, run: Callable[..., None], *args: Any) -> threading.Thread:
-    """Start a thread. Raises TransientError if the system cannot create one."""
+    """Start and return a daemon thread. Raises TransientError if the system cannot create a thread."""
     thread = threading.Thread(target=run, args=args, name=name, daemon=True)
     try:
         thread.start()
@@ -58,31 +59,35 @@ def begin(name: str, run: Callable[..., None], *args: Any) -> threading.Thread:
 
 
 class ThreadAbandoned(BaseException):
-    """Raised on an abandoned thread, whose result is no longer wanted."""
+    """Raised on a thread that was abandoned because its result is no longer needed."""
 
 
 def abandon(thread: threading.Thread) -> None:
-    """Abandon a thread, whose next call to `raise_if_abandoned` raises."""
+    """Mark a thread as abandoned. From then on, `raise_if_abandoned` raises on that thread."""
     _abandoned.add(thread)
 
 
 def raise_if_abandoned() -> None:
-    """Raise ThreadAbandoned on an abandoned thread. Called between operations such as drawing.
+    """Raise ThreadAbandoned if the calling thread has been abandoned.
 
-    An asynchronous exception could arrive inside a call to moderngl, which would crash.
+    Work calls this function between operations such as drawing. An asynchronous exception is no alternative: it could
+    arrive during a call to moderngl, which would crash.
     """
     if _abandoned and threading.current_thread() in _abandoned:
         raise ThreadAbandoned
 
 
 class BackgroundJob(Generic[T]):
-    """Job that starts on construction. `done`, `problem` and `take` never block."""
+    """Job that runs a function on a background thread, starting on construction.
+
+    The attributes `done` and `problem` and the method `take` can be polled, because they never block.
+    """
 
     def __init__(self, name: str, work: Callable[[], T], *, niceness: int = BACKGROUND_NICENESS) -> None:
         self._name, self._work, self._niceness = name, work, niceness
         self._result: T | None = None
         self.done = False
-        self.problem = ""  # reason in one line if the job failed
+        self.problem = ""  # one-line reason why the job failed; empty: no failure
         self._thread: threading.Thread | None = None
         try:
             self._thread = begin(f"job {name}", self._run)
@@ -90,12 +95,12 @@ class BackgroundJob(Generic[T]):
             self.problem, self.done = str(error), True
 
     def wait(self, timeout_s: float) -> None:
-        """Wait up to `timeout_s` for the thread to end."""
+        """Wait for the end of the job, for at most `timeout_s` and not beyond the deadline of `ends_by`."""
         if self._thread is not None:
             self._thread.join(patience_s(timeout_s))
 
     def take(self) -> T | None:
-        """Return the result, or None if there is none yet or it has been taken."""
+        """Return the result once. Before the job is done and after the result was taken, return None."""
         result, self._result = self._result, None
         return result
 
@@ -106,7 +111,7 @@ class BackgroundJob(Generic[T]):
             self._result = self._work()
         except PhasestackError as error:
             self.problem = str(error)
-        except BaseException as error:  # includes a vendor's `sys.exit()`
+        except BaseException as error:  # includes SystemExit, which the code of a vendor may raise
             self.problem = one_line(f"{self._name}: {type(error).__name__}: {error}")
             log.exception("%s", self._name)
         finally:
@@ -116,10 +121,10 @@ class BackgroundJob(Generic[T]):
 
 @contextmanager
 def before_all_others() -> Iterator[None]:
-    """Give the calling thread realtime priority within a block, or if not allowed, a low niceness.
+    """Give the calling thread realtime priority within the block, or a low niceness if not allowed.
 
-    At ordinary priority the kernel lets a busy thread finish its slice, which would delay a refresh by up to 3 ms.
-    Threads and processes started within the block have ordinary priority.
+    At ordinary priority, the kernel lets a busy thread finish its time slice first, which would delay a refresh by up
+    to 3 ms. Threads and processes that are started within the block have ordinary priority.
     """
     policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
     before = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
@@ -135,6 +140,13 @@ def before_all_others() -> Iterator[None]:
 
 
 def set_niceness(niceness: int, thread: threading.Thread | None = None) -> None:
-    """Set the niceness of a thread (default: this one) and of those it starts later, if allowed."""
+    """Set the niceness of a thread and of all threads that it starts later.
+
+    Nothing happens if the system does not allow the change.
+
+    Args:
+        niceness: Niceness from -20 to 19. A lower value has precedence.
+        thread: Thread to change, by default the calling thread.
+    """
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, (thread or threading.current_thread()).native_id or 0, niceness)

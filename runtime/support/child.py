@@ -1,7 +1,7 @@
-"""Processing of untrusted files in a child process with limits on memory and time.
+"""Process untrusted files in a child process with limits on memory and time.
 
-Parsers hold Python's lock, and even a small file can make them use all memory. Arrays are returned in shared memory.
-Progress, log lines and errors are forwarded as if the work ran in this process.
+Parsers hold Python's global lock, and even a small file can make a parser use all memory. The child returns arrays in
+shared memory. Progress, log lines and errors are forwarded as if the work ran in this process.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from runtime.support import progress
 from runtime.support.extras import missing_extra
 from runtime.support.untrusted_input import LIMITS, MIB
 
-MEMORY_MAX = 4 << 30  # bytes; enough for a scene that reaches every limit
+MEMORY_MAX = 4 << 30  # default memory limit in bytes, enough for a scene that reaches every limit
 LOOK_S = 0.05  # interval between checks for cancellation
-ALIGNED = 64  # bytes; alignment of arrays
-PR_SET_PDEATHSIG = 1  # prctl.h of Linux
-SMALL = 1 << 16  # bytes; smaller arrays are copied
+ALIGNED = 64  # alignment of arrays in bytes
+PR_SET_PDEATHSIG = 1  # constant from Linux's prctl.h
+SMALL = 1 << 16  # size in bytes below which arrays are copied
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1")
 T = TypeVar("T")
 
@@ -42,17 +42,27 @@ T = TypeVar("T")
 def in_child(
     work: Callable[..., T], *args: Any, source: str | Path, seconds: float, memory_bytes: int | None = None
 ) -> T:
-    """Call `work(*args)`, a module-level function, in a child process, and return its result.
+    """Call `work(*args)` in a child process and return the result.
 
-    memory_bytes: limit; None: `MEMORY_MAX`. The child is killed if the progress listener raises. Raises phasestack's
-    errors from `work`; InputError, naming `source`, if it exceeds a limit, fails or ends the process; TransientError
-    if no process can be started.
+    An exception in the listener of this thread's progress (`progress.listening`) kills the child and propagates.
+
+    Args:
+        work: Function at the top level of a module.
+        args: Arguments that can be pickled.
+        source: File to name in messages.
+        seconds: Time limit.
+        memory_bytes: Memory limit, by default `MEMORY_MAX`.
+
+    Raises:
+        PhasestackError: `work` raised this error.
+        InputError: `work` exceeded a limit, raised another exception or ended the process.
+        TransientError: No process can be started.
     """
     memory_bytes = memory_bytes or MEMORY_MAX
     ours, theirs = Pipe()
     memory = os.memfd_create("result")
     command = [sys.executable, "-P", "-m", __name__, str(theirs.fileno()), str(memory)]
-    # This copy of phasestack comes first.
+    # Put this copy of phasestack first.
     python_path = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, sys.path)])
     environment = os.environ | ONE_THREAD | {"PYTHONPATH": python_path}
     try:
@@ -84,7 +94,10 @@ def in_child(
 
 
 def _outcome(channel: Connection, source: str, seconds: float) -> tuple[bytes, list[int]] | None:
-    """Return the pickled result and its arrays' sizes, or None if the child ended without a result."""
+    """Wait for the child, and forward its reports.
+
+    Returns the pickled result and the sizes of its arrays in bytes, or None if the child ended without a result.
+    """
     end_s, step = time.monotonic() + seconds, (f"reading {Path(source).name}", 0, None)
     while True:
         try:
@@ -106,7 +119,10 @@ def _outcome(channel: Connection, source: str, seconds: float) -> tuple[bytes, l
 
 
 def _mapped(memory: int, sizes: list[int]) -> list[memoryview | bytearray]:
-    """Map the arrays copy-on-write. Small ones are copied, so that they do not keep the mapping alive."""
+    """Return the arrays in the shared memory, mapped copy-on-write.
+
+    Small arrays are copied. Otherwise, a small array that is kept would keep the whole mapping alive.
+    """
     total = sum(map(_room, sizes))
     whole = memoryview(mmap.mmap(memory, total, flags=mmap.MAP_PRIVATE) if total else b"")
     ends = [sum(map(_room, sizes[: number + 1])) for number in range(len(sizes))]
@@ -119,7 +135,7 @@ def _room(size: int) -> int:
 
 
 class _Forwarded(logging.Handler):
-    """Handler that sends log records to the parent process."""
+    """Handler that sends the log records of the child to the parent process."""
 
     def __init__(self, channel: Connection) -> None:
         super().__init__()
@@ -130,8 +146,13 @@ class _Forwarded(logging.Handler):
 
 
 def main(channel: Connection, memory: int) -> None:
-    """Entry point of the child process."""
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # end with the parent
+    """Run the child process: set the limits, do the work and send the result or the error.
+
+    Args:
+        channel: Connection to the parent.
+        memory: File descriptor of the shared memory for the arrays of the result.
+    """
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # end when the parent ends
     work, args, source, limits, (memory_bytes, seconds) = channel.recv()
     for name, limit in limits.items():
         setattr(LIMITS, name, limit)
@@ -141,7 +162,7 @@ def main(channel: Connection, memory: int) -> None:
         (resource.RLIMIT_CPU, processor_s),
         (resource.RLIMIT_CORE, 0),
     ):
-        hard = resource.getrlimit(kind)[1]  # inherited limit, possibly from another child
+        hard = resource.getrlimit(kind)[1]  # inherited limit, which this process may itself have got as a child
         most = most if hard == resource.RLIM_INFINITY else min(most, hard)
         resource.setrlimit(kind, (most, most))
     with suppress(OSError):
@@ -176,9 +197,9 @@ def main(channel: Connection, memory: int) -> None:
 
 
 def _passing(error: BaseException | None) -> OSError | None:
-    """Return the transient system error that caused a refusal, for `is_retryable`.
+    """Return the transient system error that caused an error of the project, for `is_retryable`, or None.
 
-    Ends the process on a MemoryError, which means that it reached its limit.
+    If the cause is a MemoryError, the process has reached its memory limit and ends.
     """
     while error is not None:
         if isinstance(error, MemoryError):

@@ -1,4 +1,4 @@
-"""ICC profiles for AVIF and HEIC pictures that declare their colours by code (`nclx`, ITU-T H.273)."""
+"""ICC profiles for AVIF and HEIC pictures that declare colours by code (`nclx`, ITU-T H.273)."""
 
 from __future__ import annotations
 
@@ -10,21 +10,28 @@ import numpy as np
 from runtime.records import F64
 
 NCLX = re.compile(rb"colrnclx(..)(..)", re.DOTALL)
-SEARCHED = 1 << 18  # bytes searched at the beginning of a file
-PQ, HLG = 16, 18  # transfer characteristics; all others are treated as sRGB
-PAPER_NITS, PQ_NITS = 203.0, 10_000.0  # luminance of white (ITU-R BT.2408); PQ's maximum
-PRIMARIES = {  # XYZ of red, green and blue, adapted to D50; BT.709 has the primaries of sRGB
+SEARCHED = 1 << 18  # number of bytes at the beginning of a file that are searched for the colour codes
+PQ, HLG = 16, 18  # codes of transfer characteristics; all other codes are treated as sRGB
+PAPER_NITS, PQ_NITS = 203.0, 10_000.0  # luminance of white (ITU-R BT.2408), and maximum luminance of PQ
+PRIMARIES = {  # XYZ of red, green and blue by code, adapted to D50; code 1 (BT.709) has the primaries of sRGB
     1: ((0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.71410)),
     9: ((0.67348, 0.27905, -0.00193), (0.16566, 0.67534, 0.02998), (0.12505, 0.04561, 0.79686)),
     12: ((0.51512, 0.24120, -0.00105), (0.29198, 0.69225, 0.04189), (0.15710, 0.06657, 0.78407)),
 }
 D50 = (0.9642, 1.0, 0.8249)
-SRGB_CURVE = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
+SRGB_CURVE = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)  # parameters g, a, b, c, d of an ICC curve
 SAMPLES = 4096  # number of samples of a transfer curve
 
 
 def stated_profile(coded: bytes) -> bytes:
-    """Return the ICC profile of a picture's declared colours, or nothing for sRGB or unknown colours."""
+    """Return the ICC profile for a picture's declared colours.
+
+    Args:
+        coded: Encoded picture, of which the beginning is sufficient.
+
+    Returns:
+        ICC profile, or empty bytes if the picture declares no colours, sRGB or unknown colours.
+    """
     found = NCLX.search(coded[:SEARCHED]) if coded[4:8] == b"ftyp" else None
     if found is None:
         return b""
@@ -49,21 +56,21 @@ def _fixed(*values: float) -> bytes:
 
 
 def _table(transfer: int) -> bytes:
-    """Return the light of each code in units of paper white, where brighter light is clipped."""
+    """Return an ICC curve from codes to light relative to paper white. Brighter light is clipped."""
     code = np.linspace(0.0, 1.0, SAMPLES)
-    light = _pq(code) if transfer == PQ else _hlg(code) / _hlg(np.array(0.75))  # where HLG has paper white
+    light = _pq(code) if transfer == PQ else _hlg(code) / _hlg(np.array(0.75))  # the HLG code of paper white is 0.75
     values = np.rint(np.clip(light, 0.0, 1.0) * 65535).astype(">u2")
     return b"curv" + bytes(4) + struct.pack(">L", SAMPLES) + values.tobytes()
 
 
 def _pq(code: F64) -> F64:
-    """Decode the perceptual quantizer (PQ), SMPTE ST 2084."""
+    """Decode the perceptual quantizer (PQ, SMPTE ST 2084) to light relative to paper white."""
     root = code ** (1 / 78.84375)
     shown = np.maximum(root - 0.8359375, 0.0) / (18.8515625 - 18.6875 * root)
     return np.asarray(shown ** (1 / 0.1593017578125) * (PQ_NITS / PAPER_NITS))
 
 
 def _hlg(code: F64) -> F64:
-    """Decode hybrid log-gamma (HLG, ARIB STD-B67), per channel, with the gamma of a 1000-nit screen."""
+    """Decode hybrid log-gamma (HLG, ARIB STD-B67) per channel, with the gamma of a 1000-nit screen."""
     a, b, c = 0.17883277, 0.28466892, 0.55991073
     return np.asarray(np.where(code <= 0.5, code**2 / 3, (np.exp((code - c) / a) + b) / 12) ** 1.2)

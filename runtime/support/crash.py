@@ -1,4 +1,4 @@
-"""Reports of unexpected exceptions. The traceback goes to a file, and one line to the user."""
+"""Report unexpected exceptions: write the traceback to a file, and show the user one line."""
 
 from __future__ import annotations
 
@@ -17,11 +17,14 @@ from runtime.errors import one_line, without_secrets
 from runtime.support.folders import state_folder
 
 STEM = "phasestack-error-"
-KEPT = 20  # number of files kept, so that a service that fails repeatedly does not fill the disk
+KEPT = 20  # maximum number of reports; a service that fails repeatedly must not fill the disk
 
 
 def written(error: BaseException) -> str:
-    """Write the report of an exception. Returns one line that names the file. Never raises."""
+    """Write a report of an exception to a file, and return a line for the user that names the file.
+
+    If no file can be written, the line says so. The function never raises an exception.
+    """
     from runtime.support.version import version
 
     summary = one_line(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__)
@@ -34,7 +37,7 @@ def written(error: BaseException) -> str:
     for folder in (state_folder(), Path(tempfile.gettempdir())):
         with contextlib.suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
-            # mkstemp makes the file readable only by its owner, since its paths and names may be private.
+            # Only the owner can read a file from mkstemp. The report may contain private paths and names.
             file, path = tempfile.mkstemp(".log", f"{STEM}{now:%Y%m%dT%H%M%S}-{os.getpid()}-", folder)
             try:
                 with os.fdopen(file, "w", encoding="utf-8", errors="backslashreplace") as opened:
@@ -42,7 +45,7 @@ def written(error: BaseException) -> str:
             except OSError:
                 Path(path).unlink()
                 raise
-            with contextlib.suppress(OSError):  # some files may be another user's
+            with contextlib.suppress(OSError):  # some files may belong to another user
                 for old in sorted(folder.glob(f"{STEM}*.log"))[:-KEPT]:
                     old.unlink()
             return f"unexpected error ({summary}); details are in {path}"
@@ -50,7 +53,7 @@ def written(error: BaseException) -> str:
 
 
 def watch_threads() -> None:
-    """Report exceptions that end a thread or that Python cannot raise, one line each."""
+    """Install hooks that report exceptions that end a thread or that Python cannot raise."""
     threading.excepthook = lambda hook: _say(hook.exc_value, hook.exc_type)
     sys.unraisablehook = lambda hook: _say(hook.exc_value, hook.exc_type)
 

@@ -239,7 +239,7 @@ def trials(*, full: bool = False) -> Iterator[Trial]:
     """Yield all trials of the models.
 
     Args:
-        full: Test every pose with every model instead of only with `balanced`, and add 4K panels.
+        full: Test poses, gaps and panel sizes with every model instead of only `balanced`, and add 4K panels.
     """
     geometries: dict[str, dict[str, float]] = {
         **{f"gap {gap:g} m": {"gap_m": gap} for gap in (1e-4, 5e-3, 0.03, 0.1, 1.0)},
