@@ -1,4 +1,4 @@
-"""Lookup of the phasestack extra that installs a missing optional package."""
+"""Find the extra of phasestack that installs a missing optional package."""
 
 from __future__ import annotations
 
@@ -8,11 +8,14 @@ from importlib.metadata import PackageNotFoundError, requires
 from runtime.errors import MissingPart
 
 IMPORTED_AS = {"usb": "pyusb"}  # packages whose module has a different name
-NOT_TO_RUN = frozenset({"all", "docs", "test"})
+NOT_TO_RUN = frozenset({"all", "docs", "test"})  # extras that are never suggested to a user
 
 
 def missing_extra(error: BaseException) -> MissingPart | None:
-    """Return an error that names the extra to install, or None if no extra contains the package."""
+    """Return an error that names the extra to install, for an import that failed.
+
+    The result is None if the import failed for another reason or if no extra contains the package.
+    """
     if not isinstance(error, ModuleNotFoundError) or not error.name:
         return None
     module = error.name.partition(".")[0]
@@ -23,7 +26,7 @@ def missing_extra(error: BaseException) -> MissingPart | None:
 
 
 def _extras_with(package: str) -> list[str]:
-    """Return the extras that contain a package, in the order of pyproject.toml."""
+    """Return the names of the extras that contain a package, in the order of pyproject.toml."""
     try:
         lines = requires("phasestack") or []
     except PackageNotFoundError:

@@ -1,4 +1,4 @@
-"""Formatting of records as readable lines, with the same names as in JSON."""
+"""Format the results of commands as readable lines, with the same names of fields as in JSON."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from typing import Any
 
 from runtime.errors import one_line
 
-LINE_MAX = 2000  # characters
+LINE_MAX = 2000  # maximum number of characters in a line
 
 
 def shown(record: Mapping[str, Any], *, as_json: bool) -> str:
-    """Format a command's result as JSON or as readable lines."""
+    """Format the result of a command as JSON or as readable lines."""
     return json.dumps(record) if as_json else "\n".join(lines_of(record))
 
 
 def lines_of(record: Mapping[str, Any]) -> Iterator[str]:
-    """Yield one line per field, or one per object in a list, skipping null, false and empty values.
+    """Yield a line for each field of a record. A list of objects gives a line for each object.
 
-    Line breaks within values are replaced.
+    Fields whose value is null, false or empty are skipped. Line breaks within values are replaced.
     """
     for name, value in record.items():
         is_list = isinstance(value, list | tuple) and all(isinstance(item, dict) for item in value)
@@ -29,7 +29,7 @@ def lines_of(record: Mapping[str, Any]) -> Iterator[str]:
 
 
 def in_words(value: Any) -> str:
-    """Format a value on one line. Null and false give an empty string."""
+    """Format a value as text. Null and false give an empty string."""
     match value:
         case None | False:
             return ""

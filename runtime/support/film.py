@@ -1,4 +1,4 @@
-"""Films opened with OpenCV's FFmpeg backend, which is restricted to the named file."""
+"""Open films with OpenCV's FFmpeg backend, which may access only the named file."""
 
 from __future__ import annotations
 
@@ -17,10 +17,13 @@ _alone = threading.Lock()
 
 
 def open_film(path: Path) -> cv2.VideoCapture:
-    """Open a film. Messages of FFmpeg and OpenCV are suppressed, because our errors name the file.
+    """Open a film.
 
-    FFmpeg is restricted, because a playlist or script with a film's suffix, or a name that looks like a URL, could make
-    it open other files and connections. Raises InputError for anything but a file.
+    FFmpeg is restricted to local files and video containers. Otherwise, a playlist or script with the suffix of a film,
+    or a name that looks like a URL, could make FFmpeg open other files and network connections. Messages of FFmpeg and
+    OpenCV are suppressed, because they do not name the file as the project's own errors do.
+
+    Raises InputError if the path is not a regular file or the file cannot be read.
     """
     untrusted_input.open_regular(path).close()
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")

@@ -1,4 +1,4 @@
-"""Offscreen OpenGL context through EGL, with any driver (at least Mesa's llvmpipe)."""
+"""Offscreen OpenGL contexts through EGL. Mesa's software renderer (llvmpipe) is sufficient."""
 
 from __future__ import annotations
 
@@ -16,22 +16,23 @@ if TYPE_CHECKING:
     import moderngl
 
 DEBIAN_PACKAGES = "libegl1 libgl1-mesa-dri libgles2 libgl1"
-MINIMUM_VERSION = 330  # OpenGL version times 100, as the shaders require
-# Sonames avoid moderngl's search for libraries, which starts a compiler and takes 60 ms.
+MINIMUM_VERSION = 330  # OpenGL 3.3, which the shaders require
+# File names spare moderngl a search for the libraries, which starts a compiler and takes 60 ms.
 EGL: dict[str, Any] = {"backend": "egl", "libegl": "libEGL.so.1", "libgl": "libGL.so.1"}
 
 
 def offscreen_context() -> moderngl.Context:
-    """Create an offscreen context and make it current. Content and offscreen panels share it.
+    """Create an offscreen OpenGL context for content and offscreen panels, and make it current.
 
-    Use it on one thread only. Raises MissingPart, naming Debian's packages, if EGL has no OpenGL 3.3.
+    Use the context on one thread only. Raises MissingPart, with the names of Debian's packages, if EGL does not provide
+    OpenGL 3.3.
     """
     try:
         import moderngl
     except ImportError as error:
         raise missing_extra(error) or error from None
 
-    if "MESA_SHADER_CACHE_DIR" not in os.environ:  # no cache in the home folder; compiling takes milliseconds
+    if "MESA_SHADER_CACHE_DIR" not in os.environ:  # write no cache to the home folder; compiling takes milliseconds
         os.environ["MESA_SHADER_CACHE_DISABLE"] = "true"
     try:
         return moderngl.create_context(require=MINIMUM_VERSION, standalone=True, **EGL)
@@ -43,7 +44,7 @@ def offscreen_context() -> moderngl.Context:
 
 
 def leave_context() -> None:
-    """Make no context current on this thread. Releasing a current one would leak it."""
+    """Detach the current context from this thread. A context that is released while current would leak."""
     egl, pointer = ctypes.CDLL(EGL["libegl"]), ctypes.c_void_p
     egl.eglGetCurrentDisplay.restype, egl.eglMakeCurrent.argtypes = pointer, [pointer] * 4
     egl.eglMakeCurrent(egl.eglGetCurrentDisplay(), None, None, None)
@@ -55,36 +56,39 @@ def _gl_finish() -> Any:
 
 
 def finish() -> None:
-    """Wait until this thread's GL commands are complete, without holding Python's lock.
+    """Wait until the OpenGL commands of this thread are complete, without holding Python's global lock.
 
-    moderngl keeps the lock during its calls: reading a picture that a software rasteriser is still drawing would block
-    all other threads for tens of milliseconds.
+    Calls of moderngl hold the lock. Reading a picture that a software rasteriser is still drawing would block all other
+    threads for tens of milliseconds.
     """
     _gl_finish()()
 
 
 @dataclass(frozen=True, slots=True)
 class DrawnPicture:
-    """8-bit RGBA picture on the GPU, with row 0 at the top."""
+    """8-bit RGBA picture on the GPU that can be read back. Row 0 is at the top."""
 
     texture: moderngl.Texture
-    target: moderngl.Framebuffer  # contains `texture`
-    held: U8  # (h, w, 4) the renderer's buffer for reading pixels back
-    grey: bool = False  # True if known to be without colour
+    target: moderngl.Framebuffer  # framebuffer with `texture` attached
+    held: U8  # (h, w, 4) buffer of the renderer into which `pixels` reads
+    grey: bool = False  # True if the picture is known to have no colour
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """(h, w, 4)."""
+        """Shape of the pixels, (h, w, 4)."""
         return self.held.shape
 
     def pixels(self) -> U8:
-        """Return the pixels (h, w, 4), valid until the next drawing. Call on the thread of the context."""
+        """Read the pixels, shape (h, w, 4), into `held`, where they stay valid until the next drawing.
+
+        Call this method on the thread of the context.
+        """
         finish()
         self.target.read_into(self.held, components=4)
         return self.held
 
 
 def describe(context: moderngl.Context) -> dict[str, str]:
-    """Return the vendor, renderer and version that the driver reports."""
+    """Return the vendor, renderer and version that the OpenGL driver reports."""
     info = context.info
     return {"vendor": str(info["GL_VENDOR"]), "renderer": str(info["GL_RENDERER"]), "version": str(info["GL_VERSION"])}

@@ -1,8 +1,8 @@
-"""Reader for the second view of a Leia picture (LIF, from a Lume Pad), a JPEG followed by fields.
+"""Find the second view of a Leia picture (LIF, from a Lume Pad), which is a JPEG followed by fields.
 
-The file ends with the total length of the fields and a marker. The fields begin with their count; each has an
-identifier, a size and its bytes. One field describes the views in JSON: the position of each and the field that
-contains its JPEG, where -1 is the file itself.
+The file ends with the total length of the fields and a marker. The fields begin with the number of fields. Each field
+consists of an identifier, a size and data. One field describes the views in JSON: it contains the position of each view
+and the identifier of the field with the view's JPEG. The identifier -1 denotes the JPEG at the start of the file.
 """
 
 from __future__ import annotations
@@ -14,12 +14,19 @@ from runtime.errors import InputError
 from runtime.support.untrusted_input import parsed_json
 
 MARK = b"\x1e\x1a"
-VIEWS, OWN = 7, -1  # field identifiers: the views' JSON; the JPEG at the start of the file
+VIEWS, OWN = 7, -1  # field identifiers of the JSON that describes the views, and of the JPEG at the start of the file
 JSON_BYTES_MAX = 65536
 
 
 def other_view(file: IO[bytes]) -> tuple[slice, bool] | None:
-    """Return the other JPEG of a pair and whether it is the left eye's, or None for other files."""
+    """Find the second JPEG of a Leia picture.
+
+    Args:
+        file: Open file, whose position changes.
+
+    Returns:
+        The range of bytes of the second JPEG, and True if it is the left eye's picture. None for other files.
+    """
     size = file.seek(0, 2)
     if size < 6:
         return None
@@ -40,7 +47,7 @@ def other_view(file: IO[bytes]) -> tuple[slice, bool] | None:
     try:
         views = parsed_json(file.read(told.stop - told.start), source="LIF")["views"]
         across = sorted((float(view["xLocation"]), int(view["albedoId"])) for view in views)
-        # Of more than two views use the outermost, because neighbours are closer together than eyes.
+        # If there are more than two views, use the outermost ones, because adjacent views are closer than two eyes.
         left, right = across[0][1], across[-1][1]
         return (fields[right], False) if left == OWN else (fields[left], True) if right == OWN else None
     except (InputError, LookupError, TypeError, ValueError):

@@ -1,6 +1,7 @@
-"""Log lines for people and for journald.
+"""Logging to a terminal or to journald.
 
-Repeated messages are rate-limited, a message cannot forge another line, and a slow reader never blocks logging.
+Repeated messages are rate-limited, a message with line breaks cannot forge other log lines, and a slow reader of the
+lines never blocks the program.
 """
 
 from __future__ import annotations
@@ -29,24 +30,27 @@ PRIORITY = {
     logging.ERROR: "<3>",
     logging.CRITICAL: "<2>",
 }
-ROOTS = ("phasestack", "runtime")  # loggers named by subject, and loggers named by module
-BURST = 5  # identical messages passed within `QUIET_NS`
-REMEMBERED = 1000  # maximum number of different messages counted
+ROOTS = ("phasestack", "runtime")  # parents of the loggers named by subject, and of the loggers named by module
+BURST = 5  # number of identical messages that pass within `QUIET_NS`
+REMEMBERED = 1000  # maximum number of different messages that are counted
 QUIET_NS = 30 * NS_PER_S  # time after which a suppressed message passes again
 QUEUED_MAX = 4096  # maximum number of lines that wait for a reader
 CLOSE_S = 1.0  # time limit for writing the last lines
-LINE_MAX = 4000  # characters
+LINE_MAX = 4000  # maximum number of characters in a line
 
 
 class TextFormat(logging.Formatter):
-    """Formatter that adds a priority under journald, which adds the time, otherwise time and level."""
+    """Formatter that starts each line with time and level or, for journald, with a priority.
+
+    Journald adds the time itself.
+    """
 
     def __init__(self, *, journald: bool) -> None:
         super().__init__()
         self._journald = journald
 
     def format(self, record: logging.LogRecord) -> str:
-        text = one_line(record.getMessage(), most=LINE_MAX)  # one line, so that a name or message cannot forge another
+        text = one_line(record.getMessage(), most=LINE_MAX)  # prevents forged lines
         if record.exc_info and record.exc_info[1]:
             text += f": {written(record.exc_info[1])}"  # the text names the file with the traceback
         if self._journald:
@@ -56,15 +60,16 @@ class TextFormat(logging.Formatter):
 
 
 class RateLimit(logging.Filter):
-    """Filter that passes five identical messages per 30 s. The next one gives the number suppressed.
+    """Filter that passes at most five identical messages within 30 s.
 
-    Records with `extra={"always": True}`, such as changes of state, always pass.
+    The next message that passes states how many messages were suppressed. Records with `extra={"always": True}`, such
+    as changes of state, always pass.
     """
 
     def __init__(self, clock: Clock) -> None:
         super().__init__()
         self._clock = clock
-        self._seen: dict[tuple[str, str], tuple[int, int, int]] = {}  # window start, passed, suppressed
+        self._seen: dict[tuple[str, str], tuple[int, int, int]] = {}  # start of the window, messages passed, suppressed
 
     def filter(self, record: logging.LogRecord) -> bool:
         if getattr(record, "always", False):
@@ -86,14 +91,17 @@ class RateLimit(logging.Filter):
 
 
 class _Lines(logging.Handler):
-    """Handler that writes lines to a descriptor. Blocks if the reader is slow, so only the listener uses it."""
+    """Handler that writes lines to a file descriptor.
+
+    A slow reader blocks the handler, so it is only used on the listener's thread.
+    """
 
     def __init__(self, descriptor: int) -> None:
         super().__init__()
         self._descriptor = descriptor
 
     def createLock(self) -> None:
-        """Use no lock, because only one thread writes, and shutting down logging must not block."""
+        """Create no lock, because only one thread writes, and the shutdown of logging must not block."""
         self.lock = None
 
     def emit(self, record: logging.LogRecord) -> None:
@@ -102,7 +110,7 @@ class _Lines(logging.Handler):
 
 
 class QueuedLines(QueueHandler):
-    """Handler with a bounded queue and a writer thread. Drops lines when the queue is full."""
+    """Handler that writes lines on a separate thread. If too many lines are waiting, it drops new lines."""
 
     def __init__(self, descriptor: int, form: logging.Formatter) -> None:
         self.queue: queue.Queue[Any] = queue.Queue(QUEUED_MAX)
@@ -113,7 +121,7 @@ class QueuedLines(QueueHandler):
         self._listener.start()
 
     def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
-        """Format the message now, but leave the exception to the listener, because that takes longer."""
+        """Format the message, but leave the exception to the listener's thread, because that takes longer."""
         prepared = copy.copy(record)
         prepared.msg, prepared.args = record.getMessage(), None
         return prepared
@@ -123,14 +131,14 @@ class QueuedLines(QueueHandler):
             self.queue.put_nowait(record)
 
     def flush(self) -> None:
-        """Wait up to `CLOSE_S` until queued lines are written."""
+        """Wait up to `CLOSE_S` seconds until the queued lines are written."""
         deadline_s = time.monotonic() + CLOSE_S
         while self.queue.unfinished_tasks and time.monotonic() < deadline_s:
             time.sleep(0.005)
 
     def close(self) -> None:
         self.flush()
-        if not self.queue.unfinished_tasks:  # else its thread is blocked and ends with the process
+        if not self.queue.unfinished_tasks:  # otherwise the listener's thread is blocked, and ends with the process
             self._listener.stop()
         super().close()
 
@@ -138,7 +146,13 @@ class QueuedLines(QueueHandler):
 def configure(
     *, stream: TextIO | None = None, clock: Clock | None = None, environment: Mapping[str, str] = os.environ
 ) -> None:
-    """Send phasestack's log lines to a stream (default stderr), which replaces any earlier one."""
+    """Set up logging, or replace an earlier setup.
+
+    Args:
+        stream: Stream for the log lines, by default stderr.
+        clock: Clock of the rate limit.
+        environment: Environment variables, from which a journald stream is recognized.
+    """
     for old in logging.getLogger(ROOTS[0]).handlers[:]:
         if isinstance(old, QueuedLines):
             old.close()
@@ -153,6 +167,9 @@ def configure(
 
 
 def flush() -> None:
-    """Wait up to `CLOSE_S` until queued lines are written, before a process ends without clean-up."""
+    """Wait up to `CLOSE_S` seconds until the queued lines are written.
+
+    Call this function before the process ends without clean-up.
+    """
     for handler in logging.getLogger(ROOTS[0]).handlers:
         handler.flush()

@@ -1,4 +1,4 @@
-"""Import of onnxruntime with telemetry disabled; nothing else in the runtime imports it."""
+"""Import ONNX Runtime with telemetry disabled. No other module imports onnxruntime directly."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 @cache
 def onnxruntime() -> Any:
-    """Import onnxruntime with telemetry disabled, both by environment variable and by function."""
+    """Import and return onnxruntime. Telemetry is disabled by an environment variable and by a function."""
     os.environ["ORT_DISABLE_TELEMETRY"] = "1"
     import onnxruntime as ort
 

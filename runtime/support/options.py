@@ -1,4 +1,4 @@
-"""Numeric command-line options with ranges, whose errors name the option."""
+"""Numeric command-line options with ranges, and errors that name the option."""
 
 from __future__ import annotations
 
@@ -11,25 +11,38 @@ import typer
 from runtime.errors import InputError
 from runtime.support.ranges import EYE_MOST_M, refusal
 
-OPTION_OF = {("content", "scene"): "scene", ("model", "name"): "model"}
+OPTION_OF = {("content", "scene"): "scene", ("model", "name"): "model"}  # options that set a setting
 
 
 def number(low: float, high: float, unit: str = "", *, help: str) -> Any:
-    """Return an option for numbers in [low, high], both finite.
+    """Return a typer option for numbers within a range.
 
-    Any other value, NaN included, raises InputError during parsing, naming command and option.
+    Parsing raises InputError, which names the command and the option, for NaN and for numbers out of range.
+
+    Args:
+        low: Smallest accepted number, finite.
+        high: Largest accepted number, finite.
+        unit: Unit for messages, such as `m`.
+        help: Help text, to which the range is appended.
     """
     return typer.Option(help=f"{help} ({low:g} to {high:g})", callback=_checked(low, high, unit))
 
 
 def place(*, help: str) -> Any:
-    """Return an option for an eye position: three coordinates in metres, in the range of the settings."""
+    """Return a typer option for an eye position: three coordinates in metres, at most ±`EYE_MOST_M`."""
     return typer.Option(help=help, metavar="X Y Z", callback=_checked(-EYE_MOST_M, EYE_MOST_M, "m"))
 
 
 @contextmanager
 def blame_option(command: str, **options: Any) -> Iterator[None]:
-    """Make an InputError about a setting name the option that set it, if any."""
+    """Reword InputErrors within the block that concern a setting which a command-line option has set.
+
+    The new error names the command and the option instead of the setting.
+
+    Args:
+        command: Name of the command.
+        options: Values of the options in OPTION_OF by name. None: the option was not given.
+    """
     try:
         yield
     except InputError as error:

@@ -1,4 +1,4 @@
-"""Checks of settings: ranges with a hint about units, valid paths, misspelt names."""
+"""Checks for settings: ranges of numbers with hints about units, valid paths, and misspelt names."""
 
 from __future__ import annotations
 
@@ -9,16 +9,23 @@ from pydantic import AfterValidator
 
 from runtime.support.ranges import refusal
 
-TEXT_MAX_BYTES = 4095  # of a path on Linux
-PART_MAX_BYTES = 255  # of one part of a path
+TEXT_MAX_BYTES = 4095  # maximum length of a path on Linux
+PART_MAX_BYTES = 255  # maximum length of one part of a path
 
 
 def within(low: float, high: float, unit: str, *, zero: bool = False) -> AfterValidator:
-    """Validator for a number in [low, high] that suggests the right unit; zero: also allow 0 ("not set").
+    """Return a validator for numbers in a range, whose message suggests the unit used by mistake.
 
-    >>> within(0.005, 20.0, "m").func(518.4)
-    Traceback (most recent call last):
-    ValueError: 518.4 m is beyond 20 m: did you mean millimetres (0.5184)?
+    Args:
+        low: Smallest valid number, finite.
+        high: Largest valid number, finite.
+        unit: Unit of the number, such as `m`.
+        zero: Also accept 0, with the meaning "not set".
+
+    Examples:
+        >>> within(0.005, 20.0, "m").func(518.4)
+        Traceback (most recent call last):
+        ValueError: 518.4 m is beyond 20 m: did you mean millimetres (0.5184)?
     """
 
     def check(value: float) -> float:
@@ -31,7 +38,7 @@ def within(low: float, high: float, unit: str, *, zero: bool = False) -> AfterVa
 
 
 def check_text(value: str) -> str:
-    """Return the text if it can be a name or a path. Raises ValueError otherwise."""
+    """Return the text unchanged if it can be a name or a path. Raises ValueError otherwise."""
     if "\0" in value:
         raise ValueError("contains a NUL character")
     try:
@@ -45,7 +52,7 @@ def check_text(value: str) -> str:
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """Return `: did you mean model?` if a known word is similar, else an empty string.
+    """Return a hint such as `: did you mean model?` if a known word is similar, else an empty string.
 
     >>> nearest("modle", ["model", "loop"])
     ': did you mean model?'
