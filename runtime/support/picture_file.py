@@ -1,4 +1,4 @@
-"""Reader for stills, stereo pairs and animations, as upright 8-bit sRGB over a background colour."""
+"""Read stills, stereo pairs and animations as upright 8-bit sRGB pictures over a background colour."""
 
 from __future__ import annotations
 
@@ -28,25 +28,34 @@ from runtime.support.untrusted_input import LIMITS
 
 log = logging.getLogger("phasestack.pictures")
 
-Colour = tuple[float, float, float]  # 0-1
+Colour = tuple[float, float, float]  # sRGB components in [0, 1]
 WHITE: Colour = (1.0, 1.0, 1.0)
-ROWS_AT_ONCE = 64  # number of rows converted together, to bound the memory
-LATTICE = 9  # values per channel at which a colour profile is compared with sRGB
-SRGB_CODES = 2  # maximum difference of a profile that counts as sRGB
-STILL_MS = 100.0  # duration of an animation frame that declares 0, as in browsers
+ROWS_AT_ONCE = 64  # number of rows that are converted together, which bounds the memory
+LATTICE = 9  # number of values per channel at which a colour profile is compared with sRGB
+SRGB_CODES = 2  # maximum difference in code values for a profile to count as sRGB
+STILL_MS = 100.0  # duration of an animation frame that declares a duration of 0, as in browsers
 DEEP = {"I;16": "<u2", "I;16L": "<u2", "I;16B": ">u2", "I;16N": "=u2"}  # Pillow's 16-bit modes
 
 
 def read_image(path: Path, *, background: Colour = WHITE) -> U8:
-    """Read the first picture of a file as 8-bit sRGB (h, w, 3), composed over a colour.
+    """Read the first picture of a file as 8-bit sRGB, shape (h, w, 3).
 
-    Raises InputError that names the file, before decoding if the picture would need too much memory.
+    Args:
+        path: Picture file.
+        background: Colour behind transparent parts.
+
+    Raises:
+        InputError: The file cannot be read or decoded, or the picture has too many pixels. The number of pixels is
+            checked before decoding.
     """
     return read_views(path, background=background)[0]
 
 
 def read_views(path: Path, *, background: Colour = WHITE) -> list[U8]:
-    """Read one picture, or both eyes' pictures if the file contains two, as `read_image` does."""
+    """Read the left and right eye's pictures of a stereo pair, or a single picture from any other file.
+
+    Each picture has the format of `read_image`, which also documents the arguments and exceptions.
+    """
     data, header = read_coded(path)
     if header.warning:
         log.warning("%s: %s", path, header.warning)
@@ -57,10 +66,10 @@ def read_views(path: Path, *, background: Colour = WHITE) -> list[U8]:
 
 
 def read_animation(path: Path, *, background: Colour = WHITE) -> tuple[list[U8], list[float]]:
-    """Read the frames of an animated picture and their durations in milliseconds.
+    """Read the frames of an animated picture, and the duration of each frame in milliseconds.
 
-    An animation larger than the largest picture becomes a still, with a warning in the log.
-    Raises InputError if the file cannot be read or decoded.
+    If the frames together have more pixels than a picture may have, only the first frame is read and a warning is
+    logged. Raises InputError if the file cannot be read or decoded.
     """
     data, header = read_coded(path)
     with opened(data) as image:
@@ -75,7 +84,10 @@ def read_animation(path: Path, *, background: Colour = WHITE) -> tuple[list[U8],
 
 
 def _decoded(path: Path, data: bytes, frames: tuple[int, ...], background: Colour) -> Iterator[tuple[U8, float]]:
-    """Yield frames with their durations. Raises InputError if one cannot be decoded or is too large."""
+    """Yield frames as 8-bit sRGB, each with its duration in milliseconds.
+
+    Raises InputError if a frame cannot be decoded or has too many pixels.
+    """
     if is_cut_off(data):
         raise InputError(path, "", undecodable(data))
     try:
@@ -96,9 +108,17 @@ def _decoded(path: Path, data: bytes, frames: tuple[int, ...], background: Colou
 
 
 def rgb_of(image: Any, source: object, *, background: Colour = WHITE) -> U8:
-    """Convert Pillow's decoded image to (h, w, 3) 8-bit sRGB over a colour.
+    """Convert a decoded Pillow image to 8-bit sRGB, shape (h, w, 3).
 
-    Applies the EXIF orientation and colour profile. Raises InputError if its values have no defined range.
+    The conversion applies the EXIF orientation and the colour profile of the image.
+
+    Args:
+        image: Decoded Pillow image.
+        source: File to name in messages.
+        background: Colour behind transparent parts.
+
+    Raises:
+        InputError: The image has 32-bit values without a defined range.
     """
     profile = image.info.get("icc_profile")
     image = _upright(image)
@@ -111,7 +131,7 @@ def rgb_of(image: Any, source: object, *, background: Colour = WHITE) -> U8:
     is_clear = image.has_transparency_data
     behind = np.array([round(value * 255) for value in background], np.uint16)
     result = np.empty((image.height, image.width, 3), np.uint8)
-    for first in range(0, image.height, ROWS_AT_ONCE):  # intermediate values need several times the picture's memory
+    for first in range(0, image.height, ROWS_AT_ONCE):  # intermediate values need several times the result's memory
         rows = slice(first, min(first + ROWS_AT_ONCE, image.height))
         part = _eight_bits(image.crop((0, rows.start, image.width, rows.stop)))
         alpha = np.asarray(part.convert("RGBA"))[..., 3:] if is_clear else None
@@ -123,20 +143,26 @@ def rgb_of(image: Any, source: object, *, background: Colour = WHITE) -> U8:
 
 
 def composed(colour: U8, alpha: U8, behind: Any) -> U8:
-    """Return colour·a + behind·(1 - a), rounded."""
+    """Compose a picture over a background, colour·a + behind·(1 - a), with rounding.
+
+    Args:
+        colour: Picture, shape (h, w, 3).
+        alpha: Opacity a times 255, shape (h, w, 1).
+        behind: Background colour in code values, shape (3,).
+    """
     mixed = colour.astype(np.uint16) * alpha + behind.astype(np.uint16) * (255 - alpha.astype(np.uint16))  # < 65,026
     return np.asarray((mixed + 127) // 255, np.uint8)
 
 
 def _upright(image: Any) -> Any:
-    with suppress(Exception):  # ignore malformed entries
+    with suppress(Exception):  # ignore malformed EXIF data
         if image.getexif().get(ORIENTATION, 1) != 1:
             return ImageOps.exif_transpose(image)
     return image
 
 
 def _eight_bits(image: Any) -> Any:
-    """Return the upper byte of 16-bit channels."""
+    """Reduce 16-bit channels to the upper 8 bits. Other images are returned unchanged."""
     if image.mode == "I":
         return Image.fromarray((np.asarray(image).clip(0, 65535) >> 8).astype(np.uint8))
     if image.mode in DEEP:
@@ -145,7 +171,15 @@ def _eight_bits(image: Any) -> Any:
 
 
 def _to_srgb(profile: bytes, colours: str, source: object) -> Any:
-    """Return a function that converts from a profile to sRGB, or None for sRGB or a broken profile."""
+    """Return a function that converts images from a colour profile to sRGB.
+
+    The result is None if no conversion is needed, because the profile is broken or close to sRGB.
+
+    Args:
+        profile: ICC profile.
+        colours: Mode of the Pillow images to convert: `L`, `RGB` or `CMYK`.
+        source: File to name in messages.
+    """
     try:
         transform = ImageCms.buildTransform(
             ImageCms.ImageCmsProfile(io.BytesIO(profile)),

@@ -1,4 +1,4 @@
-"""Headers of picture files, which are read and checked against the limits before decoding."""
+"""Read the headers of picture files, and check them against the limits before decoding."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from runtime.support.leia import other_view
 from runtime.support.untrusted_input import LIMITS
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
-PNG_DEPTH = slice(24, 25)  # position of a PNG's bit depth
-CHUNK_BYTES = 12  # overhead of a PNG chunk: length, kind, checksum
-SIDE_MAX_PX = 1 << 16  # maximum side that a header may declare
-# Pillow's names. EPS is excluded, because Pillow would start Ghostscript. Pillow identifies an MPO as JPEG.
+PNG_DEPTH = slice(24, 25)  # position of the bit depth in a PNG
+CHUNK_BYTES = 12  # overhead of a PNG chunk: length, kind and checksum
+SIDE_MAX_PX = 1 << 16  # maximum width and height that a header may declare
+# Pillow's names of the supported formats. EPS is excluded, because Pillow would start Ghostscript. JPEG includes MPO.
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "PPM", "TGA", "AVIF")
 ANIMATED = ("GIF", "PNG", "WEBP", "AVIF")
 ORIENTATION = 0x0112  # EXIF tag
-TURNED = (5, 6, 7, 8)  # quarter turns, which exchange width and height
-MP_ENTRIES, MP_NUMBER = 0xB002, 0xB101  # tags of an MPO: its pictures; a picture's viewpoint, counted from the left
+TURNED = (5, 6, 7, 8)  # EXIF orientations with a quarter turn, which exchanges width and height
+MP_ENTRIES, MP_NUMBER = 0xB002, 0xB101  # MPO tags: list of pictures, and viewpoint of a picture (counted from the left)
 DISPARITY, UNDEFINED = "Multi-Frame Image: (Disparity)", "Undefined"
-JPS, JPS_BYTES = b"_JPSJPS_", 14  # marker of a stereo header, and offset of its layout field
+JPS, JPS_BYTES = b"_JPSJPS_", 14  # marker and minimum length of a stereo header
 JPS_LAYOUTS = {2: "side-by-side", 3: "top-bottom", 4: "anaglyph"}
 JPS_HALF_HEIGHT, JPS_HALF_WIDTH, JPS_LEFT_FIRST = 1, 2, 4
 GAIN_MAP = (b"hdrgm", b"21496-1")  # markers of a gain map, a second picture that contains only brightness
-HEAD_BYTES = 512  # number of bytes read to identify a file
+HEAD_BYTES = 512  # number of bytes at the beginning of a file that identify the file's kind
 UNDECODED = "is not an image that can be decoded"
 ANOTHER = "save it as PNG, JPEG or AVIF"
 CAMERA_SET = "such a scene is trained first; its splats (.ply) are drawn, and its folder of pictures as a slideshow"
-RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")  # most are also TIFFs
+RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")  # mostly TIFF files
 RAW_KIND = "a camera's raw picture", "develop it and save it as JPEG"
-OTHER_KINDS = (  # unsupported formats: offset and value of the marker, name, remedy
+OTHER_KINDS = (  # unsupported formats, each with the offset and value of its marker, its name and a remedy
     (0, b"\xff\x0a", "JPEG XL", f"{ANOTHER} (djxl in.jxl out.png)"),
     (4, b"JXL \r\n", "JPEG XL", f"{ANOTHER} (djxl in.jxl out.png)"),
     (0, b"v/1\x01", "OpenEXR", "its values have no fixed range: tone-map it and save it as PNG"),
@@ -67,22 +67,26 @@ OTHER_KINDS = (  # unsupported formats: offset and value of the marker, name, re
 class Header:
     """Properties of a picture file that are known without decoding it."""
 
-    kind: str  # Pillow's name for the format
+    kind: str  # Pillow's name of the format
     width_px: int
     height_px: int
-    views: tuple[int, ...]  # indices of the frames: the one to show, or the left and the right eye's
+    views: tuple[int, ...]  # index of the frame to show, or indices of the left and right eye's frames
     is_animated: bool
-    is_around: bool = False  # True if its XMP declares a sphere of 360 by 180 degrees
-    warning: str = ""  # such as a missing second view
-    layout: str = ""  # arrangement of the views in one picture, from its stereo header
-    other: slice | None = None  # bytes of a Leia picture's other view
+    is_around: bool = False  # True if the XMP data declare a full sphere (equirectangular projection)
+    warning: str = ""  # warning for the user, such as a missing second view; empty: none
+    layout: str = ""  # arrangement of two views in one picture, from a JPEG's stereo header; empty: none
+    other: slice | None = None  # range of bytes of the second view in a Leia picture
 
 
 @contextmanager
 def opened(coded: bytes | IO[bytes]) -> Iterator[Any]:
-    """Open a picture with Pillow without decoding it.
+    """Open a picture with Pillow without decoding the pixels, and yield the Pillow image.
 
-    Pillow's own limits are off, because the caller applies stricter ones. Raises any exception of Pillow's formats.
+    Pillow's limits are disabled, because the callers apply stricter limits. Each of Pillow's formats raises exceptions
+    of different classes for invalid pictures.
+
+    Args:
+        coded: Encoded picture or an open file.
     """
     from PIL import Image
 
@@ -99,7 +103,7 @@ def opened(coded: bytes | IO[bytes]) -> Iterator[Any]:
 
 @cache
 def _formats() -> tuple[str, ...]:
-    """Return the names of supported Pillow formats, with HEIC if the extra `heic` is installed."""
+    """Return Pillow's names of the supported formats, including HEIF if the extra `heic` is installed."""
     if importlib.util.find_spec("pillow_heif") is None:
         return FORMATS
     import pillow_heif
@@ -109,12 +113,17 @@ def _formats() -> tuple[str, ...]:
 
 
 def _header_of(path: Path, coded: bytes | IO[bytes]) -> Header:
-    """Return the header of a picture, read from its bytes or the open file.
+    """Read the header of a picture.
 
-    If an MPO does not declare its second picture as a view, it counts as one only in a file named .mpo.
-    Raises InputError for a camera's raw picture, and for one that cannot be decoded or exceeds the size limit.
+    Args:
+        path: Picture file. Only for the suffix .mpo, a second picture of undefined type counts as an eye's view.
+        coded: Content of the file, or the open file.
+
+    Raises:
+        InputError: The file is a camera's raw picture, the header cannot be decoded, or the picture has too many
+            pixels.
     """
-    if path.suffix.lower() in RAW:  # of a TIFF, Pillow would show the thumbnail
+    if path.suffix.lower() in RAW:  # many raw files are TIFFs, of which Pillow would show only the thumbnail
         raise InputError(path, "", "is {}, which is not supported: {}".format(*RAW_KIND))
     try:
         with opened(coded) as image:
@@ -128,7 +137,7 @@ def _header_of(path: Path, coded: bytes | IO[bytes]) -> Header:
                 other, views = found[0], (1, 0) if found[1] else (0, 1)
             kind = image.format
         head = _beginning(coded, HEAD_BYTES)
-    except Exception as error:  # each of Pillow's formats raises its own
+    except Exception as error:  # each of Pillow's formats raises exceptions of different classes
         raise InputError(path, "", undecodable(_beginning(coded, LIMITS.file_bytes), error)) from None
     check_size(width, height, source=path, head=head)
     return Header(kind, width, height, views, is_animated, is_around, warning, layout, other)
@@ -142,9 +151,16 @@ def _beginning(coded: bytes | IO[bytes], most_bytes: int) -> bytes:
 
 
 def _views(image: Any, *, is_named_so: bool) -> tuple[tuple[int, ...], str]:
-    """Return the indices of the frames for the left and right eye, or of the only one, and a warning.
+    """Find the frames that show the left and the right eye's view.
 
-    A second picture is an eye's view only if the file declares it as one and if it is as large as the first.
+    A second picture counts as a view only if the file declares a stereo pair and both pictures have the same size.
+
+    Args:
+        image: Opened Pillow image.
+        is_named_so: Also accept an MPO whose second picture has an undefined type, because the file's suffix is .mpo.
+
+    Returns:
+        Indices of the left and right frame, or the index of a single frame, and a warning, which may be empty.
     """
     shown = (image.tell(),)
     if image.format == "HEIF":
@@ -160,7 +176,7 @@ def _views(image: Any, *, is_named_so: bool) -> tuple[tuple[int, ...], str]:
     size = image.size
     try:
         image.seek(1)
-    except Exception:  # as every decoder's
+    except Exception:  # each of Pillow's decoders raises exceptions of different classes
         return (0,), "its second picture is missing: both eyes see the first one"
     extra = b"".join(content for _, content in image.applist)
     if image.size != size or image.layers != 3 or any(mark in extra for mark in GAIN_MAP):
@@ -169,7 +185,12 @@ def _views(image: Any, *, is_named_so: bool) -> tuple[tuple[int, ...], str]:
 
 
 def _leia_view(coded: bytes | IO[bytes], size: tuple[int, int]) -> tuple[slice, bool] | None:
-    """Return the result of `other_view`, or None if the other view is not a picture of the same size."""
+    """Return the result of `other_view`, or None if the second view is not a picture of the given size.
+
+    Args:
+        coded: Encoded picture or an open file.
+        size: Width and height of the first view.
+    """
     file = io.BytesIO(coded) if isinstance(coded, bytes) else coded
     if found := other_view(file):
         file.seek(found[0].start)
@@ -180,7 +201,10 @@ def _leia_view(coded: bytes | IO[bytes], size: tuple[int, int]) -> tuple[slice, 
 
 
 def _jps_layout(image: Any) -> str:
-    """Return the layout in a JPEG's stereo header (JPS), as in `content.layout`, or an empty string."""
+    """Return the layout that a JPEG's stereo header (JPS) declares, or an empty string.
+
+    The result is a value of the setting `content.layout`.
+    """
     for name, data in getattr(image, "applist", ()):
         if name == "APP3" and data[:8] == JPS and len(data) >= JPS_BYTES:
             flags, kind, is_stereo = data[11], JPS_LAYOUTS.get(data[12], ""), data[13] == 1
@@ -205,10 +229,10 @@ def _size_of(image: Any, frame: int) -> tuple[int, int]:
 
 
 def _viewpoint(image: Any) -> int | None:
-    """Return the number of a frame's viewpoint in an MPO, where 1 is leftmost, or None if unknown."""
+    """Return the viewpoint number of an MPO's current frame, or None if unknown. Number 1 is leftmost."""
     from PIL import TiffImagePlugin
 
-    with suppress(Exception):  # a malformed table has no number
+    with suppress(Exception):  # treat a malformed table like a missing number
         file = io.BytesIO(image.info["mp"])
         table = TiffImagePlugin.ImageFileDirectory_v2(file.read(8))
         file.seek(struct.unpack((">" if file.getvalue()[:1] == b"M" else "<") + "L", file.getvalue()[4:8])[0])
@@ -218,20 +242,27 @@ def _viewpoint(image: Any) -> int | None:
 
 
 def picture_size(coded: bytes) -> tuple[int, int]:
-    """Return the stored width and height of an encoded picture.
+    """Return the stored width and height of an encoded picture, without applying the EXIF orientation.
 
-    Raises ValueError if its header cannot be decoded.
+    Raises ValueError if the header cannot be decoded.
     """
     try:
         with opened(coded) as image:
             width, height = image.size
             return width, height
-    except Exception as error:  # each of Pillow's formats raises its own
+    except Exception as error:  # each of Pillow's formats raises exceptions of different classes
         raise ValueError(undecodable(coded, error)) from None
 
 
 def undecodable(data: bytes, error: Exception | None = None) -> str:
-    """Return why a picture cannot be decoded: an unsupported format, with a remedy, or a damaged file."""
+    """Return the reason why a picture cannot be decoded, as the end of a message.
+
+    The reason is an unsupported format, with a remedy, or a damaged file.
+
+    Args:
+        data: Encoded picture.
+        error: Exception that Pillow raised, if any.
+    """
     from PIL import UnidentifiedImageError
 
     if not data:
@@ -253,7 +284,7 @@ def undecodable(data: bytes, error: Exception | None = None) -> str:
 
 
 def _promises_more(data: bytes) -> bool:
-    """Return True if a WebP, or a box of an AVIF or HEIC, declares more bytes than the file has."""
+    """Return True if a WebP, AVIF or HEIC picture declares more bytes than the file contains."""
     if data[:4] == b"RIFF":
         return 8 + int.from_bytes(data[4:8], "little") > len(data)
     place = 0
@@ -266,9 +297,10 @@ def _promises_more(data: bytes) -> bool:
 
 
 def is_cut_off(coded: bytes) -> bool:
-    """Return True if the chunks of a PNG exceed the file or its end is missing. False for other formats.
+    """Return True if a PNG is incomplete: a chunk exceeds the file or the last chunk is missing.
 
-    OpenCV allocates the declared size before reading, up to 2 GiB for a file of any size.
+    The result is False for other formats. OpenCV would allocate the size that the header of an incomplete picture
+    declares, up to 2 GiB for a file of any size.
     """
     if not coded.startswith(PNG):
         return False
@@ -282,9 +314,9 @@ def is_cut_off(coded: bytes) -> bool:
 
 
 def _orientation(image: Any) -> int:
-    """Return the EXIF orientation stored before the pixels. Pillow rotates TIFF itself.
+    """Return the EXIF orientation that is stored before the pixels, or 1.
 
-    Pillow's `getexif` is not used, because it would unpack a PNG.
+    Pillow rotates TIFF pictures itself. Pillow's `getexif` is not suitable, because it would decompress a whole PNG.
     """
     from PIL import Image
 
@@ -301,9 +333,20 @@ def _orientation(image: Any) -> int:
 def check_size(
     width_px: int, height_px: int, *, source: str | Path, field: str = "", name: str = "", head: bytes = b""
 ) -> None:
-    """Raise InputError for more pixels than the limit, half of it for a PNG with 16 bits per channel.
+    """Check the size of a picture against the limits.
 
-    name: the picture's name within `source`. head: beginning of the coded picture, if known.
+    A PNG with 16 bits per channel may have half as many pixels as other pictures.
+
+    Args:
+        width_px: Width of the picture.
+        height_px: Height of the picture.
+        source: File to name in messages.
+        field: Field of the file to name in messages.
+        name: Name of the picture within the file.
+        head: Beginning of the encoded picture, from which 16 bits per channel are recognized.
+
+    Raises:
+        InputError: The picture has more pixels than allowed, or one side is longer than SIDE_MAX_PX.
     """
     is_deep = head.startswith(PNG) and head[PNG_DEPTH] == b"\x10"
     most = LIMITS.pixels // (2 if is_deep else 1)
@@ -313,7 +356,17 @@ def check_size(
 
 
 def decoded_picture(coded: bytes, *, source: str | Path, field: str, name: str) -> Any:
-    """Decode a picture. Raises InputError if it is damaged, incomplete or exceeds the size limit."""
+    """Decode a picture that is part of a file, and return the Pillow image.
+
+    Args:
+        coded: Encoded picture.
+        source: File to name in messages.
+        field: Field of the file to name in messages.
+        name: Name of the picture within the file.
+
+    Raises:
+        InputError: The picture is damaged or incomplete, or has too many pixels.
+    """
     try:
         width, height = picture_size(coded)
         check_size(width, height, source=source, field=field, name=name, head=coded)
@@ -322,20 +375,25 @@ def decoded_picture(coded: bytes, *, source: str | Path, field: str, name: str) 
             return image
     except InputError:
         raise
-    except Exception as error:  # each of Pillow's decoders raises its own
+    except Exception as error:  # each of Pillow's decoders raises exceptions of different classes
         raise InputError(source, field, f"{name} {undecodable(coded, error)}") from None
 
 
 def camera_set_in(folder: Path) -> str:
-    """Return why a folder with a camera set cannot be drawn, or an empty string if it has none."""
+    """Return a message if a folder contains a camera set, which cannot be drawn, else an empty string.
+
+    A camera set is a collection of photos with camera poses, as used to train a NeRF.
+    """
     sets = sorted(folder.glob("transforms*.json"))
     return f"holds a camera set, as used for a NeRF ({sets[0].name}): {CAMERA_SET}" if sets else ""
 
 
 def read_coded(path: Path) -> tuple[bytes, Header]:
-    """Read a picture file without decoding it, and check its header.
+    """Read the bytes of a picture file, and read and check the header.
 
-    Raises InputError if the file cannot be read, its header is refused, or it is a folder with a camera set.
+    Raises:
+        InputError: The file cannot be read, is not a supported picture or exceeds a limit, or the path is a folder with
+            a camera set.
     """
     if untrusted_input.is_there(path, folder=True) and (problem := camera_set_in(path)):
         raise InputError(path, "", problem)
@@ -344,9 +402,9 @@ def read_coded(path: Path) -> tuple[bytes, Header]:
 
 
 def header_of_file(path: Path) -> Header:
-    """Return the header of a picture file.
+    """Read and check the header of a picture file.
 
-    Raises InputError if the file cannot be read, is not a supported picture or exceeds the limit of pixels.
+    Raises InputError if the file cannot be read, is not a supported picture, or exceeds a limit.
     """
     with untrusted_input.open_regular(path, most_bytes=LIMITS.file_bytes) as file:
         return _header_of(path, file)

@@ -1,4 +1,4 @@
-"""Classes of the user's, named `module:Class`, such as `mypackage.tunnel:Tunnel`."""
+"""Plugins: Python classes of users, named `module:Class`, such as `mypackage.tunnel:Tunnel`."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ PLUGIN = re.compile(r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*:[A-Za-z_]\w*", re.ASCII)
 
 
 def is_plugin(name: str) -> bool:
-    """Return True for `module:Class`."""
+    """Return True if a name has the form `module:Class`."""
     return PLUGIN.fullmatch(name) is not None
 
 
 def located(name: str, folder: Path) -> str:
-    """Resolve a relative path against a folder.
+    """Resolve a setting that may be a relative path against a folder.
 
     Names (words without slash and suffix), URLs (`rtsp://...`) and classes (`module:Class`) are returned unchanged.
     """
@@ -33,14 +33,21 @@ def located(name: str, folder: Path) -> str:
 
 
 def plugin_class(name: str, base: type, *, field: str) -> Any:
-    """Import the class `module:Class`, named by the setting `field`.
+    """Import the class of a plugin.
 
-    Raises InputError if it is missing or not derived from `base`.
+    Args:
+        name: Name of the class, in the form `module:Class`.
+        base: Class from which the plugin has to be derived.
+        field: Setting to name in messages.
+
+    Raises:
+        InputError: The module cannot be imported, or does not contain a class of that name derived from `base`.
+        MissingPart: The module needs an optional package that an extra of phasestack installs.
     """
     module, _, attribute = name.partition(":")
     try:
         plugin = getattr(importlib.import_module(module), attribute, None)
-    except (Exception, SystemExit) as error:  # any exception of the module
+    except (Exception, SystemExit) as error:  # the module may raise any exception
         if missing := missing_extra(error):
             raise missing from None
         problem = one_line(f"{type(error).__name__}: {error}")
@@ -52,7 +59,10 @@ def plugin_class(name: str, base: type, *, field: str) -> Any:
 
 
 def strict(options: type[BaseModel]) -> type[BaseModel]:
-    """Make the options of a plugin refuse unknown keys, unless the class sets `extra`."""
+    """Return a variant of a plugin's options that rejects unknown keys.
+
+    A class whose model configuration sets `extra` is returned unchanged.
+    """
     if "extra" in options.model_config:
         return options
     return type(options.__name__, (options,), {"__module__": __name__, "model_config": {"extra": "forbid"}})

@@ -1,7 +1,7 @@
-"""Progress of long work, reported to an optional listener that may stop the work.
+"""Report the progress of long work to an optional listener, which may stop the work.
 
 Functions call `tell` as they proceed, and `listening` installs a listener. An exception in the listener ends the work,
-so a signal takes effect within one step.
+which limits the reaction time to a signal to one step of the work.
 """
 
 from __future__ import annotations
@@ -13,15 +13,23 @@ from contextvars import ContextVar
 from typing import Any, TextIO, TypeVar
 
 T = TypeVar("T")
-NOW_AND_THEN_S = 10.0  # interval between lines if stderr is not a terminal
+NOW_AND_THEN_S = 10.0  # interval between two lines if the stream is not a terminal
 
-Listener = Callable[[str, int, int | None], None]  # task, steps done, total steps or None if unknown
+# Function that receives the name of the task (empty: the task has ended), the number of finished steps, and the total
+# number of steps (None: unknown).
+Listener = Callable[[str, int, int | None], None]
 
 _LISTENER: ContextVar[Listener | None] = ContextVar("progress", default=None)
 
 
 def tell(what: str, done: int, total: int | None = None) -> None:
-    """Report that `done` of `total` steps are done."""
+    """Report progress to the listener, if there is one. Exceptions of the listener propagate.
+
+    Args:
+        what: Name of the task. An empty name reports the end of the task.
+        done: Number of finished steps.
+        total: Total number of steps, or None if unknown.
+    """
     listener = _LISTENER.get()
     if listener is not None:
         listener(what, done, total)
@@ -29,9 +37,14 @@ def tell(what: str, done: int, total: int | None = None) -> None:
 
 @contextmanager
 def task(what: str, *, seconds: float, too_slow: Exception) -> Iterator[None]:
-    """Report the beginning (0 done) and end (empty name) of a task with a time limit.
+    """Report the beginning and the end of the task within the block, and limit the time of the task.
 
-    After the limit, `tell` within the task raises `too_slow`. An outer listener still receives the reports.
+    An outer listener still receives all reports.
+
+    Args:
+        what: Name of the task.
+        seconds: Time limit.
+        too_slow: Exception that `tell` raises within the block after the time limit.
     """
     end, outer = time.monotonic() + seconds, _LISTENER.get()
 
@@ -51,7 +64,7 @@ def task(what: str, *, seconds: float, too_slow: Exception) -> Iterator[None]:
 
 @contextmanager
 def listening(listener: Listener) -> Iterator[None]:
-    """Send this thread's progress reports to a listener within the block."""
+    """Send the progress reports of this thread to a listener within the block."""
     token = _LISTENER.set(listener)
     try:
         yield
@@ -61,7 +74,11 @@ def listening(listener: Listener) -> Iterator[None]:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[[int, int], None]]:
-    """Yield a function (done, total) that updates a progress bar."""
+    """Yield a function that reports the finished and the total number of steps of a task.
+
+    Args:
+        title: Name of the task, shown next to the progress bar.
+    """
     try:
         yield lambda done, total: tell(title, done, total)
     finally:
@@ -70,7 +87,11 @@ def progress_bar(title: str) -> Iterator[Callable[[int, int], None]]:
 
 @contextmanager
 def status_line(title: str) -> Iterator[Callable[[str], None]]:
-    """Yield a function that shows its text as the current step."""
+    """Yield a function that reports a text as the current step of a task.
+
+    Args:
+        title: Name of the task, shown before the text.
+    """
     try:
         yield lambda text: tell(f"{title}: {text}", 0)
     finally:
@@ -78,7 +99,7 @@ def status_line(title: str) -> Iterator[Callable[[str], None]]:
 
 
 def tracked(title: str, items: Sequence[T]) -> Iterator[T]:
-    """Yield the items while showing a progress bar."""
+    """Yield the items of a sequence, and report progress after each item."""
     with progress_bar(title) as update:
         for number, item in enumerate(items, start=1):
             yield item
@@ -86,7 +107,7 @@ def tracked(title: str, items: Sequence[T]) -> Iterator[T]:
 
 
 class ShownProgress:
-    """Listener that shows long tasks as a bar on a terminal, otherwise as occasional lines."""
+    """Listener that shows long tasks as a bar on a terminal and as occasional lines on other streams."""
 
     def __init__(self, stream: TextIO, *, after_s: float = 1.0, now_and_then_s: float = NOW_AND_THEN_S) -> None:
         self._stream, self._after_s, self._now_and_then_s = stream, after_s, now_and_then_s

@@ -1,15 +1,15 @@
-"""Ranges of numbers in settings, options and files. Cheap to import."""
+"""Ranges of numbers in settings, options and files. The module imports no heavy packages."""
 
 from __future__ import annotations
 
 import math
 
 EYE_MOST_M = 50.0  # largest absolute coordinate of an eye
-SEPARATION_MIN_M = 0.005  # minimum distance between two eyes; the tracker checks for a person's
-FOV_RANGE_DEG = (0.1, 179.0)  # horizontal field of view of a picture
-RECORD_MOST_S = 604_800.0  # a week
-SCALE = (1e-6, 1e6)  # range of scales between two frames' units, from micrometres to metres and back
-# Units used by mistake, with factor and name, by the proper unit.
+SEPARATION_MIN_M = 0.005  # minimum distance between two eyes; the tracker requires a plausible distance for a person
+FOV_RANGE_DEG = (0.1, 179.0)  # range of a picture's horizontal field of view
+RECORD_MOST_S = 604_800.0  # maximum length of a recording, one week
+SCALE = (1e-6, 1e6)  # range of scales between the units of two frames, which allows metres and micrometres
+# Units that are often used by mistake, by the proper unit. Each has the factor to the proper unit and a name.
 OTHER_UNITS = {
     "m": ((1e-3, "millimetres"), (1e-2, "centimetres")),
     "s": ((1e-3, "milliseconds"),),
@@ -18,10 +18,17 @@ OTHER_UNITS = {
 
 
 def refusal(value: float, low: float, high: float, unit: str = "") -> str:
-    """Return an error message for a number outside [low, high], both finite, or an empty string.
+    """Return an error message for a number out of range, or an empty string for a number in range.
 
-    >>> refusal(518.4, 0.005, 20.0, "m")
-    '518.4 m is beyond 20 m: did you mean millimetres (0.5184)?'
+    Args:
+        value: Number to check.
+        low: Smallest valid number, finite.
+        high: Largest valid number, finite.
+        unit: Unit of the number. For m, s and ms, the message suggests a smaller unit if it makes the number valid.
+
+    Examples:
+        >>> refusal(518.4, 0.005, 20.0, "m")
+        '518.4 m is beyond 20 m: did you mean millimetres (0.5184)?'
     """
     if low <= value <= high:
         return ""

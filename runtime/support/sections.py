@@ -1,4 +1,4 @@
-"""Reader and validation of TOML and JSON tables, with errors that name the field."""
+"""Read and validate tables in TOML and JSON files, with errors that name the field."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from runtime.support import untrusted_input
 from runtime.support.plausible import check_text, nearest
 
 TABLE_BYTES_MAX = 4 << 20
-KEY_PARTS_MAX = 16  # maximum parts of a dotted key, because tomllib's time and memory grow with their square
+KEY_PARTS_MAX = 16  # maximum number of parts of a dotted key; tomllib's time and memory grow with the square
 STRINGS_AND_COMMENTS = re.compile(
     r'''"""(?:[^\\]|\\.)*?"""|\'{3}.*?\'{3}|"(?:[^"\\\n]|\\.)*"|'[^'\n]*'|#[^\n]*''', re.DOTALL
 )
@@ -23,7 +23,10 @@ M = TypeVar("M", bound=BaseModel)
 
 
 class Section(BaseModel):
-    """Frozen table without unknown keys, whose numbers are finite and texts are valid names or paths."""
+    """Base of the records that tables are validated against.
+
+    Records are frozen. Unknown keys, non-finite numbers and texts that are neither names nor paths are rejected.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -34,7 +37,11 @@ class Section(BaseModel):
 
 
 def read_table(path: Path) -> dict[str, Any]:
-    """Read the table in a TOML or JSON file. Raises InputError that names the file and the line."""
+    """Read the table in a TOML or JSON file.
+
+    Raises InputError if the file cannot be read, is malformed or contains another JSON value than an object. For a
+    malformed file, the message names the line.
+    """
     text = untrusted_input.read_text(path, most_bytes=TABLE_BYTES_MAX)
     table = untrusted_input.parsed_json(text, source=path) if path.suffix.lower() == ".json" else _toml(text, path)
     if not isinstance(table, dict):
@@ -55,9 +62,16 @@ def _toml(text: str, path: Path) -> Any:
 
 
 def validated(model: type[M], table: dict[str, Any], *, source: str | Path, folder: Path | None = None) -> M:
-    """Return the table as a validated record. Raises InputError that names every wrong field.
+    """Validate a table and return the record.
 
-    folder: base for relative paths (`runtime.config.paths`), which stay unchanged without it.
+    Args:
+        model: Class of the record.
+        table: Table to validate.
+        source: File to name in messages.
+        folder: Folder against which relative paths are resolved (`runtime.config.paths`). None: leave paths unchanged.
+
+    Raises:
+        InputError: A field is invalid, missing or unknown. The message names every such field.
     """
     try:
         return model.model_validate(table, context=folder)
@@ -68,19 +82,19 @@ def validated(model: type[M], table: dict[str, Any], *, source: str | Path, fold
 
 
 def _wrong_field(model: type[BaseModel], error: Any) -> tuple[str, str]:
-    """Return the full name of the field in an error from pydantic, and the problem."""
+    """Return the full name of the field that an error from pydantic concerns, and the problem."""
     name = ".".join(str(part) for part in error["loc"])
     message = error["msg"].removeprefix("Value error, ")
     if error["type"] == "extra_forbidden":
         return name, "is not a setting" + nearest(str(error["loc"][-1]), _keys(model, error["loc"][:-1]))
     field, colon, rest = message.partition(": ")
     if colon and error["type"] == "value_error" and field.partition(".")[0] in _keys(model, error["loc"]):
-        return ".".join(filter(None, (name, field))), rest  # a rule about several fields
+        return ".".join(filter(None, (name, field))), rest  # error of a rule about several fields
     return name, message
 
 
 def _keys(model: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
-    """Return the allowed keys of the table at a path."""
+    """Return the allowed keys of the table at a path of keys within a record."""
     table: Any = model
     for part in path:
         if isinstance(part, str) and part in getattr(table, "model_fields", ()):

@@ -1,4 +1,4 @@
-"""Parallel loops over work that releases Python's lock (numpy, OpenCV, C++)."""
+"""Parallel loops for work that releases Python's global lock (NumPy, OpenCV, C++)."""
 
 from __future__ import annotations
 
@@ -10,36 +10,45 @@ from typing import TypeVar
 
 import cv2
 
-PIECE_ROWS = 128  # picture rows per item where `parallel_map` splits a picture
+PIECE_ROWS = 128  # number of picture rows per item if `parallel_map` is used on parts of a picture
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
 def parallel_map(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    """Call `work` on every item, on as many threads as OpenCV may use. Its exceptions propagate."""
+    """Call `work` on every item in parallel, and return the results in the order of the items.
+
+    The number of threads is that of OpenCV. Exceptions of `work` propagate.
+    """
     threads = cv2.getNumThreads()
     if threads < 2 or len(items) < 2:
         return [work(item) for item in items]
     others = [_pool(threads).submit(work, item) for item in items[1:]]
     try:
-        first = work(items[0])  # on this thread, to wake one thread less
+        first = work(items[0])  # runs on this thread, which saves waking another thread
     finally:
         wait(others)
     return [first, *(other.result() for other in others)]
 
 
 def on_rows(work: Callable[[int, int], None], rows: int, *, threads: int | None = None) -> None:
-    """Split `rows` among `threads` (default: OpenCV's) and call `work(begin, end)` in parallel."""
+    """Split a range of rows into equal parts, and call `work(begin, end)` for the parts in parallel.
+
+    Args:
+        work: Function that processes the rows from `begin` up to but excluding `end`.
+        rows: Total number of rows.
+        threads: Number of parts, by default OpenCV's number of threads.
+    """
     parts = threads or max(1, cv2.getNumThreads())
     parallel_map(lambda span: work(*span), list(pairwise(rows * part // parts for part in range(parts + 1))))
 
 
 def fresh_threads() -> None:
-    """Have `parallel_map` start new threads, which inherit the niceness of its next caller."""
+    """Make the next call of `parallel_map` start new threads, which inherit the niceness of the caller."""
     _pool.cache_clear()
 
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """Return the thread pool, which is kept because starting a thread takes two milliseconds."""
+    """Return the thread pool. Starting a thread takes 2 ms, so the pool is kept between calls."""
     return ThreadPoolExecutor(threads, "parallel-map")

@@ -1,7 +1,7 @@
-"""Reader for untrusted input (paths, files, JSON, numbers) within limits.
+"""Read untrusted input (paths, files, JSON, numbers) within limits.
 
-All untrusted bytes are read with this module. Faults raise InputError with one line that names the file, the field and,
-if it is exceeded, the limit.
+All untrusted bytes are read with this module. For invalid input, the functions raise InputError with a one-line message
+that names the file, the field and, if applicable, the limit that was exceeded.
 """
 
 from __future__ import annotations
@@ -16,37 +16,43 @@ from typing import IO, Any
 
 from runtime.errors import InputError
 
-JSON_DEPTH_MAX = 64  # depth of nested objects, well within Python's recursion limit
-JSON_BYTES_MAX = 64 << 20  # size of a JSON file
-DIGITS_MAX = 19  # digits of a 63-bit number
+JSON_DEPTH_MAX = 64  # maximum depth of nested objects, well within Python's recursion limit
+JSON_BYTES_MAX = 64 << 20  # maximum size of a JSON file
+DIGITS_MAX = 19  # maximum number of decimal digits, as in a 63-bit number
 MIB = 1 << 20
 
 
 @dataclass(slots=True)
 class Limits:
-    """Limits for files from outside, checked before memory is allocated."""
+    """Limits for untrusted files, which are checked before memory is allocated."""
 
-    file_bytes: int = 1 << 30  # one file of content or of a recording
-    pixels: int = 134_217_728  # pixels of one picture: 16384 x 8192
-    texture_pixels: int = 134_217_728  # pixels of all pictures of a scene together
-    triangles: int = 2_000_000  # triangles of a scene, all instances together
+    file_bytes: int = 1 << 30  # size of a file of content or of a recording
+    pixels: int = 134_217_728  # number of pixels of one picture: 16384 x 8192
+    texture_pixels: int = 134_217_728  # total number of pixels of all pictures in a scene
+    triangles: int = 2_000_000  # number of triangles in a scene, summed over all instances
     splats: int = 3_000_000
-    instances: int = 2000  # placed meshes in a glTF scene
-    json_values: int = 4_000_000  # values in one JSON text, which take a gigabyte in Python
-    depth: int = 64  # nesting depth of JSON or a glTF scene
-    load_s: float = 120.0  # time limit of loading one piece of content
-    start_s: float = 600.0  # time limit of a start: content and model
-    recording_s: float = 21_600.0  # longest recording that is replayed
-    chunk_bytes: int = 32 << 20  # one chunk or message of a recording, unpacked
+    instances: int = 2000  # number of placed meshes in a glTF scene
+    json_values: int = 4_000_000  # number of values in one JSON text, which take a gigabyte in Python
+    depth: int = 64  # nesting depth of JSON or of a glTF scene
+    load_s: float = 120.0  # time for loading one piece of content
+    start_s: float = 600.0  # time for a start, which loads content and model
+    recording_s: float = 21_600.0  # length of a recording that is replayed
+    chunk_bytes: int = 32 << 20  # unpacked size of one chunk or message of a recording
 
 
 LIMITS = Limits()  # not configurable; tests lower them
 
 
 def checked_path(path: str | Path, *, source: str | Path = "", field: str = "") -> Path:
-    """Check that a path, which need not exist, is valid on this system. Raises InputError if not.
+    """Check that a path is valid on this system, and return the path, which need not exist.
 
-    source, field: file and setting that contain the path, for the error message. The default is the path itself.
+    Args:
+        path: Path to check.
+        source: File to name in messages, by default the path itself.
+        field: Setting or field to name in messages.
+
+    Raises:
+        InputError: The path is too long, contains a NUL character or is not UTF-8.
     """
     try:
         os.lstat(path)
@@ -59,7 +65,15 @@ def checked_path(path: str | Path, *, source: str | Path = "", field: str = "") 
 
 
 def is_there(path: str | Path, *, folder: bool = False) -> bool:
-    """Return True if a file or folder exists at a path. Raises InputError if that cannot be determined."""
+    """Return True if a path exists.
+
+    Args:
+        path: Path to check.
+        folder: Also require that the path is a folder.
+
+    Raises:
+        InputError: The path is invalid, or the system refuses the check.
+    """
     checked = checked_path(path)
     try:
         return checked.is_dir() if folder else checked.exists()
@@ -70,9 +84,19 @@ def is_there(path: str | Path, *, folder: bool = False) -> bool:
 def open_regular(
     path: str | Path, *, most_bytes: int | None = None, source: str | Path = "", field: str = ""
 ) -> IO[bytes]:
-    """Open a regular file for reading. Raises InputError for other kinds of files or large ones.
+    """Open a regular file for reading.
 
-    Opening never waits, as it would for a FIFO without a writer. The check applies to the opened file itself.
+    The function never blocks, unlike `open` on a FIFO without a writer. The checks apply to the open file, which cannot
+    be exchanged in the meantime.
+
+    Args:
+        path: File to open.
+        most_bytes: Maximum size of the file. None: any size.
+        source: File to name in messages, by default the path.
+        field: Setting or field to name in messages.
+
+    Raises:
+        InputError: The file cannot be opened, is not a regular file or is larger than `most_bytes`.
     """
     name = source or str(path)
     checked = checked_path(path, source=source, field=field)
@@ -93,13 +117,16 @@ def open_regular(
 
 
 def read_bytes(path: str | Path, *, most_bytes: int, source: str | Path = "", field: str = "") -> bytes:
-    """Read a whole regular file. Raises InputError if it cannot be read or exceeds `most_bytes`."""
+    """Read a regular file, with the arguments of `open_regular`.
+
+    Raises InputError if the file cannot be read, is not a regular file or is larger than `most_bytes`.
+    """
     name = source or str(path)
     with open_regular(path, most_bytes=most_bytes, source=source, field=field) as file:
         try:
             size = min(os.fstat(file.fileno()).st_size, most_bytes)
             data = file.read(size + 1)  # allocates only the current size
-            if len(data) > size:  # the file has grown meanwhile
+            if len(data) > size:  # the file has grown since it was opened
                 data += file.read(most_bytes + 1 - len(data))
         except OSError as error:
             raise InputError(name, field, f"cannot be read ({error.strerror})") from None
@@ -109,16 +136,16 @@ def read_bytes(path: str | Path, *, most_bytes: int, source: str | Path = "", fi
 
 
 def read_text(path: str | Path, *, most_bytes: int = JSON_BYTES_MAX, source: str | Path = "", field: str = "") -> str:
-    """Read a whole text file.
+    """Read a UTF-8 text file, with the arguments of `open_regular`.
 
-    Raises InputError if it cannot be read, exceeds `most_bytes` or is not UTF-8.
+    Raises InputError if the file cannot be read, is larger than `most_bytes` or is not UTF-8.
     """
     data = read_bytes(path, most_bytes=most_bytes, source=source, field=field)
     return decoded(data, source=source or str(path), field=field)
 
 
 def decoded(data: bytes, *, source: str | Path, field: str = "") -> str:
-    """Decode UTF-8 and drop a byte-order mark. Raises InputError if the data are not UTF-8."""
+    """Decode UTF-8 text and drop a byte-order mark. Raises InputError if the data are not UTF-8."""
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -126,14 +153,23 @@ def decoded(data: bytes, *, source: str | Path, field: str = "") -> str:
 
 
 def read_json(path: str | Path, *, most_bytes: int = JSON_BYTES_MAX) -> Any:
-    """Read a JSON file. Raises InputError if it cannot be read or `parsed_json` refuses it."""
+    """Read a JSON file of at most `most_bytes`.
+
+    Raises InputError if the file cannot be read or `parsed_json` rejects the content.
+    """
     return parsed_json(read_bytes(path, most_bytes=most_bytes), source=path)
 
 
 def parsed_json(text: str | bytes, *, source: str | Path, most_depth: int = JSON_DEPTH_MAX) -> Any:
-    """Parse strict JSON, without NaN or Infinity.
+    """Parse strict JSON, which excludes NaN and Infinity.
 
-    Raises InputError if it is malformed, contains too many values or is nested deeper than `most_depth`.
+    Args:
+        text: JSON text, as a string or in UTF-8.
+        source: File to name in messages.
+        most_depth: Maximum depth of nested lists and objects.
+
+    Raises:
+        InputError: The text is malformed, contains too many values or is nested too deeply.
     """
     data = text if isinstance(text, bytes) else text.encode(errors="surrogatepass")
     within(sum(map(data.count, (b",", b"{", b"["))), LIMITS.json_values, source=source, field="JSON values")
@@ -162,13 +198,13 @@ def _no_constant(name: str) -> float:
 
 
 def _whole(digits: str) -> int | float:
-    # Python refuses more than 4,300 digits with its ValueError, and takes quadratic time below that.
+    # Python raises ValueError for more than 4,300 digits, and needs quadratic time for fewer digits.
     return int(digits) if len(digits) <= 400 else float(digits)
 
 
 def whole_from_text(text: str, *, source: str | Path, field: str) -> int:
-    """Parse a non-negative integer. Raises InputError for other text or too many digits."""
-    # `isdigit` accepts a superscript two, and `int` other scripts' digits.
+    """Parse a non-negative integer. Raises InputError for other text and for more than DIGITS_MAX digits."""
+    # `isdigit` alone accepts a superscript two, and `int` accepts digits of other scripts.
     if not (text.isascii() and text.isdigit()):
         raise InputError(source, field, f"is not a whole number: {shown(text)}")
     if len(text) > DIGITS_MAX:
@@ -177,13 +213,23 @@ def whole_from_text(text: str, *, source: str | Path, field: str) -> int:
 
 
 def within(count: int | float, most: int | float, *, source: str | Path, field: str) -> None:
-    """Raise InputError if a count exceeds its limit."""
+    """Check a count against a limit.
+
+    Args:
+        count: Count to check.
+        most: Limit.
+        source: File to name in messages.
+        field: Name of the counted things for messages, such as `JSON values`.
+
+    Raises:
+        InputError: The count exceeds the limit.
+    """
     if count > most:
         raise InputError(source, field, f"{count:,} exceeds the limit of {most:,}")
 
 
 def shown(value: Any, *, most: int = 40) -> str:
-    """Return an untrusted value in a short, printable form."""
+    """Return an untrusted value as printable text of about `most` characters or fewer."""
     if isinstance(value, int) and value.bit_length() > 256:
         return f"a number of about {int(value.bit_length() * 0.30103) + 1} digits"
     text = value if isinstance(value, str) else repr(value)

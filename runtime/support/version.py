@@ -1,4 +1,4 @@
-"""Version of the installed package."""
+"""Version of the installed phasestack package."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import cache
 
 @cache
 def version() -> str:
-    """Return the version of the installed package, or `unknown` without an installation."""
+    """Return the version of phasestack, or `unknown` if the package is not installed."""
     from importlib.metadata import PackageNotFoundError
     from importlib.metadata import version as installed
 
