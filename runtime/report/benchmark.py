@@ -105,7 +105,7 @@ def measured(
     Args:
         models: Names of the models.
         sizes: Width and height of the panels, in pixels.
-        progress: Function that is called after each measurement with a text that names it.
+        progress: Function that is called after each measurement with a text that names the measurement.
     """
     yardsticks, entries = [yardstick_ms()], []
     methods = [Method(name, "network", name) for name in models]
@@ -144,7 +144,7 @@ class Change:
 def compare(old: RegressionFile, new: RegressionFile) -> list[Change]:
     """Return the changes between two regression files that exceed the noise.
 
-    Times are divided by the yardstick of their file before the comparison. They are not compared if the machine was
+    Times are divided by the yardstick of their file before the comparison. Times are not compared if the machine was
     too busy during one of the measurements (`too_busy`).
     """
     later = {entry.title: entry for entry in new.methods}

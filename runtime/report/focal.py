@@ -1,4 +1,4 @@
-"""Measure focal parallax (supplement, 1.4), with which a finite pupil can focus through the layers.
+"""Measure focal parallax (supplement, 1.4), which lets an eye focus on planes beyond the panels.
 
 The eye sees the mean of the pinhole pictures through all points of its pupil. To focus at a distance f along the gaze,
 these pictures are shifted until they coincide for points at that distance: the picture through the pupil's point
@@ -62,7 +62,7 @@ class FocalStack:
 
 
 def projection(eye_m: F64, point: F64, *, focus_m: float) -> F64:
-    """Return the 3x4 projection to the picture through a point of the pupil, shifted for a focus.
+    """Return the 3x4 projection through a point of the pupil, refocused to a distance.
 
     The third homogeneous coordinate of a projected point is its distance from the eye along the gaze, in metres.
 

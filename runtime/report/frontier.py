@@ -99,7 +99,7 @@ class PairResult:
     run_ms: tuple[float, ...]
     memory_mib: float
     quality: PairQuality
-    psnr_db_off_eye: dict[str, float]  # mean PSNR at displaced eyes, by displacement: "2mm", "4mm", "6mm"
+    psnr_db_off_eye: dict[str, float]  # mean PSNR at displaced eyes, by displacement, such as "2mm"
     viewer: str = ""  # name of the viewer page that shows the layers; empty: not written
 
 
@@ -121,7 +121,7 @@ class MethodResult:
     psnr_db: float
     ssim: float
     worst_eye_psnr_db: float  # worst of all eyes and pairs
-    psnr_db_off_eye: dict[str, float]  # by displacement of the eye: "2mm", "4mm", "6mm"
+    psnr_db_off_eye: dict[str, float]  # by displacement of the eye, such as "2mm"
     pairs: list[PairResult] = field(default_factory=list)
 
     @property
@@ -155,7 +155,7 @@ def measure(
         After each measurement, the names of method and pair, and the method's result over the pairs so far.
 
     Raises:
-        FatalError: A measurement failed or its process died.
+        FatalError: A measurement failed or a measuring process died.
     """
     results: dict[str, list[PairResult]] = {method.name: [] for method in methods}
     for pair in pairs:

@@ -1,7 +1,7 @@
 """Measure live quality for moving viewers in simulated runs, with fixed and with automatic efforts.
 
-An effort is a raster and a number of steps, which determine the time of a solution. Unless it is fixed, the runtime
-chooses the effort of each solution.
+An effort is a raster and a number of steps, which determine the time of a solution. Unless the effort is fixed, the
+runtime chooses the effort of each solution.
 """
 
 from __future__ import annotations

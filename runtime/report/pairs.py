@@ -121,7 +121,7 @@ def eyes_at(*, distance_m: float, angle_deg: float = 0.0, height_m: float = 0.0,
 
 
 def beside(eye_m: ArrayLike, mm: float) -> list[F64]:
-    """Return four positions to the right of an eye, above, to the left and below, in frame `stack`.
+    """Return the positions to the right of, above, to the left of and below an eye, in frame `stack`.
 
     Args:
         eye_m: Position of the eye, shape (3,), frame `stack`. The directions are the axes of the eye's pose.

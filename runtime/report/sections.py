@@ -88,7 +88,7 @@ def kind_of(result: MethodResult) -> str:
 
 
 def method_table(results: Sequence[MethodResult]) -> Table:
-    """Return a table of all results, fastest first. It also lists times as multiples of the fastest."""
+    """Return a table of all results, sorted by time. Times are also given as multiples of the fastest."""
     ordered = sorted(results, key=lambda r: r.ms_p50)
     beside = list(dict.fromkeys(key for result in results for key in result.psnr_db_off_eye))
     headings = ["method", "× fastest", "p50 ms", "p99 ms", "MiB", "parameters", "light 1 mm dB", "0 mm", "2 mm"]

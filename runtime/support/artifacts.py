@@ -137,8 +137,8 @@ class OutputFolder:
     """Output folder whose new files appear all at once at the end, or not at all.
 
     Use the class as a context manager, and write the files to `staging`. On success, all files are moved to `target`
-    and replace files of the same names. If the block raises an exception, no new file remains. Staged files that a
-    killed process left are removed by the next process that writes to the folder.
+    and replace files of the same names. If the block raises an exception, no new file remains. If a process is killed,
+    the next process that writes to the folder removes the staged files.
     """
 
     def __init__(self, target: Path) -> None:

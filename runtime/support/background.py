@@ -70,8 +70,8 @@ def abandon(thread: threading.Thread) -> None:
 def raise_if_abandoned() -> None:
     """Raise ThreadAbandoned if the calling thread has been abandoned.
 
-    Work calls this function between operations such as drawing. An asynchronous exception is no alternative: it could
-    arrive during a call to moderngl, which would crash.
+    Background work calls this function between operations such as drawing. An asynchronous exception is no alternative,
+    because it could arrive during a call to moderngl, which would crash.
     """
     if _abandoned and threading.current_thread() in _abandoned:
         raise ThreadAbandoned

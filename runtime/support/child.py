@@ -94,7 +94,7 @@ def in_child(
 
 
 def _outcome(channel: Connection, source: str, seconds: float) -> tuple[bytes, list[int]] | None:
-    """Wait for the child, and forward its reports.
+    """Wait for the child's result, and forward progress, log lines and errors.
 
     Returns the pickled result and the sizes of its arrays in bytes, or None if the child ended without a result.
     """

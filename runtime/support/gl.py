@@ -79,7 +79,7 @@ class DrawnPicture:
         return self.held.shape
 
     def pixels(self) -> U8:
-        """Read the pixels, shape (h, w, 4), into `held`, where they stay valid until the next drawing.
+        """Read back the pixels, shape (h, w, 4). The returned array is valid until the next drawing.
 
         Call this method on the thread of the context.
         """

@@ -25,7 +25,7 @@ def other_view(file: IO[bytes]) -> tuple[slice, bool] | None:
         file: Open file, whose position changes.
 
     Returns:
-        The range of bytes of the second JPEG, and True if it is the left eye's picture. None for other files.
+        The range of bytes of the second JPEG, and True if this JPEG is the left eye's picture. None for other files.
     """
     size = file.seek(0, 2)
     if size < 6:

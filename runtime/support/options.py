@@ -35,9 +35,7 @@ def place(*, help: str) -> Any:
 
 @contextmanager
 def blame_option(command: str, **options: Any) -> Iterator[None]:
-    """Reword InputErrors within the block that concern a setting which a command-line option has set.
-
-    The new error names the command and the option instead of the setting.
+    """Make an InputError in the block name the command-line option that set the faulty setting.
 
     Args:
         command: Name of the command.

@@ -261,7 +261,7 @@ def undecodable(data: bytes, error: Exception | None = None) -> str:
 
     Args:
         data: Encoded picture.
-        error: Exception that Pillow raised, if any.
+        error: Exception that Pillow raised, or None if the picture was not opened.
     """
     from PIL import UnidentifiedImageError
 

@@ -25,7 +25,7 @@ M = TypeVar("M", bound=BaseModel)
 class Section(BaseModel):
     """Base of the records that tables are validated against.
 
-    Records are frozen. Unknown keys, non-finite numbers and texts that are neither names nor paths are rejected.
+    Records are frozen. Unknown keys, non-finite numbers and strings that are not valid names or paths are rejected.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -39,7 +39,7 @@ class Section(BaseModel):
 def read_table(path: Path) -> dict[str, Any]:
     """Read the table in a TOML or JSON file.
 
-    Raises InputError if the file cannot be read, is malformed or contains another JSON value than an object. For a
+    Raises InputError if the file cannot be read, is malformed, or contains a JSON value other than an object. For a
     malformed file, the message names the line.
     """
     text = untrusted_input.read_text(path, most_bytes=TABLE_BYTES_MAX)

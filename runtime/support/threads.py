@@ -18,7 +18,7 @@ Result = TypeVar("Result")
 def parallel_map(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
     """Call `work` on every item in parallel, and return the results in the order of the items.
 
-    The number of threads is that of OpenCV. Exceptions of `work` propagate.
+    The number of threads is OpenCV's setting (`cv2.getNumThreads`). Exceptions of `work` propagate.
     """
     threads = cv2.getNumThreads()
     if threads < 2 or len(items) < 2:
@@ -32,7 +32,7 @@ def parallel_map(work: Callable[[Item], Result], items: Sequence[Item]) -> list[
 
 
 def on_rows(work: Callable[[int, int], None], rows: int, *, threads: int | None = None) -> None:
-    """Split a range of rows into equal parts, and call `work(begin, end)` for the parts in parallel.
+    """Split rows into parts of about equal size, and call `work(begin, end)` for the parts in parallel.
 
     Args:
         work: Function that processes the rows from `begin` up to but excluding `end`.

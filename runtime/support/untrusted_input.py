@@ -117,7 +117,7 @@ def open_regular(
 
 
 def read_bytes(path: str | Path, *, most_bytes: int, source: str | Path = "", field: str = "") -> bytes:
-    """Read a regular file, with the arguments of `open_regular`.
+    """Read a regular file. The arguments are those of `open_regular`.
 
     Raises InputError if the file cannot be read, is not a regular file or is larger than `most_bytes`.
     """
@@ -136,7 +136,7 @@ def read_bytes(path: str | Path, *, most_bytes: int, source: str | Path = "", fi
 
 
 def read_text(path: str | Path, *, most_bytes: int = JSON_BYTES_MAX, source: str | Path = "", field: str = "") -> str:
-    """Read a UTF-8 text file, with the arguments of `open_regular`.
+    """Read a UTF-8 text file. The arguments are those of `open_regular`.
 
     Raises InputError if the file cannot be read, is larger than `most_bytes` or is not UTF-8.
     """

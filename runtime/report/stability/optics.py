@@ -109,7 +109,7 @@ def scale_shift(eye: Sequence[float], to_x_m: float) -> Answer:
 
 
 def followed(eye: Sequence[float], *, index: int = 2, stack: PanelStack = STACK) -> Answer:
-    """Compare M_RPU with ray tracing, at image positions whose rays cross the panel.
+    """Compare the homography M_RPU (47) with ray tracing, at image positions whose rays cross the panel.
 
     The condition number is the rate, in panel widths, at which the position on the panel changes with relative changes
     of the image position or of the eye's position.

@@ -26,7 +26,7 @@ def head_m(time_ns: int, *, span_ns: int) -> F64:
 
     Args:
         time_ns: Time since the start of the motion.
-        span_ns: Time in which the head moves by TRAVEL_M, or by less if it would be faster than FASTEST.
+        span_ns: Time in which the head moves by TRAVEL_M, or by less if the head would exceed FASTEST.
     """
     share = min(1.0, FASTEST * span_ns / NS_PER_S / float(np.linalg.norm(TRAVEL_M)))
     return EYES_M + TRAVEL_M * share * (time_ns / max(span_ns, 1))
