@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from phasestack import _rooms as _rooms  # must come first
+from phasestack import _rooms as _rooms  # must be the first import
 from phasestack.example import ExamplePair, example_pair
 from phasestack.pair import Cameras, Eyes, Measuring, Result, camera, evaluate, project, solve, solve_each
 from phasestack.pictures import find_eyes

@@ -1,4 +1,4 @@
-"""Entry point of `python -m phasestack`, which is the command `phasestack`."""
+"""Run the command `phasestack` as `python -m phasestack`."""
 
 from runtime.cli import main
 

@@ -1,6 +1,7 @@
-"""Import `runtime`, `calib` and `model_export` of phasestack, even next to others of these names.
+"""Import the packages `runtime`, `calib` and `model_export` of phasestack.
 
-Raises ImportError if the program has already imported another module of one of these names.
+They are loaded from phasestack's own folder, even if `sys.path` has other packages with these names. Raises ImportError
+if the program has already imported another module with one of these names.
 """
 
 from __future__ import annotations

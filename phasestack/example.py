@@ -18,16 +18,19 @@ SCENE, EYES_M, FOV_DEG = "room", ((0.6, -0.0315, 0.03), (0.6, 0.0315, 0.03)), 40
 
 @dataclass(frozen=True)
 class ExamplePair:
-    """Pair of pictures with the eye positions, stack and field of view for which they were rendered."""
+    """Stereo pair with the eye positions, the stack and the field of view for which it was rendered."""
 
     left: U8  # (360, 640, 3)
-    right: U8
-    eyes_m: F64  # (2, 3) left, right; frame `stack`
+    right: U8  # (360, 640, 3)
+    eyes_m: F64  # left and right eye, (2, 3) metres, frame `stack`
     stack: Stack
-    fov_deg: float
+    fov_deg: float  # horizontal
 
     def save(self, folder: str | Path) -> None:
-        """Write left.png, right.png, panels.json, and pair.json, a case for `phasestack report --pairs`."""
+        """Write the pictures and the geometry to a folder that `phasestack report --pairs` can read.
+
+        The files are left.png, right.png, panels.json and pair.json.
+        """
         out, stack = Path(folder), self.stack
         panels = {"width_m": stack.width_m, "height_m": stack.height_m, "x_m": stack.x_m}
         for name, picture in (("left.png", self.left), ("right.png", self.right)):
@@ -38,7 +41,7 @@ class ExamplePair:
 
 
 def example_pair() -> ExamplePair:
-    """Render a stereo pair of a built-in scene, with depth behind and in front of the panels."""
+    """Return a rendered stereo pair of a scene that extends behind and in front of the panels."""
     folder = Path(str(files("phasestack") / "data"))
     left, right = (read_image(folder / f"{side}.png") for side in ("left", "right"))
     stack = Stack(0.5184, 0.2916, (-0.06, 0.0, 0.06), width_px=left.shape[1], height_px=left.shape[0])

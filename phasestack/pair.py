@@ -1,4 +1,4 @@
-"""Functions that solve pairs of pictures, and measure the quality of any layers."""
+"""Solve pairs of pictures for a stack of panels, and measure the quality of arbitrary layers."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ Cameras = Sequence[Sequence[Sequence[float]]] | Sequence[F64] | F64
 
 @dataclass(frozen=True)
 class _Pair:
-    """Validated request, with pictures as seen by pinhole eyes that look at the stack's origin."""
+    """Validated arguments of a call. The pictures are what pinhole eyes see that look at the stack's origin."""
 
     pictures: tuple[Picture, ...]
     eyes_m: F64
@@ -55,26 +55,29 @@ class _Pair:
     is_resampled: bool  # True if the caller gave cameras
 
     def judged(self, layers: U8) -> SolvedPair:
-        """Return the layers with the views that both eyes have of them."""
+        """Combine layers with this request, to compute what each eye sees of the layers and how good it is."""
         return SolvedPair(layers, self.pictures, self.stack, self.eyes_m, self.fov_deg)
 
 
 class Measuring(TypedDict, total=False):
-    """Options for a faster measurement of quality."""
+    """Options that make a measurement of quality faster."""
 
     sigmas_mm: Sequence[
         float
-    ]  # tracking errors to measure, 0, 1 and 2 by default; each except 0 takes four more measurements
-    every: int  # N: measure every Nth pixel of every Nth row; 1: all pixels
+    ]  # tracking errors to evaluate, 0, 1 and 2 mm by default; each nonzero one costs four more measurements
+    every: int  # measure every Nth pixel of every Nth row; 1 measures all pixels
 
 
 class Result:
-    """Layers for a pair of pictures, with the views of both eyes and their quality."""
+    """Layers that were computed for a pair of pictures.
+
+    The result can also show what each eye sees of the layers, measure the quality, and save everything to files.
+    """
 
     layers: U8  # (panels, h, w, 3), rear to front
-    model: str  # name of the model used; `sart` if the networks do not support the stack
-    eye_sigma_mm: float
-    total_ms: float  # time that this call took
+    model: str  # name of the model that was used: `sart` if the networks do not support the stack
+    eye_sigma_mm: float  # tracking error that the layers were computed for
+    total_ms: float  # time the solver took, without loading the model
 
     def __init__(self, layers: U8, pair: _Pair, *, model: str, eye_sigma_mm: float, total_ms: float) -> None:
         self.layers, self.model, self.eye_sigma_mm, self.total_ms = layers, model, eye_sigma_mm, total_ms
@@ -86,16 +89,17 @@ class Result:
 
     @property
     def quality(self) -> PairQuality:
-        """Quality of the eyes' views. Measured on first access, which may take longer than solving.
+        """Quality of what the eyes see, relative to the pictures they should see.
 
-        Warns if `notes` explains why the quality is poor.
+        The quality is measured on first access, which may take longer than solving. A warning is issued for each of
+        the `notes`.
         """
         self._warn()
         return self._pair.quality
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
-        """Reasons why the eyes see ghosts, if the disparity of the pictures explains them."""
+        """Warnings that the eyes will see ghosts because the pictures have too much disparity for the stack."""
         asked = self._asked
         return tuple(
             disparity_doubts(
@@ -104,7 +108,14 @@ class Result:
         )
 
     def measure(self, **how: Unpack[Measuring]) -> PairQuality:
-        """Measure quality faster: `measure(sigmas_mm=(1,), every=4)`. Raises ValueError, naming the argument."""
+        """Measure the quality with options that make it faster, such as `measure(sigmas_mm=(1,), every=4)`.
+
+        Args:
+            **how: The options of `Measuring`, as in `evaluate`.
+
+        Raises:
+            ValueError: An option is out of range. The message names the option.
+        """
         self._warn()
         return _measured(self._pair, how)
 
@@ -114,7 +125,7 @@ class Result:
 
     @property
     def seen(self) -> U8:
-        """Views of the eyes (2, h, w, 3), left first."""
+        """Simulated views of the two eyes through the layers, as an array (2, h, w, 3) with the left eye first."""
         return np.stack(self._pair.seen)
 
     @cached_property
@@ -127,19 +138,26 @@ class Result:
         return line + f"one ray a pixel, as published: {self._pair.quality.psnr_db:.1f} dB"
 
     def show(self) -> Path:
-        """Open the solution's viewer in a browser. Returns the path of its file, which is not deleted."""
+        """Open an HTML page that shows the layers and the eyes' views in a browser.
+
+        Returns:
+            The path of the HTML file. The file is temporary, but is not deleted automatically.
+        """
         path = Path(tempfile.mkdtemp(prefix="phasestack-")) / "viewer.html"
         path.write_text(self._pair.viewer([self._line, *self.notes]), encoding="utf-8")
         webbrowser.open(path.as_uri())
         return path
 
     def _repr_html_(self) -> str:
-        """Return the viewer as HTML, for a notebook."""
+        """Return the viewer page as an HTML element, which notebooks display."""
         page = html.escape(self._pair.viewer([self._line, *self.notes]))
         return f'<iframe srcdoc="{page}" style="width: 100%; height: 640px; border: 0"></iframe>'
 
     def save(self, out: str | Path) -> None:
-        """Write the files of `phasestack solve --out`: layers, views, contact sheet, viewer, solve.json."""
+        """Write the layers, the eyes' views, a contact sheet, a viewer page and solve.json to a folder.
+
+        The files are the same as those that `phasestack solve --out` writes.
+        """
         with OutputFolder(Path(out)) as folder:
             self._pair.write(folder.staging, lines=[self._line, *self.notes])
             told: dict[str, Any] = {"model": self.model, "eye_sigma_mm": self.eye_sigma_mm, "notes": self.notes}
@@ -158,17 +176,28 @@ def solve(
     model: str | Path = "balanced",
     eye_sigma_mm: float = 1.0,
 ) -> Result:
-    """Compute layers that show each eye its picture.
+    """Compute the layers that show each eye its picture.
 
-    left, right: (h, w, 3 or 4), uint8 or float in 0..1, or Pillow images, as seen by a pinhole camera at each eye. The
-    cameras look at the stack's origin, are not rolled, and have a horizontal field of view of `fov_deg`.
-    eyes_m: left and right eye in metres, frame `stack` (+x out of the screen, +y the viewer's right, +z up).
-    cameras: for pictures of other pinhole cameras (parallel, shifted), two 3x4 matrices from homogeneous metres of the
-    stack's frame to pixels, +u right, +v down, pixel centres at half-integers: K·[R | t] with OpenCV's axes, plus half
-    a pixel on K's principal point if its pixel centres are integers. They replace `eyes_m` and `fov_deg`; the pictures
-    solved for and measured are then resampled to look at the stack's origin and to cover the panels.
-    model: fast, balanced, best, sart or an ONNX file. eye_sigma_mm: tracking error, 1 for a good tracker, 0 for none.
-    Raises ValueError, naming the argument. Warns about implausible arguments.
+    A warning is issued for each implausible argument.
+
+    Args:
+        left: Picture for the left eye: an array (h, w, 3 or 4) of uint8 or of floats in 0..1, or a Pillow image. It
+            must be taken by a pinhole camera at the eye that looks at the stack's origin without roll.
+        right: Picture for the right eye, of the same size.
+        stack: Geometry of the panels.
+        eyes_m: Positions of the left and the right eye in metres, in the frame `stack` (+x out of the screen, +y to
+            the viewer's right, +z up). Required unless `cameras` is given.
+        fov_deg: Horizontal field of view of the pictures, in degrees.
+        cameras: Two 3x4 matrices for pictures that were taken by other pinhole cameras, such as parallel or shifted
+            ones. A matrix maps homogeneous metres in the frame `stack` to homogeneous pixels, with +u right, +v down
+            and pixel centres at half-integers. It is K·[R | t] with OpenCV's axes; add half a pixel to the principal
+            point if K assumes pixel centres at integers. The cameras replace `eyes_m` and `fov_deg`: the pictures are
+            resampled to look at the stack's origin and to cover the panels before they are solved and measured.
+        model: `fast`, `balanced`, `best`, `sart`, or the path of an ONNX file.
+        eye_sigma_mm: Tracking error to allow for: 1 suits a good tracker, and 0 assumes exact positions.
+
+    Raises:
+        ValueError: An argument is invalid. The message begins with the name of the argument.
     """
     pair = _checked((left, right), stack=stack, eyes_m=eyes_m, fov_deg=fov_deg, cameras=cameras)
     eye_sigma_mm = _number("eye_sigma_mm", eye_sigma_mm, 0.0, 1000.0, "mm")
@@ -203,10 +232,19 @@ def solve_each(
     eye_sigma_mm: float = 1.0,
     progress: bool = True,
 ) -> Iterator[Result]:
-    """Yield a result for each pair (left picture, right picture, eyes_m). Other arguments: see `solve`.
+    """Solve many pairs one after another, and yield the result of each.
 
-    Pairs are read one by one, so `pairs` may be a generator. progress: show progress on stderr. Raises ValueError,
-    naming the pair and the argument.
+    Args:
+        pairs: Tuples (left picture, right picture, eyes_m) as in `solve`. Each pair is read only when its turn comes,
+            so `pairs` may be a generator.
+        stack: Geometry of the panels.
+        fov_deg: Horizontal field of view of all pictures, in degrees.
+        model: Model as in `solve`.
+        eye_sigma_mm: Tracking error to allow for, as in `solve`.
+        progress: Show the progress on stderr.
+
+    Raises:
+        ValueError: An argument is invalid. The message names the pair and the argument.
     """
     total = len(pairs) if isinstance(pairs, Sized) else None
     solve_one = partial(solve, stack=stack, fov_deg=fov_deg, model=model, eye_sigma_mm=eye_sigma_mm)
@@ -236,15 +274,24 @@ def evaluate(
     cameras: Cameras | None = None,
     **how: Unpack[Measuring],
 ) -> PairQuality:
-    """Measure the quality of any layers for two eyes, against their target pictures.
+    """Measure how well arbitrary layers show each eye its picture.
 
-    layers: (panels, h, w, 3 or 4), rear to front, in the stack's pixels, uint8 or float in 0..1: a panel of value v
-        rotates the polarization by v·90 degrees, and an eye sees sin² of the summed angle; floats are rounded to the
-        panels' 8 bits.
-    sigmas_mm, every: `evaluate(..., sigmas_mm=(1,), every=4)` is faster. It measures light PSNR for these tracking
-        errors alone, at every 4th pixel of every 4th row, with its standard error; SSIM is then NaN.
+    Args:
+        layers: Array (panels, h, w, 3 or 4) from rear to front, at the resolution of the stack, of uint8 or of floats
+            in 0..1. A panel value v rotates the polarization by v·90 degrees, and an eye sees sin² of the sum of the
+            angles along a ray. Floats are rounded to the 8 bits of a panel.
+        left: Picture that the left eye should see, as in `solve`.
+        right: Picture that the right eye should see, as in `solve`.
+        stack: Geometry of the panels.
+        eyes_m: Positions of the eyes, as in `solve`.
+        fov_deg: Horizontal field of view of the pictures, in degrees.
+        cameras: Cameras of the pictures, as in `solve`.
+        **how: Options that make the measurement faster. `evaluate(..., sigmas_mm=(1,), every=4)` measures only this
+            tracking error, at every 4th pixel of every 4th row, and adds the standard error of the light PSNR. SSIM
+            is then NaN.
 
-    For the other arguments see `solve`. Raises ValueError, naming the argument.
+    Raises:
+        ValueError: An argument is invalid. The message begins with the name of the argument.
     """
     pair = _checked((left, right), stack=stack, eyes_m=eyes_m, fov_deg=fov_deg, cameras=cameras)
     given = as_array("layers", layers)
@@ -263,7 +310,12 @@ def evaluate(
 
 
 def _measured(pair: SolvedPair, how: Measuring) -> PairQuality:
-    """Measure all figures of quality, or those requested. Raises ValueError, naming the argument."""
+    """Measure all figures of quality, or only those that the options request.
+
+    Raises:
+        TypeError: An option does not exist.
+        ValueError: An option is out of range. The message names the option.
+    """
     if unknown := sorted(how.keys() - Measuring.__annotations__.keys()):
         raise TypeError(f"{unknown[0]}: no such argument")
     if not how:
@@ -279,11 +331,20 @@ def _measured(pair: SolvedPair, how: Measuring) -> PairQuality:
 
 
 def camera(eye_m: Sequence[float] | F64, *, width_px: int, height_px: int, fov_deg: float = 40.0) -> F64:
-    """Return the pinhole camera (3, 4) at an eye, from homogeneous metres to homogeneous pixels.
+    """Return the matrix (3, 4) of the pinhole camera that `solve` assumes at an eye by default.
 
-    It looks at the stack's origin, with x parallel to the ground, and is the default for pictures.
+    The camera looks at the stack's origin, and its rows of pixels are parallel to the ground. The matrix maps
+    homogeneous metres in the frame `stack` to homogeneous pixels, whose third coordinate is the distance along the
+    gaze in metres.
 
-    The third coordinate is the distance along the gaze. Raises ValueError, naming the argument.
+    Args:
+        eye_m: Position of the eye in metres, in the frame `stack`.
+        width_px: Width of the picture.
+        height_px: Height of the picture.
+        fov_deg: Horizontal field of view in degrees.
+
+    Raises:
+        ValueError: An argument is invalid. The message begins with the name of the argument.
     """
     sizes = {"width_px": width_px, "height_px": height_px}
     for name, size in sizes.items():
@@ -297,9 +358,20 @@ def camera(eye_m: Sequence[float] | F64, *, width_px: int, height_px: int, fov_d
 def project(
     points_m: ArrayLike, *, eye_m: Sequence[float] | F64, width_px: int, height_px: int, fov_deg: float = 40.0
 ) -> F64:
-    """Project points (..., 3), frame `stack`, to (..., 2) pixels of an eye's picture; NaN behind the eye.
+    """Project points to the pixels of an eye's picture.
 
-    Raises ValueError, naming the argument.
+    Args:
+        points_m: Points (..., 3) in metres, in the frame `stack`.
+        eye_m: Position of the eye in metres, in the frame `stack`.
+        width_px: Width of the picture.
+        height_px: Height of the picture.
+        fov_deg: Horizontal field of view in degrees.
+
+    Returns:
+        Pixel coordinates (..., 2). The coordinates of points behind the eye are NaN.
+
+    Raises:
+        ValueError: An argument is invalid. The message begins with the name of the argument.
     """
     points = np.asarray(points_m, np.float64)
     if points.ndim < 1 or points.shape[-1] != 3:
@@ -318,7 +390,11 @@ def _checked(
     fov_deg: float,
     cameras: Cameras | None,
 ) -> _Pair:
-    """Raises ValueError, naming the argument."""
+    """Validate the arguments of `solve`, and resample pictures that other cameras took.
+
+    Raises:
+        ValueError: An argument is invalid, or an eye sees no part of the display. The message names the argument.
+    """
     pictures = [as_picture(name, picture) for name, picture in zip(("left", "right"), given, strict=True)]
     if pictures[0].shape != pictures[1].shape:
         raise ValueError(f"right: is {pictures[1].shape}, left is {pictures[0].shape}: both must have the same shape")
@@ -347,7 +423,7 @@ def _checked(
 
 
 def _number(name: str, given: Any, low: float, high: float, unit: str) -> float:
-    """Raises ValueError, naming the argument."""
+    """Return a number as a float. Raises ValueError unless it is a number from `low` to `high`."""
     if isinstance(given, bool) or not isinstance(given, int | float | np.integer | np.floating):
         raise ValueError(f"{name}: is {given!r}, not a number of {unit}")
     if problem := refusal(float(given), low, high, unit):
@@ -367,7 +443,12 @@ def _loaded(model: str, stack: PanelStack) -> Predictor:
 
 
 def _eyes(eyes_m: Any, stack: PanelStack) -> F64:
-    """Return the (2, 3) eyes if the display can serve them. Raises ValueError."""
+    """Return the eyes as an array (2, 3).
+
+    Raises:
+        ValueError: The eyes are not two points of three finite numbers, are too far away, are not in front of the
+            panels, or are less than 5 mm apart.
+    """
     try:
         eyes = np.asarray(eyes_m, np.float64)
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""Conversion of callers' pictures (arrays, tensors, Pillow images), and a finder for eyes in them."""
+"""Convert pictures from arrays, tensors and Pillow images, and find the eyes in a picture."""
 
 from __future__ import annotations
 
@@ -16,14 +16,21 @@ from runtime.records import U8
 from runtime.support.picture_file import rgb_of
 
 LEAST_PX = 16
-SLACK = 1e-3  # tolerance for rounding: a quarter of a code
-OVERSHOOT = 0.3  # resampling may overshoot by this fraction of white
+SLACK = 1e-3  # tolerance for rounding errors: a quarter of an 8-bit level
+OVERSHOOT = 0.3  # fraction of white by which resampled values may exceed the range
 
 
 def as_picture(name: str, given: Any) -> Picture:
-    """Return uint8 or float32 intensities in [0, 1], (h, w, 3). White shows through transparent pixels.
+    """Convert a picture to an array (h, w, 3) of uint8, or of float32 in [0, 1].
 
-    given: an array, a tensor, or a Pillow image in any mode. Raises ValueError, naming the argument.
+    An alpha channel is composited over white.
+
+    Args:
+        name: Name of the caller's argument, for error messages.
+        given: An array, a tensor, or a Pillow image in any mode.
+
+    Raises:
+        ValueError: The shape, the dtype or the values are not those of a picture. The message suggests a conversion.
     """
     picture: Any = _from_pillow(name, given) if hasattr(given, "getbands") else as_array(name, given)
     if picture.ndim != 3 or picture.shape[2] not in (3, 4) or min(picture.shape[:2]) < LEAST_PX:
@@ -46,7 +53,11 @@ def as_picture(name: str, given: Any) -> Picture:
 
 
 def as_array(name: str, given: Any) -> Any:
-    """Return an array, or a tensor on any device, as a numpy one. Raises ValueError, naming the argument."""
+    """Convert an array, or a tensor on any device, to a NumPy array.
+
+    Raises:
+        ValueError: The value is a file name, or is not an array of numbers. The message begins with `name`.
+    """
     if isinstance(given, str | os.PathLike):
         raise ValueError(f"{name}: is a file name; read the file first, e.g. with PIL.Image.open({os.fspath(given)!r})")
     if hasattr(given, "detach"):  # a torch tensor
@@ -64,7 +75,10 @@ def as_array(name: str, given: Any) -> Any:
 
 
 def _from_pillow(name: str, image: Any) -> U8:
-    """Convert a Pillow image: palettes, CMYK and colour profiles become sRGB, and EXIF rotates it."""
+    """Convert a Pillow image to sRGB, rotated according to its EXIF orientation.
+
+    Palettes, CMYK and embedded colour profiles are converted. Raises ValueError if the image cannot be decoded.
+    """
     try:
         return rgb_of(image, name)
     except InputError as error:
@@ -102,15 +116,23 @@ def _advice_on_range(name: str, low: float, high: float) -> str:
 
 
 def as_codes(picture: Picture) -> U8:
-    """Round to the nearest 8-bit codes."""
+    """Round floating-point intensities to the nearest 8-bit values, and leave uint8 pictures unchanged."""
     codes: Any = picture if picture.dtype == np.uint8 else np.rint(picture * 255).astype(np.uint8)
     return np.asarray(codes, np.uint8)
 
 
 def find_eyes(picture: ArrayLike) -> Pupils | None:
-    """Find the nearest viewer's pupils in a picture (h, w, 3|4), uint8 or float in 0..1. None: no viewer.
+    """Find the pupils of the nearest viewer in a picture.
 
-    `eyes_px` is (2, 2): the viewer's left eye first, which is on the right of an unmirrored picture; continuous pixels,
-    centres at half-integers. `sigma_px` is their standard deviation. Raises ValueError for anything but a picture.
+    Args:
+        picture: Array (h, w, 3 or 4) of uint8 or of floats in 0..1, or a Pillow image.
+
+    Returns:
+        The pupils, or None if the picture shows no viewer. `eyes_px` is an array (2, 2) of pixel coordinates, where
+        pixel centres are at half-integers. The viewer's left eye comes first and is on the right in a picture that is
+        not mirrored. `sigma_px` is the standard deviation of one coordinate.
+
+    Raises:
+        ValueError: The argument is not a picture.
     """
     return pupils.find_eyes(as_codes(as_picture("picture", picture)))

@@ -1,4 +1,4 @@
-"""Geometry of a display, for programs."""
+"""Geometry of a display, with validated arguments."""
 
 from __future__ import annotations
 
@@ -11,7 +11,16 @@ from runtime.optics.stack import PanelStack, Tilt
 
 
 class Stack(PanelStack):
-    """Parallel panels of one size, rear to front at `x_m` (metres), centred on the origin."""
+    """Geometry of a display whose parallel panels have the same size and are centred on the x axis.
+
+    Attributes:
+        width_m: Width of a panel's picture area in metres.
+        height_m: Height of a panel's picture area in metres.
+        x_m: Positions of the panels along the x axis in metres, ascending from the rear panel to the front panel.
+        width_px: Columns of pixels of a panel.
+        height_px: Rows of pixels of a panel.
+        tilt: Deviation of the panels from parallel planes, as measured by a calibration.
+    """
 
     __slots__ = ()
 
@@ -24,7 +33,7 @@ class Stack(PanelStack):
         height_px: int,
         tilt: Tilt | None = None,
     ) -> None:
-        """Raise ValueError, naming the argument, if the display is impossible."""
+        """Validate the geometry. Raises ValueError if an argument is invalid, naming the argument."""
         given = {"width_m": width_m, "height_m": height_m, "width_px": width_px, "height_px": height_px}
         try:
             places = tuple(float(x) for x in x_m)
@@ -38,7 +47,7 @@ class Stack(PanelStack):
 
 
 def checked_stack(stack: object) -> PanelStack:
-    """Return a plain copy of a stack. Raises ValueError for anything else."""
+    """Return a stack as a plain `PanelStack`. Raises ValueError if the argument is not a stack."""
     if not isinstance(stack, PanelStack):
         raise ValueError(f"stack: is a {type(stack).__name__}: create a phasestack.Stack")
     return PanelStack(*(getattr(stack, field.name) for field in fields(PanelStack)))
