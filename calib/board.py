@@ -1,10 +1,12 @@
-"""Coded calibration boards, whose marks identify a panel and a position on it.
+"""Draw calibration boards with coded marks that identify a panel and a position on the panel.
 
-A mark is a white square with an ArUco marker inside and a smaller white square at each corner. Where two squares touch
-there is a saddle point. It is symmetric under a half turn, so it can be located to a few hundredths of a pixel despite
-blur and the camera's tone curve. The rest of the board is black (phase 0), so the marks of other panels show through.
-One photograph therefore shows the marks of all panels, and no tripod is needed. Marks are scattered so that two that
-overlap from one viewpoint are separate from another.
+A mark is a white square that contains an ArUco marker and has a smaller white square at each corner. The point where
+two squares touch is a saddle point of the brightness. A saddle point looks the same after a half turn, so it can be
+located to a few hundredths of a pixel despite blur and the camera's tone curve.
+
+The rest of a board is black (phase 0) and lets the marks of the other panels show through. A single photograph
+therefore shows the marks of all panels, and no tripod is needed. The marks are placed irregularly, because marks that
+overlap from one viewpoint are then separate from another.
 """
 
 from __future__ import annotations
@@ -24,42 +26,42 @@ MARKER_BITS = 4
 DICTIONARY_SIZE = 100
 ACROSS, DOWN = 5, 4  # number of marks across and down a panel
 PER_PANEL = ACROSS * DOWN
-BITS_ON_SHORT_SIDE = 216  # bits along the shorter side; a bit is 5 pixels at 1080 rows
-# In bits: the marker with its black border, the quiet zone on each side, the corner squares.
+BITS_ON_SHORT_SIDE = 216  # marker bits along the shorter side of a panel; a bit is 5 pixels wide at 1080 rows
+# Sizes in bits: the marker with its black border, the quiet zone on each side, and a corner square.
 MARKER, QUIET, CORNER = MARKER_BITS + 2, 2, 3
 SQUARE = MARKER + 2 * QUIET
 TILE = SQUARE + 2 * CORNER
 
 
 def dictionary() -> Any:
-    """Return the ArUco dictionary of the markers."""
+    """Return the ArUco dictionary from which the markers are taken."""
     return cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_100)
 
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """Mark of a board."""
+    """Position and identity of one mark on a panel's board."""
 
-    number: int  # id of the marker
-    panel: int
+    number: int  # id of the ArUco marker
+    panel: int  # index of the panel that shows the mark
     left_px: int  # left edge of the white square
-    top_px: int
-    unit_px: int  # size of one bit of the marker
+    top_px: int  # top edge of the white square
+    unit_px: int  # side length of one bit of the marker
 
     @property
     def side_px(self) -> int:
-        """Side length of the white square."""
+        """Side length of the white square in pixels."""
         return SQUARE * self.unit_px
 
     @property
     def saddles_px(self) -> F64:
-        """(4, 2) corners of the white square in panel pixels, clockwise from the top left."""
+        """Corners (4, 2) of the white square in panel pixels, clockwise from the top left."""
         u, v, side = self.left_px, self.top_px, self.side_px
         return np.array([[u, v], [u + side, v], [u + side, v + side], [u, v + side]], dtype=np.float64)
 
     @property
     def marker_px(self) -> F64:
-        """(4, 2) corners of the marker itself, ordered as in `saddles_px`."""
+        """Corners (4, 2) of the ArUco marker in panel pixels, clockwise from the top left."""
         inset = QUIET * self.unit_px
         corners: F64 = self.saddles_px + inset * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
         return corners
@@ -67,7 +69,7 @@ class Mark:
 
 @lru_cache(maxsize=8)
 def marks(stack: PanelStack) -> tuple[Mark, ...]:
-    """Lay out the marks of all panels. Raises InputError if panels are too many or too small."""
+    """Lay out the marks of all panels. Raises InputError if there are too many panels or they are too small."""
     if stack.count * PER_PANEL > DICTIONARY_SIZE:
         raise InputError("stack", "x_m", f"calibration boards support at most {DICTIONARY_SIZE // PER_PANEL} panels")
     unit = max(2, round(min(stack.width_px * 9 / 16, stack.height_px) / BITS_ON_SHORT_SIDE))
@@ -89,7 +91,7 @@ def marks(stack: PanelStack) -> tuple[Mark, ...]:
 
 
 def board(stack: PanelStack, panel: int) -> U8:
-    """Draw the board of one panel (H, W), with values 0 and 255."""
+    """Draw the board of one panel as an array (H, W) of the values 0 and 255."""
     picture = np.zeros((stack.height_px, stack.width_px), np.uint8)
     for mark in marks(stack):
         if mark.panel != panel:
@@ -106,5 +108,5 @@ def board(stack: PanelStack, panel: int) -> U8:
 
 
 def boards(stack: PanelStack) -> U8:
-    """Draw the boards of all panels (N, H, W)."""
+    """Draw the boards of all panels as an array (N, H, W)."""
     return np.stack([board(stack, index) for index in range(stack.count)])

@@ -1,10 +1,12 @@
-"""Bundle adjustment of one camera, its poses and six degrees of freedom of every panel.
+"""Estimate the pose of every panel by bundle adjustment, together with one camera's lens and poses.
 
-The panels' pixel pitch sets the scale. The reference panel, at its ideal pose, defines the stack's frame. A robust fit
-(soft L1) finds outliers, then plain least squares of the other points gives an unbiased covariance. Derivatives are
-exact, and the normal equations are small, with about a hundred unknowns for thousands of coordinates. scipy's
-`least_squares` gives the same covariance (to 1e-11) but takes 30 times as long, because it decomposes the whole
-Jacobian.
+The known pixel pitch of the panels sets the scale. The reference panel is fixed at its ideal pose and defines the
+stack's frame; every other panel has six degrees of freedom. A robust fit (soft L1) first identifies outliers, and
+ordinary least squares on the remaining points then gives an unbiased covariance.
+
+The derivatives are exact. The normal equations are small: about a hundred unknowns for thousands of coordinates.
+SciPy's `least_squares` gives the same covariance (to 1e-11) but takes 30 times as long, because it decomposes the
+entire Jacobian.
 """
 
 from __future__ import annotations
@@ -24,36 +26,40 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F64
 
 LENS = 9  # fx fy cx cy k1 k2 p1 p2 k3
-POSE = 6  # turn, shift
-FOCAL_GUESSES = (0.6, 0.8, 1.1, 1.6, 2.4)  # initial focal lengths, relative to the longer side
+POSE = 6  # parameters of a pose: rotation vector, translation
+FOCAL_GUESSES = (0.6, 0.8, 1.1, 1.6, 2.4)  # initial focal lengths, relative to the photograph's longer side
 ROBUST_PX = 0.3  # scale of the soft L1 norm
-OUTLIER_SIGMAS = 4.0  # distance from which a point is an outlier
-MIN_SIGMA_PX = 0.01  # minimum noise assumed for the points, so that exact data have no outliers
+OUTLIER_SIGMAS = 4.0  # distance in standard deviations from which a point is an outlier
+MIN_SIGMA_PX = 0.01  # minimum noise assumed for the points, which keeps exact data free of outliers
 NO_FIT_PX = 5.0  # median distance from which the photographs do not show the configured stack
 MAX_STEPS, MAX_DAMPING = 60, 1e8
-# Prior standard deviations for any camera: square pixels, a centred lens, a few percent of distortion. Twelve
-# photographs outweigh them by far.
+# Prior standard deviations that suit any camera: square pixels, a centred lens and a few percent of distortion. A
+# dozen photographs outweigh the priors by far.
 SQUARE_SIGMA, CENTRE_SIGMA, DISTORTION_SIGMAS = 0.003, 0.03, (0.3, 0.5, 0.005, 0.005, 0.5)
 
 
 class Undetermined(ValueError):
-    """Raised when the photographs do not determine the panels. The message explains why."""
+    """Raised when the photographs do not determine the poses of the panels. The message gives the reason."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
-    """Result of a bundle adjustment."""
+    """Result of a bundle adjustment: the poses of the panels and the camera, with the panels' covariance."""
 
-    panels: tuple[PlacedPanel, ...]  # rear to front, frame of the reference panel
-    reference: int
-    places_m: F64  # (P, 3) positions of the camera, frame `stack`
-    covariance: F64  # (6(N-1), 6(N-1)) of each moving panel's rotation about its middle (rad) and shift (m)
-    sigma_px: float  # standard deviation of one coordinate of a saddle in a photograph
+    panels: tuple[PlacedPanel, ...]  # rear to front; the pose of the reference panel is ideal
+    reference: int  # index of the reference panel
+    places_m: F64  # (P, 3) camera positions, frame `stack`
+    covariance: F64  # (6(N-1), 6(N-1)): rotation about the centre (rad) and shift (m) of each non-reference panel
+    sigma_px: float  # standard deviation of one coordinate of a saddle point in a photograph
     used: NDArray[np.bool_]  # (K,) True for points that are not outliers
-    photograph: Any  # (K,) index of each point's photograph
+    photograph: Any  # (K,) index of the photograph that shows each point
 
     def sigma_of(self, derived: Any) -> F64:
-        """Return the first-order standard deviation of a function of the panels, in the shape of its result."""
+        """Return the standard deviation of a quantity that is computed from the panels, to first order.
+
+        Args:
+            derived: Function from a sequence of panels to an array. The standard deviations have the same shape.
+        """
         columns = []
         for number, step in enumerate(np.sqrt(np.diag(self.covariance)) * 0.1):
             up, down = (np.asarray(derived(self._stepped(number, signed))) for signed in (step, -step))
@@ -62,7 +68,7 @@ class Bundle:
         return np.asarray(np.sqrt(np.einsum("...i,ij,...j->...", slope, self.covariance, slope)), dtype=np.float64)
 
     def _stepped(self, number: int, step: float) -> tuple[PlacedPanel, ...]:
-        """Return the panels after a small step of one parameter of `covariance`."""
+        """Return the panels after a step of one parameter, numbered as in `covariance`."""
         panels, change = list(self.panels), np.zeros(POSE)
         moving = [index for index in range(len(panels)) if index != self.reference][number // POSE]
         change[number % POSE] = step
@@ -73,22 +79,26 @@ class Bundle:
 
 @dataclass(frozen=True, slots=True)
 class _State:
-    """Current values of the unknowns."""
+    """Current estimate of the lens, the panels' poses and the camera's poses."""
 
-    lens: F64  # (9,)
-    turns: F64  # (N, 3, 3) stack_from_panel
-    middles_m: F64  # (N, 3) of the panels, frame `stack`
-    poses: F64  # (P, 4, 4) camera_from_stack
+    lens: F64  # (9,) fx, fy, cx, cy, k1, k2, p1, p2, k3 as in OpenCV
+    turns: F64  # (N, 3, 3) rotations of the panels, stack_from_panel
+    middles_m: F64  # (N, 3) centres of the panels, frame `stack`
+    poses: F64  # (P, 4, 4) camera_from_stack for each photograph
 
     @property
     def camera(self) -> F64:
-        """(3, 3) intrinsic matrix."""
+        """Intrinsic matrix (3, 3) of the camera."""
         fx, fy, cx, cy = self.lens[:4]
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 class _Problem:
-    """Detected points and the layout of a step: lens, all panels except the reference, camera poses."""
+    """Least-squares problem: the detected points, their residuals and the derivatives.
+
+    A step is a vector of changes: first the lens, then the poses of all panels except the reference, and last the poses
+    of the camera.
+    """
 
     def __init__(self, seen: Sequence[SeenMarks], stack: PanelStack, *, reference: int) -> None:
         self.stack, self.reference, self.photographs = stack, reference, len(seen)
@@ -106,28 +116,31 @@ class _Problem:
         self.prior_scale = 1 / np.array(sigmas)
 
     def stack_m(self, state: _State) -> F64:
-        """Return the saddle points in frame `stack`, (K, 3)."""
+        """Return the positions (K, 3) of the saddle points in the frame `stack`."""
         turned = np.einsum("kij,kj->ki", state.turns[self.panel], self.local_m)
         return np.asarray(turned + state.middles_m[self.panel])
 
     def camera_m(self, state: _State) -> F64:
-        """Return the saddle points in the camera frame of their photograph, (K, 3)."""
+        """Return the positions (K, 3) of the saddle points, each in the camera frame of its photograph."""
         poses = state.poses[self.photograph]
         return np.asarray(np.einsum("kij,kj->ki", poses[:, :3, :3], self.stack_m(state)) + poses[:, :3, 3])
 
     def residual_px(self, state: _State) -> F64:
-        """Return projected minus detected positions, (K, 2)."""
+        """Return the projected minus the detected positions (K, 2) in pixels."""
         seen = cv2.projectPoints(self.camera_m(state), np.zeros(3), np.zeros(3), state.camera, state.lens[4:])[0]
         return np.asarray(seen.reshape(-1, 2) - self.image_px, dtype=np.float64)
 
     def residuals(self, state: _State) -> F64:
-        """Return `residual_px` and the priors' residuals in standard deviations, (2K + priors,)."""
+        """Return a vector (2K + priors,) of `residual_px` and the lens's deviations from its prior.
+
+        The deviations from the prior are in standard deviations.
+        """
         lens = state.lens
         prior = np.concatenate([[lens[0] - lens[1]], lens[2:4] - self.middle, lens[4:]]) * self.prior_scale
         return np.concatenate([self.residual_px(state).ravel(), prior])
 
     def slopes(self, state: _State) -> F64:
-        """Return the derivatives of `residuals` with respect to a step, (2K + priors, unknowns)."""
+        """Return the Jacobian (2K + priors, unknowns) of `residuals` with respect to a step."""
         count = len(self.local_m)
         slopes = cv2.projectPoints(self.camera_m(state), np.zeros(3), np.zeros(3), state.camera, state.lens[4:])[1]
         by_point = slopes[:, 3:6].reshape(count, 2, 3) @ state.poses[self.photograph, :3, :3]
@@ -148,7 +161,7 @@ class _Problem:
         return matrix
 
     def moved(self, state: _State, step: F64) -> _State:
-        """Return the state after applying a step."""
+        """Apply a step to a state and return the new state."""
         panels, cameras = step[LENS : self.poses_from].reshape(-1, POSE), step[self.poses_from :].reshape(-1, POSE)
         turns, middles_m = state.turns.copy(), state.middles_m.copy()
         turns[self.moving] = Rotation.from_rotvec(panels[:, :3]).as_matrix() @ turns[self.moving]
@@ -158,9 +171,10 @@ class _Problem:
         return _State(state.lens + step[:LENS], turns, middles_m, change @ state.poses)
 
     def start(self, *, reverse: bool = False) -> _State:
-        """Return ideal panels and the focal length and camera poses that explain the photographs best.
+        """Return the initial state: ideal panels, with the best of several focal lengths and its camera poses.
 
-        reverse: assume that the panels are in reverse order.
+        Args:
+            reverse: Assume that the panels are in reverse order.
         """
         count, origin_m = self.stack.count, self.stack.x_m[self.reference]
         middles_m = np.zeros((count, 3))
@@ -183,7 +197,14 @@ class _Problem:
 
 
 def _solved(problem: _Problem, state: _State, used: NDArray[np.bool_], *, robust: bool) -> _State:
-    """Minimise by Levenberg-Marquardt. robust: minimise the soft L1 norm by iterative reweighting."""
+    """Minimise the residuals of the `used` points with the Levenberg-Marquardt method.
+
+    Args:
+        problem: Problem to solve.
+        state: Initial state.
+        used: Mask (K,) of the points to fit.
+        robust: Minimise the soft L1 norm by iterative reweighting instead of the sum of squares.
+    """
     kept = np.concatenate([np.repeat(used, 2), np.ones(len(problem.prior_scale), bool)])
 
     def cost_of(residuals: F64) -> float:
@@ -214,8 +235,9 @@ def _solved(problem: _Problem, state: _State, used: NDArray[np.bool_], *, robust
 def _refuse_reverse(problem: _Problem, state: _State) -> None:
     """Raise Undetermined if the panels are in the reverse of the configured order.
 
-    This is the case if only the reverse order fits, or if both fit but one needs cameras behind the stack. (Such
-    cameras would take the same pictures of a stack mirrored front to rear.)
+    The order is reversed if the configured order fits only with a camera behind the stack, or if it does not fit and
+    the reverse order does. (A camera behind the stack would take the same pictures as one in front of a stack that is
+    mirrored front to rear.)
     """
     depth_m = problem.camera_m(state)[:, 2]
     behind = any(np.median(depth_m[problem.photograph == number]) <= 0 for number in range(problem.photographs))
@@ -228,14 +250,20 @@ def _refuse_reverse(problem: _Problem, state: _State) -> None:
 
 
 def _median_px(problem: _Problem, state: _State) -> float:
-    """Return the median distance between projected and detected points."""
+    """Return the median distance between projected and detected points in pixels."""
     return float(np.median(np.linalg.norm(problem.residual_px(state), axis=1)))
 
 
 def adjust(seen: Sequence[SeenMarks], stack: PanelStack, *, reference: int) -> Bundle:
-    """Fit all panels to photographs of equal size from one camera.
+    """Estimate the poses of all panels from photographs of the boards.
 
-    Raises Undetermined if the photographs do not determine the panels.
+    Args:
+        seen: Saddle points of each photograph. All photographs must have the same size and come from one camera.
+        stack: Configured geometry, from which the fit starts.
+        reference: Index of the panel that defines the frame `stack`.
+
+    Raises:
+        Undetermined: The panels are in reverse order, or the photographs are too few or too similar.
     """
     problem = _Problem(seen, stack, reference=reference)
     used = np.ones(len(problem.image_px), bool)
@@ -270,7 +298,7 @@ def adjust(seen: Sequence[SeenMarks], stack: PanelStack, *, reference: int) -> B
 
 
 def _covariance(problem: _Problem, state: _State, used: NDArray[np.bool_], *, sigma: float) -> F64:
-    """Return the covariance of the unknowns for points with noise `sigma`.
+    """Return the covariance of all unknowns if the points have the standard deviation `sigma` in pixels.
 
     Raises Undetermined if the photographs do not determine all unknowns.
     """

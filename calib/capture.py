@@ -1,4 +1,4 @@
-"""`calibrate capture`: guide a person through the viewpoints and store the accepted pairs."""
+"""Guide a person through the calibration viewpoints and store a pair of points for each (`calibrate capture`)."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from runtime.records import F64, EyePoints
 from runtime.sensor.registry import open_sensor
 from runtime.sensor.samples import RecordedSamples
 
-WINDOW_NS = NS_PER_S // 2  # a pair is the median over this window
-MAX_SPREAD_M = 0.010  # maximum motion or scatter of the eyes in the window
-MIN_SAMPLES = 5  # minimum number of samples in the window for a meaningful spread
+WINDOW_NS = NS_PER_S // 2  # time over which the median of the samples is taken
+MAX_SPREAD_M = 0.010  # maximum motion or scatter of the eyes during this time
+MIN_SAMPLES = 5  # minimum number of samples for a meaningful spread
 
 
 def midpoint(eyes: EyePoints | None) -> F64 | None:
-    """Return the midpoint of two measured eyes, or None if one is missing, uncertain or filled in."""
+    """Return the midpoint (3,) between the eyes, or None unless both eyes were measured with confidence."""
     if eyes is None or eyes.completed or eyes.confidence.min() < CONFIDENCE_MIN:
         return None
     middle = eyes.eyes_m.mean(axis=0)
@@ -38,13 +38,16 @@ def midpoint(eyes: EyePoints | None) -> F64 | None:
 
 
 class EyeWindow:
-    """Samples of the last half second."""
+    """Midpoints of the eyes during the last half second, whose median gives a steady position."""
 
     def __init__(self) -> None:
-        self._samples: deque[tuple[int, F64]] = deque()  # capture time, midpoint of the eyes
+        self._samples: deque[tuple[int, F64]] = deque()  # capture time and midpoint of the eyes
 
     def add(self, capture_ns: int, eyes: EyePoints | None) -> None:
-        """Add a sample in the sensor frame. An unusable one only advances the time of the window."""
+        """Add a sample in the sensor frame, and drop samples that are older than half a second.
+
+        The midpoint is ignored unless both eyes were measured with confidence.
+        """
         middle = midpoint(eyes)
         if middle is not None:
             self._samples.append((capture_ns, middle))
@@ -52,7 +55,11 @@ class EyeWindow:
             self._samples.popleft()
 
     def measure(self) -> tuple[F64, float] | None:
-        """Return the median (3,) in the sensor frame and robust RMS spread, or None for too few samples."""
+        """Return the median position (3,) in the sensor frame and the scatter around it, both in metres.
+
+        The scatter is a robust estimate of the RMS distance from the median. The result is None if there are too few
+        samples.
+        """
         if len(self._samples) < MIN_SAMPLES:
             return None
         points = np.array([point for _, point in self._samples])
@@ -62,7 +69,10 @@ class EyeWindow:
 
 
 class Walk:
-    """Progress of a person through the viewpoints. Uses neither a clock nor threads."""
+    """Guide for a person who moves from viewpoint to viewpoint and accepts a pair of points at each.
+
+    The caller delivers sensor samples and key presses. The class itself uses neither a clock nor threads.
+    """
 
     def __init__(
         self,
@@ -72,7 +82,14 @@ class Walk:
         say: Callable[[str], None],
         chart: Callable[[Viewpoint], None] | None = None,
     ) -> None:
-        """chart: shows the chart of a viewpoint; None if charts are shown elsewhere."""
+        """Start with the first viewpoint that has no pair yet.
+
+        Args:
+            file: File to which accepted pairs are written.
+            viewpoints: Viewpoints in the order of the visit.
+            say: Function that shows a line of text to the person.
+            chart: Function that shows the chart of a viewpoint, or None if the charts are shown in another way.
+        """
         self._file, self._say, self._chart = file, say, chart
         self._left = [v for v in viewpoints if v.name not in file.viewpoints]
         self._window = EyeWindow()
@@ -83,7 +100,7 @@ class Walk:
 
     @property
     def current(self) -> Viewpoint:
-        """Return the viewpoint that is currently shown."""
+        """Viewpoint to which the person is currently asked to move."""
         return self._left[self._index]
 
     def begin(self) -> None:
@@ -94,14 +111,14 @@ class Walk:
             self._announce()
 
     def see(self, capture_ns: int, eyes: EyePoints | None, serial: str) -> None:
-        """Add a sample in the sensor frame."""
+        """Add a sample in the sensor frame, with the serial number of the sensor."""
         if self.finished:
             return
         self._serial = serial
         self._window.add(capture_ns, eyes)
 
     def press(self, key: Key | None) -> None:
-        """Act on a key press, if any."""
+        """Accept a pair, change the viewpoint or stop, depending on the key. None has no effect."""
         if self.finished:
             return
         match key:
@@ -115,7 +132,7 @@ class Walk:
                 self._go(-1)
 
     def summary(self) -> dict[str, Any]:
-        """Return the figures for the command's summary."""
+        """Return the counts of pairs and the skipped viewpoints for the summary of the command."""
         names = self._file.viewpoints
         return {
             "file": str(self._file.path),
@@ -148,7 +165,7 @@ class Walk:
         index = min(max(self._index + step, 0), len(self._left) - 1)
         if index != self._index:
             self._index = index
-            self._window = EyeWindow()  # drop samples of the previous viewpoint
+            self._window = EyeWindow()  # drops the samples of the previous viewpoint
             self._announce()
 
     def _announce(self) -> None:
@@ -166,7 +183,22 @@ class Walk:
 def capture_live(
     out: Path, settings: Settings, hardware: SetupHardware, *, show: bool, say: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Guide a person in front of the display through the viewpoints. Raises InputError, FatalError."""
+    """Guide a person in front of the display through the viewpoints.
+
+    Args:
+        out: CSV file of the pairs. An existing file is continued.
+        settings: Configuration of the display and the sensor.
+        hardware: Real or simulated hardware.
+        show: Show the charts on the panels.
+        say: Function that shows a line of text to the person.
+
+    Returns:
+        The summary of the command.
+
+    Raises:
+        InputError: The file is invalid or cannot be written, or the sensor or the panels cannot be opened.
+        FatalError: The sensor failed permanently.
+    """
     file = PairsFile(out)
     say(f"sensor: {hardware.open_sensor(settings)}")
     try:
@@ -186,9 +218,18 @@ def capture_live(
 
 
 def capture_recording(out: Path, settings: Settings, *, source: str) -> dict[str, Any]:
-    """Write a pair for every sample of a recording that contains true eye positions.
+    """Write a pair for every sample of a recording that contains the true eye positions.
 
-    Raises InputError if there is no such sample with usable eyes.
+    Args:
+        out: CSV file of the pairs. An existing file is continued.
+        settings: Configuration of the sensor.
+        source: Path of the recording, or `demo` for the built-in recording.
+
+    Returns:
+        The summary of the command.
+
+    Raises:
+        InputError: No sample has both the true eye positions and confidently measured eyes.
     """
     chosen = settings.sensor.model_copy(update={"driver": "replay", "source": source, "loop": False})
     samples = RecordedSamples(open_sensor(chosen, SimulatedClock()))

@@ -1,7 +1,7 @@
-"""Calibration charts with black lines at the thirds of each eye's image (EyeReal, 2.3, S4).
+"""Draw calibration charts with black lines at the thirds of each eye's image (EyeReal, 2.3, S4).
 
-One set of layers serves both eyes. From the viewpoint the lines fuse into clean single lines. From elsewhere they show
-ghosts and stripes.
+The layers of a chart show both eyes the same lines. The lines fuse into clean single lines for a person whose eyes are
+at the viewpoint of the chart. From any other position they show ghosts and stripes.
 """
 
 from __future__ import annotations
@@ -23,42 +23,48 @@ from runtime.support.artifacts import OutputFolder, write_json, write_png
 from runtime.support.progress import tracked
 
 MODEL = "best"
-LINE_PX = 10.0  # width of a line
+LINE_PX = 10.0  # width of a line in pixels of the eye's image
 WIDEST_FOV_DEG = 40.0  # horizontal field of view of the eyes' images, as in the published code
 
 
 def chart_fov_deg(viewpoint: Viewpoint, stack: PanelStack) -> float:
-    """Return the field of view of a viewpoint's images: the published one, or the display's if smaller.
+    """Return the horizontal field of view of the eyes' images at a viewpoint, in degrees.
 
-    This keeps the lines on the panels at any distance.
+    This is the published 40 degrees, or the angle that the display fills if it is smaller. The lines are therefore on
+    the panels at any distance.
     """
     return min(WIDEST_FOV_DEG, float(np.degrees(2 * np.arctan(stack.width_m / 2 / (viewpoint.radius_cm / 100)))))
 
 
 def line_picture(*, width_px: int, height_px: int) -> U8:
-    """Draw the picture of one eye (h, w, 3), with lines at the thirds of its width and height."""
+    """Draw the picture (h, w, 3) for one eye, with lines at the thirds of the width and the height."""
     ink = np.maximum(_ink(width_px), _ink(height_px)[:, None])
     return np.repeat(np.rint(255 * (1 - ink)).astype(np.uint8)[..., None], 3, axis=2)
 
 
 def _ink(length_px: int) -> F64:
-    """Return the share of each pixel that is covered by lines at the thirds, (length,)."""
+    """Return the share (length,) of each pixel that two lines at the thirds of the length cover."""
     position = np.arange(length_px, dtype=np.float64) + 0.5
     distance = np.minimum(np.abs(position - length_px / 3), np.abs(position - 2 * length_px / 3))
     return np.clip(LINE_PX / 2 - distance + 0.5, 0.0, 1.0)
 
 
 class Charts:
-    """Charts for one stack."""
+    """Solver for the layers of the charts of one stack."""
 
     def __init__(self, settings: Settings) -> None:
-        """Load the model that computes the layers. Raises InputError, MissingPart."""
+        """Load the model that computes the layers.
+
+        Raises:
+            InputError: The model cannot be loaded for this stack.
+            MissingPart: An optional package or the compiled library is not installed.
+        """
         self.stack = settings.stack.stack()
         self.ipd_m = settings.calibration.ipd_m or IPD_M
         self._predictor = load_predictor(MODEL, self.stack, settings.model)
 
     def layers(self, viewpoint: Viewpoint) -> U8:
-        """Solve for layers (N, H, W, 4) that show the lines to both eyes at the viewpoint."""
+        """Compute the layers (N, H, W, 4) that show the lines to both eyes at a viewpoint."""
         picture = line_picture(width_px=self.stack.width_px, height_px=self.stack.height_px)
         eyes_m, fov_deg = viewpoint.eyes_m(self.ipd_m), chart_fov_deg(viewpoint, self.stack)
         prediction = solve_still(picture, picture, eyes_m=eyes_m, fov_deg=fov_deg, predictor=self._predictor)
@@ -70,7 +76,20 @@ class Charts:
 
 
 def make_charts(out: Path, viewpoints: Sequence[Viewpoint], settings: Settings) -> dict[str, Any]:
-    """Write a PNG for each panel and viewpoint, and `charts.json`. Raises InputError, MissingPart."""
+    """Write the layers of all charts as PNG files, together with `charts.json`.
+
+    Args:
+        out: Folder to write to.
+        viewpoints: Viewpoints that need a chart.
+        settings: Configuration of the display and the model.
+
+    Returns:
+        The summary of the command.
+
+    Raises:
+        InputError: A file cannot be written, or the model cannot be loaded for this stack.
+        MissingPart: An optional package or the compiled library is not installed.
+    """
     charts = []
     with OutputFolder(out) as folder, closing(Charts(settings)) as drawn:
         for viewpoint in tracked("charts", viewpoints):

@@ -1,4 +1,4 @@
-"""Checks of calibration pairs and solutions, which lead to refusals (InputError) or warnings."""
+"""Check calibration pairs and solutions. Unusable ones raise InputError, and doubtful ones cause warnings."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ from runtime.eyes.calibration import check_similarity
 from runtime.records import F64
 
 RESIDUAL_LIMIT_M = 0.05  # as in the EyeReal supplement (figure S5)
-SENSOR_NOISE_FLOOR_M = 0.001  # no depth camera measures a face better than this
+SENSOR_NOISE_FLOOR_M = 0.001  # least noise assumed, because no depth camera measures a face more accurately
 REFUSE_EYE_ERROR_M = 0.05  # expected error at the eye above which a calibration is useless
 WARN_EYE_ERROR_M = 0.01  # expected error at the eye above which ghosts are visible
-COPLANAR = 0.01  # ratio of the third extent of the points to the first
-MIRROR_GAIN = 0.5  # data count as mirrored if mirroring the sensor reduces the error to this share
+COPLANAR = 0.01  # ratio of the smallest to the largest extent up to which points count as coplanar
+MIRROR_GAIN = 0.5  # data count as mirrored if mirroring the sensor's points reduces the error to this share
 NAMED = 8  # maximum number of pairs named in a message
 
 
 def check_pairs(pairs: Pairs) -> list[str]:
-    """Return warnings about pairs before solving. Raises InputError that names the pairs' file.
+    """Return warnings about pairs, before a calibration is computed.
 
-    Refuses fewer than 3 pairs, coincident or collinear points, points beyond double precision, mirrored axes and mixed
-    units.
+    Raises:
+        InputError: There are fewer than 3 pairs, the points are coincident or collinear, double precision does not
+            suffice for the points, an axis is mirrored, or one side is in millimetres.
     """
     if _is_mirrored(pairs):
         raise InputError(
@@ -51,7 +52,13 @@ def check_pairs(pairs: Pairs) -> list[str]:
 def check_solution(pairs: Pairs, solution: CalibrationSolution, volume_m: F64) -> list[str]:
     """Return warnings about a solution.
 
-    volume_m: points (..., 3) that viewers use. Raises InputError if the residuals or the expected errors are too large.
+    Args:
+        pairs: Pairs from which the calibration was computed.
+        solution: Calibration to check.
+        volume_m: Points (..., 3) in the frame `stack` that span the space in which viewers move.
+
+    Raises:
+        InputError: The matrix is implausible, or the residuals or the expected error at the eye are too large.
     """
     warnings = []
     check_similarity(solution.similarity.matrix, source=pairs.source)
@@ -97,7 +104,7 @@ def _listed(pairs: Pairs, index: list[int]) -> str:
 
 
 def _is_mirrored(pairs: Pairs) -> bool:
-    """Return True if the points span space and fit a mirrored sensor far better."""
+    """Return True if the points are not coplanar and fit far better after the sensor's z axis is reversed."""
     if len(pairs) < 4 or extents(pairs.stack_m)[2] <= COPLANAR * extents(pairs.stack_m)[0]:
         return False
     straight = _typical_error_m(pairs.sensor_m, pairs.stack_m)

@@ -75,7 +75,7 @@ class Result:
     """
 
     layers: U8  # (panels, h, w, 3), rear to front
-    model: str  # name of the model that was used: `sart` if the networks do not support the stack
+    model: str  # name of the model that was used, with a note if its network does not support the stack
     eye_sigma_mm: float  # tracking error that the layers were computed for
     total_ms: float  # time the solver took, without loading the model
 
