@@ -1,4 +1,4 @@
-"""Editor for configuration files that keeps comments and old versions and writes only valid files."""
+"""Edit configuration files. Comments and old versions are kept, and only valid files are written."""
 
 from __future__ import annotations
 
@@ -20,14 +20,17 @@ if TYPE_CHECKING:
     from tomlkit import TOMLDocument
 
 
-KEPT_VERSIONS = 20  # number of backups kept per file
+KEPT_VERSIONS = 20  # number of old versions kept per file
 KEPT_BYTES_MAX = 64 << 20  # size limit for a file that is backed up
 
 
 def save(path: Path, text: str) -> Path | None:
-    """Write a file, or the target of a link, atomically and keep the version that it replaces.
+    """Write a file atomically and keep the version that it replaces under a numbered name.
 
-    Returns the path of the old version, which has the permissions of the file.
+    A symbolic link is kept, and the file to which it points is written.
+
+    Returns:
+        The path of the old version, which has the same permissions as the file, or None if the file is new.
     """
     path, kept = path.resolve(), None
     if untrusted_input.is_there(path):
@@ -61,9 +64,14 @@ def read_document(config: Path) -> TOMLDocument:
 
 
 def rewrite(config: Path, change: Callable[[TOMLDocument], None]) -> Path | None:
-    """Change a configuration. Returns the path of the old version.
+    """Change a configuration file. If the result is invalid, InputError is raised and the file stays unchanged.
 
-    Raises InputError, and writes nothing, if the result is invalid.
+    Args:
+        config: Configuration file. A missing file is created.
+        change: Function that modifies the parsed document in place.
+
+    Returns:
+        The path of the old version, or None if the file is new.
     """
     document = read_document(config)
     change(document)
@@ -76,14 +84,21 @@ def rewrite(config: Path, change: Callable[[TOMLDocument], None]) -> Path | None
 
 
 def put(document: TOMLDocument, section: str, values: Mapping[str, Any]) -> None:
-    """Set keys of a table, which is created if missing."""
+    """Set keys of a table. The table is created if the document has no such section."""
     table: Any = document.setdefault(section, tomlkit.table())
     for key, value in values.items():
         table[key] = value
 
 
 def put_panels(document: TOMLDocument, key: str, values: Mapping[int, Any], *, panels: int) -> None:
-    """Set a key, such as `lut`, in the tables of some panels. Missing tables are created."""
+    """Set a key, such as `lut`, in the tables `[[output.panels]]`. Missing tables are created.
+
+    Args:
+        document: Configuration to modify.
+        key: Key to set.
+        values: Value of the key by the index of the panel. Other panels keep their values.
+        panels: Number of panels of the stack.
+    """
     output: Any = document.setdefault("output", tomlkit.table())
     if "panels" not in output:
         output["panels"] = tomlkit.aot()
@@ -94,9 +109,13 @@ def put_panels(document: TOMLDocument, key: str, values: Mapping[int, Any], *, p
 
 
 def put_monitors(document: TOMLDocument, tables: Sequence[Mapping[str, Any]]) -> None:
-    """Set the monitor and mounting of each panel, rear to front.
+    """Set the monitor and the mounting of every panel.
 
-    A panel whose monitor and mounting have not changed keeps its registration and grey curve.
+    A panel whose monitor and mounting have not changed keeps its registration and its grey curve.
+
+    Args:
+        document: Configuration to modify.
+        tables: Keys and values that identify the monitor and describe its mounting, for each panel from rear to front.
     """
     output: Any = document.setdefault("output", tomlkit.table())
     past = [dict(table.unwrap()) for table in output.get("panels", ())]

@@ -1,4 +1,4 @@
-"""Detection of the saddle points of boards in a photograph, to hundredths of a pixel."""
+"""Locate the saddle points of calibration boards in a photograph, to hundredths of a pixel."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from calib.board import MARKER, Mark, dictionary, marks
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 
-DETECTION_PX = 2400  # size at which marks are searched; corners are located at full resolution
-MIN_MARKS = 3  # minimum number per panel; twelve points
-MIN_EXTENT = 0.3  # share of a panel that its marks must span, because one corner hardly determines the panel
+DETECTION_PX = 2400  # size of the photograph's copy in which marks are searched; corners are located in the original
+MIN_MARKS = 3  # minimum number of marks per panel, which is twelve points
+MIN_EXTENT = 0.3  # share of a panel that its marks must span, because marks in one corner hardly determine the panel
 MIN_UNIT_PX = 1.7  # minimum size of a marker's bit in the photograph
-BLURRED_BITS = 1.1  # maximum width of an edge in bits of a marker
-MIN_CONTRAST = 0.35  # minimum contrast of a saddle relative to its mark
-MIN_DYNAMIC = 24  # minimum difference between black and white in codes
+BLURRED_BITS = 1.1  # maximum width of an edge, in bits of a marker
+MIN_CONTRAST = 0.35  # minimum contrast at a saddle point, relative to the contrast of the mark
+MIN_DYNAMIC = 24  # minimum difference between black and white in 8-bit levels
 
 
 @dataclass(frozen=True, slots=True)
 class SeenMarks:
-    """Saddle points found in one photograph."""
+    """Saddle points that were found in one photograph."""
 
-    name: str
+    name: str  # file name of the photograph
     width_px: int
     height_px: int
-    panel: Any  # (K,) index of the panel
-    panel_px: F64  # (K, 2) position on the panel
-    image_px: F64  # (K, 2) position in the photograph; pixel centres are integers
-    marks: tuple[int, ...]  # number found on each panel
-    fault: str  # why the photograph is unusable, or empty
+    panel: Any  # (K,) index of the panel that shows each point
+    panel_px: F64  # (K, 2) positions on the panel
+    image_px: F64  # (K, 2) positions in the photograph; pixel centres are integers
+    marks: tuple[int, ...]  # number of marks found on each panel
+    fault: str  # reason why the photograph is unusable, or an empty string
 
 
 def _detector() -> Any:
@@ -46,7 +46,10 @@ def _detector() -> Any:
 
 
 def _markers(picture: U8, known: dict[int, Mark]) -> list[tuple[Mark, F64]]:
-    """Return the readable marks and their corners (4, 2). Codes found twice are dropped."""
+    """Return the marks that can be read in a picture and the corners (4, 2) of their markers in pixels.
+
+    Markers that appear more than once are dropped. `known` maps the ids of all markers to their marks.
+    """
     scale = min(2.0, DETECTION_PX / max(picture.shape))
     kind = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=kind)
@@ -62,7 +65,7 @@ def _markers(picture: U8, known: dict[int, Mark]) -> list[tuple[Mark, F64]]:
 
 
 def find_marks(picture: U8, stack: PanelStack, *, name: str) -> SeenMarks:
-    """Find the saddle points of all boards in a grey photograph (h, w)."""
+    """Find the saddle points of all boards in a grey photograph (h, w) with the file name `name`."""
     known = {mark.number: mark for mark in marks(stack)}
     markers = _markers(picture, known)
     panel, panel_px, image_px, edges = [], [np.zeros((0, 2))], [np.zeros((0, 2))], []
@@ -97,7 +100,10 @@ def find_marks(picture: U8, stack: PanelStack, *, name: str) -> SeenMarks:
 
 
 def _mirrored(picture: U8, known: dict[int, Mark], counts: list[int]) -> str:
-    """Return a fault if marks appear only in the mirror image of a picture, otherwise an empty string."""
+    """Return a message if marks can be read only in the mirror image of a picture, otherwise an empty string.
+
+    `counts` is the number of marks found on each panel.
+    """
     if min(counts) >= MIN_MARKS:
         return ""
     turned = [mark.panel for mark, _ in _markers(np.ascontiguousarray(picture[:, ::-1]), known)]
@@ -110,7 +116,13 @@ def _mirrored(picture: U8, known: dict[int, Mark], counts: list[int]) -> str:
 
 
 def _unreadable(counts: list[int], edges: list[float], unit_px: float) -> str:
-    """Return a fault in sharpness, or an empty string. edges: width of each edge in marker bits."""
+    """Return a message if the marks are missing, blurred or too small, otherwise an empty string.
+
+    Args:
+        counts: Number of marks found on each panel.
+        edges: Width of the edges of each mark, in marker bits.
+        unit_px: Size of a marker bit in the photograph.
+    """
     if sum(counts) == 0:
         return "shows no mark of a board; it may be blurred, too dark or of something else"
     edge_bits = float(np.median(edges))
@@ -122,9 +134,15 @@ def _unreadable(counts: list[int], edges: list[float], unit_px: float) -> str:
 
 
 def _covered(counts: list[int], places: F64, owners: Any) -> str:
-    """Return why a panel cannot be located, or an empty string.
+    """Return a message if the marks of a panel are too few or too close together to locate the panel.
 
-    places: saddles (K, 2) in panel widths and heights.
+    Args:
+        counts: Number of marks found on each panel.
+        places: Saddle points (K, 2) relative to the width and the height of their panel.
+        owners: Index (K,) of the panel that shows each saddle point.
+
+    Returns:
+        The message, or an empty string.
     """
     fewest = min(counts)
     if fewest < MIN_MARKS:
@@ -138,13 +156,24 @@ def _covered(counts: list[int], places: F64, owners: Any) -> str:
 
 
 def _unit_px(quad: F64) -> float:
-    """Return the pixels per bit of a marker in the photograph, along its shortest side."""
+    """Return the size of a marker's bit in pixels of the photograph, along the shortest side of the marker."""
     sides = np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1)
     return float(sides.min()) / MARKER
 
 
 def _refined(picture: U8, guess: F64, quad: F64, *, window: int) -> tuple[Any, F64]:
-    """Return a mask of the true saddles (white inside and outside, black at the sides) and their positions."""
+    """Locate the four saddle points of a mark and check their contrast.
+
+    Args:
+        picture: Grey photograph (h, w).
+        guess: Approximate positions (4, 2) of the saddle points.
+        quad: Corners (4, 2) of the marker in the photograph.
+        window: Half the side of the search window in pixels.
+
+    Returns:
+        A mask (4,) of the points that are white along the diagonal of the mark and black across it, and the refined
+        positions (4, 2).
+    """
     height, width = picture.shape
     inside = (
         (guess[:, 0] > window + 2) & (guess[:, 0] < width - window - 3)
@@ -157,7 +186,7 @@ def _refined(picture: U8, guess: F64, quad: F64, *, window: int) -> tuple[Any, F
     cv2.cornerSubPix(picture, points, (window, window), (-1, -1), criteria)
     refined = points.reshape(-1, 2).astype(np.float64)
     near = np.linalg.norm(refined - guess, axis=1) < 0.8 * window
-    # Steps of one bit along and across the diagonals of the mark.
+    # Offsets of about one bit along and across the diagonals of the mark.
     out = (guess - guess.mean(axis=0)) / 5 * 0.9
     arms = np.stack([refined + out, refined - out, refined + _quarter(out, guess), refined - _quarter(out, guess)])
     values = _samples(picture, arms)
@@ -168,25 +197,31 @@ def _refined(picture: U8, guess: F64, quad: F64, *, window: int) -> tuple[Any, F
 
 
 def _quarter(out: F64, guess: F64) -> F64:
-    """Estimate the other diagonal at each corner from both neighbours, to allow for perspective."""
+    """Return an offset (4, 2) across the diagonal at each corner, about as long as the offsets `out`.
+
+    The offset is parallel to the line between the neighbouring corners, which allows for perspective.
+    """
     following, before = np.roll(guess, -1, axis=0) - guess, np.roll(guess, 1, axis=0) - guess
     return np.asarray((following - before) / 10 * 0.9, dtype=np.float64)
 
 
 def _samples(picture: U8, points: F64) -> F64:
-    """Sample a picture bilinearly at (..., 2)."""
+    """Sample a picture at positions (..., 2) in pixels with bilinear interpolation."""
     flat = np.ascontiguousarray(points.reshape(-1, 1, 2).astype(np.float32))
     values = cv2.remap(picture, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(values, dtype=np.float64).reshape(points.shape[:-1])
 
 
 def _edge_px(picture: U8, quad: F64) -> float:
-    """Return the width in pixels of a marker's outer edge: contrast over steepest slope, median of sides."""
+    """Return the width of a marker's outer edge in pixels, as a measure of blur.
+
+    The width is the contrast divided by the steepest slope across the edge. It is the median over the four sides.
+    """
     widths = []
     centre = quad.mean(axis=0)
     for first, second in zip(quad, np.roll(quad, -1, axis=0), strict=True):
         middle = (first + second) / 2
-        outward = (middle - centre) / 3  # one bit
+        outward = (middle - centre) / 3  # length of one bit
         length = float(np.linalg.norm(outward))
         steps = np.linspace(-0.9, 1.6, 51)
         along = np.linspace(-0.25, 0.25, 9)[:, None, None] * (second - first)

@@ -1,4 +1,4 @@
-"""Panel windows and keyboard handling during display setup."""
+"""Show layers on the panels during the setup, and read the keys that are pressed in their windows."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class PanelDisplay:
-    """Panels that keep showing one set of layers, and the keys pressed in their windows."""
+    """Open panels that keep showing a set of layers and report the keys that are pressed in their windows."""
 
     def __init__(self, sink: PanelSink) -> None:
         self._sink = sink
@@ -27,30 +27,37 @@ class PanelDisplay:
         self._keys = WindowKeys(sink)
 
     def show(self, layers: U8) -> None:
-        """Show (N, H, W, 4) layers on all panels. Raises PanelLost if a panel is lost."""
+        """Show layers (N, H, W, 4) on the panels. Raises PanelLost if a panel is lost."""
         self._layers = layers
         self._number += 1
         self._sink.present(PanelFrame(self._number, layers, self._number))
 
     def key(self) -> Key | None:
-        """Return the next key or None. Raises PanelLost if a panel is lost.
+        """Return the next key that was pressed, or None.
 
-        Presents the layers again, so that windows respond.
+        The layers are presented again, which keeps the windows responsive. Raises PanelLost if a panel is lost.
         """
         if self._layers is not None:
             self.show(self._layers)
         return self._keys.poll()
 
     def close(self) -> None:
-        """Close the panels. May be called twice."""
+        """Close the windows of the panels. Further calls have no effect."""
         self._sink.close()
 
 
 def open_display(settings: Settings, *, registered: bool = False, grey_curve: bool = True) -> PanelDisplay:
     """Open the configured panels.
 
-    registered, grey_curve: whether to apply these corrections. Raises InputError for unsuitable settings, MissingPart
-    if OpenGL or X11 is missing, and PanelLost if a monitor is missing.
+    Args:
+        settings: Configuration of the display.
+        registered: Apply the registration, that is, the homography of each panel.
+        grey_curve: Apply the gamma or the LUT of each panel.
+
+    Raises:
+        InputError: The settings are not suitable for this machine.
+        MissingPart: OpenGL or X11 is not available.
+        PanelLost: A monitor is not connected.
     """
     stack = settings.stack.stack()
     changes: dict[str, object] = {} if registered else {"homography": IDENTITY}
@@ -64,7 +71,7 @@ def open_display(settings: Settings, *, registered: bool = False, grey_curve: bo
 
 
 def show_until_key(display: PanelDisplay, layers: U8, title: str) -> None:
-    """Show (N, H, W, 4) layers until Enter or q is pressed, then close the display.
+    """Show layers (N, H, W, 4) until Enter or q is pressed, and close the display.
 
     Raises PanelLost if a panel is lost.
     """
@@ -80,5 +87,5 @@ def show_until_key(display: PanelDisplay, layers: U8, title: str) -> None:
 
 
 def grey_layers(pictures: U8) -> U8:
-    """Convert grey pictures (N, H, W), one per panel, to (N, H, W, 4) layers."""
+    """Convert one grey picture per panel (N, H, W) to layers (N, H, W, 4) with opaque alpha."""
     return np.concatenate([np.repeat(pictures[..., None], 3, axis=-1), np.full_like(pictures[..., None], 255)], axis=-1)

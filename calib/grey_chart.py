@@ -1,11 +1,11 @@
-"""Chart that measures a panel's grey curve with a camera whose tone curve is unknown.
+"""Measure a panel's grey curve from photographs of a chart, with a camera whose tone curve is unknown.
 
-The patches of each grey are scattered over the chart, so that uneven light can be separated from the greys. Patches
-that mix black and white pixels in known proportions calibrate the camera, because their intensity does not depend on
-the panel's grey curve. Marks of the board between the patches locate them in a photograph.
+The patches of each grey are scattered over the chart, which makes it possible to separate uneven light from the greys.
+Other patches mix black and white pixels in known proportions. Their intensity does not depend on the panel's grey
+curve, so they calibrate the camera. Marks of the calibration board between the patches locate them in a photograph.
 
-Between crossed polarizers, with the other panels at zero, a panel with phase p shows dark + range·sin²(pi/2·p)
-(EyeReal, (4)). Full white is assumed to be phase 1. Intensities cannot reveal a panel that does not reach it.
+If the other panels are at zero, a panel with phase p between crossed polarizers shows dark + range·sin²(pi/2·p)
+(EyeReal, (4)). Full white is assumed to be phase 1. Photographs cannot reveal that a panel does not reach this phase.
 """
 
 from __future__ import annotations
@@ -30,34 +30,37 @@ from runtime.records import F64, U8
 from runtime.support.artifacts import write_text
 
 GREYS = tuple(round(255 * step / 12) for step in range(13))
-SHARES = tuple(step / 16 for step in (1, 2, 4, 6, 8, 11, 14))  # of white pixels in a mixed patch
+SHARES = tuple(step / 16 for step in (1, 2, 4, 6, 8, 11, 14))  # shares of white pixels in the mixed patches
 PATCHES_ACROSS = 32  # number of patches across the width of a panel
-MARGIN = 0.15  # share of a panel on each side, because its rim is dark when seen from nearby
+MARGIN = 0.15  # share of a panel left free at each edge, because the edges look dark from nearby
 INNER = 0.5  # share of a patch's side that is measured
-SAMPLES = 24  # per side of a patch
-MIN_MARKS = 4  # for the homography of a panel's patches
-FALLS = 0.01  # maximum decrease from a grey to the next brighter one, as a share of the range
+SAMPLES = 24  # number of samples along each side of a patch
+MIN_MARKS = 4  # minimum number of marks for the homography from the panel to a photograph
+FALLS = 0.01  # maximum decrease in intensity from a grey to the next brighter one, as a share of the full range
 CLIPPED = 0.02  # share of clipped pixels in white patches above which a photograph is overexposed
-LUT_ROWS = 256  # one per 8-bit phase
+LUT_ROWS = 256  # one row for each 8-bit phase
 BAYER = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]])
 
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """One square of the chart."""
+    """Square of the chart that has one grey or mixes black and white pixels."""
 
     left_px: int
     top_px: int
     side_px: int
-    grey: int  # 0 to 255; -1: mixed black and white pixels
-    share: float  # of white pixels in a mixed patch
+    grey: int  # grey from 0 to 255, or -1 for a mixture of black and white pixels
+    share: float  # share of white pixels in a mixed patch
 
 
 @lru_cache(maxsize=8)
 def patches(stack: PanelStack, panel: int) -> tuple[Patch, ...]:
-    """Return the patches between the board's marks, their kinds shuffled reproducibly."""
+    """Lay out the patches of a panel's chart between the marks of its board.
+
+    The greys and mixtures are in random order, which is always the same for a panel.
+    """
     pitch = stack.width_px // PATCHES_ACROSS
-    side = pitch * 5 // 6 // 8 * 8  # so that the measured half contains whole periods of the mixing pattern
+    side = pitch * 5 // 6 // 8 * 8  # the measured half then contains whole periods of the mixing pattern
     free = [
         (left, top)
         for top in range(round(MARGIN * stack.height_px), round((1 - MARGIN) * stack.height_px) - side, pitch)
@@ -74,7 +77,7 @@ def patches(stack: PanelStack, panel: int) -> tuple[Patch, ...]:
 
 
 def _is_covered(stack: PanelStack, panel: int, left: int, top: int, side: int) -> bool:
-    """Return True if a square overlaps or nearly overlaps a mark of the board."""
+    """Return True if a square overlaps a mark of the panel's board or is too close to one."""
     for mark in marks(stack):
         gap, tile = 2 * mark.unit_px, TILE * mark.unit_px
         u, v = (place - CORNER * mark.unit_px - gap for place in (mark.left_px, mark.top_px))
@@ -85,7 +88,10 @@ def _is_covered(stack: PanelStack, panel: int, left: int, top: int, side: int) -
 
 
 def grey_chart(stack: PanelStack, panel: int) -> U8:
-    """Draw the chart of a panel (H, W), to be shown without resampling or LUT while others are clear."""
+    """Draw the chart of a panel as an array (H, W).
+
+    The chart must be shown without resampling or LUT, while all other panels are at zero.
+    """
     picture = board(stack, panel)
     for patch in patches(stack, panel):
         area = picture[patch.top_px : patch.top_px + patch.side_px, patch.left_px : patch.left_px + patch.side_px]
@@ -98,7 +104,7 @@ def grey_chart(stack: PanelStack, panel: int) -> U8:
 
 
 def grey_charts(stack: PanelStack, panel: int) -> U8:
-    """Return pictures (N, H, W) for all panels, with the chart on one while the others are clear."""
+    """Return pictures (N, H, W) for all panels, with the chart on one panel and zeros on the others."""
     charts = np.zeros((stack.count, stack.height_px, stack.width_px), np.uint8)
     charts[panel] = grey_chart(stack, panel)
     return charts
@@ -107,9 +113,20 @@ def grey_charts(stack: PanelStack, panel: int) -> U8:
 def lut_from_photographs(
     out: Path, pictures: Iterable[tuple[str, U8]], stack: PanelStack, *, panel: int, source: str
 ) -> dict[str, Any]:
-    """Compute and write the LUT of a panel from named photographs (h, w) of its chart.
+    """Measure the grey curve of a panel from photographs of its chart, and write the LUT.
 
-    Raises InputError if a photograph or the measurement is unusable.
+    Args:
+        out: CSV file to write the LUT to.
+        pictures: Names and grey pixels (h, w) of the photographs.
+        stack: Geometry of the panels.
+        panel: Index of the panel.
+        source: Origin of the photographs, for error messages.
+
+    Returns:
+        The summary of the command.
+
+    Raises:
+        InputError: A photograph is unusable, or the measured greys do not increase.
     """
     measured = [histograms(picture, stack, panel, source=f"{source}, {name}") for name, picture in pictures]
     intensity, residual = measure(measured, stack, panel, source=source)
@@ -118,8 +135,8 @@ def lut_from_photographs(
 
 
 def write_lut(out: Path, intensity: F64) -> None:
-    """Write a LUT (256 rows of phase and grey, 0 to 1) from the intensities (13,) of `GREYS`."""
-    # The root of the intensity is smooth at both ends, for bare panels and for monitors with a tone curve.
+    """Write a LUT with 256 rows of phase and grey from 0 to 1, given the intensities (13,) of `GREYS`."""
+    # The square root of the intensity is smooth at both ends, for bare panels and for monitors with a tone curve.
     root = PchipInterpolator(np.array(GREYS) / 255, np.sqrt(np.maximum.accumulate(intensity)))
     fine, rows = np.linspace(0.0, 1.0, 4097), np.linspace(0.0, 1.0, LUT_ROWS)
     greys = np.interp(rows, phase_from_intensity(np.clip(root(fine), 0.0, 1.0) ** 2, branch=1), fine)
@@ -128,9 +145,16 @@ def write_lut(out: Path, intensity: F64) -> None:
 
 
 def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F64:
-    """Return (P, 256) histograms of the code values in the middle of each patch of a photograph (h, w).
+    """Return the histograms (P, 256) of the pixel values in the middle of each patch.
 
-    Raises InputError if the photograph is too dark or overexposed, or does not show the whole chart.
+    Args:
+        picture: Grey photograph (h, w) of a chart.
+        stack: Geometry of the panels.
+        panel: Index of the panel that shows the chart.
+        source: Name of the photograph, for error messages.
+
+    Raises:
+        InputError: The photograph is too dark or overexposed, or does not show the entire chart.
     """
     seen = find_marks(picture, stack, name="")
     mine, marks_seen = seen.panel == panel, seen.marks[panel]
@@ -160,11 +184,22 @@ def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F6
 
 
 def measure(pictures: list[F64], stack: PanelStack, panel: int, *, source: str) -> tuple[F64, float]:
-    """Estimate the intensities (13,) of `GREYS` from histograms, and the median residual.
+    """Estimate the intensities of `GREYS` from the histograms of photographs with equal exposure.
 
-    All photographs must have the same exposure. The fit includes the camera's tone curve, the uneven light of each
-    photograph (a quadratic in its logarithm) and the greys. The residual is relative to the intensity of a patch.
-    Raises InputError if the greys do not increase.
+    The fit determines the camera's tone curve, the uneven light in each photograph (a quadratic polynomial in the
+    logarithm of the light) and the intensities of the greys.
+
+    Args:
+        pictures: Histograms (P, 256) of the patches in each photograph.
+        stack: Geometry of the panels.
+        panel: Index of the panel that shows the chart.
+        source: Origin of the photographs, for error messages.
+
+    Returns:
+        The intensities (13,) from 0 to 1, and the median residual relative to the intensity of a patch.
+
+    Raises:
+        InputError: The intensities do not increase from grey to grey.
     """
     chart = patches(stack, panel)
     place = np.array([[p.left_px / stack.width_px - 0.5, p.top_px / stack.height_px - 0.5] for p in chart])

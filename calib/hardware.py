@@ -1,4 +1,4 @@
-"""Hardware that the setup uses: keys, monitors, panels, photographs and a depth sensor."""
+"""Access to the hardware that the setup uses: keys, monitors, panels, photographs and a depth sensor."""
 
 from __future__ import annotations
 
@@ -25,32 +25,43 @@ from runtime.sensor.worker import OPEN_TIMEOUT_S, SensorWorker
 Poll = Callable[[], Key | None]
 Say = Callable[[str], None]
 Named = tuple[str, U8]  # name and pixels (h, w) of a photograph
-Sample = tuple[int, EyePoints | None, str]  # capture time, eyes in the sensor frame, serial number of the sensor
+Sample = tuple[int, EyePoints | None, str]  # capture time in ns, eyes in the sensor frame, the sensor's serial number
 POLL_NS = 20 * NS_PER_MS  # interval between polls for keys and samples
-CARD_CHARACTERS = 32  # maximum length of a line on a card
+CARD_CHARACTERS = 32  # maximum number of characters in a line of an identity card
 
 
 class SetupHardware:
-    """Real hardware: monitors on X11, a sensor, a folder of photographs and a person at the keys."""
+    """Access to real hardware: monitors on X11, a sensor, a folder of photographs and a person at the keyboard.
+
+    The object opens at most one set of windows and one sensor at a time, and `close` releases everything.
+    """
 
     simulated = False
 
     def __init__(self, keys: Poll, *, photos: Path = Path("photos")) -> None:
-        """keys: keys from the terminal, used in addition to those from the panels' windows."""
+        """Store the arguments without opening any device.
+
+        Args:
+            keys: Function that returns the next key from the terminal. Keys from the panels' windows are added.
+            photos: Folder into which the person puts the photographs.
+        """
         self._keys, self._photos = keys, photos
         self._clock = MonotonicClock()
-        self._display: PanelDisplay | None = None  # the open windows, if any
+        self._display: PanelDisplay | None = None  # the windows that are open
         self._charts: Charts | None = None
         self._cards: tuple[list[U8], tuple[Monitor, ...]] = ([], ())
         self._worker: SensorWorker | None = None
         self._frames: list[SensorFrame] = []  # received, but not yet returned by `sample`
 
     def poll(self) -> Key | None:
-        """Return a key pressed in the terminal or a panel's window. Also keeps the windows responsive."""
+        """Return the next key that was pressed in the terminal or in a panel's window, or None.
+
+        The call also keeps the windows responsive.
+        """
         return self._keys() or (self._display.key() if self._display is not None else None)
 
     def key(self) -> Key:
-        """Wait for a key and return it."""
+        """Wait until a key is pressed, and return the key."""
         while (key := self.poll()) is None:
             self.wait()
         return key
@@ -73,7 +84,12 @@ class SetupHardware:
         return monitors
 
     def show_card(self, number: int, words: Sequence[str]) -> None:
-        """Show a card with the text `words` on monitor `number` and clear the other monitors."""
+        """Show a card with lines of text on one monitor, and clear the other monitors.
+
+        Args:
+            number: Index of the monitor in the result of `monitors`.
+            words: Texts to show. Long texts are wrapped.
+        """
         cards, monitors = self._cards
         height, width = cards[number].shape[:2]
         lines = [line for text in words for line in wrap(text, CARD_CHARACTERS)]
@@ -82,10 +98,17 @@ class SetupHardware:
             self._display.show(alone([*cards[:number], card, *cards[number + 1 :]], number))
 
     def photographs(self, settings: Settings, pictures: U8, *, panel: int | None, say: Say) -> Iterator[Named]:
-        """Show pictures (N, H, W) on the uncorrected panels, wait for photographs and yield them.
+        """Show pictures on the panels without registration, wait for a person's photographs and return them.
 
-        The pictures are the boards or, if `panel` is given, its grey chart. Raises InputError if there are no usable
-        photographs, and PanelLost if a panel is lost.
+        Args:
+            settings: Configuration of the display.
+            pictures: One grey picture per panel (N, H, W): the boards, or the grey chart of one panel.
+            panel: Index of the panel with the grey chart, which is shown without a grey curve. None means the boards.
+            say: Function that shows a line of text to the person.
+
+        Raises:
+            InputError: The person stopped, or the folder has no readable photographs.
+            PanelLost: A panel was lost.
         """
         self.let_go()
         folder = self._photos if panel is None else self._photos / f"grey-{panel}"
@@ -102,9 +125,11 @@ class SetupHardware:
         return photographs(folder)
 
     def open_sensor(self, settings: Settings) -> str:
-        """Start the sensor and wait until it works. Returns its name.
+        """Start the sensor, wait until it works, and return its name and serial number.
 
-        Raises InputError if it does not work in time or needs no calibration.
+        Raises:
+            InputError: The driver is unknown, the sensor does not work in time, or it needs no calibration because it
+                delivers eyes in the stack frame.
         """
         self._stop_sensor()
         open_sensor(settings.sensor, self._clock)  # refuses unknown names before anything starts
@@ -131,9 +156,10 @@ class SetupHardware:
         return f"{settings.sensor.driver} {worker.serial}".strip()
 
     def sample(self, standing_at: Viewpoint) -> Sample | None:
-        """Return the next sample, if any.
+        """Return the next sample of the sensor, or None if no sample has arrived.
 
-        No sample is lost if the panels are slow. standing_at: where the person was asked to stand, for simulations.
+        Samples are queued, and none is lost if the panels are slow. `standing_at` is the viewpoint to which the person
+        was asked to move; only the simulation uses it.
         """
         if self._worker is None:
             return None
@@ -154,12 +180,12 @@ class SetupHardware:
         return lambda viewpoint: display.show(charts.layers(viewpoint))
 
     def close(self) -> None:
-        """Release everything. May be called twice."""
+        """Close the windows, the model and the sensor. Further calls have no effect."""
         self.let_go()
         self._stop_sensor()
 
     def let_go(self) -> None:
-        """Close any open windows and the model that computes their layers."""
+        """Close the windows, and the model that computes the layers of the charts."""
         for part in (self._display, self._charts):
             if part is not None:
                 part.close()

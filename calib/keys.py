@@ -1,4 +1,4 @@
-"""Keyboard input: lines and single keys from the terminal, single keys from a panel's window."""
+"""Read lines and single keys from the terminal, and single keys from the windows of the panels."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from runtime.panels.base import PanelSink
 
 
 class Key(Enum):
-    """Keys, named after their meaning."""
+    """Keys that the setup understands, named after their meaning."""
 
     ACCEPT = auto()
     NEXT = auto()
@@ -24,7 +24,7 @@ class Key(Enum):
     QUIT = auto()
 
 
-# Names of each key in GLFW, and its byte sequences in a terminal.
+# Names of each key in GLFW, and the bytes that a terminal sends for the key.
 _MEANINGS: dict[Key, tuple[str, tuple[bytes, ...]]] = {
     Key.RIGHT: ("RIGHT", (b"\x1b[C",)),
     Key.LEFT: ("LEFT", (b"\x1b[D",)),
@@ -39,7 +39,11 @@ _OF_BYTES = {data: key for key, (_, pieces) in _MEANINGS.items() for data in pie
 
 
 def parse(data: bytes) -> tuple[list[Key], bytes]:
-    """Return the keys in bytes from a terminal, and an incomplete escape sequence at their end."""
+    """Decode bytes from a terminal.
+
+    Returns:
+        The keys, and the bytes of an escape sequence that is still incomplete.
+    """
     keys: list[Key] = []
     while data:
         if data[:1] == b"\x1b" and len(data) < 3 and b"\x1b[".startswith(data[:2]):
@@ -52,17 +56,25 @@ def parse(data: bytes) -> tuple[list[Key], bytes]:
 
 
 class TerminalKeys:
-    """Keys and lines from standard input. Between `poll` and `close` a terminal is in character mode."""
+    """Reader for keys and lines from standard input.
+
+    The first `poll` switches a terminal to character mode, and `close` restores the previous mode.
+    """
 
     def __init__(self, descriptor: int | None = None, *, quit_at_end: bool = True) -> None:
-        """quit_at_end: whether the end of input counts as the key `QUIT`. If not, no more keys are reported."""
+        """Choose the input without changing the mode of the terminal.
+
+        Args:
+            descriptor: File descriptor to read, by default that of standard input.
+            quit_at_end: Report the end of the input as the key `QUIT`. Otherwise no more keys are reported.
+        """
         self._quit_at_end = quit_at_end
         self._descriptor = _standard_input() if descriptor is None else descriptor
         self._rest = b""
         self._mode: Any = None  # previous mode of the terminal
 
     def poll(self) -> Key | None:
-        """Return the next key, or None. Never waits."""
+        """Return the next key without waiting, or None if no key was pressed."""
         if self._mode is None and self._descriptor >= 0 and os.isatty(self._descriptor):
             import termios
             import tty
@@ -81,7 +93,7 @@ class TerminalKeys:
         return None
 
     def line(self) -> str:
-        """Wait for the next line and return it, or `q` at the end of input."""
+        """Wait for the next line and return it without surrounding blanks. The end of input returns `q`."""
         self.close()
         data = b""
         while self._descriptor >= 0 and (read := os.read(self._descriptor, 1)) != b"\n":
@@ -91,7 +103,7 @@ class TerminalKeys:
         return data.decode(errors="replace").strip() if self._descriptor >= 0 else "q"
 
     def close(self) -> None:
-        """Restore the terminal. May be called twice."""
+        """Restore the previous mode of the terminal. Further calls have no effect."""
         if self._mode is not None:
             import termios
 
@@ -100,7 +112,7 @@ class TerminalKeys:
 
 
 def _standard_input() -> int:
-    """Return the descriptor of standard input, or -1 if there is none, as in a service."""
+    """Return the file descriptor of standard input, or -1 if the process has no standard input."""
     try:
         return sys.stdin.fileno()
     except (AttributeError, OSError, ValueError):
@@ -108,7 +120,10 @@ def _standard_input() -> int:
 
 
 class WindowKeys:
-    """Keys pressed in a panel's window. GLFW delivers them when a frame is presented."""
+    """Reader for keys that are pressed in the panels' windows.
+
+    GLFW delivers the keys when a frame is presented.
+    """
 
     def __init__(self, sink: PanelSink) -> None:
         self._sink = sink
@@ -116,7 +131,10 @@ class WindowKeys:
         self._pending: list[Key] = []
 
     def poll(self) -> Key | None:
-        """Return the next key, or None. Never waits. Call it after presenting, on the windows' thread."""
+        """Return the next key without waiting, or None if no key was pressed.
+
+        Must be called after a frame was presented, in the thread that created the windows.
+        """
         handles = self._sink.window_handles
         if handles != self._watched:
             self._watch(handles)

@@ -1,4 +1,4 @@
-"""Pairs of a measured sensor point and a known stack point, which are read, checked and stored here."""
+"""Read, validate and store pairs of points. Each pair has a measured sensor point and a known stack point."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Number = Annotated[float, BeforeValidator(_no_truth_value), AfterValidator(_boun
 
 
 class PairRow(BaseModel):
-    """One pair as a row of the file, in metres, with the informative columns that `capture` adds."""
+    """Pair of points in metres as a row of the file, with informative columns that `calibrate capture` adds."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", coerce_numbers_to_str=True)
 
@@ -55,7 +55,7 @@ class PairRow(BaseModel):
 
     @classmethod
     def of(cls, sensor_m: F64, stack_m: F64, viewpoint: str, *, serial: str, spread_mm: str = "") -> PairRow:
-        """Create the row for a point (3,) in `sensor` and one in `stack`."""
+        """Create the row for a point (3,) in the frame `sensor` and the same point in the frame `stack`."""
         sx, sy, sz, wx, wy, wz = np.concatenate([sensor_m, stack_m]).tolist()
         return cls(
             sensor_x=sx, sensor_y=sy, sensor_z=sz, stack_x=wx, stack_y=wy, stack_z=wz,
@@ -68,22 +68,26 @@ COLUMNS = tuple(name for name, field in PairRow.model_fields.items() if field.is
 
 @dataclass(frozen=True, slots=True)
 class Pairs:
-    """K pairs and their names for messages."""
+    """Validated pairs of points, as arrays of K rows."""
 
-    sensor_m: F64  # (K, 3)
-    stack_m: F64  # (K, 3)
-    names: tuple[str, ...]
-    source: str
-    sensor_serial: str = ""  # of the device that measured all pairs; empty if unknown
+    sensor_m: F64  # (K, 3) measured points, frame `sensor`
+    stack_m: F64  # (K, 3) known points, frame `stack`
+    names: tuple[str, ...]  # names of the pairs for messages
+    source: str  # path of the file
+    sensor_serial: str = ""  # serial number of the sensor that measured all pairs; empty if unknown
 
     def __len__(self) -> int:
         return len(self.names)
 
 
 def read_pairs(path: Path) -> Pairs:
-    """Read pairs from CSV (header `COLUMNS`) or JSON (a list of objects, or `{"pairs": [...]}`).
+    """Read pairs from a CSV file whose header contains `COLUMNS`, or from a JSON file.
 
-    Raises InputError, which names the file and the invalid rows and columns.
+    A JSON file contains a list of objects, or an object `{"pairs": [...]}` with such a list.
+
+    Raises:
+        InputError: The file cannot be read, has too many pairs or pairs of different sensors, or contains invalid
+            values. The message names the rows and columns.
     """
     labels, rows = _read_rows(path)
     if len(rows) > MAX_PAIRS:
@@ -99,7 +103,10 @@ def read_pairs(path: Path) -> Pairs:
 
 
 def _read_rows(path: Path) -> tuple[list[str], list[PairRow]]:
-    """Return labels (line or number) and pairs. Raises InputError that names wrong rows and columns."""
+    """Read a file, and return a label for each pair (its line or number) and the pairs.
+
+    Raises InputError if the file cannot be read or a value is invalid. The message names the rows and columns.
+    """
     text = untrusted_input.read_text(path)
     if path.suffix.lower() == ".json":
         value = untrusted_input.parsed_json(text, source=path)
@@ -139,16 +146,16 @@ def _problem(error: Any) -> str:
 
 
 def points_of(rows: Iterable[PairRow]) -> tuple[F64, F64]:
-    """Return (K, 3) points in `sensor` and (K, 3) points in `stack`."""
+    """Return the points (K, 3) in the frame `sensor` and the points (K, 3) in the frame `stack`."""
     table = np.array([[getattr(row, name) for name in COLUMNS] for row in rows], dtype=np.float64).reshape(-1, 6)
     return table[:, :3].copy(), table[:, 3:].copy()
 
 
 class PairsFile:
-    """CSV file written during capture. Every accepted pair is stored before the next is measured."""
+    """CSV file of the pairs accepted so far. Every change is written immediately, so an interruption loses no pair."""
 
     def __init__(self, path: Path) -> None:
-        """Continue an existing file or start a new one. Raises InputError if a file contains no pairs."""
+        """Continue an existing file or start a new one. Raises InputError if an existing file is invalid."""
         self.path = path
         self.rows: list[PairRow] = []
         if untrusted_input.is_there(path):
@@ -156,16 +163,16 @@ class PairsFile:
 
     @property
     def viewpoints(self) -> frozenset[str]:
-        """Return the names of the viewpoints in the file."""
+        """Names of the viewpoints that have a pair."""
         return frozenset(row.viewpoint for row in self.rows)
 
     def __len__(self) -> int:
         return len(self.rows)
 
     def accept(self, *pairs: PairRow) -> None:
-        """Write pairs from one sensor to the file. They replace those at the same viewpoints.
+        """Add pairs from one sensor and write the file. Existing pairs at the same viewpoints are replaced.
 
-        Raises InputError if the file has pairs of another sensor.
+        Raises InputError if the file has pairs of another sensor, or cannot be written.
         """
         serial, replaced = pairs[0].sensor_serial, {pair.viewpoint for pair in pairs} - {""}
         others = {row.sensor_serial for row in self.rows} - {"", serial}

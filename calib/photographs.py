@@ -1,4 +1,4 @@
-"""Photographs read from a folder."""
+"""Read photographs from a folder."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
 
 
 def photographs(folder: Path) -> Iterator[tuple[str, U8]]:
-    """Yield the name and grey pixels (h, w) of each photograph in a folder, in order of names.
+    """Yield the name and the grey pixels (h, w) of each photograph in a folder, sorted by name.
 
-    Raises InputError if the folder contains no photographs or too many, or if one cannot be read.
+    Raises InputError if the folder contains no photographs or too many, or if a photograph cannot be read.
     """
     if not untrusted_input.is_there(folder, folder=True):
         raise InputError(folder, "", "is not a folder")
@@ -34,7 +34,10 @@ def photographs(folder: Path) -> Iterator[tuple[str, U8]]:
 
 
 def read_photograph(path: Path) -> U8:
-    """Read grey pixels (h, w) without EXIF rotation. Raises InputError if they cannot be decoded."""
+    """Read a photograph as grey pixels (h, w). The EXIF orientation is ignored.
+
+    Raises InputError if the photograph cannot be read or decoded.
+    """
     data, _ = read_coded(path)
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
     picture = None if is_cut_off(data) else cv2.imdecode(np.frombuffer(data, np.uint8), flags)

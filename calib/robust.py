@@ -1,7 +1,7 @@
-"""Robust similarities from pairs with gross errors: least trimmed squares, rejection, refit.
+"""Fit a similarity to pairs of points of which some may have gross errors.
 
-Least trimmed squares (Rousseeuw 1984) with concentration steps (FAST-LTS, Rousseeuw & Van Driessen 1999) finds the
-half of the pairs that agree best. Pairs beyond the noise estimated from this half are rejected.
+Least trimmed squares (Rousseeuw 1984) with concentration steps (FAST-LTS, Rousseeuw & Van Driessen 1999) finds the half
+of the pairs that agree best. The noise is estimated from this half, and pairs with much larger errors are rejected.
 """
 
 from __future__ import annotations
@@ -15,32 +15,38 @@ from scipy.stats import chi2
 from calib.similarity import Degenerate, ScaleRule, Similarity, fit, fit_batch
 from runtime.records import F64
 
-STARTS = 120  # random subsets to start from
-START_PAIRS = 4  # pairs in each subset
-STEPS = 4  # concentration steps from each subset
-MAX_SCORED = 2000  # with more pairs, the starts use a random sample; rejection uses all pairs
+STARTS = 120  # number of random subsets to start from
+START_PAIRS = 4  # number of pairs in each subset
+STEPS = 4  # number of concentration steps from each subset
+MAX_SCORED = 2000  # number of pairs above which the search uses a random sample; all pairs are then tested
 REJECTION_PROBABILITY = 1e-4  # probability that a good pair with Gaussian noise is rejected
 RULE: ScaleRule = "inverse"
-MIN_NOISE = 1e-12  # relative to the points' extent; prevents rejection of exact data because of rounding
+MIN_NOISE = 1e-12  # least noise relative to the points' extent, because rounding must not reject exact data
 
 
 @dataclass(frozen=True, slots=True)
 class RobustFit:
-    """A similarity fitted to the pairs that agree."""
+    """Similarity that was fitted to the pairs that agree with each other."""
 
     similarity: Similarity
-    inlier: NDArray[np.bool_]  # (K,) True for pairs that agree
+    inlier: NDArray[np.bool_]  # (K,) True for pairs that agree, False for rejected pairs
 
 
 def _residuals(candidate: Similarity, sensor_m: F64, stack_m: F64) -> F64:
-    """(..., K) squared distances, m², divided by the squared scale, so that a small scale gives no advantage."""
+    """Return the squared errors (..., K) in m², divided by the squared scale.
+
+    Without this division, similarities with a small scale would seem better.
+    """
     squared = ((candidate.points(sensor_m) - stack_m) ** 2).sum(-1)
     residuals: F64 = squared / np.maximum(candidate.scale[..., None], 1e-300) ** 2
     return residuals
 
 
 def _best_half(sensor_m: F64, stack_m: F64, *, random: np.random.Generator) -> NDArray[np.intp]:
-    """Find the half of the pairs that agree best, from many starts, each refitted to its best half."""
+    """Return the indices of the half of the pairs that agree best.
+
+    The search starts from many random subsets. Each fit is repeated with the half of the pairs that it fits best.
+    """
     count = len(sensor_m)
     keep = min(count, max(3, (count + 5) // 2))
     chosen = np.argsort(random.random((STARTS, count)), axis=1)[:, : min(START_PAIRS, count)]
@@ -56,9 +62,16 @@ def _best_half(sensor_m: F64, stack_m: F64, *, random: np.random.Generator) -> N
 
 
 def fit_robust(sensor_m: F64, stack_m: F64) -> RobustFit:
-    """Fit a similarity to the pairs that agree, (K, 3) each, K >= 3. The result is deterministic.
+    """Fit a similarity to those pairs that agree with each other. The result is deterministic.
 
-    With five pairs or fewer there is no clear majority, so all are kept. Raises Degenerate as `fit` does.
+    Five pairs or fewer have no clear majority, so all of them are used.
+
+    Args:
+        sensor_m: Points (K, 3) in the frame `sensor`, where K is at least 3.
+        stack_m: The same points (K, 3) in the frame `stack`.
+
+    Raises:
+        Degenerate: The points do not determine a similarity, as in `similarity.fit`.
     """
     count = len(sensor_m)
     everything = fit(sensor_m, stack_m, rule=RULE)
@@ -67,14 +80,14 @@ def fit_robust(sensor_m: F64, stack_m: F64) -> RobustFit:
         return RobustFit(everything, np.ones(count, bool))
     random = np.random.default_rng(0)
     scored = random.permutation(count)[:MAX_SCORED] if count > MAX_SCORED else np.arange(count)
-    # Centred, because the batched fits are not refined.
+    # The points are centred for precision, because the batched fits are not refined.
     half = scored[_best_half(sensor_m[scored] - sensor_m.mean(0), stack_m[scored] - stack_m.mean(0), random=random)]
     limit = float(chi2.ppf(1 - REJECTION_PROBABILITY, 3))
     inlier = np.zeros(count, bool)
     inlier[half] = True
     current = fit(sensor_m[inlier], stack_m[inlier], rule=RULE)
     squared = ((current.points(sensor_m) - stack_m) ** 2).sum(-1)
-    # Noise from a quantile of chi² with three degrees of freedom, corrected for its bias in small samples.
+    # Estimate the noise from a quantile of chi² with three degrees of freedom, and correct the bias of small samples.
     share = len(half) / len(scored)
     noise_m = np.sqrt(np.partition(squared[scored], len(half) - 1)[len(half) - 1] / chi2.ppf(0.999 * share, 3))
     noise_m *= 1 + 5 / max(len(scored) - 3, 1)
@@ -92,6 +105,9 @@ def fit_robust(sensor_m: F64, stack_m: F64) -> RobustFit:
 
 
 def _noise(similarity: Similarity, sensor_m: F64, stack_m: F64, inlier: NDArray[np.bool_]) -> float:
-    """Standard deviation of one coordinate in `stack`; the fit uses up seven degrees of freedom."""
+    """Return the standard deviation of one coordinate of the inliers in the frame `stack`.
+
+    The seven parameters of the fit reduce the degrees of freedom.
+    """
     squared = ((similarity.points(sensor_m) - stack_m) ** 2).sum(-1)[inlier].sum()
     return float(np.sqrt(squared / max(3 * int(inlier.sum()) - 7, 1)))
