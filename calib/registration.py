@@ -1,9 +1,9 @@
-"""Registration of the panels from photographs of their test patterns: poses and standard errors.
+"""Register the panels: measure their poses from photographs of the calibration boards, with standard errors.
 
-The stack frame is that of the reference (middle) panel, whose picture is not resampled. Every other panel gets its
-actual distance and a homography that maps each pixel to where it would appear on a panel parallel to the reference.
-For a parallel panel this is exact at every eye position. For a tilted one it is exact only at the viewing position, and
-the models correct the tilt at other positions.
+The middle panel is the reference: it defines the stack frame, and its picture is not resampled. For every other panel
+the configuration stores the actual distance and a homography from the pixels of an ideal panel, parallel to the
+reference, to the pixels of the actual panel. The homography of a parallel panel is exact for every eye position. That
+of a tilted panel is exact only at the viewing position, and the models correct the tilt at other positions.
 """
 
 from __future__ import annotations
@@ -30,48 +30,54 @@ from runtime.support.artifacts import write_json
 from runtime.support.progress import status_line
 
 MIN_PHOTOGRAPHS = 5  # minimum number of usable photographs
-MIN_SPAN_DEG = 15.0  # minimum angle between the two directions farthest apart
-DISAGREES = 0.4  # a photograph with a larger share of outliers is excluded
+MIN_SPAN_DEG = 15.0  # minimum angle between the two most different directions of the photographs
+DISAGREES = 0.4  # share of outliers above which a photograph is excluded
 MISFIT_PX = 1.5  # residual above which the stack is not rigid or has moved
-IMPLAUSIBLE_M = 0.010  # displacement of a panel that exceeds errors of manual assembly
+IMPLAUSIBLE_M = 0.010  # displacement of a panel that is too large for an error of manual assembly
 DOUBTFUL_PX = 0.3  # uncertainty of a corner above which a registration is refused
 
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """Registered panels, with their uncertainties."""
+    """Measured geometry of the stack and homographies of the panels, with their uncertainties."""
 
-    bundle: Bundle
+    bundle: Bundle  # poses of the panels and the camera
     stack: PanelStack  # geometry to configure, with actual distances and tilts
-    gap_sigma_m: F64  # (N-1,)
-    homographies: F64  # (N, 3, 3) from ideal pixels of `stack` to actual ones
-    corners_px: F64  # (N, 4, 2) displacement of the corners (0, 0), (W, 0), (W, H), (0, H)
-    corner_sigma_px: F64  # (N, 4, 2)
-    eye_m: F64  # (3,) the viewing position
+    gap_sigma_m: F64  # (N-1,) standard deviations of the gaps
+    homographies: F64  # (N, 3, 3) from ideal pixels of `stack` to pixels of the actual panels
+    corners_px: F64  # (N, 4, 2) displacements of the corners (0, 0), (W, 0), (W, H), (0, H)
+    corner_sigma_px: F64  # (N, 4, 2) standard deviations of the displacements
+    eye_m: F64  # (3,) viewing position for which the homographies are exact, frame `stack`
     used: int  # number of photographs used
-    notes: list[str]  # excluded photographs, with reasons
+    notes: list[str]  # names of the excluded photographs, with reasons
 
     @property
     def sigma_panel_px(self) -> F64:
-        """RMS uncertainty of the corners of each panel (N,), in panel pixels."""
+        """RMS uncertainty (N,) of the four corners of each panel, in panel pixels."""
         return np.asarray(np.sqrt((self.corner_sigma_px**2).sum(-1).mean(-1)), dtype=np.float64)
 
     def eye_error_mm(self) -> float:
-        """Displacement of an eye that is equivalent to the uncertainty of the worst panel, in mm."""
+        """Return the eye movement in mm that would have the same effect as the worst panel's uncertainty."""
         gap_m = np.abs(np.array(self.stack.x_m) - self.stack.x_m[self.bundle.reference])
         pitch_m, others = self.stack.width_m / self.stack.width_px, gap_m > 0
         return float((self.sigma_panel_px[others] * pitch_m * self.eye_m[0] / gap_m[others]).max()) * 1e3
 
 
 def homographies(panels: Sequence[PlacedPanel], stack: PanelStack, eye_m: F64) -> F64:
-    """Return the homographies (N, 3, 3) from ideal to actual pixels as an eye sees them."""
+    """Return the homographies (N, 3, 3) from ideal to actual pixels, as seen by an eye at `eye_m`."""
     return np.stack([true_from_ideal_seen(panel, eye_m, stack, index) for index, panel in enumerate(panels)])
 
 
 def geometry_of(panels: Sequence[PlacedPanel], stack: PanelStack, *, eye_m: F64) -> PanelStack:
-    """Return the geometry to configure for panels at these poses, registered for an eye at (3,).
+    """Return the geometry to configure for panels at their measured poses.
 
-    Raises Undetermined if the panels are not in order.
+    Args:
+        panels: Poses of the panels from rear to front.
+        stack: Configured geometry, whose distances and tilts are replaced.
+        eye_m: Viewing position (3,) for which the panels are registered, in the frame `stack`.
+
+    Raises:
+        Undetermined: The panels are not in the configured order.
     """
     x_m = tuple(panel.axis_x_m for panel in panels)
     if any(b <= a for a, b in pairwise(x_m)):
@@ -82,7 +88,19 @@ def geometry_of(panels: Sequence[PlacedPanel], stack: PanelStack, *, eye_m: F64)
 
 
 def register_photographs(seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m: F64) -> Registration:
-    """Fit the panels' poses and check them. Raises Undetermined, with the reason, if a check fails."""
+    """Fit the poses of the panels to the marks in photographs, and check the result.
+
+    Photographs that are faulty, differ in size or contradict the others are excluded.
+
+    Args:
+        seen: Marks found in each photograph.
+        stack: Configured geometry.
+        eye_m: Viewing position (3,) for which the panels are registered, in the frame `stack`.
+
+    Raises:
+        Undetermined: The photographs are too few, too similar or inconsistent, or the result is implausible or too
+            uncertain. The message gives the reason.
+    """
     reference = stack.count // 2
     excluded = {s.name: s.fault for s in seen if s.fault}
     excluded |= _other_sizes([s for s in seen if not s.fault])
@@ -174,9 +192,21 @@ def _refuse_implausible(bundle: Bundle, stack: PanelStack) -> None:
 def register_photos(
     pictures: Iterable[tuple[str, U8]], source: str, out: Path, settings: Settings, *, config: Path | None
 ) -> dict[str, Any]:
-    """Register the panels from named photographs (h, w), report, and optionally write to `config`.
+    """Register the panels from photographs and write `registration.json`.
 
-    Raises InputError, and writes nothing, if the photographs do not determine the panels.
+    Args:
+        pictures: Names and grey pixels (h, w) of the photographs.
+        source: Origin of the photographs, for error messages.
+        out: Folder for `registration.json`.
+        settings: Configuration of the display.
+        config: Configuration file to update with the registration, or None.
+
+    Returns:
+        The summary of the command.
+
+    Raises:
+        InputError: The photographs do not determine the panels, or `config` describes another number of panels.
+            Nothing is written.
     """
     stack = settings.stack.stack()
     if config is not None and len(settings.output.panels) not in (0, stack.count):
@@ -201,7 +231,7 @@ def register_photos(
 
 
 def put_registration(document: TOMLDocument, registered: Registration) -> None:
-    """Set the distances, tilts and homographies in a configuration."""
+    """Set the distances and tilts of the panels and their homographies in a configuration."""
     matrices = registered.homographies.tolist()
     put_panels(document, "homography", dict(enumerate(matrices)), panels=len(matrices))
     tilt = registered.stack.tilt
@@ -220,8 +250,8 @@ def registration_summary(registered: Registration) -> dict[str, Any]:
     panels = [
         {
             "x_m": stack.x_m[index],
-            "tilt_deg": tilt_deg[index],  # tilt of its right and top edges towards the viewer
-            "turn_deg": np.degrees(np.arctan2(rows[index, 2], rows[index, 1])),  # counter-clockwise in its plane
+            "tilt_deg": tilt_deg[index],  # tilt of the right and the top edge towards the viewer
+            "turn_deg": np.degrees(np.arctan2(rows[index, 2], rows[index, 1])),  # counter-clockwise
             "homography": registered.homographies[index],
             "corner_off_px": np.linalg.norm(registered.corners_px[index], axis=1).max(),
             "sigma_px": registered.sigma_panel_px[index],

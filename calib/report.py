@@ -1,4 +1,4 @@
-"""`calibrate report`: a page with the error at every point (figure S5) and all other figures."""
+"""Write a page with the error at every calibration point and the other figures (`calibrate report`)."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ COLOURS = {"X": "#c0392b", "Y": "#27803b", "Z": "#2260a8"}
 
 
 class StoredPairs(Lenient):
-    """Table `[data]` of a calibration file: the pairs from which it was computed, if it contains them."""
+    """Table `[data]` of a calibration file, with the pairs from which the calibration was computed."""
 
-    sensor_m: tuple[Vector3, ...]
-    stack_m: tuple[Vector3, ...]  # known positions
-    used: tuple[bool, ...]
+    sensor_m: tuple[Vector3, ...]  # measured positions, frame `sensor`
+    stack_m: tuple[Vector3, ...]  # known positions, frame `stack`
+    used: tuple[bool, ...]  # False for pairs that were rejected as outliers
     names: tuple[str, ...]
 
     @model_validator(mode="after")
@@ -37,15 +37,27 @@ class StoredPairs(Lenient):
 
 
 class Points(NamedTuple):
-    """The pairs from which a calibration was computed."""
+    """Errors of a calibration at the pairs from which it was computed."""
 
     names: tuple[str, ...]
     residual_m: F64  # (K, 3) calibrated minus true positions, frame `stack`
-    used: NDArray[np.bool_]  # (K,)
+    used: NDArray[np.bool_]  # (K,) False for pairs that were rejected as outliers
 
 
 def write_report(file: Path, out: Path, *, viewing: CalibrationSettings) -> dict[str, Any]:
-    """Write `index.html`, its PNGs and `report.json`. Raises InputError if the file is invalid."""
+    """Write a page about a calibration, with its plots as PNG files and its figures in `report.json`.
+
+    Args:
+        file: Calibration file.
+        out: Folder to write to.
+        viewing: Settings of the viewing range, over which the error at the eye is averaged.
+
+    Returns:
+        The contents of `report.json`.
+
+    Raises:
+        InputError: The calibration file is invalid, or the page cannot be written.
+    """
     calibration, table = load_calibration(file), read_table(file)
     points = _stored_points(table.get("data"), calibration, source=file)
     summary = _summary(calibration, points, viewing_volume_m(viewing))
@@ -68,9 +80,9 @@ def write_report(file: Path, out: Path, *, viewing: CalibrationSettings) -> dict
 
 
 def _stored_points(data: Any, calibration: Calibration, *, source: Path) -> Points | None:
-    """Return the pairs in a calibration file's `[data]`, or None if there are none.
+    """Return the errors at the pairs in a file's table `[data]`, or None if the file contains no pairs.
 
-    Raises InputError if they are invalid.
+    Raises InputError if the table is invalid.
     """
     if not isinstance(data, dict) or "sensor_m" not in data:
         return None
@@ -79,7 +91,15 @@ def _stored_points(data: Any, calibration: Calibration, *, source: Path) -> Poin
 
 
 def residual_figure(points: Points, *, limit_m: float) -> bytes:
-    """Plot the X, Y and Z errors of every calibration point in mm (the EyeReal supplement's figure S5)."""
+    """Plot the X, Y and Z errors of every calibration point in mm, as in figure S5 of the EyeReal supplement.
+
+    Args:
+        points: Errors at the calibration points.
+        limit_m: Error at which dashed lines are drawn, in metres.
+
+    Returns:
+        The plot as a PNG file.
+    """
     residual_m, used = points.residual_m, points.used
     with drawing(9, 6.5) as canvas:
         axes = canvas.subplots(nrows=3, sharex=True, sharey=True)
@@ -104,7 +124,7 @@ def residual_figure(points: Points, *, limit_m: float) -> bytes:
 
 
 def _summary(calibration: Calibration, points: Points | None, volume_m: F64) -> dict[str, Any]:
-    """Return the contents of `report.json`, with None for unknown values."""
+    """Return the contents of `report.json`, in which None marks unknown values."""
     found: dict[str, Any] = {
         "method": calibration.file.method,
         "date": str(calibration.file.date),

@@ -1,4 +1,4 @@
-"""`phasestack setup`: guide a person through the steps, which can be interrupted and resumed."""
+"""Guide a person through the setup of a display, which can be interrupted and resumed (`phasestack setup`)."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ MAX_PROGRESS_BYTES = 4 << 20  # size limit for setup.json
 
 
 def progress_path(config: Path) -> Path:
-    """Return the path of the file that records the setup's progress, next to the configuration."""
+    """Return the path of the file that records the progress of the setup. It is next to the configuration."""
     return config.with_name(f"{config.stem}.setup.json")
 
 
 def read_progress(path: Path) -> dict[str, Any]:
-    """Read the figures of finished steps, by step name. Raises InputError if the file is invalid."""
+    """Return the figures of the finished steps by the name of the step. Raises InputError if the file is invalid."""
     if not untrusted_input.is_there(path):
         return {}
     try:
@@ -39,9 +39,21 @@ def read_progress(path: Path) -> dict[str, Any]:
 def run_setup(
     config: Path, *, out: Path, photos: Path, simulate: bool, seed: int, to_stderr: bool
 ) -> tuple[dict[str, Any], str]:
-    """Run the setup. Returns its summary as a dictionary and as text.
+    """Run the setup interactively.
 
-    Raises InputError if the configuration or the file of finished steps is invalid.
+    Args:
+        config: Configuration file to create or change.
+        out: Folder for reports and for the files that the configuration uses.
+        photos: Folder into which the person puts photographs.
+        simulate: Simulate the monitors, the panels and the sensor.
+        seed: Seed of the simulation.
+        to_stderr: Write all messages to stderr instead of stdout.
+
+    Returns:
+        The summary as a dictionary and as text.
+
+    Raises:
+        InputError: The configuration or the file that records the progress is invalid.
     """
 
     def say(text: str) -> None:
@@ -65,7 +77,7 @@ def run_setup(
 
 
 def walk_through(setup: Setup) -> bool:
-    """Run the steps until the last one or q. Returns True if no step is left."""
+    """Run the steps from the first unfinished one. Returns True after the last step, False if the person stops."""
     number = next((n for n, step in enumerate(STEPS) if step.name not in setup.done), 0)
     while number < len(STEPS):
         step = STEPS[number]
@@ -83,7 +95,7 @@ def walk_through(setup: Setup) -> bool:
 
 
 def _is_done(setup: Setup, step: SetupStep) -> bool:
-    """Run a step. Returns True if it succeeded."""
+    """Run a step and record its figures. Returns False if the step failed or was stopped."""
     try:
         figures = step.run(setup)
     except (SetupStopped, PhasestackError) as error:
@@ -97,7 +109,10 @@ def _is_done(setup: Setup, step: SetupStep) -> bool:
 
 
 def summarise(setup: Setup, *, finished: bool) -> tuple[dict[str, Any], str]:
-    """Write the figures and return the summary, also as text that ends with the commands to run next."""
+    """Return the summary as a dictionary and as text. If the setup is finished, the summary is also written.
+
+    The text ends with the commands to run next.
+    """
     missing = [step.name for step in STEPS if step.name not in setup.done]
     summary: dict[str, Any] = {
         "config": str(setup.config),

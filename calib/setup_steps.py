@@ -1,4 +1,4 @@
-"""Steps of `phasestack setup`, with their questions, changes to the configuration and reports."""
+"""Steps of `phasestack setup`. Each asks questions, changes the configuration and reports figures."""
 
 from __future__ import annotations
 
@@ -37,27 +37,30 @@ YES_NO = {Key.ACCEPT: True, Key.NEXT: False}
 
 
 class SetupStopped(Exception):
-    """Raised when the person interrupts the setup."""
+    """Raised when the person stops a step or the setup."""
 
 
 @dataclass
 class Setup:
-    """State shared by all steps."""
+    """State that all steps of the setup share."""
 
-    config: Path
-    out: Path  # folder for reports and for files used by the configuration
+    config: Path  # configuration file
+    out: Path  # folder for reports and for files that the configuration uses
     hardware: SetupHardware
-    say: Say
+    say: Say  # shows a line of text to the person
     line: Callable[[], str]  # returns the next line that the person types
-    done: dict[str, Figures] = field(default_factory=dict)  # figures of finished steps, by step name
+    done: dict[str, Figures] = field(default_factory=dict)  # figures of the finished steps by the name of the step
 
     @property
     def settings(self) -> Settings:
-        """Load the current configuration."""
+        """Current configuration, which is loaded on every access. A missing file means the defaults."""
         return load_settings(self.config if untrusted_input.is_there(self.config) else None)
 
     def ask(self, question: str, default: str = "") -> str:
-        """Ask a question and return the answer, or `default` for an empty line. Raises SetupStopped for q."""
+        """Ask a question and return the answer, or `default` for an empty line.
+
+        Raises SetupStopped if the answer is q.
+        """
         self.say(f"{question} [{default or 'Enter'}; q: stop]")
         answer = self.line()
         if answer == "q":
@@ -67,16 +70,19 @@ class Setup:
 
 @dataclass(frozen=True, slots=True)
 class SetupStep:
-    """One step of the setup."""
+    """Step of the setup, with the texts that introduce it to the person."""
 
     name: str
     title: str
     what: str  # explanation in one line
-    run: Callable[[Setup], Figures]
+    run: Callable[[Setup], Figures]  # performs the step and returns its figures
 
 
 def identify(setup: Setup) -> Figures:
-    """Step 1: assign monitors to panels and find how they are mounted, using a card on one at a time."""
+    """Step 1: assign the monitors to the panels and determine how each panel is mounted.
+
+    One monitor at a time shows a card, and the person answers questions about the card.
+    """
     hardware, count = setup.hardware, setup.settings.stack.stack().count
     monitors = hardware.monitors()
     if len(monitors) < count:
@@ -113,11 +119,14 @@ def _name_of(monitor: Monitor, monitors: Sequence[Monitor]) -> dict[str, Any]:
 
 
 def geometry(setup: Setup) -> Figures:
-    """Step 2: ask for sizes, the approximate gap, which registration refines, and viewing distances."""
+    """Step 2: ask for the sizes of the panels, the approximate gap and the viewing distances.
+
+    The registration measures the gaps exactly later.
+    """
     stack, calibration = setup.settings.stack, setup.settings.calibration
 
     def length_m(question: str, value_m: float, unit_m: float = 1e-3) -> float:
-        """Ask for a length and return it in metres. An empty line keeps `value_m`."""
+        """Ask for a length in units of `unit_m`, and return it in metres. An empty line keeps `value_m`."""
         while True:
             answer = setup.ask(f"{question}, {'mm' if unit_m == 1e-3 else 'm'}", f"{value_m / unit_m:.6g}")
             try:
@@ -133,7 +142,7 @@ def geometry(setup: Setup) -> Figures:
     }
     gap_m = (stack.x_m[-1] - stack.x_m[0]) / (len(stack.x_m) - 1)
     typed_m = length_m("distance from one panel to the next", gap_m)
-    if typed_m != gap_m:  # else keep distances that were measured
+    if typed_m != gap_m:  # otherwise the measured distances are kept
         middle = (len(stack.x_m) - 1) / 2
         size["x_m"] = [round((index - middle) * typed_m, 7) for index in range(len(stack.x_m))]
     near_m = length_m("nearest viewer", calibration.viewing_m[0], 1.0)
@@ -150,7 +159,7 @@ def geometry(setup: Setup) -> Figures:
 
 
 def registration(setup: Setup) -> Figures:
-    """Step 3: measure the actual poses of the panels from photographs of their test patterns."""
+    """Step 3: measure the actual poses of the panels from photographs of the calibration boards."""
     rewrite(setup.config, lambda document: None)  # creates an empty configuration if none exists
     settings = setup.settings
     pictures = setup.hardware.photographs(settings, boards(settings.stack.stack()), panel=None, say=setup.say)
@@ -161,7 +170,10 @@ def registration(setup: Setup) -> Figures:
 
 
 def grey(setup: Setup) -> Figures:
-    """Step 4: measure each panel's grey curve from photographs of a chart, and save it immediately."""
+    """Step 4: measure the grey curve of each panel from photographs of a chart.
+
+    Each curve is saved as soon as it is measured.
+    """
     stack = setup.settings.stack.stack()
     known = [bool(panel.lut) for panel in setup.settings.output.panels] or [False] * stack.count
     residuals = [0.0]
@@ -183,7 +195,7 @@ def grey(setup: Setup) -> Figures:
 
 
 def _measure_grey(setup: Setup, panel: int) -> float:
-    """Measure one panel's grey curve, add it to the configuration and return its relative error."""
+    """Measure the grey curve of a panel, add it to the configuration and return its relative error."""
     settings = setup.settings
     stack = settings.stack.stack()
     pictures = setup.hardware.photographs(settings, grey_charts(stack, panel), panel=panel, say=setup.say)
@@ -216,7 +228,7 @@ def sensor(setup: Setup) -> Figures:
 
 
 def calibration(setup: Setup) -> Figures:
-    """Step 6: measure the sensor's pose with the help of a person who moves from viewpoint to viewpoint."""
+    """Step 6: measure the pose of the sensor while a person moves from viewpoint to viewpoint."""
     pairs_path, target = setup.out / "pairs.csv", setup.out / "calibration.toml"
     count = capture_live(pairs_path, setup.settings, setup.hardware, show=True, say=setup.say)["pairs"]
     if count < MIN_PAIRS:
@@ -229,7 +241,10 @@ def calibration(setup: Setup) -> Figures:
 
 
 def service(setup: Setup) -> Figures:
-    """Step 7: gather the service's files in a folder, then install them or print the commands to do so."""
+    """Step 7: collect the files of the service in a folder and install them.
+
+    Without root permissions, or in a simulation, the commands for the installation are printed instead.
+    """
     folder = (setup.out / "service").resolve()
     files = gather(setup.config, folder)
     sudo = "" if os.geteuid() == 0 else "sudo "
@@ -251,9 +266,10 @@ def service(setup: Setup) -> Figures:
 
 
 def gather(config: Path, out: Path) -> list[str]:
-    """Copy the configuration, calibration and grey curves to a folder, and return the file names.
+    """Copy the configuration, the calibration and the grey curves to a folder, and return the file names.
 
-    Other files stay where they are and get absolute paths. Raises InputError if a file cannot be read.
+    All other files stay where they are, and the copy of the configuration refers to them by absolute paths. Raises
+    InputError if a file cannot be read or written.
     """
     if not config.exists():
         raise InputError(config, "", "does not exist yet; run the earlier steps first")
