@@ -1,12 +1,14 @@
-"""Closed-form similarities from pairs of points (supplement, (19)-(27)), with several scale rules.
+"""Fit a similarity to pairs of points in closed form (EyeReal supplement, (19)-(27)).
 
-A similarity maps a sensor point c to the stack as  w = s·R·c + t.  All rules give the same rotation, which maximises
-the correlation of the centred points (Kabsch, Umeyama 1991). They differ in the scale:
+A similarity maps a point c in the frame `sensor` to the point w = s·R·c + t in the frame `stack`. The rotation
+maximises the correlation of the centred points (Kabsch, Umeyama 1991). The scale depends on a rule:
 
-* `seed`: ratio of the RMS radii (EyeReal, (22)), the geometric mean of the next two; * `least-squares`: minimises the
-error in the stack (EyeReal, (20), Umeyama); noise in the sensor makes it too small; * `inverse`: minimises the error in
-the sensor, that is, fitted from stack to sensor and inverted; consistent if the stack's points are exact and the
-sensor's are noisy, as here; * a number: the scale is known.
+* `seed` is the ratio of the RMS radii (EyeReal, (22)), which is the geometric mean of the next two scales.
+* `least-squares` minimises the error in the stack (EyeReal, (20), Umeyama). Noise in the sensor makes the scale too
+  small.
+* `inverse` minimises the error in the sensor: the fit is made from the stack to the sensor and inverted. The scale is
+  consistent if the stack's points are exact and the sensor's points are noisy, as in a calibration.
+* A number is a known scale.
 """
 
 from __future__ import annotations
@@ -22,25 +24,25 @@ from runtime.records import F64
 
 ScaleRule = Literal["seed", "least-squares", "inverse"] | float
 EPSILON = float(np.finfo(np.float64).eps)
-ROTATION_BOUND_RAD = 1e-6  # points for which rounding alone could rotate the result by more are refused
+ROTATION_BOUND_RAD = 1e-6  # rotation by rounding errors above which points are refused
 POLISH_ABOVE = 1e2  # ratio of the points' two largest extents above which the cross-covariance loses digits
 
 
 class Degenerate(ValueError):
-    """Raised if the points do not determine a similarity in double precision; the message says why."""
+    """Raised if the points do not determine a similarity in double precision. The message gives the reason."""
 
 
 @dataclass(frozen=True, slots=True)
 class Similarity:
-    """One similarity `stack_from_sensor`, or a batch of them with leading dimensions."""
+    """Similarity from the frame `sensor` to the frame `stack`, or a batch of similarities."""
 
-    scale: F64  # (...)
+    scale: F64  # (...), where the leading dimensions are those of the batch
     rotation: F64  # (..., 3, 3)
     translation_m: F64  # (..., 3), frame `stack`
 
     @property
     def matrix(self) -> F64:
-        """Matrices (..., 4, 4) of the form [sR t; 0 1]."""
+        """Homogeneous matrix (..., 4, 4) of the form [sR t; 0 1]."""
         matrix = np.zeros((*self.scale.shape, 4, 4))
         matrix[..., :3, :3] = self.scale[..., None, None] * self.rotation
         matrix[..., :3, 3] = self.translation_m
@@ -48,13 +50,13 @@ class Similarity:
         return matrix
 
     def points(self, sensor_m: ArrayLike) -> F64:
-        """(..., K, 3) points in `stack` from (..., K, 3) in `sensor`."""
+        """Transform points (..., K, 3) from the frame `sensor` to the frame `stack`."""
         linear = self.scale[..., None, None] * self.rotation
         return np.asarray(sensor_m) @ np.swapaxes(linear, -1, -2) + self.translation_m[..., None, :]
 
 
 def _centred(points: F64) -> tuple[F64, F64]:
-    """Return the centred points and their mean; two passes keep precision with a distant origin."""
+    """Return the centred points and their mean. Two passes keep the precision of points far from the origin."""
     mean = np.zeros((*points.shape[:-2], 1, 3))
     for _ in range(2):
         mean = mean + (points - mean).mean(axis=-2, keepdims=True)
@@ -72,7 +74,10 @@ def _scale(rule: ScaleRule, *, sensor_power: F64, stack_power: F64, correlation:
 
 
 def fit_batch(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
-    """Fit a batch of pairs (..., K, 3) without checks. Degenerate ones give infinities or NaN."""
+    """Fit a similarity to each set of pairs in a batch (..., K, 3), without checks.
+
+    Degenerate points cause infinities or NaN.
+    """
     sensor, sensor_mean = _centred(sensor_m)
     stack, stack_mean = _centred(stack_m)
     left, values, right = np.linalg.svd(np.swapaxes(sensor, -1, -2) @ stack)
@@ -91,7 +96,7 @@ def fit_batch(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
 
 
 def extents(points_m: F64) -> F64:
-    """(3,) RMS extents, m, of K points along their principal axes."""
+    """Return the RMS extents (3,) of points (K, 3) along their principal axes in metres, largest first."""
     centred, _ = _centred(points_m)
     size = float(np.abs(centred).max(initial=0.0))
     if size == 0.0:
@@ -101,10 +106,17 @@ def extents(points_m: F64) -> F64:
 
 
 def fit(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
-    """Fit K >= 3 pairs, (K, 3) each, to full double precision.
+    """Fit a similarity to pairs of points with full double precision.
 
-    Raises Degenerate for points that are too few, not finite, coincident, collinear or uncorrelated, or so thin or so
-    far away that rounding alone rotates the result by more than `ROTATION_BOUND_RAD`. Measurement noise is ignored.
+    Args:
+        sensor_m: Points (K, 3) in the frame `sensor`, where K is at least 3.
+        stack_m: The same points (K, 3) in the frame `stack`.
+        rule: Rule for the scale, or the known scale.
+
+    Raises:
+        Degenerate: The points are too few, not finite, coincident, collinear or uncorrelated. Also raised if the points
+            are so nearly collinear or so far from the origin that rounding errors alone could rotate the result by
+            more than `ROTATION_BOUND_RAD`. Measurement noise is not considered.
     """
     if len(sensor_m) < 3:
         raise Degenerate(f"{len(sensor_m)} pairs: at least 3 are needed")
@@ -112,7 +124,7 @@ def fit(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
         raise Degenerate("not every coordinate is finite")
     _refuse_degenerate("sensor", sensor_m)
     first, second = _refuse_degenerate("stack", stack_m)
-    # Scale by powers of two, which is exact. Squares of 1e-200 m or 1e200 m would exceed the range of float64.
+    # Scale by powers of two, which is exact. Squares of 1e-200 m or 1e200 m would be outside the range of float64.
     sensor_unit, stack_unit = (float(np.exp2(np.frexp(np.abs(p).max())[1])) for p in (sensor_m, stack_m))
     unit_rule = rule if isinstance(rule, str) else rule * sensor_unit / stack_unit
     unit_sensor, unit_stack = sensor_m / sensor_unit, stack_m / stack_unit
@@ -141,16 +153,24 @@ def _refuse_degenerate(name: str, points_m: F64) -> tuple[float, float]:
 
 
 def _polished(start: Similarity, sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
-    """Refine the fit of a long thin cloud, for which the cross-covariance squares the aspect ratio.
+    """Refine the fit for points that form a long, thin cloud.
 
-    In the stack's principal frame rotation about the long axis has a closed form in small numbers only. Gauss-Newton
-    with a QR solver gives the rest, so that the error grows with the aspect ratio instead of its square.
+    The cross-covariance squares the aspect ratio of the cloud and loses digits. In the principal frame of the stack's
+    points, the rotation about the long axis has a closed form that involves only the small coordinates. Gauss-Newton
+    steps with a QR solver refine the other two rotations. The error then grows with the aspect ratio instead of its
+    square.
+
+    Args:
+        start: Fit to refine.
+        sensor_m: Points (K, 3) in the frame `sensor`.
+        stack_m: The same points (K, 3) in the frame `stack`.
+        rule: Rule for the scale, or the known scale.
     """
     sensor, sensor_mean = _centred(sensor_m)
     stack, stack_mean = _centred(stack_m)
     _, _, axes = np.linalg.svd(stack, full_matrices=False)
     target = stack @ axes.T
-    rotation = axes @ start.rotation  # principal frame of the stack from the sensor
+    rotation = axes @ start.rotation  # from the sensor to the principal frame of the stack's points
     norm = float(np.sqrt((stack**2).sum() / (sensor**2).sum()))
     y, w = norm * (sensor @ rotation.T)[:, 1:], target[:, 1:]
     angle = np.arctan2((y[:, 0] * w[:, 1] - y[:, 1] * w[:, 0]).sum(), (y * w).sum())
@@ -168,7 +188,7 @@ def _polished(start: Similarity, sensor_m: F64, stack_m: F64, *, rule: ScaleRule
         rotation = Rotation.from_rotvec(step).as_matrix() @ rotation
         if np.abs(step).max() < 4 * EPSILON:
             break
-    # One Newton-Schulz step restores orthogonality, which each product of rotations loses by an ulp.
+    # One Newton-Schulz step restores the orthogonality, of which each product of rotations loses an ulp.
     rotation = rotation @ (1.5 * np.eye(3) - 0.5 * rotation.T @ rotation)
     correlation = ((sensor @ rotation.T) * target).sum()
     scale = _scale(rule, sensor_power=(sensor**2).sum(), stack_power=(stack**2).sum(), correlation=correlation)

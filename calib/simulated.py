@@ -1,4 +1,4 @@
-"""Hardware simulation for `setup --simulate`."""
+"""Simulate the display, the sensor and the person for `setup --simulate`."""
 
 from __future__ import annotations
 
@@ -18,15 +18,16 @@ from runtime.optics.stack import PanelStack
 from runtime.panels.monitors import Monitor
 from runtime.records import U8, EyePoints
 
-SENSOR_NOISE_M = 0.003  # standard deviation of the simulated depth camera's coordinates
-STANDING_M = 0.002  # standard deviation, per axis, of a person's position when the lines seem fused
-SAMPLES_HERE = 16  # sensor samples per viewpoint, at 30 a second
+SENSOR_NOISE_M = 0.003  # standard deviation of each coordinate that the simulated depth camera measures
+STANDING_M = 0.002  # standard deviation per axis of a person's position when the lines seem fused
+SAMPLES_HERE = 16  # number of sensor samples per viewpoint, at 30 samples per second
 
 
 class SimulatedHardware(SetupHardware):
-    """Simulated hardware: monitors in random order, and a person who stands where asked.
+    """Simulated hardware: monitors in random order, a depth sensor, and a person who stands at each viewpoint.
 
-    The depth sensor has the same pose as the built-in recording's, so that `run` can replay this afterwards.
+    The sensor has the same pose as the sensor of the built-in recording. The resulting configuration can therefore be
+    tried with `run --replay demo`.
     """
 
     simulated = True
@@ -36,11 +37,11 @@ class SimulatedHardware(SetupHardware):
     ) -> None:
         super().__init__(keys, photos=photos)
         self._random = random = np.random.default_rng(seed)
-        # Monitor k is panel order[k]. Some are upside down, and some are seen from behind.
+        # Monitor k is panel order[k]. Some panels are upside down, and some are mounted back to front.
         self.order = random.permutation(stack.count).tolist()
         self.mounted = [(int(random.choice([0, 180])), str(random.choice(["none", "horizontal"]))) for _ in self.order]
         self._stack, self._say = stack, say
-        self._seen_ns = self._left = 0  # capture time of the newest sample; samples left at this viewpoint
+        self._seen_ns = self._left = 0  # capture time of the newest sample; number of samples left at this viewpoint
         self._here, self._off_m = "", np.zeros(3)
 
     def monitors(self) -> tuple[Monitor, ...]:

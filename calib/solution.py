@@ -1,4 +1,4 @@
-"""Calibration methods, their residuals and covariances, and the choice between them."""
+"""Compute a calibration from pairs by one of several methods, estimate its errors, and choose the best method."""
 
 from __future__ import annotations
 
@@ -16,46 +16,49 @@ from runtime.records import F64
 
 Method = Literal["seed", "least-squares", "inverse", "robust", "fixed-scale"]
 METHODS: tuple[Method, ...] = get_args(Method)
-# Prior of the scale's logarithm: share and standard deviation of three kinds of sensors. They are exact as far as pairs
-# can show, off by some percent, or in other units. With these shares, the error exceeds the best method's by at most 4%
-# both with a right metre and with one that is off by up to a tenth (tests/calib/test_methods.py). With 0.8 for exact
-# sensors, it was by 2% and 6%.
+# Prior of the scale's logarithm: the share and the standard deviation of three kinds of sensors. The scale of the first
+# kind is exact as far as pairs can show, that of the second is off by some percent, and the third has other units. The
+# resulting error exceeds that of the best method by at most 4%, both for an exact scale and for one that is off by up
+# to a tenth (tests/calib/test_methods.py). A share of 0.8 for exact sensors gave 2% and 6%.
 SCALE_PRIOR = np.array([(0.6, 0.0), (0.37, 0.06), (0.03, 1.0)])
-MIN_SIGMA = 1e-12  # least sigma of the scale's logarithm, for exact pairs
+MIN_SIGMA = 1e-12  # least standard deviation of the scale's logarithm, for exact pairs
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationSolution:
-    """Result of one method for K pairs. Parameters and pivot are those of `runtime.eyes.calibration`."""
+    """Calibration that one method computed from K pairs, with its residuals and covariance.
+
+    The seven parameters and the pivot are defined in `runtime.eyes.calibration`.
+    """
 
     method: Method
-    similarity: Similarity
-    residual_m: F64  # (K, 3) fitted minus known, frame `stack`, all pairs
-    used: NDArray[np.bool_]  # (K,) False: rejected as an outlier
-    noise_m: float  # standard deviation of one coordinate of the used pairs, in `stack`
-    pivot_m: F64  # (3,) frame `stack`: the centre of the used pairs
-    unit_covariance: F64  # (7, 7) for noise of 1 m; the scale's row is zero if it is fixed
-    condition: float  # condition number of the design, lengths in units of the pairs' RMS radius
-    reason: str = ""  # reason for choosing this method
+    similarity: Similarity  # from the frame `sensor` to the frame `stack`
+    residual_m: F64  # (K, 3) fitted minus known positions of all pairs, frame `stack`
+    used: NDArray[np.bool_]  # (K,) False for pairs that were rejected as outliers
+    noise_m: float  # standard deviation of one coordinate of the used pairs, frame `stack`
+    pivot_m: F64  # (3,) centre of the used pairs, frame `stack`
+    unit_covariance: F64  # (7, 7) covariance for noise of 1 m, with zeros for a scale that is known exactly
+    condition: float  # condition number of the design matrix, with lengths in units of the pairs' RMS radius
+    reason: str = ""  # reason for the choice of this method
 
     @property
     def covariance(self) -> F64:
-        """(7, 7) of rotation (rad), shift (m) and log scale about the pivot."""
+        """Covariance (7, 7) of the rotation vector (rad), the shift (m) and the log scale about the pivot."""
         return self.unit_covariance * self.noise_m**2
 
     @property
     def rms_m(self) -> float:
-        """RMS distance between fitted and known points of the used pairs."""
+        """RMS distance between the fitted and the known points of the used pairs."""
         return float(np.sqrt((self.residual_m[self.used] ** 2).sum(-1).mean()))
 
     @property
     def max_m(self) -> float:
-        """Largest distance between fitted and known points of the used pairs."""
+        """Largest distance between the fitted and the known points of the used pairs."""
         return float(np.sqrt((self.residual_m[self.used] ** 2).sum(-1)).max())
 
     @property
     def axis_rms_m(self) -> F64:
-        """(3,) RMS error along x, y, z of the used pairs."""
+        """RMS error (3,) of the used pairs along x, y and z."""
         return np.asarray(np.sqrt((self.residual_m[self.used] ** 2).mean(0)), dtype=np.float64)
 
     @property
@@ -64,7 +67,15 @@ class CalibrationSolution:
         return float(np.sqrt(self.covariance[6, 6]))
 
     def eye_error_m(self, stack_m: F64, *, noise_m: float | None = None) -> F64:
-        """(...) expected RMS error at points (..., 3) in `stack`, for the observed noise or `noise_m`."""
+        """Return the expected RMS error of the calibration at some points, in metres.
+
+        Args:
+            stack_m: Points (..., 3) in the frame `stack`.
+            noise_m: Standard deviation of one coordinate of the pairs. By default, the observed noise is used.
+
+        Returns:
+            An array (...) with the error at each point.
+        """
         jacobian = position_jacobian(stack_m, pivot_m=self.pivot_m)
         covariance = self.unit_covariance * (self.noise_m if noise_m is None else noise_m) ** 2
         spread: F64 = jacobian @ covariance @ np.swapaxes(jacobian, -1, -2)
@@ -72,10 +83,15 @@ class CalibrationSolution:
 
 
 def design_covariance(stack_m: F64, *, fixed_scale: bool) -> tuple[F64, F64, float]:
-    """Return the (3,) pivot, the (7, 7) covariance for noise of 1 m, and the design's condition number.
+    """Return the pivot (3,), the covariance (7, 7) for noise of 1 m, and the design's condition number.
 
-    First order, for equal and independent noise in every coordinate; noise in the sensor counts times the scale. A
-    design that leaves a parameter undetermined has infinite condition and covariance.
+    The covariance is of first order and assumes equal, independent noise in every coordinate. Noise in the sensor must
+    be multiplied by the scale. If the points leave a parameter undetermined, the covariance and the condition number
+    are infinite.
+
+    Args:
+        stack_m: Known points (K, 3) in the frame `stack`.
+        fixed_scale: Treat the scale as known, with zero variance.
     """
     pivot_m = stack_m.mean(0)
     radius_m = float(np.sqrt(((stack_m - pivot_m) ** 2).sum(-1).mean())) or 1.0
@@ -97,7 +113,18 @@ def design_covariance(stack_m: F64, *, fixed_scale: bool) -> tuple[F64, F64, flo
 def solve(
     sensor_m: F64, stack_m: F64, *, method: Method, known_scale: float = 1.0, reason: str = ""
 ) -> CalibrationSolution:
-    """Solve (K, 3) pairs by one method, with all error figures. Raises `similarity.Degenerate`."""
+    """Compute a calibration from pairs by one method, with all estimates of its error.
+
+    Args:
+        sensor_m: Measured points (K, 3) in the frame `sensor`.
+        stack_m: Known points (K, 3) in the frame `stack`.
+        method: Method to use.
+        known_scale: Scale for the method `fixed-scale`.
+        reason: Reason for the choice of the method, to be stored.
+
+    Raises:
+        Degenerate: The points do not determine a similarity, as in `similarity.fit`.
+    """
     used = np.ones(len(sensor_m), bool)
     if method == "robust":
         robust = fit_robust(sensor_m, stack_m)
@@ -121,10 +148,15 @@ def solve(
 
 
 def posterior_scale(fitted: float, *, sigma: float, freedom: int) -> tuple[float, float]:
-    """Return the posterior mean and standard deviation of a log scale, over the kinds of sensors.
+    """Return the posterior mean and standard deviation of the log scale, averaged over the kinds of sensors.
 
-    The fitted value's error `sigma` is estimated with `freedom` degrees of freedom, hence Student's likelihood.
-    Averaging avoids a threshold, and does not correct the scale of a sensor that is off by a tenth.
+    Averaging avoids a threshold between the kinds. It also leaves the fitted scale of a sensor that is off by a tenth
+    nearly unchanged.
+
+    Args:
+        fitted: Fitted logarithm of the scale.
+        sigma: Standard deviation of `fitted`, as estimated from the residuals.
+        freedom: Degrees of freedom of the estimate `sigma`. The likelihood is therefore Student's t distribution.
     """
     shares, widths = SCALE_PRIOR.T
     noise = max(sigma, MIN_SIGMA) ** 2
@@ -137,10 +169,17 @@ def posterior_scale(fitted: float, *, sigma: float, freedom: int) -> tuple[float
 
 
 def solve_default(sensor_m: F64, stack_m: F64) -> CalibrationSolution:
-    """Solve by the method with the least expected error at the eye (tests/calib/test_methods.py).
+    """Compute a calibration by the method with the least expected error at the eye.
 
-    If there are gross errors, this is `robust`. Otherwise it is `fixed-scale` with the posterior mean of the scale,
-    which is 1 unless the pairs contradict it. Raises `similarity.Degenerate`.
+    If some pairs have gross errors, the method is `robust`. Otherwise it is `fixed-scale` with the posterior mean of
+    the scale, which is close to 1 unless the pairs contradict it. tests/calib/test_methods.py compares the methods.
+
+    Args:
+        sensor_m: Measured points (K, 3) in the frame `sensor`.
+        stack_m: Known points (K, 3) in the frame `stack`.
+
+    Raises:
+        Degenerate: The points do not determine a similarity, as in `similarity.fit`.
     """
     robust = solve(sensor_m, stack_m, method="robust")
     rejected = int((~robust.used).sum())
@@ -159,6 +198,6 @@ def solve_default(sensor_m: F64, stack_m: F64) -> CalibrationSolution:
         f"prior 1 or off by about {100 * SCALE_PRIOR[1, 1]:g}%",
     )
     unit = solution.unit_covariance.copy()
-    # About the pairs' centre the scale is independent of rotation and shift.
+    # About the centre of the pairs, the scale is independent of the rotation and the shift.
     unit[6, 6] = (sigma / solution.noise_m) ** 2 if solution.noise_m > 0 else 0.0
     return replace(solution, unit_covariance=unit)

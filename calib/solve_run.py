@@ -1,4 +1,4 @@
-"""`calibrate solve`: compute a calibration file, and every method's figures, from pairs."""
+"""Compute a calibration file from pairs, and compare all methods (`calibrate solve`)."""
 
 from __future__ import annotations
 
@@ -23,16 +23,26 @@ from runtime.records import F64
 if TYPE_CHECKING:
     from tomlkit.items import Array
 
-STORED_PAIRS = 500  # most pairs stored in the calibration file
+STORED_PAIRS = 500  # number of pairs up to which the calibration file contains them
 
 
 def solve_file(
     pairs_path: Path, out: Path, *, settings: Settings, method: str = "", known_scale: float = 1.0
 ) -> dict[str, Any]:
-    """Write the calibration. Returns the summary, with every method's figures.
+    """Compute a calibration from a file of pairs and write it.
 
-    method: name of a method, or empty for the one with the least expected error at the eye. known_scale: scale for the
-    method `fixed-scale`. Raises InputError if the pairs cannot be read or do not determine the calibration.
+    Args:
+        pairs_path: CSV or JSON file of the pairs.
+        out: Calibration file to write. The version that it replaces is kept.
+        settings: Configuration of the sensor, the panels and the viewing range.
+        method: Name of a method. If empty, the method with the least expected error at the eye is chosen.
+        known_scale: Scale for the method `fixed-scale`.
+
+    Returns:
+        The summary of the command, with the figures of every method.
+
+    Raises:
+        InputError: The pairs cannot be read or do not determine the calibration, or the method is unknown.
     """
     if method and method not in METHODS:
         raise InputError("calibrate solve", "--method", f"must be one of {', '.join(METHODS)}, not {method}")
@@ -83,7 +93,18 @@ def _figures(solution: CalibrationSolution, volume_m: F64) -> dict[str, Any]:
 def calibration_text(
     solution: CalibrationSolution, pairs: Pairs, settings: Settings, *, warnings: list[str], volume_m: F64
 ) -> str:
-    """Return a solution as TOML for `runtime.eyes.calibration`; the report reads its `[data]`."""
+    """Format a solution as a calibration file for `runtime.eyes.calibration`.
+
+    Args:
+        solution: Calibration to write.
+        pairs: Pairs from which the calibration was computed. They are stored in the table `[data]` for the report.
+        settings: Configuration of the sensor and the panels.
+        warnings: Warnings to store.
+        volume_m: Points (..., 3) in the frame `stack` over which the error at the eye is averaged.
+
+    Returns:
+        The TOML text.
+    """
     document = tomlkit.document()
     document.add(tomlkit.comment("Made by `phasestack calibrate solve`. Lengths in metres, angles in radians."))
     document["stack_from_sensor"] = _rows(solution.similarity.matrix)

@@ -1,4 +1,4 @@
-"""Calibration viewpoints (EyeReal, section 2.3, extended to any distance) and the viewing volume."""
+"""Define the calibration viewpoints (EyeReal, section 2.3, extended to any distance) and the viewing volume."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from runtime.config import CalibrationSettings
 from runtime.optics.views import stack_from_eye
 from runtime.records import F64
 
-USUAL = CalibrationSettings()  # R 40 to 60 cm, phi 70 to 90 degrees from the vertical, theta 80 to 100 about it
-IPD_M = 0.060  # the paper's value, used if the configuration has none
+USUAL = CalibrationSettings()  # R 40 to 60 cm, phi 70 to 90 degrees from the vertical, theta 80 to 100 degrees
+IPD_M = 0.060  # distance between the eyes in the paper, used if the configuration has no value
 
 
 @dataclass(frozen=True, slots=True)
 class Viewpoint:
-    """Target position of the midpoint between the eyes."""
+    """Position at which a calibration needs the midpoint between the eyes, in spherical coordinates."""
 
-    radius_cm: int
-    phi_deg: int
-    theta_deg: int
+    radius_cm: int  # distance from the origin of the stack
+    phi_deg: int  # angle from the vertical
+    theta_deg: int  # angle about the vertical; 90 degrees is in front of the display
 
     @property
     def name(self) -> str:
@@ -29,29 +29,35 @@ class Viewpoint:
 
     @property
     def midpoint_m(self) -> F64:
-        """(3,) frame `stack`: x = R sin(phi) sin(theta), y = R sin(phi) cos(theta), z = R cos(phi)."""
+        """Position (3,) in the frame `stack`.
+
+        It is x = R sin(phi) sin(theta), y = R sin(phi) cos(theta), z = R cos(phi).
+        """
         return spherical_m(self.radius_cm / 100, phi_deg=self.phi_deg, theta_deg=self.theta_deg)
 
     def eyes_m(self, ipd_m: float = IPD_M) -> F64:
-        """(2, 3) left and right eye, level, perpendicular to the line to the stack's centre; frame `stack`."""
+        """Return the positions (2, 3) of the left and the right eye in the frame `stack`.
+
+        The line between the eyes is horizontal and perpendicular to the line of sight to the centre of the stack.
+        """
         right = stack_from_eye(self.midpoint_m)[:3, 0]
         return self.midpoint_m + np.outer([-ipd_m / 2, ipd_m / 2], right)
 
 
 def spherical_m(radius_m: float, *, phi_deg: float, theta_deg: float) -> F64:
-    """(3,) point in `stack` from the EyeReal supplement's polar angles."""
+    """Return the point (3,) in the frame `stack` at a radius and the polar angles of the EyeReal supplement."""
     phi, theta = np.radians(phi_deg), np.radians(theta_deg)
     return radius_m * np.array([np.sin(phi) * np.sin(theta), np.sin(phi) * np.cos(theta), np.cos(phi)])
 
 
 def viewing_place_m(viewing: CalibrationSettings) -> F64:
-    """(3,) middle of the viewing range, frame `stack`, where registration is exact."""
+    """Return the middle (3,) of the viewing range in the frame `stack`, for which the panels are registered."""
     up_deg = sum(viewing.viewing_up_deg) / 2
     return spherical_m(sum(viewing.viewing_m) / 2, phi_deg=90 - up_deg, theta_deg=90)
 
 
 def grid(viewing: CalibrationSettings = USUAL) -> tuple[Viewpoint, ...]:
-    """Return the 27 viewpoints of a viewing range, nearest first. The default range gives EyeReal's."""
+    """Return the 27 viewpoints of a viewing range, nearest first. The default range has the viewpoints of EyeReal."""
     low_deg, high_deg = viewing.viewing_up_deg
     radii_cm = np.rint(100 * np.linspace(*viewing.viewing_m, 3)).astype(int)
     phi_deg = np.rint(90 - np.linspace(high_deg, low_deg, 3)).astype(int)
@@ -60,10 +66,11 @@ def grid(viewing: CalibrationSettings = USUAL) -> tuple[Viewpoint, ...]:
 
 
 def viewing_volume_m(viewing: CalibrationSettings = USUAL) -> F64:
-    """(125, 3) points in `stack` that span the viewing volume.
+    """Return points (125, 3) in the frame `stack` that span the space in which viewers move.
 
-    The volume extends the grid to 0.75 times the nearest and 1.5 times the farthest distance, by 15 degrees sideways
-    and 10 up and down: by default 0.3 to 0.9 m away and 25 degrees to each side.
+    The volume is larger than the grid of viewpoints: it reaches from 0.75 times the nearest to 1.5 times the farthest
+    distance, and 15 degrees farther to each side and 10 degrees farther up and down. By default it reaches from 0.3 to
+    0.9 m and 25 degrees to each side.
     """
     (near_m, far_m), (low_deg, high_deg) = viewing.viewing_m, viewing.viewing_up_deg
     side_deg = viewing.viewing_side_deg + 15
