@@ -1,4 +1,4 @@
-"""Read checkpoints as weights only, so that no code from them runs, and write them atomically."""
+"""Read and write checkpoints. Only weights are read, which prevents a checkpoint from running code."""
 
 from __future__ import annotations
 
@@ -20,10 +20,13 @@ WIDTH_KEY = "subnets.in_conv.0.weight"
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """Read a checkpoint, a table whose entry `model` is a table of tensors. Raises InputError.
+    """Read a checkpoint: a dictionary whose entry `model` is a state dictionary of tensors.
 
-    Only plain values, tensors and an `argparse.Namespace` of plain values (saved by the published code) are
-    deserialised.
+    Only plain values, tensors and an `argparse.Namespace` of plain values are deserialised. The published code saves
+    such a namespace.
+
+    Raises:
+        InputError: The file cannot be read, contains other objects, or has no entry `model`.
     """
     data = untrusted_input.read_bytes(path, most_bytes=FILE_BYTES_MAX)
     try:
@@ -38,7 +41,10 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def eyereal_width(state: Mapping[str, Tensor], *, source: Path) -> int:
-    """Return the width of the published network in a checkpoint. Raises InputError."""
+    """Return the number of channels of the first layer, from the weights of a published network.
+
+    Raises InputError if the weights are not those of the published network.
+    """
     first = state.get(WIDTH_KEY)
     if first is None or first.ndim != 4:
         raise InputError(source, WIDTH_KEY, "is missing, so this is not a checkpoint of the published network")
@@ -46,10 +52,20 @@ def eyereal_width(state: Mapping[str, Tensor], *, source: Path) -> int:
 
 
 def fill(net: nn.Module, state: Mapping[str, Tensor], *, source: str | Path, arch: str) -> None:
-    """Load weights into a network. Raises InputError, which names the first weight that does not match."""
+    """Load weights into a network.
+
+    Args:
+        net: Network to modify.
+        state: Weights by name.
+        source: File of the weights, for error messages.
+        arch: Name of the network, for error messages.
+
+    Raises:
+        InputError: A weight is missing, unknown, of the wrong shape or not finite. The message names the weight.
+    """
     expected = net.state_dict()
     missing = [key for key in expected if key not in state]
-    # Old checkpoints lack this counter, which inference does not use.
+    # Old checkpoints lack this counter, which is not used for inference.
     missing = [key for key in missing if not key.endswith("num_batches_tracked")]
     surplus = [key for key in state if key not in expected]
     if missing or surplus:
@@ -66,7 +82,7 @@ def fill(net: nn.Module, state: Mapping[str, Tensor], *, source: str | Path, arc
 
 
 def save_checkpoint(path: Path, table: dict[str, Any]) -> None:
-    """Write a checkpoint atomically. The table may contain only what `load_checkpoint` reads."""
+    """Write a checkpoint atomically. The dictionary may contain only values that `load_checkpoint` reads."""
     buffer = io.BytesIO()
     torch.save(table, buffer)
     write_bytes(path, buffer.getvalue())

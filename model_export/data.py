@@ -1,4 +1,4 @@
-"""Procedural training pairs, in any number: textured planes seen from random positions."""
+"""Generate random training pairs: pictures of textured planes, seen from random eye positions."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from runtime.optics.views import image_from_stack, stack_from_eye
 from runtime.records import F64, U8
 
 PITCH_WIDTH_M = 0.5184  # width of the prototype panels
-CENTRE = 1  # index of the middle of three panels
+CENTRE = 1  # index of the middle panel of three
 WIDEST_DEG = 100.0  # largest horizontal field of view of a training picture
-LEAST_COMMON = 0.4  # share of the centre panel's size that each eye must see through all panels
+LEAST_COMMON = 0.4  # share of the middle panel's width and height that each eye must see through all panels
 
 
 @dataclass(frozen=True, slots=True)
 class TrainingPair:
-    """Pair of pictures and the eye positions for which they were rendered."""
+    """Pair of pictures with the panels and the eye positions for which they were rendered."""
 
     stack: PanelStack
-    eyes_m: F64  # (2, 3) left, right; frame `stack`
-    images: tuple[U8, U8]  # (h, w, 3) left, right
+    eyes_m: F64  # (2, 3) left and right eye, frame `stack`
+    images: tuple[U8, U8]  # (h, w, 3) pictures for the left and the right eye
     fov_deg: float  # horizontal field of view of both pictures
 
 
 def random_stack(random: Random, *, width_px: int, height_px: int) -> PanelStack:
-    """Return random, evenly spaced panels: the prototype's with fewer pixels, a part of them, or others."""
+    """Return three evenly spaced panels with a random width and a random gap."""
     width_m = PITCH_WIDTH_M * math.exp(random.uniform(math.log(0.25), math.log(1.6)))
     gap_m = math.exp(random.uniform(math.log(0.005), math.log(0.5)))
     if random.random() < 0.6:  # a practical range
@@ -38,7 +38,10 @@ def random_stack(random: Random, *, width_px: int, height_px: int) -> PanelStack
 
 
 def random_eyes(random: Random, stack: PanelStack) -> F64:
-    """Return random eyes (2, 3), 0.1 to 4 m from the centre and at least 0.1 m in front of the panels."""
+    """Return random positions (2, 3) of the left and the right eye in the frame `stack`.
+
+    The head is 0.1 to 4 m from the origin and at least 0.1 m in front of the panels, and may be rolled and turned.
+    """
     front_m = stack.x_m[-1]
     distance_m = math.exp(random.uniform(math.log(0.1 + front_m), math.log(4.0)))
     if random.random() < 0.5:
@@ -58,7 +61,12 @@ def random_eyes(random: Random, stack: PanelStack) -> F64:
 
 
 def is_served(eyes_m: F64, stack: PanelStack) -> bool:
-    """Return True if each eye sees at least `LEAST_COMMON` of the width and height through all panels."""
+    """Return True if each eye sees at least `LEAST_COMMON` of the middle panel through all panels.
+
+    Args:
+        eyes_m: Positions (2, 3) of the eyes in the frame `stack`.
+        stack: Geometry of three panels.
+    """
     for eye in eyes_m:
         edges = []
         for x_m in stack.x_m:
@@ -76,7 +84,10 @@ def is_served(eyes_m: F64, stack: PanelStack) -> bool:
 def random_place(
     random: Random, *, width_px: int, height_px: int, stack: PanelStack | None = None
 ) -> tuple[PanelStack, F64]:
-    """Return panels (`stack` or random ones) and random eyes (2, 3) that see enough of them."""
+    """Return panels and random eye positions (2, 3) from which enough of the panels is visible.
+
+    The panels are `stack` or, if it is None, random panels of the given size in pixels.
+    """
     while True:
         panels = stack or random_stack(random, width_px=width_px, height_px=height_px)
         eyes = random_eyes(random, panels)
@@ -87,9 +98,14 @@ def random_place(
 def random_pair(
     random: Random, *, width_px: int, height_px: int, stack: PanelStack | None = None, fov_deg: float = 0.0
 ) -> TrainingPair:
-    """Draw a random training pair for `stack` or, if it is None, for random panels.
+    """Draw a random scene for random eye positions.
 
-    fov_deg: horizontal field of view of the pictures; 0: as wide as the panels.
+    Args:
+        random: Source of all random numbers.
+        width_px: Width of the pictures and of random panels.
+        height_px: Height of the pictures and of random panels.
+        stack: Geometry of the panels, or None for random panels.
+        fov_deg: Horizontal field of view of the pictures, or 0 for pictures as wide as the panels.
     """
     stack, eyes = random_place(random, width_px=width_px, height_px=height_px, stack=stack)
     scene = random_scene(random, stack, eyes.mean(axis=0))
@@ -100,6 +116,6 @@ def random_pair(
 
 
 def filling_fov_deg(stack: PanelStack, eye_m: F64) -> float:
-    """Return the horizontal field of view that the panels fill at an eye's distance, at most WIDEST_DEG."""
+    """Return the angle that the width of the panels fills at an eye's distance, up to `WIDEST_DEG`, in degrees."""
     distance_m = float(np.linalg.norm(eye_m))
     return min(WIDEST_DEG, math.degrees(2 * math.atan(stack.width_m / 2 / distance_m)))

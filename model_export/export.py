@@ -40,7 +40,24 @@ def export_model(
     eye_order: EyeOrder = "left-right",
     options: dict[str, Any] | None = None,
 ) -> Report:
-    """Build and check a model, and write it if all checks pass. Raises InputError."""
+    """Build a model, check its ONNX file, and write the file if all checks pass.
+
+    Args:
+        arch: Name of a shipped model or a picture network, or `module:Class`.
+        out: ONNX file to write.
+        checkpoint: Weights of a picture network.
+        random_init: Seed of random weights, instead of a checkpoint.
+        width_px: Width of the pictures of a picture network, even.
+        height_px: Height of the pictures of a picture network, even.
+        eye_order: Order of the eyes in the input of a picture network.
+        options: Arguments of the picture network's class.
+
+    Returns:
+        The results of the checks.
+
+    Raises:
+        InputError: The arguments do not fit together, or the network cannot be built or exported.
+    """
     check_known(arch, *SHIPPED)
     if checkpoint is not None and random_init is not None:
         raise InputError("export", "--random-init", "cannot be combined with --checkpoint")
@@ -64,7 +81,7 @@ def export_model(
 
 
 def in_torch(module: nn.Module) -> Reference:
-    """Wrap a module as the reference with which its export is compared."""
+    """Wrap a torch module as the reference with which the results of its ONNX file are compared."""
 
     def run(feeds: Feeds) -> Sequence[np.ndarray]:
         with torch.no_grad():
@@ -75,7 +92,11 @@ def in_torch(module: nn.Module) -> Reference:
 
 
 def spectral_model(name: str) -> tuple[bytes, nn.Module]:
-    """Build a shipped model from its recipe. Return its ONNX file with the contract, and its module."""
+    """Build a shipped model from its recipe.
+
+    Returns:
+        The ONNX file, which contains the contract, and the torch module.
+    """
     recipe = read_recipe(name)
     net = SpectralSolver(recipe.cell_px).eval()
     contract = Contract(
@@ -106,9 +127,19 @@ def spectral_model(name: str) -> tuple[bytes, nn.Module]:
 def picture_network(
     arch: str, checkpoint: Path | None, random_init: int | None, options: dict[str, Any]
 ) -> tuple[Network, str]:
-    """Return a picture network, trained or untrained, and a digest that identifies its weights.
+    """Create a picture network with trained or random weights.
 
-    A checkpoint of `phasestack train` contains the options of its network, which must be `arch`.
+    Args:
+        arch: Name of the network, or `module:Class`.
+        checkpoint: File of the weights, or None. A checkpoint of `phasestack train` contains the network's options.
+        random_init: Seed of random weights if there is no checkpoint.
+        options: Arguments of the network's class, which override those in the checkpoint.
+
+    Returns:
+        The network and a SHA-256 that identifies its weights.
+
+    Raises:
+        InputError: There are no weights, or the checkpoint does not belong to this network.
     """
     if checkpoint is None:
         if random_init is None:
@@ -132,7 +163,18 @@ def picture_network(
 def picture_file(
     network: Network, origin: str, *, width_px: int, height_px: int, eye_order: EyeOrder = "left-right"
 ) -> bytes:
-    """Export a picture network as ONNX, for pictures of one size. Raises InputError if torch cannot."""
+    """Export a picture network as an ONNX file for pictures of one size.
+
+    Args:
+        network: Network to export.
+        origin: SHA-256 that identifies the weights, for the contract.
+        width_px: Width of the pictures.
+        height_px: Height of the pictures.
+        eye_order: Order of the eyes in the input, for the contract.
+
+    Raises:
+        InputError: The network fails for pictures of this size, or torch cannot export it.
+    """
     form, net, size = network.form, network.net.eval(), {"width_px": width_px, "height_px": height_px}
     probe(network, **size)
     check_static(network, **size)

@@ -1,4 +1,4 @@
-"""Published network (EyeReal's U-Net), with the parameter names of its published checkpoints."""
+"""EyeReal's published U-Net, with the parameter names of the published checkpoints."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from torch.nn import functional
 
 from runtime.config import Section
 
-PICTURE_FOV_DEG = 40.0  # horizontal field of view, outside which the published code makes the input black
-OFFSET = 0.2  # the published code shows sigmoid(y) - 0.2, clipped at the panel
+PICTURE_FOV_DEG = 40.0  # horizontal field of view outside which the published code makes the input black
+OFFSET = 0.2  # the published code shows sigmoid(y) - 0.2, and the panel clips negative values
 INPUT, OUTPUT = "eyes", "panels"
-LEAST_PX = 32  # minimum side, because it is halved five times
-NORM_MOMENTUM = 0.02  # of running means; torch's default (0.1) would average only ten pairs, with one pair per batch
+LEAST_PX = 32  # minimum width and height, because the network halves them five times
+NORM_MOMENTUM = 0.02  # torch's default of 0.1 would average over only ten pairs, as a batch is often a single pair
 
 
 def _block(channels: int, middle: int, out: int) -> nn.Sequential:
@@ -30,14 +30,18 @@ def _block(channels: int, middle: int, out: int) -> nn.Sequential:
 
 
 class Up(nn.Module):
-    """Upsample by two (aligned corners), pad to the skip's size, concatenate, and apply a block."""
+    """Decoder stage of the U-Net.
+
+    It doubles the size of its input (bilinear, aligned corners), pads the result to the size of the skip connection,
+    concatenates both and applies two convolutions.
+    """
 
     def __init__(self, channels: int, out: int) -> None:
         super().__init__()
         self.conv = _block(channels, channels // 2, out)
 
     def forward(self, deep: Tensor, skip: Tensor) -> Tensor:
-        """Map (n, a, h, w) and (n, b, H, W) to (n, out, H, W)."""
+        """Combine features (n, a, h, w) and a skip connection (n, b, H, W) to features (n, out, H, W)."""
         up = functional.interpolate(deep, scale_factor=2, mode="bilinear", align_corners=True)
         rows, columns = skip.shape[2] - up.shape[2], skip.shape[3] - up.shape[3]
         up = functional.pad(up, [columns // 2, columns - columns // 2, rows // 2, rows - rows // 2])
@@ -46,7 +50,10 @@ class Up(nn.Module):
 
 
 class UNet(nn.Module):
-    """Published network `subnets`, with 17,303,721 parameters at width 32, or 4,329,561 at width 16."""
+    """U-Net with five levels, which is the module `subnets` of the published network.
+
+    It has 17,303,721 parameters at width 32 and 4,329,561 at width 16.
+    """
 
     def __init__(self, width: int = 32, channels: int = 18, out: int = 9) -> None:
         super().__init__()
@@ -62,7 +69,7 @@ class UNet(nn.Module):
         self.out_conv = nn.Sequential(nn.Conv2d(w, out, 1))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map intensities (n, 18, h, w) to (n, 9, h, w), before the sigmoid."""
+        """Map intensities (n, 18, h, w) to panel values (n, 9, h, w) before the sigmoid."""
         skips = [self.in_conv(x)]
         for down in (self.down1, self.down2, self.down3, self.down4, self.down5):
             skips.append(down(skips[-1]))
@@ -74,10 +81,10 @@ class UNet(nn.Module):
 
 
 class EyeRealNet(nn.Module):
-    """Network that maps the eyes' pictures, warped to the pixels of every panel, to panel values.
+    """Published network, which computes panel values from the eyes' pictures on the pixels of every panel.
 
-    Input channels are intensities in [0, 1], ordered by panel, then eye, then RGB. Output channels are ordered by
-    panel, then RGB. As published, they are in [-0.2, 0.8]; the panel clips negative values.
+    The input channels are intensities in [0, 1], ordered by panel, then eye, then RGB. The output channels are ordered
+    by panel, then RGB. The outputs are in [-0.2, 0.8], as in the published code, and the panel clips negative values.
     """
 
     input_frame, input_value, output = "panel", "intensity", "panels"
@@ -93,5 +100,5 @@ class EyeRealNet(nn.Module):
         self.subnets = UNet(width)
 
     def forward(self, eyes: Tensor) -> Tensor:
-        """Map (1, 18, h, w) to (1, 9, h, w)."""
+        """Map intensities (1, 18, h, w) to panel values (1, 9, h, w)."""
         return torch.sigmoid(self.subnets(eyes)) - OFFSET

@@ -1,29 +1,30 @@
-"""Light and a step of the solver, as differentiable functions in plain torch.
+"""Compute the light at the eyes, and steps of the solver, as differentiable functions in torch.
 
-The runtime's kernels are tested against this reference, and networks are trained through it. Equations are those of
-docs/mathematics.md, "A step".
+The runtime's kernels are tested against this reference implementation, and networks are trained through it. The
+equations are those of docs/mathematics.md, "A step".
 
 *Light.* Panel n shows x_n in [0, 1]. Along a ray, s is the sum of x_n, and the intensity is I = sin²(pi/2·s) =
-(1 - Re exp(i·pi·s))/2. A pixel of an eye's picture is a bundle of rays. Within it, the values of different panels are
-nearly independent, so that
+(1 - Re exp(i·pi·s))/2. A pixel of an eye's picture is a bundle of rays. Within a bundle, the values of different panels
+are nearly independent. Therefore
 
     E[exp(i·pi·s)] = Z = prod_n z_n,   z_n = sum_q w_nq·exp(i·pi·x_nq)                                        (L1)
     I = (1 - Re Z)/2                                                                                          (L2)
 
-where w_nq is the share of the bundle that pixel q covers on panel n (bilinear weights if the bundle is as wide as a
-pixel).
+where w_nq is the share of the bundle that pixel q covers on panel n. The shares are bilinear weights if the bundle is
+as wide as a pixel.
 
-*A step.* With target T and residual e = I - T (0 if a ray misses a panel), consider a common change of all pixels of a
-panel that a bundle crosses. The derivative of the squared error, and a bound on its curvature, are sums over all sets:
+*A step.* Let T be the target and e = I - T the residual, which is 0 if a ray misses a panel. Consider a common change
+of all pixels of a panel that a bundle crosses. The derivative of the squared error, and a bound on its curvature, are
+sums over all sets of rays:
 
-    g_q = sum w·e·Im Z            (pi/2 times it is the derivative of sum e²/2)                               (L3)
+    g_q = sum w·e·Im Z            (pi/2·g is the derivative of sum e²/2)                                      (L3)
     D_q = sum w·(Im Z)²                                                                                       (L4)
     x' = clip(y - size·2/(pi·N)·g/max(D, floor·E), 0, 1),     y' = x' + momentum·(x' - x)                   (L5)
 
-for N panels and E ray sets. The sum over rays through a panel's pixel (the transpose of bilinear sampling) is computed
-as one bilinear sample of the rays' values through the inverse homography. The two agree if the pixels of rays and panel
-have equal size, and otherwise differ by a factor that is common to g and D. The edge pixels of pictures are repeated
-outwards for two pixels.
+for N panels and E sets of rays. The sum over the rays through a panel's pixel is the transpose of bilinear sampling. It
+is approximated by one bilinear sample of the rays' values through the inverse homography. The approximation is exact
+if the pixels of the picture and of the panel have equal size. Otherwise g and D have a common wrong factor, which
+cancels. The edge pixels of a picture are extended outwards by two pixels.
 """
 
 from __future__ import annotations
@@ -46,19 +47,23 @@ from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
 
-NEAR_PX = 0.5  # rays count if they are at least this far inside every panel
-SIZE = 0.8  # size of steps after a learned network; larger ones overshoot from poor starts
+NEAR_PX = 0.5  # distance from the edge of every panel beyond which a ray is valid
+SIZE = 0.8  # size of the steps after a trained network; larger steps overshoot from poor initial values
 MOMENTUM, FLOOR = 0.7, 0.1
 LEAST_ERROR = 1e-6  # minimum squared error, which limits the PSNR to 60 dB
 
 
 @dataclass(frozen=True, slots=True)
 class Views:
-    """E sets of rays: for each position of the head, one set for the left eye and one for the right."""
+    """Rays of both eyes through the pixels of a raster, as homographies to the panels.
 
-    panels_from_rays: Tensor  # (E, N, 3, 3) float64, from the rays' raster to panel pixels; centres at half-integers
-    width_px: int  # of the rays' raster
-    height_px: int
+    Each of the E sets of rays belongs to one eye. The sets alternate between the left and the right eye, and each pair
+    of sets belongs to one position of the head.
+    """
+
+    panels_from_rays: Tensor  # (E, N, 3, 3) float64, from raster to panel pixels; pixel centres at half-integers
+    width_px: int  # width of the raster
+    height_px: int  # height of the raster
 
     @classmethod
     def of(
@@ -71,10 +76,19 @@ class Views:
         fov_deg: float | None,
         places_m: ArrayLike = ((0.0, 0.0, 0.0),),
     ) -> Views:
-        """Return the rays through the pixels of a picture `fov_deg` wide or, if None, of the centre panel.
+        """Create the rays through the pixels of the eyes' pictures or of the middle panel.
 
-        eyes_m: (2, 3) left, right, frame `stack`. places_m: displacements of both eyes for further sets, whose rays
-        pass through the same points of the centre panel. Raises ValueError for an eye in the centre panel's plane.
+        Args:
+            stack: Geometry of the panels.
+            eyes_m: Positions (2, 3) of the left and the right eye in the frame `stack`.
+            width_px: Width of the raster.
+            height_px: Height of the raster.
+            fov_deg: Horizontal field of view of the pictures, or None for the raster of the middle panel.
+            places_m: Displacements (P, 3) of both eyes. Each displacement adds two sets of rays, which pass through
+                the same points of the middle panel.
+
+        Raises:
+            ValueError: An eye is in the plane of the middle panel.
         """
         sets = []
         for place in np.asarray(places_m, np.float64):
@@ -88,9 +102,15 @@ class Views:
 
 
 def light(panels: Tensor, views: Views) -> tuple[Tensor, Tensor]:
-    """Return intensities (E, C, h, w) of panels (N, C, H, W) by (L1) and (L2), and a mask of rays.
+    """Compute the intensities at the eyes by (L1) and (L2).
 
-    They are differentiable with respect to the panels, and have the panels' device and dtype.
+    Args:
+        panels: Panel values (N, C, H, W) in [0, 1].
+        views: Rays of the eyes.
+
+    Returns:
+        The intensities (E, C, h, w), which are differentiable with respect to the panels, and a mask (E, 1, h, w) of
+        the rays that cross all panels.
     """
     bundles, counts = _bundles(panels, views)
     return torch.stack([(1 - reduce(torch.mul, z).real) / 2 for z in bundles]), counts
@@ -99,9 +119,17 @@ def light(panels: Tensor, views: Views) -> tuple[Tensor, Tensor]:
 def traced(
     panels: Tensor, views: Views, *, rays: int = 2, random: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Estimate intensities without bias, and return them with a mask of valid pixels.
+    """Estimate the intensities at the eyes without bias by tracing random rays.
 
-    rays: across and down a pixel; each is at a random position in its part of the pixel.
+    Args:
+        panels: Panel values (N, C, H, W) in [0, 1].
+        views: Rays of the eyes.
+        rays: Number of rays across and down a pixel. The pixel is divided into rays² equal parts, and each ray is at a
+            random position in one part.
+        random: Source of the random positions.
+
+    Returns:
+        The intensities (E, C, h, w), and a mask (E, 1, h, w) of the pixels whose rays all cross all panels.
     """
     size, angle = (views.height_px, views.width_px), torch.pi * panels
     total, counts = torch.zeros((), dtype=panels.dtype, device=panels.device), torch.tensor(True, device=panels.device)
@@ -118,9 +146,17 @@ def traced(
 def light_db(
     panels: Tensor, targets: Tensor, views: Views, *, rays: int = 3, random: torch.Generator | None = None
 ) -> float:
-    """Return the PSNR of the panels' light at pinhole eyes, against targets (E, C, h, w).
+    """Return the PSNR in dB of the light at pinhole eyes.
 
-    The errors of two independent sets of rays are multiplied, so that the mean is an unbiased squared error.
+    The error is estimated twice with independent rays. The mean of the product of the two estimates is the squared
+    error without bias.
+
+    Args:
+        panels: Panel values (N, C, H, W) in [0, 1].
+        targets: Target intensities (E, C, h, w).
+        views: Rays of the eyes.
+        rays: Number of rays across and down a pixel in each of the two estimates.
+        random: Source of the random positions.
     """
     (a, in_a), (b, in_b) = (traced(panels, views, rays=rays, random=random) for _ in range(2))
     counts = in_a & in_b
@@ -138,10 +174,20 @@ def step(
     momentum: float | Tensor = MOMENTUM,
     floor: float = FLOOR,
 ) -> tuple[Tensor, Tensor]:
-    """Compute one step (L5): x' and y' from panels x and their extrapolation y, both (N, C, H, W).
+    """Compute one step of the solver by (L5).
 
-    targets: (2, C, h, w) for the left and the right eye. If the views have fewer rows, their head positions take turns
-    at the rows of the targets.
+    Args:
+        x: Panel values (N, C, H, W).
+        y: Values (N, C, H, W) that extrapolate x by the momentum of the previous step. Initially they equal x.
+        targets: Target intensities (2, C, h, w) for the left and the right eye. If they have k times as many rows as
+            the views, each of k head positions uses every k-th row.
+        views: Rays of the eyes.
+        size: Size of the step.
+        momentum: Momentum of the extrapolation.
+        floor: Lower limit of the curvature per set of rays.
+
+    Returns:
+        The new panel values x' and their extrapolation y'.
     """
     sets, turns = len(views.panels_from_rays), targets.shape[-2] // views.height_px
     back, size_px = torch.linalg.inv(views.panels_from_rays), y.shape[-2:]
@@ -158,7 +204,15 @@ def step(
 
 
 def improved(panels: Tensor, targets: Tensor, views: Views, sizes: Sequence[Any], momenta: Sequence[Any]) -> Tensor:
-    """Apply one step of each size to the panels."""
+    """Apply several solver steps to the panels.
+
+    Args:
+        panels: Initial panel values (N, C, H, W).
+        targets: Target intensities (2, C, h, w) for the left and the right eye.
+        views: Rays of the eyes.
+        sizes: Size of each step.
+        momenta: Momentum of each step.
+    """
     x = y = panels
     for size, momentum in zip(sizes, momenta, strict=True):
         x, y = step(x, y, targets, views, size=size, momentum=momentum)
@@ -166,7 +220,11 @@ def improved(panels: Tensor, targets: Tensor, views: Views, sizes: Sequence[Any]
 
 
 def _bundles(panels: Tensor, views: Views) -> tuple[list[Tensor], Tensor]:
-    """Return every ray set's z_n, complex (N, C, h, w), and a mask (E, 1, h, w) of rays that count."""
+    """Return the complex values z_n of (L1) and a mask of valid rays.
+
+    Returns:
+        A tensor (N, C, h, w) for each set of rays, and a mask (E, 1, h, w) of the rays that cross all panels.
+    """
     angle = torch.pi * panels
     parts = torch.cat([torch.cos(angle), torch.sin(angle)], dim=1)  # (N, 2C, H, W)
     bundles, counts = [], []
@@ -180,11 +238,18 @@ def _bundles(panels: Tensor, views: Views) -> tuple[list[Tensor], Tensor]:
 def _sample(
     images: Tensor, matrices: Tensor, size: Sequence[int], *, near_px: float, within: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Sample images (N, K, H, W) to (N, K, h, w) through `matrices` (N, 3, 3) from pixels of the result.
+    """Resample images through homographies.
 
-    Samples are bilinear at pixel centres. With `within`, (2, h, w) column and row positions in [0, 1] inside the
-    pixels, they are the nearest pixels there. Samples less than `near_px` inside an image are zero; the second result,
-    (N, 1, h, w), is a mask of the others.
+    Args:
+        images: Images (N, K, H, W).
+        matrices: Homographies (N, 3, 3) from pixels of the result to pixels of the images.
+        size: Height and width (h, w) of the result.
+        near_px: Distance from the edge of an image beyond which a sample is valid. It may be negative.
+        within: Column and row positions (2, h, w) in [0, 1] inside the pixels of the result. The nearest pixels are
+            then sampled. By default, samples are bilinear at pixel centres.
+
+    Returns:
+        The samples (N, K, h, w), which are zero where they are not valid, and a mask (N, 1, h, w) of valid samples.
     """
     height, width = images.shape[-2:]
     to: dict[str, Any] = {"dtype": torch.float64, "device": images.device}

@@ -62,9 +62,7 @@ class _Pair:
 class Measuring(TypedDict, total=False):
     """Options that make a measurement of quality faster."""
 
-    sigmas_mm: Sequence[
-        float
-    ]  # tracking errors to evaluate, 0, 1 and 2 mm by default; each nonzero one costs four more measurements
+    sigmas_mm: Sequence[float]  # tracking errors to evaluate; each except 0 takes four more measurements
     every: int  # measure every Nth pixel of every Nth row; 1 measures all pixels
 
 
