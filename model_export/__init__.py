@@ -1,1 +1,1 @@
-"""Networks, their training and their export to ONNX. Only this package needs torch."""
+"""Definition and training of networks, and their export to ONNX. Only this package requires torch."""

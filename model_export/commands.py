@@ -14,7 +14,7 @@ from runtime.support.options import number
 
 
 def require(*modules: str) -> None:
-    """Raise MissingPart, which names the extra to install, if one of the modules is missing."""
+    """Raise MissingPart if a module is not installed. The message names the extra to install."""
     for module in modules:
         if importlib.util.find_spec(module) is None:
             raise MissingPart(f"{module} is not installed; run: pip install 'phasestack[export]'")
@@ -87,7 +87,10 @@ def train(
 
 
 def options_of(texts: list[str] | None) -> dict[str, Any]:
-    """Parse NAME=VALUE options. A value that is not JSON is taken as text. Raises InputError."""
+    """Parse options of the form NAME=VALUE, where a value that is not JSON is text.
+
+    Raises InputError if an option has another form.
+    """
     options: dict[str, Any] = {}
     for text in texts or []:
         name, equals, value = text.partition("=")

@@ -1,4 +1,4 @@
-"""Picture networks: the published one, and any `torch.nn.Module` as `module:Class`."""
+"""Create and check picture networks: the published network, the solver's steps, or any class `module:Class`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ STEPS_MOST = 64  # maximum number of steps in a contract
 
 
 class Form(Section):
-    """Input and output format of a picture network, from class attributes or defaults."""
+    """Input and output format of a picture network. The class attributes of the network override the defaults."""
 
     input_frame: Literal["centre", "panel"] = Field(
         "centre", description="both eyes' pictures, resampled to the pixels of the centre panel or of every panel"
@@ -46,21 +46,24 @@ class Form(Section):
 
     @property
     def channels(self) -> int:
-        """Number of input channels, ordered by panel, then eye, then RGB."""
+        """Number of input channels. They are ordered by panel, then eye, then RGB."""
         return (PANELS if self.input_frame == "panel" else 1) * 2 * COLOURS
 
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """Picture network: an instance of a module, with its format and options."""
+    """Picture network with its input and output format and its options."""
 
-    arch: str
+    arch: str  # name, or `module:Class`
     net: nn.Module
     form: Form
-    options: dict[str, Any]
+    options: dict[str, Any]  # arguments with which `net` was created
 
     def steps(self) -> tuple[Sequence[Any], Sequence[Any]]:
-        """Sizes and momenta of the solver steps after the network. They are learned or constant."""
+        """Return the sizes and the momenta of the solver steps after the network.
+
+        They are the tensors `step_sizes` and `step_momenta` of the network if these exist, otherwise constants.
+        """
         learned = [getattr(self.net, name, None) for name in ("step_sizes", "step_momenta")]
         if isinstance(learned[0], Tensor) and isinstance(learned[1], Tensor):
             return list(learned[0].clamp(1e-3, 3)), list(learned[1].clamp(0, 0.99))
@@ -69,7 +72,12 @@ class Network:
 
 @contextmanager
 def blamed(arch: str, field: str) -> Iterator[None]:
-    """Convert any exception of a user's module to a one-line InputError for `field`."""
+    """Convert any exception that a user's module raises to an InputError with one line.
+
+    Args:
+        arch: Name of the module, for the message.
+        field: Operation that failed, for the message.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -88,7 +96,16 @@ def check_known(arch: str, *others: str) -> None:
 
 
 def make_network(arch: str, options: dict[str, Any], *, seed: int = 0) -> Network:
-    """Create a network with weights from a seed. Raises InputError for a wrong class or wrong attributes."""
+    """Create a picture network with random weights.
+
+    Args:
+        arch: Name of a network, or `module:Class`.
+        options: Arguments of the class, and `steps` for the number of solver steps after the network.
+        seed: Seed of the weights.
+
+    Raises:
+        InputError: The network is unknown, the class cannot be loaded or created, or an attribute or option is invalid.
+    """
     check_known(arch)
     kind = plugin_class(KNOWN.get(arch, arch), nn.Module, field="--arch")
     attributes = {name: getattr(kind, name) for name in Form.model_fields if hasattr(kind, name)}
@@ -104,7 +121,7 @@ def make_network(arch: str, options: dict[str, Any], *, seed: int = 0) -> Networ
 
 
 def probe(network: Network, *, width_px: int, height_px: int) -> None:
-    """Raise InputError unless the network maps pictures of that size to finite panels."""
+    """Raise InputError unless the network maps pictures of the given size to three panels with finite values."""
     arch, form = network.arch, network.form
     example = torch.rand(1, form.channels, height_px, width_px, generator=torch.Generator().manual_seed(1))
     expected = (1, PANELS * COLOURS, height_px, width_px)
@@ -124,10 +141,10 @@ def probe(network: Network, *, width_px: int, height_px: int) -> None:
 
 
 def check_static(network: Network, *, width_px: int, height_px: int) -> None:
-    """Raise InputError if the module branches on its input's values, which a graph cannot represent."""
+    """Raise InputError if the network branches on the values of its input, which a graph cannot represent."""
     example = torch.zeros(1, network.form.channels, height_px, width_px)
     try:
-        with quiet(), redirect_stderr(StringIO()), torch.no_grad():  # torch prints graphs that it cannot trace
+        with quiet(), redirect_stderr(StringIO()), torch.no_grad():  # torch prints a graph that it cannot trace
             torch.export.export(network.net.eval(), (example,), strict=False)
     except Exception as error:  # the exporter reports other failures
         if "data-dependent" in str(error).lower():
@@ -137,7 +154,7 @@ def check_static(network: Network, *, width_px: int, height_px: int) -> None:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Suppress warnings for developers of the exporter, and graphs that C++ code prints."""
+    """Suppress warnings that only concern developers of torch's exporter, and graphs that its C++ code prints."""
     sys.stdout.flush()
     level, output = logging.root.manager.disable, os.dup(1)
     with Path(os.devnull).open("wb") as nothing:

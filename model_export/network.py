@@ -1,4 +1,4 @@
-"""Shipped network, which solves along the line of the eyes in closed form, for a tracking error."""
+"""Network of the shipped models, which solves for the outer panels in closed form with a given tracking error."""
 
 from __future__ import annotations
 
@@ -12,21 +12,26 @@ from runtime.kernels import FULL
 
 INPUTS = ("left", "right", "waves", "shifted_waves", "spectrum", "modes_in", "eye_sigma_px")
 OUTPUTS = ("rear", "front", "check")
-BLOCK_ROWS = 8  # rows that are transformed together; the raster consists of whole blocks
-BOX = 0.5  # outer panels start in the middle of their range and can change by this much
-IN_SCALE = 64  # codes per unit of the transformed inputs, which in codes would overflow half precision
+BLOCK_ROWS = 8  # number of rows that are transformed together; the raster consists of complete blocks
+BOX = 0.5  # maximum change of the outer panels, which start in the middle of their range
+IN_SCALE = 64  # divisor of the transformed inputs, which would otherwise overflow half precision
 
 
 class SpectralSolver(nn.Module):
-    """Solver for both outer panels, given the eyes' residuals on epipolar rows.
+    """Solver that computes both outer panels from the eyes' residuals on epipolar rows.
 
-    Let the panels be front = h + g and rear = h - g about the middle of their range. Let s be the parallax, in columns,
-    that half the eyes' separation causes on either panel, e that of the centre panel, and w and v frequencies along the
-    eyes' line and across it. The difference of the eyes' pictures is D = 4i·(sin(ws)cos(we)·g + cos(ws)sin(we)·h). A
-    tracking error with standard deviations of c columns and r rows moves the panels' pictures in opposite directions.
-    It attenuates the mean of a wave to m = exp(-(c²w² + r²v²)/2) and turns the rest into noise. The expected squared
-    error has a closed-form minimum for every frequency (`gains`). The frequencies are those of the chain, combined with
-    those of a block of `BLOCK_ROWS` rows and one cell's columns.
+    Let the panels be front = h + g and rear = h - g about the middle of their range. Let s be the parallax in columns
+    that half the separation of the eyes causes on an outer panel, and e the same parallax on the centre panel. Let w be
+    a frequency along the line of the eyes and v a frequency across this line. The difference of the eyes' pictures is
+    D = 4i·(sin(ws)cos(we)·g + cos(ws)sin(we)·h).
+
+    A tracking error with standard deviations of c columns and r rows moves the pictures of the two panels in opposite
+    directions. It attenuates the mean of a wave by the factor m = exp(-(c²w² + r²v²)/2) and turns the rest into noise.
+    The expected squared error has a closed-form minimum for every frequency (`gains`).
+
+    A raster row consists of cells of 2K columns, where K is `cell_px`. The transform along a row combines the modes of
+    the chain (`runtime.model.chain`) with the frequencies of a cell's columns. The transform across the rows covers a
+    block of `BLOCK_ROWS` rows.
     """
 
     def __init__(self, cell_px: int = 4) -> None:
@@ -40,26 +45,32 @@ class SpectralSolver(nn.Module):
         self.w: Tensor
         self.v: Tensor
         self.register_buffer("columns", columns, persistent=False)
-        # Combine the block's row transform with a difference and sum: of the eyes on input, of g and h on output.
+        # The row transform of a block also computes a difference and a sum: of the eyes on input, of g and h on output.
         into = torch.cat([torch.cat([-rows, rows], dim=1), torch.cat([rows, rows], dim=1)]) / IN_SCALE
         back = rows.transpose(0, 1) * FULL
         out = torch.stack([torch.cat([-back, back], dim=1), torch.cat([back, back], dim=1)])
         self.register_buffer("rows_in", into, persistent=False)
         self.register_buffer("rows_out", out, persistent=False)
-        # Patterns: rows of the block, then columns of the cell.
+        # Frequencies of all patterns, ordered by the rows of a block, then by the columns of a cell.
         self.register_buffer("w", w.repeat(BLOCK_ROWS), persistent=False)
         self.register_buffer("v", v.repeat_interleave(2 * cell_px), persistent=False)
         self.log_floor = nn.Parameter(torch.log(torch.tensor([0.01, 0.2])))  # regularisation λ of g and of h
-        self.log_rough = nn.Parameter(torch.log(torch.tensor([0.05, 0.2])))  # its growth with w²
-        self.log_sigma_scale = nn.Parameter(torch.zeros(2))  # factors on eye_sigma_px along and across the eyes' line
+        self.log_rough = nn.Parameter(torch.log(torch.tensor([0.05, 0.2])))  # increase of λ with w²
+        self.log_sigma_scale = nn.Parameter(torch.zeros(2))  # factors for eye_sigma_px along and across the eyes' line
 
     def gains(self, spectrum: Tensor, eye_sigma_px: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the numerator and denominator of g's gain without h's share, and the gain of h.
+        """Compute the gains from the transformed input to g and h.
 
-        Each is (patterns, cells + 1).
+        Args:
+            spectrum: Singular values s (cells + 1,) of the chain.
+            eye_sigma_px: The input (3,) of `forward`.
+
+        Returns:
+            The numerator and the denominator of the gain of g, which excludes the part that h explains, and the gain of
+            h. All three have the shape (patterns, cells + 1).
         """
         scale = torch.exp(self.log_sigma_scale)
-        # A mode of the chain times a pattern of the block is two waves, at the pattern's frequency ± `offset`.
+        # The product of a chain's mode and a block's pattern is two waves, at the pattern's frequency ± `offset`.
         offset = 2 * torch.asin(torch.clamp(spectrum / 4, 0, 1))[None] / (2 * self.cell_px)
         pattern = self.w[:, None]
         along2 = (eye_sigma_px[0] * scale[0]) ** 2 * (pattern * pattern + offset * offset)
@@ -79,25 +90,32 @@ class SpectralSolver(nn.Module):
         return share * m * spectrum[None], share * alpha2 + cost_g, gain_h
 
     def forward(self, *feeds: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the rear and the front panel, and a check that is finite if all intermediate numbers are.
+        """Compute the rear and the front panel for C colour channels.
 
-        The panels are (rows, cells + 1, 2K·C) 16-bit codes, which begin one parallax before column 0.
+        Args:
+            *feeds: The tensors that `INPUTS` names.
 
-        feeds: `INPUTS`, in this order. left, right: (rows, cells, 2K·C) 16-bit codes, each eye's residual along its
-        rays through the raster. waves, shifted_waves, spectrum, modes_in: V and Ũ (cells + 1, cells + 1), s
-        (cells + 1,) and U^T (cells + 1, cells) of `runtime.model.chain.chain_modes`. eye_sigma_px: (3,) c columns, r
-        rows, e columns.
+                * `left`, `right`: residual of each eye along the eye's rays through the raster, (rows, cells, 2K·C)
+                  16-bit codes.
+                * `waves`, `shifted_waves`, `spectrum`, `modes_in`: V and Ũ (cells + 1, cells + 1), s (cells + 1,) and
+                  U^T (cells + 1, cells) of `runtime.model.chain.chain_modes`.
+                * `eye_sigma_px`: c in columns, r in rows and e in columns (3,).
+
+        Returns:
+            The rear and the front panel, (rows, cells + 1, 2K·C) 16-bit codes that begin one parallax before column 0,
+            and a number (1,) that is finite if all intermediate results are finite.
         """
         rear, front, check = self._solved(feeds, added=0.5)
-        # The cast truncates. Adding a half makes it round, because values are clamped to be non-negative.
+        # The cast truncates. Adding a half rounds instead, because the values are clamped to be non-negative.
         codes = (_by_rows(torch.clamp(x, 0, FULL + 0.5), like=feeds[0]).to(torch.int16) for x in (rear, front))
         return (*codes, check)  # type: ignore[return-value]
 
     def _solved(self, feeds: tuple[Tensor, ...], *, added: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Return rear and front panel (1, block's rows, all else), in codes plus `added`, and the check.
+        """Return the rear and the front panel (1, rows of a block, all others) and the check.
 
-        Each row of a cell stays contiguous throughout, and the same row of all blocks is stored together. This makes
-        copies cheap, and the products with the rows' and the chain's matrices few and large.
+        The panels are in 16-bit codes plus `added`. The same row of all blocks is stored together, and each row of a
+        cell stays contiguous. Copies are therefore cheap, and the products with the matrices of the rows and of the
+        chain are few and large.
         """
         left, right, waves, shifted_waves, spectrum, modes_in, eye_sigma_px = feeds
         channels = left.shape[2] // (2 * self.cell_px)
@@ -111,18 +129,23 @@ class SpectralSolver(nn.Module):
         both = self._in_columns(both, torch.cat([numerator / denominator, gain_h]), channels)
         both = both.reshape(2, BLOCK_ROWS, both.shape[1], -1)
         both = torch.matmul(torch.stack([waves, shifted_waves])[:, None], both).reshape(1, rows, -1)
-        # Written as a convolution, the matrix product is fused with the addition and the clamp.
+        # The matrix product is written as a convolution, which is fused with the addition and the clamp.
         rear, front = (functional.conv1d(both, out[..., None], bias) for out in self.rows_out)
         return rear, front, _size(both)
 
     def _in_columns(self, x: Tensor, gains: Tensor, channels: int) -> Tensor:
-        """Scale the waves along the columns of x by their gains.
+        """Scale each wave along the columns of a cell by its gain.
 
-        x: (n waves of the rows, modes, blocks, 2K·C); gains: (n·2K, modes). One matrix for each mode and wave of the
-        rows transforms to the columns' waves, scales them, and transforms back.
+        For each wave of the rows and each mode, a single matrix transforms the columns to waves, scales the waves and
+        transforms them back.
+
+        Args:
+            x: Values (n, modes, blocks, 2K·C) for n waves of the rows.
+            gains: Gains (n·2K, modes).
+            channels: Number C of colour channels.
         """
         count, modes, _, row = x.shape
-        # Projections of a cell's row on each of the columns' waves.
+        # Projections of a cell's row onto each wave of the columns.
         parts = self.columns[:, :, None, None, None] * self.columns[:, None, None, :, None]
         parts = (parts * _same(channels, like=parts)).reshape(2 * self.cell_px, -1)
         matrices = torch.matmul(gains.reshape(count, -1, modes).transpose(1, 2), parts)
@@ -130,25 +153,25 @@ class SpectralSolver(nn.Module):
 
 
 def _same(channels: int, *, like: Tensor) -> Tensor:
-    """Return the identity over channels (C, 1, C)."""
+    """Return the identity matrix of the colour channels as a tensor (C, 1, C)."""
     one = torch.arange(channels, device=like.device)
     return (one[:, None, None] == one).to(torch.float32)
 
 
 def _by_block_rows(image: Tensor) -> Tensor:
-    """Rearrange an image (rows, cells, 2K·C) to (block's rows, cells, blocks, 2K·C)."""
+    """Rearrange an image (rows, cells, 2K·C) to (rows of a block, cells, blocks, 2K·C)."""
     return image.reshape(-1, BLOCK_ROWS, *image.shape[1:]).permute(1, 2, 0, 3)
 
 
 def _by_rows(x: Tensor, *, like: Tensor) -> Tensor:
-    """Invert `_by_block_rows` for x (block's rows, all else), with one cell more than the input `like`."""
+    """Invert `_by_block_rows` for a tensor (rows of a block, all others) with one cell more than `like`."""
     cells, row = like.shape[1] + 1, like.shape[2]
     return x.reshape(BLOCK_ROWS, cells, -1, row).permute(2, 0, 1, 3).reshape(-1, cells, row)
 
 
 def _size(x: Tensor) -> Tensor:
-    """Return the norm (1,) of x. It is finite only if x is, with a margin for later products."""
-    size: Tensor = torch.linalg.vector_norm(x)  # squares overflow long before later results would
+    """Return the norm (1,) of a tensor, which is finite only if all values are finite and not extremely large."""
+    size: Tensor = torch.linalg.vector_norm(x)  # the squares overflow long before later products would
     return size.reshape(1)
 
 

@@ -1,4 +1,4 @@
-"""Convert torch modules to ONNX files with a contract."""
+"""Convert torch modules to ONNX files that contain a contract."""
 
 from __future__ import annotations
 
@@ -34,24 +34,24 @@ FIXED = {"one", "channels", "eye_sigmas"}
 
 
 def spectral_bytes(net: nn.Module, *, cell_px: int) -> bytes:
-    """Export the spectral solver, with variable numbers of rows, cells and columns."""
+    """Export the spectral solver as an ONNX file for any number of rows, cells and columns."""
     sides = (torch.zeros(16, 8, 6 * cell_px, dtype=torch.int16),) * 2
     modes = tuple(torch.from_numpy(part) for part in chain_modes(8))
     return _exported(net, (*sides, *modes, torch.ones(3)), network.INPUTS, network.OUTPUTS, CELL_AXES, folded=False)
 
 
 def ports(names: Sequence[str]) -> tuple[Port, ...]:
-    """Return a contract's declaration of inputs or outputs with these names."""
+    """Return the contract's declarations of the inputs or outputs with the given names."""
     return tuple(Port(name=name, axes=(CELL_AXES | PICTURE_AXES)[name]) for name in names)
 
 
 def picture_bytes(net: nn.Module, *, channels: int, width_px: int, height_px: int) -> bytes:
-    """Export a picture network for one size."""
+    """Export a picture network as an ONNX file for pictures of one size."""
     return _exported(net, (torch.zeros(1, channels, height_px, width_px),), (eyereal.INPUT,), (eyereal.OUTPUT,), {})
 
 
 def with_contract(data: bytes, contract: Contract) -> bytes:
-    """Add the contract to a model, as the metadata entry that the runtime reads."""
+    """Add a contract to an ONNX file, as the metadata entry that the runtime reads."""
     model = onnx.load_from_string(data)
     del model.metadata_props[:]
     known = digest(model.SerializeToString(deterministic=True))
@@ -71,9 +71,15 @@ def _exported(
     *,
     folded: bool = True,
 ) -> bytes:
-    """Export a module as ONNX.
+    """Export a module as an ONNX file.
 
-    folded: True to fold constants, False to keep the names of weights.
+    Args:
+        net: Module to export, in evaluation mode.
+        example: Example of the inputs.
+        inputs: Names of the inputs.
+        outputs: Names of the outputs.
+        axes: Names of the dimensions by input or output. Dimensions that `FIXED` does not name are variable.
+        folded: Fold constants. If False, the weights keep their names.
     """
     buffer = io.BytesIO()
     with quiet(), torch.no_grad():

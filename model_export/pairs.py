@@ -1,4 +1,4 @@
-"""Prepare training pairs for picture networks: input, targets and true eyes."""
+"""Prepare training pairs for picture networks: the input, the targets and the rays of the eyes."""
 
 from __future__ import annotations
 
@@ -35,20 +35,29 @@ PICTURE_FOV_DEG = 40.0  # field of view of pictures in the published data set
 
 @dataclass(frozen=True)
 class TrainingPairs(Dataset[dict[str, Tensor]]):
-    """Data set for training a picture network. Each pair depends only on (seed, number)."""
+    """Data set for training a picture network. Each pair depends only on the seed and the number of the pair.
 
-    form: Form
+    The pictures are read from a folder, rendered from a scene, or generated at random.
+    """
+
+    form: Form  # input format of the network
     seed: int
-    width_px: int
-    height_px: int
-    eye_sigma_mm: float
-    count: int = 0  # number of different pairs before they repeat; 0: unlimited
-    stack: PanelStack | None = None  # None: random panels
-    folder: tuple[Pair, ...] = ()  # pairs to use; empty: procedural ones
-    scene: str = ""  # scene to draw instead, rotated about the vertical axis
+    width_px: int  # width of the panels and the pictures
+    height_px: int  # height of the panels and the pictures
+    eye_sigma_mm: float  # standard deviation of the tracking error along one axis
+    count: int = 0  # number of different pairs, after which they repeat; 0 means unlimited
+    stack: PanelStack | None = None  # geometry of the panels, or None for random panels
+    folder: tuple[Pair, ...] = ()  # pairs to use; if empty, pairs are rendered or generated
+    scene: str = ""  # scene to render at random rotations about the vertical axis; if empty, pairs are generated
 
     def __getitem__(self, number: int) -> dict[str, Tensor]:
-        """Return the network's input, the targets, and the rays of the estimated and the true eyes."""
+        """Return a pair as tensors.
+
+        Returns:
+            `input` is the input of the network (channels, H, W), and `targets` the target intensities (2, 3, h, w).
+            `believed` and `views` are homographies (2, N, 3, 3) as in `light.Views`, for the estimated eyes and for the
+            true eyes.
+        """
         pair = self.pair(number)
         random = np.random.default_rng([self.seed, number, 1])
         pose = stack_from_eye(pair.eyes_m.mean(axis=0))
@@ -71,7 +80,7 @@ class TrainingPairs(Dataset[dict[str, Tensor]]):
         return self.count
 
     def pair(self, number: int) -> TrainingPair:
-        """Return the pictures and eyes of pair `number`."""
+        """Return the pictures, the panels and the eyes of the pair with this number."""
         if self.folder:
             pair = self.folder[number % len(self.folder)]
             return photographed(
@@ -83,7 +92,7 @@ class TrainingPairs(Dataset[dict[str, Tensor]]):
         return random_pair(random, **self._size, stack=self.stack, fov_deg=self.form.picture_fov_deg)
 
     def _drawn(self, random: np.random.Generator) -> TrainingPair:
-        """Draw the scene for random eyes, at a random time and a random rotation about the vertical."""
+        """Render the scene for random eyes, at a random time and a random rotation about the vertical axis."""
         width_px, height_px = self.width_px, self.height_px
         stack, eyes_m = random_place(random, **self._size, stack=self.stack or prototype(**self._size))
         fov_deg = self.form.picture_fov_deg or filling_fov_deg(stack, eyes_m.mean(axis=0))
@@ -99,14 +108,18 @@ class TrainingPairs(Dataset[dict[str, Tensor]]):
 
 @lru_cache(maxsize=2)
 def opened(scene: str, stack: PanelStack, _process: int) -> ContentSource:
-    """Open a scene for drawing in this process, on its only thread. Raises InputError."""
+    """Open a scene for rendering in this process, which must have a single thread.
+
+    Raises InputError if the scene cannot be loaded.
+    """
     return open_content(ContentSettings(scene=scene), stack, offscreen_context())
 
 
 def folder_pairs(folder: Path) -> tuple[Pair, ...]:
-    """Read the pairs in a folder in the published data set's format. Raises InputError.
+    """Read the pairs in a folder that has the format of the published data set.
 
-    The folder's name must contain the name of its scene.
+    Raises:
+        InputError: The name of the folder does not contain the name of a published scene, or the folder is invalid.
     """
     name = next((name for name in preset_names() if name in folder.resolve().name), "")
     if not name:
@@ -122,7 +135,13 @@ def prototype(*, width_px: int, height_px: int) -> PanelStack:
 
 
 def photographed(pair: Pair, stack: PanelStack, fov_deg: float) -> TrainingPair:
-    """Resample a pair to the raster of the panels, for eyes that look at the middle of the display."""
+    """Resample a published pair as if the eyes looked at the centre of the display.
+
+    Args:
+        pair: Pair to resample.
+        stack: Geometry of the panels, whose size in pixels the pictures get.
+        fov_deg: Horizontal field of view of the pictures in degrees.
+    """
     size, images = {"width_px": stack.width_px, "height_px": stack.height_px}, []
     for side, eye_m in enumerate(pair.eyes_m):
         size_px = stack.width_px, stack.height_px
@@ -134,7 +153,7 @@ def photographed(pair: Pair, stack: PanelStack, fov_deg: float) -> TrainingPair:
 
 
 def network_input(pair: TrainingPair, form: Form) -> F32:
-    """Return a picture network's input (channels, H, W), ordered by panel, then eye, then RGB."""
+    """Return the input (channels, H, W) of a picture network. Channels are ordered by panel, then eye, then RGB."""
     stack, table = pair.stack, np.arange(256, dtype=np.float32) / np.float32(255)
     if form.input_value == "phase":
         table = phase_from_intensity(table, form.branch)
@@ -150,7 +169,15 @@ def network_input(pair: TrainingPair, form: Form) -> F32:
 
 
 def _warped(picture: U8, picture_from_raster: F64, stack: PanelStack, border: int) -> U8:
-    """Resample a picture bilinearly to the pixels of the panels. OpenCV's pixel centres are integers."""
+    """Resample a picture bilinearly to the pixels of a panel.
+
+    Args:
+        picture: Picture (h, w, 3).
+        picture_from_raster: Homography from pixels of the panel to pixels of the picture, with pixel centres at
+            half-integers. It is converted for OpenCV, whose pixel centres are integers.
+        stack: Geometry of the panels.
+        border: Border mode of OpenCV for pixels outside the picture.
+    """
     to_centres = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
     matrix = np.linalg.inv(to_centres) @ picture_from_raster @ to_centres
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP

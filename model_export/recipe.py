@@ -1,4 +1,4 @@
-"""Recipes of the shipped models, each a small JSON file."""
+"""Read the recipes of the shipped models, which are small JSON files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DESIGN_RANGE = TrainedFor(
 
 
 class Recipe(Section):
-    """Recipe of a shipped model: a closed-form network and the steps after it."""
+    """Recipe of a shipped model, which is a closed-form network followed by solver steps."""
 
     name: str
     arch: Literal["spectral"] = "spectral"
@@ -29,12 +29,12 @@ class Recipe(Section):
     steps: Steps = ()
 
     def sha256(self) -> str:
-        """Digest of the canonical JSON of the recipe, for the contract."""
+        """Return the SHA-256 of the recipe's canonical JSON, which the contract contains."""
         text = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()
 
 
 def read_recipe(name: str) -> Recipe:
-    """Read the recipe of a shipped model. Raises InputError."""
+    """Read the recipe of a shipped model. Raises InputError if the recipe is missing or invalid."""
     path = RECIPES / f"{name}.json"
     return validated(Recipe, dict(untrusted_input.read_json(path)), source=path)

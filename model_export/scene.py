@@ -1,4 +1,4 @@
-"""Scenes of textured cards with exact geometry, drawn for any eye directly to a raster."""
+"""Generate random scenes of textured cards, and draw them with exact geometry for any eye."""
 
 from __future__ import annotations
 
@@ -11,33 +11,39 @@ import numpy as np
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8
 
-FINER = 2  # supersampling factor, for antialiasing
-TEXELS = (24, 768)  # minimum and maximum side of a texture
+FINER = 2  # supersampling factor for antialiasing
+TEXELS = (24, 768)  # minimum and maximum side of a texture in pixels
 Random = np.random.Generator
 
 
 @dataclass(frozen=True, slots=True)
 class Plane:
-    """Textured parallelogram. Point (u, v) in [0, 1]² of the texture is at corner + u·across + v·down."""
+    """Textured parallelogram. The point (u, v) of the texture is at corner + u·across + v·down for 0 <= u, v <= 1."""
 
     texture: U8  # (h, w, 4) RGBA
-    corner_m: F64  # (3,) frame `stack`
-    across_m: F64  # (3,)
-    down_m: F64  # (3,)
+    corner_m: F64  # (3,) top left corner, frame `stack`
+    across_m: F64  # (3,) vector along the top edge
+    down_m: F64  # (3,) vector along the left edge
 
 
 Scene = tuple[Plane, ...]
 
 
 def draw(scene: Scene, projection: F64, *, width_px: int, height_px: int) -> U8:
-    """Draw a picture (h, w, 3) of a scene through a 3x4 projection from the stack frame to pixels.
+    """Draw a picture (h, w, 3) of a scene.
 
-    Each pixel shows the nearest plane, by its exact depth there; half-transparent edges blend with planes drawn
-    earlier. Nothing behind the eye is drawn.
+    Each pixel shows the plane that is nearest at this pixel. Translucent edges are blended with planes drawn earlier.
+    Nothing behind the eye is drawn.
+
+    Args:
+        scene: Planes in drawing order.
+        projection: Projection (3, 4) from homogeneous metres in the frame `stack` to homogeneous pixels.
+        width_px: Width of the picture.
+        height_px: Height of the picture.
     """
     width, height = width_px * FINER, height_px * FINER
     picture = np.zeros((height, width, 3), np.float32)
-    nearness = np.zeros((height, width), np.float32)  # 1 over the distance; negative behind the eye
+    nearness = np.zeros((height, width), np.float32)  # reciprocal of the distance, which is negative behind the eye
     for plane in scene:
         on_raster = (
             np.diag([FINER, FINER, 1.0])
@@ -52,7 +58,10 @@ def draw(scene: Scene, projection: F64, *, width_px: int, height_px: int) -> U8:
 
 
 def _part(raster_from_plane: F64, width: int, height: int) -> tuple[slice, slice] | None:
-    """Return the rows and columns that the unit square of a plane can cover, or None."""
+    """Return the rows and the columns of the raster that a plane can cover, or None if it is not visible.
+
+    The homography maps texture coordinates (u, v, 1) of the plane to pixels of the raster.
+    """
     corners = raster_from_plane @ np.array([[0, 1, 1, 0], [0, 0, 1, 1], [1, 1, 1, 1]], dtype=np.float64)
     area = np.linalg.det(raster_from_plane)
     if not np.isfinite(area) or abs(area) < 1e-12 or (corners[2] <= 0).all():
@@ -66,7 +75,15 @@ def _part(raster_from_plane: F64, width: int, height: int) -> tuple[slice, slice
 
 
 def _draw_plane(texture: U8, raster_from_plane: F64, part: tuple[slice, slice], picture: F32, nearness: F32) -> None:
-    """Draw one plane where it is nearer than what the picture shows; update both arrays."""
+    """Draw a plane where it is nearer than the planes in the picture so far.
+
+    Args:
+        texture: Texture (h, w, 4) of the plane.
+        raster_from_plane: Homography from texture coordinates (u, v, 1) to pixels of the picture.
+        part: Rows and columns of the picture that the plane can cover.
+        picture: Picture (H, W, 3), which is updated.
+        nearness: Reciprocal distance (H, W) of the planes in the picture, which is updated.
+    """
     rows, columns = part
     left, top = columns.start, rows.start
     height, width = texture.shape[:2]
@@ -76,7 +93,7 @@ def _draw_plane(texture: U8, raster_from_plane: F64, part: tuple[slice, slice], 
     drawn = cv2.warpPerspective(texture, shifted, (columns.stop - left, rows.stop - top), flags=cv2.INTER_LINEAR)
     inverse = np.linalg.inv(raster_from_plane)
     u, v = np.arange(left, columns.stop) + 0.5, np.arange(top, rows.stop)[:, None] + 0.5
-    # The third coordinate of a pixel mapped back to the plane is 1 over its distance along the projection's axis.
+    # If a pixel is mapped back to the plane, the third coordinate is the reciprocal of its distance along the gaze.
     near = (inverse[2, 0] * u + inverse[2, 1] * v + inverse[2, 2]).astype(np.float32)
     alpha = drawn[..., 3].astype(np.float32) * np.float32(1 / 255)
     alpha *= near >= nearness[part]
@@ -85,12 +102,15 @@ def _draw_plane(texture: U8, raster_from_plane: F64, part: tuple[slice, slice], 
 
 
 def _shift(right: float, down: float) -> F64:
-    """Return a translation (3, 3) by pixels."""
+    """Return the homography (3, 3) that translates by a number of pixels."""
     return np.array([[1.0, 0.0, right], [0.0, 1.0, down], [0.0, 0.0, 1.0]])
 
 
 def random_scene(random: Random, stack: PanelStack, middle_m: F64) -> Scene:
-    """Return a random backdrop, and cards at many depths around the panels, for a viewer near `middle_m`."""
+    """Return a random scene for a viewer whose head is near `middle_m` (3,) in the frame `stack`.
+
+    The scene has a backdrop and cards at random depths behind and in front of the panels.
+    """
     centre_m = stack.x_m[1]
     distance_m = middle_m[0] - centre_m
     deep_m = (stack.x_m[-1] - centre_m) * math.exp(random.uniform(math.log(0.3), math.log(6.0)))
@@ -101,7 +121,15 @@ def random_scene(random: Random, stack: PanelStack, middle_m: F64) -> Scene:
     tones = np.clip(np.rint((np.arange(256) - 127.5) * contrast + 127.5 + 255 * level), 0, 255).astype(np.uint8)
 
     def card(x_m: float, size_m: F64, aside: F64, *, slant: float, see_through: bool) -> Plane:
-        """Return a card. aside: position of its middle as seen on the centre panel, in panel sizes."""
+        """Return a card with a random texture.
+
+        Args:
+            x_m: Depth of the card in the frame `stack`.
+            size_m: Width and height (2,) of the card.
+            aside: Position (2,) at which the viewer sees the card on the middle panel, relative to the panel's size.
+            slant: Largest angle in radians by which the card is turned.
+            see_through: Make the texture opaque only on lines.
+        """
         share = (x_m - centre_m) / distance_m
         middle = aside * panel_m * (1 - share) + middle_m[1:] * share
         turns = random.uniform(-slant, slant, 2)
@@ -125,9 +153,16 @@ def random_scene(random: Random, stack: PanelStack, middle_m: F64) -> Scene:
 
 
 def _texture(random: Random, width: int, height: int, tones: U8, *, see_through: bool) -> U8:
-    """Return a texture (height, width, 4): noise whose power falls with frequency, or discs and boxes.
+    """Return a random RGBA texture (height, width, 4).
 
-    see_through: True for a texture that is opaque only on lines.
+    The texture is either noise whose power decreases with frequency, or a collage of discs and boxes.
+
+    Args:
+        random: Source of all random numbers.
+        width: Width of the texture.
+        height: Height of the texture.
+        tones: Table (256,) that is applied to all colours.
+        see_through: Make the texture opaque only on random lines.
     """
     picture = np.full((height, width, 4), 255, np.uint8)
     if random.random() < 0.5:

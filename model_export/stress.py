@@ -1,4 +1,4 @@
-"""Inputs with which a model is checked: an ordinary pair, and extreme pictures."""
+"""Inputs for checking a model: an ordinary pair of pictures, and extreme pictures."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from runtime.records import F32
 Feeds = dict[str, np.ndarray]
 ORDINARY = "ordinary pair"
 EXTRA = ("one eye black", "noise")
-LARGE_PX = 1_000_000  # for pictures with more pixels, some cases are skipped
+LARGE_PX = 1_000_000  # number of pixels above which the cases `EXTRA` are skipped
 
 
 def stress_pictures(height: int, width: int) -> dict[str, tuple[F32, F32]]:
-    """Return, by name, pairs of left and right pictures (h, w, 3) with intensities in [0, 1]."""
+    """Return extreme pairs of pictures by name: left and right intensities (h, w, 3) in [0, 1]."""
     v, u = np.mgrid[0:height, 0:width]
 
     def grey(values: np.ndarray) -> F32:
@@ -41,14 +41,14 @@ def stress_pictures(height: int, width: int) -> dict[str, tuple[F32, F32]]:
 
 
 def ordinary_pictures(height: int, width: int) -> tuple[F32, F32]:
-    """Return a procedural pair of pictures (h, w, 3), left and right."""
+    """Return the left and the right picture (h, w, 3) of a random scene, with intensities in [0, 1]."""
     pair = random_pair(np.random.default_rng([77, 0]), width_px=width, height_px=height)
     left, right = (image.astype(np.float32) / np.float32(255) for image in pair.images)
     return left, right
 
 
 def spectral_cases(cell_px: int) -> dict[str, Feeds]:
-    """Return inputs of the spectral solver: short and long epipolar rows, exact and uncertain eyes."""
+    """Return inputs of the spectral solver by name, for rows of three lengths and different tracking errors."""
     cases = {}
     for cells, eye_sigma_px in ((16, (0.0, 0.0, 0.5)), (112, (0.13, 0.15, 0.3)), (400, (0.5, 0.6, 0.1))):
         size = (64, cells * 2 * cell_px)
@@ -66,7 +66,7 @@ def spectral_cases(cell_px: int) -> dict[str, Feeds]:
 
 
 def picture_cases(contract: Contract, height: int, width: int) -> dict[str, Feeds]:
-    """Return inputs of a picture network, with the same pictures for every panel."""
+    """Return inputs of a picture network by name. The pictures are the same for every panel."""
     cases = {ORDINARY: ordinary_pictures(height, width), **stress_pictures(height, width)}
     if height * width > LARGE_PX:  # the published network takes seconds per case
         for name in EXTRA:
@@ -76,7 +76,16 @@ def picture_cases(contract: Contract, height: int, width: int) -> dict[str, Feed
 
 
 def picture_feeds(pictures: tuple[F32, F32], contract: Contract, panels: int) -> Feeds:
-    """Return a picture network's input (1, panels x 6, h, w), ordered by panel, then eye, then RGB."""
+    """Return the input of a picture network for a pair of pictures.
+
+    Args:
+        pictures: Left and right intensities (h, w, 3) in [0, 1].
+        contract: Contract of the network.
+        panels: Number of panels for which the pictures are repeated.
+
+    Returns:
+        The name of the input and its value (1, 6·panels, h, w). Channels are ordered by panel, then eye, then RGB.
+    """
     if contract.input_value == "phase":
         left, right = (phase_from_intensity(picture, contract.branch) for picture in pictures)
         pictures = left, right

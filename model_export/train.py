@@ -1,7 +1,7 @@
-"""Train a picture network, with the light at the eyes as the loss (`phasestack train`).
+"""Train a picture network with the error of the light at the eyes as the loss (`phasestack train`).
 
-The optimizer is AdamW, with cosine decay of the learning rate. Pair k and all random numbers of iteration k depend only
-on (seed, k), so a resumed training gives the same result as an uninterrupted one.
+The optimizer is AdamW with cosine decay of the learning rate. Pair k and all random numbers of iteration k depend only
+on the seed and k. A training that is interrupted and resumed therefore gives the same result as an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from runtime.report.page import drawing, png
 from runtime.support.artifacts import write_bytes, write_text
 from runtime.support.progress import progress_bar
 
-HELD_OUT_SEED = 9_000_001  # seed of the validation pairs; greater than any training seed
-HELD_OUT, HELD_OUT_SHARE = 6, 8  # number of procedural validation pairs; of a folder, one in this many is held out
-FIRST_SAVED = 10  # iteration of the first checkpoint, so that a short training can be resumed
-SMALL_PX = 30_000  # up to this many pixels in a batch, one thread is faster (17 s instead of 24 at 160x90)
+HELD_OUT_SEED = 9_000_001  # seed of the validation pairs, which is greater than any training seed
+HELD_OUT, HELD_OUT_SHARE = 6, 8  # number of generated validation pairs; one in this many pairs of a folder is held out
+FIRST_SAVED = 10  # iteration of the first checkpoint, from which a short training can be resumed
+SMALL_PX = 30_000  # number of pixels per batch up to which one thread is faster (17 s instead of 24 s at 160x90)
 COLUMNS = ("iteration", "light_db", "held_out_light_db")
 Device = Literal["auto", "cpu", "cuda"]
 Batch = dict[str, Tensor]
 
 
 class Training(Section):
-    """Everything that determines the result of a training, as stored in checkpoints."""
+    """Settings that determine the result of a training. They are stored in the checkpoint."""
 
     arch: str
     options: Annotated[dict[str, Any], Field(default_factory=dict)]
@@ -63,7 +63,20 @@ class Training(Section):
 
 
 def run_training(out: Path, training: Training, *, device: Device = "auto", resume: bool = False) -> dict[str, Any]:
-    """Train, and write the checkpoint, the curve and its plot at regular intervals. Raises InputError."""
+    """Train a picture network. The checkpoint, the learning curve and its plot are written at regular intervals.
+
+    Args:
+        out: Folder for `checkpoint.pth`, `curve.csv` and `curve.png`.
+        training: Settings of the training.
+        device: Device to train on. `auto` selects a GPU if torch finds one.
+        resume: Continue from the checkpoint in `out`.
+
+    Returns:
+        The summary of the command.
+
+    Raises:
+        InputError: The network, the data or the checkpoint is invalid, or the loss is not finite.
+    """
     place, start = _placed(device), time.monotonic()
     network = make_network(training.arch, training.options, seed=training.seed)
     probe(network, width_px=training.width_px, height_px=training.height_px)
@@ -133,9 +146,9 @@ def run_training(out: Path, training: Training, *, device: Device = "auto", resu
 
 @contextlib.contextmanager
 def _signals() -> Iterator[list[int]]:
-    """Yield a list that receives SIGINT or SIGTERM. A second signal stops at once.
+    """Yield a list to which the first SIGINT or SIGTERM is appended. A second signal exits immediately.
 
-    After the first one, the caller stops when the iteration ends.
+    The caller must check the list after each iteration.
     """
     came: list[int] = []
 
@@ -156,13 +169,16 @@ def _signals() -> Iterator[list[int]]:
 
 
 def displayed(panels: Tensor) -> Tensor:
-    """Clip and quantise panel values to 8 bits, with a straight-through gradient."""
+    """Clip panel values to [0, 1] and quantise them to 8 bits, with a straight-through gradient."""
     codes = (panels.clamp(0, 1) * 255).round() / 255
     return panels + (codes - panels).detach()
 
 
 def _loss(network: Network, batch: Batch) -> Tensor:
-    """Return the negative mean of the pairs' light in dB, which gives easy and hard pairs equal weight."""
+    """Return the negative mean over the pairs of the light PSNR in dB.
+
+    The mean of logarithms gives easy and hard pairs equal weight.
+    """
     with torch.autocast(batch["input"].device.type, torch.bfloat16, enabled=batch["input"].is_cuda):
         answer = network.net.train()(batch["input"])
     losses = []
@@ -175,7 +191,10 @@ def _loss(network: Network, batch: Batch) -> Tensor:
 
 
 def _shown(network: Network, answer: Tensor, batch: Batch) -> Iterator[Tensor]:
-    """Yield each pair's displayed panels: the output, after the solver's steps for the estimated eyes."""
+    """Yield the displayed panel values (N, C, H, W) of each pair in a batch.
+
+    The solver's steps for the estimated eyes are applied to the output of the network.
+    """
     for panels, targets, matrices in zip(displayed(answer.float()), batch["targets"], batch["believed"], strict=True):
         views = Views(matrices, targets.shape[-1], targets.shape[-2])
         x = panels.reshape(PANELS, COLOURS, *panels.shape[1:])
@@ -184,7 +203,7 @@ def _shown(network: Network, answer: Tensor, batch: Batch) -> Iterator[Tensor]:
 
 @torch.no_grad()
 def _held_out_db(network: Network, batches: list[Batch], device: torch.device) -> float:
-    """Return the mean light of the held-out pairs, estimated without bias by random rays."""
+    """Return the mean light PSNR in dB of the validation pairs, which random rays estimate without bias."""
     lights_db = []
     for number, batch in enumerate(_on(batch, device) for batch in batches):
         with blamed(network.arch, "validation"):
@@ -198,7 +217,10 @@ def _held_out_db(network: Network, batches: list[Batch], device: torch.device) -
 
 
 def _data(training: Training, form: Form) -> tuple[TrainingPairs, TrainingPairs]:
-    """Return the training and the held-out pairs. Raises InputError."""
+    """Return the training pairs and the validation pairs.
+
+    Raises InputError if the panels or the folder of pairs are unsuitable, or if both a folder and a scene are given.
+    """
     width_px, height_px = training.width_px, training.height_px
     stack = load_stack(Path(training.panels), width_px=width_px, height_px=height_px) if training.panels else None
     if stack is not None:
@@ -218,7 +240,7 @@ def _data(training: Training, form: Form) -> tuple[TrainingPairs, TrainingPairs]
 
 
 def _loader(pairs: TrainingPairs, training: Training, first: int, last: int) -> DataLoader[Batch]:
-    """Load the batches of iterations `first` to `last`. They depend only on their numbers."""
+    """Load the batches of the iterations after `first` up to `last`. Each batch depends only on its number."""
     size = training.batch
     workers = min(8, len(os.sched_getaffinity(0)) - 1) if torch.cuda.is_available() else 0
     return DataLoader(pairs, size, sampler=range(first * size, last * size), num_workers=workers)
@@ -237,9 +259,20 @@ def _on(batch: Batch, device: torch.device) -> Batch:
 def _resumed(
     out: Path, training: Training, network: Network, *parts: Any
 ) -> tuple[int, list[list[float]], list[float]]:
-    """Restore weights, optimizer and learning rate from a checkpoint. Raises InputError.
+    """Restore the weights, the optimizer and the learning rate from the checkpoint of a training.
 
-    Returns the number of iterations done, the curve, and the iterations' light since the curve's last point.
+    Args:
+        out: Folder of the checkpoint.
+        training: Settings, which must equal those in the checkpoint.
+        network: Network that receives the weights.
+        *parts: Optimizer and scheduler of the learning rate, which receive their states.
+
+    Returns:
+        The number of completed iterations, the learning curve, and the light PSNR of each iteration since the last
+        point of the curve.
+
+    Raises:
+        InputError: The checkpoint is invalid or has other settings.
     """
     path = out / "checkpoint.pth"
     table = load_checkpoint(path)
@@ -262,7 +295,7 @@ def _row(point: list[float]) -> str:
 
 
 def _drawn(curve: list[list[float]], title: str) -> bytes:
-    """Plot the curve as a PNG."""
+    """Plot the learning curve and return the PNG file."""
     with drawing(7, 4) as figure:
         axes = figure.add_subplot(title=title, xlabel="iterations", ylabel="light, dB")
         numbers, learned, held_out = zip(*curve, strict=True)

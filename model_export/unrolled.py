@@ -1,4 +1,4 @@
-"""Steps of the solver as a trainable network, whose weights are their sizes and momenta."""
+"""Trainable network that consists of solver steps. Its weights are the sizes and the momenta of the steps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ from runtime.config import Section
 
 
 class Unrolled(nn.Module):
-    """Network of trainable solver steps, which start from panels with equal shares of the mean picture."""
+    """Network whose only weights are the sizes and the momenta of the solver steps after it.
+
+    The steps start from panels that have equal shares of the mean picture.
+    """
 
     class Options(Section):
         """Number of steps and their initial size."""
@@ -27,7 +30,10 @@ class Unrolled(nn.Module):
         self.step_momenta = nn.Parameter(torch.full((steps,), MOMENTUM))
 
     def forward(self, eyes: Tensor) -> Tensor:
-        """Map intensities (n, 6, h, w) to (n, 9, h, w): every panel gets a third of the mean picture's phase."""
+        """Map intensities (n, 6, h, w) to panel values (n, 9, h, w), which are equal for all panels.
+
+        Each panel value is a third of the phase, between 1 and 2, at which the sum shows the mean picture.
+        """
         mean = (eyes[:, :3] + eyes[:, 3:]) / 2
         phase = torch.asin(mean.clamp(0, 1).sqrt()) * (2 / torch.pi)
         return ((2 - phase) / 3).repeat(1, 3, 1, 1)

@@ -1,7 +1,7 @@
-"""Check a model file: the runtime's requirements, then its results for ordinary and stress inputs.
+"""Check a model file: the requirements of the runtime, and the results for ordinary and extreme inputs.
 
-On export, results are compared with those of the torch module. For an existing file, they are compared with those of
-the same graph without onnxruntime's optimisations, so every file that the runtime accepts can be checked.
+On export, the results are compared with those of the torch module. Those of an existing file are compared with the same
+graph without onnxruntime's optimisations, so every file that the runtime accepts can be checked.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from runtime.support import untrusted_input
 from runtime.support.progress import tracked
 
 FILE_BYTES_MAX = 4 << 30  # maximum size of a model file
-LIMIT = 0.25 / 255  # maximum difference of panel values: a quarter of a code
-SMALL = (96, 160)  # size of pictures for a model without a fixed size
+LIMIT = 0.25 / 255  # maximum difference of panel values: a quarter of an 8-bit level
+SMALL = (96, 160)  # height and width of the pictures for a model without a fixed size
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Result of one check."""
+    """Result of one check, with texts that say what was found and what is required."""
 
     name: str
     found: str
@@ -43,7 +43,7 @@ class Check:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Results of all checks of one file."""
+    """Results of all checks of a model file, as text or JSON."""
 
     file: str
     checks: tuple[Check, ...]
@@ -57,7 +57,7 @@ class Report:
         return json.dumps({"file": self.file, "passed": self.passed, "checks": [asdict(c) for c in self.checks]})
 
     def table(self) -> str:
-        """Return a readable table of the checks, with what was found and what is required."""
+        """Return a readable table of the checks, each with the result and the requirement."""
         rows = [f"{'ok' if c.passed else 'FAILED':8}{c.name}: {c.found}; wanted: {c.wanted}" for c in self.checks]
         failed = sum(not check.passed for check in self.checks)
         end = f"{failed} of {len(self.checks)} checks failed" if failed else f"all {len(self.checks)} checks passed"
@@ -68,7 +68,7 @@ Reference = Callable[[Feeds], Sequence[np.ndarray]]
 
 
 def validate_file(path: Path) -> Report:
-    """Check a model file. Raises InputError if every command would refuse it."""
+    """Check a model file. Raises InputError if the runtime would refuse to load the file."""
     session = ModelSession(path)
     contract = session.contract
     if contract.input_frame != "chain":
@@ -79,9 +79,16 @@ def validate_file(path: Path) -> Report:
 
 
 def check_model(data: bytes, *, source: str, reference: Reference | None = None) -> Report:
-    """Check a model against its torch module `reference` or, without one, against its unoptimised graph.
+    """Check the results of a model against a reference.
 
-    Raises InputError if the bytes are not an ONNX model or have no known contract.
+    Args:
+        data: Contents of the ONNX file.
+        source: Name of the file, for the report.
+        reference: Function that computes the correct results, such as the torch module. By default, it is the graph
+            without optimisations.
+
+    Raises:
+        InputError: The bytes are not an ONNX model, or the model has no valid contract.
     """
     try:
         model = onnx.load_from_string(data)
@@ -107,7 +114,10 @@ def check_model(data: bytes, *, source: str, reference: Reference | None = None)
 
 
 def _size(shape: Sequence[Any], contract: Contract) -> tuple[int, int]:
-    """Return the height and width of test pictures, from the graph or the contract, or small ones."""
+    """Return the height and the width of the test pictures.
+
+    They are those of the graph or of the contract. If neither fixes a size, they are `SMALL`.
+    """
     graph, given = (*shape[2:], None, None)[:2], (contract.height_px, contract.width_px)
     found = [g if isinstance(g, int) else c or s for g, c, s in zip(graph, given, SMALL, strict=True)]
     return found[0], found[1]
@@ -127,7 +137,7 @@ def _run(session: onnxruntime.InferenceSession) -> Reference:
 
 
 def _ports(session: onnxruntime.InferenceSession, contract: Contract) -> list[Check]:
-    """Check that the names and ranks of the graph's inputs and outputs match the contract."""
+    """Check that the names and ranks of the graph's inputs and outputs agree with the contract."""
     checks = []
     for what, items, ports in (
         ("inputs", session.get_inputs(), contract.inputs),
@@ -140,9 +150,10 @@ def _ports(session: onnxruntime.InferenceSession, contract: Contract) -> list[Ch
 
 
 def _panels(answer: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the outputs of a model as panel values in one row.
+    """Return the outputs of a model as a vector of panel values, or a single NaN if its check failed.
 
-    answer: panels in sixteenths of a code, or one tensor of values.
+    Integer outputs are in sixteenths of an 8-bit level, and floating-point outputs are panel values. A scalar output
+    that is not finite is a failed check.
     """
     if any(part.size == 1 and not np.isfinite(part).all() for part in answer):
         return np.full(1, np.nan, np.float32)
@@ -153,7 +164,7 @@ def _panels(answer: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _compared(name: str, run: Reference, reference: Reference, feeds: Feeds) -> Check:
-    """Run one input through both models, and check shape, finite values and the largest difference."""
+    """Run one input through both models, and check the shape, the values and their largest difference."""
     name = f"{'values' if name.startswith(ORDINARY) else 'drift'}, {name}"
     try:
         found = _panels(run(feeds))
