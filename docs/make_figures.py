@@ -1,4 +1,7 @@
-"""Draws docs/images/optics.png, architecture.png, clocks.png and the example pair: `python -m docs.make_figures`."""
+"""Draw optics.png, architecture.png and clocks.png in docs/images, and the example pair.
+
+Run `python -m docs.make_figures`.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ FOV_DEG = 40.0
 def arrow(
     axes: Any, start: tuple[float, float], end: tuple[float, float], colour: str = INK, bend: float = 0.0
 ) -> None:
-    """An arrow in data coordinates."""
+    """Draw an arrow between two points in data coordinates."""
     style = f"arc3,rad={bend}"
     axes.add_patch(
         FancyArrowPatch(start, end, arrowstyle="-|>", mutation_scale=12, lw=1.4, color=INK, connectionstyle=style)
@@ -35,14 +38,14 @@ def arrow(
 
 
 def box(axes: Any, x: float, y: float, width: float, height: float, text: str, colour: str) -> None:
-    """A box with centred text."""
+    """Draw a box with centred text."""
     shape = "round,pad=0.02,rounding_size=0.12"
     axes.add_patch(FancyBboxPatch((x, y), width, height, boxstyle=shape, fc=colour, ec=INK, lw=1.0))
     axes.text(x + width / 2, y + height / 2, text, ha="center", va="center", fontsize=9.5, color=INK)
 
 
 def blank(figure: Any, place: Any, x: tuple[float, float], y: tuple[float, float]) -> Any:
-    """Axes without ticks or frame."""
+    """Add axes without ticks and frame to a figure."""
     axes = figure.add_subplot(place)
     axes.set(xlim=x, ylim=y, xticks=[], yticks=[])
     axes.set_frame_on(False)
@@ -50,7 +53,7 @@ def blank(figure: Any, place: Any, x: tuple[float, float], y: tuple[float, float
 
 
 def optics() -> Figure:
-    """Figure of the stack from above with both eyes' rays, the layers of a built-in scene, and each eye's view."""
+    """Draw the stack from above with the rays of both eyes, the layers of a scene, and the view of each eye."""
     stack = StackGeometry().stack()
     eyes = eyes_at(distance_m=0.6, height_m=0.05)
     with PairPainter("room", stack) as painter:
@@ -72,7 +75,7 @@ def optics() -> Figure:
         axes.plot([100 * x_m] * 2, [-half, half], color=INK, lw=3)
         axes.text(100 * x_m, -half - 1, f"panel {n}", ha="center", va="top", fontsize=9)
     for eye, colour, name in ((eyes[0], LEFT, "left eye"), (eyes[1], RIGHT, "right eye")):
-        x, y = 100 * eye[0], 100 * eye[1]  # seen from above: the viewer's right is up
+        x, y = 100 * eye[0], 100 * eye[1]  # in the view from above, the viewer's right is up
         for place in (9.0, -7.0):
             slope = (y - place) / x
             axes.plot([x, -16], [y, place - 16 * slope], color=colour, lw=1.1, alpha=0.8)
@@ -98,7 +101,7 @@ def optics() -> Figure:
 
 
 def architecture() -> Figure:
-    """Diagram of the threads and the data that they exchange."""
+    """Draw a diagram of the threads and the data that they exchange."""
     figure = Figure(figsize=(11, 5.6), layout="constrained")
     axes = blank(figure, 111, (0, 22), (0, 11))
     threads = (
@@ -134,7 +137,7 @@ def architecture() -> Figure:
 
 
 def clocks() -> Figure:
-    """Samples, solutions and refreshes of a third of a second."""
+    """Draw the samples, solutions and refreshes over a fifth of a second."""
     figure = Figure(figsize=(11, 3.6), layout="constrained")
     axes = blank(figure, 111, (-38, 205), (-0.7, 3.4))
     refresh_ms, solve_ms, first_ms = 1e3 / 60, 42.0, 18.0
@@ -165,7 +168,7 @@ def clocks() -> Figure:
 
 
 def draw_example() -> None:
-    """The pictures of `phasestack.example_pair`."""
+    """Render the pictures of `phasestack.example_pair`."""
     stack = replace(StackGeometry().stack(), width_px=640, height_px=360)
     with PairPainter(SCENE, stack) as painter:
         pair = painter.pair(SCENE, np.array(EYES_M), stack, fov_deg=EXAMPLE_FOV_DEG, off_mm=())
@@ -174,7 +177,7 @@ def draw_example() -> None:
 
 
 def main() -> None:
-    """Write all of them."""
+    """Write the example pair and all figures."""
     draw_example()
     for draw in (optics, architecture, clocks):
         draw().savefig(IMAGES / f"{draw.__name__}.png", dpi=110, metadata={"Software": None})

@@ -1,8 +1,10 @@
-"""Writes docs/performance.md, from one demo and one report, and the pages' pictures. `make gallery` (minutes), or
+"""Write docs/performance.md and the pictures of the documentation from the results of a demo and a report.
+
+Run `make gallery`, which takes minutes, or
 
     python -m docs.make_gallery [--work FOLDER] [--keep] [REPORT OPTION ...]
 
-`--keep` reuses the work folder of an earlier call. Other options (such as `--quick`) are passed to the report.
+`--keep` reuses the work folder of an earlier run. Other options, such as `--quick`, are passed to the report.
 """
 
 from __future__ import annotations
@@ -47,9 +49,9 @@ from tests.calib.simulator import Camera, camera_from_stack, ideal_panel, photog
 DOCS = Path(__file__).resolve().parent
 IMAGES = DOCS / "images"
 WIDTH_PX, LIMIT_BYTES = 1200, 200_000
-FILM_BYTES, FILM_PX, FILM_EVERY = 1_500_000, (400, 225), 4  # each of three pictures; refreshes of one
-FILM_S = 2.0, 8.0  # of the run: first and last
-PICTURES = {  # in docs/images: results of the commands, and of this script
+FILM_BYTES, FILM_PX, FILM_EVERY = 1_500_000, (400, 225), 4  # size limit, size of a picture, refreshes per film frame
+FILM_S = 2.0, 8.0  # start and end of the film in the run
+PICTURES = {  # name in docs/images: path in the work folder
     "boards.jpg": "boards.png",
     "kinds.jpg": "kinds.png",
     "contact-sheet.jpg": "demo/contact-sheet.png",
@@ -101,7 +103,7 @@ HEADINGS = ["method", "time, × fastest", "ms", "memory, MiB", "light 0 mm, dB",
 
 
 def page(report: dict[str, Any]) -> str:
-    """The text of docs/performance.md."""
+    """Format the text of docs/performance.md from the contents of report.json."""
     machine = report["machine"]
     facts = f"{machine['processor']}, {machine['cores']} cores, phasestack {machine['phasestack']}, {machine['date']}"
     methods = sorted(report["methods"], key=lambda method: method["ms_p50"])
@@ -147,7 +149,10 @@ def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def kinds(folder: Path) -> Image.Image:
-    """Contact sheet of `examples/content.py`: front layer, both eyes' views, and the left eye's target."""
+    """Draw a contact sheet of the runs of `examples/content.py`.
+
+    Each row shows the front layer, the views of both eyes, and the target of the left eye.
+    """
     names = ("layer-2.png", "seen-left.png", "seen-right.png", "wanted-left.png")
     runs = sorted(path.parent for path in folder.glob(f"*/{names[0]}"))
     width, height, rows = 176, 99, -(-len(runs) // 2)
@@ -161,7 +166,7 @@ def kinds(folder: Path) -> Image.Image:
 
 
 def boards() -> Image.Image:
-    """Boards of three panels seen by a phone from the left."""
+    """Simulate a photograph of the calibration boards on three panels, taken from the left with a phone."""
     stack = StackGeometry().stack()
     panels = [ideal_panel(stack, index) for index in range(stack.count)]
     pose = camera_from_stack(np.array([0.44, -0.26, 0.07]), towards_m=np.array([0.0, -0.06, 0.0]))
@@ -170,7 +175,7 @@ def boards() -> Image.Image:
 
 
 def moving_text(found: Sequence[Moving]) -> str:
-    """Table of the measured motions, and where `auto` is not the best of the efforts."""
+    """Format the table of the measured motions, and name the motions for which `auto` is not the best effort."""
     rows, worse = [], []
     for motion in dict.fromkeys(one.motion for one in found):
         own = {one.effort: one for one in found if one.motion == motion}
@@ -192,7 +197,7 @@ def _live(one: Moving) -> list[str]:
 
 
 def look_into(folder: Path) -> None:
-    """A solution's `viewer.html`."""
+    """Write the files of a solution, whose `viewer.html` is shown in the documentation."""
     stack = replace(StackGeometry().stack(), width_px=640, height_px=360)
     eyes = eyes_at(distance_m=0.65, angle_deg=4, height_m=0.08)
     with PairPainter("room", stack) as painter:
@@ -201,12 +206,12 @@ def look_into(folder: Path) -> None:
 
 
 class KeptInMemory:
-    """Output of a run that keeps lines, and light with its true pictures, in memory."""
+    """Output of a run that keeps the lines, the layers and the true pictures in memory."""
 
     def __init__(self) -> None:
-        self.lines: list[Mapping[str, Any]] = []
-        self.layers: dict[int, U8] = {}  # by refresh
-        self.true: dict[int, tuple[Mapping[str, Any], Pictures]] = {}  # what light.json says, and both pictures
+        self.lines: list[Mapping[str, Any]] = []  # lines of frames.jsonl
+        self.layers: dict[int, U8] = {}  # layers by the number of the refresh
+        self.true: dict[int, tuple[Mapping[str, Any], Pictures]] = {}  # entry of light.json and pictures by refresh
 
     def refresh(self, line: Mapping[str, Any]) -> None:
         self.lines.append(line)
@@ -220,7 +225,10 @@ class KeptInMemory:
 
 
 def leaning(folder: Path) -> None:
-    """Write `leaning.webp`: a leaning head's left eye with the whole model, with chosen efforts, and the true view."""
+    """Write the film `leaning.webp` of what the left eye of a leaning head sees.
+
+    Each frame shows the full model, the effort `auto` and the true view.
+    """
     recording = folder / "lean.mcap"
     write_motion(recording, "lean", seconds=FILM_S[1], seed=SEED, noise_mm=NOISE_MM)
     runs: list[KeptInMemory] = []
@@ -251,7 +259,10 @@ def leaning(folder: Path) -> None:
 
 
 def light_of(eye_m: F64, layers: U8, stack: PanelStack, *, fov_deg: float) -> U8:
-    """Compute an eye's picture, averaged over its pupil. Rays that miss a panel are black."""
+    """Compute the picture (h, w, 3) that an eye sees of the layers, averaged over the pupil.
+
+    Rays that miss a panel are black. `eye_m` is the eye's position (3,) in the frame `stack`.
+    """
     points = pupil_points(PUPIL_MM / 1000) @ stack_from_eye(eye_m)[:3, :2].T
     seen = average(
         [
@@ -263,7 +274,10 @@ def light_of(eye_m: F64, layers: U8, stack: PanelStack, *, fov_deg: float) -> U8
 
 
 def save_film(frames: Sequence[Image.Image], path: Path, *, period_ms: float) -> None:
-    """Write an animated WebP as good as its limit permits. Raises SystemExit where it stays too large."""
+    """Write an animated WebP with the best quality that the size limit permits.
+
+    Raises SystemExit if the file is too large even at the lowest quality.
+    """
     options: dict[str, Any] = {"duration": round(period_ms), "loop": 0, "method": 6}
     for quality in range(70, 10, -10):
         frames[0].save(path, save_all=True, append_images=frames[1:], quality=quality, **options)
@@ -278,7 +292,10 @@ def _label(sheet: Image.Image, place: tuple[int, int], text: str) -> None:
 
 
 def smaller(source: Path, name: str) -> bytes:
-    """Reduce a picture for the pages. Raises SystemExit if it stays too large."""
+    """Reduce a picture to the width of the pages and return the JPEG or PNG file, depending on the name.
+
+    Raises SystemExit if the file is too large even at the lowest quality.
+    """
     image = Image.open(source).convert("RGB")
     image.thumbnail((WIDTH_PX, 10 * WIDTH_PX), Image.Resampling.LANCZOS)
     for quality in range(90, 50, -5):
@@ -293,7 +310,7 @@ def smaller(source: Path, name: str) -> bytes:
 
 
 def main() -> None:
-    """Run all commands, then write, so that a failure leaves the page as it was."""
+    """Run all commands, and then write the page and the pictures. A failed command leaves them unchanged."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, default=DOCS.parent / "out" / "gallery")
     parser.add_argument("--keep", action="store_true")

@@ -1,6 +1,7 @@
-"""Writes THIRD_PARTY.md, the runtime's packages and their licences. Run it in the environment of `make test`.
+"""Write THIRD_PARTY.md, which lists the packages of the runtime and their licences.
 
-The packages are those of requirements/runtime.lock; pip-licenses reads their metadata.
+Run it in the environment of `make test`. The packages are those in requirements/runtime.lock, and pip-licenses reads
+their metadata.
 """
 
 from __future__ import annotations
@@ -37,13 +38,13 @@ libusb (LGPL-2.1) and OpenNI2 (Apache-2.0).
 
 
 def locked() -> dict[str, str]:
-    """Name and version of every package of the runtime."""
+    """Return the versions of the runtime's packages by name."""
     text = (ROOT / "requirements" / "runtime.lock").read_text(encoding="utf-8")
     return dict(re.findall(r"^([A-Za-z0-9._-]+)==([^ \\\n]+)", text, re.MULTILINE))
 
 
 def licences(names: list[str]) -> list[dict[str, str]]:
-    """Name, Version, License and URL of installed packages, as pip-licenses reports them."""
+    """Return the entries `Name`, `Version`, `License` and `URL` of installed packages, sorted by name."""
     command = [
         Path(sys.executable).parent / "pip-licenses",
         "--from=mixed",
@@ -57,7 +58,7 @@ def licences(names: list[str]) -> list[dict[str, str]]:
 
 
 def page(packages: list[dict[str, str]]) -> str:
-    """The whole page."""
+    """Format the page."""
     rows = [[package[key].replace("|", "/") for key in ("Name", "URL", "Version", "License")] for package in packages]
     return HEAD + "".join(f"| [{name}]({home}) | {' | '.join(rest)} |\n" for name, home, *rest in rows) + TAIL
 

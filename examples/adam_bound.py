@@ -1,8 +1,8 @@
-"""Upper bound on the quality of three panels for a pair: the solver's gradient steps, then Adam.
+"""Estimate the best quality that panels can reach for a pair of pictures: solver steps, followed by Adam.
 
-Adam minimises the squared error of random rays through square pixels, with a new set at every iteration. With the
-model of light (`light`) it would do worse than the steps, because it finds panels for which the model is wrong, by up
-to 2 dB at 44 dB.
+Adam minimises the squared error of random rays through square pixels, with new rays in every iteration. If it used the
+model of light (`light`) instead, the result would be worse than that of the steps, because Adam finds panels for which
+the model is wrong by up to 2 dB at 44 dB.
 
 python examples/adam_bound.py left.png right.png --panels panels.json --left-eye 0.6 -0.03 0 --right-eye 0.6 0.03 0
 """
@@ -61,7 +61,7 @@ def main() -> None:
 
 
 def shown(method: str, number: int, panels: torch.Tensor, targets: torch.Tensor, views: Views) -> None:
-    """Return a line of the table: the light of the panels, rounded to 8 bits."""
+    """Print a line of the table with the light PSNR of the panels, rounded to 8 bits."""
     print(f"{method}, {number}, {light_db((panels * 255).round() / 255, targets, views):.2f}")
 
 

@@ -1,8 +1,10 @@
-"""Write and run one scene of each kind: its file, the three layers, each eye's view, a contact sheet.
+"""Create a scene of each kind of content and run it.
 
-    python examples/content.py gltf --out out/content        # any of the kinds; without one: all
+The output contains the layers, the eyes' views and a contact sheet.
 
-The scene's file is kept next to the run's pictures, so that you can show it on a display:
+    python examples/content.py gltf --out out/content        # one kind; by default, all kinds are run
+
+The file of the scene is kept next to the pictures of the run, and can be shown on a display:
 
     phasestack run --scene out/content/gltf/ring.glb
 """
@@ -19,11 +21,17 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-Made = tuple[str, str]  # value of --scene; further lines of [content]
+Made = tuple[str, str]  # value of `scene` and further lines of the table [content]
 
 
 def ball_and_ground(width: int, height: int, eye_x: float = 0.0) -> tuple[Image.Image, Image.Image]:
-    """Draw a ball and bars in front of a background, with depth (white is nearest); eye_x: shift for a second view."""
+    """Draw a ball and bars in front of a background, and a depth map in which white is nearest.
+
+    Args:
+        width: Width of the pictures.
+        height: Height of the pictures.
+        eye_x: Shift of the ball in pixels for another view; nearer parts of the scene shift more.
+    """
     colour, depth = Image.new("RGB", (width, height), (235, 225, 205)), Image.new("L", (width, height), 50)
     pen, deep = ImageDraw.Draw(colour), ImageDraw.Draw(depth)
     for row in range(0, height, height // 9):
@@ -44,13 +52,13 @@ def ball_and_ground(width: int, height: int, eye_x: float = 0.0) -> tuple[Image.
 
 
 def picture(folder: Path) -> Made:
-    """A flat picture."""
+    """Write a flat picture."""
     ball_and_ground(960, 540)[0].save(folder / "picture.png")
     return str(folder / "picture.png"), ""
 
 
 def side_by_side(folder: Path, *, half: bool = False) -> Made:
-    """Two views side by side."""
+    """Write two views side by side. If `half` is true, both are compressed to half the columns."""
     left, right = (ball_and_ground(960, 540, eye_x=x)[0] for x in (-12, 12))
     pair = Image.new("RGB", (1920, 540))
     pair.paste(left, (0, 0))
@@ -61,12 +69,12 @@ def side_by_side(folder: Path, *, half: bool = False) -> Made:
 
 
 def half_side_by_side(folder: Path) -> Made:
-    """Two views side by side in half the columns."""
+    """Write two views side by side that are compressed to half the columns."""
     return side_by_side(folder, half=True)
 
 
 def quilt(folder: Path) -> Made:
-    """Views of 24 cameras in one picture."""
+    """Write a quilt: the views of 24 cameras in one picture."""
     columns, rows, wide, high = 8, 3, 240, 135
     sheet = Image.new("RGB", (columns * wide, rows * high))
     for number in range(columns * rows):
@@ -77,7 +85,7 @@ def quilt(folder: Path) -> Made:
 
 
 def rgbd(folder: Path) -> Made:
-    """A picture and its depth."""
+    """Write a picture with its depth map on the right."""
     colour, depth = ball_and_ground(960, 540)
     both = Image.new("RGB", (1920, 540))
     both.paste(colour, (0, 0))
@@ -87,7 +95,7 @@ def rgbd(folder: Path) -> Made:
 
 
 def film(folder: Path) -> Made:
-    """Film of two views side by side."""
+    """Write a film of two views side by side."""
     import cv2
 
     writer = cv2.VideoWriter(str(folder / "film_sbs.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 25, (960, 270))
@@ -100,7 +108,7 @@ def film(folder: Path) -> Made:
 
 
 def mesh(folder: Path, suffix: str) -> Made:
-    """Two coloured shapes."""
+    """Write a mesh of two coloured shapes in the format of the suffix."""
     import trimesh
 
     parts = [trimesh.creation.torus(1.0, 0.35), trimesh.creation.icosphere(subdivisions=3, radius=0.5)]
@@ -113,17 +121,17 @@ def mesh(folder: Path, suffix: str) -> Made:
 
 
 def obj(folder: Path) -> Made:
-    """A mesh with vertex colours."""
+    """Write a mesh with vertex colours as an OBJ file."""
     return mesh(folder, ".obj")
 
 
 def stl(folder: Path) -> Made:
-    """A mesh without colours."""
+    """Write a mesh without colours as an STL file."""
     return mesh(folder, ".stl")
 
 
 def splats(folder: Path) -> Made:
-    """A ring of Gaussians, in the reference implementation's PLY."""
+    """Write a ring of Gaussian splats as a PLY file in the format of the reference implementation."""
     rng = np.random.default_rng(0)
     count = 4000
     u, v = rng.random((2, count)) * 2 * np.pi
@@ -143,12 +151,12 @@ def splats(folder: Path) -> Made:
 
 
 def gltf(folder: Path) -> Made:
-    """A mesh with vertex colours, as one binary file."""
+    """Write a mesh with vertex colours as a binary glTF file."""
     return mesh(folder, ".glb")
 
 
 def playlist(folder: Path) -> Made:
-    """Three scenes, half a second each."""
+    """Write a playlist that shows three scenes for half a second each."""
     stl(folder)
     rgbd(folder)
     (folder / "evening.toml").write_text(
@@ -160,7 +168,7 @@ def playlist(folder: Path) -> Made:
 
 
 def data_set(folder: Path) -> Made:
-    """Pair with the published data set's file names, in a folder named after its scene."""
+    """Write a pair with the file names of the published data set, in a folder that is named after a scene."""
     pairs = folder / "lego_bulldozer"
     pairs.mkdir(exist_ok=True)
     for half, y, shift in ((1, -0.263, -20), (0, 0.237, 20)):
@@ -169,7 +177,7 @@ def data_set(folder: Path) -> Made:
 
 
 def placed(folder: Path) -> Made:
-    """The demo scene, smaller, moved and turning."""
+    """Show the demo scene reduced in size, moved, and rotating."""
     return "demo", "scale = 0.8\noffset_m = [0.02, 0.0, 0.01]\nturntable_per_min = 10"
 
 
@@ -181,7 +189,7 @@ KINDS: dict[str, Callable[[Path], Made]] = {
 
 
 def main() -> int:
-    """Run the command line."""
+    """Create and run the scenes that the command line selects."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("kind", nargs="*", choices=[*KINDS, []], help="kinds to run; default: all")
     parser.add_argument(

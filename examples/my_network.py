@@ -1,12 +1,15 @@
-"""Custom network: a small U-Net from two pictures to three panels. One file on Python's path.
+"""Custom network: a small U-Net that computes three panels from two pictures.
+
+The file must be on Python's path:
 
     export PYTHONPATH=examples
     phasestack train --arch my_network:MyNetwork --panels panels.json --out out/mine
     phasestack export --arch my_network:MyNetwork --checkpoint out/mine/checkpoint.pth --out mine.onnx
     phasestack solve --model mine.onnx ...
 
-Input: both eyes' pictures on the centre panel's pixels, (batch, 6, height, width), left eye first, intensities from 0
-to 1. Output: the panels' codes, (batch, 9, height, width), rear panel first, 0 to 1.
+The input (batch, 6, height, width) is the pictures for both eyes, resampled to the pixels of the centre panel, as
+intensities from 0 to 1 with the left eye first. The output (batch, 9, height, width) is the panel values from 0 to 1,
+with the rear panel first.
 """
 
 from __future__ import annotations
@@ -20,13 +23,19 @@ from torch.nn import functional
 
 
 class MyNetwork(nn.Module):
-    """Predict each panel's deviation from an equal share of the mean picture; works on every second pixel."""
+    """U-Net that predicts how each panel deviates from an equal share of the mean picture.
 
-    input_frame = "centre"  # or "panel": both eyes' pictures on the pixels of every panel, 18 channels
-    input_value = "intensity"  # or "phase": the sum of the panels' values that gives it
+    It works at half the resolution of the panels: blocks of 2 by 2 pixels become channels.
+    """
+
+    input_frame = "centre"  # alternative: "panel", with the pictures on the pixels of every panel (18 channels)
+    input_value = "intensity"  # alternative: "phase", the sum of panel values that shows the intensity
 
     class Options(BaseModel):
-        """Values of `--option`: validated by name, stored in the checkpoint, passed to `__init__`."""
+        """Options of the network, which `--option` sets.
+
+        They are validated, passed to `__init__` and stored in the checkpoint.
+        """
 
         width: int = Field(32, ge=4, le=256, description="channels on the finest raster")
         levels: int = Field(3, ge=1, le=5, description="coarser rasters")
@@ -38,7 +47,7 @@ class MyNetwork(nn.Module):
         self.down = nn.ModuleList(block(a, b, stride=2) for a, b in pairwise(widths))
         self.up = nn.ModuleList(block(a + b, a) for a, b in pairwise(widths))
         self.last = nn.Conv2d(width, 9 * 4, 1)
-        nn.init.zeros_(self.last.weight)  # initially all panels show the same picture
+        nn.init.zeros_(self.last.weight)  # all panels show the same picture initially
         nn.init.zeros_(self.last.bias)
 
     def forward(self, eyes: Tensor) -> Tensor:
@@ -53,7 +62,7 @@ class MyNetwork(nn.Module):
             x = up(torch.cat([skip, x], dim=1))
         mean = (eyes[:, :3] + eyes[:, 3:]) / 2
         phase = torch.asin(mean.clamp(1e-4, 1 - 1e-4).sqrt()) * (2 / torch.pi)  # sum of panel values for this intensity
-        even = (2 - phase) / 3  # a third of 2 minus that: near the middle of a panel's range
+        even = (2 - phase) / 3  # 2 - phase gives the same intensity, and a third is near the middle of a panel's range
         return even.repeat(1, 3, 1, 1) + functional.pixel_shuffle(self.last(x), 2)
 
 

@@ -1,7 +1,7 @@
-"""A program that draws for the display: a turning cube, by moderngl. Needs `pip install moderngl websockets numpy`.
+"""Program that draws a turning cube for the display with moderngl.
 
-With `phasestack try --scene program` (or `run`): python examples/program.py ADDRESS
-`phasestack status` and the page of `try` show the address (`program`).
+It requires `pip install moderngl websockets numpy`. Start `phasestack try --scene program` (or `run`), and then
+`python examples/program.py ADDRESS`. `phasestack status` and the page of `try` show the address as `program`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,10 @@ FRAGMENT = "#version 330\nin vec3 colour; out vec4 seen; void main() { seen = ve
 
 
 def cube() -> np.ndarray:
-    """(36, 3) corners of 12 triangles; metres, x out of the screen, y to the viewer's right, z up."""
+    """Return the corners (36, 3) of the cube's 12 triangles.
+
+    They are in metres, with x out of the screen, y to the viewer's right and z up.
+    """
     square = np.array([[-1, -1], [1, -1], [1, 1], [-1, -1], [1, 1], [-1, 1]])
     faces = [np.insert(square, axis, side, axis=1) for axis in range(3) for side in (-1, 1)]
     return 0.06 * np.concatenate(faces).astype("f4")

@@ -1,4 +1,6 @@
-"""Custom sensor: eyes as JSON datagrams. One file on Python's path, one line of TOML.
+"""Custom sensor that receives eye positions as JSON over UDP.
+
+The file must be on Python's path, and the configuration must name the class:
 
     [sensor]
     driver = "udp_eyes:UdpEyes"
@@ -6,8 +8,9 @@
 
     PYTHONPATH=examples phasestack run --config udp.toml --headless --out out/udp
 
-A datagram is `{"n": 1, "t_ns": 0, "left": [x, y, z], "right": [x, y, z]}`: a count, the sender's time, and metres
-in the sensor's frame (x to its right, y down, z away from it); `left` is the viewer's.
+A datagram is `{"n": 1, "t_ns": 0, "left": [x, y, z], "right": [x, y, z]}`. It contains a counter, the sender's time and
+the positions of the viewer's left and right eye in metres. The sensor's frame has x to the sensor's right, y down and
+z away from the sensor.
 """
 
 from __future__ import annotations
@@ -23,21 +26,21 @@ from phasestack import Capabilities, DeviceClock, EyePoints, Sensor, SensorFrame
 
 
 class UdpOptions(BaseModel):
-    """Fields of [sensor.options]."""
+    """Options of the sensor in the table [sensor.options]."""
 
     port: int = Field(ge=1, le=65535)
-    noise_mm: tuple[float, float, float] = (0.5, 0.5, 2.0)  # standard deviations to the right, down and away
+    noise_mm: tuple[float, float, float] = (0.5, 0.5, 2.0)  # standard deviations along x, y and z
 
 
 class UdpEyes(Sensor):
-    """Receives on the loopback interface."""
+    """Sensor that receives eye positions on a UDP port of the loopback interface."""
 
     Options = UdpOptions
     name = "udp-eyes"
     capabilities = Capabilities(eye_points=True)
 
     def __init__(self, options: UdpOptions, *, clock: Any) -> None:
-        # Only store settings here; anything that can fail belongs in `open`.
+        # Only store the settings here. Everything that can fail belongs in `open`.
         self._port, self._clock = options.port, clock
         self._covariance_m2 = np.diag(np.square(options.noise_mm)) * 1e-6
         self._socket: socket.socket | None = None

@@ -1,4 +1,4 @@
-"""Prints the udev rules for all known sensors. Run `python systemd/make_udev_rules.py`."""
+"""Print the udev rules for all known sensors. Run `python systemd/make_udev_rules.py`."""
 
 from __future__ import annotations
 
