@@ -1,5 +1,5 @@
-// Connects a page that draws for the display (docs/programs.md). `draw(asked, eye, rgba)` fills the bytes of a picture, starting
-// with the bottom row.
+// Connects a page that draws for the display (docs/programs.md). `draw(asked, eye, rgba)` fills the bytes of a picture,
+// starting with the bottom row.
 export function connect(address, draw, name = document.title) {
   const socket = new WebSocket(address);
   socket.onopen = () => socket.send(JSON.stringify({ name, rows: "bottom-up" }));

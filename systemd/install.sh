@@ -17,7 +17,7 @@ case "${1:-}" in
   -h | --help) usage; exit 0 ;;
   *) echo "install: unknown argument $1 (see --help)" >&2; exit 2 ;;
 esac
-# The service's user must be able to read the installed files.
+# The user of the service must be able to read the installed files.
 umask 022
 here=$(CDPATH='' cd -- "$(dirname -- "$0")" && pwd)
 source=$(dirname -- "$here")
@@ -37,7 +37,7 @@ live=no running=''
 if [ -z "$DESTDIR" ] && [ -d /run/systemd/system ]; then
   live=yes
 fi
-# Replaced files are kept until the new version runs.
+# put MODE SOURCE TARGET installs a file. The file that it replaces is kept until the new version runs.
 put() {
   [ ! -e "$DESTDIR$3" ] || install -D -m "$1" "$DESTDIR$3" "$kept/tree$3"
   case $2 in /*) from=$2 ;; *) from=$here/$2 ;; esac
@@ -45,16 +45,16 @@ put() {
 }
 
 if [ "${APP:-yes}" != no ]; then
-  # An earlier installation may have made it readable only by root.
+  # An earlier installation may have made the folder readable only by root.
   install -d -m 755 "$DESTDIR/opt/phasestack"
   rm -rf "$DESTDIR$library.new"
   "$python" -m pip install --quiet --root-user-action=ignore --target "$DESTDIR$library.new" -r "$source/requirements/runtime.lock"
-  # From a copy, since a build folder left in the source would be installed, with deleted modules.
+  # Install from a copy, because pip would also install deleted modules from a build folder that remains in the source.
   (cd "$source" && mkdir "$kept/source" && cp -r pyproject.toml README.md LICENSE THIRD_PARTY.md phasestack runtime calib model_export "$kept/source")
   "$python" -m pip install --quiet --root-user-action=ignore --no-deps --target "$DESTDIR$library.new" "$kept/source"
 fi
 
-# A running program must not load modules of the new version.
+# Stop the running services first, because they must not load modules of the new version.
 if [ "$live" = yes ]; then
   for unit in phasestack-page phasestack phasestack-x; do
     case $(systemctl show --property=ActiveState --value "$unit") in

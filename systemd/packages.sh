@@ -1,10 +1,10 @@
 #!/bin/sh
-# Debian packages for a runtime built from source; `test` adds those for the tests, `slow` those for the slow tests.
-# Installs them as root; otherwise prints the command.
+# Installs the Debian packages that a runtime built from source needs, or prints the command if the user is not root.
+# The argument `test` adds the packages for the tests, and `slow` also those for the slow tests.
 set -u
 runtime="g++ libegl1 libgl1-mesa-dri libgles2 libgl1 libusb-1.0-0 libopenni2-0"
 testing="xvfb xserver-xorg-core xserver-xorg-video-dummy x11-xserver-utils x11-apps imagemagick chromium systemd udev"
-slow="debootstrap systemd-container buildah e2fsprogs"  # a booted system, the image, a power cut
+slow="debootstrap systemd-container buildah e2fsprogs"  # tests of a booted system, of the image and of a power cut
 case ${1:-} in
   test) wanted="$runtime $testing" ;;
   slow) wanted="$runtime $testing $slow" ;;

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Removes the files of install.sh. See `sh systemd/uninstall.sh --help`.
+# Removes the files that install.sh installed. See `sh systemd/uninstall.sh --help`.
 set -eu
 usage() {
   cat <<'HELP'
