@@ -1,4 +1,4 @@
-"""`phasestack calibrate`: measure the panels, their grey curves and the sensor's pose."""
+"""Commands of `phasestack calibrate`, which measure the panels, their grey curves and the sensor's pose."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def charts(
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw the calibration charts, whose lines fuse only for eyes at the viewpoint of the chart.
+    """Draw the calibration charts. The lines of a chart fuse only for eyes at its viewpoint.
 
     Example: phasestack calibrate charts --out charts
     """
@@ -125,7 +125,7 @@ def capture(
     show: Annotated[bool, typer.Option("--show", help="show the charts on the panels")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Pair the viewpoint of each chart with the measured eyes, and save every accepted pair at once.
+    """Pair the viewpoint of each chart with the measured eyes, and save every accepted pair immediately.
 
     With a live sensor, move until the lines of the chart fuse, then press Enter. Press n for the next chart, p to go
     back and replace a pair, or q to stop. A recording must contain true eye positions, as the demo does.
@@ -162,6 +162,7 @@ def solve(
     as_json: JsonOption = False,
 ) -> None:
     """Compute the sensor's pose (stack_from_sensor) from pairs. Inadequate pairs are refused.
+
     Example: phasestack calibrate solve --pairs pairs.csv --out calibration.toml
     """
     from calib.solve_run import solve_file

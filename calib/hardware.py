@@ -67,7 +67,7 @@ class SetupHardware:
         return key
 
     def wait(self) -> None:
-        """Sleep until the next poll."""
+        """Sleep until keys and samples should be polled again."""
         self._clock.sleep_until_ns(self._clock.now_ns() + POLL_NS)
 
     def monitors(self) -> tuple[Monitor, ...]:

@@ -149,7 +149,7 @@ def validate(
     file: Annotated[Path, typer.Argument(help="the ONNX file")],
     as_json: Annotated[bool, typer.Option("--json", help="the checks as one object on stdout")] = False,
 ) -> None:
-    """Check a model file: its contract, names and shapes, and its results for stress inputs.
+    """Check the contract of a model file, its names and shapes, and its results for extreme inputs.
 
     Exits with 1 if a check fails.
 

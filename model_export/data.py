@@ -32,7 +32,7 @@ def random_stack(random: Random, *, width_px: int, height_px: int) -> PanelStack
     """Return three evenly spaced panels with a random width and a random gap."""
     width_m = PITCH_WIDTH_M * math.exp(random.uniform(math.log(0.25), math.log(1.6)))
     gap_m = math.exp(random.uniform(math.log(0.005), math.log(0.5)))
-    if random.random() < 0.6:  # a practical range
+    if random.random() < 0.6:  # most stacks have a practical gap
         gap_m = random.uniform(0.01, 0.12)
     return PanelStack(width_m, width_m * height_px / width_px, (-gap_m, 0.0, gap_m), width_px, height_px)
 

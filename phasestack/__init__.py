@@ -1,4 +1,4 @@
-"""Public, stable interface for programs (docs/contracts.md, "From Python")."""
+"""Public and stable Python interface of phasestack (docs/contracts.md, "From Python")."""
 
 from __future__ import annotations
 
