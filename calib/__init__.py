@@ -1,1 +1,1 @@
-"""Calibration of a display: the pose of the sensor, the registration of the panels and their grey curves."""
+"""Calibration of the sensor's pose, the registration of the panels and their grey curves."""

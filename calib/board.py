@@ -69,7 +69,7 @@ class Mark:
 
 @lru_cache(maxsize=8)
 def marks(stack: PanelStack) -> tuple[Mark, ...]:
-    """Lay out the marks of all panels. Raises InputError if there are too many panels or they are too small."""
+    """Lay out the marks of all panels. Raises InputError if panels are too many or too small."""
     if stack.count * PER_PANEL > DICTIONARY_SIZE:
         raise InputError("stack", "x_m", f"calibration boards support at most {DICTIONARY_SIZE // PER_PANEL} panels")
     unit = max(2, round(min(stack.width_px * 9 / 16, stack.height_px) / BITS_ON_SHORT_SIDE))

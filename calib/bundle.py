@@ -171,7 +171,7 @@ class _Problem:
         return _State(state.lens + step[:LENS], turns, middles_m, change @ state.poses)
 
     def start(self, *, reverse: bool = False) -> _State:
-        """Return the initial state: ideal panels, with the best of several focal lengths and its camera poses.
+        """Return the initial state: ideal panels, and the best of several focal lengths with its poses.
 
         Args:
             reverse: Assume that the panels are in reverse order.

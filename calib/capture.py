@@ -1,4 +1,7 @@
-"""Guide a person through the calibration viewpoints and store a pair of points for each (`calibrate capture`)."""
+"""Guide a person through the calibration viewpoints and store a pair of points for each.
+
+The command `phasestack calibrate capture` uses this module.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Check calibration pairs and solutions. Unusable ones raise InputError, and doubtful ones cause warnings."""
+"""Check calibration pairs and solutions.
+
+Unusable data raise InputError, and doubtful data cause warnings.
+"""
 
 from __future__ import annotations
 
@@ -104,7 +107,7 @@ def _listed(pairs: Pairs, index: list[int]) -> str:
 
 
 def _is_mirrored(pairs: Pairs) -> bool:
-    """Return True if the points are not coplanar and fit far better after the sensor's z axis is reversed."""
+    """Return True if the points are not coplanar and fit far better with the sensor's z axis reversed."""
     if len(pairs) < 4 or extents(pairs.stack_m)[2] <= COPLANAR * extents(pairs.stack_m)[0]:
         return False
     straight = _typical_error_m(pairs.sensor_m, pairs.stack_m)

@@ -1,4 +1,4 @@
-"""Commands of `phasestack calibrate`, which measure the panels, their grey curves and the sensor's pose."""
+"""Commands of `phasestack calibrate`, which measure panels, grey curves and the sensor's pose."""
 
 from __future__ import annotations
 

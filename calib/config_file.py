@@ -64,7 +64,9 @@ def read_document(config: Path) -> TOMLDocument:
 
 
 def rewrite(config: Path, change: Callable[[TOMLDocument], None]) -> Path | None:
-    """Change a configuration file. If the result is invalid, InputError is raised and the file stays unchanged.
+    """Change a configuration file.
+
+    If the result is invalid, InputError is raised and the file stays unchanged.
 
     Args:
         config: Configuration file. A missing file is created.

@@ -100,7 +100,7 @@ def find_marks(picture: U8, stack: PanelStack, *, name: str) -> SeenMarks:
 
 
 def _mirrored(picture: U8, known: dict[int, Mark], counts: list[int]) -> str:
-    """Return a message if marks can be read only in the mirror image of a picture, otherwise an empty string.
+    """Return a message if marks can be read only in the mirror image of a picture, otherwise "".
 
     `counts` is the number of marks found on each panel.
     """
@@ -156,7 +156,7 @@ def _covered(counts: list[int], places: F64, owners: Any) -> str:
 
 
 def _unit_px(quad: F64) -> float:
-    """Return the size of a marker's bit in pixels of the photograph, along the shortest side of the marker."""
+    """Return the size of a marker's bit in the photograph, along the shortest side of the marker."""
     sides = np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1)
     return float(sides.min()) / MARKER
 

@@ -18,7 +18,7 @@ IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class PanelDisplay:
-    """Open panels that keep showing a set of layers and report the keys that are pressed in their windows."""
+    """Open panels that keep showing a set of layers and report keys pressed in their windows."""
 
     def __init__(self, sink: PanelSink) -> None:
         self._sink = sink

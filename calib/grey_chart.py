@@ -1,4 +1,4 @@
-"""Measure a panel's grey curve from photographs of a chart, with a camera whose tone curve is unknown.
+"""Measure a panel's grey curve from photographs of a chart, with a camera of unknown tone curve.
 
 The patches of each grey are scattered over the chart, which makes it possible to separate uneven light from the greys.
 Other patches mix black and white pixels in known proportions. Their intensity does not depend on the panel's grey

@@ -31,7 +31,7 @@ CARD_CHARACTERS = 32  # maximum number of characters in a line of an identity ca
 
 
 class SetupHardware:
-    """Access to real hardware: monitors on X11, a sensor, a folder of photographs and a person at the keyboard.
+    """Access to real hardware: monitors on X11, a sensor, a folder of photographs and the keyboard.
 
     The object opens at most one set of windows and one sensor at a time, and `close` releases everything.
     """

@@ -1,4 +1,7 @@
-"""Read, validate and store pairs of points. Each pair has a measured sensor point and a known stack point."""
+"""Read, validate and store pairs of points.
+
+Each pair has a measured sensor point and a known stack point.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +42,7 @@ Number = Annotated[float, BeforeValidator(_no_truth_value), AfterValidator(_boun
 
 
 class PairRow(BaseModel):
-    """Pair of points in metres as a row of the file, with informative columns that `calibrate capture` adds."""
+    """Pair of points in metres as a row of the file, with the columns that `calibrate capture` adds."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", coerce_numbers_to_str=True)
 
@@ -152,7 +155,10 @@ def points_of(rows: Iterable[PairRow]) -> tuple[F64, F64]:
 
 
 class PairsFile:
-    """CSV file of the pairs accepted so far. Every change is written immediately, so an interruption loses no pair."""
+    """CSV file of the pairs accepted so far.
+
+    Every change is written immediately, so an interruption loses no pair.
+    """
 
     def __init__(self, path: Path) -> None:
         """Continue an existing file or start a new one. Raises InputError if an existing file is invalid."""

@@ -55,7 +55,7 @@ def panel_from_pixels(stack: PanelStack) -> F64:
 
 
 def stack_from_pixels(panel: PlacedPanel, stack: PanelStack) -> F64:
-    """Return the 3x3 matrix that maps a pixel (u, v, 1) of a panel to its actual position in the stack frame."""
+    """Return the 3x3 matrix that maps a pixel (u, v, 1) to its actual position in the stack frame."""
     return panel.rotation @ panel_from_pixels(stack) + np.outer(panel.centre_m, HOMOGENEOUS)
 
 

@@ -1,4 +1,4 @@
-"""Register the panels: measure their poses from photographs of the calibration boards, with standard errors.
+"""Measure the poses of the panels, with standard errors, from photographs of the calibration boards.
 
 The middle panel is the reference: it defines the stack frame, and its picture is not resampled. For every other panel
 the configuration stores the actual distance and a homography from the pixels of an ideal panel, parallel to the

@@ -91,7 +91,7 @@ def _stored_points(data: Any, calibration: Calibration, *, source: Path) -> Poin
 
 
 def residual_figure(points: Points, *, limit_m: float) -> bytes:
-    """Plot the X, Y and Z errors of every calibration point in mm, as in figure S5 of the EyeReal supplement.
+    """Plot the errors of every calibration point in mm, as in figure S5 of the EyeReal supplement.
 
     Args:
         points: Errors at the calibration points.

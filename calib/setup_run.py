@@ -1,4 +1,7 @@
-"""Guide a person through the setup of a display, which can be interrupted and resumed (`phasestack setup`)."""
+"""Guide a person through the setup of a display, which can be interrupted and resumed.
+
+The command `phasestack setup` uses this module.
+"""
 
 from __future__ import annotations
 
@@ -20,12 +23,15 @@ MAX_PROGRESS_BYTES = 4 << 20  # size limit for setup.json
 
 
 def progress_path(config: Path) -> Path:
-    """Return the path of the file that records the progress of the setup. It is next to the configuration."""
+    """Return the path of the file next to the configuration that records the progress of the setup."""
     return config.with_name(f"{config.stem}.setup.json")
 
 
 def read_progress(path: Path) -> dict[str, Any]:
-    """Return the figures of the finished steps by the name of the step. Raises InputError if the file is invalid."""
+    """Return the figures of the finished steps by the name of the step.
+
+    Raises InputError if the file is invalid.
+    """
     if not untrusted_input.is_there(path):
         return {}
     try:
@@ -77,7 +83,10 @@ def run_setup(
 
 
 def walk_through(setup: Setup) -> bool:
-    """Run the steps from the first unfinished one. Returns True after the last step, False if the person stops."""
+    """Run the steps from the first unfinished one.
+
+    Returns True after the last step, or False if the person stops.
+    """
     number = next((n for n, step in enumerate(STEPS) if step.name not in setup.done), 0)
     while number < len(STEPS):
         step = STEPS[number]
@@ -109,7 +118,7 @@ def _is_done(setup: Setup, step: SetupStep) -> bool:
 
 
 def summarise(setup: Setup, *, finished: bool) -> tuple[dict[str, Any], str]:
-    """Return the summary as a dictionary and as text. If the setup is finished, the summary is also written.
+    """Return the summary as a dictionary and as text. The summary of a finished setup is also written.
 
     The text ends with the commands to run next.
     """

@@ -29,7 +29,10 @@ POLISH_ABOVE = 1e2  # ratio of the points' two largest extents above which the c
 
 
 class Degenerate(ValueError):
-    """Raised if the points do not determine a similarity in double precision. The message gives the reason."""
+    """Raised if the points do not determine a similarity in double precision.
+
+    The message gives the reason.
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +59,10 @@ class Similarity:
 
 
 def _centred(points: F64) -> tuple[F64, F64]:
-    """Return the centred points and their mean. Two passes keep the precision of points far from the origin."""
+    """Return the centred points and their mean.
+
+    Two passes keep the precision of points far from the origin.
+    """
     mean = np.zeros((*points.shape[:-2], 1, 3))
     for _ in range(2):
         mean = mean + (points - mean).mean(axis=-2, keepdims=True)

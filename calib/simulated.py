@@ -24,7 +24,7 @@ SAMPLES_HERE = 16  # number of sensor samples per viewpoint, at 30 samples per s
 
 
 class SimulatedHardware(SetupHardware):
-    """Simulated hardware: monitors in random order, a depth sensor, and a person who stands at each viewpoint.
+    """Simulated hardware: monitors in random order, a depth sensor, and a person at each viewpoint.
 
     The sensor has the same pose as the sensor of the built-in recording. The resulting configuration can therefore be
     tried with `run --replay demo`.

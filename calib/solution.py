@@ -1,4 +1,4 @@
-"""Compute a calibration from pairs by one of several methods, estimate its errors, and choose the best method."""
+"""Compute a calibration from pairs, estimate its error, and choose the best of several methods."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def solve(
 
 
 def posterior_scale(fitted: float, *, sigma: float, freedom: int) -> tuple[float, float]:
-    """Return the posterior mean and standard deviation of the log scale, averaged over the kinds of sensors.
+    """Return the mean and standard deviation of the log scale's posterior over the kinds of sensors.
 
     Averaging avoids a threshold between the kinds. It also leaves the fitted scale of a sensor that is off by a tenth
     nearly unchanged.

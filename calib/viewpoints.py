@@ -1,4 +1,7 @@
-"""Define the calibration viewpoints (EyeReal, section 2.3, extended to any distance) and the viewing volume."""
+"""Define the calibration viewpoints and the viewing volume.
+
+The viewpoints are those of EyeReal, section 2.3, extended to any distance.
+"""
 
 from __future__ import annotations
 
@@ -45,19 +48,22 @@ class Viewpoint:
 
 
 def spherical_m(radius_m: float, *, phi_deg: float, theta_deg: float) -> F64:
-    """Return the point (3,) in the frame `stack` at a radius and the polar angles of the EyeReal supplement."""
+    """Convert a radius and the polar angles of the EyeReal supplement to a point (3,) in `stack`."""
     phi, theta = np.radians(phi_deg), np.radians(theta_deg)
     return radius_m * np.array([np.sin(phi) * np.sin(theta), np.sin(phi) * np.cos(theta), np.cos(phi)])
 
 
 def viewing_place_m(viewing: CalibrationSettings) -> F64:
-    """Return the middle (3,) of the viewing range in the frame `stack`, for which the panels are registered."""
+    """Return the middle (3,) of the viewing range in `stack`, for which the panels are registered."""
     up_deg = sum(viewing.viewing_up_deg) / 2
     return spherical_m(sum(viewing.viewing_m) / 2, phi_deg=90 - up_deg, theta_deg=90)
 
 
 def grid(viewing: CalibrationSettings = USUAL) -> tuple[Viewpoint, ...]:
-    """Return the 27 viewpoints of a viewing range, nearest first. The default range has the viewpoints of EyeReal."""
+    """Return the 27 viewpoints of a viewing range, nearest first.
+
+    The default range has the viewpoints of EyeReal.
+    """
     low_deg, high_deg = viewing.viewing_up_deg
     radii_cm = np.rint(100 * np.linspace(*viewing.viewing_m, 3)).astype(int)
     phi_deg = np.rint(90 - np.linspace(high_deg, low_deg, 3)).astype(int)

@@ -53,7 +53,7 @@ def blank(figure: Any, place: Any, x: tuple[float, float], y: tuple[float, float
 
 
 def optics() -> Figure:
-    """Draw the stack from above with the rays of both eyes, the layers of a scene, and the view of each eye."""
+    """Draw the stack from above with the rays of both eyes, the layers, and the view of each eye."""
     stack = StackGeometry().stack()
     eyes = eyes_at(distance_m=0.6, height_m=0.05)
     with PairPainter("room", stack) as painter:

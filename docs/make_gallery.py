@@ -1,4 +1,4 @@
-"""Write docs/performance.md and the pictures of the documentation from the results of a demo and a report.
+"""Write docs/performance.md and the documentation's pictures from a demo and a report.
 
 Run `make gallery`, which takes minutes, or
 
@@ -175,7 +175,7 @@ def boards() -> Image.Image:
 
 
 def moving_text(found: Sequence[Moving]) -> str:
-    """Format the table of the measured motions, and name the motions for which `auto` is not the best effort."""
+    """Format the table of the motions, and name those for which `auto` is not the best effort."""
     rows, worse = [], []
     for motion in dict.fromkeys(one.motion for one in found):
         own = {one.effort: one for one in found if one.motion == motion}

@@ -1,4 +1,4 @@
-"""Estimate the best quality that panels can reach for a pair of pictures: solver steps, followed by Adam.
+"""Estimate the best quality that panels can reach for a pair, by solver steps and then by Adam.
 
 Adam minimises the squared error of random rays through square pixels, with new rays in every iteration. If it used the
 model of light (`light`) instead, the result would be worse than that of the steps, because Adam finds panels for which

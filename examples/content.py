@@ -168,7 +168,7 @@ def playlist(folder: Path) -> Made:
 
 
 def data_set(folder: Path) -> Made:
-    """Write a pair with the file names of the published data set, in a folder that is named after a scene."""
+    """Write a pair with the file names of the published data set, in a folder named after a scene."""
     pairs = folder / "lego_bulldozer"
     pairs.mkdir(exist_ok=True)
     for half, y, shift in ((1, -0.263, -20), (0, 0.237, 20)):

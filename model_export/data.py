@@ -116,6 +116,6 @@ def random_pair(
 
 
 def filling_fov_deg(stack: PanelStack, eye_m: F64) -> float:
-    """Return the angle that the width of the panels fills at an eye's distance, up to `WIDEST_DEG`, in degrees."""
+    """Return the angle that the panels' width fills at an eye's distance, at most `WIDEST_DEG`."""
     distance_m = float(np.linalg.norm(eye_m))
     return min(WIDEST_DEG, math.degrees(2 * math.atan(stack.width_m / 2 / distance_m)))

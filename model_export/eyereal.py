@@ -81,7 +81,7 @@ class UNet(nn.Module):
 
 
 class EyeRealNet(nn.Module):
-    """Published network, which computes panel values from the eyes' pictures on the pixels of every panel.
+    """Published network that maps the eyes' pictures, resampled for every panel, to panel values.
 
     The input channels are intensities in [0, 1], ordered by panel, then eye, then RGB. The output channels are ordered
     by panel, then RGB. The outputs are in [-0.2, 0.8], as in the published code, and the panel clips negative values.

@@ -1,4 +1,4 @@
-"""Create and check picture networks: the published network, the solver's steps, or any class `module:Class`."""
+"""Create and check picture networks: the published one, the solver's steps, or any `module:Class`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,10 @@ STEPS_MOST = 64  # maximum number of steps in a contract
 
 
 class Form(Section):
-    """Input and output format of a picture network. The class attributes of the network override the defaults."""
+    """Input and output format of a picture network.
+
+    The class attributes of the network override the defaults.
+    """
 
     input_frame: Literal["centre", "panel"] = Field(
         "centre", description="both eyes' pictures, resampled to the pixels of the centre panel or of every panel"
@@ -121,7 +124,7 @@ def make_network(arch: str, options: dict[str, Any], *, seed: int = 0) -> Networ
 
 
 def probe(network: Network, *, width_px: int, height_px: int) -> None:
-    """Raise InputError unless the network maps pictures of the given size to three panels with finite values."""
+    """Raise InputError unless the network maps pictures of this size to three finite panels."""
     arch, form = network.arch, network.form
     example = torch.rand(1, form.channels, height_px, width_px, generator=torch.Generator().manual_seed(1))
     expected = (1, PANELS * COLOURS, height_px, width_px)
@@ -141,7 +144,10 @@ def probe(network: Network, *, width_px: int, height_px: int) -> None:
 
 
 def check_static(network: Network, *, width_px: int, height_px: int) -> None:
-    """Raise InputError if the network branches on the values of its input, which a graph cannot represent."""
+    """Raise InputError if the network branches on the values of its input.
+
+    A graph cannot represent such branches.
+    """
     example = torch.zeros(1, network.form.channels, height_px, width_px)
     try:
         with quiet(), redirect_stderr(StringIO()), torch.no_grad():  # torch prints a graph that it cannot trace
@@ -154,7 +160,7 @@ def check_static(network: Network, *, width_px: int, height_px: int) -> None:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Suppress warnings that only concern developers of torch's exporter, and graphs that its C++ code prints."""
+    """Suppress warnings for developers of torch's exporter, and graphs that its C++ code prints."""
     sys.stdout.flush()
     level, output = logging.root.manager.disable, os.dup(1)
     with Path(os.devnull).open("wb") as nothing:

@@ -1,4 +1,4 @@
-"""Network of the shipped models, which solves for the outer panels in closed form with a given tracking error."""
+"""Network of the shipped models, which solves for the outer panels in closed form."""
 
 from __future__ import annotations
 
@@ -170,7 +170,7 @@ def _by_rows(x: Tensor, *, like: Tensor) -> Tensor:
 
 
 def _size(x: Tensor) -> Tensor:
-    """Return the norm (1,) of a tensor, which is finite only if all values are finite and not extremely large."""
+    """Return the norm (1,) of a tensor. It is finite only if all values are finite and not too large."""
     size: Tensor = torch.linalg.vector_norm(x)  # the squares overflow long before later products would
     return size.reshape(1)
 

@@ -35,7 +35,9 @@ PICTURE_FOV_DEG = 40.0  # field of view of pictures in the published data set
 
 @dataclass(frozen=True)
 class TrainingPairs(Dataset[dict[str, Tensor]]):
-    """Data set for training a picture network. Each pair depends only on the seed and the number of the pair.
+    """Data set for training a picture network.
+
+    Each pair depends only on the seed and the number of the pair.
 
     The pictures are read from a folder, rendered from a scene, or generated at random.
     """
@@ -153,7 +155,10 @@ def photographed(pair: Pair, stack: PanelStack, fov_deg: float) -> TrainingPair:
 
 
 def network_input(pair: TrainingPair, form: Form) -> F32:
-    """Return the input (channels, H, W) of a picture network. Channels are ordered by panel, then eye, then RGB."""
+    """Return the input (channels, H, W) of a picture network.
+
+    The channels are ordered by panel, then eye, then RGB.
+    """
     stack, table = pair.stack, np.arange(256, dtype=np.float32) / np.float32(255)
     if form.input_value == "phase":
         table = phase_from_intensity(table, form.branch)

@@ -18,7 +18,10 @@ Random = np.random.Generator
 
 @dataclass(frozen=True, slots=True)
 class Plane:
-    """Textured parallelogram. The point (u, v) of the texture is at corner + u·across + v·down for 0 <= u, v <= 1."""
+    """Textured parallelogram.
+
+    The point (u, v) of the texture is at corner + u·across + v·down for 0 <= u, v <= 1.
+    """
 
     texture: U8  # (h, w, 4) RGBA
     corner_m: F64  # (3,) top left corner, frame `stack`

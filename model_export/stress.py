@@ -48,7 +48,7 @@ def ordinary_pictures(height: int, width: int) -> tuple[F32, F32]:
 
 
 def spectral_cases(cell_px: int) -> dict[str, Feeds]:
-    """Return inputs of the spectral solver by name, for rows of three lengths and different tracking errors."""
+    """Return inputs of the spectral solver by name, with three row lengths and tracking errors."""
     cases = {}
     for cells, eye_sigma_px in ((16, (0.0, 0.0, 0.5)), (112, (0.13, 0.15, 0.3)), (400, (0.5, 0.6, 0.1))):
         size = (64, cells * 2 * cell_px)

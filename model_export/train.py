@@ -63,7 +63,9 @@ class Training(Section):
 
 
 def run_training(out: Path, training: Training, *, device: Device = "auto", resume: bool = False) -> dict[str, Any]:
-    """Train a picture network. The checkpoint, the learning curve and its plot are written at regular intervals.
+    """Train a picture network.
+
+    The checkpoint, the learning curve and its plot are written at regular intervals.
 
     Args:
         out: Folder for `checkpoint.pth`, `curve.csv` and `curve.png`.
@@ -240,7 +242,10 @@ def _data(training: Training, form: Form) -> tuple[TrainingPairs, TrainingPairs]
 
 
 def _loader(pairs: TrainingPairs, training: Training, first: int, last: int) -> DataLoader[Batch]:
-    """Load the batches of the iterations after `first` up to `last`. Each batch depends only on its number."""
+    """Load the batches of the iterations after `first` up to `last`.
+
+    Each batch depends only on its number.
+    """
     size = training.batch
     workers = min(8, len(os.sched_getaffinity(0)) - 1) if torch.cuda.is_available() else 0
     return DataLoader(pairs, size, sampler=range(first * size, last * size), num_workers=workers)

@@ -1,4 +1,4 @@
-"""Trainable network that consists of solver steps. Its weights are the sizes and the momenta of the steps."""
+"""Trainable network of solver steps, whose weights are the sizes and the momenta of the steps."""
 
 from __future__ import annotations
 

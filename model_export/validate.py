@@ -1,4 +1,4 @@
-"""Check a model file: the requirements of the runtime, and the results for ordinary and extreme inputs.
+"""Check that a model file meets the runtime's requirements and gives correct results.
 
 On export, the results are compared with those of the torch module. Those of an existing file are compared with the same
 graph without onnxruntime's optimisations, so every file that the runtime accepts can be checked.

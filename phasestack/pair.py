@@ -46,7 +46,10 @@ Cameras = Sequence[Sequence[Sequence[float]]] | Sequence[F64] | F64
 
 @dataclass(frozen=True)
 class _Pair:
-    """Validated arguments of a call. The pictures are what pinhole eyes see that look at the stack's origin."""
+    """Validated arguments of a call.
+
+    The pictures are views of pinhole eyes that look at the stack's origin.
+    """
 
     pictures: tuple[Picture, ...]
     eyes_m: F64
@@ -123,7 +126,7 @@ class Result:
 
     @property
     def seen(self) -> U8:
-        """Simulated views of the two eyes through the layers, as an array (2, h, w, 3) with the left eye first."""
+        """Simulated views (2, h, w, 3) of the eyes through the layers, with the left eye first."""
         return np.stack(self._pair.seen)
 
     @cached_property
