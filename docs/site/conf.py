@@ -3,7 +3,7 @@
 project = "phasestack"
 author = "the phasestack authors"
 html_title = "phasestack"
-extensions = ["myst_parser", "sphinx.ext.autodoc"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 include_patterns = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "THIRD_PARTY.md", "docs/*.md"]
 exclude_patterns = [
     ".*",
