@@ -1,4 +1,4 @@
-"""Optics of the display as pure functions of arrays.
+"""Optics of the display, implemented as pure functions of arrays.
 
-Names and docstrings state frames, units and equations.
+Names and docstrings state the frame and unit of each quantity, and the equation that a function implements.
 """

@@ -1,16 +1,19 @@
-"""Align layers that were solved for earlier eyes to the current eyes.
+"""Align layers that were solved for earlier eye positions to the current eye positions.
 
-Parallel planes seen from one point differ by a scale and a shift. Let m be the point midway between the eyes. Its ray
-through a point c of the reference plane (x = r) meets the panel at x = a at c·k + m·(1 - k), k = (m_x - a) / (m_x - r).
-When this midpoint moves from o to n, the ray from n through a point p of the panel is traced to the reference plane,
-and from there back to the panel along the ray from o. Both steps are a scale and a shift, so they lead from p to
-q = p·s + t. With d = n - o and D = o_x - a,
+Seen from one point, two parallel planes are related by a scale and a shift. Let m be the midpoint between the eyes. The
+ray from m through a point c of the reference plane (x = r) meets the panel at x = a at the point c·k + m·(1 - k), where
+k = (m_x - a) / (m_x - r).
+
+When the midpoint moves from o to n, a point p of the panel is projected along the ray from n onto the reference plane,
+and from the reference plane along the ray from o back onto the panel. Each projection is a scale and a shift, so p maps
+to q = p·s + t. For d = n - o and D = o_x - a, the coefficients are
 
     s = 1 + d_x·(r - a) / ((D + d_x)·(o_x - r)),    t = (a - r) / (o_x - r) · (o·d_x - d·D) / (D + d_x).
 
-In this form s = 1 and t = 0 without rounding error if the midpoint has not moved or the panel is the reference plane.
-Rays from the midpoint map exactly. So do both eyes' rays if the head faces the panels and has moved parallel to them.
-If the head has come nearer or moved away, the disparity remains the old one; no shift can change that.
+This form yields s = 1 and t = 0 without rounding error if the midpoint has not moved or the panel is the reference
+plane. The map is exact for rays from the midpoint. It is also exact for the rays of both eyes if the head faces the
+panels and has moved parallel to them. If the head has moved closer or farther away, the layers keep the disparity that
+they were solved with, because a shift cannot change the disparity.
 """
 
 from __future__ import annotations
@@ -28,41 +31,53 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8, PanelFrame, Parallax
 
 FARTHEST_M = 1e6  # coordinates beyond this are treated as not finite
-NEAREST_M = 0.01  # least distance of an eye from the front panel
-MOST_SHIFT = 0.5  # largest shift of a panel's middle, in panel widths or heights
-MOST_SCALE = 2.0  # largest enlargement or reduction of a panel
-ROWS = 32  # rows per resampled strip; a strip's float32 pixels fit in a core's cache
+NEAREST_M = 0.01  # minimum distance between an eye and the front panel
+MOST_SHIFT = 0.5  # maximum shift of a panel's centre, in panel widths or heights
+MOST_SCALE = 2.0  # maximum factor by which a panel is enlarged or reduced
+ROWS = 32  # rows per resampled strip; the float32 pixels of a strip fit in a core's cache
 
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Maps with which the layers are drawn for the current eyes."""
+    """Transformation that adapts solved layers to the current eyes."""
 
-    solved_from_shown: tuple[F64, ...]  # per panel (3, 3), scale and shift from shown pixels to the solved layer's
-    limited: str = ""  # why the alignment stopped short of the current eyes; empty if it did not
-    parallax: Parallax | None = None  # motion of content off the middle panel; None: the eyes have not moved
+    # One (3, 3) matrix per panel: scale and shift from shown pixels to the solved layer's pixels.
+    solved_from_shown: tuple[F64, ...]
+    limited: str = ""  # reason why the alignment does not reach the current eyes; empty if it reaches them
+    # Motion of content off the middle panel; None if the eyes have not moved or the number of panels is even.
+    parallax: Parallax | None = None
 
 
 def reference_x_m(stack: PanelStack) -> float:
-    """Return x of the reference plane: the centre panel, or halfway between the two middle ones."""
+    """Return the x coordinate of the reference plane of an alignment.
+
+    The reference plane is the plane of the centre panel. If the number of panels is even, it is the plane halfway
+    between the two panels in the middle.
+    """
     half = stack.count // 2
     return stack.x_m[half] if stack.count % 2 else (stack.x_m[half - 1] + stack.x_m[half]) / 2
 
 
 def align(stack: PanelStack, *, solved_for_m: F64, eyes_m: F64) -> Alignment:
-    """Align layers solved for eyes (2, 3) to eyes (2, 3) at another position, both in frame `stack`.
+    """Align layers that were solved for other eye positions to the current eyes.
 
-    The limits: each eye stays at least `NEAREST_M` in front of the front panel, no panel's middle moves by more than
-    `MOST_SHIFT` of its size, and no panel is drawn `MOST_SCALE` times larger or smaller. Beyond a limit, the result is
-    the alignment at the farthest allowed point on the straight line from the old eyes to the new ones, so it stays
-    continuous. Eyes that are not finite leave the layers unchanged. Never raises.
+    An alignment is limited in three ways: each eye stays at least `NEAREST_M` in front of the front panel, the centre
+    of a panel moves by at most `MOST_SHIFT` of the panel's size, and a panel is enlarged or reduced by at most the
+    factor `MOST_SCALE`. If the current eyes exceed a limit, the layers are aligned to the farthest allowed point on the
+    straight line from the old eyes to the current eyes, which keeps the alignment continuous.
+
+    The function never raises an exception. If a coordinate is not finite, the layers stay unchanged.
+
+    Args:
+        solved_for_m: (2, 3) eyes that the layers were solved for, in frame `stack`.
+        eyes_m: (2, 3) current eyes in frame `stack`.
     """
-    if not (np.abs(solved_for_m).max() <= FARTHEST_M and np.abs(eyes_m).max() <= FARTHEST_M):  # nor NaN
+    if not (np.abs(solved_for_m).max() <= FARTHEST_M and np.abs(eyes_m).max() <= FARTHEST_M):  # also catches NaN
         return Alignment(_as_they_are(stack), "the eyes' positions are not finite")
     old, new = _middle(solved_for_m), _middle(eyes_m)
     share, limited = 1.0, ""
     for most, least, why in _limits(stack, solved_for_m, eyes_m, old=old, new=new):
-        # Every limit has the form share · most <= least, where `share` is the allowed part of the movement.
+        # Every limit has the form share · most <= least, where `share` is the allowed fraction of the movement.
         reach = 0.0 if least < 0.0 else 1.0 if most <= least else least / most
         if reach < share:
             share, limited = reach, why
@@ -74,9 +89,9 @@ def align(stack: PanelStack, *, solved_for_m: F64, eyes_m: F64) -> Alignment:
 
 
 def scale_and_shift(matrix: F64) -> tuple[float, float, float, float]:
-    """Return (scale_u, scale_v, shift_u, shift_v) of a 3x3 matrix.
+    """Return (scale_u, scale_v, shift_u, shift_v) of a 3x3 matrix that maps pixels to pixels.
 
-    Raises ValueError if the matrix is not just a scale and a shift.
+    Raises ValueError if the matrix does anything other than scale and shift.
     """
     (su, a, tu), (b, sv, tv), last = matrix.tolist()
     if a or b or last != [0.0, 0.0, 1.0]:
@@ -85,17 +100,19 @@ def scale_and_shift(matrix: F64) -> tuple[float, float, float, float]:
 
 
 def is_identity(matrix: F64) -> bool:
-    """Return True if this alignment shows the solved pixels without resampling."""
+    """Return True if a panel's alignment matrix leaves every pixel where it is, which avoids resampling."""
     return scale_and_shift(matrix) == (1.0, 1.0, 0.0, 0.0)
 
 
 def shown_layers(frame: PanelFrame) -> U8:
-    """Return the (N, h, w, 4) layers exactly as shown, before each panel's curve, rotation and mirroring.
+    """Return the (N, h, w, 4) layers of a frame before panel curves, rotation and mirroring are applied.
 
-    This function is the reference for the presentation shader. It samples bilinearly with exact weights (for moved
-    eyes, bicubic sampling was never better by more than 0.05 dB: docs/mathematics.md), enlarges a coarse solution in
-    the same pass, fills pixels outside the layer with the rest code, and mixes in the flat picture before rounding. If
-    the frame needs none of this, its own array is returned. Raises ValueError if the frame has nothing to show.
+    This function is the reference for the presentation shader. It samples bilinearly with exact weights; for moved
+    eyes, bicubic sampling was never better by more than 0.05 dB (docs/mathematics.md). A coarse solution is enlarged in
+    the same pass. Pixels outside the layer are filled with the rest code, and the flat picture is mixed in before
+    rounding. If the frame needs none of these operations, its array is returned without a copy.
+
+    Raises ValueError if the frame needs a flat picture but has none.
     """
     flatness = 1.0 if frame.solved is None else frame.flatness
     if flatness > 0.0 and frame.flat is None:
@@ -145,7 +162,7 @@ def _solved_from_shown(stack: PanelStack, index: int, *, old: F64, step: F64) ->
     shift_m = (raster.x_m - reference_m) / height_m * (old[1:] * step[0] - step[1:] * distance_m) / now_m
     matrix = np.eye(3)
     matrix[0, 0] = matrix[1, 1] = 1.0 + magnified
-    # The pixels' origin is the top left corner, not the centre.
+    # The origin of the pixel coordinates is the panel's top left corner, not its centre.
     matrix[0, 2] = (raster.left_m * magnified + shift_m[0]) / raster.pitch_u_m
     matrix[1, 2] = -(raster.top_m * magnified + shift_m[1]) / raster.pitch_v_m
     matrix += 0.0  # avoids negative zeros
@@ -155,7 +172,10 @@ def _solved_from_shown(stack: PanelStack, index: int, *, old: F64, step: F64) ->
 def _limits(
     stack: PanelStack, solved_for_m: F64, eyes_m: F64, *, old: F64, new: F64
 ) -> Iterator[tuple[float, float, str]]:
-    """Yield (most, least, why) per limit. A share of the movement is allowed if share · most <= least."""
+    """Yield (most, least, why) for each limit of an alignment.
+
+    A fraction `share` of the movement is allowed if share · most <= least. The text `why` describes the excess.
+    """
     front_m = stack.x_m[-1]
     for name, before, after in zip(("left", "right"), solved_for_m, eyes_m, strict=True):
         room_m = before[0] - front_m - NEAREST_M
@@ -179,9 +199,17 @@ def _limits(
 
 
 def _places(count: int, shown: int, *, scale: float, shift: float) -> tuple[NDArray[np.intp], F32]:
-    """Return the source pixel before each of `shown` pixels, and the distance past it.
+    """Return the source pixels and weights for linear interpolation along one axis.
 
-    Indices are those of a source padded by one pixel, so 0 is its border.
+    Args:
+        count: Number of source pixels.
+        shown: Number of shown pixels.
+        scale: Source pixels per shown pixel.
+        shift: Source position of the shown pixels' left or top edge, in source pixels.
+
+    Returns:
+        For each shown pixel, the index of the last source pixel before its position, and the distance in pixels from
+        the source pixel to the position. The indices refer to a source that is padded by one pixel at both ends.
     """
     place = np.clip((np.arange(shown) + 0.5) * scale + shift - 0.5, -1.0, count)
     first = np.minimum(np.floor(place), count - 1.0)
@@ -189,10 +217,17 @@ def _places(count: int, shown: int, *, scale: float, shift: float) -> tuple[NDAr
 
 
 def _resampled(layer: U8, matrix: F64, rest: int, *, size: tuple[int, int]) -> Iterator[tuple[slice, F32]]:
-    """Yield strips of rows of a shown layer of `size` (height, width), with unrounded codes (rows, w, 4).
+    """Resample a layer and yield the result in strips of rows.
 
-    Each strip overwrites the codes of the one before. A coarse layer is extended by a pixel on every side, so that it
-    does not fade at its edge.
+    The surroundings of the layer have the code `rest`. A coarse layer is first extended by one pixel on every side,
+    because otherwise its edge would fade into the surroundings.
+
+    Args:
+        matrix: (3, 3) scale and shift from shown pixels to pixels of the full-size layer.
+        size: Height and width of the shown layer in pixels.
+
+    Yields:
+        The rows of a strip, and their unrounded (rows, w, 4) codes.
     """
     su, sv, tu, tv = scale_and_shift(matrix)
     height, width = layer.shape[:2]
@@ -214,7 +249,7 @@ def _resampled(layer: U8, matrix: F64, rest: int, *, size: tuple[int, int]) -> I
             inside.start - 1 : inside.stop - 1
         ]
         lines = _between(source.take(first - low, axis=0), source.take(first + 1 - low, axis=0), weight)
-        # Gather each pixel of four floats as one number.
+        # View each pixel's four floats as a single number, which is faster to gather.
         pixels = lines.view(np.complex128)[..., 0]
         left, right = (
             pixels.take(columns + k, axis=1).view(np.float32).reshape(*pixels.shape[:1], size[1], 4) for k in (0, 1)
@@ -225,11 +260,11 @@ def _resampled(layer: U8, matrix: F64, rest: int, *, size: tuple[int, int]) -> I
 def _displaced(
     displacement: Displacement, layer: U8, matrix: F64, rest: int, *, size: tuple[int, int]
 ) -> Iterator[tuple[slice, F32]]:
-    """Yield strips like those of `_resampled`, with a separate displacement for every pixel."""
+    """Resample a layer like `_resampled`, but move every pixel by a separate displacement as well."""
     su, sv, tu, tv = scale_and_shift(matrix)
     height, width = layer.shape[:2]
     by_u, by_v, extended = width / size[1], height / size[0], int((height, width) != size)
-    # The rest code surrounds the layer. A coarse layer is first extended by one pixel of its edge.
+    # Surround the layer with the rest code. A coarse layer is first extended by repeating its edge pixels.
     padded = np.pad(layer, ((extended, extended), (extended, extended), (0, 0)), mode="edge")
     padded = np.pad(padded, ((1, 1), (1, 1), (0, 0)), constant_values=rest).astype(np.float32)
     padded[..., 3] = 255.0
@@ -253,7 +288,7 @@ def _displaced(
 
 
 def _between(low: F32, high: F32, weight: F32) -> F32:
-    """Return low · (1 - weight) + high · weight, computed in `low`; `high` is overwritten."""
+    """Interpolate low · (1 - weight) + high · weight into `low` and return it. `high` is overwritten."""
     high -= low
     high *= weight
     low += high

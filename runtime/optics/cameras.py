@@ -17,17 +17,24 @@ from runtime.records import F32, F64, U8
 
 OUTSIDE_MOST = 1 / 3  # warn if a larger share of a picture is outside the panels
 LEAST_PX = 16  # smallest side of a resampled picture
-EXACT = 1e-6  # cameras that differ by less, relative to the focal length, count as equal
-DIGITS = 9  # decimals of metres and degrees; rounding to them recovers the values a camera matrix was built from
+EXACT = 1e-6  # cameras whose matrices differ by less than this times the picture's width count as equal
+DIGITS = 9  # decimals of metres and degrees; this rounding recovers the values that a camera matrix was built from
 NAMES = ("left", "right")
 Picture = U8 | F32  # (h, w, 3)
 
 
 def as_cameras(matrices: Any) -> tuple[F64, F64]:
-    """Return two cameras' projections (2, 3, 4), pixels from `stack`, and positions (2, 3) in metres.
+    """Return the projections and positions of two cameras that are given by their 3x4 matrices.
 
-    The projections are right-handed. Raises ValueError unless `matrices` are two 3x4 matrices whose left 3x3 parts
-    have an inverse.
+    Args:
+        matrices: Matrices of the left and right camera, which map metres in frame `stack` to pixels.
+
+    Returns:
+        The matrices (2, 3, 4), with the sign that makes the third homogeneous coordinate positive in front of the
+        camera, and the positions (2, 3) in metres in frame `stack`.
+
+    Raises:
+        ValueError: `matrices` are not two finite 3x4 matrices, or the left 3x3 part of a matrix has no inverse.
     """
     try:
         cameras = np.asarray(matrices, np.float64)
@@ -46,15 +53,24 @@ def as_cameras(matrices: Any) -> tuple[F64, F64]:
 def looking_at_origin(
     pictures: Sequence[Picture], cameras: F64, eyes_m: F64, stack: PanelStack
 ) -> tuple[list[Picture], float]:
-    """Resample the pictures of `cameras` (2, 3, 4) as if the eyes (2, 3) looked at the stack's origin.
+    """Resample two cameras' pictures as if the cameras had been aimed at the stack's origin.
 
-    Returns the (h, w, 3) pictures and their horizontal field of view in degrees. The pictures cover as much of the
-    panels as both originals do. Sampling is bicubic; pictures that already look at the origin are returned unchanged.
-    Raises ValueError if a picture does not show the stack's centre.
+    The new pictures cover as much of the panels as both originals allow. Sampling is bicubic. If both cameras are
+    already aimed at the origin, their pictures are returned unchanged.
+
+    Args:
+        cameras: (2, 3, 4) projections from frame `stack` to the pictures' pixels (`as_cameras`).
+        eyes_m: (2, 3) positions of the cameras in frame `stack`.
+
+    Returns:
+        The resampled (h, w, 3) pictures, and their horizontal field of view in degrees.
+
+    Raises:
+        ValueError: A picture does not show the stack's centre.
     """
     height, width = pictures[0].shape[:2]
     turns = [np.diag([1.0, -1.0, -1.0]) @ stack_from_eye(eye_m)[:3, :3].T for eye_m in eyes_m]
-    # Pixels of the pictures from directions (x, y, 1) of eyes that look at the origin.
+    # These matrices map directions (x, y, 1), relative to a gaze at the origin, to pixels of the pictures.
     pixels_from_gaze = [camera[:, :3] @ turn.T for camera, turn in zip(cameras, turns, strict=True)]
     pixels_from_gaze = [matrix / matrix[2, 2] for matrix in pixels_from_gaze]
     focal_px = pixels_from_gaze[0][0, 0]
@@ -95,9 +111,9 @@ def looking_at_origin(
 
 
 def _within(matrix: F64, half: F64, width: int, height: int) -> bool:
-    """Return True if a picture contains every direction (x, y, 1) with |x|, |y| up to `half` (2,).
+    """Return True if a picture contains every direction (x, y, 1) with |x| <= half[0] and |y| <= half[1].
 
-    matrix: 3x3, pixels from directions.
+    `matrix` (3x3) maps homogeneous directions to pixels of the picture.
     """
     corners = np.array([(x * half[0], y * half[1], 1.0) for x in (-1, 1) for y in (-1, 1)]) @ matrix.T
     if not (corners[:, 2] > 0).all():
@@ -107,7 +123,7 @@ def _within(matrix: F64, half: F64, width: int, height: int) -> bool:
 
 
 def _most(holds: Any, least: float = 0.0) -> float:
-    """Return the largest number from `least` to 1 that satisfies the monotonic condition `holds`."""
+    """Return the largest number between `least` and 1 for which the monotonic condition `holds` is true."""
     most = 1.0
     if holds(most):
         return most
@@ -118,14 +134,17 @@ def _most(holds: Any, least: float = 0.0) -> float:
 
 
 def _slope(matrix: F64) -> F64:
-    """Return the (2, 2) derivative of a picture's pixels with respect to direction, straight ahead."""
+    """Return the (2, 2) derivative of pixel coordinates with respect to direction at (0, 0, 1)."""
     return np.asarray(matrix[:2, :2] - np.outer(matrix[:2, 2], matrix[2, :2]))
 
 
 def doubts(eyes_m: ArrayLike, stack: PanelStack, *, fov_deg: float, size: tuple[int, int]) -> list[str]:
-    """Return one line for each probable mistake in the eyes or `fov_deg`.
+    """Return a one-line warning for each probable mistake in `eyes_m` or `fov_deg`.
 
-    size: (width, height) of the pictures.
+    Args:
+        eyes_m: (2, 3) left and right eye in frame `stack`.
+        fov_deg: Horizontal field of view of the pictures.
+        size: Width and height of the pictures in pixels.
     """
     eyes, warnings = np.asarray(eyes_m, np.float64), []
     if fov_deg <= math.pi:

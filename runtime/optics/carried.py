@@ -1,9 +1,10 @@
-"""Carried, expected and light quality of layers seen by other eyes than they were solved for.
+"""Carried, expected and light quality of layers at eye positions that they were not solved for.
 
-These measures are defined in docs/contracts.md. The picture that the layers were solved for is treated as painted on
-the centre panel: each pixel's ray is replaced by the ray from the true eye through the same point of that panel. Ghosts
-and colour fringes count as errors. The parallax between the nominal and the true eye does not count, because no shift
-of the layers can add it. The age of the view does not count either; `evaluation.refresh_quality` measures it.
+The three measures are defined in docs/contracts.md. They treat the picture that the layers were solved for as if it
+were painted on the centre panel: the ray of each pixel is replaced by the ray from the true eye through the same point
+of the centre panel. Ghosts and colour fringes count as errors. The parallax between the nominal and the true eye does
+not count, because no shift of the layers can add it. The age of the view does not count either;
+`evaluation.refresh_quality` measures the error that it causes.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import stack_from_eye
 from runtime.records import F32, F64, U8
 
-PLENTY = 3_000_000  # pictures with more values than this are sampled more sparsely
+PLENTY = 3_000_000  # number of values above which a picture is sampled more sparsely
 
 
 def carried_db(
@@ -33,11 +34,17 @@ def carried_db(
     eyes_m: ArrayLike,
     fov_deg: float,
 ) -> float:
-    """Return the PSNR at `eyes_m` (2, 3) of layers solved for `solved_for_m` (2, 3), one ray per pixel.
+    """Return the PSNR of layers that are seen from `eyes_m`, measured with one ray per pixel.
 
-    layers: (N, H, W, 3 or 4) code values, exactly as displayed; drawn: an (h, w, 3) retina picture for each eye of
-    `solved_for_m`, `fov_deg` wide, as code values or float in [0, 1].
-    Raises ValueError for an eye behind a panel, or if the eyes see no part of the panels.
+    Args:
+        layers: (N, H, W, 3 or 4) code values as the panels receive them, rear to front.
+        drawn: An (h, w, 3) retina picture for each of the eyes `solved_for_m`, as code values or float in [0, 1].
+        solved_for_m: (2, 3) eyes that the layers were solved for, in frame `stack`.
+        eyes_m: (2, 3) true eyes in frame `stack`.
+        fov_deg: Horizontal field of view of the retina pictures.
+
+    Raises:
+        ValueError: An eye is not in front of every panel, or the eyes see no part of the panels.
     """
     targets = [intensities(picture) for picture in drawn]
     solved_for, eyes = np.asarray(solved_for_m, np.float64), np.asarray(eyes_m, np.float64)
@@ -48,9 +55,9 @@ def carried_db(
 
 
 class AtEyes(TypedDict):
-    """Eyes, field of view and tracking errors for which an expected quality is computed."""
+    """Viewing conditions for which an expected quality is computed."""
 
-    eyes_m: ArrayLike  # (2, 3) eyes that the layers were solved for
+    eyes_m: ArrayLike  # (2, 3) eyes that the layers were solved for, frame `stack`
     fov_deg: float  # horizontal field of view of the pictures
     sigmas_mm: Sequence[float]  # standard deviations of the tracking error
     seen_from_m: NotRequired[ArrayLike | None]  # (2, 3) true positions of the eyes; by default `eyes_m`
@@ -64,17 +71,27 @@ def expected_errors(
     sampling: Sampling | None = None,
     **at: Unpack[AtEyes],
 ) -> dict[float, F64]:
-    """Return the carried squared errors expected for normal tracking errors, by standard deviation.
+    """Return the carried squared errors that are expected for normally distributed tracking errors.
 
-    Each value is an array: the error of all rows, then of each group of rows. The expectation is a sum over five
-    points, which is exact for second moments: no tracking error with weight 1/2, and two standard deviations left,
-    right, up and down with weight 1/8 each.
+    The expectation is a sum over five eye positions, which is exact for second moments. The position without tracking
+    error has weight 1/2. The positions two standard deviations to the left, right, top and bottom have weight 1/8 each.
 
-    drawn: an (h, w, 3) picture for each of the eyes (2, 3) that the layers were solved for. sampling: by default the
-    one for light, the figure to quote, with four times as many rays per pixel in pictures of at most `PLENTY` values.
-    Moved eyes are sampled with a quarter of the rays, which costs less than 0.02 dB: larger pictures use every second
-    pixel of every second row, others use two rays across and down each pixel instead of four. The other arguments and
-    the exceptions are those of `carried_db`.
+    At these four positions, a quarter of the rays is used, which costs less than 0.02 dB. Large pictures use every
+    second pixel of every second row. Other pictures use two rays across and down each pixel instead of four.
+
+    Args:
+        layers: (N, H, W, 3 or 4) code values as the panels receive them, rear to front.
+        drawn: An (h, w, 3) retina picture for each of the eyes that the layers were solved for, as code values or
+            float in [0, 1].
+        sampling: Rays to use. By default `LIGHT`, which measures the figure to quote, but with four times the number of
+            rays per pixel if a picture has at most `PLENTY` values.
+        **at: Viewing conditions (`AtEyes`).
+
+    Returns:
+        For each standard deviation in mm, an array with the error of all rows and the error of each group of rows.
+
+    Raises:
+        ValueError: An eye is not in front of every panel, or the eyes see no part of the panels.
     """
     chosen = sampling or (LIGHT if drawn[0].size > PLENTY else LIGHT._replace(rays=2 * LIGHT.rays))
     seen_from_m = at.get("seen_from_m")
@@ -109,15 +126,17 @@ def expected_psnrs_db(
     sampling: Sampling | None = None,
     **at: Unpack[AtEyes],
 ) -> dict[float, float]:
-    """Return the PSNRs of `expected_errors` in dB, keyed by the tracking error's standard deviation."""
+    """Return the PSNRs of `expected_errors` in dB, keyed by the standard deviation in mm."""
     errors = expected_errors(layers, drawn, stack, sampling=sampling, **at)
     return {sigma_mm: psnr_db(error[0]) for sigma_mm, error in errors.items()}
 
 
 def standard_error_db(errors: F64) -> float:
-    """Return the standard error in dB of the PSNR that belongs to the first of these errors.
+    """Return the standard error in dB of a PSNR, estimated from the scatter between groups of rows.
 
-    errors: (1 + groups,) squared errors of all rows, then of each group of rows.
+    Args:
+        errors: (1 + groups,) mean squared errors. The first error covers all rows and determines the PSNR. Each of the
+            other errors covers one group of rows.
     """
     groups = errors[1:]
     relative = float(np.std(groups, ddof=1)) / len(groups) ** 0.5 / max(float(errors[0]), 1e-12)
@@ -125,7 +144,7 @@ def standard_error_db(errors: F64) -> float:
 
 
 def intensities(picture: U8 | F32) -> F32:
-    """Convert a picture of code values or intensities to (h, w, 3) float32 intensities in [0, 1]."""
+    """Convert a picture to (h, w, 3) float32 intensities in [0, 1]. Code values are divided by 255."""
     part = picture[..., :3].astype(np.float32)
     if picture.dtype == np.uint8:
         part /= np.float32(255)

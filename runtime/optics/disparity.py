@@ -1,4 +1,4 @@
-"""Compare the disparity of a pair of pictures with the largest that a stack's gaps can show."""
+"""Compare the disparity of a pair of pictures with the largest disparity that a stack can show."""
 
 from __future__ import annotations
 
@@ -17,34 +17,37 @@ from runtime.records import F32, F64, U8
 
 WIDTH_PX = 256  # width of the middle panel's raster on which the pictures are compared
 REACH_PX = WIDTH_PX // 4  # largest disparity searched, in either direction
-# Largest ghosts that are not reported, as a root mean square relative to full scale. The other errors of the example
-# pair are about as large (37 dB of light), so larger ghosts would cost more than 3 dB.
+# Ghosts up to this size are not reported (root mean square relative to full scale). The example pair's other errors are
+# about equally large (37 dB of light), so larger ghosts would cost more than 3 dB.
 GHOSTS_MOST = 0.015
-BEYOND_LEAST = 0.1  # share of the matches that must be outside the stack; disparity within it causes no ghosts
-LARGER, MOST_LARGER = 1.1, 20.0  # ratio of successive gaps that are tried; largest, relative to the stack's own
+BEYOND_LEAST = 0.1  # minimum share of the matches outside the stack; content inside the stack causes no ghosts
+LARGER, MOST_LARGER = 1.1, 20.0  # ratio of successive gaps that are tried; largest gap relative to the stack's gap
 ROLLED, TURNED = 0.05, 0.2  # largest slopes of the line between the eyes for which picture rows correspond
-LEAST_MATCHED = 0.1  # share of the panel that must be matched
-LEAST_ONCE = 1 / 3  # share of the matches that must be unambiguous; otherwise the picture is repetitive
-WINDOW_PX, APART_PX = 21, 4  # side of the cost window; least distance between two matches of a pixel
-NO_WORSE = 1.3, 1.0  # ambiguous: another match's error is at most this factor times the best one's, plus these codes
+LEAST_MATCHED = 0.1  # minimum share of the panel with a match
+LEAST_ONCE = 1 / 3  # minimum share of unambiguous matches; below this share, the picture is repetitive
+WINDOW_PX, APART_PX = 21, 4  # side of the cost window; minimum distance between two matches of a pixel
+NO_WORSE = 1.3, 1.0  # a match is ambiguous if another error is at most 1.3 times the smallest error, plus 1 code
 
 
 @dataclass(frozen=True, slots=True)
 class _Compared:
-    """Both pictures, left first, on a coarse raster of the middle panel."""
+    """Left and right picture, resampled to a coarse raster of the middle panel and compared there."""
 
-    grey: tuple[U8, U8]
+    grey: tuple[U8, U8]  # (h, w) each
     inside: tuple[U8, U8]  # 255 where the picture covers the panel
     panel: PlaneRaster
 
     def ghosts(self, unit_m: float) -> float:
-        """Estimate the light that reaches the wrong eye because panel values are limited (RMS, 0 to 1).
+        """Estimate the light that reaches the wrong eye because the panel values are limited.
 
-        Both eyes' rays through one point of the front panel cross the middle panel `unit_m` apart, and those through
-        a point of the rear panel as far apart in the other direction. The difference between the eyes' pictures, in
-        panel values, is therefore the slope of (front - rear) times `unit_m`, and front - rear stays between -1 and
-        1. Each row is integrated from left to right. Beyond that range the difference is lost, and both eyes see the
-        mean.
+        The two eyes' rays through a point of the front panel cross the middle panel at a distance of `unit_m`. The rays
+        through a point of the rear panel cross the middle panel at the same distance, but in reverse order. In panel
+        values, the difference between the eyes' pictures is therefore `unit_m` times the slope of (front - rear), and
+        front - rear is limited to [-1, 1]. Each row is integrated from left to right. Where the integral would leave
+        this range, the difference is lost, and both eyes see the mean.
+
+        Returns:
+            Root mean square of the ghosts, relative to full scale.
         """
         light = np.stack(self.grey) / 255.0
         value = np.arcsin(np.sqrt(light)) / (np.pi / 2)
@@ -62,8 +65,8 @@ class _Compared:
     def disparities_m(self) -> F64:
         """Return the (n,) disparities of all unambiguously matched points, in metres on the middle panel.
 
-        A disparity is positive for a point in front of that panel, which appears farther right to the left eye. The
-        result is empty if most of the picture is repetitive, or if too little of it matches.
+        A point in front of the middle panel appears farther right to the left eye than to the right eye and has a
+        positive disparity. The result is empty if most of the picture is repetitive or too few points match.
         """
         sides = 0, 0, REACH_PX, REACH_PX
         framed: list[Any] = [
@@ -83,7 +86,13 @@ class _Compared:
 
 
 def _compared(pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, *, fov_deg: float) -> _Compared:
-    """Resample both pictures, `fov_deg` wide and aimed at the stack's origin, to the coarse raster."""
+    """Resample two pictures to a coarse raster of the middle panel.
+
+    Args:
+        pictures: Left and right (h, w, 3) picture, each from a camera at the eye that is aimed at the stack's origin.
+        eyes_m: (2, 3) left and right eye in frame `stack`.
+        fov_deg: Horizontal field of view of the pictures.
+    """
     small = replace(stack, width_px=WIDTH_PX, height_px=max(16, round(WIDTH_PX * stack.height_m / stack.width_m)))
     panel, size = small.panel(stack.count // 2), (WIDTH_PX, small.height_px)
     framed: list[Any] = []
@@ -100,14 +109,18 @@ def _compared(pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, *, f
 
 
 def _width_m(eye_m: F64, fov_deg: float) -> float:
-    """Return the width in metres of an eye's picture at the stack's origin."""
+    """Return the width in metres that an eye's picture spans at the distance of the stack's origin."""
     return float(2 * np.linalg.norm(eye_m) * np.tan(np.radians(fov_deg / 2)))
 
 
 def _is_ambiguous(left: U8, right: U8, matched: F64) -> NDArray[np.bool_]:
-    """Return a mask of pixels that match at another disparity as well, as in a repetitive texture.
+    """Return a mask of pixels whose match is ambiguous, as in a repetitive texture.
 
-    The matcher's own uniqueness test compares ratios of errors, so it misses matches with an error of 0.
+    A match is ambiguous if another disparity fits almost equally well. The matcher's own uniqueness test compares
+    ratios of errors and fails if the smallest error is 0.
+
+    Args:
+        matched: (h, w) disparities in pixels that the matcher found.
     """
     there = right.astype(np.float32)
     halves = (there + np.roll(there, 1, 1)) / 2, (there + np.roll(there, -1, 1)) / 2
@@ -115,7 +128,8 @@ def _is_ambiguous(left: U8, right: U8, matched: F64) -> NDArray[np.bool_]:
     best, other = np.full((2, *left.shape), np.inf, np.float32)
     for shift_px in range(-REACH_PX, REACH_PX + 1):
         low, high = np.roll(least, shift_px, 1), np.roll(most, shift_px, 1)
-        error = np.maximum(0.0, np.maximum(left - high, low - left))  # Birchfield and Tomasi: half a pixel is free
+        # Birchfield and Tomasi's error, which tolerates a shift of half a pixel.
+        error = np.maximum(0.0, np.maximum(left - high, low - left))
         cost = cv2.blur(error, (WINDOW_PX, WINDOW_PX))
         away_px = np.abs(matched - shift_px)
         np.minimum(best, cost, out=best, where=away_px <= 1)
@@ -126,13 +140,18 @@ def _is_ambiguous(left: U8, right: U8, matched: F64) -> NDArray[np.bool_]:
 def disparity_doubts(
     pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, *, fov_deg: float, parallel: bool = True
 ) -> list[str]:
-    """Return a one-line warning in a list if eyes (2, 3) will see ghosts in the pictures, otherwise [].
+    """Return a list with a one-line warning if the pictures will cause ghosts, or an empty list.
 
-    parallel: the pictures may be a rectified pair from parallel cameras, passed by mistake as the eyes' own views.
+    Args:
+        pictures: Left and right (h, w, 3) picture, each from a camera at the eye that is aimed at the stack's origin.
+        eyes_m: (2, 3) left and right eye in frame `stack`.
+        fov_deg: Horizontal field of view of the pictures.
+        parallel: The pictures might be a rectified pair from parallel cameras, passed by mistake. If the disparities
+            suggest a mistake, the warning says so.
     """
     line = eyes_m[1] - eyes_m[0]
     if line[1] <= 0 or abs(line[2]) > ROLLED * line[1] or abs(line[0]) > TURNED * line[1]:
-        return []  # points are in different rows of the two pictures
+        return []  # a point may appear in different rows of the two pictures
     compared = _compared(pictures, eyes_m, stack, fov_deg=fov_deg)
     apart_m, away_m = float(line[1]), float(eyes_m[:, 0].mean())
     centre_m = stack.x_m[stack.count // 2]
