@@ -1,10 +1,13 @@
-"""Mean squared error that displayed layers cause at the eyes (docs/contracts.md, Error).
+"""Mean squared error of the light that eyes receive through displayed layers.
 
-*Light* is the figure to quote. Each panel pixel is a square of one colour. Each pixel of the eye's picture receives the
-mean intensity over that pixel's area and over the pupil, which is focused on the centre panel. Two independent sets of
-random rays estimate this mean. The mean product of their errors is an unbiased estimate of the squared error, whereas
-the mean square of one set's errors would include the variance of its rays. *One ray*, as in published evaluations, goes
-through the centres of pixel and pupil and samples the panels bilinearly.
+The section "Error" of docs/contracts.md defines the terms. The error can be measured in two ways:
+
+* *Light*, the figure to quote, models a panel pixel as a square of one colour. A pixel of the eye's picture receives
+  the mean intensity over the pixel's area and over the pupil, which is focused on the centre panel. This mean is
+  estimated from two independent sets of random rays. The mean product of the two sets' errors is an unbiased estimate
+  of the squared error. The mean square of a single set's errors would include the variance of the rays.
+* *One ray*, which published evaluations use, traces a single ray through the centres of the pixel and the pupil, and
+  samples the panels bilinearly.
 """
 
 from __future__ import annotations
@@ -27,16 +30,16 @@ from runtime.optics.tilt import layer_from_seen, layer_pixels_from_seen
 from runtime.optics.views import stack_from_eye
 from runtime.records import F32, F64, U8
 
-RINGS = 9  # rings of points on the pupil, one point for each ray: 271 points are as good as a disc
+RINGS = 9  # rings of points on the pupil; their 271 points are as good as a disc
 
 
 class Sampling(NamedTuple):
     """The rays along which the squared error is measured."""
 
-    rays: int = 2  # rays across and down a pixel, in each of the two sets; 0: a single ray, sampled bilinearly
+    rays: int = 2  # rays across and down a pixel in each of the two sets; 0: a single ray, sampled bilinearly
     pupil_mm: float = PUPIL_MM  # pupil diameter; 0: a pinhole
-    step: int = 1  # every `step`-th pixel of every `step`-th row
-    groups: int = 0  # groups of rows, for the standard error
+    step: int = 1  # only every `step`-th pixel of every `step`-th row is measured
+    groups: int = 0  # number of groups of rows, from which the standard error is estimated
 
 
 LIGHT = Sampling()
@@ -44,11 +47,11 @@ ONE_RAY = Sampling(rays=0, pupil_mm=0.0)
 
 
 class LightView(NamedTuple):
-    """An eye's target picture and the geometry of its rays."""
+    """Target picture of an eye, and the geometry of the rays through the picture's pixels."""
 
     target: F32  # (h, w, 3) intensities
-    centre_from_image: F64  # (3, 3) from the image's pixels to the centre panel's
-    panels_from_centre: F64  # (pupil points, N, 3, 3) from the centre panel's pixels to each panel's
+    centre_from_image: F64  # (3, 3) homography from pixels of the picture to pixels of the centre panel
+    panels_from_centre: F64  # (pupil points, N, 3, 3) homographies from pixels of the centre panel to each panel's
     toward: F64  # (3,) vector whose dot product with (u, v, 1) is negative for rays towards the panels
     first_ray: int  # number of the view's first ray, which seeds its random positions
 
@@ -63,13 +66,26 @@ def squared_errors(
     fov_deg: float,
     sampling: Sampling,
 ) -> F64:
-    """Return (1 + groups,) mean squared errors of the light at `eyes_m` (2, 3), against carried targets.
+    """Return the mean squared errors of the light that eyes receive, compared with carried targets.
 
-    layers: (N, H, W, 3 or 4) code values, rear to front; targets: (h, w, 3) intensities, `fov_deg` wide, for each of
-    the eyes `solved_for_m` (2, 3). The first error is that of all rows. The others are those of interleaved groups of
-    rows; their scatter gives the standard error of the first. A pixel counts if all its rays cross every panel at
-    least half a pixel inside its edge. For nearly perfect light the result can be negative, because of the rays' noise.
-    Raises ValueError for an eye behind a panel, or if no pixel counts.
+    A carried target is a picture that is treated as painted on the centre panel (docs/contracts.md). A pixel counts if
+    all its rays cross every panel at least half a pixel inside the panel's edge.
+
+    Args:
+        layers: (N, H, W, 3 or 4) code values, rear to front.
+        targets: (h, w, 3) intensities for each of the eyes `solved_for_m`.
+        solved_for_m: (2, 3) eyes that the layers were solved for, in frame `stack`.
+        eyes_m: (2, 3) true eyes in frame `stack`.
+        fov_deg: Horizontal field of view of the targets.
+        sampling: Rays to trace.
+
+    Returns:
+        (1 + groups,) errors. The first error covers all rows. Each of the other errors covers one of the interleaved
+        groups of rows; the scatter of these errors gives the standard error of the first. For nearly perfect light, an
+        error can be negative because the rays are random.
+
+    Raises:
+        ValueError: An eye is not in front of every panel, or no pixel counts.
     """
     cores, step = len(os.sched_getaffinity(0)), sampling.step
     parts = -(-min(len(target) for target in targets) // step) if sampling.groups else 4 * cores
@@ -90,7 +106,7 @@ def squared_errors(
         sums = np.array(list(pool.map(error, calls)), np.float64)  # (calls, 2): sum of squared errors, number of terms
     if not sums[:, 1].any():
         raise ValueError("no ray from these eyes crosses every panel")
-    if sampling.groups:  # one part per row
+    if sampling.groups:  # each call measured one row
         sums = sums.reshape(len(targets), -1, 2).sum(axis=0)
     groups = [sums[group :: sampling.groups].sum(axis=0) for group in range(sampling.groups)]
     total, counted = np.array([sums.sum(axis=0), *groups]).T
@@ -100,7 +116,7 @@ def squared_errors(
 def _squared_error(
     codes: U8, view: LightView, table: F32, sampling: Sampling, first: int, last: int
 ) -> tuple[float, int]:
-    """Return the sum of squared errors over some rows of one eye's picture, and the number of terms."""
+    """Return the sum of squared errors over the rows from `first` to `last` - 1, and the number of terms."""
     count, height, width, components = codes.shape
     target, table = np.ascontiguousarray(view.target, np.float32), np.ascontiguousarray(table, np.float32)
     matrices = [
@@ -121,9 +137,18 @@ def _squared_error(
 def view_of(
     side: int, nominal_m: F64, true_m: F64, target: F32, stack: PanelStack, *, fov_deg: float, pupil_mm: float
 ) -> LightView:
-    """Return the view of an eye at `true_m` (3,) of layers solved for `nominal_m` (3,).
+    """Return the target and the rays of one eye.
 
-    side: 0 left, 1 right. Raises ValueError for an eye behind a panel.
+    Args:
+        side: 0 for the left eye, 1 for the right eye.
+        nominal_m: (3,) eye that the layers were solved for, in frame `stack`.
+        true_m: (3,) true position of the eye in frame `stack`.
+        target: (h, w, 3) intensities that the nominal eye should see.
+        fov_deg: Horizontal field of view of the target.
+        pupil_mm: Diameter of the pupil. If 0, the eye is a pinhole.
+
+    Raises:
+        ValueError: The nominal eye or a point of the true eye's pupil is not in front of every panel.
     """
     height, width = target.shape[:2]
     rays = Rays.of_eye(checked_eye(nominal_m, stack), width_px=width, height_px=height, fov_deg=fov_deg)
@@ -134,12 +159,19 @@ def view_of(
 
 
 def first_ray(side: int) -> int:
-    """Return the number of an eye's first ray; the two eyes' ray numbers never overlap."""
+    """Return the number of an eye's first ray. Rays of the left (0) and right (1) eye share no number."""
     return side << 40
 
 
 def panels_from_centre(true_m: F64, stack: PanelStack) -> F64:
-    """Return (..., N, 3, 3) homographies from the centre panel's pixels to each layer, for eyes (..., 3)."""
+    """Return the homographies from pixels of the centre panel to pixels of every layer.
+
+    Args:
+        true_m: (..., 3) eyes in frame `stack`.
+
+    Returns:
+        (..., N, 3, 3) homographies along the rays of each eye.
+    """
     centre = stack.panel(stack.count // 2)
     x, y, z = np.moveaxis(true_m[..., None], -2, 0)
     share = (np.array(stack.x_m) - x) / (centre.x_m - x)

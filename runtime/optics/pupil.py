@@ -1,4 +1,4 @@
 """Default pupil diameter and tracking error of an eye (docs/mathematics.md, Light)."""
 
 PUPIL_MM = 4.0  # diameter
-TRACKING_SIGMA_MM = 1.0  # standard deviation of the eyes' common position along each axis, with a good tracker
+TRACKING_SIGMA_MM = 1.0  # standard deviation along each axis of a good tracker's error, which both eyes share

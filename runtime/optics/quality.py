@@ -11,27 +11,32 @@ import numpy as np
 from runtime.optics.retina import Mask, strips
 from runtime.records import F32
 
-HALF_WINDOW = 5  # half the width of SSIM's window, in pixels
+HALF_WINDOW = 5  # pixels of SSIM's window on each side of its central pixel
 
 
 @dataclass(frozen=True, slots=True)
 class Quality:
-    """PSNR and SSIM of both eyes together, and PSNR of each."""
+    """PSNR and SSIM over both eyes' images, and the PSNR of each eye's image."""
 
     psnr_db: float  # computed from the mean squared error over all counted pixels, channels and eyes
-    ssim: float  # mean over eyes
+    ssim: float  # mean over the eyes; NaN if not computed
     eye_psnr_db: tuple[float, ...]
 
 
 def psnr_db(mean_squared_error: float) -> float:
-    """Return the peak signal-to-noise ratio in dB for intensities in [0, 1], at most 120."""
+    """Return the peak signal-to-noise ratio in dB, at most 120 dB, for intensities in [0, 1]."""
     return float(-10 * np.log10(max(mean_squared_error, 1e-12)))
 
 
 def ssim(a: F32, b: F32, mask: Mask) -> float:
-    """Return the mean SSIM of two images over a mask, as in Wang et al. 2004.
+    """Return the mean structural similarity of two images over a mask (Wang et al. 2004).
 
-    The window is an 11x11 Gaussian of sigma 1.5.
+    The window is an 11x11 Gaussian with a sigma of 1.5 pixels.
+
+    Args:
+        a: (h, w, C) image with intensities in [0, 1].
+        b: Image of the same shape.
+        mask: (h, w) pixels to average over.
     """
 
     def blur(x: F32) -> F32:
@@ -42,7 +47,7 @@ def ssim(a: F32, b: F32, mask: Mask) -> float:
     for rows in strips(len(mask)):
         if not mask[rows].any():
             continue
-        # Half a window more at both ends completes every row's window. The image is mirrored at its border.
+        # Add half a window at both ends, which completes the windows of all rows. OpenCV mirrors the image's border.
         first = max(rows.start - HALF_WINDOW, 0)
         around, inside = slice(first, rows.stop + HALF_WINDOW), slice(rows.start - first, rows.stop - first)
         x, y = a[around], b[around]
@@ -66,9 +71,16 @@ def squared_error(image: F32, target: F32, mask: Mask) -> tuple[float, int]:
 
 
 def quality(seen: Sequence[F32], targets: Sequence[F32], masks: Sequence[Mask], *, similarity: bool = True) -> Quality:
-    """Return the displayed quality, pooled over the eyes. Its SSIM is NaN unless `similarity` is True.
+    """Return the displayed quality of the images that the eyes see.
 
-    Raises ValueError if, for some eye, no ray crosses every panel.
+    Args:
+        seen: (h, w, 3) image of each eye, with intensities in [0, 1].
+        targets: (h, w, 3) picture that each eye should see.
+        masks: (h, w) pixels of each image that count.
+        similarity: Compute the SSIM. If False, the SSIM is NaN.
+
+    Raises:
+        ValueError: No pixel of an eye's image counts.
     """
     errors, weights, per_eye, similarities = 0.0, 0, [], []
     for image, target, mask in zip(seen, targets, masks, strict=True):

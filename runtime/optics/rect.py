@@ -10,7 +10,10 @@ from runtime.optics.stack import PlaneRaster
 
 @dataclass(frozen=True, slots=True)
 class PixelRect:
-    """Pixels [u0, u1) x [v0, v1) of a raster (u right, v down); empty if u1 <= u0 or v1 <= v0."""
+    """Rectangle of the pixels of a raster with u0 <= u < u1 and v0 <= v < v1.
+
+    The u axis points right and the v axis down. The rectangle is empty if u1 <= u0 or v1 <= v0.
+    """
 
     u0: int
     v0: int
@@ -31,11 +34,11 @@ class PixelRect:
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """Slices (rows, columns) that index this box in an image."""
+        """Slices of rows and columns that select this rectangle in an image."""
         return slice(self.v0, self.v1), slice(self.u0, self.u1)
 
     def beside(self, *, width_px: int, height_px: int) -> list[PixelRect]:
-        """Return the other pixels of a raster of this size, as up to four boxes."""
+        """Return up to four disjoint rectangles that cover the rest of a raster of the given size."""
         if not self.width_px or not self.height_px:
             return [PixelRect(0, 0, width_px, height_px)]
         boxes = (
@@ -47,11 +50,11 @@ class PixelRect:
         return [box for box in boxes if box.width_px and box.height_px]
 
     def in_rows(self, rows: int) -> list[PixelRect]:
-        """Split the rectangle into boxes of at most `rows` rows."""
+        """Split the rectangle into rectangles with at most `rows` rows each."""
         return [PixelRect(self.u0, v, self.u1, min(v + rows, self.v1)) for v in range(self.v0, self.v1, rows)]
 
     def cut(self, raster: PlaneRaster) -> PlaneRaster:
-        """Crop a raster to this box."""
+        """Return the part of a raster that this rectangle selects."""
         return replace(
             raster,
             left_m=raster.left_m + self.u0 * raster.pitch_u_m,
@@ -62,7 +65,10 @@ class PixelRect:
 
 
 def union(boxes: Sequence[PixelRect]) -> PixelRect:
-    """Return the smallest box that contains all non-empty boxes; an empty box if there are none."""
+    """Return the smallest rectangle that contains all non-empty rectangles.
+
+    If every rectangle is empty, the result is empty.
+    """
     filled = [box for box in boxes if box.width_px and box.height_px]
     if not filled:
         return PixelRect(0, 0, 0, 0)

@@ -1,13 +1,13 @@
-"""Depth of the content (its relief), and the motion on the panels that it causes when the eyes move.
+"""Relief, the content's depth relative to the middle panel, and its effect when the eyes move.
 
-Let o be the point midway between the eyes. From o, a content point at depth x is seen through a point c on the middle
-panel's plane (x = r). Measure c from the plane's origin. Let b = (x - r) / (o_x - x) be the relief, n the new midpoint
-between the eyes, and k = (o_x - r) / (n_x - r). The content now seen through c was previously seen through
+Let o be the midpoint between the eyes, and x = r the plane of the middle panel. Seen from o, a content point at depth x
+appears at a point c of this plane, measured from the plane's origin. The relief of the content point is b = (x - r) /
+(o_x - x). When the midpoint moves to n, the content that now appears at c previously appeared at
 
-    c + b·((k·n - o) + (1 - k)·c)        (in y and z only).
+    c + b·((k·n - o) + (1 - k)·c),    k = (o_x - r) / (n_x - r)        (in y and z only).
 
-A point on the middle panel has relief 0: content there does not move; `alignment` treats all content this way. The ray
-from the old midpoint through that point gives the pixel on each of the other panels.
+Content on the middle panel has relief 0 and does not move; `alignment` treats all content in this way. The ray from the
+old midpoint through the previous point on the middle panel crosses every other panel at the corresponding pixel.
 """
 
 from __future__ import annotations
@@ -23,26 +23,33 @@ from numpy.typing import NDArray
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, Parallax
 
-WIDEST_PX = 480  # columns of a relief; more of them do not give finer outlines
-RIM_PX = 2  # relief pixels by which nearer content is dilated, so that its outline moves with it
-COARSE_RIM_PX = 1  # the same for a coarse raster, whose relief has fewer pixels
+WIDEST_PX = 480  # maximum number of columns of a relief; more columns do not give finer outlines
+RIM_PX = 2  # relief pixels by which nearer content is dilated to make its outline move with it
+COARSE_RIM_PX = 1  # like RIM_PX, for a coarse raster, whose relief has fewer pixels
 
 Pixels = NDArray[np.floating[Any]]
 
 
 def block_px(width_px: int) -> int:
-    """Return the side of the block that one relief pixel covers, in pixels of any raster.
+    """Return the side, in raster pixels, of the square block that one relief pixel covers.
 
-    width_px: columns of the full raster. Blocks of a coarse raster have the same number of pixels, each larger.
+    The side is the same for a coarse raster, whose pixels are larger.
+
+    Args:
+        width_px: Number of columns of the full raster.
     """
     return -(-width_px // WIDEST_PX)
 
 
 def relief_of(nearness: Sequence[F32], *, distance_m: Sequence[float], rim_px: int = RIM_PX) -> F32:
-    """Combine both eyes' depth into one (h, w) relief. Each pixel takes the value that is farther from 0.
+    """Combine the depth that the two eyes see into one (h, w) relief.
 
-    nearness: for each eye, the (h, w) inverse distances along x in 1/m; 0 for the background, whose relief is 0.
-    distance_m: each eye's distance from the middle panel. rim_px: dilation of nearer content, in relief pixels.
+    Each pixel takes the eye's relief that has the larger magnitude. The background has relief 0.
+
+    Args:
+        nearness: For each eye, (h, w) inverse distances from the eye along x in 1/m. The background is 0.
+        distance_m: Distance of each eye from the middle panel along x.
+        rim_px: Number of relief pixels by which nearer content is dilated.
     """
     rim = np.ones((2 * rim_px + 1,) * 2, np.uint8)
     reliefs = []
@@ -54,9 +61,14 @@ def relief_of(nearness: Sequence[F32], *, distance_m: Sequence[float], rim_px: i
 
 
 def parallax(stack: PanelStack, *, old_m: F64, new_m: F64) -> Parallax | None:
-    """Return the content's motion on the panels when the eyes' midpoint (3,) moves, in frame `stack`.
+    """Return the motion of the content on the panels when the midpoint between the eyes moves.
 
-    Returns None if there is no middle panel (an even number of panels) or no movement.
+    Args:
+        old_m: (3,) midpoint that the layers were solved for, in frame `stack`.
+        new_m: (3,) current midpoint in frame `stack`.
+
+    Returns:
+        The motion, or None if the midpoint has not moved or the even number of panels leaves no middle panel.
     """
     if stack.count % 2 == 0 or np.array_equal(old_m, new_m):
         return None
@@ -67,7 +79,7 @@ def parallax(stack: PanelStack, *, old_m: F64, new_m: F64) -> Parallax | None:
     places, weights = [], []
     for n in range(stack.count):
         raster = stack.panel(n)
-        # Project from the panel to the middle one along the new midpoint's rays.
+        # Project from this panel to the middle panel along the rays of the new midpoint.
         scale = (new_m[0] - middle.x_m) / (new_m[0] - raster.x_m)
         matrix = np.diag([scale * raster.pitch_u_m / middle.pitch_u_m, scale * raster.pitch_v_m / middle.pitch_v_m, 1])
         y_m, z_m = new_m[1:] + (np.array([raster.left_m, raster.top_m]) - new_m[1:]) * scale
@@ -83,16 +95,28 @@ def parallax(stack: PanelStack, *, old_m: F64, new_m: F64) -> Parallax | None:
 
 @dataclass(frozen=True, slots=True)
 class Displacement:
-    """Correction of a panel's alignment for content off the middle panel."""
+    """Correction of a panel's alignment for content off the middle panel.
 
-    relief: F32
+    The fields are those of `Parallax` for a single panel, and the relief of the content.
+    """
+
+    relief: F32  # (h, w)
     drift_px: tuple[float, float]
     growth: float
-    middle_from_shown: F64
+    middle_from_shown: F64  # (3, 3)
     weight: float
 
     def at(self, columns: Pixels, rows: Pixels, *, size_px: tuple[int, int]) -> tuple[F32, F32]:
-        """Return the displacements, right and down, of pixel centres: two (rows, columns) in panel pixels."""
+        """Return the displacements to add to the aligned positions of the panel's pixels.
+
+        Args:
+            columns: Horizontal positions of the pixels' centres.
+            rows: Vertical positions of the pixels' centres.
+            size_px: Width and height of the panel in pixels.
+
+        Returns:
+            Displacements to the right and displacements down, each (rows, columns) in panel pixels.
+        """
         scale_u, scale_v = self.middle_from_shown[0, 0], self.middle_from_shown[1, 1]
         u = columns * scale_u + self.middle_from_shown[0, 2]
         v = rows * scale_v + self.middle_from_shown[1, 2]
@@ -110,7 +134,7 @@ class Displacement:
 
 
 def displacement(relief: F32 | None, parallax: Parallax | None, panel: int) -> Displacement | None:
-    """Return a panel's displacement, or None if there is no relief or no movement."""
+    """Return the displacement of a panel's pixels, or None if `relief` or `parallax` is None."""
     if relief is None or parallax is None:
         return None
     return Displacement(
@@ -119,7 +143,10 @@ def displacement(relief: F32 | None, parallax: Parallax | None, panel: int) -> D
 
 
 def _between_centres(place: Pixels, count: int) -> tuple[NDArray[np.intp], F32]:
-    """Return the last of `count` pixel centres before each place, and the clamped distance past it."""
+    """Return the last of `count` pixel centres before each position, and the distance from the centre.
+
+    The centre is returned as an index. Positions outside the outermost centres are clamped.
+    """
     inside = np.clip(place - 0.5, 0.0, count - 1.0)
     low = np.floor(inside)
     return low.astype(np.intp), (inside - low).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Simulated retinas: an eye's images through the layers, for a pinhole or a finite pupil."""
+"""Simulate the images that an eye sees through the layers with a pinhole or a finite pupil."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from runtime.records import F32, F64, U8
 
 Mask = NDArray[np.bool_]
 
-STRIP_ROWS = 32  # rows processed together, which fit in the cache
+STRIP_ROWS = 32  # rows that are processed together because they fit in the cache
 
 
 @dataclass(frozen=True, slots=True)
 class Retina:
-    """An eye's image, and a mask of the rays that cross every panel half a pixel inside its edge."""
+    """Image that an eye sees, and a mask of the pixels that count in measurements of quality."""
 
     image: F32  # (h, w, 3) in [0, 1]
-    mask: Mask  # (h, w)
+    mask: Mask  # (h, w) True for rays that cross every panel at least half a pixel inside the panel's edge
 
     def codes(self) -> U8:
-        """Return the image as (h, w, 3) 8-bit code values, black where a ray misses a panel."""
+        """Return the image as (h, w, 3) 8-bit code values. Pixels whose rays miss a panel are black."""
         return np.asarray(as_codes(self.image) * self.mask[..., None], np.uint8)
 
 
 def strips(rows: int) -> Iterator[slice]:
-    """Return slices of an image's rows, small enough to stay in the cache between two operations."""
+    """Return slices of an image's rows that are small enough to stay in the cache between operations."""
     return (slice(start, min(start + STRIP_ROWS, rows)) for start in range(0, rows, STRIP_ROWS))
 
 
@@ -44,11 +44,11 @@ def _planes(layer: NDArray[np.uint8] | F32) -> list[F32]:
 
 
 class _Samples:
-    """Bilinear weights and indices of positions (h, w), computed once for all channels."""
+    """Bilinear sampling at (h, w) positions. Weights and indices are computed once for all channels."""
 
     def __init__(self, u: F32, v: F32, shape: tuple[int, ...]) -> None:
         height, width = shape[:2]
-        # fmax and fmin ignore NaN, the position of a ray that never meets the panel.
+        # A ray that never meets the panel has the position NaN, which fmax and fmin ignore.
         x = np.fmin(np.fmax(u - np.float32(0.5), np.float32(0)), np.float32(width - 1))
         y = np.fmin(np.fmax(v - np.float32(0.5), np.float32(0)), np.float32(height - 1))
         self._corner = np.empty((*x.shape, 2), np.int16)
@@ -58,9 +58,9 @@ class _Samples:
         self._right, self._below = slice(min(1, width - 1), None), slice(min(1, height - 1), None)
 
     def of(self, plane: F32) -> F32:
-        """Return the (h, w) samples of a plane (H, W)."""
+        """Return the (h, w) samples of one channel (H, W) of a layer."""
         right, below = self._right, self._below
-        no_second_map: Any = None  # None is valid, but missing from OpenCV's stubs
+        no_second_map: Any = None  # OpenCV accepts None, but its type stubs do not
         top, top_right, bottom, bottom_right = (
             np.asarray(cv2.remap(part, self._corner, no_second_map, cv2.INTER_NEAREST), np.float32)
             for part in (plane, plane[:, right], plane[below], plane[below, right])
@@ -72,7 +72,7 @@ class _Samples:
 
 
 def _mix(a: F32, b: F32, weight: F32) -> None:
-    """Compute a + (b - a)·weight in `a`; `b` is overwritten."""
+    """Overwrite `a` with a + (b - a)·weight, and `b` with an intermediate result."""
     b -= a
     b *= weight
     a += b
@@ -80,15 +80,15 @@ def _mix(a: F32, b: F32, weight: F32) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Rays:
-    """Rays through the pixels of an image, from an eye that looks at the stack's origin."""
+    """Rays from an eye that looks at the stack's origin, through the centres of its image's pixels."""
 
-    from_stack: F64  # (3, 4) `image_from_stack`
-    u: F64  # (w,) columns
-    v: F64  # (h, 1) rows
+    from_stack: F64  # (3, 4) projection from frame `stack` to the image (`image_from_stack`)
+    u: F64  # (w,) horizontal positions of the pixels' centres
+    v: F64  # (h, 1) vertical positions of the pixels' centres
 
     @classmethod
     def of_eye(cls, eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg: float) -> Rays:
-        """Create the rays of an eye (3,), in frame `stack`, for an image of this size and field of view."""
+        """Create the rays of an eye (3,) in frame `stack`. `fov_deg` is the horizontal field of view."""
         return cls(
             image_from_stack(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg),
             np.arange(width_px, dtype=np.float64) + 0.5,
@@ -100,9 +100,14 @@ class Rays:
         return len(self.v), len(self.u)
 
     def on(self, raster: PlaneRaster, rows: slice = slice(None), *, moved: F64 | None = None) -> tuple[F64, F64]:
-        """Return the raster pixels, u and v (h, w), at which the rays of `rows` cross it (M_RPU).
+        """Return the positions u and v, in raster pixels, at which rays cross a raster (M_RPU).
 
-        moved: (3, 3) map that is applied to those pixels afterwards.
+        Args:
+            rows: Rows of the image whose rays are traced.
+            moved: (3, 3) homography that is applied to the positions afterwards.
+
+        Returns:
+            u and v, each (h, w) for h traced rows.
         """
         h = panel_from_image(self.from_stack, raster)
         if moved is not None:
@@ -119,8 +124,11 @@ class Rays:
         return result
 
     def toward(self) -> F64:
-        """Return a ray's x component as coefficients (3,) of (u, v, 1); negative towards the panels."""
-        # A ray's direction is the inverse of the projection's left part times (u, v, 1).
+        """Return the (3,) coefficients of (u, v, 1) whose sum is a ray's x component in frame `stack`.
+
+        The x component is negative for rays towards the panels.
+        """
+        # The direction of a ray is the inverse of the projection's left 3x3 part times (u, v, 1).
         return np.asarray(np.linalg.inv(self.from_stack[:, :3])[0])
 
 
@@ -133,10 +141,19 @@ def seen_by(
     width_px: int | None = None,
     height_px: int | None = None,
 ) -> Retina:
-    """Compute a pinhole eye's image from the panel values summed along each ray (supplement, (6), (7)).
+    """Compute the image of a pinhole eye from the sum of panel values along each ray.
 
-    layers: (N, H, W, 3 or 4), rear to front, uint8 code values or float in [0, 1]; a fourth channel is ignored. By
-    default the image has the layers' size. Raises ValueError for an eye behind a panel.
+    The image follows equations (6) and (7) of the supplement.
+
+    Args:
+        eye_m: (3,) eye in frame `stack`.
+        layers: (N, H, W, 3 or 4) layers, rear to front, as code values or float in [0, 1]. A fourth channel is ignored.
+        fov_deg: Horizontal field of view of the image.
+        width_px: Width of the image. By default, the width of the layers.
+        height_px: Height of the image. By default, the height of the layers.
+
+    Raises:
+        ValueError: The eye is not in front of every panel.
     """
     eye = checked_eye(eye_m, stack)
     width, height = width_px or layers.shape[2], height_px or layers.shape[1]
@@ -148,14 +165,17 @@ def seen_by(
 
 
 def _moved(stack: PanelStack, index: int, eye_m: F64) -> F64 | None:
-    """Return the 3x3 map for an eye from the ideal panel's pixels to a layer's; None: identity."""
+    """Return the 3x3 homography from pixels of the ideal panel to pixels of the layer, seen from an eye.
+
+    The result is None if the panels are parallel, which makes the homography an identity.
+    """
     if stack.tilt is None:
         return None
     return layer_pixels_from_seen(stack.panel(index), layer_from_seen(stack, index, eye_m))
 
 
 def checked_eye(eye_m: ArrayLike, stack: PanelStack) -> F64:
-    """Return an eye (3,) as float64. Raises ValueError unless it is in front of every panel."""
+    """Return an eye (3,) as float64. Raises ValueError unless the eye is in front of every panel."""
     eye = np.asarray(eye_m, dtype=np.float64)
     if not np.isfinite(eye).all() or eye[0] <= max(stack.x_m):
         raise ValueError("the eye must be in front of every panel")
@@ -165,10 +185,14 @@ def checked_eye(eye_m: ArrayLike, stack: PanelStack) -> F64:
 def through_layers(
     layers: U8 | F32, positions: Callable[[slice], Iterable[tuple[F64, F64]]], mask: Mask, stack: PanelStack
 ) -> Retina:
-    """Compute an image along rays whose positions on each panel are given.
+    """Compute an image by adding panel values along rays whose positions on each panel are given.
 
-    positions: function that returns (h, w) u and v on every panel, rear to front, for a slice of rows. mask: (h, w)
-    rays that may count; of these, the result's mask keeps those that cross every panel half a pixel inside its edge.
+    Args:
+        layers: (N, H, W, 3 or 4) layers, rear to front, as code values or float in [0, 1]. A fourth channel is ignored.
+        positions: Function from a slice of the image's rows to positions u and v on every panel, rear to front, each
+            (h, w) in panel pixels.
+        mask: (h, w) rays that may count. The mask of the result excludes all rays that miss a panel or cross it less
+            than half a pixel inside its edge.
     """
     image, counted = np.empty((*mask.shape, 3), np.float32), mask.copy()
     planes = [_planes(layer[..., :3]) for layer in layers]
@@ -191,7 +215,10 @@ def as_codes(image: F32) -> U8:
 
 
 def pupil_points(diameter_m: float, rings: int = 2) -> F64:
-    """Return (K, 2) points (right, up) in metres that cover a round pupil evenly, the centre first."""
+    """Return (K, 2) points that cover a round pupil evenly.
+
+    A point is an offset to the right and up from the pupil's centre, in metres. The first point is the centre.
+    """
     points = [(0.0, 0.0)]
     for ring in range(1, rings + 1):
         radius = diameter_m / 2 * ring / (rings + 0.5)
@@ -201,7 +228,10 @@ def pupil_points(diameter_m: float, rings: int = 2) -> F64:
 
 
 def average(images: Iterable[F32]) -> F32:
-    """Return the mean (h, w, C) of images, which a finite pupil sees. Raises ValueError for no images."""
+    """Return the (h, w, C) mean of the images seen from the points of a finite pupil.
+
+    Raises ValueError if there are no images.
+    """
     total: F32 | None = None
     count = 0
     for image in images:

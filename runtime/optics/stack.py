@@ -1,4 +1,4 @@
-"""Geometry of the stack of panels, and rasters on planes parallel to them."""
+"""Geometry of the stack of panels, and of pixel grids on planes parallel to the panels."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ import numpy as np
 
 from runtime.records import F64
 
-UNEVEN_MOST = 0.15  # largest minus smallest gap over the mean gap (docs/models.md)
+UNEVEN_MOST = 0.15  # maximum of (largest gap - smallest gap) / mean gap for the shipped networks (docs/models.md)
 
 
 @dataclass(frozen=True, slots=True)
 class PlaneRaster:
-    """A pixel grid on a plane x = x_m of the `stack` frame, rows along -z, columns along +y.
+    """Pixel grid on the plane x = x_m of frame `stack`. u points along +y (right) and v along -z (down).
 
-    Pixel (u, v), continuous with centres at half-integers, is at y = left_m + u·pitch_u_m, z = top_m - v·pitch_v_m.
+    Pixel coordinates are continuous, and pixel centres are at half-integers. The pixel position (u, v) is at
+    y = left_m + u·pitch_u_m and z = top_m - v·pitch_v_m.
     """
 
     x_m: float
@@ -27,15 +28,15 @@ class PlaneRaster:
     height_px: int
 
     def stack_from_raster(self) -> F64:
-        """Return the 3x3 map to homogeneous `stack` coordinates (x, y, z) from a homogeneous pixel (u, v, 1)."""
+        """Return the 3x3 matrix from pixels (u, v, 1) to coordinates (x, y, z) in frame `stack`."""
         return np.array([[0.0, 0.0, self.x_m], [self.pitch_u_m, 0.0, self.left_m], [0.0, -self.pitch_v_m, self.top_m]])
 
     def plane_from_raster(self) -> F64:
-        """Return the 3x3 map to homogeneous (y, z, 1) on the plane from homogeneous (u, v, 1)."""
+        """Return the 3x3 matrix from pixels (u, v, 1) to points (y, z, 1) of the raster's plane."""
         return np.array([[self.pitch_u_m, 0.0, self.left_m], [0.0, -self.pitch_v_m, self.top_m], [0.0, 0.0, 1.0]])
 
     def raster_from_plane(self) -> F64:
-        """Return the 3x3 map to homogeneous (u, v, 1) from (y, z, 1) on the plane, in closed form."""
+        """Return the 3x3 matrix from points (y, z, 1) of the raster's plane to pixels (u, v, 1)."""
         return np.array(
             [
                 [1.0 / self.pitch_u_m, 0.0, -self.left_m / self.pitch_u_m],
@@ -47,19 +48,19 @@ class PlaneRaster:
 
 @dataclass(frozen=True, slots=True)
 class Tilt:
-    """Slopes of panels that are not quite parallel, and the position from which they were registered."""
+    """Slopes of panels that are not quite parallel, and the position they were registered from."""
 
-    depth: tuple[tuple[float, float, float], ...]  # per panel (d, r, u): at (y, z), x = x_m + d + r·y + u·z
+    depth: tuple[tuple[float, float, float], ...]  # (d, r, u) of each panel's plane x = x_m + d + r·y + u·z
     seen_from_m: tuple[float, float, float]  # frame `stack`
 
 
 @dataclass(frozen=True, slots=True)
 class PanelStack:
-    """Geometry of the display: (nearly) parallel panels of one size, rear (0) to front (N-1)."""
+    """Geometry of the display: parallel or nearly parallel panels of equal size, from rear to front."""
 
     width_m: float
     height_m: float
-    x_m: tuple[float, ...]  # ascending; frame `stack`
+    x_m: tuple[float, ...]  # x coordinate of each panel in frame `stack`, in ascending order
     width_px: int
     height_px: int
     tilt: Tilt | None = None  # None: the panels are parallel
@@ -70,19 +71,22 @@ class PanelStack:
 
     @property
     def is_evenly_spaced(self) -> bool:
-        """True if the gaps are equal enough for the shipped networks (`UNEVEN_MOST`)."""
+        """True if the gaps between the panels differ little enough for the shipped networks (`UNEVEN_MOST`)."""
         gaps = np.diff(self.x_m)
         return bool(gaps.size == 0 or np.ptp(gaps) <= UNEVEN_MOST * gaps.mean())
 
     def reduced(self, reduction: int) -> PanelStack:
-        """Return the stack with its rows and columns divided by `reduction`; at least one of each remains."""
+        """Return a stack of the same size in metres with fewer pixels.
+
+        The numbers of rows and columns are divided by `reduction`. At least one row and one column remain.
+        """
         if reduction == 1:
             return self
         width_px, height_px = (max(1, round(px / reduction)) for px in (self.width_px, self.height_px))
         return replace(self, width_px=width_px, height_px=height_px)
 
     def transposed(self) -> PanelStack:
-        """Return the stack with rows and columns swapped: down (-z) becomes right (+y), and vice versa."""
+        """Return the stack with rows and columns swapped: down (-z) becomes right (+y), right becomes down."""
         tilt = self.tilt
         if tilt is not None:
             x, y, z = tilt.seen_from_m
@@ -90,7 +94,7 @@ class PanelStack:
         return PanelStack(self.height_m, self.width_m, self.x_m, self.height_px, self.width_px, tilt)
 
     def panel(self, index: int) -> PlaneRaster:
-        """Return the pixel grid of panel `index`."""
+        """Return the pixel grid of panel `index`, which is treated as parallel to the other panels."""
         return PlaneRaster(
             x_m=self.x_m[index],
             left_m=-self.width_m / 2,

@@ -1,10 +1,13 @@
-"""Tilted panels: homographies from the ideal panel's points to those of a layer, for one eye.
+"""Homographies that correct the layers of tilted panels for the position of an eye.
 
-Registration by photographs places every pixel of a layer where an eye at `seen_from_m` sees it on the ideal panel,
-which is parallel and at the nominal x_m. From any other position, including the second eye's, a tilted panel's pixels
-appear displaced. The eye's ray meets the tilted plane at a point; the line from `seen_from_m` through that point meets
-the ideal plane at the layer's pixel. Both are projections between planes, so their composition is a homography. It is
-affine for eyes at the distance of `seen_from_m`.
+Each panel is modelled by an ideal panel, which is parallel to the others and at the nominal x_m. Registration by
+photographs places every pixel of a layer where an eye at `seen_from_m` sees the pixel on the ideal panel. From any
+other position, including the position of the other eye, the pixels of a tilted panel appear displaced.
+
+A ray of the eye through a point of the ideal panel meets the tilted plane at some point. The line from `seen_from_m`
+through the latter point meets the ideal panel at the pixel of the layer that the eye sees. Each of these two steps is a
+projection from plane to plane, so the composition is a homography. The homography is affine if the eye and
+`seen_from_m` have equal distances from the panel.
 """
 
 from __future__ import annotations
@@ -17,25 +20,32 @@ from runtime.optics.stack import PanelStack, PlaneRaster, Tilt
 from runtime.records import F64
 
 Triple = tuple[float, float, float]
-UNSEEN_PX = 0.05  # displacements below this, in panel pixels, are ignored
+UNSEEN_PX = 0.05  # smaller displacements, in panel pixels, are ignored
 
 
 def layer_from_seen(stack: PanelStack, index: int, eye_m: F64) -> F64:
-    """Return the 3x3 map, for an eye (3,), from (y, z, 1) on the ideal panel to the layer's (y, z, 1)."""
+    """Return the 3x3 homography from the ideal panel's points (y, z, 1) to the layer's points (y, z, 1).
+
+    Args:
+        index: Number of the panel.
+        eye_m: (3,) eye that sees the ideal panel, in frame `stack`.
+    """
     if stack.tilt is None or not any(stack.tilt.depth[index]):
         return np.eye(3)
     return _projected(stack.tilt.depth[index], stack.tilt.seen_from_m, _triple(eye_m), stack.x_m[index])
 
 
 def layer_pixels_from_seen(raster: PlaneRaster, layer_from_seen_m: F64) -> F64:
-    """Convert `layer_from_seen` from metres to a raster's pixels."""
+    """Convert a homography of `layer_from_seen` from metres to pixels of a raster."""
     return raster.raster_from_plane() @ layer_from_seen_m @ raster.plane_from_raster()
 
 
 def coarse_layer_from_seen(stack: PanelStack, index: int, eye_m: F64) -> F64:
-    """Return the simplest approximation of `layer_from_seen` within `UNSEEN_PX` at the panel's corners.
+    """Return the simplest map that approximates `layer_from_seen` closely enough.
 
-    Tried in order: identity, scale and shift (fast to resample), affine, homography.
+    The candidates are, in this order, the identity, a scale and a shift (fast to resample), an affine map, and the
+    exact homography. The first candidate is returned that deviates by at most `UNSEEN_PX` at nine points: the corners
+    of the panel, the middles of its edges, and its centre.
     """
     if stack.tilt is None or not any(stack.tilt.depth[index]):
         return np.eye(3)
@@ -60,14 +70,17 @@ def _projected(
     eye: tuple[float, float, float],
     x_m: float,
 ) -> F64:
-    """Return the map to the tilted plane along the eye's rays, and back along rays from `seen_from`."""
+    """Return the homography that projects the plane x = x_m onto the tilted plane and back.
+
+    The first projection is along the rays of the eye, the second along the rays from `seen_from`.
+    """
     offset_m, right, up = depth
     normal, far = np.array([1.0, -right, -up]), x_m + offset_m
     origin, place = np.array(seen_from), np.array(eye)
     ideal = np.array([[0.0, 0.0, x_m], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # (x, y, z) from (y, z, 1)
     weight = normal @ ideal - [0.0, 0.0, normal @ place]
     ray = ideal - np.outer(place, [0.0, 0.0, 1.0])
-    point = np.outer(place, weight) + ray * (far - normal @ place)  # multiplied by the weight
+    point = np.outer(place, weight) + ray * (far - normal @ place)  # point on the tilted plane times `weight`
     ahead = point[0] - origin[0] * weight
     sideways = np.outer(origin[1:], ahead) + (point[1:] - np.outer(origin[1:], weight)) * (x_m - origin[0])
     matrix = np.vstack([sideways, ahead])

@@ -1,4 +1,6 @@
-"""Eye poses and projections (EyeReal supplement, 2.1 and 3.1, errata applied)."""
+"""Poses of eyes, and projections onto images and panels.
+
+The equations are from sections 2.1 and 3.1 of the EyeReal supplement, corrected as in docs/mathematics.md."""
 
 from __future__ import annotations
 
@@ -14,19 +16,20 @@ from runtime.records import F64
 def stack_from_eye(eye_m: ArrayLike) -> F64:
     """Return the 4x4 pose of an eye that looks at the stack's origin (EyeReal supplement, (10)-(14)).
 
-    Axes: x right and parallel to the ground, y up, z from the scene towards the eye. For an eye on the vertical axis
-    the pose is the limit from +x (r_x = +y), because the limit depends on the direction of approach.
+    The x axis points right and is parallel to the ground, y points up, and z points from the scene towards the eye. On
+    the vertical axis, the limit of the pose depends on the direction of approach. There, the pose is the limit from +x
+    (r_x = +y).
 
-    Raises ValueError if the eye is at the origin or not finite.
+    Raises ValueError if the eye is at the origin or a coordinate is not finite.
     """
     eye = np.asarray(eye_m, dtype=np.float64)
     scale = float(np.abs(eye).max())
     if not np.isfinite(scale) or scale == 0.0:
         raise ValueError(f"an eye at {eye.tolist()} has no direction of gaze")
-    # Scale first: the squares of 1e-200 or 1e200 would leave float64's range.
+    # Scale the eye first, because the squares of 1e-200 and 1e200 exceed the range of float64.
     back = eye / scale
     back = back / math.hypot(*back)
-    # Use the unscaled eye: near the vertical axis its x and y may be too small to survive the scaling.
+    # Use the unscaled eye, because x and y near the vertical axis may be too small to survive the scaling.
     off_axis = float(np.abs(eye[:2]).max())
     along = eye[:2] / off_axis if off_axis > 0.0 else np.array([1.0, 0.0])
     along = along / math.hypot(*along)
@@ -43,9 +46,10 @@ def image_from_camera(*, width_px: int, height_px: int, fov_deg: float) -> F64:
 
 
 def image_from_stack(eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg: float) -> F64:
-    """Return the 3x4 projection K·diag(1, -1, -1)·R_e^T·[I | -e] of `stack` to an image ((31)-(39)).
+    """Return the 3x4 projection from frame `stack` to the image of an eye aimed at the stack's origin.
 
-    The third homogeneous coordinate is the distance along the gaze in metres, positive in front of the eye.
+    The projection is K·diag(1, -1, -1)·R_e^T·[I | -e] ((31)-(39)). The third homogeneous coordinate is the distance
+    along the gaze in metres, which is positive in front of the eye.
     """
     pose = stack_from_eye(eye_m)
     rotation = np.diag([1.0, -1.0, -1.0]) @ pose[:3, :3].T
@@ -55,14 +59,14 @@ def image_from_stack(eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg
 
 
 def raster_from_stack(eye_m: ArrayLike, raster: PlaneRaster) -> F64:
-    """Return the 3x4 projection of `stack` points, seen from an eye, onto a plane's pixels.
+    """Return the 3x4 projection from frame `stack`, along an eye's rays, to the pixels of a raster.
 
-    Equals M_RPU · `image_from_stack` for any image of the eye. The third coordinate is the eye's distance from the
-    point along x, in metres.
+    The projection equals M_RPU · `image_from_stack` for any image of the eye. The third homogeneous coordinate is the
+    distance along x from the point to the eye, in metres.
     """
     eye = np.asarray(eye_m, dtype=np.float64)
     depth = raster.x_m - eye[0]
-    # A point p goes to e + (p - e)·(x_plane - e_x)/(p_x - e_x), written with e_x - p_x as the weight.
+    # A point p is mapped to e + (p - e)·(x_plane - e_x)/(p_x - e_x), written with the weight e_x - p_x.
     plane_from_stack = np.array(
         [
             [-eye[1], -depth, 0.0, eye[1] * eye[0] + eye[1] * depth],
@@ -75,15 +79,17 @@ def raster_from_stack(eye_m: ArrayLike, raster: PlaneRaster) -> F64:
 
 
 def image_from_raster(image_from_stack: F64, raster: PlaneRaster) -> F64:
-    """Return the 3x3 homography from a plane's pixels to an eye's image pixels (H of (40)-(42))."""
+    """Return the 3x3 homography from pixels of a raster to pixels of an eye's image (H in (40)-(42))."""
     return image_from_stack[:, :3] @ raster.stack_from_raster() + np.outer(image_from_stack[:, 3], [0.0, 0.0, 1.0])
 
 
 def relative_scale_shift(eye_m: ArrayLike, *, from_x_m: float, to_x_m: float) -> tuple[float, F64]:
-    """Return the scale and shift (2,) in metres that project a plane onto a parallel one from an eye.
+    """Return the scale and the (2,) shift in metres that project a plane onto a parallel plane.
 
-    The ray through a point p crosses the other plane at p·scale + shift. Raises ValueError for an eye in the first
-    plane.
+    The ray from the eye through the point p (y, z) of the plane x = from_x_m crosses the plane x = to_x_m at
+    p·scale + shift.
+
+    Raises ValueError if the eye is in the plane x = from_x_m.
     """
     eye = np.asarray(eye_m, dtype=np.float64)
     distance_m = eye[0] - from_x_m
