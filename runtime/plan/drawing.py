@@ -1,4 +1,4 @@
-"""Draw the targets of a solution. Only this module knows content, views and models."""
+"""Draw the target pictures of a solution. Only this module combines content, views and models."""
 
 from __future__ import annotations
 
@@ -20,9 +20,12 @@ from runtime.support.gl import DrawnPicture
 
 
 def raster_views(eyes_m: F64, raster: PlaneRaster, *, reduction: int = 1) -> tuple[View, View]:
-    """Return the left and right eye's views of a raster; eyes (2, 3), frame `stack`.
+    """Return the views in which content is drawn on a raster for the left and the right eye.
 
-    reduction: divisor of the panels' rows and columns that gives the raster's.
+    Args:
+        eyes_m: (2, 3) left and right eye in frame `stack`.
+        raster: Pixels to draw on, usually those of the middle panel.
+        reduction: Factor by which the raster has fewer rows and columns than the display's panels.
     """
     left, right = (
         View(eye, side, raster_from_stack(eye, raster), raster.width_px, raster.height_px, reduction)
@@ -32,7 +35,13 @@ def raster_views(eyes_m: F64, raster: PlaneRaster, *, reduction: int = 1) -> tup
 
 
 def retina_view(eye_m: F64, side: int, *, width_px: int, height_px: int, fov_deg: float) -> View:
-    """Return the view of an eye's own image; the eye looks at the stack's origin."""
+    """Return the view in which content is drawn as the image of an eye that looks at the stack's origin.
+
+    Args:
+        eye_m: (3,) eye in frame `stack`.
+        side: 0 for the left eye, 1 for the right eye.
+        fov_deg: Horizontal field of view of the image.
+    """
     projection = image_from_stack(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
     return View(eye_m, side, projection, width_px, height_px)
 
@@ -40,7 +49,13 @@ def retina_view(eye_m: F64, side: int, *, width_px: int, height_px: int, fov_deg
 def retina_pictures(
     content: ContentSource, eyes_m: F64, stack: PanelStack, *, fov_deg: float, time_ns: int
 ) -> tuple[U8, U8]:
-    """Draw retina pictures (h, w, 3) of content, as large as a panel, for eyes (2, 3) in frame `stack`."""
+    """Draw the (h, w, 3) pictures that the two eyes should see, in the size of a panel.
+
+    Args:
+        eyes_m: (2, 3) left and right eye in frame `stack`. Each eye looks at the stack's origin.
+        fov_deg: Horizontal field of view of the pictures.
+        time_ns: Time on the run's clock, for moving content.
+    """
     size = {"width_px": stack.width_px, "height_px": stack.height_px}
     views = [retina_view(eye, side, **size, fov_deg=fov_deg) for side, eye in enumerate(eyes_m)]
     content.expect(views, time_ns=time_ns)
@@ -59,12 +74,23 @@ def drawn_job(
     before: SolveWindow | None = None,
     in_depth: bool = False,
 ) -> Job:
-    """Return the job for eyes (2, 3), frame `stack`, with content drawn on the middle panel's pixels.
+    """Draw content for both eyes on the middle panel's pixels, and return a job with these pictures.
 
-    Pictures stay in textures if the model can read textures; otherwise they are the source's own arrays. reduction:
-    divisor of the panels' rows and columns. trimmed: skip work that the scene does not need (`trim`), including drawing
-    if the content knows its extent. before: the previous solution's window, on the same raster. in_depth: include the
-    content's relief, if the source knows it.
+    Pictures that the content draws with OpenGL stay in textures if the model can read them. Other pictures are arrays
+    that belong to the content source.
+
+    Args:
+        eyes_m: (2, 3) left and right eye in frame `stack`.
+        time_ns: Time on the run's clock, for moving content.
+        reduction: Factor by which the panels' rows and columns are divided.
+        trimmed: Skip work that the scene does not need (`trim`). If the content knows its extent, the rest of the
+            picture is not even drawn.
+        before: Window of the previous solution, on the same raster.
+        in_depth: Include the relief of the content if the source knows the depth.
+
+    Raises:
+        ContentFailure: The content could not be drawn.
+        ContextLost: The OpenGL context was lost.
     """
     stack, trimmed = predictor.stack.reduced(reduction), trimmed and predictor.trims
     window: SolveWindow | None = None
@@ -80,7 +106,7 @@ def drawn_job(
     content.expect(views, time_ns=time_ns)
     drawn = [_drawn(predictor, content, view, time_ns=time_ns) for view in views]
     relief = _relief(content, views, stack, window, every=block_px(predictor.stack.width_px)) if in_depth else None
-    # Reading back waits until the picture is complete, so both are drawn before either is read.
+    # Reading back a picture waits until it is complete, so both pictures are drawn before the first is read back.
     reads_textures = predictor.reads_textures_of(content.draws_in)
     pictures = [p.pixels() if isinstance(p, DrawnPicture) and not reads_textures else p for p in drawn]
     job = Job(Targets(stack, eyes_m, drawn_views(pictures, stack, window)), window=window, relief=relief)
@@ -88,7 +114,10 @@ def drawn_job(
 
 
 def _extent(content: ContentSource, eyes_m: F64, middle: PlaneRaster, *, time_ns: int) -> PixelRect | None:
-    """Return the middle panel's pixels outside which both eyes see only the background; None: unknown."""
+    """Return the part of the middle panel outside which both eyes see only the background.
+
+    The result is None if the content does not know its extent.
+    """
     views = raster_views(eyes_m, middle)
     boxes = [content.extent(view, time_ns=time_ns) for view in views]
     known = [box for box in boxes if box is not None]
@@ -98,7 +127,15 @@ def _extent(content: ContentSource, eyes_m: F64, middle: PlaneRaster, *, time_ns
 def _relief(
     content: ContentSource, views: tuple[View, View], stack: PanelStack, window: SolveWindow | None, *, every: int
 ) -> F32 | None:
-    """Return the relief, on the middle panel, of the content drawn for both views; None without depth."""
+    """Return the relief on the middle panel of the content that was drawn for both views.
+
+    The result is None if the content source does not know the depth.
+
+    Args:
+        views: Views of the left and the right eye.
+        window: Window of the middle panel that was drawn. If None, the whole panel was drawn.
+        every: Side of a relief pixel in panel pixels.
+    """
     u0, v0 = (0, 0) if window is None else (window.box.u0, window.box.v0)
     left, right = (content.nearness(view, every=every, first=(u0 % every, v0 % every)) for view in views)
     if left is None or right is None:
@@ -114,9 +151,11 @@ def _relief(
 
 
 def _drawn(predictor: Predictor, content: ContentSource, view: View, *, time_ns: int) -> U8 | DrawnPicture:
-    """Return a view's picture as a texture, or as an array if the content does not draw with OpenGL.
+    """Draw a view and return a texture, or an array if the content does not draw with OpenGL.
 
-    Raises ContentFailure and ContextLost.
+    Raises:
+        ContentFailure: The content could not be drawn.
+        ContextLost: Drawing failed in the OpenGL context that the predictor uses.
     """
     try:
         picture = content.draw(view, time_ns=time_ns)

@@ -1,4 +1,4 @@
-"""Measure what each saving of the plan changes in time and quality, on this machine and scene."""
+"""Measure the effect of each saving on time and quality, for a scene on this machine."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ MAX_DRIFT_M = 0.001  # a resting head may drift this far before its picture is r
 
 
 class TrialResult(NamedTuple):
-    """Quality, and median time per frame including drawing, of one way to compute the layers."""
+    """Time and quality of one method to compute the layers."""
 
-    frame_ms: float
-    psnr_db: float
+    frame_ms: float  # median time per frame, including drawing
+    psnr_db: float  # displayed quality
 
     def saving_over(self, other: TrialResult) -> Saving:
-        """Return what this way saves and costs relative to `other`, a way that saves less."""
+        """Return the time saved and the quality lost, relative to a method that skips less work."""
         return Saving(other.frame_ms - self.frame_ms, other.psnr_db - self.psnr_db)
 
 
 class Measurement(NamedTuple):
-    """Results for a scene with and without the plan, measured alternately."""
+    """Results for a scene with and without the plan. The runs of the two trials alternate."""
 
     numbers: Measured
     with_plan: TrialResult
@@ -56,7 +56,12 @@ class Measurement(NamedTuple):
 
 
 def measure(predictor: Predictor, content: ContentSource, eyes_m: F64, *, fov_deg: float) -> Measurement:
-    """Measure the scene with and without each saving, for eyes (2, 3) and pictures `fov_deg` wide."""
+    """Measure a scene with and without each saving.
+
+    Args:
+        eyes_m: (2, 3) left and right eye in frame `stack`.
+        fov_deg: Horizontal field of view of the pictures that quality is measured on.
+    """
     stack = predictor.stack
 
     def psnr_db(layers: U8, at_m: F64) -> float:
@@ -97,7 +102,17 @@ def measure(predictor: Predictor, content: ContentSource, eyes_m: F64, *, fov_de
 
 
 def plan_for(config: Path | None, *, scene: str | None, model: str | None, scale: float) -> dict[str, Any]:
-    """Measure one scene and return what `phasestack plan` prints. Raises PhasestackError."""
+    """Measure a scene and return the table that `phasestack plan` prints.
+
+    Args:
+        config: Configuration file. If None, the default configuration is used.
+        scene: Scene that replaces the configured scene.
+        model: Model that replaces the configured model.
+        scale: Factor by which the panels' rows and columns are multiplied.
+
+    Raises:
+        PhasestackError: The configuration, the scene or the model cannot be used.
+    """
     settings = with_options(load_settings(config), scene=scene, model=model)
     cv2.setNumThreads(settings.model.threads or -1)
     stack = settings.stack.stack()
@@ -141,13 +156,13 @@ def plan_for(config: Path | None, *, scene: str | None, model: str | None, scale
 
 
 def _check_viewer(eyes_m: F64, stack: PanelStack, *, fov_deg: float) -> None:
-    """Raise InputError for eyes (2, 3) that see no part of the display."""
+    """Raise InputError if an eye is not in front of the panels or neither eye sees a part of the display."""
     nearest_m = float(eyes_m[:, 0].min())
     if nearest_m <= max(stack.x_m):
         raise InputError(
             "sensor.fixed_eyes_m", "", f"x = {nearest_m:g} m : not in front of the panels (x > {max(stack.x_m):g} m)"
         )
-    # A coarse raster gives the same answer.
+    # A coarse raster suffices to find out if the display is visible.
     coarse = replace(stack, width_px=64, height_px=36)
     blank = np.zeros((stack.count, coarse.height_px, coarse.width_px, 3), np.uint8)
     if not any(seen_by(eye_m, blank, coarse, fov_deg=fov_deg).mask.any() for eye_m in eyes_m):

@@ -1,4 +1,4 @@
-"""Decide which work can be skipped for a scene, display and viewer."""
+"""Decide which work can be skipped for the current scene, display and viewer."""
 
 from __future__ import annotations
 
@@ -26,42 +26,53 @@ RETURN_MARGIN_DEG = 3.0  # three standard deviations of an eye's direction at 0.
 
 @dataclass(frozen=True, slots=True)
 class Saving:
-    """Time that a saving saves and quality that it costs; None: not measured."""
+    """Measured effect of skipping some work. Values that were not measured are None."""
 
-    saves_ms: float | None = None
-    costs_db: float | None = None
+    saves_ms: float | None = None  # time saved per frame
+    costs_db: float | None = None  # quality lost
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Times and errors measured on this machine for this scene."""
+    """Effects of all savings, measured on this machine for one scene."""
 
-    reuse: Saving = Saving()
-    focus: Saving = Saving()
-    one_channel: Saving = Saving()
-    one_eye: Saving = Saving()
-    left_out: Savings = field(default_factory=Savings)  # savings of the newest job
+    reuse: Saving = Saving()  # showing the previous solution again
+    focus: Saving = Saving()  # solving only the window in which the eyes' pictures differ
+    one_channel: Saving = Saving()  # solving one channel of grey pictures
+    one_eye: Saving = Saving()  # solving for the only eye that sees the display
+    left_out: Savings = field(default_factory=Savings)  # work skipped by the newest job
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Savings in use: the eyes to solve for, and items to show to an operator."""
+    """Eyes to solve for, and a description of all skipped work for an operator."""
 
-    eyes: tuple[bool, bool]  # left, right: True if it is solved for
-    items: tuple[PlanItem, ...] = field(default=())
+    eyes: tuple[bool, bool]  # (left, right), True for an eye that is solved for
+    items: tuple[PlanItem, ...] = field(default=())  # one item for each kind of skipped work
 
 
 def eyes_in_range(eyes_m: F64, *, range_deg: float = VISIBLE_DEG) -> tuple[bool, bool]:
-    """Return (left, right): True if that eye is in front of the display, within `range_deg` of its axis."""
+    """Return, for the left and the right eye, True if the eye can see the display.
+
+    An eye can see the display if its direction from the display's centre is within `range_deg` of the display's axis.
+
+    Args:
+        eyes_m: (2, 3) left and right eye in frame `stack`.
+    """
     off_axis = np.degrees(np.arctan2(np.linalg.norm(eyes_m[:, 1:], axis=1), eyes_m[:, 0]))
     left, right = (off_axis <= range_deg).tolist()
     return left, right
 
 
 def seeing_eyes(eyes_m: F64, before: tuple[bool, bool]) -> tuple[bool, bool]:
-    """Return `eyes_in_range` with hysteresis: an excluded eye returns only when well inside the range.
+    """Return, for the left and the right eye, True if the eye can see the display, with hysteresis.
 
-    before: the previous result. Without hysteresis, noise would switch an eye at the limit on and off.
+    An eye that was excluded before is included again only when it is at least `RETURN_MARGIN_DEG` inside the range.
+    Without hysteresis, noise would switch an eye at the limit of the range on and off.
+
+    Args:
+        eyes_m: (2, 3) left and right eye in frame `stack`.
+        before: Previous result.
     """
     outer = eyes_in_range(eyes_m)
     inner = eyes_in_range(eyes_m, range_deg=VISIBLE_DEG - RETURN_MARGIN_DEG)
@@ -70,7 +81,14 @@ def seeing_eyes(eyes_m: F64, before: tuple[bool, bool]) -> tuple[bool, bool]:
 
 
 def selected_eyes(eyes_m: F64, seeing: tuple[bool, bool]) -> F64:
-    """Return the eyes (2, 3) to draw and solve for. An eye that cannot see is replaced by the other."""
+    """Return the (2, 3) eyes to draw and solve for.
+
+    An eye that cannot see the display is replaced by the eye that can. If neither can, both eyes are returned.
+
+    Args:
+        eyes_m: (2, 3) left and right eye in frame `stack`.
+        seeing: For the left and the right eye, True if the eye can see the display (`seeing_eyes`).
+    """
     if seeing == (True, False):
         return eyes_m[[0, 0]]
     if seeing == (False, True):
@@ -87,10 +105,14 @@ def make_plan(
     measured: Measured | None = None,
     loaded_modules: Collection[str] = (),
 ) -> Plan:
-    """Return the plan for a scene and a viewer. It must be renewed when either changes.
+    """Return the plan for a scene and a viewer, which is valid until the scene or the viewer changes.
 
-    eyes_m: (2, 3), if known. seeing: which eyes can see the display, if known (`seeing_eyes`). loaded_modules: names
-    of imported modules (`sys.modules`).
+    Args:
+        eyes_m: (2, 3) left and right eye in frame `stack`. None if unknown.
+        seeing: For the left and the right eye, True if the eye can see the display (`seeing_eyes`). If None, the result
+            is computed from `eyes_m`.
+        measured: Effects of the savings, which the items quote.
+        loaded_modules: Names of imported modules (`sys.modules`). The plan lists the optional parts not among them.
     """
     on, numbers = settings.plan.enabled, measured or Measured()
     if seeing is None and eyes_m is not None:
@@ -116,7 +138,7 @@ def make_plan(
 
 
 def network_items(info: ContentInfo, numbers: Measured) -> list[PlanItem]:
-    """Return the plan items for work that the model skips."""
+    """Return the plan items for the work that the model skipped in the newest job (`Measured.left_out`)."""
     items, share = [], numbers.left_out.solved_share
     if info.flat_x_m is not None and share == 0.0:
         why = "everything lies in the centre panel's plane: both eyes see the same"
