@@ -1,1 +1,1 @@
-"""Predictors, which compute the values of every panel from the target pictures of two eyes."""
+"""Predictors, which compute the values of all panels from the target pictures of two eyes."""

@@ -1,4 +1,4 @@
-"""Choose the solver's device: the configured one or, for `auto`, the faster one on this machine."""
+"""Choose the backend that runs the solver: the configured backend or, for `auto`, the faster one."""
 
 from __future__ import annotations
 
@@ -23,27 +23,32 @@ if TYPE_CHECKING:
 log = logging.getLogger("phasestack.model")
 
 EYES_M = ((0.6, -0.031, 0.0), (0.6, 0.031, 0.0))
-FIRST_SHARE = 4  # in the first comparison, the panels' columns and rows are divided by this
-CLEAR = 2.5  # a backend that is this many times as fast in the first comparison wins without a second one
-RUNS = 3  # timed runs; the fastest one counts
+FIRST_SHARE = 4  # divisor of the panels' columns and rows in the first comparison
+CLEAR = 2.5  # a backend that is this many times as fast in the first comparison wins without a second comparison
+RUNS = 3  # timed runs, of which the fastest counts
 
 Wanted = Literal["auto", "cpu", "gl"]
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """A backend and the reason for choosing it."""
+    """A backend, and the reason for choosing it."""
 
     backend: SolverBackend
-    why: str  # one line, with the measurement
+    why: str  # one line, including the times if they were measured
 
 
 def choose(wanted: Wanted, predictor: Predictor, context: Callable[[], Any]) -> Choice:
     """Choose the backend for a loaded model, and log the reason.
 
-    wanted: for `auto`, both backends are timed, and the processor is used if OpenGL is unavailable. context: function,
-    called only if needed, that returns an OpenGL context that is current on this thread, or raises MissingPart.
-    Raises MissingPart (`gl` without OpenGL), InputError (a panel too large for the driver) and ModelFailure.
+    Args:
+        wanted: Configured backend. For `auto`, both backends are timed, and the processor is used if OpenGL fails.
+        context: Function that returns an OpenGL context that is current on this thread, or raises MissingPart. The
+            function is called only if the context is needed.
+
+    Raises:
+        MissingPart: `wanted` is `gl`, but OpenGL is unavailable.
+        InputError: `wanted` is `gl`, but a panel is too large for the OpenGL driver.
     """
     if predictor.on_panels(predictor.stack) is None:
         choice = Choice(_cpu(), f"the only one for {predictor.name}")
@@ -89,11 +94,14 @@ def _faster(predictor: Predictor, made: Callable[[], GlBackend]) -> Choice:
 
 
 def solution_ms(predictor: Predictor, stack: PanelStack, backend: SolverBackend, *, runs: int) -> float:
-    """Return the time in ms of the fastest of `runs` solutions, after one that compiles and allocates."""
+    """Return the time in ms of the fastest of `runs` solutions.
+
+    An additional solution before the timed runs compiles the code and allocates the memory.
+    """
     solver = predictor.on_panels(stack)
     assert solver is not None
     solver.set_backend(backend)
-    # Assume exactly known eyes: allowing for a tracking error costs the same on every backend.
+    # Assume that the eyes are known exactly, because a tracking error increases the time equally on every backend.
     job = replace(drawn_job([_noise(stack, seed) for seed in (0, 1)], np.array(EYES_M), stack), eye_sigma_m=0.0)
     try:
         solver.solve(job)
@@ -108,7 +116,7 @@ def solution_ms(predictor: Predictor, stack: PanelStack, backend: SolverBackend,
 
 
 def _noise(stack: PanelStack, seed: int) -> U8:
-    """Return an (h, w, 4) picture of coloured noise, which leaves the solver nothing to skip."""
+    """Return an (h, w, 4) picture of coloured noise, in which the solver cannot skip any work."""
     noise = np.random.default_rng(seed).integers(0, 256, (stack.height_px, stack.width_px, 4), np.uint8)
     noise[..., 3] = 255
     return noise
