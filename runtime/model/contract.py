@@ -1,4 +1,4 @@
-"""Contract in a model file (docs/contracts.md), checked when the model is loaded."""
+"""Contract that a model file contains (docs/contracts.md). It is checked when the model is loaded."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ class TrainedFor(Section):
 
 
 class Port(Section):
-    """An input or output of the network."""
+    """Input or output of the network."""
 
     name: Annotated[str, Field(min_length=1)]
     axes: Annotated[tuple[str, ...], Field(max_length=8)] = Field(description="what each dimension counts")
 
 
 class Contract(Section):
-    """The model's metadata entry `phasestack.contract`."""
+    """Properties of a model that its metadata entry `phasestack.contract` declares."""
 
     version: Literal[2]
     arch: str
@@ -90,7 +90,14 @@ class Contract(Section):
 
 
 def parse_contract(metadata: dict[str, str], *, source: str | Path) -> Contract:
-    """Return the contract in an ONNX file's metadata. Raises InputError if it is missing or unsuitable."""
+    """Return the contract in an ONNX file's metadata.
+
+    Args:
+        source: File that an error message names.
+
+    Raises:
+        InputError: The contract is missing, malformed, of another version or invalid.
+    """
     text = metadata.get(METADATA_KEY)
     if text is None:
         raise InputError(source, METADATA_KEY, "the model has no contract, so it was not made for phasestack")

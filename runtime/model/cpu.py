@@ -1,4 +1,4 @@
-"""Solver on the processor: `runtime.kernels` updates panels of 16-bit integers."""
+"""Solver backend on the processor, which updates panels of 16-bit integers with `runtime.kernels`."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F64, I16
 from runtime.support.threads import on_rows, parallel_map
 
-WEIGHT, TAPER = 8191, 32767  # fixed-point values that stand for 1 in the targets' weights and in tapers
-SAFE = 4 * MARGIN  # elements allocated around the panels' rows, because whole vectors may read past their ends
+WEIGHT, TAPER = 8191, 32767  # fixed-point values of 1 in the targets' weights and in the tapers
+SAFE = 4 * MARGIN  # additional elements after a panel's rows, because whole vectors are read past the end of a row
 
 
 class CpuBackend:
-    """Backend on the processor, available everywhere."""
+    """Backend that runs the solver on the processor and is always available."""
 
     name = "cpu"
     context: object = None
@@ -34,7 +34,7 @@ class CpuBackend:
         return CpuState(stack, threads=threads)
 
     def close(self) -> None:
-        """Do nothing: this backend holds no resources."""
+        """Do nothing, because this backend holds no resources."""
 
 
 class CpuState:
@@ -43,7 +43,7 @@ class CpuState:
     def __init__(self, stack: PanelStack, *, threads: int) -> None:
         self._stack, self._threads = stack, max(1, threads)
         self._rest = rest_of(stack.count)
-        self._buffers: dict[int, _Buffers] = {}  # by number of channels
+        self._buffers: dict[int, _Buffers] = {}  # keyed by the number of channels
 
     def begin(self, job: Job, geometry: Geometry, *, resumed: bool = False) -> AbstractContextManager[None]:
         self._geometry, self._channels, self._sigma_m = geometry, job.channels, job.eye_sigma_m
@@ -75,7 +75,7 @@ class CpuState:
 
     def step(self, step: Step) -> None:
         held = self._held
-        # Rays read rows after their update. In the first step they read `last`, so the update is written elsewhere.
+        # A row may still be read by rays after its update. The first step reads `last`, so it writes to other memory.
         ahead, last = (held.last, held.ahead) if self._starts else (held.ahead, held.last)
         panels_from_rays = self._geometry.panels_from_rays(step.places, self._sigma_m)
         problem, _keep = self._problem(panels_from_rays, ahead=ahead, last=last)
@@ -89,7 +89,7 @@ class CpuState:
         if outside is None:
             buffer.outside = None
         elif buffer.outside != (key := (outside, geometry.boxes, geometry.kept)):
-            for n, layer in enumerate(layers):  # whole pixels at a time
+            for n, layer in enumerate(layers):  # write whole pixels instead of single components
                 pixel = np.array([*outside_codes(self._stack.count, n, outside), 255], np.uint8)
                 layer.view(np.uint32)[..., 0] = pixel.view(np.uint32)[0]
             buffer.outside = key
@@ -110,7 +110,7 @@ class CpuState:
         self._buffers = {}
 
     def _rest_others(self) -> None:
-        """Set every panel that has not been set yet to rest."""
+        """Set all panels that have not been set to the rest value."""
         for n in self._resting:
             box = self._geometry.boxes[n]
             self._held.last[n, : box.height_px, : box.width_px * self._channels] = self._rest
@@ -120,7 +120,7 @@ class CpuState:
         parallel_map(lambda part: work(byref(problem), part, self._threads), range(self._threads))
 
     def _problem(self, panels_from_rays: F64, *, ahead: I16, last: I16) -> tuple[Problem, object]:
-        """Return the arguments of the compiled loops, and the arrays that must outlive the call."""
+        """Return the arguments of the compiled loops, and the arrays that must stay alive during the call."""
         geometry, held, channels = self._geometry, self._held, self._channels
         seen, back = np.ascontiguousarray(panels_from_rays), np.ascontiguousarray(inverse(panels_from_rays))
         if len(seen) > MAX_SETS:
@@ -144,13 +144,16 @@ class CpuState:
 
 @lru_cache(maxsize=8)
 def _packed_table(panels: int) -> NDArray[np.int32]:
-    """Return `target_table` as (256,) integers: sums in the lower 16 bits, weights in the upper ones."""
+    """Return `target_table` as (256,) integers, with the sum in the lower 16 bits and the weight above."""
     sums, weights = np.rint(target_table(panels) * np.array((1, WEIGHT), np.float32)).astype(np.int32).T
     return np.asarray(sums + (weights << 16), np.int32)
 
 
 class _Buffers:
-    """Panels between steps, for one number of channels. A box starts at the first row and element."""
+    """Values of all panels between steps, for one number of channels.
+
+    A panel's box is stored from the first row and element on.
+    """
 
     def __init__(self, stack: PanelStack, channels: int) -> None:
         shape = (stack.count, stack.height_px + 1, stack.width_px * channels + SAFE)

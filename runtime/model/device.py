@@ -1,4 +1,4 @@
-"""Interface of a device (`cpu` or `gl`): the operations that make up a solution."""
+"""Interface of the devices (`cpu` and `gl`), which implement the operations of the solver."""
 
 from __future__ import annotations
 
@@ -14,46 +14,53 @@ from runtime.records import I16
 
 
 class SolverState(Protocol):
-    """The panels of one stack on one device, kept between frames. Only one thread uses it."""
+    """Panels of one stack on one device, which are kept between frames. Only one thread may use a state."""
 
     def begin(self, job: Job, geometry: Geometry, *, resumed: bool = False) -> AbstractContextManager[None]:
-        """Load the targets. All other methods must be called within the returned context.
+        """Load the targets of a job. All other methods must be called within the returned context.
 
-        Panels are at rest in their boxes until they are set. resumed: keep the panels and momentum of the previous
-        solution, which must have had the same geometry.
+        All pixels of the panels' boxes have the rest value until a panel is set.
+
+        Args:
+            resumed: Keep the panels and the momentum of the previous solution, which must have had the same geometry.
         """
 
     def set_panel(self, panel: int, codes: I16) -> None:
-        """Set a panel's box to codes (rows, columns[, 3]), in sixteenths of an 8-bit code."""
+        """Set the box of a panel to (rows, columns[, 3]) values in sixteenths of an 8-bit code."""
 
     def close_middle(self) -> None:
         """Solve the middle panel for both eyes and leave the other panels as they are."""
 
     def start(self) -> None:
-        """Prepare for steps from the panels' present values, without momentum."""
+        """Prepare for steps that start from the current values of the panels, without momentum."""
 
     def step(self, step: Step) -> None:
-        """Update all panels once."""
+        """Update all panels once (docs/mathematics.md, L5)."""
 
     def write(self, buffer: LayerBuffer, outside: int | tuple[int, ...] | None) -> None:
         """Write all panels to a buffer as 8-bit codes.
 
-        outside: code or colour of the middle panel outside its box; the outer panels get the rest code there. With
-        None, the buffer's contents outside the boxes are kept.
+        Args:
+            outside: Contents of the middle panel outside its box: a panel code, or a colour that the eyes should see.
+                The outer panels have the rest code outside their boxes. If None, the buffer's contents outside the
+                boxes are kept.
         """
 
     def close(self) -> None:
-        """Release textures. May be called twice."""
+        """Release textures. The method may be called more than once."""
 
 
 class SolverBackend(Protocol):
-    """A device that runs the solver's steps."""
+    """Device that runs the solver's steps."""
 
-    name: str  # value of `model.backend` that selects it
-    context: object  # OpenGL context whose textures it reads; None: it reads arrays
+    name: str  # value of the setting `model.backend` that selects this device
+    context: object  # OpenGL context whose textures the device can read; None: it can only read arrays
 
     def state(self, stack: PanelStack, *, threads: int) -> SolverState:
-        """Create the state for a stack. Raises InputError if the device does not support its size."""
+        """Create the state for a stack. Raises InputError if a panel is too large for the device."""
 
     def close(self) -> None:
-        """Release what the states share, after all of them are closed. May be called twice."""
+        """Release the resources that the states share.
+
+        All states must be closed before. The method may be called more than once.
+        """
