@@ -1,4 +1,4 @@
-"""Job: the input of one solution, with targets, their rays, and the part of the panels to solve."""
+"""Job: the input of one solution, with target pictures, their rays and the pixels to solve."""
 
 from __future__ import annotations
 
@@ -23,47 +23,47 @@ NOWHERE = PixelRect(0, 0, 0, 0)
 
 @dataclass(frozen=True, slots=True)
 class SolveWindow:
-    """Window in which every panel is solved.
+    """Window in which all panels are solved.
 
-    Outside the window, the outer panels stay at mid-range, where the solver starts, and the middle panel carries the
-    picture that both eyes see.
+    Outside the window, the outer panels stay at the rest value, from which the solver starts, and the middle panel
+    shows the picture that both eyes see.
     """
 
-    box: PixelRect  # panel pixels; empty: nothing is solved
-    kept: PixelRect  # middle-panel pixels inside `box` that the solution writes; the others get the flat fill
-    taper_px: tuple[float, float]  # (right, down) width over which the outer panels' drive is tapered to zero
-    colour: tuple[int, ...] | None = None  # 8-bit codes of the background outside; None: taken from the pictures
+    box: PixelRect  # pixels of every panel; if empty, nothing is solved
+    kept: PixelRect  # pixels inside `box` that are solved on the middle panel; the others show what both eyes see
+    taper_px: tuple[float, float]  # width (right, down) over which the outer panels fade to the rest value
+    colour: tuple[int, ...] | None = None  # 8-bit codes of the uniform background outside; None: use the pictures
 
 
 @dataclass(frozen=True)
 class Targets:
-    """Target pictures of both eyes, and their pixels' rays through the panels."""
+    """Target pictures of both eyes, and the rays of the pictures' pixels through the panels."""
 
-    stack: PanelStack  # panels with the raster that is solved: the display's own or a coarser one
+    stack: PanelStack  # panels with the raster to solve, which may be coarser than the display's
     eyes_m: F64  # (2, 3) left and right, frame `stack`
     views: tuple[TargetView, TargetView]  # left and right
 
     @cached_property
     def visible(self) -> Geometry:
-        """Geometry of all rays on which the eyes see through every panel."""
+        """Geometry of all rays that cross every panel."""
         return geometry_of(self.stack, self.eyes_m, self.views, boxes=visible_boxes(self.eyes_m, self.stack))
 
     @cached_property
     def every_pixel(self) -> Geometry:
-        """Geometry of the rays through every pixel of every panel, visible or not."""
+        """Geometry in which all pixels of all panels are solved, including those that the eyes do not see."""
         whole = PixelRect(0, 0, self.stack.width_px, self.stack.height_px)
         return geometry_of(self.stack, self.eyes_m, self.views, boxes=(whole,) * self.stack.count)
 
     def within(self, window: SolveWindow) -> Geometry:
-        """Return the geometry of the rays through a window."""
+        """Return the geometry in which the pixels of a window are solved."""
         boxes = (window.box,) * self.stack.count
         return geometry_of(self.stack, self.eyes_m, self.views, boxes=boxes, kept=window.kept, taper_px=window.taper_px)
 
     def reduced(self, reduction: int) -> tuple[TargetView, TargetView]:
-        """Return the views averaged down by `reduction` (`reduced_view`); each is computed only once."""
+        """Return the left and right view averaged down by `reduction` (`reduced_view`). The result is cached."""
         if reduction not in self._reduced:
             middle = self.stack.panel(self.stack.count // 2)
-            # A texture can only be read back on its context's thread, which is this one.
+            # Read textures back here, because only the thread of their context can do so.
             views = [TargetView(view.pixels, view.plane_from_picture) for view in self.views]
             left, right = parallel_map(lambda view: reduced_view(view, middle, reduction), views)
             self._reduced[reduction] = left, right
@@ -76,25 +76,26 @@ class Targets:
 
 @dataclass(frozen=True, slots=True)
 class Savings:
-    """Work that a job saves."""
+    """Reduced amount of work of a trimmed job."""
 
     solved_share: float = 1.0  # share of the panels' pixels that is solved
-    channels: int = 3
+    channels: int = 3  # number of colour channels that are solved
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """Input of one solution. For a cheaper solution, `runtime.model.trim` changes a few fields."""
+    """Input of one solution. `runtime.model.trim` changes a few fields to make the solution cheaper."""
 
     targets: Targets
-    # Standard deviation of the tracking error per axis, right and up, common to both eyes; 0: exactly known eyes.
+    # Standard deviation along each axis (right and up) of the tracking error, which both eyes share. 0: the eyes are
+    # known exactly.
     eye_sigma_m: float = TRACKING_SIGMA_M
-    window: SolveWindow | None = None  # None: everything that the eyes see
-    channels: int = 3  # 1: the pictures are grey, so one channel is solved for all three
-    steps: int | None = None  # largest number of updates of all panels; None: the model's
-    continued: bool = False  # start from the previous solution's panels if its rays were the same
+    window: SolveWindow | None = None  # None: solve everything that the eyes see
+    channels: int = 3  # 1: the pictures are grey, and one channel is solved for all three
+    steps: int | None = None  # maximum number of updates of all panels; None: the number that the model specifies
+    continued: bool = False  # start from the panels of the previous solution if its rays were the same
     deadline_ns: int | None = None  # no step begins after this time (`time.perf_counter_ns`); None: no limit
-    relief: F32 | None = None  # (h, w) the content's relief on the middle panel, for the presenter (`optics.relief`)
+    relief: F32 | None = None  # (h, w) relief of the content on the middle panel, for the presenter (`optics.relief`)
 
     @property
     def views(self) -> tuple[TargetView, TargetView]:
@@ -103,7 +104,7 @@ class Job:
 
     @property
     def stack(self) -> PanelStack:
-        """Panels with the raster that is solved."""
+        """Panels with the raster to solve."""
         return self.targets.stack
 
     @property
@@ -113,7 +114,7 @@ class Job:
 
     @property
     def savings(self) -> Savings:
-        """Work that this job saves."""
+        """Reduced amount of work of this job."""
         box = None if self.window is None else self.window.box
         pixels = self.stack.width_px * self.stack.height_px
         return Savings(1.0 if box is None else box.width_px * box.height_px / pixels, self.channels)
@@ -122,7 +123,12 @@ class Job:
 def drawn_views(
     pictures: Sequence[U8 | DrawnPicture], stack: PanelStack, window: SolveWindow | None = None
 ) -> tuple[TargetView, TargetView]:
-    """Return left and right views of pictures (h, w, 3 or 4) on the middle panel or its window."""
+    """Return the left and right view of pictures that were drawn on the middle panel's pixels.
+
+    Args:
+        pictures: Left and right (h, w, 3 or 4) picture.
+        window: Window whose pixels the pictures cover. If None, the pictures cover the whole panel.
+    """
     raster = stack.panel(stack.count // 2)
     if window is not None:
         raster = window.box.cut(raster)
@@ -131,11 +137,20 @@ def drawn_views(
 
 
 def drawn_job(pictures: Sequence[U8 | DrawnPicture], eyes_m: F64, stack: PanelStack) -> Job:
-    """Return the job of a whole stack for eyes (2, 3) and pictures (h, w, 3 or 4) on the middle panel."""
+    """Return a job without a window for pictures that were drawn on the middle panel's pixels.
+
+    Args:
+        pictures: Left and right (h, w, 3 or 4) picture.
+        eyes_m: (2, 3) left and right eye in frame `stack`.
+    """
     return Job(Targets(stack, eyes_m, drawn_views(pictures, stack)))
 
 
 def grey_job(eyes_m: F64, stack: PanelStack) -> Job:
-    """Return a job with grey pictures, to warm up with."""
+    """Return a job with uniformly grey pictures, which is used to warm up a model.
+
+    Args:
+        eyes_m: (2, 3) left and right eye in frame `stack`.
+    """
     grey = np.full((stack.height_px, stack.width_px, 4), 128, np.uint8)
     return drawn_job((grey, grey), eyes_m, stack)
