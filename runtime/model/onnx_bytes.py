@@ -1,6 +1,6 @@
-"""Read an ONNX file's digest and its references to other files without loading the model.
+"""Compute the digest of an ONNX file and find references to other files, without loading the model.
 
-The file is a protocol buffer, a sequence of tags and values. Field numbers are those of onnx.proto.
+The file is a protocol buffer, which is a sequence of tags and values. The field numbers are defined in onnx.proto.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import hashlib
 from collections.abc import Iterator
 
 MODEL_METADATA = 14
-# Messages that may contain a tensor, and the numbers of their fields that hold such messages.
+# Messages that may contain a tensor: numbers of the fields that hold further such messages, and the types of these.
 PARTS: dict[str, dict[int, str]] = {
     "model": {7: "graph", 25: "function"},
     "graph": {1: "node", 5: "tensor", 15: "sparse tensor"},
@@ -20,13 +20,15 @@ PARTS: dict[str, dict[int, str]] = {
 }
 TENSOR_EXTERNAL, TENSOR_LOCATION = 13, 14
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
-DEEPEST = 32  # deepest nesting of graphs within attributes of graphs
+DEEPEST = 32  # maximum nesting depth of graphs in attributes of graphs
 
 
 def fields(data: memoryview) -> Iterator[tuple[int, memoryview, memoryview]]:
-    """Yield (number, value, whole field) for each field of a message.
+    """Yield the number, the value and the whole bytes of each field of a message.
 
-    The value of a field that holds the number 0 is empty. Raises ValueError if the bytes are not a message.
+    The value of a variable-length integer is empty if the integer is 0.
+
+    Raises ValueError if the bytes are not a message.
     """
     at = 0
     while at < len(data):
@@ -52,7 +54,7 @@ def fields(data: memoryview) -> Iterator[tuple[int, memoryview, memoryview]]:
 
 
 def digest(data: bytes) -> str:
-    """Return the SHA-256 of a model without its metadata. Raises ValueError if it is malformed."""
+    """Return the SHA-256 of a model without its metadata. Raises ValueError if the model is malformed."""
     digester = hashlib.sha256()
     for number, _, whole in fields(memoryview(data)):
         if number != MODEL_METADATA:
@@ -61,9 +63,9 @@ def digest(data: bytes) -> str:
 
 
 def has_external_data(data: bytes) -> bool:
-    """Return True if a tensor of a model is stored in another file.
+    """Return True if a model stores a tensor in another file.
 
-    Raises ValueError if the model is malformed.
+    Raises ValueError if the model is malformed or nested too deep.
     """
     return _refers_to_a_file("model", memoryview(data), DEEPEST)
 

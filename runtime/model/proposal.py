@@ -1,7 +1,8 @@
-"""Proposals by a network for the outer panels, from which the steps begin.
+"""Proposals for the outer panels by a network. The solver's steps start from a proposal.
 
-The network receives the difference of both eyes' pictures on a separate raster (`chain`) along the line through the
-eyes, where an eye's parallax is a whole number of columns. It returns both outer panels on that raster.
+The network receives the difference between the eyes' pictures on a separate raster (`chain`). The rows of the raster
+are parallel to the line through the eyes, and the parallax is a whole number of columns. The network returns both outer
+panels on the same raster.
 """
 
 from __future__ import annotations
@@ -27,45 +28,54 @@ from runtime.optics.tilt import coarse_layer_from_seen
 from runtime.records import F32, F64, I16
 from runtime.support.threads import parallel_map
 
-HALF_BASELINE_M = 0.031  # assumed if a single eye stands in for both; any value works
-EDGE_SHARE = 1 / 40  # a picture's edge pixels are repeated outwards by at most this share of its size
-UNSEEN = -1  # marks pixels that an eye does not see; targets are positive
-SHARPENED = 0.2  # gain by which the difference is sharpened on either side, against the blur of two interpolations
+HALF_BASELINE_M = 0.031  # half of the assumed eye separation if one eye replaces the other; any value works
+EDGE_SHARE = 1 / 40  # a picture's edge pixels are repeated outwards by at most this share of the picture's size
+UNSEEN = -1  # value of pixels that an eye does not see; targets are not negative
+SHARPENED = 0.2  # gain of the sharpening that compensates for the blur of two interpolations
 SHARPENING = np.array([-SHARPENED, 1 + 2 * SHARPENED, -SHARPENED])
-EVEN = rest_of(3)  # an outer panel at rest, sixteenths of a code
-_SWAPPED = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # (y, z, 1) from (-z, -y, 1), and back
+EVEN = rest_of(3)  # rest value of an outer panel in sixteenths of a code
+_SWAPPED = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # swaps (y, z, 1) and (-z, -y, 1)
 
 
 class Proposal(Protocol):
-    """A network that proposes the panels from which the steps begin."""
+    """Network that proposes values of panels, from which the solver's steps start."""
 
-    any_raster: bool  # can propose panels of any size, and windows of them
+    any_raster: bool  # True if the network can propose panels of any size, and windows of panels
     session: ModelSession
 
     def panels(self, job: Job, geometry: Geometry, watch: Stopwatch) -> dict[int, I16]:
-        """Return the box (rows, columns[, 3]) of each proposed panel, in sixteenths of a code, by panel.
+        """Return the proposed values in the boxes of the panels.
 
-        Panels that are missing stay at rest. Raises ModelFailure or its subclass EyesNotServed.
+        Args:
+            watch: Stopwatch to which the times of the stages "prepare" and "inference" are added.
+
+        Returns:
+            For each proposed panel, the (rows, columns[, 3]) values of its box in sixteenths of a code. Panels without
+            a proposal stay at the rest value.
+
+        Raises:
+            ModelFailure: Inference failed or returned numbers that are not finite.
+            EyesNotServed: The network does not support the job's eye positions.
         """
 
 
 @dataclass(frozen=True, slots=True)
 class _Local:
-    """A window of the panels as a separate stack, rotated so that the eyes are roughly level."""
+    """Window of the panels as a separate stack, which may be transposed to make the eyes roughly level."""
 
     stack: PanelStack
-    eyes_m: F64  # (2, 3), the eye on the left of this stack first
-    order: tuple[int, int]  # indices of these eyes in the whole stack
-    plane_from_local: F64  # 3x3, (y, z, 1) of frame `stack` from this stack's
+    eyes_m: F64  # (2, 3) eyes in the window's frame; the first eye is on the left in this frame
+    order: tuple[int, int]  # indices of these eyes in the job
+    plane_from_local: F64  # 3x3 map from (y, z, 1) in the window's frame to (y, z, 1) in frame `stack`
 
     def in_stack(self, point_m: F64) -> F64:
-        """Convert a point (3,) of this stack to frame `stack`."""
+        """Convert a point (3,) from the window's frame to frame `stack`."""
         y_m, z_m, _ = self.plane_from_local @ (point_m[1], point_m[2], 1.0)
         return np.array([point_m[0], y_m, z_m])
 
 
 class ChainProposal:
-    """Proposals by a network whose `input_frame` is `chain`, for three (nearly) evenly spaced panels."""
+    """Proposals by a network whose `input_frame` is `chain`, for three panels with roughly equal gaps."""
 
     any_raster = True
 
@@ -87,7 +97,7 @@ class ChainProposal:
         )
 
         def residual(side: int) -> I16:
-            """Return half of an eye's targets minus the other eye's, on the first eye's rays."""
+            """Return half the difference between the eyes' targets, along the rays of eye `side`."""
             to_plane = local.plane_from_local @ frame.plane_from_frame(local.eyes_m[side], x_m=middle_x_m)
             own, other = (
                 warp(
@@ -98,7 +108,7 @@ class ChainProposal:
             )  # fmt: skip
             return _residual(own, other)
 
-        # One thread does all the work for an eye: handing over single operations would take longer than small ones do.
+        # Each eye is processed by one thread, because passing small operations between threads would take longer.
         left, right = parallel_map(residual, (0, 1))
         waves, shifted_waves, spectrum, modes_in = chain_modes(frame.cells)
         feeds: dict[str, NDArray[Any]] = {
@@ -121,9 +131,10 @@ class ChainProposal:
         return dict(zip(outer, panels, strict=True))
 
     def _target_codes(self, view: TargetView, channels: int) -> tuple[I16, F64]:
-        """Return each pixel's target sum and the view's 3x3 map to pixels from the middle panel's plane.
+        """Return the target sum of panel values for each pixel of a view, and the view's inverse homography.
 
-        Sums are in sixteenths of a code, up to a constant.
+        The sums are in sixteenths of a code and may differ from the true sums by a constant. The inverse homography
+        (3x3) maps points (y, z, 1) of the middle panel's plane to pixels of the view.
         """
         codes = cv2.LUT(without_alpha(view.pixels, channels), self._codes)
         return np.asarray(codes, np.int16), np.asarray(np.linalg.inv(view.plane_from_picture), np.float64)
@@ -134,7 +145,7 @@ class ChainProposal:
         middle_m = local.in_stack(frame.middle_m)
         seen_from_layer = np.linalg.inv(coarse_layer_from_seen(geometry.stack, n, middle_m))
         to_frame = frame.frame_from_plane(x_m=raster.x_m) @ np.linalg.inv(local.plane_from_local)
-        # The output begins one parallax before the raster's first column.
+        # The output begins `cell_px` columns (one parallax) before the raster's first column.
         begin = np.array([[1.0, 0.0, frame.cell_px], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
         columns = ColumnLaw(frame.columns.bend, frame.columns.middle + frame.cell_px)
         matrix = begin @ to_frame @ seen_from_layer @ raster.plane_from_raster()
@@ -148,7 +159,10 @@ class ChainProposal:
 
 
 def _residual(own: I16, other: I16) -> I16:
-    """Return half of an eye's target minus the other eye's, sharpened."""
+    """Return half the difference between an eye's targets and the other eye's targets, sharpened.
+
+    The result is 0 where one of the eyes sees nothing (`UNSEEN`), except for the effect of the sharpening.
+    """
     half = np.asarray(cv2.subtract(own, other), np.int16) >> 1
     # Rays outside one eye's picture have no residual.
     np.copyto(half, 0, where=cv2.min(own, other) < 0)
@@ -167,17 +181,25 @@ def _local(geometry: Geometry, *, whole: bool) -> _Local:
         eyes_m = eyes_m - np.array([0.0, y_m, z_m])
         plane_from_local = np.array([[1.0, 0.0, y_m], [0.0, 1.0, z_m], [0.0, 0.0, 1.0]])
     apart_m = np.abs(eyes_m[1] - eyes_m[0])
-    if apart_m[2] > apart_m[1]:  # if one eye is above the other, down (-z) becomes right (+y)
+    if apart_m[2] > apart_m[1]:  # one eye is above the other: transpose, so down (-z) becomes right (+y)
         eyes_m = np.stack([eyes_m[:, 0], -eyes_m[:, 2], -eyes_m[:, 1]], axis=1)
         stack, plane_from_local = replace(stack, tilt=None).transposed(), plane_from_local @ _SWAPPED
-    elif not apart_m.any():  # if a single eye stands in for both there is no difference, so any line will do
+    elif not apart_m.any():  # one eye replaces the other: the pictures do not differ, and any line is suitable
         eyes_m = eyes_m + HALF_BASELINE_M * np.array([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
     order = (0, 1) if eyes_m[1, 1] >= eyes_m[0, 1] else (1, 0)
     return _Local(stack, eyes_m[list(order)], order, plane_from_local)
 
 
 def _wave_taper(geometry: Geometry, raster: PlaneRaster, middle_m: F64) -> F32:
-    """Return the taper (rows, columns) of an outer panel: 0 at the window's edges, 1 inside."""
+    """Return the (rows, columns) weights by which the proposal for an outer panel is tapered.
+
+    The weights are 1 inside the window and fall to 0 at its edges. Positions are projected from the outer panel to the
+    centre panel along the rays of `middle_m`.
+
+    Args:
+        raster: Pixels of the outer panel's box.
+        middle_m: (3,) point between the eyes in frame `stack`.
+    """
     stack, kept = geometry.stack, geometry.kept
     centre = stack.panel(stack.count // 2)
     share = (centre.x_m - raster.x_m) / (middle_m[0] - raster.x_m)
