@@ -1,4 +1,4 @@
-"""Run a model in onnxruntime with buffers that are bound once."""
+"""Load models, check them, and run them in onnxruntime with buffers that are bound only once."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from runtime.support.onnx_runtime import onnxruntime
 from runtime.support.untrusted_input import LIMITS
 
 FILE_BYTES_MAX = 1 << 30
-MEMORY_MAX = 1 << 30  # bytes that a process which loads an untrusted file may use, in addition to 8 times the file
+MEMORY_MAX = 1 << 30  # memory limit in bytes for loading an untrusted file, in addition to 8 times the file's size
 
 log = logging.getLogger("phasestack.model")
 
@@ -37,17 +37,24 @@ TYPES = {"tensor(float)": np.float32, "tensor(int16)": np.int16}
 NEWER_OPSET = re.compile(r"(Opset) (\d+) is under development.*till opset (\d+)")
 NEWER_IR = re.compile(r"(IR version): (\d+), max supported IR version: (\d+)")
 ERROR_KIND = re.compile(r"^\[ONNXRuntimeError\] : \d+ : \w+ : ")
-SOURCE_PLACE = re.compile(r"/\S+\.(cc|h|cpp):\d+ .*\) ")  # source line and function in onnxruntime
+SOURCE_PLACE = re.compile(r"/\S+\.(cc|h|cpp):\d+ .*\) ")  # reference to onnxruntime's source code in a message
 Shape = tuple[int, ...]
 
 
 class ModelSession:
-    """One loaded model. `run` binds a set of buffers once for each input shape, and reuses it."""
+    """Loaded model. `run` binds buffers once for each combination of shapes and then reuses them."""
 
     def __init__(self, path: Path, *, provider: str = "cpu", threads: int = 2, sha256: str = "") -> None:
-        """Load a model. Raises InputError (not ONNX, wrong digest, no contract) or MissingPart.
+        """Load a model and check it.
 
-        provider: MissingPart is raised if it is not installed. sha256: digest of the whole file; empty: unknown.
+        Args:
+            provider: Key of `PROVIDERS`.
+            sha256: Expected digest of the file. If it is empty (unknown), the file is first loaded in a child process.
+
+        Raises:
+            InputError: The file is not an ONNX model that onnxruntime can load, a digest differs, or the contract is
+                missing or does not fit the graph.
+            MissingPart: The provider is not installed or does not start.
         """
         ort = onnxruntime()
         name, package = PROVIDERS[provider]
@@ -55,7 +62,7 @@ class ModelSession:
             raise MissingPart(f"model.provider: {provider} is not installed: pip install {package}")
         options = ort.SessionOptions()
         options.intra_op_num_threads = threads
-        # A spinning thread pool takes cores from the camera and the renderer.
+        # The threads of a spinning pool would take cores from the camera and the renderer.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.log_severity_level = 3
         options.add_session_config_entry(RECORD_NODES, "1")
@@ -67,11 +74,11 @@ class ModelSession:
             metadata = self._session.get_modelmeta().custom_metadata_map
         except UnicodeDecodeError:
             raise InputError(path, "metadata", "is not valid UTF-8") from None
-        if name not in self._session.get_providers():  # onnxruntime continues without it, with only a message on stderr
+        if name not in self._session.get_providers():  # onnxruntime only prints a message and uses another provider
             problem = f"is installed but does not start: check {package} and its driver"
             raise MissingPart(f"model.provider: {provider} {problem}")
         self.provider: str = provider
-        self.fell_back = nodes_elsewhere(self._session, name)  # nodes of the graph that another provider runs
+        self.fell_back = nodes_elsewhere(self._session, name)  # nodes of the graph that run on another provider
         if count := len(self.fell_back):
             names = ", ".join((*self.fell_back[:NODES_LOGGED], *(["..."] if count > NODES_LOGGED else [])))
             log.warning("%s leaves %d node%s to another provider: %s", provider, count, "s" * (count != 1), names)
@@ -84,15 +91,21 @@ class ModelSession:
         self._bound: dict[tuple[Any, ...], tuple[Any, dict[str, Any], dict[str, Any]]] = {}
 
     def run(self, feeds: Mapping[str, NDArray[Any]], shapes: Mapping[str, Shape]) -> dict[str, NDArray[Any]]:
-        """Run the model on `feeds` (inputs by name) and return its outputs by name.
+        """Run the model and return its outputs by name.
 
-        shapes: of the outputs, by name. The outputs are the session's own buffers, valid until the next run with the
-        same shapes. Raises ModelFailure if onnxruntime fails.
+        The outputs are buffers of the session, whose contents are valid until the next run with the same shapes.
+
+        Args:
+            feeds: Inputs by name.
+            shapes: Shapes of the outputs by name.
+
+        Raises:
+            ModelFailure: onnxruntime failed.
         """
         key = (*((name, array.shape) for name, array in feeds.items()), *shapes.items())
         try:
             if key not in self._bound:
-                if len(self._bound) > 8:  # a viewer who walks about causes only a few shapes
+                if len(self._bound) > 8:  # a walking viewer causes only a few shapes
                     self._bound.clear()
                 self._bound[key] = self._bind(feeds, shapes)
             binding, values, results = self._bound[key]
@@ -117,7 +130,7 @@ class ModelSession:
         return binding, values, results
 
     def _check_ports(self, path: Path) -> None:
-        """Raise InputError unless the graph has the inputs and outputs that the contract declares."""
+        """Raise InputError if the graph's ports differ from the contract's or have an unsupported type."""
         for field, ports, items in (
             ("inputs", self.contract.inputs, self._session.get_inputs()),
             ("outputs", self.contract.outputs, self._session.get_outputs()),
@@ -133,10 +146,17 @@ class ModelSession:
                     raise InputError(path, f"{field}.{item.name}", problem)
 
     def check_fits(self, source: Path, feeds: Mapping[str, Shape], answers: Mapping[str, Shape]) -> None:
-        """Raise InputError, which names the port, unless the graph's ports have these names and shapes.
+        """Check the shapes of the graph's inputs and outputs.
 
-        feeds: shapes of the inputs by name; answers: of the outputs. If the graph leaves sizes open, the model is run
-        once.
+        If the graph does not specify all sizes, the model is run once.
+
+        Args:
+            source: Model file that an error message names.
+            feeds: Expected shapes of the inputs by name.
+            answers: Expected shapes of the outputs by name.
+
+        Raises:
+            InputError: A shape differs, or the model does not run with these shapes.
         """
         is_open = False
         for field, items, shapes in (
@@ -165,9 +185,13 @@ class ModelSession:
 
 
 def nodes_elsewhere(session: Any, provider: str) -> tuple[str, ...]:
-    """Return the names (or kinds) of the graph's nodes that do not run on the requested provider.
+    """Return the names of the graph's nodes that do not run on the requested provider.
 
-    session: created with RECORD_NODES. Nodes are those after onnxruntime's basic optimizations.
+    The nodes are those that remain after onnxruntime's basic optimizations. A node without a name is represented by its
+    operator type.
+
+    Args:
+        session: Session of onnxruntime that was created with the option `RECORD_NODES`.
     """
     return tuple(
         node.name or node.op_type
@@ -200,13 +224,15 @@ def _opened(path: Path, data: bytes, options: Any, provider: str) -> Any:
         raise InputError(path, "", _why_not_loaded(error)) from None
 
 
-_tried_out: set[bytes] = set()  # digests of files that are known to load within the limits
+_tried_out: set[bytes] = set()  # digests of files that have been loaded within the limits
 
 
 def _try_out(path: Path, data: bytes) -> None:
-    """Load the file in a child process with limited memory and time. Raises InputError if that fails.
+    """Load a file in a child process with limited memory and time, unless this has succeeded before.
 
-    When a model is loaded, a few bytes of constants can expand until they fill all memory.
+    The limits are necessary because a few bytes of constants can expand while a model is loaded and fill all memory.
+
+    Raises InputError if the file cannot be loaded within the limits.
     """
     checksum = hashlib.sha256(data).digest()
     if checksum not in _tried_out:
@@ -222,7 +248,10 @@ def _tried_here(path: Path, data: bytes) -> None:
 
 
 def _why_not_loaded(error: Exception) -> str:
-    """Return why onnxruntime could not load a model, with both versions if the model is too new."""
+    """Return the reason why onnxruntime could not load a model.
+
+    If the model is too new, the reason names the model's version and the newest supported version.
+    """
     text = str(error)
     for found in (NEWER_OPSET.search(text), NEWER_IR.search(text)):
         if found:

@@ -1,6 +1,7 @@
-"""Solver: propose the outer panels, solve the middle panel, then run steps (docs/mathematics.md).
+"""Solver, which proposes the outer panels, solves the middle panel, and then runs steps.
 
-The devices (`cpu`, `gl`) implement the single operations; this module calls them in order.
+The algorithm is described in docs/mathematics.md. This module calls the operations in order. The devices (`cpu` and
+`gl`) implement the operations.
 """
 
 from __future__ import annotations
@@ -20,14 +21,14 @@ from runtime.model.proposal import Proposal
 from runtime.optics.malus import rest_code
 from runtime.optics.stack import PanelStack
 
-_Done = tuple[int, int | None]  # all steps; how many of them an earlier solution had done, None: not continued
+_Done = tuple[int, int | None]  # number of steps, and number of steps by earlier solutions; None: not continued
 REDUCTIONS = (1, 2, 3, 4)  # supported rasters, as divisors of the display's rows and columns
-REFINED_STEPS = 8  # a solution is continued up to this many steps, the number of `best`
-REFINING = (Step(size=0.8, places="falling"), Step(size=0.8, places="rising"))  # alternate after the model's
+REFINED_STEPS = 8  # a solution is continued up to this number of steps, which is the number of `best`
+REFINING = (Step(size=0.8, places="falling"), Step(size=0.8, places="rising"))  # alternate after the model's steps
 
 
 class StepPredictor(Predictor):
-    """Model that runs steps from a network's proposal or from panels at rest, for any stack and eyes."""
+    """Model that runs steps, starting from a network's proposal or from panels at the rest value."""
 
     def __init__(
         self,
@@ -39,7 +40,15 @@ class StepPredictor(Predictor):
         threads: int = 2,
         backend: SolverBackend | None = None,
     ) -> None:
-        """Create the model. Without a proposal, panels start at rest; the default backend is the processor."""
+        """Create the model.
+
+        Args:
+            proposal: Network whose proposal the steps start from. If None, all panels start at the rest value.
+            steps: Steps of a solution.
+            name: Name of the model for the user.
+            threads: Number of threads on the processor.
+            backend: Device for everything except the network. By default, the processor.
+        """
         self.stack, self.name, self._proposal, self._steps = stack, name, proposal, tuple(steps)
         self.provider, self.parameters, self._threads = "cpu", 0, threads
         if proposal is not None:
@@ -53,7 +62,8 @@ class StepPredictor(Predictor):
         self.refined_steps = max(self.steps, REFINED_STEPS)
         self._backend: SolverBackend = backend or CpuBackend()
         self._rasters: dict[PanelStack, tuple[SolverState, LayerPool]] = {}
-        self._improved: tuple[Geometry, int, int] | None = None  # rays, channels and steps of the panels in the state
+        # Geometry, channels and number of steps of the newest solution, whose panels the state still holds.
+        self._improved: tuple[Geometry, int, int] | None = None
 
     @property
     def backend(self) -> str:  # type: ignore[override]
@@ -79,7 +89,7 @@ class StepPredictor(Predictor):
         state, pool = self._rasters[job.stack]
         buffer, rest, window = pool.take(), rest_code(job.stack.count), job.window
         done: _Done = 0, None
-        if window is None:  # solve all that the eyes see or, with a network of whole pictures, all that it proposes
+        if window is None:  # solve everything that the eyes see, or all pixels if the network proposes whole panels
             geometry = job.targets.visible if self.any_raster else job.targets.every_pixel
             done = self._improve(job, geometry, state, buffer, watch, outside=rest)
         else:
@@ -103,7 +113,13 @@ class StepPredictor(Predictor):
         *,
         outside: int | tuple[int, ...] | None,
     ) -> _Done:
-        """Run steps from the proposal, or from the previous solution's panels if their rays are the same."""
+        """Run steps from the proposal, or continue the previous solution if the rays are the same.
+
+        The result is written to `buffer`.
+
+        Args:
+            outside: Contents of the middle panel outside its box (`SolverState.write`).
+        """
         before = self._improved
         resumed = job.continued and before is not None and before[1] == job.channels and geometry.is_like(before[0])
         first = before[2] if before is not None and resumed else None
