@@ -23,9 +23,9 @@ from runtime.records import I16, U8
 class PictureProposal:
     """Proposals by a model whose `input_frame` is `panel` or `centre`.
 
-    The network reads one picture per eye for every panel (`panel`) or for the centre panel only (`centre`). The
-    layout is NCHW, and the channels are ordered by panel, then by eye, then by colour. Each picture is warped to the
-    pixels of the panel (EyeReal supplement, (47)). It is black outside the contract's field of view, as in training.
+    The network reads one picture per eye for every panel (`panel`) or for the centre panel only (`centre`). The layout
+    is NCHW, and the channels are ordered by panel, then by eye, then by colour. Each picture is warped to the pixels of
+    the panel (EyeReal supplement, (47)). It is black outside the contract's field of view, as in training.
     """
 
     any_raster = False  # the network can only propose whole panels of one size

@@ -1,4 +1,4 @@
-"""Tables that convert a picture's 8-bit codes to target sums of panel values, in fixed point."""
+"""Tables that convert the 8-bit codes of a picture to target sums of panel values in fixed point."""
 
 from __future__ import annotations
 
@@ -12,26 +12,30 @@ from runtime.optics.malus import Branch, phase_from_intensity, rest_code, rest_v
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, I16, U8
 
-SLOPE_FLOOR = 0.25  # least weight of a ray, relative to the steepest slope of sin²
-COARSE_STEP = 16  # spacing in pixels of a quick test that recognises most coloured pictures
+SLOPE_FLOOR = 0.25  # minimum weight of a ray; the steepest slope of sin² has the weight 1
+COARSE_STEP = 16  # distance in pixels between the samples of a quick test that recognises most coloured pictures
 
 
 def rest_of(panels: int) -> int:
-    """Return the value of a panel at rest, in sixteenths of a code."""
+    """Return the rest value of a panel in sixteenths of a code."""
     return round(rest_value(panels) * FULL)
 
 
 def slope_of(panels: int) -> int:
-    """Return the slope of sin² used for the sums: 1 (falling, sums 1 to 2) or 2 (rising, 2 to 3)."""
+    """Return the slope of sin² on which the sums of panel values are, counted from 0.
+
+    Slope 1 is the falling slope for sums from 1 to 2. Slope 2 is the rising slope for sums from 2 to 3.
+    """
     return int(rest_value(panels) * panels)
 
 
 @lru_cache(maxsize=8)
 def target_table(panels: int) -> F32:
-    """Return (256, 2) target sums of the panels and their weights, for each code an eye should see.
+    """Return the (256, 2) target sums of panel values and their weights.
 
-    Sums are in sixteenths of a code; each is the solution nearest to the rest state. The weight is the slope of sin²
-    there, 1 where it is steepest.
+    The table has a row for each code that an eye should see. Of all sums that show a code, the target is the sum
+    nearest to the panels' rest values. It is in sixteenths of a code. The weight depends on the slope of sin² at the
+    target and is 1 at the steepest slope.
     """
     intensities = np.arange(256) / 255.0
     slope = slope_of(panels)
@@ -43,13 +47,18 @@ def target_table(panels: int) -> F32:
 
 @lru_cache(maxsize=8)
 def middle_codes(panels: int) -> U8:
-    """Return the (256,) middle-panel codes with which an eye sees each code while the other panels rest."""
+    """Return the (256,) middle-panel codes that show each code if the other panels are at rest."""
     codes = (target_table(panels)[:, 0] - (panels - 1) * rest_of(panels)) / SUBCODE
     return np.clip(np.rint(codes), 0, 255).astype(np.uint8)
 
 
 def outside_codes(panels: int, n: int, outside: int | tuple[int, ...]) -> list[int]:
-    """Return the RGB code of panel `n` outside the window: `outside` for the middle panel, others rest."""
+    """Return the RGB code of panel `n` outside the window.
+
+    Args:
+        outside: Code of the middle panel, or RGB colour that the eyes should see there. Other panels have the rest
+            code.
+    """
     if n != panels // 2:
         return [rest_code(panels)] * 3
     return middle_codes(panels)[list(outside)].tolist() if isinstance(outside, tuple) else [outside] * 3
@@ -57,7 +66,9 @@ def outside_codes(panels: int, n: int, outside: int | tuple[int, ...]) -> list[i
 
 @lru_cache(maxsize=4)
 def phase_codes(branch: Branch = 2) -> I16:
-    """Return the (256,) phase sums, in sixteenths of a panel code, for each code that an eye should see."""
+    """Return the (256,) sums of panel values for each code that an eye should see.
+
+    The sums are in sixteenths of a code."""
     codes = np.arange(256) / 255.0
     return np.rint(phase_from_intensity(codes, branch) * FULL).astype(np.int16)
 
@@ -72,7 +83,7 @@ def is_grey(picture: U8) -> bool:
 
 
 def without_alpha(picture: U8, channels: int) -> U8:
-    """Return a contiguous picture (h, w, 3), or (h, w) if `channels` is 1 because it is grey."""
+    """Return a contiguous (h, w, 3) picture. If `channels` is 1, return only its first channel (h, w)."""
     if channels == 1:
         return np.asarray(cv2.extractChannel(picture, 0), np.uint8)
     if picture.shape[2] == 3:
@@ -81,10 +92,10 @@ def without_alpha(picture: U8, channels: int) -> U8:
 
 
 def flat_layers(image: U8, stack: PanelStack) -> U8:
-    """Return (N, h, w, 4) layers that show every eye the same picture (h, w, 4)."""
+    """Return (N, h, w, 4) layers that show the same (h, w, 4) picture to all eyes."""
     middle = stack.count // 2
     layers = np.full((stack.count, stack.height_px, stack.width_px, 4), 255, np.uint8)
-    # The other panels share the sum at which the slope starts; the middle one adds the picture to it.
+    # The other panels add up to the sum at which the slope begins. The middle panel adds the picture.
     even = slope_of(stack.count) * 255 // (stack.count - 1)
     layers[..., :3] = even
     sums = np.rint(target_table(stack.count)[:, 0] / SUBCODE)

@@ -78,8 +78,8 @@ class Passes:
     ) -> None:
         """Draw the pass of a shader into all outputs.
 
-        Inputs and uniforms have the shader's names for them; unused inputs are ignored. defines: as for `source`;
-        at: (first column, first row, width, height) to draw, by default all of the first output.
+        Inputs and uniforms have the shader's names for them; unused inputs are ignored. defines: as for `source`; at:
+        (first column, first row, width, height) to draw, by default all of the first output.
         """
         raise_if_abandoned()
         program, array, held = self._program(name, defines)
