@@ -17,16 +17,20 @@ from runtime.optics.stack import PlaneRaster
 from runtime.records import F64, I16, U8
 from runtime.support.threads import on_rows
 
-LEAST_PX, MIN_SCALE = 16, 0.25  # least side and scale of a resized picture; a smaller scale adds no information
-REACH_PX = EDGE_PX - 1.0  # largest extension of an image's edge
-LARGEST = 8191  # largest absolute value that the compiled loop can sample
+# Minimum side of a resized picture, and minimum number of old pixels per new pixel. Enlarging a picture further adds no
+# information.
+LEAST_PX, MIN_SCALE = 16, 0.25
+REACH_PX = EDGE_PX - 1.0  # maximum distance to which an image's edge is repeated outwards
+LARGEST = 8191  # maximum absolute value that the compiled loop can sample
 _TRANSPOSED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def source_px(image_from_raster: F64, size: tuple[int, int]) -> tuple[float, float]:
-    """Return how many image pixels a raster pixel spans, right and down, at the raster's middle.
+    """Return the numbers of image pixels that a raster pixel spans, to the right and down, at the centre.
 
-    size: (width, height) of the raster.
+    Args:
+        image_from_raster: 3x3 homography from pixels of the raster to pixels of the image.
+        size: Width and height of the raster.
     """
     a = image_from_raster
     x, y, w = a @ (size[0] / 2, size[1] / 2, 1.0)
@@ -35,12 +39,16 @@ def source_px(image_from_raster: F64, size: tuple[int, int]) -> tuple[float, flo
 
 
 def resized_px(pixels: int, scale: float) -> int:
-    """Return the number of pixels that replace `pixels` if each new one covers `scale` old ones."""
+    """Return the number of new pixels for `pixels` old pixels if a new pixel covers `scale` old pixels."""
     return max(min(pixels, LEAST_PX), round(pixels / max(scale, MIN_SCALE)))
 
 
 def reduced_view(view: TargetView, middle: PlaneRaster, reduction: int) -> TargetView:
-    """Average a view down to about one pixel per `reduction` x `reduction` middle-panel pixels."""
+    """Average a view's picture down to about one pixel per `reduction` x `reduction` panel pixels.
+
+    Args:
+        middle: Pixel grid of the middle panel.
+    """
     picture = view.pixels
     picture_from_middle = np.linalg.inv(view.plane_from_picture) @ middle.plane_from_raster()
     scales = source_px(picture_from_middle, (middle.width_px, middle.height_px))
@@ -50,7 +58,7 @@ def reduced_view(view: TargetView, middle: PlaneRaster, reduction: int) -> Targe
     )
     if (by_u, by_v) == (1, 1):
         return TargetView(picture, view.plane_from_picture)
-    # OpenCV shrinks by whole factors ten times as fast.
+    # Crop to a multiple of the factors, because OpenCV shrinks by whole factors ten times as fast.
     cropped = picture[: height // by_v * by_v, : width // by_u * by_u]
     small = cv2.resize(cropped, (width // by_u, height // by_v), interpolation=cv2.INTER_AREA)
     return TargetView(np.asarray(small, np.uint8), view.plane_from_picture @ np.diag([by_u, by_v, 1.0]))
@@ -59,10 +67,15 @@ def reduced_view(view: TargetView, middle: PlaneRaster, reduction: int) -> Targe
 def picture_on(
     view: TargetView, middle: PlaneRaster, *, middle_from_result: F64, edge: int, size: tuple[int, int]
 ) -> U8:
-    """Resample a view's picture (rows, columns, 3 or 4) to a raster of `size` (rows, columns).
+    """Resample a view's (rows, columns, 3 or 4) picture to another raster.
 
-    middle_from_result: 3x3 map from that raster's pixels to the middle panel's. A picture that is already on that
-    raster is returned unchanged. edge: OpenCV's border mode.
+    If the picture's pixels already coincide with the raster, the picture is returned unchanged.
+
+    Args:
+        middle: Pixel grid of the middle panel.
+        middle_from_result: 3x3 homography from pixels of the raster to pixels of the middle panel.
+        edge: OpenCV's border mode.
+        size: Rows and columns of the raster.
     """
     picture_from_result = np.linalg.inv(view.plane_from_picture) @ middle.plane_from_raster() @ middle_from_result
     picture_from_result = picture_from_result / picture_from_result[2, 2]
@@ -74,9 +87,13 @@ def picture_on(
 def resample(
     image: NDArray[Any], image_from_result: F64, *, size: tuple[int, int], edge: int = cv2.BORDER_CONSTANT
 ) -> NDArray[Any]:
-    """Sample an image (h, w[, C]) bilinearly on a raster of `size` (rows, columns).
+    """Sample an image (h, w[, C]) bilinearly on another raster.
 
-    Pixel centres are at half-integers. edge: OpenCV's border mode.
+    Args:
+        image_from_result: 3x3 homography from pixels of the raster to pixels of the image. Pixel centres are at
+            half-integers.
+        size: Rows and columns of the raster.
+        edge: OpenCV's border mode.
     """
     to_corners = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
     at_centres = np.linalg.inv(to_corners) @ image_from_result @ to_corners
@@ -95,15 +112,22 @@ def warp(
     result_columns: ColumnLaw = EVEN_COLUMNS,
     threads: int | None = None,
 ) -> I16:
-    """Resample an int16 image (h, w[, 3]) like `resample`, several times as fast.
+    """Resample an int16 image (h, w[, 3]) like `resample`, but several times as fast.
 
-    Values must be within ±LARGEST. The homography applies to columns that the two column laws have transformed; at
-    least one law must be even. outside: value of pixels more than `reach_px` (at most REACH_PX) outside the image; up
-    to there, the edge's value is used. threads: by default OpenCV's number.
+    Args:
+        image: Image, whose values are clipped to ±LARGEST.
+        image_from_result: 3x3 homography from columns and rows of the result to columns and rows of the image. The
+            columns of both are the coordinates t that the column laws define (`ColumnLaw`).
+        size: Rows and columns of the result.
+        outside: Value of pixels that are more than `reach_px` outside the image.
+        reach_px: Distance, at most REACH_PX, to which the values at the image's edge are repeated outwards.
+        image_columns: Column law of the image. At least one of the column laws must be even.
+        result_columns: Column law of the result.
+        threads: Number of threads. By default, the number that OpenCV uses.
     """
     x, y, w = image_from_result @ (result_columns.middle or size[1] / 2, size[0] / 2, 1.0)
     right, down = image_from_result[:2, 0] - np.array([x, y]) / w * image_from_result[2, 0]
-    turned = abs(down) > abs(right)  # the loop needs the result's rows to run along the image's
+    turned = abs(down) > abs(right)  # the compiled loop requires that the rows of result and image run the same way
     if turned and result_columns.bend:
         image, image_from_result, turned = np.swapaxes(image, 0, 1), _TRANSPOSED @ image_from_result, False
     elif turned:

@@ -1,1 +1,1 @@
-"""Operations of the solver as fragment shaders of OpenGL 3.3 core."""
+"""Operations of the solver, implemented as fragment shaders for the core profile of OpenGL 3.3."""

@@ -1,4 +1,4 @@
-"""Compile fragment shaders and draw with them from images into images."""
+"""Compile fragment shaders, and run them with images as inputs and outputs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CONSTANTS = f"FULL {FULL:.1f}", f"EDGE_CLAMP_PX {EDGE_CLAMP_PX:.1f}"
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """Part of a texture that is in use, starting at the texture's first row and column."""
+    """Used part of a texture, which begins at the texture's first row and column."""
 
     texture: Any  # moderngl.Texture
     width_px: int
@@ -34,7 +34,12 @@ class Image:
 
 
 def source(name: str, *, defines: Sequence[str] = ()) -> str:
-    """Return a shader's source code with its includes. defines: names that its `#ifdef`s test."""
+    """Return the source code of a shader, in which included files are inserted.
+
+    Args:
+        name: File name of the shader.
+        defines: Names to define for the shader's `#ifdef` lines.
+    """
 
     def read(file: str) -> str:
         return (resources.files(SHADERS) / "shaders" / file).read_text(encoding="ascii")
@@ -44,7 +49,7 @@ def source(name: str, *, defines: Sequence[str] = ()) -> str:
 
 
 class Passes:
-    """Shader programs of one context, each compiled on its first use."""
+    """Runs the shader programs of one context. A program is compiled on its first use."""
 
     def __init__(self, context: moderngl.Context) -> None:
         self.context = context
@@ -54,7 +59,7 @@ class Passes:
 
     @contextmanager
     def drawing(self) -> Iterator[None]:
-        """Prepare the context for drawing. Raises ContextLost if drawing fails."""
+        """Prepare the context for drawing. Raises ContextLost if OpenGL reports an error meanwhile."""
         try:
             self.context.enable_only(moderngl.NOTHING)
             yield
@@ -76,10 +81,15 @@ class Passes:
         defines: tuple[str, ...] = (),
         at: tuple[int, int, int, int] | None = None,
     ) -> None:
-        """Draw the pass of a shader into all outputs.
+        """Run a shader for every pixel of the outputs.
 
-        Inputs and uniforms have the shader's names for them; unused inputs are ignored. defines: as for `source`; at:
-        (first column, first row, width, height) to draw, by default all of the first output.
+        Args:
+            name: Name of the fragment shader without its suffix.
+            outputs: Images that the shader writes to.
+            inputs: Images by the names that the shader gives them. Images that the shader does not use are ignored.
+            uniforms: Other uniforms by the names that the shader gives them. Unused uniforms are ignored.
+            defines: Names to define for the shader's `#ifdef` lines.
+            at: First column, first row, width and height of the area to draw. By default, the whole first output.
         """
         raise_if_abandoned()
         program, array, held = self._program(name, defines)
@@ -95,7 +105,7 @@ class Passes:
         array.render(moderngl.TRIANGLES, vertices=3)
 
     def target(self, outputs: Sequence[Image]) -> Any:
-        """Return a framebuffer that draws into these images."""
+        """Return the framebuffer that draws into the textures of all outputs."""
         key = tuple(output.texture.glo for output in outputs)
         if key not in self._targets:
             self._targets[key] = self.context.framebuffer([output.texture for output in outputs])
@@ -103,13 +113,14 @@ class Passes:
 
     def forget(self, texture: Any) -> None:
         """Release a texture and its framebuffers."""
-        self.context.detect_framebuffer(0).use()  # moderngl binds the last one again, which must still exist
+        # moderngl later binds the framebuffer in use again, which must therefore still exist.
+        self.context.detect_framebuffer(0).use()
         for key in [key for key in self._targets if texture.glo in key]:
             self._targets.pop(key).release()
         texture.release()
 
     def release(self) -> None:
-        """Release programs and framebuffers, but no textures: their owners do that."""
+        """Release all programs and framebuffers. Textures are released by their owners."""
         self.context.detect_framebuffer(0).use()
         for target in self._targets.values():
             target.release()

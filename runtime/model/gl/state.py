@@ -1,8 +1,8 @@
-"""Solver on OpenGL: panels are textures, and steps are passes of fragment shaders.
+"""Solver backend on OpenGL, where panels are textures and steps are passes of fragment shaders.
 
-All data between steps are 16-bit values from 0 to 1 (see `shaders/places.glsl` for their meaning), which every driver
-can filter and draw into. A texture has one component if one channel is solved. Otherwise it has four, one of them
-unused, because OpenGL need not support drawing into three.
+All data between steps are 16-bit values from 0 to 1, which every driver can filter and draw into. Their meaning is
+described in `shaders/places.glsl`. If one channel is solved, a texture has one component. Otherwise it has four
+components, one of which is unused, because drivers need not support drawing into textures with three components.
 """
 
 from __future__ import annotations
@@ -31,12 +31,18 @@ PANELS, MIDDLE = 3, 1
 
 
 class GlBackend:
-    """Backend on one OpenGL context, whose programs its models share. Used on that context's thread."""
+    """Backend that runs the solver on one OpenGL context.
+
+    All models of the backend share its shader programs. Only the thread of the context may use the backend.
+    """
 
     name = "gl"
 
     def __init__(self, context: Any, stack: PanelStack) -> None:
-        """Raise InputError if a panel is too large for the driver. The caller releases `context`."""
+        """Create the backend. Raises InputError if a panel is too large for the driver.
+
+        The caller releases `context`.
+        """
         check_size(context, stack)
         self.context, self.passes = context, Passes(context)
 
@@ -49,14 +55,17 @@ class GlBackend:
 
 
 class GlState:
-    """`SolverState` of three panels, used only on its context's thread."""
+    """`SolverState` for three panels. Only the thread of the OpenGL context may use a state."""
 
     def __init__(self, passes: Passes, stack: PanelStack) -> None:
-        """Raise InputError if a panel is too large for the driver. `passes` may be shared."""
+        """Create the state. Raises InputError if a panel is too large for the driver.
+
+        Several states may share `passes`.
+        """
         check_size(passes.context, stack)
         self._passes, self._stack = passes, stack
         self._textures: dict[tuple[Any, ...], Any] = {}
-        self._names: dict[str, str] = {}  # image now in use for each role, for pairs that are swapped
+        self._names: dict[str, str] = {}  # image that currently has a role, for pairs of images that are swapped
         self._closed = False
 
     @contextmanager
@@ -96,7 +105,7 @@ class GlState:
         self._swap("last", "spare", MIDDLE)
 
     def start(self) -> None:
-        self._ahead = "last"  # until the first step
+        self._ahead = "last"  # the first step reads the panels themselves, because there is no momentum yet
 
     def step(self, step: Step) -> None:
         seen = self._geometry.panels_from_rays(step.places, self._sigma_m)
@@ -147,7 +156,10 @@ class GlState:
             self._textures = {}
 
     def _loaded(self, view: TargetView, side: int) -> tuple[Image, tuple[int, int]]:
-        """Return the image of an eye's target and the (column, row) of its first ray; uploads arrays."""
+        """Return the image of an eye's target picture and the (column, row) of the first ray in the image.
+
+        A picture that is an array is uploaded to a texture.
+        """
         rays = self._geometry.rays
         if isinstance(view.picture, DrawnPicture):
             texture = view.picture.texture
@@ -178,7 +190,7 @@ class GlState:
         return max(self._stack.width_px, self._stack.height_px, rays.width_px, rays.height_px)
 
     def _panel(self, name: str, n: int) -> Image:
-        """Return an image for a panel's box. Its texture is as large as the panel, so the box may move."""
+        """Return the image for a panel's box. Its texture is as large as the panel, so the box may move."""
         box, key = self._geometry.boxes[n], (self._names.get(f"{name} {n}", name), n)
         size = self._stack.width_px, self._stack.height_px
         return Image(self._texture(key, size, self._components, dtype="nu2"), box.width_px, box.height_px)
@@ -188,7 +200,7 @@ class GlState:
         self._names[a], self._names[b] = self._names.get(b, other), self._names.get(a, one)
 
     def _rays(self, name: str, places: int = 1) -> Image:
-        """Return an image for one quantity of each ray in a set."""
+        """Return the image for one quantity of all rays in a set."""
         image = self._ray_image(name, self._components, "nu2")
         return Image(image.texture, image.width_px, image.height_px // places)
 
@@ -196,7 +208,7 @@ class GlState:
         return Image(self._texture(name, (self._longest, 1), 1, dtype="f4"), self._longest, 1)
 
     def _ray_image(self, name: str, components: int, dtype: str) -> Image:
-        """Return an image with a pixel per ray. The number of rays varies, but the texture only grows."""
+        """Return an image with one pixel per ray. A texture that is too small is replaced by a larger one."""
         width_px, height_px = self._geometry.rays.width_px, self._geometry.rays.height_px
         size = width_px, height_px
         texture = self._textures.get(key := (name, components, dtype))
@@ -216,7 +228,7 @@ class GlState:
 
 
 def check_size(context: moderngl.Context, stack: PanelStack) -> None:
-    """Raise InputError if a panel is wider or higher than the driver allows."""
+    """Raise InputError if a panel is wider or higher than the OpenGL driver allows."""
     most = int(context.info["GL_MAX_TEXTURE_SIZE"])
     most_wide, most_high = (min(most, int(value)) for value in context.info["GL_MAX_VIEWPORT_DIMS"])
     for name, value, limit in (("width_px", stack.width_px, most_wide), ("height_px", stack.height_px, most_high)):
@@ -225,5 +237,5 @@ def check_size(context: moderngl.Context, stack: PanelStack) -> None:
 
 
 def _mat3(matrix: F64) -> tuple[float, ...]:
-    """Return a matrix's values in column-major order, for OpenGL."""
+    """Return the values of a matrix in column-major order, which OpenGL expects."""
     return tuple(matrix.T.ravel().tolist())

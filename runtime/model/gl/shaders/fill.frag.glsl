@@ -1,5 +1,5 @@
 #version 330 core
-// Set the middle panel to the mean of the residuals of all rays through its pixels.
+// Set each pixel of the middle panel to the mean residual of all rays through the pixel.
 uniform vec2 origin;
 #include "places.glsl"
 uniform sampler2D last, weight0, residual0, weight1, residual1;

@@ -1,5 +1,5 @@
 #version 330 core
-// Gradient step with momentum for one panel (L5).
+// Update one panel by a gradient step with momentum (docs/mathematics.md, L5).
 uniform vec2 origin;
 #include "places.glsl"
 uniform sampler2D ahead, last, curvature0, gradient0, curvature1, gradient1;

@@ -1,5 +1,5 @@
-// Positions in images, in pixels with centres at half-integers. An image is the first pixels of a texture.
-// programs.py defines FULL and EDGE_CLAMP_PX, with the values of runtime/kernels.
+// Functions for positions in images. Positions are in pixels, whose centres are at half-integers. An image occupies the
+// first rows and columns of a texture. FULL and EDGE_CLAMP_PX are defined by programs.py, as in runtime/kernels.
 
 vec2 place(mat3 homography) {
     vec3 at = homography * vec3(gl_FragCoord.xy - origin, 1.0);
@@ -10,12 +10,13 @@ bool inside(vec2 at, vec2 size, float near) {
     return all(greaterThanEqual(at, vec2(near - 1e-3))) && all(lessThanEqual(at, size - near + 1e-3));
 }
 
-// Bilinear sample, clamped to the image's edges.
+// Sample an image bilinearly. Positions outside are clamped to the image's edges.
 vec4 sampled(sampler2D image, vec2 at, vec2 size) {
     return texture(image, clamp(at, vec2(0.5), size - 0.5) / vec2(textureSize(image, 0)));
 }
 
-// Conversions to 16-bit values from 0 to 1: of panels, whose momentum may exceed their range, and of signed numbers.
+// Convert between numbers and the 16-bit values from 0 to 1 that textures hold. Panel values are stored with the range
+// from -1 to 2, because momentum may exceed the range from 0 to 1. Signed numbers are stored with the range from -1 to 1.
 vec4 panel(vec4 held) { return held * 3.0 - 1.0; }
 vec4 held_panel(vec4 shown) { return (shown + 1.0) / 3.0; }
 vec4 signed_number(vec4 held) { return held * 2.0 - 1.0; }

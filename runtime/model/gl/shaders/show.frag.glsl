@@ -1,5 +1,5 @@
 #version 330 core
-// Convert a panel to 8-bit codes, at the box's place within the whole panel.
+// Convert the box of a panel to 8-bit codes, at the position of the box within the whole panel.
 uniform vec2 origin;
 #include "places.glsl"
 uniform sampler2D last;
