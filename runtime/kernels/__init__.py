@@ -1,7 +1,8 @@
-"""Compiled C++ loops, called through `ctypes`, which releases the GIL meanwhile.
+"""Compiled C++ loops, which are called through `ctypes`. The GIL is released during a call.
 
-The structures below mirror those of the C++ files field by field. `KernelImage` is called `Image` there, `KernelView`
-`View`, and `ErrorSum` `Result`. `library` compares their sizes and the limit on ray sets.
+The structures of this module mirror the structures of the C++ files field by field. In C++, `KernelImage` is called
+`Image`, `KernelView` is called `View`, and `ErrorSum` is called `Result`. `library` compares the sizes of the
+structures and the maximum number of ray sets with the compiled values.
 """
 
 from __future__ import annotations
@@ -15,13 +16,13 @@ from typing import Any
 from numpy.typing import NDArray
 
 MAX_PANELS = 5
-MAX_SETS = 4  # sets of rays: both eyes at two head positions
+MAX_SETS = 4  # maximum number of sets of rays: both eyes at two head positions
 MARGIN = 64  # elements after an image's rows that the loops may read or overwrite
-SUBCODE = 16  # fixed point: sixteenths of an 8-bit panel code
-FULL = 255 * SUBCODE  # a panel's whole range, which is a quarter turn of polarization
-EDGE_PX = 4  # pixels outside an image that may be sampled
-EDGE_CLAMP_PX = 2  # the values of a picture's border rays are repeated for this many pixels outside it
-TABLE_STEPS = 16  # table entries per code value, for the intensities of bilinear rays
+SUBCODE = 16  # fixed-point units per 8-bit panel code
+FULL = 255 * SUBCODE  # range of a panel value, which rotates the polarization by up to a quarter turn
+EDGE_PX = 4  # maximum distance in pixels outside an image at which the image may be sampled
+EDGE_CLAMP_PX = 2  # distance in pixels outside a picture to which the values of its border rays are repeated
+TABLE_STEPS = 16  # table entries per code value for the intensities of bilinearly sampled rays
 _AGAIN = "install phasestack again (it needs g++)"
 _pointer, _int, _long, _float, _double = (
     ctypes.c_void_p, ctypes.c_int32, ctypes.c_int64, ctypes.c_float, ctypes.c_double
@@ -29,18 +30,25 @@ _pointer, _int, _long, _float, _double = (
 
 
 class KernelImage(ctypes.Structure):
-    """Rows of 16-bit elements with interleaved channels."""
+    """Image of 16-bit elements with interleaved channels, whose rows may be in a ring buffer."""
 
     _fields_ = (("data", _pointer), ("stride", _long), ("rows", _int), ("width", _int), ("ring", _int))
 
     @classmethod
     def of(cls, array: NDArray[Any], *, rows: int, width: int) -> KernelImage:
-        """Return an image of part of an int16 array (rows, elements), which the caller must keep alive."""
+        """Return an image of the first rows and pixels of an int16 array (rows, elements).
+
+        The caller must keep the array alive.
+
+        Args:
+            rows: Number of rows of the image.
+            width: Number of pixels in a row of the image.
+        """
         return cls(array.ctypes.data, array.strides[0] // array.itemsize, rows, width, len(array))
 
 
 class Panel(ctypes.Structure):
-    """Images of one panel, from one step to the next."""
+    """Images that hold the values of one panel before and after a step."""
 
     _fields_ = tuple((name, KernelImage) for name in ("ahead", "moved", "before", "last"))
 
@@ -57,7 +65,7 @@ class Problem(ctypes.Structure):
 
 
 class Warp(ctypes.Structure):
-    """Map from a raster to an image, and the distance (below `EDGE_PX`) to which its edge is repeated."""
+    """Map from a raster to an image, and the distance, below `EDGE_PX`, to which its edge is repeated."""
 
     _fields_ = (
         ("image_from_raster", _double * 9), ("image_bend", _double), ("image_middle", _double),
@@ -66,7 +74,7 @@ class Warp(ctypes.Structure):
 
 
 class KernelView(ctypes.Structure):
-    """One eye's view of the displayed layers."""
+    """View of the displayed layers from one eye, and the target picture to compare the view with."""
 
     _fields_ = (
         ("layers", _pointer), ("panels", _int), ("height", _int), ("width", _int), ("components", _int),
@@ -77,7 +85,7 @@ class KernelView(ctypes.Structure):
 
 
 class ErrorSum(ctypes.Structure):
-    """Sum of squared errors, and the number of its terms."""
+    """Sum of squared errors, and the number of terms in the sum."""
 
     _fields_ = (("total", _double), ("counted", _long))
 
@@ -90,8 +98,8 @@ COMPILED = {
 
 @cache
 def library() -> Any:
-    """Return the compiled library. Raises ImportError if it is missing or from another version."""
-    built = Path(__file__).with_name("compiled" + EXTENSION_SUFFIXES[0])  # a file built for another Python may be stale
+    """Return the compiled library. Raises ImportError if it is missing or was built from another version."""
+    built = Path(__file__).with_name("compiled" + EXTENSION_SUFFIXES[0])  # a build for another Python may be outdated
     if not built.exists():
         raise ImportError(f"runtime.kernels is not compiled for this Python: {_AGAIN}")
     loops = ctypes.CDLL(str(built))

@@ -1,4 +1,4 @@
-// Sampler of all kernels: it samples images bilinearly along the rows of a raster, through a homography.
+// Bilinear sampling of images along the rows of a raster, through a homography. All kernels use this sampler.
 #pragma once
 
 #include <algorithm>
@@ -6,7 +6,7 @@
 #include <cstdint>
 #include <cstring>
 
-// Exported functions are compiled for three processor levels, together with the functions that they inline.
+// Exported functions, and the functions that are inlined into them, are compiled for three levels of processors.
 #if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
 #define FOR_EVERY_CPU extern "C" __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
 #else
@@ -15,25 +15,25 @@
 #define INLINE static inline __attribute__((always_inline))
 #define VECTORISED _Pragma("GCC ivdep")
 
-constexpr int LANES = 32;     // elements per vector in the loops; the compiler splits it for the processor
-constexpr int TILE_PX = 256;  // pixels of a row that are sampled together; their data fits the first-level cache
-constexpr int EDGE_PX = 4;    // pixels outside an image that may be sampled
+constexpr int LANES = 32;     // elements per vector in the loops; the compiler splits vectors as the processor requires
+constexpr int TILE_PX = 256;  // pixels of a row that are sampled together; their data fits in the first-level cache
+constexpr int EDGE_PX = 4;    // maximum distance in pixels outside an image at which the image may be sampled
 constexpr int MAX_PANELS = 5;
 constexpr int MAX_CHANNELS = 3;
-constexpr int TILE = TILE_PX * MAX_CHANNELS + 2 * LANES;  // elements, with those that may be overwritten at the end
-constexpr int SOURCE = 2 * TILE + MAX_CHANNELS * LANES;
-constexpr int FIELDS = 2;  // most images sampled together
-constexpr float WEIGHT_UNIT = 16384;
+constexpr int TILE = TILE_PX * MAX_CHANNELS + 2 * LANES;  // elements, including some that may be overwritten at the end
+constexpr int SOURCE = 2 * TILE + MAX_CHANNELS * LANES;   // elements
+constexpr int FIELDS = 2;  // maximum number of images that are sampled together
+constexpr float WEIGHT_UNIT = 16384;  // fixed-point value of an interpolation weight of 1
 
-// An image of 16-bit elements with interleaved channels. Whole vectors are read past the end of a row.
+// Image of 16-bit elements with interleaved channels. Whole vectors are read, which may extend past the end of a row.
 struct Image {
   int16_t *data;
-  int64_t stride;  // elements
+  int64_t stride;  // distance between rows in elements
   int32_t rows, width, ring;  // row r is stored at index r % ring
   const int16_t *row(int r) const { return data + int64_t(r % ring) * stride; }
 };
 
-struct Ramp {  // pixel index of each element
+struct Ramp {  // pixel index of each element for images with one and with three channels
   int16_t one_channel[LANES + MAX_CHANNELS] = {}, three_channels[LANES + MAX_CHANNELS] = {};
   constexpr Ramp() {
     for (int e = 0; e < LANES + MAX_CHANNELS; ++e) one_channel[e] = int16_t(e), three_channels[e] = int16_t(e / 3);
@@ -41,7 +41,8 @@ struct Ramp {  // pixel index of each element
 };
 constexpr Ramp RAMP;
 
-// A raster's row mapped by a homography: positions of its pixels u in an image with pixel centres at integers.
+// Row of a raster, mapped by a homography. x and y return the position in the image of the pixel with index u, where
+// pixel centres are at integers.
 struct Line {
   double x0, xu, y0, yu, w0, wu;
   Line() = default;
@@ -56,7 +57,7 @@ struct Line {
 };
 
 struct Span {
-  int first, last;  // pixels [first, last)
+  int first, last;  // pixels from first to last - 1
 };
 
 INLINE Span common(Span a, Span b) {
@@ -70,9 +71,9 @@ INLINE void at_least_zero(double slope, double offset, double &low, double &high
   else if (offset < 0) high = -1;
 }
 
-// Pixels of a row of `count` whose positions are at least `near` pixels inside the image's edges.
+// Return the pixels, in a row of `count` pixels, whose positions are at least `near` pixels inside the image's edges.
 INLINE Span inside(const Line &line, int count, const Image &image, double near) {
-  constexpr double rounded = 1e-6;  // counts a position on an edge as inside, despite rounding
+  constexpr double rounded = 1e-6;  // tolerance for rounding errors of positions on an edge
   const double right = image.width - near, below = image.rows - near;
   double low = 0, high = count - 1;
   at_least_zero(line.wu, line.w0 - 1e-9, low, high);
@@ -89,10 +90,11 @@ INLINE int64_t whole_vectors(int64_t elements) { return (elements + LANES - 1) /
 
 INLINE int16_t rounded(float x) { return int16_t(int(std::nearbyintf(x))); }
 
-// a·b/32768, rounded: a single instruction on most processors.
+// Return a·b/32768, rounded. Most processors compute it in a single instruction.
 INLINE int16_t product(int16_t a, int16_t b) { return int16_t((((int32_t(a) * int32_t(b)) >> 14) + 1) >> 1); }
 
-// Share, in WEIGHT_UNIT, of the way from a to b. Both are within ±8191, so that twice their difference fits.
+// Interpolate from a to b, where `share` is in WEIGHT_UNIT: part_of returns the change and mixed the interpolated
+// value. a and b must be within ±8191, because twice their difference must fit in 16 bits.
 INLINE int16_t part_of(int16_t a, int16_t b, int16_t share) { return product(int16_t(2 * (b - a)), share); }
 INLINE int16_t mixed(int16_t a, int16_t b, int16_t share) { return int16_t(a + part_of(a, b, share)); }
 
@@ -102,12 +104,12 @@ struct alignas(2 * LANES) Work {
   int16_t sum[TILE];
 };
 
-// Pixels [first, last) of a line in an image, and the image's pixels that surround them.
+// Positions in an image of consecutive pixels of a line, and the columns of the image that must be read for them.
 struct Stretch {
-  double xs, xe, ys, ye;  // positions of the first and the last pixel
-  int first, steps;       // first pixel, number of steps to the last
-  bool on_pixels;         // the pixels coincide with consecutive columns of the image
-  int s0, elements;       // first pixel to read, number of elements from there
+  double xs, xe, ys, ye;  // positions (x, y) of the first pixel (s) and of the last pixel (e)
+  int first, steps;       // first pixel of the line, and number of steps from the first to the last pixel
+  bool on_pixels;         // true if the pixels coincide with consecutive columns of the image
+  int s0, elements;       // first column of the image to read, and number of elements to read from there
 };
 
 template <int C, typename AnyLine>
@@ -122,7 +124,8 @@ INLINE Stretch stretch_of(const Image &image, const AnyLine &line, int first, in
   return {xs, xe, line.y(first), line.y(last - 1), first, steps, on_pixels, s0, std::min((s1 - s0 + 1) * C, SOURCE - 4 * LANES)};
 }
 
-// Mix the two rows around a stretch for each image, into to[f], in runs with linearly growing weights.
+// Interpolate between the image rows above and below a stretch, and store the result for image f in to[f]. The stretch
+// is processed in runs, along which the weights grow linearly.
 template <int F, int C>
 INLINE void mix_rows(const Image *images, const Stretch &along, int16_t *const (&to)[F]) {
   const Image &image = images[0];
@@ -131,7 +134,7 @@ INLINE void mix_rows(const Image *images, const Stretch &along, int16_t *const (
   for (int at = 0, length; at < along.elements; at += length) {
     const double y = along.ys + (along.s0 + at / C - along.xs) * slope, within = std::clamp(y, 0.0, bottom);
     const int row = std::min(int(within), std::max(image.rows - 2, 0));
-    double grows = y == within ? slope : 0, until = 1e6;  // pixels
+    double grows = y == within ? slope : 0, until = 1e6;  // growth of the weight per pixel; length of the run in pixels
     if (std::abs(slope) > 1e-7) {
       const double end = y < 0 ? (slope > 0 ? 0 : -1e9) : y > bottom ? (slope < 0 ? bottom : 1e9) : row + (slope > 0);
       until = std::min((end - y) / slope, 1e6);
@@ -155,7 +158,7 @@ INLINE void mix_rows(const Image *images, const Stretch &along, int16_t *const (
   }
 }
 
-// Repeat the first and the last pixel of mixed rows beyond their ends (clamp to edge).
+// Repeat the first and the last pixel of interpolated rows beyond the ends of the rows (clamp to edge).
 template <int C>
 INLINE void clamp_ends(int16_t *source, int elements) {
   for (int beyond = 1; beyond <= EDGE_PX; ++beyond)
@@ -165,10 +168,11 @@ INLINE void clamp_ends(int16_t *source, int elements) {
     }
 }
 
-// Parabola in 2^-32 pixels: k plus its value at k is pixel k's position, from the first pixel that is read.
+// Parabola that approximates the positions of pixels in units of 2^-32 pixels. The position of pixel k, relative to the
+// first column that is read, is k + begin + drift·k + turn·k².
 struct Parabola {
   int64_t begin, drift, turn;
-  int at_once;  // elements per vector
+  int at_once;  // elements that are processed together as a vector
 };
 
 template <int C, typename AnyLine>
@@ -176,9 +180,10 @@ INLINE Parabola parabola_of(const AnyLine &line, const Stretch &along) {
   const int steps = along.steps;
   const double half = 0.5 * steps, middle = steps > 1 ? line.x(along.first + half) : 0.5 * (along.xs + along.xe);
   const double bend = steps > 1 ? (along.xs + along.xe - 2 * middle) / (half * half) * 0.5 : 0;
-  const double scale = steps > 0 ? (along.xe - along.xs) / steps - bend * steps : 1;  // at the first pixel
-  // Use as many elements per vector as keep the source's gain below three pixels and a chord close to the parabola.
-  // With one channel the limit is two, because the rounding of a weight's growth adds up over 32 pixels.
+  const double scale = steps > 0 ? (along.xe - along.xs) / steps - bend * steps : 1;  // scale at the first pixel
+  // Choose the largest vectors in which the positions gain less than three pixels on the line, and a chord is close to
+  // the parabola. For one channel, the limit is two pixels, because rounding errors of the growing weight accumulate
+  // over 32 pixels.
   constexpr double gains = C == 1 ? 1.9 : 2.9;
   const double most = std::max(std::abs(scale - 1), std::abs(scale - 1 + 2 * bend * steps));
   int at_once = LANES;
@@ -187,18 +192,18 @@ INLINE Parabola parabola_of(const AnyLine &line, const Stretch &along) {
   return {int64_t((along.xs - along.s0) * one), int64_t((scale - 1) * one), int64_t(bend * one), at_once};
 }
 
-// Mix neighbours in mixed rows, one vector at a time. The source advances a little faster or slower than the line, so a
-// vector needs two to five neighbours.
+// Interpolate horizontally between neighbours in interpolated rows, one vector at a time. Positions in the source
+// advance slightly faster or slower than the line's pixels, so a vector needs two to five neighbours.
 template <int F, int C>
 INLINE void mix_neighbours(const Parabola &by, int elements, const int16_t *const (&sources)[F], int16_t *const (&to)[F]) {
   const int16_t *ramp = C == 1 ? RAMP.one_channel : RAMP.three_channels;
   for (int e = 0; e < elements; e += by.at_once) {
     const int k = e / C, phase = e - k * C, px = (by.at_once - 1 + phase) / C;
-    const int first_at = int((by.begin + k * (by.drift + by.turn * k)) >> 18);  // now in WEIGHT_UNIT, like weights
+    const int first_at = int((by.begin + k * (by.drift + by.turn * k)) >> 18);  // in WEIGHT_UNIT
     const int each = int((by.drift + by.turn * (2 * k + px) + (1 << 17)) >> 18), last_at = first_at + each * px;
     const int offset = std::min(first_at, last_at) >> 14, further = (std::max(first_at, last_at) >> 14) - offset;  // pixels
     const uint16_t share = uint16_t(first_at - offset * int(WEIGHT_UNIT));
-    int16_t weights[4][LANES];  // from each neighbour to the next
+    int16_t weights[4][LANES];  // weights of the differences between successive neighbours
     VECTORISED for (int i = 0; i < LANES; ++i) {
       constexpr uint16_t full = uint16_t(WEIGHT_UNIT);
       const uint16_t weight = uint16_t(share + uint16_t(each) * uint16_t(ramp[i + phase])), to_second = std::min(weight, full);
@@ -220,12 +225,13 @@ INLINE void mix_neighbours(const Parabola &by, int elements, const int16_t *cons
   }
 }
 
-// Sample F images of equal shape at pixels [first, last) of a line (at most TILE_PX, all `inside`) into out[f], from
-// element `begin_at` on. Up to a vector and two pixels after the last may be overwritten, nothing before the first.
+// Sample F images of equal shape at the pixels of a line from `first` to `last` - 1. There may be at most TILE_PX
+// pixels, and all must be `inside`. The samples of image f are stored in out[f] from element `begin_at` on. Up to a
+// vector and two pixels after the last sample may be overwritten, but nothing before the first sample.
 template <int F, int C, typename AnyLine>
 INLINE void sample(const Image *images, const AnyLine &line, int first, int last, Work &work, int16_t (*out)[TILE], int begin_at = 0) {
   const Stretch along = stretch_of<C>(images[0], line, first, last);
-  int16_t *mixes[F], *to[F];  // mix directly into the output if pixels coincide
+  int16_t *mixes[F], *to[F];  // if the pixels coincide with columns, the rows are interpolated directly into the output
   for (int f = 0; f < F; ++f) to[f] = out[f] + begin_at, mixes[f] = along.on_pixels ? to[f] : work.source[f] + LANES;
   mix_rows<F, C>(images, along, mixes);
   if (along.on_pixels) return;
@@ -233,7 +239,8 @@ INLINE void sample(const Image *images, const AnyLine &line, int first, int last
   mix_neighbours<F, C>(parabola_of<C>(line, along), (along.steps + 1) * C, mixes, to);
 }
 
-// Length of a tile of a line: short enough for a parabola with an error of 0.01 pixel, and for the source's buffer.
+// Return the length of a line's tiles in pixels. It limits the error of a parabola to 0.01 pixel, and the source to the
+// size of its buffer.
 INLINE int tile_px(const Line &line, Span span) {
   const double nearest = std::min(std::abs(line.w0 + line.wu * span.first), std::abs(line.w0 + line.wu * span.last));
   const double turn = std::max(std::abs(line.wu) / nearest, 1e-9);

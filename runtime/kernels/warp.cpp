@@ -1,13 +1,14 @@
-// Resample an image to another raster, through a homography between columns after both column laws (model/chain.py).
+// Resample an image to another raster through a homography. The columns of the image and of the raster may be unevenly
+// spaced (ColumnLaw in runtime/model/chain.py).
 #include "sampling.hpp"
 
 namespace {
 
-constexpr int BENT_TILE_PX = 64;   // short enough for a parabola to approximate a law's curve
-constexpr int SOURCE_PX = 480;     // capacity for a tile's source; near a law's end columns are wide
-constexpr double BEYOND = 1e-9;    // smallest argument of the logarithm, where a law has no column
+constexpr int BENT_TILE_PX = 64;   // maximum length of a tile in which a parabola approximates unevenly spaced columns
+constexpr int SOURCE_PX = 480;     // maximum width of a tile's source; at the end of a column law, columns are wide
+constexpr double BEYOND = 1e-9;    // minimum argument of the logarithm; no column corresponds to smaller arguments
 
-struct Columns {  // column u corresponds to t = middle + (1 - exp(-bend (u - middle))) / bend in the homography
+struct Columns {  // for column u, the homography applies to t = middle + (1 - exp(-bend (u - middle))) / bend
   double bend, middle;
   double to(double u) const { return bend == 0 ? u : middle - std::expm1(-bend * (u - middle)) / bend; }
   double from(double t) const { return bend == 0 ? t : middle - std::log(std::max(1 - bend * (t - middle), BEYOND)) / bend; }
@@ -16,18 +17,18 @@ struct Columns {  // column u corresponds to t = middle + (1 - exp(-bend (u - mi
 struct Warp {
   double image_from_raster[9];
   Columns image, raster;
-  double reach_px;  // distance outside the image, below EDGE_PX, up to which it is clamped to its edge
+  double reach_px;  // distance outside the image, below EDGE_PX, to which the image's edge is repeated
 };
 
 struct WarpedLine {
-  Line line;  // maps columns after both laws
+  Line line;  // maps evenly spaced columns (t)
   Columns image, raster;
   double t(double u) const { return raster.to(u + 0.5) - 0.5; }
   double x(double u) const { return image.from(line.x(t(u)) + 0.5) - 0.5; }
   double y(double u) const { return line.y(t(u)); }
 };
 
-// Pixels of a line inside an image, or at most reach_px outside, where the image is clamped to its edge.
+// Return the pixels of a line that are inside an image or at most reach_px outside.
 INLINE Span reaches(const WarpedLine &at, int count, const Image &image, double reach_px) {
   const Line &line = at.line;
   const double left = at.image.to(-reach_px), right = at.image.to(image.width + reach_px), below = image.rows + reach_px;
@@ -67,7 +68,8 @@ INLINE void warp_rows(const Image &image, const Image &result, const Warp &warp,
 
 }  // namespace
 
-// Sample rows of the result bilinearly from an image with elements within ±8191; `outside` where it has none.
+// Sample rows of the result bilinearly from an image whose elements are within ±8191. Pixels of the result that are
+// outside the image have the value `outside`.
 FOR_EVERY_CPU void warp(const Image *image, const Image *result, const Warp *by, int channels, int outside, int first, int end) {
   if (channels == 3) warp_rows<3>(*image, *result, *by, outside, first, end);
   else warp_rows<1>(*image, *result, *by, outside, first, end);

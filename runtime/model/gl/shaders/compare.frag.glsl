@@ -5,7 +5,8 @@ uniform vec2 origin;
 uniform sampler2D ahead0, ahead1, ahead2, targets, column_taper, row_taper;
 uniform mat3 from_rays0, from_rays1, from_rays2;
 uniform vec2 size0, size1, size2;
-uniform ivec2 targets_origin, turn;  // turn: number of head positions, which alternate from row to row, and index of this set's position
+// turn: number of head positions, which alternate from row to row of a picture, and index of this set's position
+uniform ivec2 targets_origin, turn;
 layout(location = 0) out vec4 curvature;
 layout(location = 1) out vec4 gradient;
 

@@ -15,8 +15,8 @@ vec4 sampled(sampler2D image, vec2 at, vec2 size) {
     return texture(image, clamp(at, vec2(0.5), size - 0.5) / vec2(textureSize(image, 0)));
 }
 
-// Convert between numbers and the 16-bit values from 0 to 1 that textures hold. Panel values are stored with the range
-// from -1 to 2, because momentum may exceed the range from 0 to 1. Signed numbers are stored with the range from -1 to 1.
+// Convert between numbers and the 16-bit values from 0 to 1 that textures hold. The range
+// of stored panel values is -1 to 2, because momentum may move them outside 0 to 1. That of signed numbers is -1 to 1.
 vec4 panel(vec4 held) { return held * 3.0 - 1.0; }
 vec4 held_panel(vec4 shown) { return (shown + 1.0) / 3.0; }
 vec4 signed_number(vec4 held) { return held * 2.0 - 1.0; }
