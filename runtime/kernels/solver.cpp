@@ -1,39 +1,41 @@
-// Steps of the solver on the processor (docs/mathematics.md, L1 to L5). The reference is model_export/light.py.
+// Steps of the solver on the processor (docs/mathematics.md, L1 to L5). The reference implementation is
+// model_export/light.py.
 //
-// Rays are processed row by row. Residuals go to a ring buffer of rows; a panel row is updated once every ray that
-// crosses it has been processed. Phasors are kept in a ring buffer too, from a row's first ray to its last, so only the
-// panels themselves are read from and written to memory.
+// Rays are processed row by row, and their residuals are stored in a ring buffer of rows. A row of a panel is updated
+// after all rays that cross it have been processed. The phasors of a panel row are also stored in a ring buffer, from
+// the first ray that needs them to the last. Only the panels are read from and written to main memory.
 #include <vector>
 
 #include "sampling.hpp"
 
 namespace {
 
-constexpr int FULL = 255 * 16;   // panel value 1, in sixteenths of a code
-constexpr float UNIT = 8100;     // value of 1 in phasors, small enough that rounded products stay within 8191
+constexpr int FULL = 255 * 16;   // panel value of 1, in sixteenths of a code
+constexpr float UNIT = 8100;     // fixed-point value of 1 in phasors; rounded products must stay within 8191
 constexpr float PI = 3.14159265f;
 constexpr double NEAR_PX = 0.5;  // rays count if they cross every panel at least this far inside its edges
-constexpr double EDGE_CLAMP_PX = 2;  // border ray bundles are extended this many pixels beyond the picture (clamp to edge)
-constexpr int MAX_SETS = 4;      // sets of rays; their sum of squared slopes, up to 7830 each, fits 16 bits
+constexpr double EDGE_CLAMP_PX = 2;  // ray bundles at the border extend this far beyond the picture (clamp to edge)
+constexpr int MAX_SETS = 4;      // sets of rays; the sum of their squared slopes, each at most 7830, fits in 16 bits
 static_assert(FIELDS * MAX_SETS <= 2 * MAX_PANELS, "work has too few tiles to gather all sets");
 
 struct Panel {
-  Image ahead;   // read by the rays: includes momentum
-  Image moved;   // its successor after the step
-  Image before;  // without momentum
-  Image last;    // its successor: the same image, except in the first step, where `before` is `ahead`
+  Image ahead;   // values with momentum, at which the rays are evaluated
+  Image moved;   // values with momentum after the step
+  Image before;  // values without momentum
+  Image last;    // values without momentum after the step; same image as `before`, except in the first step, where
+                 // `before` is `ahead`
 };
 
 struct Problem {
-  int32_t panels, sets, channels;  // sets of rays: left and right eye alternately, for each head position
-  int32_t height, width;           // of a set's rays; head positions alternate from row to row of a picture
-  const double *panels_from_rays;  // (sets, panels, 3, 3)
-  const double *rays_from_panels;  // their inverses
-  const uint8_t *targets[2];       // left and right eye: (rows of all positions, width, channels)
-  const int16_t *column_taper;     // (width, channels) weights of the rays' errors, 32767 for 1
-  const int16_t *row_taper;        // (rows of all positions)
-  const int32_t *table;            // (256,) by target code: the panels' sum that shows it, plus 65536 times its weight
-  float rest, missing;             // for close_middle: value outside a panel; weight of rays that miss a panel
+  int32_t panels, sets, channels;  // each head position has two sets of rays, for the left and for the right eye
+  int32_t height, width;           // size of a set; head positions alternate from row to row of a picture
+  const double *panels_from_rays;  // (sets, panels, 3, 3) homographies from a set's rays to panel pixels
+  const double *rays_from_panels;  // (sets, panels, 3, 3) inverse homographies
+  const uint8_t *targets[2];       // for each eye (rows of all head positions, width, channels)
+  const int16_t *column_taper;     // (width, channels) weights of the rays' errors; 32767 stands for 1
+  const int16_t *row_taper;        // (rows of all head positions) further weights
+  const int32_t *table;            // (256,) for each target code, the sum of panel values plus 65536 times the weight
+  float rest, missing;             // for close_middle: value outside a panel, and weight of rays that miss a panel
   Panel panel[MAX_PANELS];
   float size, momentum, floor;
 
@@ -43,15 +45,15 @@ struct Problem {
   }
 };
 
-// One thread's partition: rows of rays, and the panel rows that these complete.
+// Part of the work that one thread does: rows of rays, and the panel rows that can be updated after these rays.
 struct Share {
-  int first, end;
-  std::vector<int> since[MAX_PANELS], until[MAX_PANELS];  // first and last row of rays that see each row of a panel
-  int panel_first[MAX_PANELS], panel_end[MAX_PANELS];
-  int16_t *ring;
-  int64_t stride, plane;  // elements per row, per field
-  int rows;               // rows of the rays' ring buffer
-  Image cosine[MAX_PANELS], sine[MAX_PANELS];  // of pi times `ahead`
+  int first, end;  // rows of rays
+  std::vector<int> since[MAX_PANELS], until[MAX_PANELS];  // first and last row of the rays that cross each panel row
+  int panel_first[MAX_PANELS], panel_end[MAX_PANELS];     // rows of each panel to update
+  int16_t *ring;          // ring buffer of the rays' residuals
+  int64_t stride, plane;  // elements per row, elements per field
+  int rows;               // number of rows in the rays' ring buffer
+  Image cosine[MAX_PANELS], sine[MAX_PANELS];  // phasors: cosine and sine of pi times `ahead`
 
   int16_t *field(int set, int f) const { return ring + (int64_t(set) * FIELDS + f) * plane; }
   int16_t *row(int set, int f, int r) const { return field(set, f) + int64_t(r % rows) * stride; }
@@ -64,21 +66,21 @@ struct Range {
   double low, high;
 };
 
-// Range of ray rows, over all sets, that cross row q of a panel.
+// Return the range of ray rows, over all sets, that cross row q of panel n.
 Range rays_through(const Problem &problem, int n, int q) {
   const double right = problem.panel[n].ahead.width - 0.5;
   Range rays{1e9, -1e9};
   for (int set = 0; set < problem.sets; ++set) {
     const Line line(problem.rays_from_panels + (set * problem.panels + n) * 9, q);
     const double top = line.y(-0.5), bottom = line.y(right), run = std::abs(line.x(right) - line.x(-0.5));
-    const double margin = 2 * std::abs(bottom - top) / std::max(run, 1.0);  // two pixels further along the line
+    const double margin = 2 * std::abs(bottom - top) / std::max(run, 1.0);  // extends the line by two pixels
     rays.low = std::min({rays.low, top - margin, bottom - margin});
     rays.high = std::max({rays.high, top + margin, bottom + margin});
   }
   return rays;
 }
 
-// Set `since` and `until` for each row of a panel. Both are non-decreasing.
+// Compute `since` and `until` for each row of a panel. Neither decreases from one row to the next.
 void find_dependencies(const Problem &problem, int n, Share &share) {
   const int rows = problem.panel[n].ahead.rows;
   const double last = problem.height - 1.0;
@@ -92,13 +94,13 @@ void find_dependencies(const Problem &problem, int n, Share &share) {
   for (int q = rows - 2; q >= 0; --q) since[q] = std::min(since[q], since[q + 1]);
 }
 
-// First row whose last ray is in row r or later.
+// Return the first panel row that is still crossed by a ray in ray row r or later.
 int first_until(const std::vector<int> &until, int r) {
   return int(std::lower_bound(until.begin(), until.end(), r) - until.begin());
 }
 
-// Divide the ray rows evenly. A partition updates the panel rows whose last ray is in its share, and also processes the
-// earlier rays that cross those rows.
+// Divide the ray rows evenly between the parts. A part updates the panel rows whose last ray is in its range. It must
+// also process all earlier rays that cross these panel rows.
 void assign_rows(const Problem &problem, int part, int parts, Share &share) {
   const int first = int(int64_t(problem.height) * part / parts);
   share.first = first, share.end = int(int64_t(problem.height) * (part + 1) / parts);
@@ -110,15 +112,17 @@ void assign_rows(const Problem &problem, int part, int parts, Share &share) {
   }
 }
 
-// Number of ray rows, plus two, that a panel row may have to wait for.
+// Return the number of ray rows to keep in the ring buffer: the rows between the first and the last ray of a panel row,
+// and two more.
 int ray_rows(const std::vector<int> &since, const std::vector<int> &until) {
   int rows = 1;
   for (size_t q = 0; q < since.size(); ++q) rows = std::max(rows, until[q] - since[q] + 2);
   return rows;
 }
 
-// Number of a panel's phasor rows in use at the same time. Rays between two rows read both, so a row's phasors are
-// needed from the previous row's first ray to the next row's last.
+// Return the maximum number of phasor rows of a panel that are in use at the same time. Rays between two panel rows
+// read both rows, so the phasors of a row are needed from the first ray of the previous row to the last ray of the next
+// row.
 int phasor_rows(const std::vector<int> &since, const std::vector<int> &until) {
   int rows = 2;
   for (int q = 0, oldest = 0; q < int(since.size()); ++q) {
@@ -130,7 +134,7 @@ int phasor_rows(const std::vector<int> &since, const std::vector<int> &until) {
 
 int64_t stride_of(const Problem &problem, int width) { return whole_vectors(int64_t(width) * problem.channels + LANES); }
 
-// Place the ring buffers in memory that the thread keeps between calls.
+// Place the ring buffers in memory that the thread keeps for later calls.
 void lay_out(const Problem &problem, bool phasors, Share &share) {
   static thread_local std::vector<int16_t> memory;
   share.rows = 1;
@@ -160,23 +164,24 @@ Share share_of(const Problem &problem, int part, int parts, bool phasors) {
   return share;
 }
 
-// sin(pi/2 x) as a polynomial: coefficients of x, x^3, x^5, x^7, and UNIT (16384 is 1); 32768 / FULL - 8 (32768 is 1).
+// Constants in fixed point. The first four are coefficients of x, x^3, x^5 and x^7 in a polynomial for sin(pi/2 x), and
+// `unit` is UNIT; 16384 stands for 1. `beyond_eight` is 32768 / FULL - 8; 32768 stands for 1.
 struct Factors {
   int16_t first = 25736, third = -10583, fifth = 1302, seventh = -71, unit = int16_t(UNIT * 2), beyond_eight = 1028;
 };
 
-// UNIT times the cosine of an angle; 32768 is half a turn.
+// Return UNIT times the cosine of an angle, where 32768 stands for half a turn.
 INLINE int16_t cosine_of(int16_t angle, const Factors &by) {
-  const int16_t within = int16_t(16384 - (angle < 0 ? -angle : angle));     // the sine's argument, up to a quarter turn
+  const int16_t within = int16_t(16384 - (angle < 0 ? -angle : angle));   // argument of the sine, at most a quarter turn
   const int16_t x = int16_t(2 * within - (within >> 14)), y = product(x, x);  // subtracting 1 avoids 32768
   const int16_t series = int16_t(by.third + product(y, int16_t(by.fifth + product(y, by.seventh))));
   return product(product(x, int16_t(by.first + product(y, series))), by.unit);
 }
 
-// Write cosine and sine of pi times row q of a panel.
+// Compute the cosine and the sine of pi times the values in row q of panel n.
 INLINE void to_phasors(const Problem &problem, const Share &share, int n, int q) {
   Factors by;
-  asm("" : "+m"(by));  // hides the constants: GCC would expand products with them, which takes four times as long
+  asm("" : "+m"(by));  // hide the constants from GCC, which would expand the products and quadruple the time
   const int16_t *row = problem.panel[n].ahead.row(q);
   int16_t *cosine = const_cast<int16_t *>(share.cosine[n].row(q)), *sine = const_cast<int16_t *>(share.sine[n].row(q));
   const int count = problem.panel[n].ahead.width * problem.channels;
@@ -195,14 +200,14 @@ INLINE void clear_outside(const Problem &problem, const Share &share, int set, i
   }
 }
 
-// Fixed-point value of 1 in the product of the panels' phasors.
+// Return the fixed-point value of 1 in the product of the panels' phasors.
 INLINE float unit_of(int panels) {
   float unit = UNIT;
   for (int n = 1; n < panels; ++n) unit *= UNIT / 8192;
   return unit;
 }
 
-// Compute the squared slope, and the error times the slope, for row r of a set of rays.
+// Compute the squared slope (curvature), and the error times the slope (gradient), for row r of a set of rays.
 template <int C, int N>
 INLINE void compare(const Problem &problem, const Share &share, int set, int r, Work &work) {
   Line lines[N];
@@ -233,14 +238,14 @@ INLINE void compare(const Problem &problem, const Share &share, int set, int r, 
           re = int16_t(product(a, c) - product(b, s)), im = int16_t(product(a, s) + product(b, c));
         }
         const int16_t doubled = product(int16_t(target[k] << 7), twice);
-        const int16_t error = product(int16_t(one - re - doubled), product(taper[k], row_taper));  // twice
+        const int16_t error = product(int16_t(one - re - doubled), product(taper[k], row_taper));  // twice the error
         curvature[k] = product(int16_t(2 * im), int16_t(2 * im)), gradient[k] = product(error, int16_t(2 * im));
       }
   }
   clear_outside(problem, share, set, r, span);
 }
 
-// Lines of all sets' rays through a row of a panel.
+// Row of a panel, mapped to the rays of each set.
 struct Back {
   Line line[MAX_SETS];
   Span span[MAX_SETS];
@@ -252,7 +257,8 @@ struct Back {
   }
 };
 
-// Sum the first F fields of all sets at the pixels of a panel's row, into work.tile[0] to [F - 1].
+// At the pixels of a panel row, sum the first F fields of the rays over all sets. The sums are stored in work.tile[0]
+// to work.tile[F - 1].
 template <int F, int C>
 INLINE void gather(const Problem &problem, const Share &share, const Back &back, Span tile, Work &work) {
   const int count = (tile.last - tile.first) * C;
@@ -275,7 +281,7 @@ INLINE void gather(const Problem &problem, const Share &share, const Back &back,
   }
 }
 
-// Gradient step with momentum for row q of a panel (L5).
+// Update row q of panel n by a gradient step with momentum (L5).
 template <int C, int N>
 INLINE void move(const Problem &problem, const Share &share, int n, int q, Work &work) {
   const Panel &panel = problem.panel[n];
@@ -299,13 +305,14 @@ INLINE void move(const Problem &problem, const Share &share, int n, int q, Work 
   }
 }
 
-// Compute the targets' weights, and their products with the middle panel's residuals, for row r of a set of rays.
+// For row r of a set of rays, compute the weights of the targets, and the products of the weights and the residuals
+// that the middle panel must correct.
 template <int C>
 INLINE void residual(const Problem &problem, const Share &share, int set, int r, Work &work) {
   const int middle = problem.panels / 2;
   const double *homographies = problem.panels_from_rays + set * problem.panels * 9;
   const Span span = inside(Line(homographies + middle * 9, r), problem.width, problem.panel[middle].last, 0);
-  Span whole = span;  // rays that cross every panel
+  Span whole = span;  // rays that cross all panels
   for (int n = 0; n < problem.panels; ++n)
     whole = common(whole, inside(Line(homographies + n * 9, r), problem.width, problem.panel[n].last, 0));
   for (int u = span.first; u < span.last; u += TILE_PX) {
@@ -342,7 +349,8 @@ INLINE void residual(const Problem &problem, const Share &share, int set, int r,
   clear_outside(problem, share, set, r, span);
 }
 
-// Set row q of the middle panel to the mean residual of all rays there, or to the rest value if there are no rays.
+// Set each pixel in row q of the middle panel to the mean residual of the rays through the pixel, or to the rest value
+// if there are no rays.
 template <int C>
 INLINE void fill(const Problem &problem, const Share &share, int q, Work &work) {
   const Image &image = problem.panel[problem.panels / 2].last;
@@ -361,7 +369,7 @@ INLINE void fill(const Problem &problem, const Share &share, int q, Work &work) 
 template <int C, int N>
 INLINE void step_rows(const Problem &problem, const Share &share) {
   Work work{};
-  int at[N], ready[N];  // next row of each panel to update, and to convert to phasors
+  int at[N], ready[N];  // for each panel, the next row to update and the next row to convert to phasors
   std::copy(share.panel_first, share.panel_first + N, at);
   for (int n = 0; n < N; ++n)
     ready[n] = std::max(0, first_until(share.until[n], share.first) - 1);
@@ -388,7 +396,7 @@ INLINE void close_rows(const Problem &problem, const Share &share) {
 
 }  // namespace
 
-// Run partition `part` of `parts` of one step. Partitions are independent. Phasors are computed from `ahead`.
+// Run part number `part` of a step that is divided into `parts` independent parts.
 FOR_EVERY_CPU void step(const Problem *problem, int part, int parts) {
   const Share share = share_of(*problem, part, parts, true);
   switch (problem->channels * 10 + problem->panels) {
@@ -403,14 +411,15 @@ FOR_EVERY_CPU void step(const Problem *problem, int part, int parts) {
   }
 }
 
-// Run partition `part` of `parts` of solving the middle panel's `last`, with the other panels fixed.
+// Solve the middle panel (`last`) while the other panels stay fixed. The work is divided into `parts` independent
+// parts, of which this call does part number `part`.
 FOR_EVERY_CPU void close_middle(const Problem *problem, int part, int parts) {
   const Share share = share_of(*problem, part, parts, false);
   if (problem->channels == 3) close_rows<3>(*problem, share);
   else close_rows<1>(*problem, share);
 }
 
-// Convert rows of a panel to opaque 8-bit codes in (rows, width) RGBA pixels.
+// Convert the rows of a panel from `first` to `end` - 1 to opaque RGBA pixels with 8-bit codes.
 FOR_EVERY_CPU void show(const Image *panel, int channels, uint32_t *pixels, int64_t stride, int first, int end) {
   for (int r = first; r < end; ++r) {
     const int16_t *row = panel->row(r);
