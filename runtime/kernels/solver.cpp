@@ -172,7 +172,7 @@ struct Factors {
 
 // Return UNIT times the cosine of an angle, where 32768 stands for half a turn.
 INLINE int16_t cosine_of(int16_t angle, const Factors &by) {
-  const int16_t within = int16_t(16384 - (angle < 0 ? -angle : angle));   // argument of the sine, at most a quarter turn
+  const int16_t within = int16_t(16384 - (angle < 0 ? -angle : angle));  // argument of the sine, at most a quarter turn
   const int16_t x = int16_t(2 * within - (within >> 14)), y = product(x, x);  // subtracting 1 avoids 32768
   const int16_t series = int16_t(by.third + product(y, int16_t(by.fifth + product(y, by.seventh))));
   return product(product(x, int16_t(by.first + product(y, series))), by.unit);

@@ -32,7 +32,7 @@ Wanted = Literal["auto", "cpu", "gl"]
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """A backend, and the reason for choosing it."""
+    """Backend, and the reason for choosing it."""
 
     backend: SolverBackend
     why: str  # one line, including the times if they were measured

@@ -76,7 +76,7 @@ class Targets:
 
 @dataclass(frozen=True, slots=True)
 class Savings:
-    """Reduced amount of work of a trimmed job."""
+    """Amount of work that a trimmed job still requires."""
 
     solved_share: float = 1.0  # share of the panels' pixels that is solved
     channels: int = 3  # number of colour channels that are solved
@@ -114,7 +114,7 @@ class Job:
 
     @property
     def savings(self) -> Savings:
-        """Reduced amount of work of this job."""
+        """Amount of work that this job requires."""
         box = None if self.window is None else self.window.box
         pixels = self.stack.width_px * self.stack.height_px
         return Savings(1.0 if box is None else box.width_px * box.height_px / pixels, self.channels)

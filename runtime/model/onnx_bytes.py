@@ -9,7 +9,7 @@ import hashlib
 from collections.abc import Iterator
 
 MODEL_METADATA = 14
-# Messages that may contain a tensor: numbers of the fields that hold further such messages, and the types of these.
+# For each type of message, the fields through which a tensor can be reached, with the type of message in the field.
 PARTS: dict[str, dict[int, str]] = {
     "model": {7: "graph", 25: "function"},
     "graph": {1: "node", 5: "tensor", 15: "sparse tensor"},

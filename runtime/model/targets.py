@@ -22,7 +22,7 @@ def rest_of(panels: int) -> int:
 
 
 def slope_of(panels: int) -> int:
-    """Return the slope of sin² on which the sums of panel values are, counted from 0.
+    """Return the number, counted from 0, of the slope of sin² that contains the sums of panel values.
 
     Slope 1 is the falling slope for sums from 1 to 2. Slope 2 is the rising slope for sums from 2 to 3.
     """

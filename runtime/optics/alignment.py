@@ -288,7 +288,7 @@ def _displaced(
 
 
 def _between(low: F32, high: F32, weight: F32) -> F32:
-    """Interpolate low · (1 - weight) + high · weight into `low` and return it. `high` is overwritten."""
+    """Return low · (1 - weight) + high · weight, computed in `low`. The contents of `high` are lost."""
     high -= low
     high *= weight
     low += high

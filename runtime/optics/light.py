@@ -34,7 +34,7 @@ RINGS = 9  # rings of points on the pupil; their 271 points are as good as a dis
 
 
 class Sampling(NamedTuple):
-    """The rays along which the squared error is measured."""
+    """Selection of the rays along which the squared error is measured."""
 
     rays: int = 2  # rays across and down a pixel in each of the two sets; 0: a single ray, sampled bilinearly
     pupil_mm: float = PUPIL_MM  # pupil diameter; 0: a pinhole

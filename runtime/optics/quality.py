@@ -1,4 +1,4 @@
-"""Displayed quality (docs/contracts.md): PSNR and SSIM of retina images rounded to 8 bits."""
+"""Displayed quality (docs/contracts.md): PSNR and SSIM of the images that eyes see through the layers."""
 
 from __future__ import annotations
 

@@ -4,10 +4,10 @@ Each panel is modelled by an ideal panel, which is parallel to the others and at
 photographs places every pixel of a layer where an eye at `seen_from_m` sees the pixel on the ideal panel. From any
 other position, including the position of the other eye, the pixels of a tilted panel appear displaced.
 
-A ray of the eye through a point of the ideal panel meets the tilted plane at some point. The line from `seen_from_m`
-through the latter point meets the ideal panel at the pixel of the layer that the eye sees. Each of these two steps is a
-projection from plane to plane, so the composition is a homography. The homography is affine if the eye and
-`seen_from_m` have equal distances from the panel.
+A ray of the eye through a point of the ideal panel meets the tilted plane at a point q. The line from `seen_from_m`
+through q meets the ideal panel at the pixel of the layer that the eye sees. Both steps are projections from plane to
+plane, so their composition is a homography. The homography is affine if the eye and `seen_from_m` are equally far from
+the panel.
 """
 
 from __future__ import annotations

@@ -16,9 +16,9 @@ from runtime.records import F64
 def stack_from_eye(eye_m: ArrayLike) -> F64:
     """Return the 4x4 pose of an eye that looks at the stack's origin (EyeReal supplement, (10)-(14)).
 
-    The x axis points right and is parallel to the ground, y points up, and z points from the scene towards the eye. On
-    the vertical axis, the limit of the pose depends on the direction of approach. There, the pose is the limit from +x
-    (r_x = +y).
+    The x axis points right and is parallel to the ground, y points up, and z points from the scene towards the eye. The
+    pose of an eye on the vertical axis is the limit from +x (r_x = +y), because the limit depends on the direction of
+    approach.
 
     Raises ValueError if the eye is at the origin or a coordinate is not finite.
     """

@@ -49,7 +49,7 @@ def source(name: str, *, defines: Sequence[str] = ()) -> str:
 
 
 class Passes:
-    """Runs the shader programs of one context. A program is compiled on its first use."""
+    """Shader programs of one OpenGL context, which `draw` compiles on their first use and runs."""
 
     def __init__(self, context: moderngl.Context) -> None:
         self.context = context
