@@ -1,4 +1,4 @@
-"""Displayed quality (docs/contracts.md): PSNR and SSIM of the images that eyes see through the layers."""
+"""Displayed quality (docs/contracts.md): PSNR and SSIM of the images seen through the layers."""
 
 from __future__ import annotations
 
