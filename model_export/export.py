@@ -23,6 +23,7 @@ from model_export.validate import Reference, Report, check_model
 from runtime.errors import InputError
 from runtime.model.contract import Contract, Step
 from runtime.model.predictor import SHIPPED
+from runtime.model.proposal import INPUTS
 from runtime.support import untrusted_input
 from runtime.support.artifacts import write_bytes
 
@@ -114,7 +115,7 @@ def spectral_model(name: str) -> tuple[bytes, nn.Module]:
         value_range=(0.0, 1.0),
         trained_for=DESIGN_RANGE,
         recipe_sha256=recipe.sha256(),
-        inputs=ports(network.INPUTS),
+        inputs=ports(INPUTS),
         outputs=ports(network.OUTPUTS),
         parameters=_parameters(net),
         cell_px=recipe.cell_px,

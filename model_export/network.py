@@ -10,7 +10,6 @@ from torch.nn import functional
 
 from runtime.kernels import FULL
 
-INPUTS = ("left", "right", "waves", "shifted_waves", "spectrum", "modes_in", "eye_sigma_px")
 OUTPUTS = ("rear", "front", "check")
 BLOCK_ROWS = 8  # number of rows that are transformed together; the raster consists of complete blocks
 BOX = 0.5  # maximum change of the outer panels, which start in the middle of their range
@@ -29,40 +28,38 @@ class SpectralSolver(nn.Module):
     directions. It attenuates the mean of a wave by the factor m = exp(-(c²w² + r²v²)/2) and turns the rest into noise.
     The expected squared error has a closed-form minimum for every frequency (`gains`).
 
-    A raster row consists of cells of 2K columns, where K is `cell_px`. The transform along a row combines the modes of
-    the chain (`runtime.model.chain`) with the frequencies of a cell's columns. The transform across the rows covers a
-    block of `BLOCK_ROWS` rows.
+    A raster row consists of cells of 2K columns. The transform along a row combines the modes of the chain
+    (`runtime.model.chain`) with the frequencies of a cell's columns. The transform across the rows covers a block of
+    `BLOCK_ROWS` rows. The number K may differ from run to run, because the waves of a cell are inputs. The unit of
+    length along a row is always the parallax divided by `cell_px`, so that the gains do not depend on K.
     """
 
     def __init__(self, cell_px: int = 4) -> None:
         super().__init__()
         self.cell_px = cell_px
-        columns, w = _fourier(2 * cell_px)
         rows, v = _cosines(BLOCK_ROWS)
-        self.columns: Tensor
         self.rows_in: Tensor
         self.rows_out: Tensor
-        self.w: Tensor
         self.v: Tensor
-        self.register_buffer("columns", columns, persistent=False)
         # The row transform of a block also computes a difference and a sum: of the eyes on input, of g and h on output.
         into = torch.cat([torch.cat([-rows, rows], dim=1), torch.cat([rows, rows], dim=1)]) / IN_SCALE
         back = rows.transpose(0, 1) * FULL
         out = torch.stack([torch.cat([-back, back], dim=1), torch.cat([back, back], dim=1)])
         self.register_buffer("rows_in", into, persistent=False)
         self.register_buffer("rows_out", out, persistent=False)
-        # Frequencies of all patterns, ordered by the rows of a block, then by the columns of a cell.
-        self.register_buffer("w", w.repeat(BLOCK_ROWS), persistent=False)
-        self.register_buffer("v", v.repeat_interleave(2 * cell_px), persistent=False)
+        self.register_buffer("v", v[:, None], persistent=False)
         self.log_floor = nn.Parameter(torch.log(torch.tensor([0.01, 0.2])))  # regularisation λ of g and of h
         self.log_rough = nn.Parameter(torch.log(torch.tensor([0.05, 0.2])))  # increase of λ with w²
         self.log_sigma_scale = nn.Parameter(torch.zeros(2))  # factors for eye_sigma_px along and across the eyes' line
 
-    def gains(self, spectrum: Tensor, eye_sigma_px: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def gains(self, spectrum: Tensor, cell_frequencies: Tensor, eye_sigma_px: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Compute the gains from the transformed input to g and h.
+
+        A pattern is the product of a wave of a block's rows and a wave of a cell's columns.
 
         Args:
             spectrum: Singular values s (cells + 1,) of the chain.
+            cell_frequencies: The input (2K,) of `forward`.
             eye_sigma_px: The input (3,) of `forward`.
 
         Returns:
@@ -72,9 +69,10 @@ class SpectralSolver(nn.Module):
         scale = torch.exp(self.log_sigma_scale)
         # The product of a chain's mode and a block's pattern is two waves, at the pattern's frequency ± `offset`.
         offset = 2 * torch.asin(torch.clamp(spectrum / 4, 0, 1))[None] / (2 * self.cell_px)
-        pattern = self.w[:, None]
+        pattern = (cell_frequencies[None] / self.cell_px + torch.zeros_like(self.v)).reshape(-1, 1)
+        pattern_v = (self.v + torch.zeros_like(cell_frequencies)[None]).reshape(-1, 1)
         along2 = (eye_sigma_px[0] * scale[0]) ** 2 * (pattern * pattern + offset * offset)
-        across = (eye_sigma_px[1] * scale[1] * self.v)[:, None]
+        across = eye_sigma_px[1] * scale[1] * pattern_v
         m2 = torch.exp(-(along2 + across * across))
         s2 = (spectrum * spectrum)[None]  # 16 sin²(ws)
         c2 = 16 - s2
@@ -99,7 +97,9 @@ class SpectralSolver(nn.Module):
                   16-bit codes.
                 * `waves`, `shifted_waves`, `spectrum`, `modes_in`: V and Ũ (cells + 1, cells + 1), s (cells + 1,) and
                   U^T (cells + 1, cells) of `runtime.model.chain.chain_modes`.
-                * `eye_sigma_px`: c in columns, r in rows and e in columns (3,).
+                * `cell_waves`, `cell_frequencies`: (2K, 2K) and (2K,) of `runtime.model.chain.cell_waves`.
+                * `eye_sigma_px`: c, r and e (3,). The unit of c and e is the parallax divided by `cell_px`, the unit of
+                  r is a row.
 
         Returns:
             The rear and the front panel, (rows, cells + 1, 2K·C) 16-bit codes that begin one parallax before column 0,
@@ -117,39 +117,40 @@ class SpectralSolver(nn.Module):
         cell stays contiguous. Copies are therefore cheap, and the products with the matrices of the rows and of the
         chain are few and large.
         """
-        left, right, waves, shifted_waves, spectrum, modes_in, eye_sigma_px = feeds
-        channels = left.shape[2] // (2 * self.cell_px)
-        numerator, denominator, gain_h = self.gains(spectrum, eye_sigma_px)
+        left, right, waves, shifted_waves, spectrum, modes_in, cell_waves, cell_frequencies, eye_sigma_px = feeds
+        numerator, denominator, gain_h = self.gains(spectrum, cell_frequencies, eye_sigma_px)
         numerator, gain_h = numerator * (IN_SCALE / FULL), gain_h * (IN_SCALE / FULL)
         sides = torch.cat([_by_block_rows(left), _by_block_rows(right)]).to(torch.float32)
         bias = torch.full((BLOCK_ROWS,), BOX * FULL + added, device=left.device)
         rows, cells = 2 * BLOCK_ROWS, sides.shape[1]
         both = torch.matmul(self.rows_in, sides.reshape(rows, -1)).reshape(rows, cells, -1)
         both = torch.matmul(modes_in, both).reshape(rows, -1, *sides.shape[2:])
-        both = self._in_columns(both, torch.cat([numerator / denominator, gain_h]), channels)
+        both = _in_columns(both, torch.cat([numerator / denominator, gain_h]), cell_waves)
         both = both.reshape(2, BLOCK_ROWS, both.shape[1], -1)
         both = torch.matmul(torch.stack([waves, shifted_waves])[:, None], both).reshape(1, rows, -1)
         # The matrix product is written as a convolution, which is fused with the addition and the clamp.
         rear, front = (functional.conv1d(both, out[..., None], bias) for out in self.rows_out)
         return rear, front, _size(both)
 
-    def _in_columns(self, x: Tensor, gains: Tensor, channels: int) -> Tensor:
-        """Scale each wave along the columns of a cell by its gain.
 
-        For each wave of the rows and each mode, a single matrix transforms the columns to waves, scales the waves and
-        transforms them back.
+def _in_columns(x: Tensor, gains: Tensor, cell_waves: Tensor) -> Tensor:
+    """Scale each wave along the columns of a cell by its gain.
 
-        Args:
-            x: Values (n, modes, blocks, 2K·C) for n waves of the rows.
-            gains: Gains (n·2K, modes).
-            channels: Number C of colour channels.
-        """
-        count, modes, _, row = x.shape
-        # Projections of a cell's row onto each wave of the columns.
-        parts = self.columns[:, :, None, None, None] * self.columns[:, None, None, :, None]
-        parts = (parts * _same(channels, like=parts)).reshape(2 * self.cell_px, -1)
-        matrices = torch.matmul(gains.reshape(count, -1, modes).transpose(1, 2), parts)
-        return torch.matmul(x, matrices.reshape(count, modes, row, row))
+    For each wave of the rows and each mode, a single matrix transforms the columns to waves, scales the waves and
+    transforms them back.
+
+    Args:
+        x: Values (n, modes, blocks, 2K·C) for n waves of the rows.
+        gains: Gains (n·2K, modes).
+        cell_waves: Waves (2K, 2K) of a cell's columns.
+    """
+    count, modes, _, row = x.shape
+    columns = cell_waves.shape[0]
+    # Projections of a cell's row onto each wave of the columns.
+    parts = cell_waves[:, :, None, None, None] * cell_waves[:, None, None, :, None]
+    parts = (parts * _same(row // columns, like=parts)).reshape(columns, -1)
+    matrices = torch.matmul(gains.reshape(count, -1, modes).transpose(1, 2), parts)
+    return torch.matmul(x, matrices.reshape(count, modes, row, row))
 
 
 def _same(channels: int, *, like: Tensor) -> Tensor:
@@ -173,23 +174,6 @@ def _size(x: Tensor) -> Tensor:
     """Return the norm (1,) of a tensor. It is finite only if all values are finite and not too large."""
     size: Tensor = torch.linalg.vector_norm(x)  # the squares overflow long before later products would
     return size.reshape(1)
-
-
-def _fourier(size: int) -> tuple[Tensor, Tensor]:
-    """Return the orthonormal real Fourier basis (size, size) and its frequencies in radians per sample.
-
-    Each row of the basis is one wave.
-    """
-    at = torch.arange(size, dtype=torch.float64)
-    rows, w = [torch.ones(size, dtype=torch.float64) / math.sqrt(size)], [0.0]
-    for k in range(1, (size + 1) // 2):
-        for wave in (torch.cos, torch.sin):
-            rows.append(wave(2 * math.pi * k * at / size) * math.sqrt(2 / size))
-            w.append(2 * math.pi * k / size)
-    if size % 2 == 0:
-        rows.append(torch.cos(math.pi * at) / math.sqrt(size))
-        w.append(math.pi)
-    return torch.stack(rows).float(), torch.tensor(w)
 
 
 def _cosines(size: int) -> tuple[Tensor, Tensor]:

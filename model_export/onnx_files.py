@@ -12,9 +12,10 @@ from torch import nn
 
 from model_export import eyereal, network
 from model_export.modules import quiet
-from runtime.model.chain import chain_modes
+from runtime.model.chain import cell_waves, chain_modes
 from runtime.model.contract import METADATA_KEY, Contract, Port
 from runtime.model.onnx_bytes import digest
+from runtime.model.proposal import INPUTS
 
 CELL_AXES = {
     "left": ("rows", "cells", "columns"),
@@ -23,6 +24,8 @@ CELL_AXES = {
     "shifted_waves": ("cells_and_one", "modes"),
     "spectrum": ("modes",),
     "modes_in": ("modes", "cells"),
+    "cell_waves": ("waves_of_cell", "columns_of_cell"),
+    "cell_frequencies": ("waves_of_cell",),
     "eye_sigma_px": ("eye_sigmas",),
     "rear": ("rows", "cells_and_one", "columns"),
     "front": ("rows", "cells_and_one", "columns"),
@@ -36,8 +39,8 @@ FIXED = {"one", "channels", "eye_sigmas"}
 def spectral_bytes(net: nn.Module, *, cell_px: int) -> bytes:
     """Export the spectral solver as an ONNX file for any number of rows, cells and columns."""
     sides = (torch.zeros(16, 8, 6 * cell_px, dtype=torch.int16),) * 2
-    modes = tuple(torch.from_numpy(part) for part in chain_modes(8))
-    return _exported(net, (*sides, *modes, torch.ones(3)), network.INPUTS, network.OUTPUTS, CELL_AXES, folded=False)
+    modes = tuple(torch.from_numpy(part) for part in (*chain_modes(8), *cell_waves(cell_px)))
+    return _exported(net, (*sides, *modes, torch.ones(3)), INPUTS, network.OUTPUTS, CELL_AXES, folded=False)
 
 
 def ports(names: Sequence[str]) -> tuple[Port, ...]:

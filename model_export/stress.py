@@ -6,8 +6,9 @@ import numpy as np
 
 from model_export.data import random_pair
 from runtime.kernels import FULL
-from runtime.model.chain import chain_modes
+from runtime.model.chain import cell_waves, chain_modes
 from runtime.model.contract import Contract
+from runtime.model.proposal import INPUTS
 from runtime.optics.malus import phase_from_intensity
 from runtime.records import F32
 
@@ -55,7 +56,7 @@ def spectral_cases(cell_px: int) -> dict[str, Feeds]:
         for name, pictures in {ORDINARY: ordinary_pictures(*size), **stress_pictures(*size)}.items():
             left, right = (phase_from_intensity(picture) for picture in pictures)
             half = np.rint((right - left).reshape(64, cells, -1) * (FULL / 2)).astype(np.int16)
-            modes = dict(zip(("waves", "shifted_waves", "spectrum", "modes_in"), chain_modes(cells), strict=True))
+            modes = dict(zip(INPUTS[2:-1], (*chain_modes(cells), *cell_waves(cell_px)), strict=True))
             cases[f"{name}, {cells} cells"] = {
                 "left": -half,
                 "right": half,

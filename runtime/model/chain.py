@@ -32,6 +32,8 @@ ROWS_STEP = 32  # the number of rows is rounded up to a multiple of this if the 
 # Maximum number of rows, relative to level eyes. The limit saves a quarter of the network's time for a walking viewer.
 ROWS_SHARE = 1.75
 CELLS_MAX = 1024
+# Maximum width of a column, in panel columns / `reduction`. A limit of 1.2 loses up to 0.25 dB, 0.4 gains nothing.
+WIDEST = 0.8
 BLOCK_ROWS = 8  # rows that the network transforms together; the number of rows is a multiple of this
 ROWS_MAX = 1 << 15  # eye positions that would need more rows than this at full height are implausible
 NEAREST_F = 0.8  # maximum ratio of the raster's half width to the distance between its middle and F
@@ -62,6 +64,10 @@ class ColumnLaw:
             return t
         return np.asarray(self.middle - np.log(np.maximum(1 - self.bend * (t - self.middle), BEYOND_F)) / self.bend)
 
+    def mirrored(self, width_px: int) -> ColumnLaw:
+        """Return the law of a raster whose `width_px` columns are in reverse order."""
+        return ColumnLaw(-self.bend, width_px - self.middle) if self.bend else self
+
 
 EVEN_COLUMNS = ColumnLaw()
 BEYOND_F = 1e-9  # lower limit of the argument of the logarithm
@@ -80,6 +86,7 @@ class ChainFrame:
     cells: int  # chain cells per row; the raster has cells·2K columns
     cell_px: int  # K
     rows: int
+    stretch: float  # height that the rows cover, relative to level eyes
     middle_m: F64  # (3,) point between the eyes, frame `stack`, relative to which the eyes' parallaxes are opposite
 
     @property
@@ -97,15 +104,18 @@ class ChainFrame:
         inverse = np.linalg.inv(self.plane_from_frame(self.middle_m, x_m=x_m))
         return np.asarray(inverse / inverse[2, 2], np.float64)
 
-    def eye_sigma_px(self, stack: PanelStack, *, eye_sigma_m: float) -> F32:
-        """Return the (3,) lengths in pixels of this raster that the network needs.
+    def eye_sigma_px(self, stack: PanelStack, *, eye_sigma_m: float, cell_px: int) -> F32:
+        """Return the (3,) lengths that the network needs.
 
-        The first two lengths are the distances, in columns and in rows, by which a tracking error of one standard
+        The first two lengths are the distances, along and across the rows, by which a tracking error of one standard
         deviation moves the outer panels' pictures. The third length is the parallax of the centre panel relative to the
-        raster's plane, in columns.
+        raster's plane, along the rows. The unit along the rows is the outer panels' parallax divided by `cell_px`, the
+        unit across the rows is a row.
 
         Args:
+            stack: Stack of the raster.
             eye_sigma_m: Standard deviation of the tracking error.
+            cell_px: Divisor that the model's contract states.
         """
         reach = (stack.x_m[-1] - self.x_m) / (self.middle_m[0] - stack.x_m[-1])
         centre = (self.x_m - stack.x_m[1]) / (self.middle_m[0] - stack.x_m[1])
@@ -114,20 +124,21 @@ class ChainFrame:
         raster = self.plane_from_raster
         at = raster @ (self.columns.middle, self.rows / 2, 1.0)
         (across_m, along_m), (_, down_m) = ((raster[:2, k] - at[:2] / at[2] * raster[2, k]) / at[2] for k in (0, 1))
-        columns = moved_m / abs(across_m)
+        columns = moved_m / abs(across_m) * cell_px / self.cell_px
         rows = moved_m * np.hypot(1.0, along_m / across_m) / abs(down_m)
-        return np.array([columns, rows, self.cell_px * centre / reach], np.float32)
+        return np.array([columns, rows, cell_px * centre / reach], np.float32)
 
 
-def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int) -> ChainFrame:
+def chain_frame(eyes_m: F64, stack: PanelStack, *, most_cell_px: int, reduction: int) -> ChainFrame:
     """Return the raster for a pair of eyes.
 
     The raster covers the part of the panels that the eyes see through all panels, plus a margin. The rows are sheared
-    along the line of the eyes.
+    along the line of the eyes. The outer panels' parallax is the smallest whole number of columns whose columns are at
+    most `WIDEST` wide, or `most_cell_px` columns.
 
     Args:
         eyes_m: (2, 3) left and right eye in frame `stack`.
-        cell_px: Parallax of the outer panels in columns of the raster (K).
+        most_cell_px: Maximum parallax of the outer panels in columns of the raster (K).
         reduction: Height of a row in panel rows. If the eyes are not level, rows may be higher.
 
     Raises:
@@ -139,8 +150,11 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int)
     middle_m = between_m - half_m * (half_m[0] / ahead_m)
     window = _window_of(middle_m, stack, plane_m=plane_m)
     line = _line_of_eyes(between_m, half_m, plane_m=plane_m, window=window)
-    per_column = (stack.x_m[-1] - plane_m) / (middle_m[0] - stack.x_m[-1]) / (cell_px * ahead_m)
-    column_m = abs(line.from_f_m2[0] * per_column)  # at the window's middle
+    per_parallax = (stack.x_m[-1] - plane_m) / (middle_m[0] - stack.x_m[-1]) / ahead_m
+    parallax_m = abs(line.from_f_m2[0] * per_parallax)  # at the window's middle
+    widest_m = WIDEST * reduction * stack.width_m / stack.width_px
+    cell_px = min(max(ceil(parallax_m / widest_m), 1), most_cell_px)
+    per_column, column_m = per_parallax / cell_px, parallax_m / cell_px
     if column_m < 1e-12:
         raise ValueError("the eyes have no horizontal separation: one is behind, above or at the other")
     half_columns = window.half_width_m / column_m * (atanh(line.nearness) / line.nearness if line.nearness else 1.0)
@@ -167,7 +181,7 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int)
         [-bend_z_m, -row_m, middle_z_m + row_m * rows / 2 + bend_z_m * middle_column],
         [-bend, 0.0, 1.0 + bend * middle_column],
     ])  # fmt: skip
-    return ChainFrame(plane_m, plane_from_raster, columns, cells, cell_px, rows, middle_m)
+    return ChainFrame(plane_m, plane_from_raster, columns, cells, cell_px, rows, share, middle_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,3 +286,21 @@ def chain_modes(cells: int) -> tuple[F32, F32, F32, F32]:
         np.ascontiguousarray(x, np.float32) for x in (v, shifted, 4 * np.sin(angle / 2), u_transposed)
     )
     return v, shifted, s, u_transposed
+
+
+@lru_cache(maxsize=8)
+def cell_waves(cell_px: int) -> tuple[F32, F32]:
+    """Return the orthonormal real Fourier basis (2K, 2K) of a cell's columns, and its frequencies (2K,).
+
+    Each row of the basis is one wave. Frequencies are in radians per parallax, which is `cell_px` (K) columns.
+    """
+    size = 2 * cell_px
+    at = np.arange(size)
+    waves, frequencies = [np.full(size, 1 / np.sqrt(size))], [0.0]
+    for k in range(1, cell_px):
+        for wave in (np.cos, np.sin):
+            waves.append(wave(2 * np.pi * k * at / size) * np.sqrt(2 / size))
+            frequencies.append(np.pi * k)
+    waves.append(np.cos(np.pi * at) / np.sqrt(size))
+    frequencies.append(np.pi * cell_px)
+    return np.array(waves, np.float32), np.array(frequencies, np.float32)

@@ -85,7 +85,7 @@ def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None 
 
         return SartPredictor(stack)
     from runtime.model.network import PictureProposal
-    from runtime.model.proposal import ChainProposal
+    from runtime.model.proposal import INPUTS, ChainProposal
     from runtime.model.session import ModelSession
     from runtime.model.solver import StepPredictor
 
@@ -101,6 +101,8 @@ def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None 
     if contract.input_frame == "chain":
         if not stack.is_evenly_spaced:
             raise InputError(path, "contract.panels", "needs evenly spaced panels; use the model sart")
+        if tuple(port.name for port in contract.inputs) != INPUTS:
+            raise InputError(path, "contract.inputs", f"are not {', '.join(INPUTS)}; please export the model again")
         return StepPredictor(
             stack, ChainProposal(session), contract.steps, name=contract.name, threads=settings.threads
         )

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from runtime.clock import Stopwatch
 from runtime.errors import EyesNotServed, ModelFailure
 from runtime.kernels import FULL
-from runtime.model.chain import ChainFrame, ColumnLaw, chain_frame, chain_modes
+from runtime.model.chain import ChainFrame, ColumnLaw, cell_waves, chain_frame, chain_modes
 from runtime.model.geometry import Geometry, TargetView, taper
 from runtime.model.job import Job
 from runtime.model.session import ModelSession
@@ -28,12 +28,25 @@ from runtime.optics.tilt import coarse_layer_from_seen
 from runtime.records import F32, F64, I16
 from runtime.support.threads import parallel_map
 
+INPUTS = (
+    "left",
+    "right",
+    "waves",
+    "shifted_waves",
+    "spectrum",
+    "modes_in",
+    "cell_waves",
+    "cell_frequencies",
+    "eye_sigma_px",
+)
 HALF_BASELINE_M = 0.031  # half of the assumed eye separation if one eye replaces the other; any value works
 EDGE_SHARE = 1 / 40  # a picture's edge pixels are repeated outwards by at most this share of the picture's size
 UNSEEN = -1  # value of pixels that an eye does not see; targets are not negative
 SHARPENED = 0.2  # gain of the sharpening that compensates for the blur of two interpolations
 SHARPENING = np.array([-SHARPENED, 1 + 2 * SHARPENED, -SHARPENED])
 EVEN = rest_of(3)  # rest value of an outer panel in sixteenths of a code
+# A transposed raster samples the pictures less accurately. Its stretch must be below this share of the upright one's.
+TRANSPOSED_BELOW = 0.7
 _SWAPPED = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # swaps (y, z, 1) and (-z, -y, 1)
 
 
@@ -86,9 +99,10 @@ class ChainProposal:
         self._codes = codes - codes.min()
 
     def panels(self, job: Job, geometry: Geometry, watch: Stopwatch) -> dict[int, I16]:
-        local = _local(geometry, whole=job.window is None)
         try:
-            frame = chain_frame(local.eyes_m, local.stack, cell_px=self._cell_px, reduction=self._reduction)
+            local, frame = _with_raster(
+                geometry, whole=job.window is None, most_cell_px=self._cell_px, reduction=self._reduction
+            )
         except ValueError as error:
             raise EyesNotServed(str(error)) from None
         middle_x_m = geometry.rasters[geometry.middle].x_m
@@ -111,6 +125,7 @@ class ChainProposal:
         # Each eye is processed by one thread, because passing small operations between threads would take longer.
         left, right = parallel_map(residual, (0, 1))
         waves, shifted_waves, spectrum, modes_in = chain_modes(frame.cells)
+        cell, cell_frequencies = cell_waves(frame.cell_px)
         feeds: dict[str, NDArray[Any]] = {
             "left": left.reshape(frame.rows, frame.cells, -1),
             "right": right.reshape(frame.rows, frame.cells, -1),
@@ -118,7 +133,9 @@ class ChainProposal:
             "shifted_waves": shifted_waves,
             "spectrum": spectrum,
             "modes_in": modes_in,
-            "eye_sigma_px": frame.eye_sigma_px(local.stack, eye_sigma_m=job.eye_sigma_m),
+            "cell_waves": cell,
+            "cell_frequencies": cell_frequencies,
+            "eye_sigma_px": frame.eye_sigma_px(local.stack, eye_sigma_m=job.eye_sigma_m, cell_px=self._cell_px),
         }
         shape = (frame.rows, frame.cells + 1, feeds["left"].shape[2])
         watch.lap("prepare")
@@ -169,7 +186,35 @@ def _residual(own: I16, other: I16) -> I16:
     return np.asarray(cv2.sepFilter2D(half, cv2.CV_16S, SHARPENING, SHARPENING), np.int16)
 
 
+def _with_raster(geometry: Geometry, *, whole: bool, most_cell_px: int, reduction: int) -> tuple[_Local, ChainFrame]:
+    """Return the panels and their raster, transposed if this shortens the raster's rows considerably.
+
+    Args:
+        geometry: Geometry of the whole panels.
+        whole: Solve the whole panels. If False, solve only the window.
+        most_cell_px: As for `chain_frame`.
+        reduction: As for `chain_frame`.
+
+    Raises:
+        ValueError: `chain_frame` refuses the eyes in both orientations.
+    """
+    choices: list[tuple[float, _Local, ChainFrame]] = []
+    refusals: list[ValueError] = []
+    upright = _local(geometry, whole=whole)
+    for local, weight in ((upright, TRANSPOSED_BELOW), (_transposed(upright), 1.0)):
+        try:
+            frame = chain_frame(local.eyes_m, local.stack, most_cell_px=most_cell_px, reduction=reduction)
+            choices.append((frame.stretch * weight, local, frame))
+        except ValueError as error:
+            refusals.append(error)
+    if not choices:
+        raise refusals[0]
+    _, local, frame = min(choices, key=lambda choice: choice[0])
+    return local, frame
+
+
 def _local(geometry: Geometry, *, whole: bool) -> _Local:
+    """Return the whole panels or the window as a separate stack."""
     stack, eyes_m, box = geometry.stack, geometry.eyes_m, geometry.boxes[geometry.middle]
     plane_from_local = np.eye(3)
     if not whole:
@@ -180,14 +225,23 @@ def _local(geometry: Geometry, *, whole: bool) -> _Local:
         stack = PanelStack(float(across_m), float(down_m), stack.x_m, box.width_px, box.height_px)
         eyes_m = eyes_m - np.array([0.0, y_m, z_m])
         plane_from_local = np.array([[1.0, 0.0, y_m], [0.0, 1.0, z_m], [0.0, 0.0, 1.0]])
-    apart_m = np.abs(eyes_m[1] - eyes_m[0])
-    if apart_m[2] > apart_m[1]:  # one eye is above the other: transpose, so down (-z) becomes right (+y)
-        eyes_m = np.stack([eyes_m[:, 0], -eyes_m[:, 2], -eyes_m[:, 1]], axis=1)
-        stack, plane_from_local = replace(stack, tilt=None).transposed(), plane_from_local @ _SWAPPED
-    elif not apart_m.any():  # one eye replaces the other: the pictures do not differ, and any line is suitable
+    if np.array_equal(eyes_m[0], eyes_m[1]):  # one eye replaces the other: any line is suitable
         eyes_m = eyes_m + HALF_BASELINE_M * np.array([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
+    return _Local(stack, *_left_first(eyes_m), plane_from_local)
+
+
+def _transposed(local: _Local) -> _Local:
+    """Return the same stack with down (-z) as right (+y)."""
+    eyes_m = local.eyes_m[list(local.order)]
+    eyes_m, order = _left_first(np.stack([eyes_m[:, 0], -eyes_m[:, 2], -eyes_m[:, 1]], axis=1))
+    stack = replace(local.stack, tilt=None).transposed()
+    return _Local(stack, eyes_m, order, local.plane_from_local @ _SWAPPED)
+
+
+def _left_first(eyes_m: F64) -> tuple[F64, tuple[int, int]]:
+    """Return the eyes (2, 3) from left to right, and their indices."""
     order = (0, 1) if eyes_m[1, 1] >= eyes_m[0, 1] else (1, 0)
-    return _Local(stack, eyes_m[list(order)], order, plane_from_local)
+    return eyes_m[list(order)], order
 
 
 def _wave_taper(geometry: Geometry, raster: PlaneRaster, middle_m: F64) -> F32:

@@ -132,6 +132,12 @@ def warp(
         image, image_from_result, turned = np.swapaxes(image, 0, 1), _TRANSPOSED @ image_from_result, False
     elif turned:
         image_from_result, size = image_from_result @ _TRANSPOSED, size[::-1]
+    if _runs_left(image_from_result, result_columns.middle or size[1] / 2, size[0] / 2):
+        # The loop samples tiles of pixels only if the result's columns run to the right in the image.
+        width_px = image.shape[1]
+        image = np.asarray(cv2.flip(np.ascontiguousarray(image), 1), np.int16)
+        image_from_result = np.array([[-1.0, 0.0, width_px], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) @ image_from_result
+        image_columns = image_columns.mirrored(width_px)
     elements = prod(image.shape)
     source: I16 = np.empty(elements + MARGIN, np.int16)[:elements].reshape(image.shape)
     np.clip(image, -LARGEST, LARGEST, out=source)
@@ -143,3 +149,9 @@ def warp(
     loops, arguments = library(), [byref(argument) for argument in (*images, by)]
     on_rows(lambda first, end: loops.warp(*arguments, channels, outside, first, end), size[0], threads=threads)
     return np.ascontiguousarray(np.swapaxes(result, 0, 1)) if turned else result
+
+
+def _runs_left(image_from_result: F64, u: float, v: float) -> bool:
+    """Return True if the image's column decreases with the result's, at a pixel of the result."""
+    x, _, w = image_from_result @ (u, v, 1.0)
+    return bool((image_from_result[0, 0] * w - x * image_from_result[2, 0]) < 0)

@@ -9,7 +9,16 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from runtime.model.chain import BLOCK_ROWS, ROWS_SHARE, ROWS_STEP, ColumnLaw, chain_frame, chain_modes
+from runtime.model.chain import (
+    BLOCK_ROWS,
+    ROWS_SHARE,
+    ROWS_STEP,
+    WIDEST,
+    ColumnLaw,
+    cell_waves,
+    chain_frame,
+    chain_modes,
+)
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import relative_scale_shift
 from runtime.report.pairs import eyes_at
@@ -33,7 +42,7 @@ def test_modes_are_the_singular_value_decomposition_of_the_chain_operator(cells:
 
 def test_sigma_moves_the_outer_panels_as_a_displaced_eye_does() -> None:
     pair = eyes(0.6, 0.1, 0.05, roll_deg=10)
-    frame = chain_frame(pair, STACK, cell_px=4, reduction=2)
+    frame = chain_frame(pair, STACK, most_cell_px=4, reduction=2)
     raster_from_plane = np.linalg.inv(frame.plane_from_raster)
     at = frame.plane_from_raster @ np.array([frame.width_px / 3, frame.rows / 2, 1.0])
 
@@ -43,13 +52,32 @@ def test_sigma_moves_the_outer_panels_as_a_displaced_eye_does() -> None:
         there, back = relative_scale_shift(frame.middle_m, from_x_m=x_m, to_x_m=frame.x_m)
         return raster_from_plane @ np.append((at[:2] * here + shift) * there + back, 1.0)
 
-    columns, rows, own = frame.eye_sigma_px(STACK, eye_sigma_m=2e-3)
+    columns, rows, own = frame.eye_sigma_px(STACK, eye_sigma_m=2e-3, cell_px=4)
     aside = on(frame.middle_m + np.array([0, 2e-3, 0]), STACK.x_m[2]) - on(frame.middle_m, STACK.x_m[2])
     above = on(frame.middle_m + np.array([0, 0, 2e-3]), STACK.x_m[2]) - on(frame.middle_m, STACK.x_m[2])
-    assert abs(aside[0]) == pytest.approx(columns, rel=1e-4) and abs(above[0]) < 1e-6
+    quarters = 4 / frame.cell_px  # of a parallax, per column
+    assert abs(aside[0]) * quarters == pytest.approx(columns, rel=1e-4) and abs(above[0]) < 1e-6
     assert np.hypot(aside[1], above[1]) == pytest.approx(rows, rel=1e-4)
     beside = on(pair[1], STACK.x_m[1]) - on(frame.middle_m, STACK.x_m[1])
-    assert abs(beside[0]) == pytest.approx(own, rel=1e-4)
+    assert abs(beside[0]) * quarters == pytest.approx(own, rel=1e-4)
+
+
+@pytest.mark.parametrize("reduction", [1, 2, 4, 8])
+def test_coarse_pictures_get_few_columns_per_parallax(reduction: int) -> None:
+    frame = chain_frame(eyes(0.7), STACK, most_cell_px=4, reduction=reduction)
+    column_px = abs(frame.plane_from_raster[0, 0]) / (reduction * STACK.width_m / STACK.width_px)
+    assert 1 <= frame.cell_px <= 4
+    assert frame.cell_px == 4 or column_px <= WIDEST
+    assert frame.cell_px == 1 or column_px * frame.cell_px / (frame.cell_px - 1) > WIDEST
+
+
+def test_waves_of_a_cell_are_orthonormal_and_have_their_frequencies() -> None:
+    for cell_px in (1, 2, 3, 4):
+        waves, frequencies = cell_waves(cell_px)
+        assert waves @ waves.T == pytest.approx(np.eye(2 * cell_px), abs=1e-6)
+        second_difference = 2 * waves - np.roll(waves, 1, axis=1) - np.roll(waves, -1, axis=1)
+        expected = 2 - 2 * np.cos(frequencies / cell_px)
+        assert second_difference == pytest.approx(expected[:, None] * waves, abs=1e-5)
 
 
 @given(
@@ -63,7 +91,7 @@ def test_both_outer_panels_are_seen_one_cell_beside_the_middle_view(
     distance_m: float, side_m: float, up_m: float, separation_m: float, roll_deg: float
 ) -> None:
     pair = eyes(distance_m, side_m, up_m, separation_m=separation_m, roll_deg=roll_deg)
-    frame = chain_frame(pair, STACK, cell_px=4, reduction=2)
+    frame = chain_frame(pair, STACK, most_cell_px=4, reduction=2)
     raster_from_plane = np.linalg.inv(frame.plane_from_raster)
     somewhere = frame.plane_from_raster @ np.array([frame.width_px / 3, frame.rows / 2, 1.0])
     for x_m, sign in ((STACK.x_m[0], 1), (STACK.x_m[2], -1)):
@@ -92,7 +120,7 @@ def test_one_eye_may_be_nearer_than_the_other(
 ) -> None:
     angle_deg = -angle_deg if mirrored else angle_deg
     pair = eyes_at(distance_m=distance_m, angle_deg=angle_deg, height_m=height_m, ipd_m=ipd_m)
-    frame = chain_frame(pair, STACK, cell_px=4, reduction=2)
+    frame = chain_frame(pair, STACK, most_cell_px=4, reduction=2)
     assume(frame.columns.bend)
     # One viewpoint stands for both eyes' parallaxes to the second order of how much nearer one is.
     within = 0.002 + 3.1 * ((pair[1, 0] - pair[0, 0]) / 2 / (frame.middle_m[0] - frame.x_m)) ** 2
@@ -120,7 +148,7 @@ def test_a_column_law_inverts_and_without_bend_is_even() -> None:
 
 def test_the_raster_covers_all_panels_from_the_side_too() -> None:
     for angle_deg in (-50, -20, 20, 50):
-        frame = chain_frame(eyes_at(distance_m=0.7, angle_deg=angle_deg), STACK, cell_px=4, reduction=2)
+        frame = chain_frame(eyes_at(distance_m=0.7, angle_deg=angle_deg), STACK, most_cell_px=4, reduction=2)
         scale, shift = relative_scale_shift(frame.middle_m, from_x_m=STACK.x_m[1], to_x_m=frame.x_m)
         raster_from_plane = np.linalg.inv(frame.plane_from_raster)
         for y in (-0.5, 0.5):
@@ -134,7 +162,7 @@ def test_the_raster_covers_all_panels_from_the_side_too() -> None:
 
 
 def test_the_raster_covers_what_is_seen_of_all_panels() -> None:
-    frame = chain_frame(eyes(0.6), STACK, cell_px=4, reduction=2)
+    frame = chain_frame(eyes(0.6), STACK, most_cell_px=4, reduction=2)
     corners = frame.plane_from_raster @ np.array([[0, frame.width_px], [0, frame.rows], [1, 1]])
     # The rear panel is the smallest as seen on the plane between.
     scale, _ = relative_scale_shift(frame.middle_m, from_x_m=STACK.x_m[0], to_x_m=frame.x_m)
@@ -146,12 +174,12 @@ def test_the_raster_covers_what_is_seen_of_all_panels() -> None:
 def test_eyes_above_each_other_have_no_row_to_solve_along() -> None:
     upright = np.array([[0.6, 0.0, -0.03], [0.6, 0.0, 0.03]])
     with pytest.raises(ValueError, match="no horizontal separation"):
-        chain_frame(upright, STACK, cell_px=4, reduction=2)
+        chain_frame(upright, STACK, most_cell_px=4, reduction=2)
 
 
 def test_a_far_viewer_of_a_thin_stack_is_limited_in_cells() -> None:
     thin = PanelStack(0.5184, 0.2916, (-0.0005, 0.0, 0.0005), 1920, 1080)
-    frame = chain_frame(eyes(10.0), thin, cell_px=4, reduction=2)
+    frame = chain_frame(eyes(10.0), thin, most_cell_px=4, reduction=2)
     assert frame.cells <= 1024
 
 
@@ -161,7 +189,7 @@ TILTED, UPRIGHT = eyes(0.55, 0.12, 0.09, roll_deg=15), eyes(0.7, -0.1, 0.05)
 @pytest.mark.parametrize("pair", [TILTED, UPRIGHT], ids=["tilted", "upright"])
 @pytest.mark.parametrize("x_m", [-0.06, 0.0, 0.06])
 def test_a_pixel_maps_to_where_the_eye_s_ray_crosses_a_panel(pair: np.ndarray, x_m: float) -> None:
-    frame = chain_frame(pair, STACK, cell_px=4, reduction=2)
+    frame = chain_frame(pair, STACK, most_cell_px=4, reduction=2)
     for pixel in ([0.0, 0.0], [100.0, 30.0], [frame.width_px - 1.0, frame.rows / 2]):
         y_m, z_m, _ = frame.plane_from_raster @ [*pixel, 1.0]
         for eye_m in (*pair, frame.middle_m):
@@ -173,7 +201,7 @@ def test_a_pixel_maps_to_where_the_eye_s_ray_crosses_a_panel(pair: np.ndarray, x
 @pytest.mark.parametrize("pair", [TILTED, UPRIGHT], ids=["tilted", "upright"])
 @pytest.mark.parametrize("x_m", [-0.06, 0.0, 0.06])
 def test_back_projection_is_the_inverse_as_seen_between_the_eyes(pair: np.ndarray, x_m: float) -> None:
-    frame = chain_frame(pair, STACK, cell_px=4, reduction=2)
+    frame = chain_frame(pair, STACK, most_cell_px=4, reduction=2)
     there_and_back = frame.frame_from_plane(x_m=x_m) @ frame.plane_from_frame(frame.middle_m, x_m=x_m)
     np.testing.assert_allclose(there_and_back / there_and_back[2, 2], np.eye(3), atol=1e-9)
 
@@ -181,7 +209,7 @@ def test_back_projection_is_the_inverse_as_seen_between_the_eyes(pair: np.ndarra
 @pytest.mark.parametrize("reduction", [1, 2, 4])
 @pytest.mark.parametrize("pair", [TILTED, UPRIGHT], ids=["tilted", "upright"])
 def test_rows_are_panel_rows_and_cover_the_centre_panel(pair: np.ndarray, reduction: int) -> None:
-    frame = chain_frame(pair, STACK, cell_px=4, reduction=reduction)
+    frame = chain_frame(pair, STACK, most_cell_px=4, reduction=reduction)
     from_panel = frame.frame_from_plane(x_m=0.0)
     half_y, half_z, high = STACK.width_m / 2, STACK.height_m / 2, STACK.height_px / reduction
     # Straight above each other on the panel, both ends of any column are as many rows apart as it has.
@@ -199,9 +227,9 @@ def test_rows_are_panel_rows_and_cover_the_centre_panel(pair: np.ndarray, reduct
 
 def test_rows_of_oblique_eyes_grow_higher_instead_of_many() -> None:
     """With rows as high as those of level eyes, this pair would need many more than `ROWS_SHARE` allows."""
-    level = chain_frame(UPRIGHT, STACK, cell_px=4, reduction=2)
+    level = chain_frame(UPRIGHT, STACK, most_cell_px=4, reduction=2)
     steep = np.array([[0.5, -0.031, -0.031], [0.5, 0.031, 0.031]])
-    frame = chain_frame(steep, STACK, cell_px=4, reduction=2)
+    frame = chain_frame(steep, STACK, most_cell_px=4, reduction=2)
     assert level.rows * ROWS_SHARE <= frame.rows < level.rows * ROWS_SHARE + 2 * ROWS_STEP
     from_panel = frame.frame_from_plane(x_m=0.0)
     corners = [from_panel @ [y, z, 1.0] for y in (-STACK.width_m / 2, STACK.width_m / 2) for z in (-0.01, 0.01)]
@@ -211,16 +239,20 @@ def test_rows_of_oblique_eyes_grow_higher_instead_of_many() -> None:
 def test_where_the_origin_lies_along_x_changes_nothing() -> None:
     aside = np.array([0.2, 0.0, 0.0])
     moved = replace(STACK, x_m=tuple(x_m + 0.2 for x_m in STACK.x_m))
-    here, there = (chain_frame(p, s, cell_px=4, reduction=2) for p, s in ((TILTED, STACK), (TILTED + aside, moved)))
+    here, there = (
+        chain_frame(p, s, most_cell_px=4, reduction=2) for p, s in ((TILTED, STACK), (TILTED + aside, moved))
+    )
     assert there.x_m == pytest.approx(here.x_m + 0.2)
     assert (there.cells, there.rows) == (here.cells, here.rows)
     np.testing.assert_allclose(there.plane_from_raster, here.plane_from_raster, atol=1e-12)
     np.testing.assert_allclose(
-        there.eye_sigma_px(moved, eye_sigma_m=2e-3), here.eye_sigma_px(STACK, eye_sigma_m=2e-3), rtol=1e-6
+        there.eye_sigma_px(moved, eye_sigma_m=2e-3, cell_px=4),
+        here.eye_sigma_px(STACK, eye_sigma_m=2e-3, cell_px=4),
+        rtol=1e-6,
     )
 
 
 def test_eyes_whose_raster_would_be_far_higher_than_the_panels_are_refused() -> None:
     pair = np.array([[50.0, 50.0, 50.0], [0.07, -50.0, -50.0]])
     with pytest.raises(ValueError, match="times as high"):
-        chain_frame(pair, STACK, cell_px=4, reduction=2)
+        chain_frame(pair, STACK, most_cell_px=4, reduction=2)

@@ -72,6 +72,25 @@ def test_a_model_for_other_panels_is_refused(tmp_path: Path) -> None:
         load_predictor(str(path), STACK)
 
 
+def test_a_shipped_network_with_the_inputs_of_another_version_is_refused(tmp_path: Path) -> None:
+    model = onnx.load(str(model_path("fast")))
+    old = contract_of("fast")
+    for port in (*model.graph.input, *old["inputs"]):  # type: ignore[misc]
+        if isinstance(port, dict):
+            port["name"] = port["name"].replace("cell_waves", "basis")
+        else:
+            port.name = port.name.replace("cell_waves", "basis")
+    for node in model.graph.node:
+        node.input[:] = ["basis" if name == "cell_waves" else name for name in node.input]
+    for entry in model.metadata_props:
+        if entry.key == METADATA_KEY:
+            entry.value = json.dumps(old | {"graph_sha256": ""})
+    path = tmp_path / "old.onnx"
+    onnx.save(model, str(path))
+    with pytest.raises(InputError, match=r"contract\.inputs.*export the model again"):
+        load_predictor(str(path), STACK)
+
+
 def test_a_named_file_never_quietly_becomes_another_solver(tmp_path: Path) -> None:
     uneven = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.03), 480, 270)
     with pytest.raises(InputError, match="evenly"):

@@ -60,7 +60,7 @@ def test_uneven_gaps_are_served_without_the_network_and_named_so() -> None:
 
 @pytest.mark.parametrize("x_m", [(-0.06, 0.0, 0.06), (-0.058, 0.001, 0.065)])
 def test_the_chain_runs_where_both_outer_panels_have_one_parallax(x_m: tuple[float, float, float]) -> None:
-    frame = chain_frame(EYES, replace(STACK, x_m=x_m), cell_px=4, reduction=2)
+    frame = chain_frame(EYES, replace(STACK, x_m=x_m), most_cell_px=4, reduction=2)
     rear, front = (abs(x - frame.x_m) / (EYES[0, 0] - x) for x in (x_m[0], x_m[2]))
     assert rear == pytest.approx(front, rel=1e-12)
 

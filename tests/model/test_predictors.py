@@ -118,6 +118,14 @@ def test_a_viewer_at_the_side_is_served_as_well(angle_deg: float) -> None:
     assert displayed(solved("balanced", pair), pair, STACK).psnr_db > from_ahead - 3.2
 
 
+def test_a_head_that_is_turned_and_tilted_by_50_degrees_is_served_as_well() -> None:
+    """A walking viewer at the edge of the range. Rows along y and along z are both much higher than the panels."""
+    pair = np.array([[0.85, 0.905, -0.01], [0.81, 0.94, -0.05]])
+    level = eyes_at(distance_m=1.25, angle_deg=47)
+    from_level = displayed(solved("balanced", level), level, STACK).psnr_db
+    assert displayed(solved("balanced", pair), pair, STACK).psnr_db > from_level - 1.5
+
+
 def test_a_head_that_lies_down_and_sits_up_again_leaves_nothing_behind() -> None:
     predictor = load_predictor("balanced", STACK, ModelSettings(threads=1))
     for roll_deg in (0, 90, 0):

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from runtime.model.chain import ColumnLaw
 from runtime.model.warp import warp
-from runtime.records import F64
+from runtime.records import F64, I16
 
-BESIDE = -1
+OUTSIDE = -1
 TOLERANCE = 2.5  # of elements up to 4080: two mixtures, rounded, with weights of 14 bits that grow from pixel to pixel
 
 
@@ -47,7 +49,7 @@ def test_any_scale(size: tuple[int, int], channels: int, scale: float) -> None:
     image = np.random.default_rng(0).integers(0, 4081, (*size, channels)).astype(np.int16)
     matrix = scaled(scale, size)
     expected, within = bilinear(image, matrix, size)
-    found = warp(image[..., 0] if channels == 1 else image, matrix, size=size, outside=BESIDE, reach_px=0.0)
+    found = warp(image[..., 0] if channels == 1 else image, matrix, size=size, outside=OUTSIDE, reach_px=0.0)
     off = np.abs(found.reshape(expected.shape) - expected)[within]
     assert off.size
     assert off.max() < TOLERANCE
@@ -58,9 +60,9 @@ def test_pixels_on_pixels_are_the_images_own(shift_px: tuple[float, float]) -> N
     image = np.random.default_rng(1).integers(0, 4081, (40, 333, 3)).astype(np.int16)
     matrix = np.array([[1.0, 0, shift_px[0]], [0, 1.0, shift_px[1]], [0, 0, 1.0]])
     expected, within = bilinear(image, matrix, (40, 333))
-    found = warp(image, matrix, size=(40, 333), outside=BESIDE, reach_px=0.0)
+    found = warp(image, matrix, size=(40, 333), outside=OUTSIDE, reach_px=0.0)
     assert np.abs(found - expected)[within].max() <= (0.5 if shift_px[1] % 1 else 0)
-    assert (found[~within] == BESIDE).all()
+    assert (found[~within] == OUTSIDE).all()
 
 
 @pytest.mark.parametrize("turn", [-9e-4, 1e-5, 3e-4, 9e-4])
@@ -70,5 +72,29 @@ def test_perspective_along_rows(turn: float) -> None:
     image = np.repeat((2040 + 1500 * np.sin(columns / 5) * np.cos(rows / 7))[..., None], 3, axis=2).astype(np.int16)
     matrix = np.array([[0.9, 0.01, 20], [0.004, 0.95, 2], [turn, 0, 1.0 - 388 * turn]])
     expected, within = bilinear(image, matrix, (90, 777), near_px=1.0)
-    found = warp(image, matrix, size=(90, 777), outside=BESIDE, reach_px=0.0)
+    found = warp(image, matrix, size=(90, 777), outside=OUTSIDE, reach_px=0.0)
     assert np.abs(found - expected)[within].max() < 4
+
+
+@pytest.mark.parametrize("bent", ["neither", "image", "result"])
+def test_mirrored_columns_are_sampled_in_the_same_time(bent: str) -> None:
+    size = (540, 960)
+    image = np.random.default_rng(2).integers(0, 4081, (*size, 3)).astype(np.int16)
+    law = ColumnLaw(2e-4, 400.0)
+    laws = {} if bent == "neither" else {f"{bent}_columns": law}
+    mirrored_laws = {"image_columns": law.mirrored(size[1])} if bent == "image" else laws
+    forwards = np.array([[0.9, 0.3, 40.0], [0.1, 0.9, 5.0], [0.0, 0.0, 1.0]])
+    backwards = np.array([[-1.0, 0.0, size[1]], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) @ forwards
+
+    def warped(matrix: F64, source: NDArray[np.int16], **laws: ColumnLaw) -> tuple[I16, float]:
+        seconds = []
+        for _ in range(5):
+            begun = perf_counter()
+            found = warp(source, matrix, size=size, outside=OUTSIDE, threads=1, **laws)
+            seconds.append(perf_counter() - begun)
+        return found, min(seconds)
+
+    expected, seconds = warped(forwards, image, **laws)
+    found, mirrored_s = warped(backwards, np.ascontiguousarray(image[:, ::-1]), **mirrored_laws)
+    assert np.abs(found - expected).max() <= 1
+    assert mirrored_s < 3 * seconds

@@ -10,20 +10,22 @@ import pytest
 torch = pytest.importorskip("torch")
 from model_export.network import BOX, SpectralSolver, _by_rows  # noqa: E402
 from runtime.kernels import FULL  # noqa: E402
-from runtime.model.chain import chain_modes  # noqa: E402
+from runtime.model.chain import cell_waves, chain_modes  # noqa: E402
 from runtime.model.predictor import SHIPPED, model_path  # noqa: E402
 from runtime.records import F64  # noqa: E402
 from runtime.support.onnx_runtime import onnxruntime  # noqa: E402
 
-MODES = ("waves", "shifted_waves", "spectrum", "modes_in")
-K = 4  # columns
+MODES = ("waves", "shifted_waves", "spectrum", "modes_in", "cell_waves", "cell_frequencies")
+K = 4  # the model's unit is a parallax / K
 BLOCK = 8  # rows
 
 
-def feeds_of(*, cells: int = 9, blocks: int = 3, channels: int = 3, most: int = 1500) -> dict[str, np.ndarray]:
+def feeds_of(
+    *, cells: int = 9, blocks: int = 3, channels: int = 3, cell_px: int = 4, most: int = 1500
+) -> dict[str, np.ndarray]:
     random = np.random.default_rng(cells + channels)
-    sides = random.integers(-most, most + 1, (2, blocks * BLOCK, cells, 2 * K * channels)).astype(np.int16)
-    modes = dict(zip(MODES, chain_modes(cells), strict=True))
+    sides = random.integers(-most, most + 1, (2, blocks * BLOCK, cells, 2 * cell_px * channels)).astype(np.int16)
+    modes = dict(zip(MODES, (*chain_modes(cells), *cell_waves(cell_px)), strict=True))
     return {"left": sides[0], "right": sides[1], **modes, "eye_sigma_px": np.array([0.2, 0.3, 0.4], np.float32)}
 
 
@@ -34,21 +36,23 @@ def answers(net: SpectralSolver, feeds: dict[str, np.ndarray]) -> tuple[np.ndarr
 
 def plainly(net: SpectralSolver, feeds: dict[str, np.ndarray]) -> tuple[F64, F64]:
     """Rear and front panel (rows, cells + 1, 2K·C), not clamped: one transform after another, in double precision."""
-    left, right, v, shifted, _, modes_in, _ = (np.asarray(x, np.float64) for x in feeds.values())
-    spectrum, unsure = torch.from_numpy(feeds["spectrum"]), torch.from_numpy(feeds["eye_sigma_px"])
-    with torch.no_grad():
-        gains = (x.double().reshape(BLOCK, 2 * K, -1).numpy() for x in net.gains(spectrum, unsure))
-    numerator, denominator, gain_h = (x.transpose(0, 2, 1)[:, :, :, None, None] for x in gains)  # rows, modes, columns
-    at = np.arange(2 * K)
-    turns = [np.exp(2j * np.pi * k * at / (2 * K)) * np.sqrt((2 - (k in (0, K))) / (2 * K)) for k in range(K + 1)]
-    columns = np.stack(
-        [turns[0].real, *(p for k in range(1, K) for p in (turns[k].real, turns[k].imag)), turns[K].real]
+    left, right, v, shifted, _, modes_in, waves, *_ = (np.asarray(x, np.float64) for x in feeds.values())
+    spectrum, frequencies, unsure = (
+        torch.from_numpy(feeds[name]) for name in ("spectrum", "cell_frequencies", "eye_sigma_px")
     )
-    rows = np.cos(np.pi * at[:BLOCK, None] * (np.arange(BLOCK) + 0.5) / BLOCK) * np.sqrt(2 / BLOCK)
+    k_px = len(waves) // 2
+    with torch.no_grad():
+        gains = (x.double().reshape(BLOCK, 2 * k_px, -1).numpy() for x in net.gains(spectrum, frequencies, unsure))
+    numerator, denominator, gain_h = (x.transpose(0, 2, 1)[:, :, :, None, None] for x in gains)  # rows, modes, columns
+    at = np.arange(2 * k_px)
+    turns = [np.exp(1j * np.pi * k * at / k_px) * np.sqrt((2 - (k in (0, k_px))) / (2 * k_px)) for k in range(k_px + 1)]
+    between = [part for turn in turns[1:-1] for part in (turn.real, turn.imag)]
+    columns = np.stack([turns[0].real, *between, turns[-1].real])
+    rows = np.cos(np.pi * np.arange(BLOCK)[:, None] * (np.arange(BLOCK) + 0.5) / BLOCK) * np.sqrt(2 / BLOCK)
     rows[0] /= np.sqrt(2)
 
     def split(image: np.ndarray) -> F64:
-        return image.reshape(-1, BLOCK, image.shape[1], 2 * K, image.shape[2] // (2 * K)).astype(np.float64)
+        return image.reshape(-1, BLOCK, image.shape[1], 2 * k_px, image.shape[2] // (2 * k_px)).astype(np.float64)
 
     def into(image: F64, chain: F64) -> F64:
         return np.einsum("pr,kc,qu,brcus->pkqbs", rows, chain, columns, image, optimize=True)
@@ -62,9 +66,10 @@ def plainly(net: SpectralSolver, feeds: dict[str, np.ndarray]) -> tuple[F64, F64
     return rear, front
 
 
+@pytest.mark.parametrize("cell_px", [1, 2, 3, 4, 6])
 @pytest.mark.parametrize("channels", [1, 3])
-def test_it_works_out_what_the_same_steps_do_one_by_one(channels: int) -> None:
-    net, feeds = SpectralSolver(K).eval(), feeds_of(channels=channels)
+def test_it_works_out_what_the_same_steps_do_one_by_one(channels: int, cell_px: int) -> None:
+    net, feeds = SpectralSolver(K).eval(), feeds_of(channels=channels, cell_px=cell_px)
     wanted = plainly(net, feeds)
     with torch.no_grad():
         panels = net._solved(tuple(map(torch.from_numpy, feeds.values())), added=0.0)[:2]
@@ -91,7 +96,7 @@ def test_a_number_that_is_not_finite_is_told_wherever_it_comes_in(name: str, bad
     good = feeds_of()
     assert np.isfinite(session.run(["check"], good)[0]).all()
     random = np.random.default_rng(3)
-    for field in ("waves", "shifted_waves", "modes_in", "eye_sigma_px"):
+    for field in ("waves", "shifted_waves", "modes_in", "cell_waves", "cell_frequencies", "eye_sigma_px"):
         for at in random.integers(0, good[field].size, 6):
             spoilt: dict[str, Any] = {key: value.copy() for key, value in good.items()}
             spoilt[field].flat[at] = bad
