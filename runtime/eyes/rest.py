@@ -18,7 +18,7 @@ DRIFT_NS = 3 * NS_PER_S  # time span of the median that measures drift
 EVERY = 8  # number of samples between measurements of noise and drift, which change slowly
 FEWEST = 8  # minimum number of samples for any conclusion
 KEPT = 256  # number of samples of a resting head that are kept
-GRACE_M = 0.0005  # addition to every threshold for sensors without noise
+GRACE_M = 0.0003  # addition to every threshold for sensors without noise
 NOISE_MAX_M = 0.005  # no head counts as at rest above this noise, because its departure would go unnoticed
 # Thresholds in standard deviations of one sample. White noise at 60 samples a second exceeds each of the thresholds
 # only once in hours.
