@@ -26,7 +26,7 @@ from runtime.records import F32, F64, Parallax
 
 WIDEST_PX = 480  # maximum number of columns in a relief; more columns would not give finer outlines
 RIM_PX = 2  # relief pixels that nearer content is dilated by, so that its outline moves with it
-COARSE_RIM_PX = 1  # like RIM_PX, but for coarse rasters, whose reliefs have fewer pixels
+COARSE_RIM_PX = 1  # RIM_PX for coarse rasters, whose reliefs have fewer pixels
 
 Pixels = NDArray[np.floating[Any]]
 
