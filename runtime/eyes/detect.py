@@ -26,9 +26,10 @@ log = logging.getLogger(__name__)
 class EyeFinder:
     """Finder that locates one viewer's eyes in camera pictures and ignores other people.
 
-    Attributes: choice: Description of how the viewer was chosen. reason: Why no eyes were found in the last frame, or
-        an empty string. pupils: Pupils found in the last frame, even if their distance is unknown. None if there were
-        none.
+    Attributes:
+        choice: Description of how the viewer was chosen.
+        reason: Why no eyes were found in the last frame, or an empty string.
+        pupils: Pupils found in the last frame, even if their distance is unknown. None if there were none.
     """
 
     def __init__(self, settings: Settings | None = None) -> None:

@@ -70,7 +70,7 @@ class FaceDepth:
         eyes = np.array([relief[list(corners)].mean() for corners in CORNERS])
         focal = float(np.sqrt(intrinsics.fx_px * intrinsics.fy_px))
         # Away from the picture's centre, a plane perpendicular to the line of sight is tilted relative to the image
-        # plane. There, the mesh's z axis follows the line of sight, and pixels are stretched.
+        # plane. The mesh's z axis follows the line of sight, and pixels are stretched.
         middle_px = pupils.eyes_px.mean(axis=0)
         sight = (middle_px - [intrinsics.cx_px, intrinsics.cy_px]) / focal
         tilt = -sight / (1 + sight @ sight)  # pixels of depth per picture pixel

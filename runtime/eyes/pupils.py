@@ -32,8 +32,7 @@ IRIS_RANGE = (0.12, 0.33)  # diameter in eye separations; the separation looks s
 IRIS_RATIO_MAX = 1.4  # maximum ratio between the two irises' diameters
 # The upper lid hides part of the iris, and the network returns the centre of the visible part. For any camera and
 # distance, this centre is too low by the following share of the eye separation (0.6 mm). The share was fitted to all 51
-# measured faces. If it is fitted to a random half of the faces, the error on the other half is 0.61 to 0.67 mm up to 1
-# m.
+# measured faces. If it is fitted to a random half of them, the error on the other half is 0.61 to 0.67 mm up to 1 m.
 TOO_LOW = 0.0093
 OPEN_MIN = 0.12  # minimum ratio of height to width for an open eye; a blink hides the iris
 
@@ -97,8 +96,10 @@ class _Look:
 class PupilFinder:
     """Finder that follows one viewer's pupils from picture to picture.
 
-    Attributes: viewer: Viewer number, which increases with every new viewer. reason: Why no pupils were found in the
-        last picture, or an empty string. choice: Description of how the viewer was chosen.
+    Attributes:
+        viewer: Viewer number, which increases with every new viewer.
+        reason: Why no pupils were found in the last picture, or an empty string.
+        choice: Description of how the viewer was chosen.
     """
 
     def __init__(self, *, lock_ns: int = 0) -> None:

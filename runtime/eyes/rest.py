@@ -28,7 +28,7 @@ HALVES = 4.5  # for the difference between the two halves of the samples, in its
 MAD_TO_SIGMA = 1.4826  # a normal distribution's standard deviation, divided by its median absolute deviation
 MEDIAN_EFFICIENCY = 1.25  # a median's standard deviation, divided by a mean's
 LEVER_M = 0.15  # RMS distance from the centre to the points on a display half a metre wide
-NEAREST_M = 0.1  # smaller distances from the display are rounded up to this
+NEAREST_M = 0.1  # smaller distances from the display are raised to this
 
 
 class RestWatch:

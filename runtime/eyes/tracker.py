@@ -269,7 +269,7 @@ class Tracker:
     def ahead(self, time_ns: int) -> EyesEstimate:
         """Return the same estimate as `at`, for a time when no picture is shown.
 
-        This call leaves the last shown position, from which later blends start, as it is.
+        Later blends start from the last shown position, which this call leaves unchanged.
         """
         asked_ns = self._asked_ns
         estimate = self.at(time_ns)
