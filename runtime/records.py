@@ -117,7 +117,7 @@ class PanelFrame:
     flat: U8 | None = None  # (N, height_px, width_px, 4) flat picture, which is never aligned
     flat_version: int = 0
     flatness: float = 0.0  # weight of `flat` in a linear mix of 8-bit codes; 0: only `solved`, 1: only `flat`
-    size_px: tuple[int, int] | None = None  # columns and rows of the panels; None: the size of `solved`
+    size_px: tuple[int, int] | None = None  # panel columns and rows; None: the size of `solved`
     relief: F32 | None = None  # (h, w) relief of the solution's content on the middle panel; None: unknown
     parallax: Parallax | None = None  # None: content does not move on the middle panel
 
@@ -163,7 +163,7 @@ class SolveRequest:
     flat_wanted: bool  # True if the flat picture is shown or will be needed
     paused: bool = False  # True if no new solutions are wanted
     effort: Effort | None = None  # effort for a new solution; None: full effort
-    refined_to: Effort | None = None  # effort to which to refine an unchanged solution; None: do not refine
+    refined_to: Effort | None = None  # effort to refine an unchanged solution to; None: do not refine
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Estimate the distance of the viewer's eyes from the camera, averaged over time.
+"""Estimate the distance from the camera to the viewer's eyes, averaged over time.
 
 A filter estimates a single number from the depth measured on the rigid face: the viewer's eye separation in metres. The
 distance is this separation times the focal length, divided by the eye separation in pixels. The separation in pixels is
@@ -41,7 +41,7 @@ class EyeDepths:
 
 
 class FaceDepth:
-    """Estimator for the distance of one viewer's eyes. Each viewer needs a new instance."""
+    """Estimator for the distance from the camera to one viewer's eyes. Each viewer needs a new instance."""
 
     def __init__(self, *, eye_distance_m: float = 0.0) -> None:
         """Create an estimator.
@@ -82,7 +82,7 @@ class FaceDepth:
         self._predict(float(across) / length)
         relief, eyes = relief - eyes.mean(), eyes - eyes.mean()
         if depth_mm is not None:
-            scale = self._distance / length  # m per pixel of the mesh
+            scale = self._distance / length  # metres per mesh pixel
             tilts_m = tilts[0] * scale, tilts[1] * scale
             self._measure(pupils, depth_mm, depth_from_colour, relief * scale, eyes * scale, tilts_m, away)
         elif not self._known:
@@ -184,7 +184,7 @@ def _window(depth_mm: U16, centre: F64, radius: float) -> F64:
 
     Args:
         centre: (2,) window centre in pixels.
-        radius: Half of the window's side in pixels.
+        radius: Half the window's side, in pixels.
     """
     height, width = depth_mm.shape
     x0, y0 = np.clip(np.floor(centre - radius), 0, [width, height]).astype(int)

@@ -21,7 +21,7 @@ RIGID = np.array([
     362, 130, 359,
 ])  # fmt: skip
 BRIDGE = 168  # mesh point on the bridge of the nose, between the eyes
-SIZE = 192  # side of the grey crop, in pixels
+SIZE = 192  # side of the grey crop in pixels
 EYE_DISTANCE = 64.0  # distance between the eyes in the crop, in pixels
 WINDOW = 17  # side of the window compared around each point, in crop pixels
 RETURNS_WITHIN = 0.4  # a point is discarded if its forward-backward error is larger, in pixels

@@ -1,9 +1,9 @@
 """Interacting multiple models (Blom and Bar-Shalom 1988): Kalman filters that differ in agility.
 
-Each model uses Singer's acceleration model (1970), in which acceleration decays with a time constant and is driven by
-noise. The models differ in the strength of this noise: a still head needs heavy filtering, a fast head needs light
-filtering, and a still head can become a fast one within a tenth of a second. The measurement noise is a covariance
-matrix, because a camera measures positions to the right and up twenty times as precisely as depth.
+Each model follows Singer (1970): acceleration decays with a time constant and is driven by noise. The models differ in
+the strength of this noise: a still head needs heavy filtering, a fast head needs light filtering, and a still head can
+become a fast one within a tenth of a second. The measurement noise is a covariance matrix, because a camera measures
+positions to the right and up twenty times as precisely as depth.
 
 A state has nine numbers: position, velocity and acceleration along x, y and z, in metres and seconds.
 """
@@ -19,7 +19,7 @@ import numpy as np
 
 from runtime.records import F64
 
-FADE_S = 0.25  # time constant with which an acceleration decays
+FADE_S = 0.25  # time for an acceleration to decay by a factor of e
 ROUNDING = 1e-12  # share of a covariance's trace to add to its diagonal: (10 nm)² for a head's (1 cm)²
 WEIGHT_FLOOR = 1e-6  # minimum probability of each model, so that it can recover
 _NODES, _SHARES = np.polynomial.legendre.leggauss(10)

@@ -152,7 +152,7 @@ def observe(
         outliers: Share of outliers among the samples. In an outlier, one or both eyes are displaced by 4 to 20 cm.
         dropout_every_s: Time between dropouts. If 0, there are no dropouts.
         seed: Seed for the noise, the outliers and their displacements.
-        path: Variation of the motion.
+        path: Variation on the motion.
     """
     random = np.random.default_rng([seed, *motion.encode(), round(rate_hz)])
     times_s = np.arange(round(seconds * rate_hz)) / rate_hz

@@ -59,7 +59,7 @@ def resampled(picture: U8, size: tuple[int, int], crop_from_picture: F64) -> U8:
 
     Args:
         picture: RGB picture (h, w, 3).
-        size: Width and height of the result in pixels.
+        size: Width and height of the result, in pixels.
         crop_from_picture: (2, 3) affine matrix that maps the picture's continuous pixels to the result's.
     """
     ratio = 1 / np.sqrt(abs(np.linalg.det(crop_from_picture[:, :2])))  # picture pixels per crop pixel
@@ -137,7 +137,7 @@ class FaceNetwork:
             picture: RGB picture (h, w, 3).
             longest_px: Maximum length of the picture's longer side. Larger pictures are reduced to this before the
                 search.
-            score_min: Minimum score of a face.
+            score_min: Minimum face score.
         """
         height, width = picture.shape[:2]
         scale = min(1.0, longest_px / max(height, width))

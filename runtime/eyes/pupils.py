@@ -61,9 +61,9 @@ class Pupils:
     eyes_px: F64  # (2, 2) left and right pupil in continuous pixels
     sigma_px: float  # standard deviation of one pupil along one axis
     mesh_px: F64  # (468, 3) face mesh points; z, also in pixels, points away from the camera
-    iris_px: float  # mean of the two irises' diameters
+    iris_px: float  # mean iris diameter
     seen: Seen
-    hidden: Side  # hidden eye, placed by means of the rest of the face; empty: neither
+    hidden: Side  # hidden eye, whose position is estimated from the rest of the face; empty: none
     certainty: float  # probability that this is a face
 
     @property

@@ -17,7 +17,7 @@ LOST_NS = NS_PER_S  # a longer gap between samples than this resets the detector
 DRIFT_NS = 3 * NS_PER_S  # time span of the median used to measure drift
 EVERY = 8  # noise and drift change slowly, so they are measured once in this many samples
 FEWEST = 8  # minimum number of samples needed to conclude anything
-KEPT = 256  # number of samples kept of a head at rest
+KEPT = 256  # number of samples kept for a head at rest
 GRACE_M = 0.0005  # added to every threshold, for sensors without noise
 NOISE_MAX_M = 0.005  # with more noise than this, no head counts as at rest, because it could move off unnoticed
 # Thresholds in standard deviations of one sample. At 60 samples a second, white noise exceeds each of them only once in

@@ -182,8 +182,8 @@ INLINE Parabola parabola_of(const AnyLine &line, const Stretch &along) {
   const double half = 0.5 * steps, middle = steps > 1 ? line.x(along.first + half) : 0.5 * (along.xs + along.xe);
   const double bend = steps > 1 ? (along.xs + along.xe - 2 * middle) / (half * half) * 0.5 : 0;
   const double scale = steps > 0 ? (along.xe - along.xs) / steps - bend * steps : 1;  // scale at the first pixel
-  // Choose the largest vectors over which the positions gain less than three pixels on the line and the parabola stays
-  // close to its chord. With one channel, the limit is two pixels, because rounding errors in the growing weight
+  // Make vectors as large as possible, while the positions gain less than three pixels on the line and the parabola
+  // stays close to its chord. With one channel, the limit is two pixels, because rounding errors in the growing weight
   // accumulate over 32 pixels.
   constexpr double gains = C == 1 ? 1.9 : 2.9;
   const double most = std::max(std::abs(scale - 1), std::abs(scale - 1 + 2 * bend * steps));

@@ -32,7 +32,7 @@ ROWS_STEP = 32  # if the eyes are not level, the number of rows is rounded up to
 # time.
 ROWS_SHARE = 1.75
 CELLS_MAX = 1024
-# Maximum width of a column, in panel columns / `reduction`. 1.2 would lose up to 0.25 dB, and 0.4 would gain nothing.
+# Maximum column width, in panel columns / `reduction`. 1.2 would lose up to 0.25 dB, and 0.4 would gain nothing.
 WIDEST = 0.8
 BLOCK_ROWS = 8  # rows that the network transforms together; the number of rows is always a multiple of this
 ROWS_MAX = 1 << 15  # eye positions are implausible if they would need more rows than this at full height
@@ -80,7 +80,7 @@ class ChainFrame:
     The homographies apply to points (t, v, 1), where v is the row, and `columns` converts the column u to t.
     """
 
-    x_m: float  # x coordinate of the plane in frame `stack`
+    x_m: float  # the plane's x coordinate in frame `stack`
     plane_from_raster: F64  # 3x3 map from (t, v, 1) to points (y, z, 1) on the plane; t runs along the line of the eyes
     columns: ColumnLaw
     cells: int  # chain cells per row; the raster has cells·2K columns
@@ -138,7 +138,7 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, most_cell_px: int, reduction:
 
     Args:
         eyes_m: (2, 3) left and right eye in frame `stack`.
-        most_cell_px: Maximum parallax of the outer panels, in raster columns (K).
+        most_cell_px: The outer panels' maximum parallax, in raster columns (K).
         reduction: Row height in panel rows. If the eyes are not level, rows may be taller.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Contract contained in a model file (docs/contracts.md), which is checked when the model is loaded."""
+"""Contract in a model file (docs/contracts.md), checked when the model is loaded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Geometry of a solution: windows on the panels, and homographies from rays to panel pixels.
+"""Solution geometry: windows on the panels, and homographies from rays to panel pixels.
 
 Each ray belongs to one picture pixel. Content may be drawn on the middle panel's raster, on a window of it or on a
 coarser raster; all of these differ from captured photographs only in the homography from picture to panel.
@@ -88,7 +88,7 @@ class Geometry:
 
     @cached_property
     def rasters(self) -> tuple[PlaneRaster, ...]:
-        """Pixel grids of the panels, cropped to their boxes."""
+        """The panels' pixel grids, cropped to their boxes."""
         return tuple(box.cut(self.stack.panel(n)) for n, box in enumerate(self.boxes))
 
     def panels_from_rays(self, places: Places, eye_sigma_m: float) -> F64:

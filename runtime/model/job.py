@@ -23,7 +23,7 @@ NOWHERE = PixelRect(0, 0, 0, 0)
 
 @dataclass(frozen=True, slots=True)
 class SolveWindow:
-    """The window in which all panels are solved.
+    """A window to solve on all panels.
 
     Outside the window, the outer panels keep the rest value that the solver starts from, and the middle panel shows the
     picture that both eyes see.

@@ -1,8 +1,8 @@
 """A network's proposals for the outer panels, which the solver's steps start from.
 
-The network is given the difference between the eyes' pictures on a raster of a special kind (`chain`), whose rows are
-parallel to the line through the eyes and on which the parallax is a whole number of columns. It returns both outer
-panels on the same raster.
+The network is given the difference between the eyes' pictures on a special raster (`chain`). Its rows are parallel to
+the line through the eyes, and the parallax is a whole number of columns. The network returns both outer panels on the
+same raster.
 """
 
 from __future__ import annotations
@@ -191,7 +191,7 @@ def _with_raster(geometry: Geometry, *, whole: bool, most_cell_px: int, reductio
     """Return the panels and their raster, transposed if this considerably reduces the raster's height.
 
     Args:
-        geometry: Geometry of the whole panels.
+        geometry: Geometry for the whole panels.
         whole: True to solve the whole panels, False to solve only the window.
         most_cell_px: As for `chain_frame`.
         reduction: As for `chain_frame`.

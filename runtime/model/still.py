@@ -39,7 +39,7 @@ def solve_still(
         left: (h, w, 3 or 4) picture for the left eye.
         right: (h, w, 3 or 4) picture for the right eye.
         eyes_m: (2, 3) left and right eye in frame `stack`.
-        fov_deg: Horizontal field of view of the pictures.
+        fov_deg: The pictures' horizontal field of view.
         eye_sigma_mm: Standard deviation of the tracking error.
         trimmed: True to skip work that the pictures do not need (`trim`), if the model supports it.
     """
@@ -62,7 +62,7 @@ def captured_views(
         pictures: Left and right (h, w, 3) picture, taken from the eye positions with the camera aimed at the stack's
             origin.
         eyes_m: (2, 3) left and right eye in frame `stack`.
-        fov_deg: Horizontal field of view of the pictures.
+        fov_deg: The pictures' horizontal field of view.
     """
     height, width = pictures[0].shape[:2]
     middle = stack.panel(stack.count // 2)

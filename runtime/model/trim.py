@@ -39,13 +39,13 @@ COMPARED = 2  # captured pictures are compared on a raster this many times as co
 
 
 def trim(job: Job, before: SolveWindow | None = None) -> Job:
-    """Return a job in which only the necessary window and channels are solved.
+    """Return a job that solves only the necessary window and channels.
 
     If the job has no window, the window where the eyes' pictures differ is used. If the pictures are grey there, a
     single channel is solved.
 
     Args:
-        before: Window of the previous solution, which is kept if it still fits.
+        before: The previous solution's window, which is kept if it still fits.
     """
     window = job.window or differing_window(job, before)
     grey = (window is None or window.box.width_px > 0) and all(_is_grey(view, job, window) for view in job.views)
@@ -59,9 +59,9 @@ def extent_window(
 
     Args:
         extent: Middle-panel pixels. Outside them, both eyes see only the background.
-        colour: 8-bit codes of the background.
+        colour: The background's 8-bit codes.
         eyes_m: (2, 3) left and right eye in frame `stack`.
-        before: Window of the previous solution, which is kept if it still fits.
+        before: The previous solution's window, which is kept if it still fits.
 
     Returns:
         The window, or None if the extent is empty or solving the whole panel would be as fast.

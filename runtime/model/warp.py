@@ -47,7 +47,7 @@ def reduced_view(view: TargetView, middle: PlaneRaster, reduction: int) -> Targe
     """Average a view's picture down to about one pixel per `reduction` x `reduction` panel pixels.
 
     Args:
-        middle: Pixel grid of the middle panel.
+        middle: The middle panel's pixel grid.
     """
     picture = view.pixels
     picture_from_middle = np.linalg.inv(view.plane_from_picture) @ middle.plane_from_raster()
@@ -72,7 +72,7 @@ def picture_on(
     If the picture's pixels already coincide with the raster's, the picture is returned unchanged.
 
     Args:
-        middle: Pixel grid of the middle panel.
+        middle: The middle panel's pixel grid.
         middle_from_result: 3x3 homography from pixels on the new raster to middle-panel pixels.
         edge: OpenCV's border mode.
         size: Number of rows and columns in the new raster.

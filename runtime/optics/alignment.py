@@ -33,7 +33,7 @@ from runtime.records import F32, F64, U8, PanelFrame, Parallax
 FARTHEST_M = 1e6  # larger coordinates are treated as not finite
 NEAREST_M = 0.01  # minimum distance between an eye and the front panel
 MOST_SHIFT = 0.5  # maximum shift of a panel's centre, in panel widths or heights
-MOST_SCALE = 2.0  # maximum factor by which a panel is enlarged or reduced
+MOST_SCALE = 2.0  # maximum factor for enlarging or reducing a panel
 ROWS = 32  # rows resampled at a time; a strip's float32 pixels fit in a core's cache
 
 
@@ -107,10 +107,10 @@ def is_identity(matrix: F64) -> bool:
 def shown_layers(frame: PanelFrame) -> U8:
     """Return a frame's (N, h, w, 4) layers before panel curves, rotation and mirroring are applied.
 
-    This is the reference implementation for the presentation shader. It samples bilinearly with exact weights; once the
-    eyes had moved, bicubic sampling was never more than 0.05 dB better (docs/mathematics.md). A coarse solution is
-    enlarged in the same pass. Pixels outside the layer are filled with the rest code, and the flat picture is mixed in
-    before rounding. If the frame needs none of these operations, its array is returned without a copy.
+    Reference implementation for the presentation shader. Sampling is bilinear with exact weights; for moved eyes,
+    bicubic sampling was never more than 0.05 dB better (docs/mathematics.md). A coarse solution is enlarged in the same
+    pass. Pixels outside the layer are filled with the rest code, and the flat picture is mixed in before rounding. If
+    the frame needs none of these operations, its array is returned without a copy.
 
     Raises ValueError if the frame needs a flat picture but has none.
     """
@@ -225,7 +225,7 @@ def _resampled(layer: U8, matrix: F64, rest: int, *, size: tuple[int, int]) -> I
 
     Args:
         matrix: (3, 3) scale and shift from shown pixels to full-size layer pixels.
-        size: Height and width of the shown layer in pixels.
+        size: Height and width of the shown layer, in pixels.
 
     Yields:
         A strip's rows, as a slice, and their unrounded (rows, w, 4) codes.

@@ -60,7 +60,7 @@ def looking_at_origin(
 
     Args:
         cameras: (2, 3, 4) projections from frame `stack` to picture pixels (`as_cameras`).
-        eyes_m: (2, 3) positions of the cameras in frame `stack`.
+        eyes_m: (2, 3) camera positions in frame `stack`.
 
     Returns:
         The resampled (h, w, 3) pictures, and their horizontal field of view in degrees.
@@ -143,8 +143,8 @@ def doubts(eyes_m: ArrayLike, stack: PanelStack, *, fov_deg: float, size: tuple[
 
     Args:
         eyes_m: (2, 3) left and right eye in frame `stack`.
-        fov_deg: Horizontal field of view of the pictures.
-        size: Width and height of the pictures in pixels.
+        fov_deg: The pictures' horizontal field of view.
+        size: Picture width and height in pixels.
     """
     eyes, warnings = np.asarray(eyes_m, np.float64), []
     if fov_deg <= math.pi:

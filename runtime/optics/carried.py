@@ -41,7 +41,7 @@ def carried_db(
         drawn: The (h, w, 3) retina picture for each of the eyes `solved_for_m`, as code values or float in [0, 1].
         solved_for_m: (2, 3) eyes that the layers were solved for, in frame `stack`.
         eyes_m: (2, 3) true eyes in frame `stack`.
-        fov_deg: Horizontal field of view of the retina pictures.
+        fov_deg: The retina pictures' horizontal field of view.
 
     Raises:
         ValueError: An eye is not in front of every panel, or the eyes see no part of the panels.
@@ -58,7 +58,7 @@ class AtEyes(TypedDict):
     """Viewing conditions that an expected quality is computed for."""
 
     eyes_m: ArrayLike  # (2, 3) eyes that the layers were solved for, frame `stack`
-    fov_deg: float  # horizontal field of view of the pictures
+    fov_deg: float  # the pictures' horizontal field of view
     sigmas_mm: Sequence[float]  # standard deviations of the tracking error to assume
     seen_from_m: NotRequired[ArrayLike | None]  # (2, 3) true eye positions; by default `eyes_m`
 

@@ -22,7 +22,7 @@ REACH_PX = WIDTH_PX // 4  # largest disparity searched, in either direction
 GHOSTS_MOST = 0.015
 BEYOND_LEAST = 0.1  # minimum share of matches outside the stack; content inside the stack causes no ghosts
 LARGER, MOST_LARGER = 1.1, 20.0  # ratio of one gap tried to the one before; largest gap tried, relative to the stack's
-ROLLED, TURNED = 0.05, 0.2  # steepest slopes of the line between the eyes at which picture rows still correspond
+ROLLED, TURNED = 0.05, 0.2  # steepest slopes of the line between the eyes for picture rows to correspond
 LEAST_MATCHED = 0.1  # minimum share of the panel that must have a match
 LEAST_ONCE = 1 / 3  # minimum share of matches that must be unambiguous; otherwise the picture is repetitive
 WINDOW_PX, APART_PX = 21, 4  # side of the cost window; minimum distance between two matches of a pixel
@@ -31,7 +31,7 @@ NO_WORSE = 1.3, 1.0  # a match is ambiguous if another error is at most 1.3 time
 
 @dataclass(frozen=True, slots=True)
 class _Compared:
-    """Left and right pictures, resampled to a coarse middle-panel raster to be compared there."""
+    """Left and right pictures, resampled to a coarse middle-panel raster for comparison."""
 
     grey: tuple[U8, U8]  # (h, w) each
     inside: tuple[U8, U8]  # 255 where the picture covers the panel
@@ -91,7 +91,7 @@ def _compared(pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, *, f
     Args:
         pictures: Left and right (h, w, 3) picture, each from a camera at the eye that is aimed at the stack's origin.
         eyes_m: (2, 3) left and right eye in frame `stack`.
-        fov_deg: Horizontal field of view of the pictures.
+        fov_deg: The pictures' horizontal field of view.
     """
     small = replace(stack, width_px=WIDTH_PX, height_px=max(16, round(WIDTH_PX * stack.height_m / stack.width_m)))
     panel, size = small.panel(stack.count // 2), (WIDTH_PX, small.height_px)
@@ -145,7 +145,7 @@ def disparity_doubts(
     Args:
         pictures: Left and right (h, w, 3) picture, each from a camera at the eye that is aimed at the stack's origin.
         eyes_m: (2, 3) left and right eye in frame `stack`.
-        fov_deg: Horizontal field of view of the pictures.
+        fov_deg: The pictures' horizontal field of view.
         parallel: True if the pictures might be a rectified pair from parallel cameras, passed by mistake. The warning
             says so if the disparities suggest it.
     """

@@ -76,12 +76,12 @@ def squared_errors(
         targets: (h, w, 3) intensities, for each of the eyes `solved_for_m`.
         solved_for_m: (2, 3) eyes that the layers were solved for, in frame `stack`.
         eyes_m: (2, 3) true eyes in frame `stack`.
-        fov_deg: Horizontal field of view of the targets.
+        fov_deg: The targets' horizontal field of view.
         sampling: Rays to trace.
 
     Returns:
-        (1 + groups,) errors. The first is over all rows. Each of the others is over one of several interleaved groups
-        of rows; their scatter gives the standard error of the first. If the light is nearly perfect, an error can be
+        (1 + groups,) errors. The first is over all rows. Each of the others is over one of the interleaved groups of
+        rows; their scatter gives the first one's standard error. If the light is nearly perfect, an error can be
         negative because the rays are random.
 
     Raises:
@@ -144,7 +144,7 @@ def view_of(
         nominal_m: (3,) eye position that the layers were solved for, in frame `stack`.
         true_m: (3,) true eye position in frame `stack`.
         target: (h, w, 3) intensities that the nominal eye should see.
-        fov_deg: Horizontal field of view of the target.
+        fov_deg: The target's horizontal field of view.
         pupil_mm: Pupil diameter. If 0, the eye is a pinhole.
 
     Raises:

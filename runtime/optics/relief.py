@@ -113,7 +113,7 @@ class Displacement:
         Args:
             columns: Horizontal positions of the pixel centres.
             rows: Vertical positions of the pixel centres.
-            size_px: Width and height of the panel in pixels.
+            size_px: Panel width and height in pixels.
 
         Returns:
             Displacements to the right and displacements down, each with shape (rows, columns), in panel pixels.

@@ -148,7 +148,7 @@ def seen_by(
     Args:
         eye_m: (3,) eye in frame `stack`.
         layers: (N, H, W, 3 or 4) layers, rear to front, as code values or float in [0, 1]. A fourth channel is ignored.
-        fov_deg: Horizontal field of view of the image.
+        fov_deg: The image's horizontal field of view.
         width_px: Image width. By default, the layers' width.
         height_px: Image height. By default, the layers' height.
 

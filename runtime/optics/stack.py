@@ -48,7 +48,7 @@ class PlaneRaster:
 
 @dataclass(frozen=True, slots=True)
 class Tilt:
-    """Slopes of panels that are not quite parallel, and the position from which they were registered."""
+    """Slopes of panels that are not quite parallel, and the position they were registered from."""
 
     depth: tuple[tuple[float, float, float], ...]  # (d, r, u) for each panel's plane, x = x_m + d + r·y + u·z
     seen_from_m: tuple[float, float, float]  # frame `stack`
@@ -56,7 +56,7 @@ class Tilt:
 
 @dataclass(frozen=True, slots=True)
 class PanelStack:
-    """Geometry of the display: parallel or nearly parallel panels of equal size, from rear to front."""
+    """Display geometry: parallel or nearly parallel panels of equal size, from rear to front."""
 
     width_m: float
     height_m: float
@@ -78,7 +78,7 @@ class PanelStack:
     def reduced(self, reduction: int) -> PanelStack:
         """Return a stack with the same size in metres but fewer pixels.
 
-        The number of rows and the number of columns are each divided by `reduction`, but at least one of each remains.
+        The rows and columns are divided by `reduction`, with at least one of each left.
         """
         if reduction == 1:
             return self

@@ -25,7 +25,7 @@ def raster_views(eyes_m: F64, raster: PlaneRaster, *, reduction: int = 1) -> tup
     Args:
         eyes_m: (2, 3) left and right eye in frame `stack`.
         raster: Pixels to draw on, usually the middle panel's.
-        reduction: Factor by which the raster's rows and columns are fewer than the panels'.
+        reduction: The panels' number of rows and columns, divided by the raster's.
     """
     left, right = (
         View(eye, side, raster_from_stack(eye, raster), raster.width_px, raster.height_px, reduction)
@@ -53,7 +53,7 @@ def retina_pictures(
 
     Args:
         eyes_m: (2, 3) left and right eye in frame `stack`. Each eye looks at the stack's origin.
-        fov_deg: Horizontal field of view of the pictures.
+        fov_deg: The pictures' horizontal field of view.
         time_ns: Time on the run's clock, for moving content.
     """
     size = {"width_px": stack.width_px, "height_px": stack.height_px}
@@ -85,7 +85,7 @@ def drawn_job(
         reduction: Number to divide the panels' rows and columns by.
         trimmed: True to skip work that the scene does not need (`trim`). If the content knows its extent, the rest of
             the picture is not even drawn.
-        before: Window of the previous solution, on the same raster.
+        before: The previous solution's window, on the same raster.
         in_depth: True to include the content's relief, if the source knows the depth.
 
     Raises:
@@ -114,7 +114,7 @@ def drawn_job(
 
 
 def _extent(content: ContentSource, eyes_m: F64, middle: PlaneRaster, *, time_ns: int) -> PixelRect | None:
-    """Return a box on the middle panel outside of which both eyes see only the background.
+    """Return the middle-panel box to draw. Outside it, both eyes see only the background.
 
     Returns None if the content does not know its extent.
     """
@@ -132,7 +132,7 @@ def _relief(
     Returns None if the content source does not know the depth.
 
     Args:
-        views: Views of the left and the right eye.
+        views: The left and the right eye's view.
         window: Window that was drawn on the middle panel. If None, the whole panel was drawn.
         every: Side of a relief pixel, in panel pixels.
     """

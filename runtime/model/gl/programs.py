@@ -22,7 +22,7 @@ CONSTANTS = f"FULL {FULL:.1f}", f"EDGE_CLAMP_PX {EDGE_CLAMP_PX:.1f}"
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """The part of a texture that is in use. It starts at the texture's first row and column."""
+    """Part of a texture in use. It starts at the texture's first row and column."""
 
     texture: Any  # moderngl.Texture
     width_px: int
