@@ -184,7 +184,7 @@ class Effort:
 class Measures:
     """Squared errors measured for a solution, with intensities from 0 to 1. None means not measured."""
 
-    residual: float | None = None  # error of sampled rays relative to the solution's targets
+    residual: float | None = None  # error of sampled rays, measured against the solution's targets
     detail: Mapping[int, float] = field(default_factory=dict)  # error of the pictures on a coarser raster, by reduction
     contrast: float | None = None  # half the pictures' variance, used as the error of unrelated pictures
     change: tuple[float, float, float] | None = None  # error of earlier pictures, metres the eyes moved, seconds passed

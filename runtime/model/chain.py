@@ -94,18 +94,18 @@ class ChainFrame:
         return self.cells * 2 * self.cell_px
 
     def plane_from_frame(self, eye_m: F64, *, x_m: float) -> F64:
-        """Return the 3x3 map along an eye's rays from (t, v, 1) to (y, z, 1) on the plane at `x_m`."""
+        """Return the 3x3 map along a (3,) eye's rays from (t, v, 1) to (y, z, 1) on the plane at `x_m`."""
         t = (x_m - self.x_m) / (eye_m[0] - self.x_m)
         across = np.array([[1 - t, 0.0, eye_m[1] * t], [0.0, 1 - t, eye_m[2] * t], [0.0, 0.0, 1.0]])
         return across @ self.plane_from_raster
 
     def frame_from_plane(self, *, x_m: float) -> F64:
-        """Return the 3x3 map along rays from `middle_m` from (y, z, 1) on the plane at `x_m` to (t, v, 1)."""
+        """Return the 3x3 map from (y, z, 1) on the plane at `x_m` to (t, v, 1), along rays from `middle_m`."""
         inverse = np.linalg.inv(self.plane_from_frame(self.middle_m, x_m=x_m))
         return np.asarray(inverse / inverse[2, 2], np.float64)
 
     def eye_sigma_px(self, stack: PanelStack, *, eye_sigma_m: float, cell_px: int) -> F32:
-        """Return the three lengths that the network needs as input.
+        """Return the three lengths that the network needs as input, as a (3,) array.
 
         The first two are how far a tracking error of one standard deviation moves the outer panels' pictures, along and
         across the rows. The third is the centre panel's parallax relative to the raster's plane, along the rows.

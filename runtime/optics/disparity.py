@@ -63,7 +63,7 @@ class _Compared:
         return float(np.sqrt(np.mean((share * (light[0] - light[1]) / 2)[both] ** 2))) if both.any() else 0.0
 
     def disparities_m(self) -> F64:
-        """Return the disparities of all n unambiguously matched points, in metres on the middle panel.
+        """Return the (n,) disparities of all unambiguously matched points, in metres on the middle panel.
 
         Disparity is positive for a point in front of the middle panel, which appears farther right to the left eye than
         to the right eye. The result is empty if most of the picture is repetitive or too few points match.

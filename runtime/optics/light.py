@@ -66,7 +66,7 @@ def squared_errors(
     fov_deg: float,
     sampling: Sampling,
 ) -> F64:
-    """Return the mean squared errors of the light that reaches the eyes, relative to carried targets.
+    """Return the mean squared errors of the light that reaches the eyes, compared with carried targets.
 
     A carried target is a picture treated as if it were painted on the centre panel (docs/contracts.md). A pixel counts
     if all its rays cross every panel at least half a pixel inside the panel's edge.
