@@ -1,4 +1,4 @@
-"""Monotonic clocks in integer nanoseconds, which are passed to every component that needs the time."""
+"""Monotonic clocks that count integer nanoseconds. Every component that needs the time is given one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ NS_PER_MS = 1_000_000
 
 
 class Clock(Protocol):
-    """Interface through which the runtime reads the time, from a real or a simulated clock."""
+    """Interface used to read the time and to sleep, whether the clock is real or simulated."""
 
     def now_ns(self) -> int:
         """Return the time in nanoseconds on a monotonic clock with an arbitrary zero."""
@@ -20,7 +20,7 @@ class Clock(Protocol):
 
 
 class MonotonicClock:
-    """Clock that reads the monotonic time of the operating system."""
+    """Clock that reads the operating system's monotonic time."""
 
     def now_ns(self) -> int:
         return time.monotonic_ns()
@@ -32,7 +32,7 @@ class MonotonicClock:
 
 
 class SimulatedClock:
-    """Clock for tests and fast replay, whose time passes only when a caller sleeps or advances the clock."""
+    """Clock for tests and fast replay. Its time passes only when a caller sleeps or advances it."""
 
     def __init__(self, start_ns: int = 0) -> None:
         self._now_ns = start_ns
@@ -53,8 +53,8 @@ class SimulatedClock:
 class Stopwatch:
     """Stopwatch that adds up the real time spent in named stages, in milliseconds.
 
-    A stage begins when the previous stage ends, and ends when `lap` is called with the name of the stage. The totals
-    are in `stage_ms`.
+    Each stage begins when the previous one ends, and ends when `lap` is called with its name. The totals are kept in
+    `stage_ms`.
     """
 
     def __init__(self, *stages: str) -> None:
@@ -67,7 +67,7 @@ class Stopwatch:
         self._last_ns = time.perf_counter_ns()
 
     def lap(self, stage: str) -> float:
-        """Add the time since the previous call to a stage, and return that time in milliseconds."""
+        """Credit the time elapsed since the previous call to a stage, and return it in milliseconds."""
         now_ns = time.perf_counter_ns()
         spent_ms, self._last_ns = (now_ns - self._last_ns) / NS_PER_MS, now_ns
         self.stage_ms[stage] = self.stage_ms.get(stage, 0.0) + spent_ms

@@ -1,4 +1,4 @@
-"""Exception classes, and functions that clean and classify errors.
+"""Exception classes, and functions that clean up messages and classify errors.
 
 After a transient error, the daemon keeps the last good frame, degrades and retries. After a fatal error, the program
 exits with code 2.
@@ -12,17 +12,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-PART_CHARACTERS_MAX = 300  # limit for each part of a message, because an untrusted name must not fill the screen
-PROBLEM_CHARACTERS_MAX = 1500  # limit for the description of all problems in a file
+PART_CHARACTERS_MAX = 300  # limit for each part of a message, so that an untrusted name cannot fill the screen
+PROBLEM_CHARACTERS_MAX = 1500  # limit for a description of all the problems in a file
 _USER_OF_ADDRESS = re.compile(r"""(:/{1,2})[^/\s'"]*@""")  # a URL that was converted to a path has only one slash
-# System errors that indicate a lack of resources, a hardware failure that may be temporary, or an interrupted call.
+# System errors caused by a lack of resources, a hardware failure that may be temporary, or an interrupted call.
 PASSING = frozenset(
     (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.ENOBUFS, errno.EINTR)
 )
 
 
 def without_secrets(text: str) -> str:
-    """Return the text without the user names and passwords that precede an `@` in URLs.
+    """Return the text with any user names and passwords before an `@` in URLs removed.
 
     >>> without_secrets("rtsp://user:a@b@host/door"), without_secrets("/etc/rtsp:/user:a@host/door")
     ('rtsp://host/door', '/etc/rtsp:/host/door')
@@ -33,8 +33,8 @@ def without_secrets(text: str) -> str:
 def one_line(text: str, *, most: int = PART_CHARACTERS_MAX) -> str:
     r"""Return the text as one printable line without secrets.
 
-    Each unprintable character becomes `?`, which keeps untrusted text from forging log lines. In a text of more than
-    `most` characters, `...` replaces the middle.
+    Each unprintable character is replaced by `?`, so that untrusted text cannot forge log lines. If the text is longer
+    than `most` characters, its middle is replaced by `...`.
 
     >>> one_line("a\nb"), one_line("x" * 9, most=7)
     ('a?b', 'xx...xx')
@@ -47,7 +47,7 @@ def one_line(text: str, *, most: int = PART_CHARACTERS_MAX) -> str:
 
 
 class PhasestackError(Exception):
-    """Base class of all errors that phasestack raises on purpose."""
+    """Base class for all errors that phasestack raises on purpose."""
 
 
 class FatalError(PhasestackError):
@@ -71,7 +71,7 @@ class InputError(FatalError):
 
 
 class MissingPart(FatalError):
-    """A package or library that the requested function needs is missing. The message names that part."""
+    """A package or library needed by the requested function is missing. The message names it."""
 
 
 class TransientError(PhasestackError):
@@ -81,7 +81,7 @@ class TransientError(PhasestackError):
 class SensorLost(TransientError):
     """The sensor is disconnected, hangs or delivers invalid data.
 
-    The sensor thread closes the sensor and reopens it, with a delay that doubles up to a maximum.
+    The sensor thread closes and reopens the sensor, after a delay that doubles each time up to a maximum.
     """
 
 
@@ -90,7 +90,7 @@ class SensorTimeout(TransientError):
 
 
 class EndOfRecording(TransientError):
-    """The recording that is being replayed has no more samples."""
+    """The recording being replayed has no more samples."""
 
 
 class ContentFailure(TransientError):
@@ -104,7 +104,8 @@ class ModelFailure(TransientError):
 class EyesNotServed(ModelFailure):
     """The model does not support the requested eye positions.
 
-    A moving viewer may return to supported positions. Unsupported positions in a command's options are refused.
+    The failure is transient because a moving viewer may return to a supported position. Unsupported positions given in
+    a command's options are refused.
     """
 
 
@@ -113,9 +114,9 @@ class ContextLost(TransientError):
 
 
 class PanelLost(TransientError):
-    """The window, monitor or GL context of a panel is lost.
+    """A panel's window, monitor or GL context is lost.
 
-    The display loop continues and tries to rebuild the panels.
+    The display loop keeps running and tries to rebuild the panels.
     """
 
 
@@ -125,9 +126,9 @@ class Stopped(PhasestackError):
 
 @contextmanager
 def retry_advised() -> Iterator[None]:
-    """Convert temporary failures of the machine to TransientError.
+    """Convert temporary machine failures to TransientError.
 
-    The exit code of a TransientError, 75, advises the caller to start the program again.
+    The exit code for a TransientError, 75, tells the caller that starting the program again may help.
     """
     try:
         yield
@@ -138,9 +139,9 @@ def retry_advised() -> Iterator[None]:
 
 
 def is_retryable(error: BaseException | None) -> bool:
-    """Return True if any exception in a chain is a temporary failure of the machine, not bad input.
+    """Return True if any exception in the chain is a temporary machine failure rather than bad input.
 
-    Functions that read files convert a system error to an InputError that names the file. The system error stays in
+    Functions that read files convert a system error to an InputError that names the file, but the system error stays in
     the chain of causes and contexts.
     """
     while error is not None:

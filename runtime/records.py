@@ -1,6 +1,6 @@
-"""Immutable records that the stages of the runtime pass to each other.
+"""Immutable records passed between the stages of the runtime.
 
-The arrays in a record never change after the record has been constructed.
+A record's arrays never change once the record has been constructed.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Inference = Literal["ran", "reused", "skipped"]
 
 
 class State(StrEnum):
-    """State of the daemon. The reason reported with DEGRADED names the missing parts."""
+    """Daemon state. The reason reported with DEGRADED names the missing parts."""
 
     STARTING = "starting"
     TRACKING = "tracking"
@@ -37,7 +37,7 @@ class State(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Intrinsics:
-    """Intrinsic parameters of a pinhole camera. The centres of pixels have half-integer coordinates."""
+    """Intrinsic parameters of a pinhole camera. Pixel centres have half-integer coordinates."""
 
     width_px: int
     height_px: int
@@ -63,20 +63,20 @@ class EyePoints:
 
     eyes_m: F64  # (2, 3) left and right eye in metres, frame `sensor` or `stack` depending on the context
     confidence: F64  # (2,) confidence in the left and right eye, 0 to 1
-    completed: Literal["", "left", "right"] = ""  # hidden eye whose position was inferred from the head's pose
-    covariance_m2: F64 | None = None  # (3, 3) covariance of the eyes' midpoint in the frame of `eyes_m`; None: unknown
+    completed: Literal["", "left", "right"] = ""  # hidden eye whose position was inferred from the head pose
+    covariance_m2: F64 | None = None  # (3, 3) covariance of the eyes' midpoint, in the same frame; None: unknown
 
 
 @dataclass(frozen=True, slots=True)
 class SensorFrame:
-    """Sample of a sensor, which combines the data of all streams at one instant."""
+    """A sensor sample that combines the data from all streams at one instant."""
 
     sequence: int  # frame number assigned by the device; a gap means lost frames
     capture_ns: int  # time of exposure, on the monotonic clock
-    eyes: EyePoints | None = None  # eyes in the frame `sensor`; None: no face, or the sensor does not find eyes
+    eyes: EyePoints | None = None  # eyes in frame `sensor`; None: no face, or a sensor that does not find eyes
     colour: U8 | None = None  # (h, w, 3) RGB
     depth_mm: U16 | None = None  # (h, w), registered to the colour image where both exist; 0: no measurement
-    intrinsics: Intrinsics | None = None  # intrinsics of the image to which depth and colour are registered
+    intrinsics: Intrinsics | None = None  # intrinsics of the image that depth and colour are registered to
     true_eyes_m: F64 | None = None  # (2, 3) true eyes in metres, frame `stack`; None: no ground truth
 
 
@@ -84,7 +84,7 @@ class SensorFrame:
 class EyesEstimate:
     """Estimated eye positions at one instant, with a label that says how they were obtained."""
 
-    time_ns: int  # instant of the estimate
+    time_ns: int  # instant that the estimate is for
     capture_ns: int  # capture time of the newest sample used; may be 0 with label `none`
     eyes_m: F64 | None  # (2, 3) left and right eye in metres, frame `stack`; None with label `none`
     label: EyesLabel
@@ -93,10 +93,11 @@ class EyesEstimate:
 
 @dataclass(frozen=True, slots=True)
 class Parallax:
-    """Motion of content on the panels as the eyes move away from the solution's eye positions.
+    """Motion of the content on the panels as the eyes move away from the solution's eye positions.
 
-    The eyes now see content of relief b through pixel p of the middle panel. From the solution's eye positions, the
-    same content appeared at pixel p + b·(drift_px + growth·p). `optics.relief` derives this equation.
+    Suppose the eyes now see content with relief b through pixel p of the middle panel. Seen from the solution's eye
+    positions, the same content appeared at pixel p + b·(drift_px + growth·p). The equation is derived in
+    `optics.relief`.
     """
 
     drift_px: tuple[float, float]  # shift to the right and down
@@ -107,33 +108,33 @@ class Parallax:
 
 @dataclass(frozen=True, slots=True)
 class PanelFrame:
-    """Layers that the panels show at one refresh: an aligned solution, the flat picture or a mix."""
+    """The layers that the panels show at one refresh: an aligned solution, the flat picture or a mix."""
 
-    number: int  # number of the refresh, the same on all panels
+    number: int  # refresh number, the same on all panels
     solved: U8 | None  # (N, h, w, 4) RGBA layers of the solution, rear to front, on any raster; None: no solution yet
     solved_version: int  # changes whenever `solved` changes
-    solved_from_shown: tuple[F64, ...] = ()  # for each panel, (3, 3) map of panel pixels; empty: identity
+    solved_from_shown: tuple[F64, ...] = ()  # for each panel, (3, 3) map from its pixels to `solved`; empty: identity
     flat: U8 | None = None  # (N, height_px, width_px, 4) flat picture, which is never aligned
     flat_version: int = 0
     flatness: float = 0.0  # weight of `flat` in a linear mix of 8-bit codes; 0: only `solved`, 1: only `flat`
-    size_px: tuple[int, int] | None = None  # columns and rows of the panels; None: the size of `solved`
+    size_px: tuple[int, int] | None = None  # panel columns and rows; None: the size of `solved`
     relief: F32 | None = None  # (h, w) relief of the solution's content on the middle panel; None: unknown
     parallax: Parallax | None = None  # None: content does not move on the middle panel
 
 
 @dataclass(frozen=True, slots=True)
 class PresentReport:
-    """Times at which the panels showed a PanelFrame."""
+    """Times when the panels showed a PanelFrame."""
 
     number: int
-    present_ns: int  # estimated time at which the last panel was lit
+    present_ns: int  # estimated time when the last panel was lit
     skew_ms: float  # time between the buffer swaps of the first and the last panel
     vblank_ns: int | None = None  # estimated time of the refresh's vertical blank; None: not applicable
 
 
 @dataclass(frozen=True, slots=True)
 class PlanItem:
-    """Work that the plan omits, with the reason, the time saved and the quality lost."""
+    """A piece of work that the plan leaves out, with the reason, the time saved and the quality lost."""
 
     what: str  # the omitted work
     why: str
@@ -146,14 +147,14 @@ class FrameTiming:
     """Predicted times of one refresh, on the run's clock."""
 
     id: int  # refresh number
-    wake_ns: int  # time at which the presenter wakes
-    present_ns: int  # time of the vertical blank or, without one, of the end of presenting
+    wake_ns: int  # time when the presenter wakes
+    present_ns: int  # time of the vertical blank, or the end of presenting if there is none
     photon_ns: int  # middle of the display time
 
 
 @dataclass(frozen=True, slots=True)
 class SolveRequest:
-    """Request from the presenter to the solver. A new request replaces one that the solver has not begun."""
+    """A request from the presenter to the solver. It replaces any request that the solver has not begun."""
 
     time_ns: int  # instant to solve for, the middle of the solution's expected display time
     eyes_m: F64 | None  # (2, 3) left and right eye in metres, frame `stack`, predicted for `time_ns`; None: no viewer
@@ -162,16 +163,16 @@ class SolveRequest:
     flat_wanted: bool  # True if the flat picture is shown or will be needed
     paused: bool = False  # True if no new solutions are wanted
     effort: Effort | None = None  # effort for a new solution; None: full effort
-    refined_to: Effort | None = None  # effort to which to refine an unchanged solution; None: do not refine
+    refined_to: Effort | None = None  # effort to refine an unchanged solution to; None: do not refine
 
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """Work spent on a solution, given by the resolution of the layers and the number of steps."""
+    """Amount of work put into a solution: the resolution of the layers and the number of steps."""
 
     reduction: int = 1  # divisor of the panels' rows and columns
     steps: int = 0  # updates of all panels
-    continued_from: int | None = None  # number of steps in the solution that is continued; None: a new solution
+    continued_from: int | None = None  # number of steps in the solution being continued; None: a new solution
 
     @property
     def name(self) -> str:
@@ -181,22 +182,22 @@ class Effort:
 
 @dataclass(frozen=True, slots=True)
 class Measures:
-    """Measured squared errors of a solution, for intensities from 0 to 1. None means not measured."""
+    """Squared errors measured for a solution, with intensities from 0 to 1. None means not measured."""
 
-    residual: float | None = None  # error of sampled rays against the solution's targets
-    detail: Mapping[int, float] = field(default_factory=dict)  # error of the pictures on coarser rasters, by reduction
-    contrast: float | None = None  # half the pictures' variance, which stands for the error of unrelated pictures
-    change: tuple[float, float, float] | None = None  # error of earlier pictures, metres the eyes moved, seconds since
+    residual: float | None = None  # error of sampled rays, measured against the solution's targets
+    detail: Mapping[int, float] = field(default_factory=dict)  # error of the pictures on a coarser raster, by reduction
+    contrast: float | None = None  # half the pictures' variance, used as the error of unrelated pictures
+    change: tuple[float, float, float] | None = None  # error of earlier pictures, metres the eyes moved, seconds passed
 
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """Immutable layers that were computed for one pair of eye positions, or for the flat picture."""
+    """Immutable layers computed for one pair of eye positions, or for the flat picture."""
 
-    number: int  # counted from 1, for solutions and flat pictures together
-    layers: U8  # (N, h, w, 4) RGBA layers, rear to front; their raster is coarser by `effort.reduction`
+    number: int  # counted from 1, over solutions and flat pictures together
+    layers: U8  # (N, h, w, 4) RGBA layers, rear to front, on a raster that is coarser by `effort.reduction`
     solved_for_m: F64 | None  # (2, 3) left and right eye in metres, frame `stack`; None: a flat picture
-    solved_for_ns: int  # instant for which the eyes and the content were predicted
+    solved_for_ns: int  # instant that the eyes and the content were predicted for
     seeing: tuple[bool, bool] = (True, True)  # left, right; False: eye out of range, replaced by the other eye
     eye_sigma_m: float | None = None  # tracking error that the solution allows for
     stage_ms: dict[str, float] = field(default_factory=dict)  # time of each of `SOLVING_STAGES`, on the run's clock
@@ -207,23 +208,23 @@ class Solution:
 
 @dataclass(frozen=True, slots=True)
 class RefreshAccount:
-    """Record of one refresh, written as a line of frames.jsonl (docs/contracts.md)."""
+    """Record of one refresh, written as a line in frames.jsonl (docs/contracts.md)."""
 
     frame: int
     capture_ns: int  # capture time of the newest sample used; 0: no sample
     predicted_for_ns: int  # display time
     present_ns: int
-    eyes_m: F64 | None  # (2, 3) eyes to which the panels are aligned, in metres, frame `stack`
+    eyes_m: F64 | None  # (2, 3) eyes that the panels are aligned to, in metres, frame `stack`
     eyes_label: EyesLabel
     eye_sigma_mm: float | None  # standard deviation of the eyes along each axis; None: no eyes
     state: State
-    solution: int | None  # number of the solution that is shown; None: only the flat picture
+    solution: int | None  # number of the solution shown; None: only the flat picture
     solved_for_m: F64 | None  # (2, 3) eyes that the solution was computed for, in metres, frame `stack`
     solution_age_ms: float | None  # display time minus the instant that the solution was computed for
     inference: Inference  # ran: first refresh to show the solution; reused: a later refresh; skipped: no solution
     presented: bool
     skew_ms: float
     photon_ns: int = 0  # display time, computed from the actual present time
-    true_eyes_m: F64 | None = None  # (2, 3) at the display time, from recordings with ground truth
-    stage_ms: dict[str, float] = field(default_factory=dict)  # time of each stage, on the run's clock
+    true_eyes_m: F64 | None = None  # (2, 3) true eyes at the display time, from recordings with ground truth
+    stage_ms: dict[str, float] = field(default_factory=dict)  # time taken by each stage, on the run's clock
     effort: str | None = None  # name of the shown solution's effort (`Effort.name`)

@@ -1,1 +1,1 @@
-"""Eye finder, which locates eyes in pictures, and tracker, which predicts eye positions in `stack`."""
+"""Eye finder, which locates eyes in pictures, and tracker, which predicts their positions in `stack`."""

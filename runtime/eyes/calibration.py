@@ -1,8 +1,8 @@
-"""Load, check and apply the calibration that relates the sensor frame to the stack frame.
+"""Load, check and apply calibrations, which relate the sensor frame to the stack frame.
 
-A calibration has seven parameters: three of a rotation vector (rad, about the axes of `stack`), three of a shift (m)
-and a log scale. The parameters refer to a pivot w0 in `stack`, the centre of the point pairs used for calibration. This
-choice makes the parameters nearly uncorrelated. A small change d of the parameters moves a point w by
+A calibration has seven parameters: a rotation vector (three numbers in rad, about the axes of `stack`), a shift
+(three numbers in m) and a log scale. The parameters refer to a pivot w0 in `stack`, the centre of the point pairs used
+for calibration, which makes them nearly uncorrelated. A small change d in the parameters moves a point w by
 
     d_rot × (w - w0) + d_shift + d_scale·(w - w0).
 """
@@ -23,10 +23,10 @@ from runtime.errors import InputError
 from runtime.records import F64, EyePoints
 
 DEMO_FILE = Path(__file__).parent / "data" / "demo-calibration.toml"
-SIMILARITY_TOLERANCE = 1e-3  # relative; accepts a matrix that is rounded to four digits, but not a sheared matrix
-PLAUSIBLE_SCALE = (0.8, 1.25)  # scale between two frames in metres
-SCALE = (5e-4, 2e3)  # range of scales that millimetres in one of the point sets could explain; others are refused
-NEAR_M, MAX_DISTANCE_M = 5.0, 20.0  # sensor distances from the display above which to warn and to refuse, respectively
+SIMILARITY_TOLERANCE = 1e-3  # relative; accepts a matrix rounded to four digits, but not a sheared one
+PLAUSIBLE_SCALE = (0.8, 1.25)  # scale expected between two frames that are both in metres
+SCALE = (5e-4, 2e3)  # range of scales that could be explained by millimetres in one point set; others are refused
+NEAR_M, MAX_DISTANCE_M = 5.0, 20.0  # warn or refuse, respectively, if the sensor is farther from the display
 
 Number = Annotated[float, Field(strict=True, ge=-MOST, le=MOST)]  # refuses "1.0" and true
 Row4 = tuple[Number, Number, Number, Number]
@@ -35,26 +35,26 @@ Row7 = tuple[Number, Number, Number, Number, Number, Number, Number]
 
 
 class Lenient(Section):
-    """Table that ignores unknown keys, because a later version of phasestack may have written the file."""
+    """Table that ignores unknown keys, because the file may come from a later version of phasestack."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
 
 class Residuals(Lenient):
-    """Table `[residuals]`: distances that remain between paired points, in metres of the stack frame."""
+    """Table `[residuals]`: distances left between paired points, in metres in the stack frame."""
 
     rms_m: Annotated[float, Field(ge=0)]
 
 
 class CovarianceTable(Lenient):
-    """Table `[covariance]`: covariance of the seven parameters, and the pivot to which they refer."""
+    """Table `[covariance]`: the seven parameters' covariance, and the pivot they refer to."""
 
     pivot_m: Vector3
     matrix: tuple[Row7, Row7, Row7, Row7, Row7, Row7, Row7]
 
 
 class CalibrationFile(Lenient):
-    """Contents of a calibration file. Only the key `stack_from_sensor` is required."""
+    """Contents of a calibration file. Only `stack_from_sensor` is required."""
 
     stack_from_sensor: tuple[Row4, Row4, Row4, Row4]
     units: Literal["m"] = "m"
@@ -72,18 +72,18 @@ class Calibration:
 
     stack_from_sensor: F64  # (4, 4) matrix [sR t; 0 1]
     file: CalibrationFile
-    source: str  # name of the file in messages
-    warnings: tuple[str, ...]  # one line each, to show to the user
+    source: str  # file name to use in messages
+    warnings: tuple[str, ...]  # lines to show to the user
 
     @property
     def scale(self) -> float:
-        """Metres in the stack frame per metre in the sensor frame."""
+        """Number of metres in the stack frame per metre in the sensor frame."""
         return float(np.cbrt(np.linalg.det(self.stack_from_sensor[:3, :3])))
 
     def points(self, sensor_m: ArrayLike) -> F64:
-        """Transform points (..., 3), in metres, from the sensor frame to the stack frame.
+        """Transform (..., 3) points, in metres, from the sensor frame to the stack frame.
 
-        This is equation (28) of the EyeReal supplement.
+        Implements equation (28) of the EyeReal supplement.
         """
         points = np.asarray(sensor_m, dtype=np.float64)
         return points @ self.stack_from_sensor[:3, :3].T + self.stack_from_sensor[:3, 3]
@@ -98,12 +98,12 @@ class Calibration:
         )
 
     def position_error_m(self, stack_m: ArrayLike) -> F64 | None:
-        """Return the RMS position error that the calibration causes at each point, in metres.
+        """Return the RMS position error caused by the calibration at each point, in metres.
 
         Returns None if the calibration file contains no covariance.
 
         Args:
-            stack_m: Points (..., 3) in the frame `stack`.
+            stack_m: (..., 3) points in frame `stack`.
         """
         if self.file.covariance is None:
             return None
@@ -113,10 +113,10 @@ class Calibration:
         return error_m
 
     def serial_warning(self, serial: str) -> str:
-        """Return a one-line warning if a sensor is not the calibrated one, otherwise an empty string.
+        """Return a one-line warning if a sensor is not the calibrated one, or an empty string if it is.
 
         Args:
-            serial: Serial number of the sensor in use, or an empty string if the sensor reports none.
+            serial: Serial number of the sensor in use, or an empty string if it reports none.
         """
         calibrated = self.file.sensor_serial
         if not calibrated or serial == calibrated:
@@ -126,9 +126,9 @@ class Calibration:
 
 
 def position_jacobian(stack_m: ArrayLike, *, pivot_m: ArrayLike) -> F64:
-    """Return the derivatives (..., 3, 7) of points (..., 3) with respect to the seven parameters.
+    """Return the (..., 3, 7) derivatives of (..., 3) points with respect to the seven parameters.
 
-    Points and pivot are in the frame `stack`.
+    The points and the pivot are in frame `stack`.
     """
     arm = np.asarray(stack_m, dtype=np.float64) - np.asarray(pivot_m, dtype=np.float64)
     jacobian = np.zeros((*arm.shape, 7))
@@ -141,10 +141,10 @@ def position_jacobian(stack_m: ArrayLike, *, pivot_m: ArrayLike) -> F64:
 
 
 def similarity_defect(matrix: ArrayLike) -> float:
-    """Return the deviation of a matrix from a similarity: max |A^T A / s² - I|.
+    """Return how far a matrix deviates from a similarity: max |A^T A / s² - I|.
 
-    A is the upper left 3x3 block, and s is its scale. The deviation of an exact similarity is 0, even if the similarity
-    includes a reflection. The deviation of a zero matrix is infinite.
+    A is the upper left 3x3 block, and s is its scale. The deviation is 0 for an exact similarity, even one that
+    includes a reflection, and infinite for a zero matrix.
     """
     linear = np.asarray(matrix, dtype=np.float64)[:3, :3]
     largest = float(np.abs(linear).max())
@@ -158,7 +158,7 @@ def check_similarity(matrix: F64, *, source: str | Path) -> None:
     """Check that a 4x4 matrix is a plausible calibration.
 
     Args:
-        source: Name of the file that contains the matrix, for the message of the error.
+        source: Name of the file that contains the matrix, for the error message.
 
     Raises:
         InputError: The matrix has an entry beyond `MOST` or a wrong last row, is not a similarity, mirrors space, has a
@@ -207,10 +207,11 @@ def _warnings(matrix: F64, source: str) -> tuple[str, ...]:
 def load_calibration(path: Path | None) -> Calibration:
     """Load and check a calibration file.
 
-    A scale far from 1, or a sensor more than `NEAR_M` from the display, only adds a line to `Calibration.warnings`.
+    If the scale is far from 1, or the sensor is more than `NEAR_M` from the display, the file is accepted, but a line
+    is added to `Calibration.warnings`.
 
     Args:
-        path: Calibration file. None selects the calibration of the demo recording.
+        path: Calibration file. If None, the demo recording's calibration is loaded.
 
     Raises:
         InputError: The file is missing or malformed, or its matrix has the wrong shape, is not finite or fails
@@ -228,7 +229,7 @@ def load_calibration(path: Path | None) -> Calibration:
 
 
 def demo_stack_from_sensor() -> F64:
-    """Return the 4x4 calibration of the demo's sensor, which faces +x and is tilted down by 10 degrees."""
+    """Return the 4x4 calibration for the demo's sensor, which faces +x and is tilted down by 10 degrees."""
     return load_calibration(None).stack_from_sensor
 
 

@@ -1,4 +1,4 @@
-"""Compute the viewer's eye positions and their covariance from camera pictures."""
+"""Compute the viewer's eye positions, and their covariance, from camera pictures."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from runtime.eyes.face_depth import EyeDepths, FaceDepth
 from runtime.eyes.pupils import SIDES, PupilFinder, Pupils
 from runtime.records import F64, EyePoints, Intrinsics, SensorFrame
 
-# Standard deviation of the eyes' midpoint, relative to the standard deviation of one pupil. The sideways errors of the
-# two pupils are nearly independent, but the vertical errors are the same.
+# Standard deviation of the eyes' midpoint, relative to one pupil's. The two pupils' sideways errors are nearly
+# independent, but their vertical errors are the same.
 MIDDLE_SIDEWAYS, MIDDLE_UP = 0.55, 1.1
-RANGE_MAX_M = 4.0  # a face at a greater distance is not a viewer
-LOCK_NS = NS_PER_S  # a viewer unseen for this long is replaced; a passer-by hides the viewer for less time
-FILLED_IN_CONFIDENCE = 0.4  # confidence in a hidden eye whose position is inferred
+RANGE_MAX_M = 4.0  # a face farther away than this is not a viewer
+LOCK_NS = NS_PER_S  # a viewer unseen for this long is replaced; a passer-by blocks the view for less time
+FILLED_IN_CONFIDENCE = 0.4  # confidence in a hidden eye with an inferred position
 
 log = logging.getLogger(__name__)
 
 
 class EyeFinder:
-    """Finder that locates the eyes of one viewer in camera pictures and ignores other people.
+    """Finder that locates one viewer's eyes in camera pictures and ignores other people.
 
     Attributes:
         choice: Description of how the viewer was chosen.
-        reason: Reason why no eyes were found in the last frame, or an empty string.
-        pupils: Pupils found in the last frame, even if their distance is unknown. None if no pupils were found.
+        reason: Why no eyes were found in the last frame, or an empty string.
+        pupils: Pupils found in the last frame, even if their distance is unknown. None if there were none.
     """
 
     def __init__(self, settings: Settings | None = None) -> None:
         """Create a finder.
 
         Args:
-            settings: Settings whose section `calibration` contains the viewer's eye separation, if that is known.
+            settings: Settings. The `calibration` section contains the viewer's eye separation, if that is known.
         """
         settings = settings or Settings()
         self._new_depth = partial(FaceDepth, eye_distance_m=settings.calibration.ipd_m)
@@ -54,7 +54,7 @@ class EyeFinder:
         return self._finder.choice
 
     def find(self, frame: SensorFrame) -> EyePoints | None:
-        """Return the viewer's eyes in the sensor frame, or None and store the cause in `reason`.
+        """Return the viewer's eyes in the sensor frame, or return None and store the cause in `reason`.
 
         Args:
             frame: Sample that contains colour and intrinsics. Depth is optional and must be registered to colour.
@@ -98,13 +98,14 @@ def _eye_points(pupils: Pupils, depths: EyeDepths, intrinsics: Intrinsics) -> Ey
 
 
 def covariance(point: F64, line: F64, sideways_m: float, up_m: float, along_m: float) -> F64:
-    """Return the covariance (3, 3), in m², of the position of a point that is seen from the origin.
+    """Return the (3, 3) covariance, in m², of the position of a point seen from the origin.
 
     Args:
-        point: Point (3,) in metres.
-        line: Vector (3,) between the eyes. The component perpendicular to the line of sight defines sideways.
+        point: (3,) point in metres.
+        line: (3,) vector between the eyes. Its component perpendicular to the line of sight defines the sideways
+            direction.
         sideways_m: Standard deviation along the sideways direction.
-        up_m: Standard deviation perpendicular to the sideways direction and the line of sight.
+        up_m: Standard deviation perpendicular to both the sideways direction and the line of sight.
         along_m: Standard deviation along the line of sight.
     """
     sight = point / np.linalg.norm(point)

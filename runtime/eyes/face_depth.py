@@ -1,10 +1,10 @@
-"""Estimate the distance of the viewer's eyes from the camera, averaged over time.
+"""Estimate the distance from the camera to the viewer's eyes, averaged over time.
 
-A filter estimates a single number from the measured depth of the rigid face: the viewer's eye separation in metres. The
+A filter estimates a single number from the depth measured on the rigid face: the viewer's eye separation in metres. The
 distance is this separation times the focal length, divided by the eye separation in pixels. The separation in pixels is
 measured in space along the line between the eyes, using the face mesh. Holes in the depth picture and bad frames
-therefore do no harm, and averaging reduces the depth noise without adding lag. Without depth pictures, the separation
-in metres comes from the settings or is learnt from the size of the irises.
+therefore do no harm, and averaging reduces depth noise without adding lag. If there are no depth pictures, the
+separation in metres is taken from the settings or learnt from the size of the irises.
 """
 
 from __future__ import annotations
@@ -18,52 +18,52 @@ from runtime.eyes.pupils import CORNERS, Pupils
 from runtime.records import F64, U16, Intrinsics
 
 M_PER_MM = 1e-3
-EYE_DISTANCE_M = (0.063, 0.0036)  # mean and standard deviation of the eye separation of adults
+EYE_DISTANCE_M = (0.063, 0.0036)  # mean and standard deviation of adults' eye separations
 KNOWN_SIGMA_M = 0.001  # standard deviation of an eye separation measured by an optician
-IRIS_M, IRIS_SIGMA = 0.0117, 0.07  # diameter of an iris; relative spread of irises and of the network's errors
-PERSON_M = (0.045, 0.085)  # eye separations of people, including children; depths that imply others are rejected
-FLYING_M = 0.03  # a point that deviates more from the other points is a flying pixel or lies on the wall
+IRIS_M, IRIS_SIGMA = 0.0117, 0.07  # iris diameter; relative spread due to different irises and the network's errors
+PERSON_M = (0.045, 0.085)  # people's eye separations, including children's; depths that imply others are rejected
+FLYING_M = 0.03  # a point that deviates more than this from the others is a flying pixel or lies on the wall
 POINTS_MIN = 8  # minimum number of rigid mesh points with depth
-RELIEF_MAX, RELIEF_PICTURES = 1.3, 30  # largest ratio of a face's relief to the mesh's; number of pictures averaged
-POINT_SIGMA_M = 0.0005  # minimum standard deviation of an average of many points, whose errors are not independent
-SHAPE_SIGMA_M = 0.006  # standard deviation of an eye's depth relative to the mesh
-EYE_SIGMA_M, EYE_GATE_M = 0.002, 0.02  # standard deviation of depth at an eye; larger deviations (glasses) are rejected
-EYE_WINDOW = 0.12  # radius of the depth window at an eye, in eye separations
-PICTURE_SHARE, TURN_SHARE = 0.0007, 0.3  # relative uncertainty added per picture and per change of foreshortening
+RELIEF_MAX, RELIEF_PICTURES = 1.3, 30  # maximum ratio of a face's relief to the mesh's; number of pictures averaged
+POINT_SIGMA_M = 0.0005  # minimum standard deviation of an average over many points, because their errors are correlated
+SHAPE_SIGMA_M = 0.006  # standard deviation of an eye's depth relative to the mesh's
+EYE_SIGMA_M, EYE_GATE_M = 0.002, 0.02  # standard deviation of depth at an eye; limit for deviations, to reject glasses
+EYE_WINDOW = 0.12  # radius of the depth window around an eye, in eye separations
+PICTURE_SHARE, TURN_SHARE = 0.0007, 0.3  # relative uncertainty added per picture and per change in foreshortening
 
 
 @dataclass(frozen=True, slots=True)
 class EyeDepths:
-    """Distances of the eyes from the camera along the optical axis, in metres."""
+    """The eyes' distances from the camera along the optical axis, in metres."""
 
     eyes_m: F64  # (2,) left and right eye
-    sigma_m: float  # standard deviation of the mean of both distances
+    sigma_m: float  # standard deviation of the two distances' mean
 
 
 class FaceDepth:
-    """Estimator of the distance of one viewer's eyes. Each viewer requires a new instance."""
+    """Estimator for the distance from the camera to one viewer's eyes. Each viewer needs a new instance."""
 
     def __init__(self, *, eye_distance_m: float = 0.0) -> None:
         """Create an estimator.
 
         Args:
-            eye_distance_m: The viewer's eye separation, or 0 to estimate the separation from the pictures.
+            eye_distance_m: The viewer's eye separation, or 0 to estimate it from the pictures.
         """
         self._known = eye_distance_m > 0
         self._distance, sigma = (eye_distance_m, KNOWN_SIGMA_M) if self._known else EYE_DISTANCE_M
         self._variance = sigma**2
         self._shape, self._shape_variance = np.zeros(2), np.full(2, SHAPE_SIGMA_M**2)  # (2,) m, eyes minus mesh
-        self._relief, self._reliefs = 1.0, 0  # ratio of the face's relief to the mesh's; number of pictures averaged
+        self._relief, self._reliefs = 1.0, 0  # ratio of the face's relief to the mesh's; pictures averaged
         self._foreshortening = 1.0
         self._irises: list[float] = []  # ratios of eye separation to iris diameter
         self.has_measured = False
 
     def at(self, pupils: Pupils, depth_mm: U16 | None, intrinsics: Intrinsics, depth_from_colour: F64) -> EyeDepths:
-        """Estimate the distances of both eyes from the camera in one picture.
+        """Estimate both eyes' distances from the camera in one picture.
 
         Args:
-            depth_mm: (h, w) depth picture, in which 0 means not measured. None if there is no depth picture.
-            intrinsics: Intrinsics of the colour picture.
+            depth_mm: (h, w) depth picture, where 0 means not measured. None if there is no depth picture.
+            intrinsics: The colour picture's intrinsics.
             depth_from_colour: (2,) number of depth pixels per colour pixel in each direction.
         """
         relief = pupils.mesh_px[:, 2]
@@ -73,7 +73,7 @@ class FaceDepth:
         # plane. The mesh's z axis follows the line of sight, and pixels are stretched.
         middle_px = pupils.eyes_px.mean(axis=0)
         sight = (middle_px - [intrinsics.cx_px, intrinsics.cy_px]) / focal
-        tilt = -sight / (1 + sight @ sight)  # pixels of depth per pixel of the picture
+        tilt = -sight / (1 + sight @ sight)  # pixels of depth per picture pixel
         apart = pupils.eyes_px[0] - pupils.eyes_px[1]
         across = np.sqrt(apart @ apart + (apart @ tilt) * (apart @ sight))
         length = float(np.hypot(across, eyes[0] - eyes[1]))
@@ -82,14 +82,14 @@ class FaceDepth:
         self._predict(float(across) / length)
         relief, eyes = relief - eyes.mean(), eyes - eyes.mean()
         if depth_mm is not None:
-            scale = self._distance / length  # m per pixel of the mesh
+            scale = self._distance / length  # metres per mesh pixel
             tilts_m = tilts[0] * scale, tilts[1] * scale
             self._measure(pupils, depth_mm, depth_from_colour, relief * scale, eyes * scale, tilts_m, away)
         elif not self._known:
             self._learn(length / pupils.iris_px)
         middle = self._distance * away
         shape = self._shape - self._shape.mean()
-        # An eye separation measured with depth already includes the pixel error of the pupils. For a separation from
+        # An eye separation measured from depth already includes the pupils' pixel error. If the separation comes from
         # the settings or the irises, this error must be added.
         added = self._shape_variance.mean() if self.has_measured else 2 * (pupils.sigma_px / length * middle) ** 2
         sigma = np.sqrt(self._variance * away**2 + added)
@@ -97,14 +97,14 @@ class FaceDepth:
         return EyeDepths(middle + relief_m + shape, float(sigma))
 
     def _predict(self, foreshortening: float) -> None:
-        """Increase the variance for a new picture, and for a turn of the head since the previous picture."""
+        """Increase the variance for a new picture, and for any turn of the head since the previous one."""
         turn = TURN_SHARE * (foreshortening - self._foreshortening)
         self._foreshortening = foreshortening
         if self.has_measured:
             self._variance += (PICTURE_SHARE**2 + turn**2) * self._distance**2
 
     def _learn(self, ratio: float) -> None:
-        """Estimate the eye separation from the irises, whose size varies least between people.
+        """Estimate the eye separation from the irises, because their size varies the least between people.
 
         Args:
             ratio: Eye separation divided by the iris diameter in the current picture.
@@ -122,10 +122,10 @@ class FaceDepth:
 
         Args:
             scale: (2,) number of depth pixels per colour pixel in each direction.
-            relief: (468,) depths of the mesh points behind the eyes' midpoint, in metres.
-            eyes: (2,) depths of the mesh's eyes behind the eyes' midpoint, in metres.
-            tilts: Depths in metres that the rigid mesh points and the two eyes would have on a plane perpendicular to
-                the line of sight.
+            relief: (468,) depths of the mesh points relative to the eyes' midpoint (positive behind it), in metres.
+            eyes: (2,) depths of the mesh's eyes relative to the eyes' midpoint (positive behind it), in metres.
+            tilts: Depths, in metres, that the rigid mesh points and the two eyes would have if they lay on a plane
+                perpendicular to the line of sight.
             away: Distance of the eyes' midpoint, in eye separations.
         """
         face, shape = _sampled(depth_mm, pupils.mesh_px[RIGID, :2] * scale), relief[RIGID]
@@ -163,7 +163,7 @@ class FaceDepth:
         self.has_measured = True
 
     def _fit_relief(self, depths: F64, shape: F64) -> None:
-        """Update the ratio of the face's relief to the mesh's. The ratio is near 0 for a printed face."""
+        """Update the ratio of the face's relief to the mesh's, which is near 0 for a printed face."""
         off = shape - shape.mean()
         seen = float(np.clip(off @ (depths - depths.mean()) / max(float(off @ off), 1e-12), 0, RELIEF_MAX))
         self._reliefs = min(self._reliefs + 1, RELIEF_PICTURES)
@@ -171,7 +171,7 @@ class FaceDepth:
 
 
 def _sampled(depth_mm: U16, points: F64) -> F64:
-    """Return the depths (n,), in metres, at pixel positions (n, 2). The depth outside the picture is 0."""
+    """Return the (n,) depths at (n, 2) pixel positions, in metres. Outside the picture, the depth is 0."""
     height, width = depth_mm.shape
     x, y = np.floor(points).astype(int).T
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
@@ -180,11 +180,11 @@ def _sampled(depth_mm: U16, points: F64) -> F64:
 
 
 def _window(depth_mm: U16, centre: F64, radius: float) -> F64:
-    """Return the depths (n,), in metres, of the pixels in a square window.
+    """Return the (n,) depths of the pixels in a square window, in metres.
 
     Args:
-        centre: (2,) centre of the window in pixels.
-        radius: Half of the window's side in pixels.
+        centre: (2,) window centre in pixels.
+        radius: Half the window's side, in pixels.
     """
     height, width = depth_mm.shape
     x0, y0 = np.clip(np.floor(centre - radius), 0, [width, height]).astype(int)

@@ -1,7 +1,7 @@
-"""Measure the motion of a face between pictures with the optical flow of its rigid parts.
+"""Measure how a face moves between pictures from the optical flow of its rigid parts.
 
-The errors of the face networks are independent from picture to picture. The optical flow between two pictures is far
-more precise, to 1/50 pixel. The pupils therefore follow the flow, and the networks only correct them slowly.
+The face networks' errors are independent from one picture to the next. Optical flow between two pictures is far more
+precise, to 1/50 pixel. The pupils therefore follow the flow, and the networks only correct them slowly.
 """
 
 from __future__ import annotations
@@ -14,22 +14,22 @@ import numpy as np
 from runtime.eyes.networks import resampled, transformed
 from runtime.records import F64, U8
 
-# Mesh points that move rigidly with the head: forehead, nose, cheeks and the corners of the eyes.
+# Mesh points that move rigidly with the head: forehead, nose, cheeks and eye corners.
 RIGID = np.array([
     6, 8, 9, 10, 168, 197, 195, 5, 4, 1, 151, 108, 337, 67, 297, 54, 284, 21, 251, 103, 332, 107, 336, 55, 285, 122,
     351, 196, 419, 114, 343, 188, 412, 116, 345, 117, 346, 50, 280, 101, 330, 36, 266, 205, 425, 33, 133, 263,
     362, 130, 359,
 ])  # fmt: skip
 BRIDGE = 168  # mesh point on the bridge of the nose, between the eyes
-SIZE = 192  # side of the grey crop, in pixels
+SIZE = 192  # side of the grey crop in pixels
 EYE_DISTANCE = 64.0  # distance between the eyes in the crop, in pixels
-WINDOW = 17  # side of the window that is compared around each point, in pixels of the crop
-RETURNS_WITHIN = 0.4  # forward-backward error in pixels above which a point is discarded
-POINTS_MIN, INLIERS_MIN = 10, 8  # minimum number of tracked points, and of inliers of their similarity
+WINDOW = 17  # side of the window compared around each point, in crop pixels
+RETURNS_WITHIN = 0.4  # a point is discarded if its forward-backward error is larger, in pixels
+POINTS_MIN, INLIERS_MIN = 10, 8  # minimum number of tracked points, and of inliers that fit their similarity
 
 
 class FaceFlow:
-    """Optical flow that measures the motion of a face between a remembered picture and a new one."""
+    """Optical flow that measures how a face has moved between a remembered picture and a new one."""
 
     def __init__(self) -> None:
         self._grey: Any = None
@@ -40,8 +40,8 @@ class FaceFlow:
         """Remember the face in a picture.
 
         Args:
-            mesh: (468, 3) points of the face mesh, in pixels.
-            eye_distance: Separation of the eyes in pixels.
+            mesh: (468, 3) face mesh points, in pixels.
+            eye_distance: Eye separation in pixels.
         """
         scale = EYE_DISTANCE / eye_distance
         offset = SIZE / 2 - scale * mesh[BRIDGE, :2]
@@ -49,12 +49,12 @@ class FaceFlow:
         self._grey, self._mesh = self._crop(picture), mesh[RIGID, :2].copy()
 
     def moved(self, picture: U8, mesh: F64) -> F64 | None:
-        """Return the similarity (2, 3) that maps pixels of the remembered picture to those of a new one.
+        """Return the (2, 3) similarity that maps pixels in the remembered picture to pixels in a new one.
 
-        Returns None if too few points can be tracked or fit a similarity.
+        Returns None if too few points can be tracked or too few of them fit a similarity.
 
         Args:
-            mesh: (468, 3) points of the face mesh in the new picture, in pixels.
+            mesh: (468, 3) face mesh points in the new picture, in pixels.
         """
         grey = self._crop(picture)
         matrix = self._crop_from_picture
@@ -82,11 +82,11 @@ def _flow(before: Any, after: Any, start: Any, guess: Any) -> tuple[Any, Any]:
     """Track points from one grey picture to another.
 
     Args:
-        start: Positions (n, 2) of the points in `before`.
-        guess: Initial estimates (n, 2) of the positions in `after`. They are overwritten.
+        start: (n, 2) positions of the points in `before`.
+        guess: (n, 2) initial estimates of the positions in `after`, which are overwritten.
 
     Returns:
-        The positions (n, 2) in `after`, and a mask (n, 1) of the points that were found.
+        The (n, 2) positions in `after`, and an (n, 1) mask of the points that were found.
     """
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
     ends, is_found, _ = cv2.calcOpticalFlowPyrLK(

@@ -1,4 +1,4 @@
-"""Simulated head motions, and samples that a simulated depth camera takes, for benchmarks and tests."""
+"""Simulated head motions, sampled by a simulated depth camera, for benchmarks and tests."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from runtime.clock import NS_PER_S
 from runtime.records import F64, EyePoints
 
 IPD_M = 0.063
-DISTANCE_M = 0.6  # distance of the resting eyes from the panels
+DISTANCE_M = 0.6  # distance from the panels to the eyes at rest
 DROPOUT_S = 0.2  # duration of each dropout
 NECK_TO_EYES_M = np.array([-0.09, 0.0, 0.14])  # x (negative: towards the display), sideways, up
 
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """Sample in the form in which the tracker receives it."""
+    """A sample, in the form that the tracker receives."""
 
     capture_ns: int
-    points: EyePoints | None  # eyes in the frame `stack`; None: dropout
+    points: EyePoints | None  # eyes in frame `stack`; None: dropout
 
 
-# Function that maps times (n,) in seconds to the neck's displacement (n, 3) in metres, frame `stack`, and pitch (n,) in
-# radians.
+# Function that maps (n,) times in seconds to the neck's (n, 3) displacement in metres, frame `stack`, and its (n,)
+# pitch in radians.
 Motion = Callable[[F64], tuple[F64, F64]]
 
 
@@ -33,9 +33,9 @@ def minimum_jerk(times_s: F64, *, knots_s: F64, values: F64) -> F64:
     """Interpolate between stops with minimum-jerk movements (Flash and Hogan 1985).
 
     Args:
-        times_s: Times (n,) at which to interpolate.
-        knots_s: Times (k,) of the stops.
-        values: Values (k, ...) at the stops.
+        times_s: (n,) times to interpolate at.
+        knots_s: (k,) times of the stops.
+        values: (k, ...) values at the stops.
     """
     index = np.clip(np.searchsorted(knots_s, times_s, side="right") - 1, 0, len(knots_s) - 2)
     s = np.clip((times_s - knots_s[index]) / (knots_s[index + 1] - knots_s[index]), 0, 1)
@@ -44,7 +44,7 @@ def minimum_jerk(times_s: F64, *, knots_s: F64, values: F64) -> F64:
 
 
 def _still(times_s: F64) -> tuple[F64, F64]:
-    """Sit still, except for breathing and a sway of a few millimetres."""
+    """Sit still apart from breathing and a few millimetres of sway."""
     sway = [0.0015 * np.sin(1.7 * times_s), 0.002 * np.sin(0.9 * times_s + 1), 0.0015 * np.sin(1.6 * times_s)]
     return np.stack(sway, 1), np.zeros_like(times_s)
 
@@ -74,7 +74,7 @@ def _walk(times_s: F64) -> tuple[F64, F64]:
 
 
 def _stop_and_go(times_s: F64) -> tuple[F64, F64]:
-    """Move by 10 to 30 cm within half a second to a second, with pauses of similar length."""
+    """Move 10 to 30 cm in half a second to a second, with pauses of similar length."""
     random = np.random.default_rng(7)
     knots, places, place = [0.0], [np.zeros(3)], np.zeros(3)
     while knots[-1] <= times_s.max():
@@ -92,19 +92,19 @@ MOTIONS: dict[str, Motion] = {"still": _still, "lean": _lean, "nod": _nod, "walk
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """Variation of a motion in phase, speed, extent and initial direction."""
+    """A variation on a motion in phase, speed, extent and initial direction."""
 
-    start_s: float = 0.0  # time within the motion at which the path starts
+    start_s: float = 0.0  # time within the motion when the path starts
     pace: float = 1.0  # factor on the speed
     size: float = 1.0  # factor on the extent
-    side: float = 1.0  # -1: left and right are exchanged
+    side: float = 1.0  # -1: left and right are swapped
 
 
 BENCHMARK_PATH = Path()
 
 
 def path_of(seed: int) -> Path:
-    """Return the random path that belongs to a seed. Seed 0 gives the benchmark's path."""
+    """Return the random path for a seed. Seed 0 gives the benchmark's path."""
     if seed == 0:
         return BENCHMARK_PATH
     random = np.random.default_rng([seed, 0x70617468])
@@ -114,11 +114,11 @@ def path_of(seed: int) -> Path:
 
 
 def true_eyes(motion: str, times_s: F64, *, path: Path = BENCHMARK_PATH) -> F64:
-    """Return the positions (n, 2, 3) of the left and right eye during a motion, in metres, frame `stack`.
+    """Return the (n, 2, 3) left and right eye positions during a motion, in metres, frame `stack`.
 
     Args:
         motion: Name of a motion in `MOTIONS`.
-        times_s: Times (n,).
+        times_s: (n,) times.
     """
     neck, pitch = MOTIONS[motion](path.start_s + path.pace * times_s)
     neck, pitch = path.size * neck * [1.0, path.side, 1.0], path.size * pitch
@@ -144,15 +144,15 @@ def observe(
     seed: int = 1,
     path: Path = BENCHMARK_PATH,
 ) -> list[Observation]:
-    """Simulate the samples that a sensor takes of a motion.
+    """Simulate the samples taken by a sensor during a motion.
 
     Args:
         motion: Name of a motion in `MOTIONS`.
-        noise_m: Standard deviation of the noise of each eye along each axis.
-        outliers: Share of samples that are outliers, in which one or both eyes are displaced by 4 to 20 cm.
-        dropout_every_s: Time between dropouts. 0 disables dropouts.
-        seed: Seed of the noise, the outliers and their displacements.
-        path: Variation of the motion.
+        noise_m: Standard deviation of the noise for each eye along each axis.
+        outliers: Share of outliers among the samples. In an outlier, one or both eyes are displaced by 4 to 20 cm.
+        dropout_every_s: Time between dropouts. If 0, there are no dropouts.
+        seed: Seed for the noise, the outliers and their displacements.
+        path: Variation on the motion.
     """
     random = np.random.default_rng([seed, *motion.encode(), round(rate_hz)])
     times_s = np.arange(round(seconds * rate_hz)) / rate_hz

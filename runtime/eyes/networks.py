@@ -1,8 +1,8 @@
 """Run the three face networks, which find faces, face meshes and irises in pictures.
 
 Pixel coordinates are continuous: the centre of the first pixel is at (0.5, 0.5). *Left* means the viewer's left, which
-is on the right of an unmirrored picture. The left eye comes first unless stated otherwise. `docs/sensors.md` gives the
-origin of the models.
+is on the right in an unmirrored picture. The left eye comes first unless stated otherwise. For the origin of the
+models, see `docs/sensors.md`.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from runtime.support.onnx_runtime import onnxruntime
 
 MODELS = Path(str(files("runtime.eyes") / "models"))
 STRIDES = (8, 16, 32)  # pixels per cell of YuNet's three grids
-OVERLAP_MAX = 0.3  # intersection over union above which two of YuNet's boxes count as the same face
-CROP_BLUR = 0.45  # standard deviation of the anti-aliasing filter, in pixels of the crop
+OVERLAP_MAX = 0.3  # two YuNet boxes count as the same face if their intersection over union is larger
+CROP_BLUR = 0.45  # standard deviation of the anti-aliasing filter, in crop pixels
 
 
 def load_network(name: str) -> Any:
     """Load a network into a single-threaded onnxruntime session.
 
-    The network runs once during loading, because the first run is slow.
+    The network is run once during loading, because the first run is slow.
 
     Args:
-        name: Name of a file in the folder `models`.
+        name: Name of a file in the `models` folder.
     """
     ort = onnxruntime()
     options = ort.SessionOptions()
@@ -44,23 +44,23 @@ def load_network(name: str) -> Any:
 
 
 def transformed(matrix: F64, points: F64) -> F64:
-    """Apply an affine matrix (2, 3) to points (n, 2)."""
+    """Apply a (2, 3) affine matrix to (n, 2) points."""
     result: F64 = points @ matrix[:, :2].T + matrix[:, 2]
     return result
 
 
 def inverse(matrix: F64) -> F64:
-    """Return the inverse of an affine matrix (2, 3)."""
+    """Return the inverse of a (2, 3) affine matrix."""
     return np.asarray(cv2.invertAffineTransform(matrix), np.float64)
 
 
 def resampled(picture: U8, size: tuple[int, int], crop_from_picture: F64) -> U8:
-    """Crop and warp a picture with anti-aliasing. Pixels outside the picture repeat its edge.
+    """Crop and warp a picture with anti-aliasing. Outside the picture, its edge is repeated.
 
     Args:
         picture: RGB picture (h, w, 3).
-        size: Width and height of the result in pixels.
-        crop_from_picture: Affine matrix (2, 3) that maps continuous pixels of the picture to those of the result.
+        size: Width and height of the result, in pixels.
+        crop_from_picture: (2, 3) affine matrix that maps the picture's continuous pixels to the result's.
     """
     ratio = 1 / np.sqrt(abs(np.linalg.det(crop_from_picture[:, :2])))  # picture pixels per crop pixel
     corners = np.array([[0, 0], [size[0], 0], [0, size[1]], [size[0], size[1]]], np.float64)
@@ -79,25 +79,25 @@ def resampled(picture: U8, size: tuple[int, int], crop_from_picture: F64) -> U8:
 
 @dataclass(frozen=True, slots=True)
 class Square:
-    """Square region of a picture, rotated to align with a face."""
+    """A square region in a picture, rotated to align with a face."""
 
     centre: F64  # (2,) px
     side: float  # px
     angle: float  # direction of the lower edge, in radians clockwise on the screen
 
     def picture_from_crop(self, size: int, *, mirrored: bool = False) -> F64:
-        """Return the matrix (2, 3) that maps continuous pixels of a crop to those of the picture.
+        """Return the (2, 3) matrix that maps a crop's continuous pixels to the picture's.
 
         Args:
-            size: Side of the crop in pixels.
-            mirrored: Mirror the crop horizontally.
+            size: Side of the crop, in pixels.
+            mirrored: True to mirror the crop horizontally.
         """
         c, s = np.cos(self.angle) * self.side / size, np.sin(self.angle) * self.side / size
         matrix = np.array([[-c if mirrored else c, -s], [-s if mirrored else s, c]])
         return np.column_stack([matrix, self.centre - matrix @ [size / 2, size / 2]])
 
     def crop(self, picture: U8, size: int, *, mirrored: bool = False) -> tuple[F32, F64]:
-        """Return a crop (1, size, size, 3) with values from 0 to 1, and its matrix from `picture_from_crop`."""
+        """Return a (1, size, size, 3) crop with values from 0 to 1, and its matrix from `picture_from_crop`."""
         matrix = self.picture_from_crop(size, mirrored=mirrored)
         pixels = resampled(picture, (size, size), inverse(matrix))
         return np.divide(pixels[None], 255, dtype=np.float32), matrix
@@ -105,19 +105,19 @@ class Square:
 
 @dataclass(frozen=True, slots=True)
 class FoundFace:
-    """Face that YuNet found, with its bounding box and five points."""
+    """A face found by YuNet, with its bounding box and five points."""
 
     score: float  # 0 to 1
     box: F64  # (4,) x, y, width and height in pixels
-    points: F64  # (5, 2) right eye, left eye, nose, right and left corner of the mouth, in pixels
+    points: F64  # (5, 2) right eye, left eye, nose, right and left mouth corners, in pixels
 
     @property
     def size(self) -> float:
-        """Side length in pixels of a square with the same area as the box."""
+        """Side, in pixels, of a square with the same area as the box."""
         return float(np.sqrt(self.box[2] * self.box[3]))
 
     def square(self) -> Square:
-        """Return the square region around the face that the mesh network takes as input."""
+        """Return the square region around the face to use as the mesh network's input."""
         eyes, mouth = self.points[:2].mean(axis=0), self.points[3:].mean(axis=0)
         line = self.points[1] - self.points[0]
         size = max(np.linalg.norm(line), 0.95 * np.linalg.norm(mouth - eyes))
@@ -131,12 +131,13 @@ class FaceNetwork:
         self._session = load_network("yunet.onnx")
 
     def find(self, picture: U8, *, longest_px: int, score_min: float) -> list[FoundFace]:
-        """Return the faces in an RGB picture (h, w, 3), ordered from the highest score to the lowest.
+        """Return the faces in a picture, ordered from the highest score to the lowest.
 
         Args:
             picture: RGB picture (h, w, 3).
-            longest_px: Length of the longer side to which a larger picture is reduced before the search.
-            score_min: Minimum score of a face.
+            longest_px: Maximum length of the picture's longer side. Larger pictures are reduced to this before the
+                search.
+            score_min: Minimum face score.
         """
         height, width = picture.shape[:2]
         scale = min(1.0, longest_px / max(height, width))
@@ -153,7 +154,7 @@ class FaceNetwork:
 
     @staticmethod
     def _decoded(outputs: list[F32], width: int, score_min: float) -> list[FoundFace]:
-        """Decode the grid cells that contain a face. Only the best of several overlapping faces is kept."""
+        """Decode the grid cells that contain a face. If several faces overlap, only the best is kept."""
         faces = []
         for level, stride in enumerate(STRIDES):
             classes, objects, boxes, points = (outputs[kind * len(STRIDES) + level][0] for kind in range(4))
@@ -170,7 +171,7 @@ class FaceNetwork:
 
 
 class MeshNetwork:
-    """Network that finds 468 face points, numbered as in MediaPipe, in a square region of the picture."""
+    """Network that finds 468 face points, numbered as in MediaPipe, in a square region of a picture."""
 
     SIZE = 192
 
@@ -178,9 +179,9 @@ class MeshNetwork:
         self._session = load_network("face_mesh.onnx")
 
     def points(self, picture: U8, square: Square) -> tuple[F64, float]:
-        """Return the face's points (468, 3) and the probability that the square contains a face.
+        """Return the (468, 3) face points, and the probability that the square contains a face.
 
-        The points are in pixels of the picture, with z pointing away from the camera.
+        The points are in picture pixels, with z pointing away from the camera.
         """
         crop, matrix = square.crop(picture, self.SIZE)
         mesh, presence = self._session.run(None, {"input_1": crop})
@@ -198,12 +199,13 @@ class IrisNetwork:
         self._session = load_network("iris.onnx")
 
     def points(self, picture: U8, square: Square, *, is_left: bool) -> tuple[F64, F64]:
-        """Return points on the iris (5, 2) and on the lids (16, 2), in pixels of the picture.
+        """Return (5, 2) points on the iris and (16, 2) points on the lids, in picture pixels.
 
-        The centre of the iris precedes four points on its edge. The lower lid precedes the upper lid.
+        The first iris point is the centre, followed by four points on the edge. The lower lid comes before the upper
+        lid.
 
         Args:
-            is_left: True for the viewer's left eye, for which the input of the network is mirrored.
+            is_left: True for the viewer's left eye. The network's input is then mirrored.
         """
         crop, matrix = square.crop(picture, self.SIZE, mirrored=is_left)
         names = ["output_iris", "output_eyes_contours_and_brows"]

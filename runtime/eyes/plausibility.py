@@ -1,7 +1,7 @@
-"""Detect points that cannot be eyes, because they are swapped, in millimetres or behind the display.
+"""Detect points that cannot be eyes, such as points in millimetres or behind the display.
 
-No function in this module reads a clock. Eyes are in metres in the frame `stack`, whose axes point out of the screen
-(+x), to the viewer's right (+y) and up (+z).
+Nothing in this module reads a clock. Eyes are in metres in frame `stack`, with axes that point out of the screen (+x),
+to the viewer's right (+y) and up (+z).
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ TOO_DISTANT = "too far away for a viewer"
 EXCHANGED = "left and right swapped"
 
 IPD_MIN_M, IPD_MAX_M = 0.050, 0.078  # range of people's eye separations
-WINDOW = 30  # number of recent samples that are examined: one second of a typical depth camera
-SAMPLES_MIN = 10  # minimum number of samples before a reason is reported
-WARNING_SHARE = 0.5  # share of samples refused for the same reason above which to warn
-UNIT_SLACK = 1.25  # factor by which the limits are widened when checking for millimetres
-DISTANT_M = 20.0  # distance from the display beyond which no sensor sees a face
-UPSIDE_DOWN_COSINE = -0.5  # with a roll of more than 120 degrees, the eyes are swapped
+WINDOW = 30  # number of recent samples examined: one second with a typical depth camera
+SAMPLES_MIN = 10  # minimum number of samples needed before a reason is reported
+WARNING_SHARE = 0.5  # warn if more than this share of samples is refused for the same reason
+UNIT_SLACK = 1.25  # factor to widen the limits by when checking for millimetres
+DISTANT_M = 20.0  # no sensor sees a face farther from the display than this
+UPSIDE_DOWN_COSINE = -0.5  # the eyes count as swapped if the head seems rolled by more than 120 degrees
 
 MISTAKES = (NOT_NEWER, NOT_A_NUMBER, MILLIMETRES, TOO_CLOSE, TOO_FAR_APART, BEHIND, TOO_DISTANT, EXCHANGED)
 _HINTS = {
@@ -40,13 +40,13 @@ _HINTS = {
 
 
 def reason_against(eyes_m: F64, *, in_front_m: float = 0.0) -> str:
-    """Return the reason why two points cannot be a viewer's left and right eye, or an empty string.
+    """Return why two points cannot be a viewer's left and right eye, or an empty string if they can.
 
-    The eyes count as swapped if the vector from the left to the right eye points to the viewer's left.
+    The eyes count as swapped if the vector from the left eye to the right eye points to the viewer's left.
 
     Args:
-        eyes_m: Left and right eye (2, 3) in the frame `stack`.
-        in_front_m: Value of x that both eyes must exceed.
+        eyes_m: (2, 3) left and right eye in frame `stack`.
+        in_front_m: Both eyes must have a larger x than this.
     """
     (lx, ly, lz), (rx, ry, rz) = eyes_m.tolist()
     if not all(map(math.isfinite, (lx, ly, lz, rx, ry, rz))):
@@ -61,13 +61,13 @@ def reason_against(eyes_m: F64, *, in_front_m: float = 0.0) -> str:
         return TOO_DISTANT
     if min(lx, rx) <= in_front_m:
         return BEHIND
-    # For a viewer who faces the display, right is up × the direction to the eyes: (-my, mx, 0).
+    # For a viewer facing the display, right is up × the direction to the eyes: (-my, mx, 0).
     towards_right = (-my * (rx - lx) + mx * (ry - ly)) / math.hypot(mx, my) / apart_m
     return EXCHANGED if towards_right < UPSIDE_DOWN_COSINE else ""
 
 
 class RefusalWatch:
-    """Counter of refused samples, which warns once if most samples are refused for the same reason."""
+    """Counter for refused samples. It warns once if most samples are refused for the same reason."""
 
     def __init__(self) -> None:
         self._last: deque[str] = deque(maxlen=WINDOW)
@@ -76,14 +76,14 @@ class RefusalWatch:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Number of refused samples for each reason."""
+        """Number of samples refused for each reason."""
         return self._counts
 
     def update(self, reason: str) -> str:
-        """Count a sample. Return a line to log if the warning has changed, otherwise an empty string.
+        """Count a sample. Return a line to log if the warning has changed, or an empty string if it has not.
 
         Args:
-            reason: Reason why the sample was refused, or an empty string if it was accepted.
+            reason: Why the sample was refused, or an empty string if it was accepted.
         """
         self._last.append(reason if reason in MISTAKES else "")
         if reason:

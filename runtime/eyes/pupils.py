@@ -17,51 +17,51 @@ Seen = Literal["found", "followed", "filled in"]
 Side = Literal["", "left", "right"]
 SIDES: tuple[Side, Side] = ("left", "right")
 
-LEVELS_PX = (320, 640)  # longer side of the searched picture; the second value is used if the first yields no face
-SCORE_MIN = 0.8  # minimum score of a face; people in the dark at 1.5 m score 0.85, most dogs less than 0.8
-PRESENCE_FOUND, PRESENCE_FOLLOWED = 0.9, 0.5  # minimum probability of a face, in a new and in a known position
-CANDIDATES_MAX = 4  # maximum number of faces that are examined in a search for the viewer
-FARTHEST_OUT = 0.7  # relative penalty for a face in the corner of the picture in the choice of a viewer
-CORNERS = ((362, 263), (33, 133))  # mesh points at the corners of the left and right eye
-EYE_SQUARE = 2.7  # side of the iris network's input, in eye widths; the most accurate of values from 1.8 to 3.1
-FACE_SQUARE = 1.5  # side of the mesh network's input, relative to the size of the face
-MOVED_FAR = 0.35  # movement in eye separations after which the mesh network runs again
+LEVELS_PX = (320, 640)  # longer side of the picture to search; the second value is tried if the first yields no face
+SCORE_MIN = 0.8  # minimum face score; people in the dark at 1.5 m score 0.85, and most dogs score less than 0.8
+PRESENCE_FOUND, PRESENCE_FOLLOWED = 0.9, 0.5  # minimum probability of a face in a new position, and in a known one
+CANDIDATES_MAX = 4  # maximum number of faces to examine in a search for the viewer
+FARTHEST_OUT = 0.7  # relative penalty for a face in a corner of the picture when the viewer is chosen
+CORNERS = ((362, 263), (33, 133))  # mesh points at the corners of the left and the right eye
+EYE_SQUARE = 2.7  # side of the iris network's input, in eye widths; the most accurate value between 1.8 and 3.1
+FACE_SQUARE = 1.5  # side of the mesh network's input, relative to the face size
+MOVED_FAR = 0.35  # the mesh network runs again after a movement of more than this, in eye separations
 
-# A human iris measures 11.7 mm, and human eyes are 50 to 75 mm apart. The following limits exclude dogs and monkeys.
-IRIS_RANGE = (0.12, 0.33)  # diameter in eye separations; the separation appears shorter when the head turns
-IRIS_RATIO_MAX = 1.4  # maximum ratio of the diameters of the two irises
-# The upper lid hides part of the iris, and the network returns the centre of the visible part. This centre is too low
-# by the following share of the eye separation (0.6 mm) for any camera and distance. The share was fitted to all 51
-# measured faces. With a fit to a random half of the faces, the error on the other half is 0.61 to 0.67 mm up to 1 m.
+# A human iris measures 11.7 mm, and human eyes are 50 to 75 mm apart. These limits exclude dogs and monkeys.
+IRIS_RANGE = (0.12, 0.33)  # diameter in eye separations; the separation looks shorter when the head turns
+IRIS_RATIO_MAX = 1.4  # maximum ratio between the two irises' diameters
+# The upper lid hides part of the iris, and the network returns the centre of the visible part. For any camera and
+# distance, this centre is too low by the following share of the eye separation (0.6 mm). The share was fitted to all 51
+# measured faces. If it is fitted to a random half of them, the error on the other half is 0.61 to 0.67 mm up to 1 m.
 TOO_LOW = 0.0093
-OPEN_MIN = 0.12  # minimum ratio of height to width of an open eye; a blink hides the iris
+OPEN_MIN = 0.12  # minimum ratio of height to width for an open eye; a blink hides the iris
 
-PULL = 0.1  # share of the deviation from the networks' estimate that each picture corrects
-# When the gaze changes, the gain rises by up to GAZE_PULL as the deviation goes from GAZE_FROM to GAZE_FULL (in eye
-# separations).
+PULL = 0.1  # share of the deviation from the networks' estimate corrected with each picture
+# When the gaze changes, the gain rises by up to GAZE_PULL as the deviation increases from GAZE_FROM to GAZE_FULL
+# (in eye separations).
 GAZE_FROM, GAZE_FULL, GAZE_PULL = 0.02, 0.06, 0.6
-# Eyes turn together. If only one eye seems to turn by more than APART_MAX (in eye separations), a hand or hair hides
-# the eye, and the network only guesses its position. The pupil is then moved with the face for at most CARRIED_MAX
+# Eyes turn together. If only one eye seems to turn by more than APART_MAX (in eye separations), it is hidden by a hand
+# or hair, and the network is only guessing its position. Its pupil is then moved with the face for at most CARRIED_MAX
 # pictures.
 APART_MAX, CARRIED_MAX = 0.06, 30
 
-SAME_LOOKS = 0.75  # minimum correlation between two views of one person; 19 out of 20 other people have less
+SAME_LOOKS = 0.75  # minimum correlation between two views of one person; for 19 out of 20 other people, it is lower
 SAME_LOOKS_FOLLOWED = 0.6  # minimum correlation for a face at the viewer's last position
-LOOKS_PULL = 0.05  # rate at which the stored appearance adapts to light and pose
+LOOKS_PULL = 0.05  # rate of adapting the stored appearance to light and pose
 
-# Contributions to the standard deviation of a pupil along an axis: variation between people about the networks' mean
-# (in eye separations), pixel noise (px), and the share of an unexpected change that remains after one picture.
+# Contributions to a pupil's standard deviation along an axis: variation between people about the networks' mean
+# (in eye separations), pixel noise (px), and the share of an unexpected change that is left after one picture.
 SIGMA_PERSON, SIGMA_PICTURE_PX, SIGMA_SURPRISE = 0.0088, 0.14, 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Pupils:
-    """Positions of one viewer's pupils in one picture, with the face mesh and the uncertainty."""
+    """One viewer's pupil positions in one picture, with the face mesh and the uncertainty."""
 
     eyes_px: F64  # (2, 2) left and right pupil in continuous pixels
     sigma_px: float  # standard deviation of one pupil along one axis
-    mesh_px: F64  # (468, 3) points of the face mesh; z, also in pixels, points away from the camera
-    iris_px: float  # mean diameter of the two irises
+    mesh_px: F64  # (468, 3) face mesh points; z, also in pixels, points away from the camera
+    iris_px: float  # mean iris diameter
     seen: Seen
     hidden: Side  # hidden eye, whose position is estimated from the rest of the face; empty: none
     certainty: float  # probability that this is a face
@@ -73,13 +73,13 @@ class Pupils:
 
 @dataclass(frozen=True, slots=True)
 class _Look:
-    """Estimates that the networks make of one face in one picture."""
+    """The networks' estimates for one face in one picture."""
 
-    mesh: F64  # (468, 3) points of the face mesh, px
+    mesh: F64  # (468, 3) face mesh points, px
     presence: float  # probability of a face
     eyes: F64  # (2, 2) left and right pupil, px
-    iris: F64  # (2,) diameters of the irises, px
-    openness: F64  # (2,) ratios of height to width of the eyes
+    iris: F64  # (2,) iris diameters, px
+    openness: F64  # (2,) height-to-width ratios of the eyes
     looks: F64  # (468,) grey values at the mesh points, normalized to mean 0 and norm 1
 
     @property
@@ -87,7 +87,7 @@ class _Look:
         return float(np.linalg.norm(self.eyes[0] - self.eyes[1]))
 
     def are_human(self) -> bool:
-        """Return True if the irises have the size and similarity of human irises."""
+        """Return True if the irises are as large, and as similar to each other, as human irises."""
         sizes = self.iris / self.eye_distance
         in_range = IRIS_RANGE[0] < sizes.min() and sizes.max() < IRIS_RANGE[1]
         return bool(in_range and sizes.max() < IRIS_RATIO_MAX * sizes.min())
@@ -97,8 +97,8 @@ class PupilFinder:
     """Finder that follows one viewer's pupils from picture to picture.
 
     Attributes:
-        viewer: Number of the viewer, which increases with every new viewer.
-        reason: Reason why no pupils were found in the last picture, or an empty string.
+        viewer: Viewer number, which increases with every new viewer.
+        reason: Why no pupils were found in the last picture, or an empty string.
         choice: Description of how the viewer was chosen.
     """
 
@@ -106,7 +106,7 @@ class PupilFinder:
         """Create a finder.
 
         Args:
-            lock_ns: Time after which another person may replace a viewer who is no longer seen.
+            lock_ns: Time after which a viewer who is no longer seen may be replaced by another person.
         """
         self._faces, self._meshes, self._irises = FaceNetwork(), MeshNetwork(), IrisNetwork()
         self._flow, self._lock_ns = FaceFlow(), lock_ns
@@ -115,19 +115,19 @@ class PupilFinder:
 
     def forget(self) -> None:
         """Forget the viewer. The next picture is treated as the first one."""
-        self._looks: F64 | None = None  # appearance of the viewer's face, kept while the viewer is not seen
-        self._last: _Look | None = None  # estimates for the viewer in the previous picture
+        self._looks: F64 | None = None  # appearance of the viewer's face, kept while it is out of sight
+        self._last: _Look | None = None  # the viewer's estimates from the previous picture
         self._eyes = np.zeros((2, 2))  # pupils returned for the previous picture, px
         self._steps = self._carried = 0  # pictures averaged in `_eyes`; consecutive pictures with a hidden eye
         self._seen_ns = 0
         self.reason, self.choice = "", "no viewer yet"
 
     def find(self, picture: U8, *, time_ns: int = 0) -> Pupils | None:
-        """Return the viewer's pupils in a picture, or None and store the cause in `reason`.
+        """Return the viewer's pupils in a picture, or return None and store the cause in `reason`.
 
         Args:
             picture: RGB picture (h, w, 3).
-            time_ns: Capture time of the picture.
+            time_ns: The picture's capture time.
         """
         if self._looks is not None and time_ns - self._seen_ns > self._lock_ns:
             self.forget()
@@ -143,7 +143,7 @@ class PupilFinder:
         return self._steadied(picture, look, "followed" if seen == "followed" else "found")
 
     def _follow(self, picture: U8) -> _Look | None:
-        """Look for the viewer at the face's position in the previous picture."""
+        """Look for the viewer where the face was in the previous picture."""
         if self._last is None or self._looks is None:
             return None
         last = self._last
@@ -199,7 +199,7 @@ class PupilFinder:
     def _steadied(self, picture: U8, look: _Look, seen: Seen) -> Pupils:
         """Return pupils with reduced jitter.
 
-        The pupils of the previous picture are moved with the face and then corrected towards the networks' estimates.
+        The previous picture's pupils are moved with the face, then corrected towards the networks' estimates.
         """
         eyes, surprise, hidden = look.eyes.copy(), np.zeros(2), np.zeros(2, bool)
         last = self._last if self._steps else None
@@ -236,17 +236,17 @@ class PupilFinder:
 
 
 def _worth(face: FoundFace, middle: F64) -> float:
-    """Return a face's score as a possible viewer: the size, reduced towards the edges of the picture.
+    """Return a face's score as a possible viewer: its size, reduced towards the picture's edges.
 
     Args:
-        middle: (2,) centre of the picture in pixels.
+        middle: (2,) picture centre in pixels.
     """
     away = np.abs(face.box[:2] + face.box[2:] / 2 - middle) / middle
     return face.size * (1 - FARTHEST_OUT * float(np.linalg.norm(away) / np.sqrt(2)))
 
 
 def _square_of(mesh: F64) -> Square:
-    """Return the square around a known face mesh, as the next input of the mesh network."""
+    """Return the square around a known face mesh, to be used as the mesh network's next input."""
     line = mesh[CORNERS[0][1], :2] - mesh[CORNERS[1][0], :2]
     angle = float(np.arctan2(line[1], line[0]))
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -256,9 +256,9 @@ def _square_of(mesh: F64) -> Square:
 
 
 def _looks(picture: U8, mesh: F64, eye_distance: float) -> F64:
-    """Return the grey values (468,) at the points of a face mesh, which describe a person's appearance.
+    """Return the (468,) grey values at face mesh points, which describe a person's appearance.
 
-    The values are normalized to mean 0 and norm 1, which makes them independent of brightness and contrast.
+    The values are normalized to mean 0 and norm 1, so that they do not depend on brightness or contrast.
     """
     margin = max(2, round(eye_distance / 4))
     height, width = picture.shape[:2]
@@ -275,7 +275,7 @@ def _looks(picture: U8, mesh: F64, eye_distance: float) -> F64:
 
 
 def _similarity(last: F64, mesh: F64) -> F64:
-    """Return the similarity (2, 3) that maps the eye corners of the mesh `last` to those of `mesh`."""
+    """Return the (2, 3) similarity that maps the eye corners in the mesh `last` to those in `mesh`."""
     corners = np.ravel(CORNERS)
     matrix, _ = cv2.estimateAffinePartial2D(last[corners, :2], mesh[corners, :2], method=cv2.LMEDS)
     return np.eye(2, 3) if matrix is None else np.asarray(matrix, np.float64)
@@ -287,7 +287,7 @@ def _still_finder() -> PupilFinder:
 
 
 def find_eyes(picture: U8) -> Pupils | None:
-    """Return the pupils of the foremost viewer in an RGB picture (h, w, 3), or None without a viewer."""
+    """Return the foremost viewer's pupils in an (h, w, 3) RGB picture, or None if there is no viewer."""
     finder = _still_finder()
     finder.forget()
     return finder.find(picture)

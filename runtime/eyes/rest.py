@@ -1,8 +1,8 @@
-"""Detect a head at rest from the samples that the tracker accepts.
+"""Detect a head at rest from the samples accepted by the tracker.
 
-The tracker's predictions jitter by several times the sensor's noise, because predicting ahead amplifies the noise in
-the estimated velocity. While the head is at rest, the median of the samples is the best estimate of the head's
-position, and the picture can stand still.
+The tracker's predictions jitter by several times the sensor's noise, because predicting ahead amplifies noise in the
+estimated velocity. While the head is at rest, the best estimate of its position is the median of the samples, and the
+picture can stand still.
 """
 
 from __future__ import annotations
@@ -13,49 +13,49 @@ from runtime.clock import NS_PER_S
 from runtime.records import F64
 
 REST_NS = NS_PER_S  # a head counts as at rest if it has not moved for this long
-LOST_NS = NS_PER_S  # a longer gap between samples resets the detector
-DRIFT_NS = 3 * NS_PER_S  # time span of the median that measures drift
-EVERY = 8  # number of samples between measurements of noise and drift, which change slowly
-FEWEST = 8  # minimum number of samples for any conclusion
-KEPT = 256  # number of samples of a resting head that are kept
-GRACE_M = 0.0003  # addition to every threshold for sensors without noise
-NOISE_MAX_M = 0.005  # no head counts as at rest above this noise, because its departure would go unnoticed
-# Thresholds in standard deviations of one sample. White noise at 60 samples a second exceeds each of the thresholds
-# only once in hours.
+LOST_NS = NS_PER_S  # a longer gap between samples than this resets the detector
+DRIFT_NS = 3 * NS_PER_S  # time span of the median used to measure drift
+EVERY = 8  # noise and drift change slowly, so they are measured once in this many samples
+FEWEST = 8  # minimum number of samples needed to conclude anything
+KEPT = 256  # number of samples kept for a head at rest
+GRACE_M = 0.0003  # added to every threshold, for sensors without noise
+NOISE_MAX_M = 0.005  # with more noise than this, no head counts as at rest, because it could move off unnoticed
+# Thresholds in standard deviations of one sample. At 60 samples a second, white noise exceeds each of them only once in
+# hours.
 SINGLE = 4.5  # for two consecutive samples that deviate in the same direction
 MEDIAN_OF_FIVE = 2.6  # for the median of the newest five samples
-HALVES = 4.5  # for the difference between two halves of the samples, in standard deviations of this difference
-MAD_TO_SIGMA = 1.4826  # standard deviation of normal noise, divided by its median absolute deviation
-MEDIAN_EFFICIENCY = 1.25  # standard deviation of a median, divided by that of a mean
-LEVER_M = 0.15  # RMS distance of points from the centre of a display that is half a metre wide
+HALVES = 4.5  # for the difference between the two halves of the samples, in its own standard deviations
+MAD_TO_SIGMA = 1.4826  # a normal distribution's standard deviation, divided by its median absolute deviation
+MEDIAN_EFFICIENCY = 1.25  # a median's standard deviation, divided by a mean's
+LEVER_M = 0.15  # RMS distance from the centre to the points on a display half a metre wide
 NEAREST_M = 0.1  # smaller distances from the display are raised to this
 
 
 class RestWatch:
-    """Detector that finds out whether a head is at rest, and where.
+    """Detector that tells if a head is at rest, and where.
 
-    The detector is not thread-safe. It takes the time from the samples and reads no clock.
+    Not thread-safe. The time is taken from the samples; no clock is read.
     """
 
     def __init__(self, *, max_drift_m: float) -> None:
         """Create a detector.
 
         Args:
-            max_drift_m: Drift beyond the noise above which the position of a resting head is updated.
+            max_drift_m: If the drift exceeds the noise by more than this, the resting head's position is updated.
         """
         self._max_drift_m = max_drift_m
         self._times = np.zeros(2 * KEPT, np.int64)
         self._eyes = np.zeros((2 * KEPT, 2, 3))
         self._count = 0
-        self.place: F64 | None = None  # (2, 3) eyes at rest, a new array for each rest; None while the head moves
-        self.noise_m = np.zeros(6)  # standard deviation of one sample, as `_shifts` measures it
+        self.place: F64 | None = None  # (2, 3) eyes at rest, a new array each time; None while the head moves
+        self.noise_m = np.zeros(6)  # standard deviation of one sample, in the terms of `_shifts`
         self.sigma_m = 0.0  # standard deviation of `place` along an axis, including undetected drift
 
     def update(self, eyes_m: F64, *, capture_ns: int) -> None:
         """Add a sample and update `place`.
 
         Args:
-            eyes_m: Left and right eye (2, 3) in the frame `stack`.
+            eyes_m: (2, 3) left and right eye in frame `stack`.
         """
         if self._count and not 0 < capture_ns - self._times[self._count - 1] < LOST_NS:
             self.forget()
@@ -71,14 +71,14 @@ class RestWatch:
             if self._stands():
                 self._settle(capture_ns - REST_NS)
         elif self._left(self.place):
-            # Samples taken before a motion do not help to detect the end of the motion.
+            # Samples taken before a motion do not help to detect when it ends.
             self._keep_last(2)
             self.place = None
         elif slow_checks and self._drifted(self.place):
             self._settle(capture_ns - DRIFT_NS)
 
     def forget(self) -> None:
-        """Discard all samples, after the face was lost or the clock jumped."""
+        """Discard all samples, because the face was lost or the clock jumped."""
         self._count, self.place = 0, None
 
     def _append(self, eyes_m: F64, capture_ns: int) -> None:
@@ -94,7 +94,7 @@ class RestWatch:
         self._count = count
 
     def _since(self, time_ns: int) -> F64:
-        """Return the samples (n, 2, 3) since `time_ns`, but at least the newest `FEWEST` samples."""
+        """Return the (n, 2, 3) samples since `time_ns`, but at least the newest `FEWEST`."""
         first = min(int(np.searchsorted(self._times[: self._count], time_ns)), self._count - FEWEST)
         return self._eyes[first : self._count]
 
@@ -105,12 +105,12 @@ class RestWatch:
         median_sigma_m = MEDIAN_EFFICIENCY * noise_m / len(recent) ** 0.5
         # `_drifted` does not detect a drift up to this value.
         drift_m = self._max_drift_m + 2 * MEDIAN_EFFICIENCY * noise_m * (4 / max(len(recent), FEWEST)) ** 0.5
-        self.sigma_m = float(np.hypot(median_sigma_m, drift_m / 2**0.5))  # drift is mostly in one direction
+        self.sigma_m = float(np.hypot(median_sigma_m, drift_m / 2**0.5))  # drift mostly goes in one direction
 
     def _measure_noise(self) -> None:
-        """Measure noise as the distance of each sample from the line between the neighbouring samples.
+        """Measure noise as each sample's distance from the line between its neighbours.
 
-        This measure is not affected by steady motion.
+        Steady motion does not affect this measure.
         """
         first = max(0, self._count - KEPT // 2)
         times, shifts = self._times[first : self._count], _shifts(self._eyes[first : self._count], self._eyes[first])
@@ -121,7 +121,7 @@ class RestWatch:
         self.noise_m = np.tile([max(right, up), max(right, up), deep], 2)
 
     def _stands(self) -> bool:
-        """Return True if the two halves of the last second agree with each other and with the newest samples."""
+        """Return True if the last second's two halves agree with each other and with the newest samples."""
         now_ns = int(self._times[self._count - 1])
         if now_ns - self._times[0] < REST_NS:
             return False
@@ -135,7 +135,7 @@ class RestWatch:
         return not self._left(np.median(recent, axis=0))
 
     def _left(self, place: F64) -> bool:
-        """Return True if the newest samples deviate from `place` by more than noise explains."""
+        """Return True if the newest samples deviate from `place` by more than noise can explain."""
         shifts = _shifts(self._eyes[self._count - 5 : self._count], place)
         if (np.abs(np.median(shifts, axis=0)) > MEDIAN_OF_FIVE * self.noise_m + GRACE_M).any():
             return True
@@ -158,10 +158,10 @@ class RestWatch:
 
 
 def _shifts(eyes_m: F64, place: F64) -> F64:
-    """Return displacements (n, 6) of samples (n, 2, 3) from a place (2, 3), as seen on the display.
+    """Return the (n, 6) displacements of (n, 2, 3) samples from a (2, 3) place, as seen on the display.
 
-    Each eye has three displacements in metres: to the right and up as seen from the display's centre, and the effect
-    that a change of the eye's distance has on points away from the centre.
+    Each eye has three displacements in metres: to the right and up, as seen from the display's centre, and the effect
+    of a change in the eye's distance on points away from the centre.
     """
     away = eyes_m - place
     distance = np.maximum(place[:, :1], NEAREST_M)

@@ -1,4 +1,4 @@
-"""Track the viewer's eyes: refuse implausible samples, filter the others and predict eye positions."""
+"""Track the viewer's eyes: refuse implausible samples, filter the rest and predict eye positions."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ from runtime.eyes.plausibility import NOT_NEWER, reason_against
 from runtime.records import F64, EyePoints, EyesEstimate, EyesLabel
 
 HISTORY = 256  # number of filtered samples kept: four seconds at 60 Hz
-CONFIDENCE_MIN = 0.3  # samples with less confidence, such as those of a blink, are refused
-CHI2_GATE = 21.1  # limit of chi² with three degrees of freedom; refuses one good sample in 10,000
-CHI2_DOUBT = 11.3  # 1 % limit; a sample beyond this limit is undone if the next two fit better without it
+CONFIDENCE_MIN = 0.3  # samples with less confidence, such as those taken during a blink, are refused
+CHI2_GATE = 21.1  # limit for chi² with three degrees of freedom; refuses one good sample in 10,000
+CHI2_DOUBT = 11.3  # 1 % limit; a sample beyond it is undone if the next two fit better without it
 ACCELERATION = (0.05, 0.4, 2.0)  # standard deviations in m/s² for a calm, a moving and a fast head
-STAY_S = 1.0  # mean time for which a head stays calm, moving or fast
-# Standard deviations in m/s² for half the vector between the eyes, of a head that hardly turns and of a shaking head.
+STAY_S = 1.0  # mean time that a head stays calm, moving or fast
+# Standard deviations in m/s² for half the vector between the eyes, for a head that hardly turns and one that shakes.
 TURN_ACCELERATION = (0.03, 0.4)
-FIRST_SPEED = 0.3  # standard deviation of the velocity of a newly found head, in m/s
+FIRST_SPEED = 0.3  # standard deviation of a newly found head's velocity, in m/s
 REACH_SPEED, REACH_ACCELERATION = 2.0, 30.0  # limits of a head's motion in m/s and m/s²
-KEEP_S = 0.4  # after a longer gap between samples, a head's estimated motion is discarded
-ANOTHER_AFTER_S = 0.5  # another person replaces a viewer who is unseen for this long, or for hold_s if that is shorter
-LOSS_S = 0.2  # time without a sample after which eyes are held instead of predicted
+KEEP_S = 0.4  # after a longer gap between samples, a head's motion estimate is discarded
+ANOTHER_AFTER_S = 0.5  # a viewer unseen for this long, or for hold_s if that is shorter, is replaced by another person
+LOSS_S = 0.2  # after this long without a sample, eyes are held rather than predicted
 HORIZON_S = 0.2  # longest prediction
-DECAY_S = 0.06  # time constant with which the predicted motion of a lost head slows to rest
-REVIVE_S = 0.06  # duration of the blend when lost eyes are found again
-CLOCK_RESET_NS = NS_PER_S  # a capture time this far in the past means that the clock was set back
-COMPLETED_NOISE = 2.0  # factor on the standard deviation of a pair of eyes if the position of one eye is inferred
-NOISE_FLOOR_M = 2e-5  # smallest standard deviation accepted from a driver; no sensor measures a pupil better
-ESTABLISHED = 3  # a head with fewer samples may be a mistake
-SIGMA_AHEAD_S = 1.0  # uncertainty is not extrapolated beyond this horizon
-NEAREST_M = 0.1  # minimum distance from the display that is used to weigh depth errors
-PANEL_M = (0.5184, 0.2916)  # default width and height of the panels
+DECAY_S = 0.06  # time constant for slowing a lost head's predicted motion to rest
+REVIVE_S = 0.06  # length of the blend when lost eyes are found again
+CLOCK_RESET_NS = NS_PER_S  # if a capture time is this far in the past, the clock was set back
+COMPLETED_NOISE = 2.0  # factor for the standard deviation of a pair of eyes if one eye's position is inferred
+NOISE_FLOOR_M = 2e-5  # smallest standard deviation accepted from a driver; no sensor measures pupils more precisely
+ESTABLISHED = 3  # a head with fewer samples than this may be a mistake
+SIGMA_AHEAD_S = 1.0  # uncertainty is extrapolated no further than this
+NEAREST_M = 0.1  # minimum distance from the display to use when weighing depth errors
+PANEL_M = (0.5184, 0.2916)  # default panel width and height
 NO_JUMP = np.zeros((2, 3))
 
 UNCERTAIN = "uncertain"
@@ -46,25 +46,25 @@ ELSEWHERE = "not where the viewer is"
 
 
 class _Head(NamedTuple):
-    """Estimated motion of one head at the time of the head's newest sample."""
+    """One head's estimated motion at the time of its newest sample."""
 
     capture_ns: int  # capture time of the newest sample
     middle: imm.Belief  # midpoint of the eyes, frame `stack`
     half: imm.Belief  # vector from the midpoint to the right eye
-    samples: int  # number of samples that the estimate is based on
+    samples: int  # number of samples behind the estimate
     surprise: float  # chi² of the newest sample
 
     def age_s(self, time_ns: int) -> float:
         return (time_ns - self.capture_ns) / NS_PER_S
 
     def eyes_m(self, ahead_s: float) -> F64:
-        """Return the left and right eye (2, 3) `ahead_s` seconds after the newest sample."""
+        """Return the (2, 3) left and right eye `ahead_s` seconds after the newest sample."""
         middle, half = imm.ahead(self.middle, ahead_s), imm.ahead(self.half, ahead_s)
         return np.array([middle - half, middle + half])
 
 
 class _Sample(NamedTuple):
-    """Measurement that has passed the plausibility checks."""
+    """A measurement that has passed the plausibility checks."""
 
     capture_ns: int
     middle_m: F64  # (3,) midpoint of the eyes, frame `stack`
@@ -72,13 +72,13 @@ class _Sample(NamedTuple):
     noise_m2: F64  # (3, 3) covariance of `middle_m`, and also of `half_m`
 
     def begun(self) -> _Head:
-        """Return a new head that is estimated from this sample alone."""
+        """Return a new head estimated from this sample alone."""
         middle = imm.started(self.middle_m, noise=self.noise_m2, speed=FIRST_SPEED, acceleration=ACCELERATION)
         half = imm.started(self.half_m, noise=self.noise_m2, speed=FIRST_SPEED / 3, acceleration=TURN_ACCELERATION)
         return _Head(self.capture_ns, middle, half, 1, 0.0)
 
     def continued(self, head: _Head) -> _Head | None:
-        """Return a head updated with this sample, or None if the sample cannot belong to that head."""
+        """Return a head updated with this sample, or None if the sample cannot belong to it."""
         age_s = head.age_s(self.capture_ns)
         if age_s > KEEP_S:
             return None
@@ -99,7 +99,7 @@ class _Sample(NamedTuple):
         )
 
     def is_within_reach_of(self, head: _Head) -> bool:
-        """Return True if a head could have moved to this sample's position since the head's newest sample."""
+        """Return True if a head could have moved to this sample's position since its own newest sample."""
         age_s = head.age_s(self.capture_ns)
         reach_m = min(REACH_SPEED * age_s, REACH_ACCELERATION * age_s**2 / 2)
         noise_m = math.sqrt(np.trace(self.noise_m2 + head.middle.covariance[0, :3, :3]))
@@ -109,18 +109,18 @@ class _Sample(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Shown:
-    """State of the viewer's head after a sample, with a jump that remains to be smoothed out."""
+    """The viewer's head after a sample, with a jump that is still being smoothed out."""
 
     head: _Head
-    jump_m: F64  # (2, 3) vectors from the measured to the last shown eyes at `jump_ns`, which decay afterwards
+    jump_m: F64  # (2, 3) vectors from the measured to the last shown eyes at `jump_ns`; they decay from then on
     jump_ns: int
 
     def eyes_m(self, ahead_s: float, time_ns: int) -> F64:
-        """Return the eyes (2, 3) to show at a given time.
+        """Return the (2, 3) eyes to show at a given time.
 
         Args:
-            ahead_s: Time after the newest sample for which to predict the eyes.
-            time_ns: Time at which the eyes are shown, which determines the rest of the jump.
+            ahead_s: Time, after the newest sample, to predict the eyes for.
+            time_ns: Time when the eyes are shown, which determines how much of the jump is left.
         """
         eyes = self.head.eyes_m(ahead_s)
         if self.jump_m is not NO_JUMP:
@@ -130,19 +130,19 @@ class _Shown:
 
 
 class _Other(NamedTuple):
-    """Head that was seen at a different position than the viewer's head."""
+    """A head that was seen somewhere other than the viewer's position."""
 
     head: _Head
     may_be_viewer: bool  # True if the viewer could have moved to this head's position
 
 
 class Tracker:
-    """Tracker that filters and predicts the eye positions of one viewer.
+    """Tracker that filters and predicts one viewer's eye positions.
 
-    `update` takes samples as they arrive, and `at` returns the eye positions for a given time. The first person who is
-    seen remains the viewer while visible. When eyes return after a loss, the output moves smoothly from the last shown
-    position to the measured position. When another person becomes the viewer, the output jumps to the new viewer's
-    eyes.
+    `update` takes samples as they arrive, and `at` returns the eye positions for a given time. The first person to be
+    seen stays the viewer as long as they are visible. When lost eyes are found again, the output moves smoothly from
+    the last shown position to the measured one. When another person becomes the viewer, the output jumps to the new
+    viewer's eyes.
     """
 
     def __init__(
@@ -155,9 +155,9 @@ class Tracker:
         """Create a tracker.
 
         Args:
-            settings: Settings of the tracker. None selects the default settings.
-            panel_m: Width and height of the panels, which determine the weight of depth errors.
-            in_front_m: Value of x, in the frame `stack`, that both eyes must exceed.
+            settings: Tracker settings. If None, the defaults are used.
+            panel_m: Panel width and height, which determine the weight of depth errors.
+            in_front_m: Both eyes must have a larger x than this, in frame `stack`.
         """
         self.settings = settings or TrackerSettings()
         self._panel_m, self._in_front_m = panel_m, in_front_m
@@ -165,21 +165,21 @@ class Tracker:
         self._other: _Other | None = None
         self._lost_ns: int | None = None
         self._newest_ns = -1
-        self._asked_ns = 0  # latest display time for which `at` has predicted eyes
+        self._asked_ns = 0  # latest display time that `at` has predicted eyes for
 
     def update(self, points: EyePoints | None, *, capture_ns: int) -> str:
         """Add a sample.
 
-        A sample is refused if it is not newer than the previous one, uncertain (as in a blink), implausible for a
-        person or away from the viewer. If two consecutive samples are at a position that the viewer could have
-        reached, the second sample is accepted. Another person's samples are accepted only after the viewer has left.
+        A sample is refused if it is not newer than the previous one, is uncertain (as in a blink), is implausible for a
+        person or is away from the viewer. If two samples in a row are at a position that the viewer could have reached,
+        the second one is accepted. Another person's samples are accepted only after the viewer has left.
 
         Args:
-            points: Eyes in the frame `stack`, or None if the sensor saw no face.
-            capture_ns: Capture time of the sample.
+            points: Eyes in frame `stack`, or None if the sensor saw no face.
+            capture_ns: The sample's capture time.
 
         Returns:
-            The reason why the sample was refused, or an empty string.
+            Why the sample was refused, or an empty string if it was accepted.
         """
         if capture_ns <= self._newest_ns:
             if self._newest_ns - capture_ns < CLOCK_RESET_NS:
@@ -203,9 +203,9 @@ class Tracker:
         self._newest_ns, self._asked_ns = -1, 0
 
     def _noise(self, points: EyePoints) -> F64:
-        """Return the covariance (3, 3), in m², of the eyes' midpoint.
+        """Return the (3, 3) covariance of the eyes' midpoint, in m².
 
-        The covariance that the driver reports is raised to a minimum. Without it, the noise in the settings applies.
+        If the driver reports a covariance, it is raised to a minimum. Otherwise, the noise in the settings is used.
         """
         noise: F64 = self.settings.noise_m**2 / 2 * np.eye(3)
         if points.covariance_m2 is not None and np.isfinite(points.covariance_m2).all():
@@ -240,7 +240,7 @@ class Tracker:
             and len(self._history) > 1
             and (head := sample.continued(self._history[-2].head))
         ):
-            self._history.pop()  # the last two samples fit better without this entry
+            self._history.pop()  # the two newest samples fit better without this entry
             self._follow(head, is_return=True)
         elif age_s > min(ANOTHER_AFTER_S, self.settings.hold_s) or (is_second and last.head.samples < ESTABLISHED):
             self._history.clear()
@@ -254,7 +254,7 @@ class Tracker:
         """Make `head` the viewer's head.
 
         Args:
-            is_return: Blend from the last shown position, because the eyes were lost or have jumped.
+            is_return: True to blend from the last shown position, because the eyes were lost or have jumped.
         """
         jump_m, jump_ns = (self._history[-1].jump_m, self._history[-1].jump_ns) if self._history else (NO_JUMP, 0)
         if is_return:
@@ -267,9 +267,9 @@ class Tracker:
             self._other = None
 
     def ahead(self, time_ns: int) -> EyesEstimate:
-        """Return the same estimate as `at`, for a time at which no picture is shown.
+        """Return the same estimate as `at`, for a time when no picture is shown.
 
-        Later blends start from the last shown position, which this call does not change.
+        Later blends start from the last shown position, which this call leaves unchanged.
         """
         asked_ns = self._asked_ns
         estimate = self.at(time_ns)
@@ -279,16 +279,16 @@ class Tracker:
     def at(self, time_ns: int) -> EyesEstimate:
         """Return the eyes at a display time.
 
-        The label of the estimate is
+        The estimate's label is
 
         * `exact` at the time of a sample,
         * `interpolated` between two samples,
         * `predicted` up to `LOSS_S` after the newest sample,
-        * `held` once the face is lost, when the predicted eyes slow to rest,
+        * `held` once the face is lost and the predicted eyes slow to rest,
         * `none` if the eyes were never seen, were lost for longer than `hold_s` or were forgotten.
 
         Args:
-            time_ns: Display time on the clock of the samples.
+            time_ns: Display time, on the samples' clock.
         """
         if not self._history or time_ns < self._history[0].head.capture_ns:
             return EyesEstimate(time_ns, 0, None, "none")
@@ -320,7 +320,7 @@ class Tracker:
         return self._estimate(time_ns, after.head, eyes_m, "interpolated")
 
     def _estimate(self, time_ns: int, head: _Head, eyes_m: F64, label: EyesLabel) -> EyesEstimate:
-        """Return the estimate for `eyes_m`, with the standard deviation that has grown since the sample."""
+        """Return the estimate for `eyes_m`, with a standard deviation that has grown since the sample."""
         age_s = min(max(head.age_s(time_ns), 0.0), SIGMA_AHEAD_S)
         middle_m, half_m = (eyes_m[0] + eyes_m[1]) / 2, (eyes_m[1] - eyes_m[0]) / 2
         if label in ("exact", "interpolated"):
@@ -332,16 +332,16 @@ class Tracker:
 
 
 def sideways_sigma_m(error_m2: F64, eye_m: F64, *, panel_m: tuple[float, float]) -> float:
-    """Return the sideways standard deviation that has the same effect on the display as a position error.
+    """Return the sideways standard deviation with the same effect on the display as a position error.
 
-    If an eye is nearer than its estimated distance x by d, the effect on a point of the display equals that of a
-    sideways displacement of d·u/x. Here u is the distance from the point to the foot of the perpendicular from the eye
-    to the display. The result is the root mean square over the display.
+    If an eye is nearer than its estimated distance x by d, the effect on a point on the display is that of a sideways
+    displacement of d·u/x, where u is the distance from the point to the foot of the perpendicular from the eye to the
+    display. The result is the root mean square over the display.
 
     Args:
-        error_m2: Covariance (3, 3) of the position error, in m².
-        eye_m: Position (3,) of the eyes' midpoint in the frame `stack`.
-        panel_m: Width and height of the panels.
+        error_m2: (3, 3) covariance of the position error, in m².
+        eye_m: (3,) position of the eyes' midpoint in frame `stack`.
+        panel_m: Panel width and height.
     """
     x, y, z = max(float(eye_m[0]), NEAREST_M), float(eye_m[1]), float(eye_m[2])
     lever2 = (y * y + z * z + (panel_m[0] ** 2 + panel_m[1] ** 2) / 12) / (x * x)

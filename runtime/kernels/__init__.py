@@ -1,8 +1,8 @@
-"""Compiled C++ loops, which are called through `ctypes`. The GIL is released during a call.
+"""Compiled C++ loops, called through `ctypes`. The GIL is released during each call.
 
-The structures of this module mirror the structures of the C++ files field by field. In C++, `KernelImage` is called
-`Image`, `KernelView` is called `View`, and `ErrorSum` is called `Result`. `library` compares the sizes of the
-structures and the maximum number of ray sets with the compiled values.
+The structures in this module mirror those in the C++ files field by field. In C++, `KernelImage` is called `Image`,
+`KernelView` is called `View`, and `ErrorSum` is called `Result`. `library` checks that the structure sizes and the
+maximum number of ray sets match the compiled values.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from typing import Any
 from numpy.typing import NDArray
 
 MAX_PANELS = 5
-MAX_SETS = 4  # maximum number of sets of rays: both eyes at two head positions
-MARGIN = 64  # elements after an image's rows that the loops may read or overwrite
+MAX_SETS = 4  # maximum number of ray sets: both eyes at two head positions
+MARGIN = 64  # elements past the end of an image's rows that the loops may read or overwrite
 SUBCODE = 16  # fixed-point units per 8-bit panel code
 FULL = 255 * SUBCODE  # range of a panel value, which rotates the polarization by up to a quarter turn
-EDGE_PX = 4  # maximum distance in pixels outside an image at which the image may be sampled
-EDGE_CLAMP_PX = 2  # distance in pixels outside a picture to which the values of its border rays are repeated
-TABLE_STEPS = 16  # table entries per code value for the intensities of bilinearly sampled rays
+EDGE_PX = 4  # maximum distance, in pixels, that an image may be sampled beyond its edge
+EDGE_CLAMP_PX = 2  # distance, in pixels, that the values of a picture's border rays are repeated beyond it
+TABLE_STEPS = 16  # table entries per code value, for the intensities of bilinearly sampled rays
 _AGAIN = "install phasestack again (it needs g++)"
 _pointer, _int, _long, _float, _double = (
     ctypes.c_void_p, ctypes.c_int32, ctypes.c_int64, ctypes.c_float, ctypes.c_double
@@ -30,25 +30,25 @@ _pointer, _int, _long, _float, _double = (
 
 
 class KernelImage(ctypes.Structure):
-    """Image of 16-bit elements with interleaved channels, whose rows may be in a ring buffer."""
+    """Image of 16-bit elements with interleaved channels. Its rows may be in a ring buffer."""
 
     _fields_ = (("data", _pointer), ("stride", _long), ("rows", _int), ("width", _int), ("ring", _int))
 
     @classmethod
     def of(cls, array: NDArray[Any], *, rows: int, width: int) -> KernelImage:
-        """Return an image of the first rows and pixels of an int16 array (rows, elements).
+        """Return an image made of the first rows and pixels of a (rows, elements) int16 array.
 
         The caller must keep the array alive.
 
         Args:
-            rows: Number of rows of the image.
-            width: Number of pixels in a row of the image.
+            rows: Number of rows in the image.
+            width: Number of pixels in each row.
         """
         return cls(array.ctypes.data, array.strides[0] // array.itemsize, rows, width, len(array))
 
 
 class Panel(ctypes.Structure):
-    """Images that hold the values of one panel before and after a step."""
+    """Images that hold one panel's values before and after a step."""
 
     _fields_ = tuple((name, KernelImage) for name in ("ahead", "moved", "before", "last"))
 
@@ -65,7 +65,7 @@ class Problem(ctypes.Structure):
 
 
 class Warp(ctypes.Structure):
-    """Map from a raster to an image, and the distance, below `EDGE_PX`, to which its edge is repeated."""
+    """Map from a raster to an image, and how far (below `EDGE_PX`) the image's edge is repeated outwards."""
 
     _fields_ = (
         ("image_from_raster", _double * 9), ("image_bend", _double), ("image_middle", _double),
@@ -74,7 +74,7 @@ class Warp(ctypes.Structure):
 
 
 class KernelView(ctypes.Structure):
-    """View of the displayed layers from one eye, and the target picture to compare the view with."""
+    """One eye's view of the displayed layers, and the target picture to compare it with."""
 
     _fields_ = (
         ("layers", _pointer), ("panels", _int), ("height", _int), ("width", _int), ("components", _int),
@@ -85,7 +85,7 @@ class KernelView(ctypes.Structure):
 
 
 class ErrorSum(ctypes.Structure):
-    """Sum of squared errors, and the number of terms in the sum."""
+    """Sum of squared errors, and its number of terms."""
 
     _fields_ = (("total", _double), ("counted", _long))
 
@@ -98,7 +98,7 @@ COMPILED = {
 
 @cache
 def library() -> Any:
-    """Return the compiled library. Raises ImportError if it is missing or was built from another version."""
+    """Return the compiled library. Raises ImportError if it is missing or built from another version."""
     built = Path(__file__).with_name("compiled" + EXTENSION_SUFFIXES[0])  # a build for another Python may be outdated
     if not built.exists():
         raise ImportError(f"runtime.kernels is not compiled for this Python: {_AGAIN}")

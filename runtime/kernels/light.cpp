@@ -1,24 +1,25 @@
-// Squared error of an eye's view of displayed layers, computed for some rows ray by ray (runtime/optics/light.py).
+// Squared error of an eye's view of the displayed layers, computed ray by ray for a range of rows
+// (runtime/optics/light.py).
 #include <cstdint>
 
 #include "sampling.hpp"
 
 namespace {
 
-constexpr int TABLE_STEPS = 16;  // table entries per code value if rays are sampled bilinearly
+constexpr int TABLE_STEPS = 16;  // table entries per code value for bilinearly sampled rays
 
 struct View {
   const uint8_t *layers;  // (panels, height, width, components)
   int32_t panels, height, width, components;
   const float *target;  // (rows, columns, 3) intensities
   int32_t rows, columns;
-  const double *centre_from_image;   // (3, 3) homography from pixels of the picture to pixels of the centre panel
+  const double *centre_from_image;   // (3, 3) homography from picture pixels to centre-panel pixels
   const double *panels_from_centre;  // (points, panels, 3, 3) homographies from the centre panel to each panel
   const double *toward;              // (3) vector whose product with (u, v, 1) is negative for rays towards the panels
-  const float *table;                // intensity for each sum of codes; a sum is rounded to an index
+  const float *table;                // intensity for each sum of codes; sums are rounded to an index
   int64_t first_ray;                 // number of the first ray
-  // points: number of points on the pupil. rays: rays along a pixel's side in each set, or 0 for one ray, which is
-  // sampled bilinearly. step: only every step-th pixel of every step-th row is measured.
+  // points: number of points on the pupil. rays: rays along a pixel's side in each set, or 0 for a single ray, sampled
+  // bilinearly. step: only every step-th pixel in every step-th row is measured.
   int32_t points, rays, step;
 };
 
@@ -27,8 +28,8 @@ struct Result {
   int64_t counted;
 };
 
-// Return the random bits that belong to the number of a ray (splitmix64). The lower 24 bits are used for the horizontal
-// position within the pixel, the next 24 bits for the vertical position, and the upper 16 bits for the pupil point.
+// Return the random bits for a ray's number (splitmix64). The lower 24 bits are used for the horizontal position within
+// the pixel, the next 24 for the vertical position, and the upper 16 for the pupil point.
 INLINE uint64_t random_bits(uint64_t ray) {
   uint64_t bits = ray * 0x9E3779B97F4A7C15u;
   bits = (bits ^ (bits >> 30)) * 0xBF58476D1CE4E5B9u;
@@ -36,7 +37,7 @@ INLINE uint64_t random_bits(uint64_t ray) {
   return bits ^ (bits >> 31);
 }
 
-// Add the red, green and blue intensity along one ray to `seen`. Return false if the ray misses a panel.
+// Add the red, green and blue intensities along one ray to `seen`. Return false if the ray misses a panel.
 INLINE bool see(const View &view, double u, double v, int point, float *seen) {
   if (!(view.toward[0] * u + view.toward[1] * v + view.toward[2] < 0)) return false;
   const double *c = view.centre_from_image, weight = 1 / (c[6] * u + c[7] * v + c[8]);

@@ -1,4 +1,4 @@
-// Bilinear sampling of images along the rows of a raster, through a homography. All kernels use this sampler.
+// Bilinear sampling of images along raster rows, through a homography. Used by all the kernels.
 #pragma once
 
 #include <algorithm>
@@ -6,7 +6,7 @@
 #include <cstdint>
 #include <cstring>
 
-// Exported functions, and the functions that are inlined into them, are compiled for three levels of processors.
+// Exported functions, and the functions inlined into them, are compiled for three processor levels.
 #if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
 #define FOR_EVERY_CPU extern "C" __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
 #else
@@ -16,16 +16,17 @@
 #define VECTORISED _Pragma("GCC ivdep")
 
 constexpr int LANES = 32;     // elements per vector in the loops; the compiler splits vectors as the processor requires
-constexpr int TILE_PX = 256;  // pixels of a row that are sampled together; their data fits in the first-level cache
-constexpr int EDGE_PX = 4;    // maximum distance in pixels outside an image at which the image may be sampled
+constexpr int TILE_PX = 256;  // pixels in a row that are sampled together; their data fits in the first-level cache
+constexpr int EDGE_PX = 4;    // maximum distance, in pixels, that an image may be sampled beyond its edge
 constexpr int MAX_PANELS = 5;
 constexpr int MAX_CHANNELS = 3;
 constexpr int TILE = TILE_PX * MAX_CHANNELS + 2 * LANES;  // elements, including some that may be overwritten at the end
 constexpr int SOURCE = 2 * TILE + MAX_CHANNELS * LANES;   // elements
-constexpr int FIELDS = 2;  // maximum number of images that are sampled together
-constexpr float WEIGHT_UNIT = 16384;  // fixed-point value of an interpolation weight of 1
+constexpr int FIELDS = 2;  // maximum number of images sampled together
+constexpr float WEIGHT_UNIT = 16384;  // an interpolation weight of 1 in fixed point
 
-// Image of 16-bit elements with interleaved channels. Whole vectors are read, which may extend past the end of a row.
+// Image of 16-bit elements with interleaved channels. Reads are in whole vectors, which may extend past the end of a
+// row.
 struct Image {
   int16_t *data;
   int64_t stride;  // distance between rows in elements
@@ -33,7 +34,7 @@ struct Image {
   const int16_t *row(int r) const { return data + int64_t(r % ring) * stride; }
 };
 
-struct Ramp {  // pixel index of each element for images with one and with three channels
+struct Ramp {  // each element's pixel index, for images with one or three channels
   int16_t one_channel[LANES + MAX_CHANNELS] = {}, three_channels[LANES + MAX_CHANNELS] = {};
   constexpr Ramp() {
     for (int e = 0; e < LANES + MAX_CHANNELS; ++e) one_channel[e] = int16_t(e), three_channels[e] = int16_t(e / 3);
@@ -41,8 +42,8 @@ struct Ramp {  // pixel index of each element for images with one and with three
 };
 constexpr Ramp RAMP;
 
-// Row of a raster, mapped by a homography. x and y return the position in the image of the pixel with index u, where
-// pixel centres are at integers.
+// A raster row, mapped by a homography. x and y return the image position of the pixel with index u, with pixel centres
+// at integers.
 struct Line {
   double x0, xu, y0, yu, w0, wu;
   Line() = default;
@@ -71,9 +72,9 @@ INLINE void at_least_zero(double slope, double offset, double &low, double &high
   else if (offset < 0) high = -1;
 }
 
-// Return the pixels, in a row of `count` pixels, whose positions are at least `near` pixels inside the image's edges.
+// Return the pixels in a row of `count` that are mapped to positions at least `near` pixels inside the image's edges.
 INLINE Span inside(const Line &line, int count, const Image &image, double near) {
-  constexpr double rounded = 1e-6;  // tolerance for rounding errors of positions on an edge
+  constexpr double rounded = 1e-6;  // tolerance for rounding errors in positions on an edge
   const double right = image.width - near, below = image.rows - near;
   double low = 0, high = count - 1;
   at_least_zero(line.wu, line.w0 - 1e-9, low, high);
@@ -93,8 +94,8 @@ INLINE int16_t rounded(float x) { return int16_t(int(std::nearbyintf(x))); }
 // Return a·b/32768, rounded. Most processors compute it in a single instruction.
 INLINE int16_t product(int16_t a, int16_t b) { return int16_t((((int32_t(a) * int32_t(b)) >> 14) + 1) >> 1); }
 
-// Interpolate from a to b, where `share` is in WEIGHT_UNIT: part_of returns the change and mixed the interpolated
-// value. a and b must be within ±8191, because twice their difference must fit in 16 bits.
+// Interpolate from a to b by `share`, in WEIGHT_UNIT: part_of returns the change, and mixed returns the interpolated
+// value. a and b must be within ±8191, so that twice their difference fits in 16 bits.
 INLINE int16_t part_of(int16_t a, int16_t b, int16_t share) { return product(int16_t(2 * (b - a)), share); }
 INLINE int16_t mixed(int16_t a, int16_t b, int16_t share) { return int16_t(a + part_of(a, b, share)); }
 
@@ -104,12 +105,12 @@ struct alignas(2 * LANES) Work {
   int16_t sum[TILE];
 };
 
-// Positions in an image of consecutive pixels of a line, and the columns of the image that must be read for them.
+// Image positions of consecutive pixels on a line, and the image columns that must be read for them.
 struct Stretch {
-  double xs, xe, ys, ye;  // positions (x, y) of the first pixel (s) and of the last pixel (e)
-  int first, steps;       // first pixel of the line, and number of steps from the first to the last pixel
-  bool on_pixels;         // true if the pixels coincide with consecutive columns of the image
-  int s0, elements;       // first column of the image to read, and number of elements to read from there
+  double xs, xe, ys, ye;  // positions (x, y) of the first pixel (s) and the last pixel (e)
+  int first, steps;       // first pixel, and number of steps from there to the last pixel
+  bool on_pixels;         // true if the pixels coincide with consecutive image columns
+  int s0, elements;       // first image column to read, and number of elements to read from there
 };
 
 template <int C, typename AnyLine>
@@ -125,7 +126,7 @@ INLINE Stretch stretch_of(const Image &image, const AnyLine &line, int first, in
 }
 
 // Interpolate between the image rows above and below a stretch, and store the result for image f in to[f]. The stretch
-// is processed in runs, along which the weights grow linearly.
+// is divided into runs, and weights change linearly along each run.
 template <int F, int C>
 INLINE void mix_rows(const Image *images, const Stretch &along, int16_t *const (&to)[F]) {
   const Image &image = images[0];
@@ -134,7 +135,7 @@ INLINE void mix_rows(const Image *images, const Stretch &along, int16_t *const (
   for (int at = 0, length; at < along.elements; at += length) {
     const double y = along.ys + (along.s0 + at / C - along.xs) * slope, within = std::clamp(y, 0.0, bottom);
     const int row = std::min(int(within), std::max(image.rows - 2, 0));
-    double grows = y == within ? slope : 0, until = 1e6;  // growth of the weight per pixel; length of the run in pixels
+    double grows = y == within ? slope : 0, until = 1e6;  // growth of the weight per pixel; run length in pixels
     if (std::abs(slope) > 1e-7) {
       const double end = y < 0 ? (slope > 0 ? 0 : -1e9) : y > bottom ? (slope < 0 ? bottom : 1e9) : row + (slope > 0);
       until = std::min((end - y) / slope, 1e6);
@@ -158,7 +159,7 @@ INLINE void mix_rows(const Image *images, const Stretch &along, int16_t *const (
   }
 }
 
-// Repeat the first and the last pixel of interpolated rows beyond the ends of the rows (clamp to edge).
+// Repeat the first and last pixels of interpolated rows beyond the ends of the rows (clamp to edge).
 template <int C>
 INLINE void clamp_ends(int16_t *source, int elements) {
   for (int beyond = 1; beyond <= EDGE_PX; ++beyond)
@@ -168,11 +169,11 @@ INLINE void clamp_ends(int16_t *source, int elements) {
     }
 }
 
-// Parabola that approximates the positions of pixels in units of 2^-32 pixels. The position of pixel k, relative to the
-// first column that is read, is k + begin + drift·k + turn·k².
+// Parabola that approximates pixel positions, in units of 2^-32 pixels. Relative to the first column read, pixel k is
+// at k + begin + drift·k + turn·k².
 struct Parabola {
   int64_t begin, drift, turn;
-  int at_once;  // elements that are processed together as a vector
+  int at_once;  // elements processed together as a vector
 };
 
 template <int C, typename AnyLine>
@@ -181,9 +182,9 @@ INLINE Parabola parabola_of(const AnyLine &line, const Stretch &along) {
   const double half = 0.5 * steps, middle = steps > 1 ? line.x(along.first + half) : 0.5 * (along.xs + along.xe);
   const double bend = steps > 1 ? (along.xs + along.xe - 2 * middle) / (half * half) * 0.5 : 0;
   const double scale = steps > 0 ? (along.xe - along.xs) / steps - bend * steps : 1;  // scale at the first pixel
-  // Choose the largest vectors in which the positions gain less than three pixels on the line, and a chord is close to
-  // the parabola. For one channel, the limit is two pixels, because rounding errors of the growing weight accumulate
-  // over 32 pixels.
+  // Make vectors as large as possible, while the positions gain less than three pixels on the line and the parabola
+  // stays close to its chord. With one channel, the limit is two pixels, because rounding errors in the growing weight
+  // accumulate over 32 pixels.
   constexpr double gains = C == 1 ? 1.9 : 2.9;
   const double most = std::max(std::abs(scale - 1), std::abs(scale - 1 + 2 * bend * steps));
   int at_once = LANES;
@@ -192,8 +193,8 @@ INLINE Parabola parabola_of(const AnyLine &line, const Stretch &along) {
   return {int64_t((along.xs - along.s0) * one), int64_t((scale - 1) * one), int64_t(bend * one), at_once};
 }
 
-// Interpolate horizontally between neighbours in interpolated rows, one vector at a time. Positions in the source
-// advance slightly faster or slower than the line's pixels, so a vector needs two to five neighbours.
+// Interpolate horizontally between neighbours in interpolated rows, one vector at a time. Source positions advance
+// slightly faster or slower than the line's pixels, so each vector needs two to five neighbours.
 template <int F, int C>
 INLINE void mix_neighbours(const Parabola &by, int elements, const int16_t *const (&sources)[F], int16_t *const (&to)[F]) {
   const int16_t *ramp = C == 1 ? RAMP.one_channel : RAMP.three_channels;
@@ -225,13 +226,13 @@ INLINE void mix_neighbours(const Parabola &by, int elements, const int16_t *cons
   }
 }
 
-// Sample F images of equal shape at the pixels of a line from `first` to `last` - 1. There may be at most TILE_PX
-// pixels, and all must be `inside`. The samples of image f are stored in out[f] from element `begin_at` on. Up to a
-// vector and two pixels after the last sample may be overwritten, but nothing before the first sample.
+// Sample F images of equal shape at a line's pixels from `first` to `last` - 1. There may be at most TILE_PX pixels,
+// and all of them must be `inside`. The samples of image f are stored in out[f], starting at element `begin_at`. Up to
+// a vector and two pixels after the last sample may be overwritten, but nothing before the first.
 template <int F, int C, typename AnyLine>
 INLINE void sample(const Image *images, const AnyLine &line, int first, int last, Work &work, int16_t (*out)[TILE], int begin_at = 0) {
   const Stretch along = stretch_of<C>(images[0], line, first, last);
-  int16_t *mixes[F], *to[F];  // if the pixels coincide with columns, the rows are interpolated directly into the output
+  int16_t *mixes[F], *to[F];  // if pixels coincide with columns, rows are interpolated directly into the output
   for (int f = 0; f < F; ++f) to[f] = out[f] + begin_at, mixes[f] = along.on_pixels ? to[f] : work.source[f] + LANES;
   mix_rows<F, C>(images, along, mixes);
   if (along.on_pixels) return;
@@ -239,8 +240,8 @@ INLINE void sample(const Image *images, const AnyLine &line, int first, int last
   mix_neighbours<F, C>(parabola_of<C>(line, along), (along.steps + 1) * C, mixes, to);
 }
 
-// Return the length of a line's tiles in pixels. It limits the error of a parabola to 0.01 pixel, and the source to the
-// size of its buffer.
+// Return the tile length for a line, in pixels. It is short enough to keep the parabola's error below 0.01 pixel and to
+// make the source fit in its buffer.
 INLINE int tile_px(const Line &line, Span span) {
   const double nearest = std::min(std::abs(line.w0 + line.wu * span.first), std::abs(line.w0 + line.wu * span.last));
   const double turn = std::max(std::abs(line.wu) / nearest, 1e-9);

@@ -1,41 +1,40 @@
-// Steps of the solver on the processor (docs/mathematics.md, L1 to L5). The reference implementation is
-// model_export/light.py.
+// Solver steps on the processor (docs/mathematics.md, L1 to L5). The reference implementation is model_export/light.py.
 //
-// Rays are processed row by row, and their residuals are stored in a ring buffer of rows. A row of a panel is updated
-// after all rays that cross it have been processed. The phasors of a panel row are also stored in a ring buffer, from
-// the first ray that needs them to the last. Only the panels are read from and written to main memory.
+// Rays are processed row by row, and their residuals are stored in a ring buffer of rows. A panel row is updated once
+// all the rays that cross it have been processed. Its phasors are kept in another ring buffer, from the first ray that
+// needs them to the last. Only the panels are read from and written to main memory.
 #include <vector>
 
 #include "sampling.hpp"
 
 namespace {
 
-constexpr int FULL = 255 * 16;   // panel value of 1, in sixteenths of a code
-constexpr float UNIT = 8100;     // fixed-point value of 1 in phasors; rounded products must stay within 8191
+constexpr int FULL = 255 * 16;   // a panel value of 1, in sixteenths of a code
+constexpr float UNIT = 8100;     // 1 in fixed-point phasors; rounded products must stay within 8191
 constexpr float PI = 3.14159265f;
 constexpr double NEAR_PX = 0.5;  // rays count if they cross every panel at least this far inside its edges
-constexpr double EDGE_CLAMP_PX = 2;  // ray bundles at the border extend this far beyond the picture (clamp to edge)
-constexpr int MAX_SETS = 4;      // sets of rays; the sum of their squared slopes, each at most 7830, fits in 16 bits
+constexpr double EDGE_CLAMP_PX = 2;  // bundles of rays at the border extend this far beyond the picture (clamp to edge)
+constexpr int MAX_SETS = 4;      // ray sets; the sum of their squared slopes, each at most 7830, fits in 16 bits
 static_assert(FIELDS * MAX_SETS <= 2 * MAX_PANELS, "work has too few tiles to gather all sets");
 
 struct Panel {
-  Image ahead;   // values with momentum, at which the rays are evaluated
+  Image ahead;   // values with momentum, used to evaluate the rays
   Image moved;   // values with momentum after the step
   Image before;  // values without momentum
-  Image last;    // values without momentum after the step; same image as `before`, except in the first step, where
+  Image last;    // values without momentum after the step; the same image as `before`, except in the first step, where
                  // `before` is `ahead`
 };
 
 struct Problem {
-  int32_t panels, sets, channels;  // each head position has two sets of rays, for the left and for the right eye
-  int32_t height, width;           // size of a set; head positions alternate from row to row of a picture
+  int32_t panels, sets, channels;  // each head position has two ray sets, one for each eye
+  int32_t height, width;           // size of a set; head positions alternate from one picture row to the next
   const double *panels_from_rays;  // (sets, panels, 3, 3) homographies from a set's rays to panel pixels
-  const double *rays_from_panels;  // (sets, panels, 3, 3) inverse homographies
-  const uint8_t *targets[2];       // for each eye (rows of all head positions, width, channels)
-  const int16_t *column_taper;     // (width, channels) weights of the rays' errors; 32767 stands for 1
+  const double *rays_from_panels;  // (sets, panels, 3, 3) inverses of these homographies
+  const uint8_t *targets[2];       // for each eye, (rows of all head positions, width, channels)
+  const int16_t *column_taper;     // (width, channels) weights for the rays' errors; 32767 stands for 1
   const int16_t *row_taper;        // (rows of all head positions) further weights
-  const int32_t *table;            // (256,) for each target code, the sum of panel values plus 65536 times the weight
-  float rest, missing;             // for close_middle: value outside a panel, and weight of rays that miss a panel
+  const int32_t *table;            // (256,) the sum of panel values plus 65536 times the weight, for each target code
+  float rest, missing;             // for close_middle: value outside the panels, and weight for rays that miss a panel
   Panel panel[MAX_PANELS];
   float size, momentum, floor;
 
@@ -45,14 +44,14 @@ struct Problem {
   }
 };
 
-// Part of the work that one thread does: rows of rays, and the panel rows that can be updated after these rays.
+// The part of the work done by one thread: rows of rays, and the panel rows that can be updated once they are done.
 struct Share {
   int first, end;  // rows of rays
-  std::vector<int> since[MAX_PANELS], until[MAX_PANELS];  // first and last row of the rays that cross each panel row
+  std::vector<int> since[MAX_PANELS], until[MAX_PANELS];  // first and last ray row that crosses each panel row
   int panel_first[MAX_PANELS], panel_end[MAX_PANELS];     // rows of each panel to update
-  int16_t *ring;          // ring buffer of the rays' residuals
-  int64_t stride, plane;  // elements per row, elements per field
-  int rows;               // number of rows in the rays' ring buffer
+  int16_t *ring;          // ring buffer for the rays' residuals
+  int64_t stride, plane;  // elements per row and per field
+  int rows;               // number of rows in this ring buffer
   Image cosine[MAX_PANELS], sine[MAX_PANELS];  // phasors: cosine and sine of pi times `ahead`
 
   int16_t *field(int set, int f) const { return ring + (int64_t(set) * FIELDS + f) * plane; }
@@ -66,7 +65,7 @@ struct Range {
   double low, high;
 };
 
-// Return the range of ray rows, over all sets, that cross row q of panel n.
+// Return the range of ray rows, over all sets, that cross row q in panel n.
 Range rays_through(const Problem &problem, int n, int q) {
   const double right = problem.panel[n].ahead.width - 0.5;
   Range rays{1e9, -1e9};
@@ -80,7 +79,7 @@ Range rays_through(const Problem &problem, int n, int q) {
   return rays;
 }
 
-// Compute `since` and `until` for each row of a panel. Neither decreases from one row to the next.
+// Compute `since` and `until` for each row in a panel. Neither decreases from one row to the next.
 void find_dependencies(const Problem &problem, int n, Share &share) {
   const int rows = problem.panel[n].ahead.rows;
   const double last = problem.height - 1.0;
@@ -94,13 +93,13 @@ void find_dependencies(const Problem &problem, int n, Share &share) {
   for (int q = rows - 2; q >= 0; --q) since[q] = std::min(since[q], since[q + 1]);
 }
 
-// Return the first panel row that is still crossed by a ray in ray row r or later.
+// Return the first panel row that ray row r or a later one still crosses.
 int first_until(const std::vector<int> &until, int r) {
   return int(std::lower_bound(until.begin(), until.end(), r) - until.begin());
 }
 
-// Divide the ray rows evenly between the parts. A part updates the panel rows whose last ray is in its range. It must
-// also process all earlier rays that cross these panel rows.
+// Divide the ray rows evenly between the parts. Each part updates the panel rows whose last ray is in its range, so it
+// must also process all the earlier rays that cross these panel rows.
 void assign_rows(const Problem &problem, int part, int parts, Share &share) {
   const int first = int(int64_t(problem.height) * part / parts);
   share.first = first, share.end = int(int64_t(problem.height) * (part + 1) / parts);
@@ -112,17 +111,16 @@ void assign_rows(const Problem &problem, int part, int parts, Share &share) {
   }
 }
 
-// Return the number of ray rows to keep in the ring buffer: the rows between the first and the last ray of a panel row,
-// and two more.
+// Return the number of ray rows to keep in the ring buffer: those from the first to the last that cross a panel row,
+// and one more.
 int ray_rows(const std::vector<int> &since, const std::vector<int> &until) {
   int rows = 1;
   for (size_t q = 0; q < since.size(); ++q) rows = std::max(rows, until[q] - since[q] + 2);
   return rows;
 }
 
-// Return the maximum number of phasor rows of a panel that are in use at the same time. Rays between two panel rows
-// read both rows, so the phasors of a row are needed from the first ray of the previous row to the last ray of the next
-// row.
+// Return the maximum number of a panel's phasor rows in use at the same time. Rays between two panel rows read both, so
+// a row's phasors are needed from the first ray of the row before it to the last ray of the row after it.
 int phasor_rows(const std::vector<int> &since, const std::vector<int> &until) {
   int rows = 2;
   for (int q = 0, oldest = 0; q < int(since.size()); ++q) {
@@ -134,7 +132,7 @@ int phasor_rows(const std::vector<int> &since, const std::vector<int> &until) {
 
 int64_t stride_of(const Problem &problem, int width) { return whole_vectors(int64_t(width) * problem.channels + LANES); }
 
-// Place the ring buffers in memory that the thread keeps for later calls.
+// Lay out the ring buffers in memory that the thread keeps for later calls.
 void lay_out(const Problem &problem, bool phasors, Share &share) {
   static thread_local std::vector<int16_t> memory;
   share.rows = 1;
@@ -164,24 +162,25 @@ Share share_of(const Problem &problem, int part, int parts, bool phasors) {
   return share;
 }
 
-// Constants in fixed point. The first four are coefficients of x, x^3, x^5 and x^7 in a polynomial for sin(pi/2 x), and
-// `unit` is UNIT; 16384 stands for 1. `beyond_eight` is 32768 / FULL - 8; 32768 stands for 1.
+// Fixed-point constants. The first four are the coefficients of x, x^3, x^5 and x^7 in a polynomial for sin(pi/2 x),
+// and `unit` is UNIT; for all of these, 16384 stands for 1. `beyond_eight` is 32768 / FULL - 8, with 32768 standing for
+// 1.
 struct Factors {
   int16_t first = 25736, third = -10583, fifth = 1302, seventh = -71, unit = int16_t(UNIT * 2), beyond_eight = 1028;
 };
 
 // Return UNIT times the cosine of an angle, where 32768 stands for half a turn.
 INLINE int16_t cosine_of(int16_t angle, const Factors &by) {
-  const int16_t within = int16_t(16384 - (angle < 0 ? -angle : angle));  // argument of the sine, at most a quarter turn
+  const int16_t within = int16_t(16384 - (angle < 0 ? -angle : angle));  // sine argument, at most a quarter turn
   const int16_t x = int16_t(2 * within - (within >> 14)), y = product(x, x);  // subtracting 1 avoids 32768
   const int16_t series = int16_t(by.third + product(y, int16_t(by.fifth + product(y, by.seventh))));
   return product(product(x, int16_t(by.first + product(y, series))), by.unit);
 }
 
-// Compute the cosine and the sine of pi times the values in row q of panel n.
+// Compute the cosine and sine of pi times the values in row q of panel n.
 INLINE void to_phasors(const Problem &problem, const Share &share, int n, int q) {
   Factors by;
-  asm("" : "+m"(by));  // hide the constants from GCC, which would expand the products and quadruple the time
+  asm("" : "+m"(by));  // hides the constants from GCC, which would expand the products and take four times as long
   const int16_t *row = problem.panel[n].ahead.row(q);
   int16_t *cosine = const_cast<int16_t *>(share.cosine[n].row(q)), *sine = const_cast<int16_t *>(share.sine[n].row(q));
   const int count = problem.panel[n].ahead.width * problem.channels;
@@ -200,14 +199,14 @@ INLINE void clear_outside(const Problem &problem, const Share &share, int set, i
   }
 }
 
-// Return the fixed-point value of 1 in the product of the panels' phasors.
+// Return the fixed-point value that stands for 1 in the product of the panels' phasors.
 INLINE float unit_of(int panels) {
   float unit = UNIT;
   for (int n = 1; n < panels; ++n) unit *= UNIT / 8192;
   return unit;
 }
 
-// Compute the squared slope (curvature), and the error times the slope (gradient), for row r of a set of rays.
+// Compute the squared slope (curvature) and the error times the slope (gradient) for row r of a ray set.
 template <int C, int N>
 INLINE void compare(const Problem &problem, const Share &share, int set, int r, Work &work) {
   Line lines[N];
@@ -245,7 +244,7 @@ INLINE void compare(const Problem &problem, const Share &share, int set, int r, 
   clear_outside(problem, share, set, r, span);
 }
 
-// Row of a panel, mapped to the rays of each set.
+// A panel row, mapped to the rays of each set.
 struct Back {
   Line line[MAX_SETS];
   Span span[MAX_SETS];
@@ -257,8 +256,8 @@ struct Back {
   }
 };
 
-// At the pixels of a panel row, sum the first F fields of the rays over all sets. The sums are stored in work.tile[0]
-// to work.tile[F - 1].
+// Sum the rays' first F fields over all sets at the pixels of a panel row. The sums are stored in work.tile[0] to
+// work.tile[F - 1].
 template <int F, int C>
 INLINE void gather(const Problem &problem, const Share &share, const Back &back, Span tile, Work &work) {
   const int count = (tile.last - tile.first) * C;
@@ -305,8 +304,8 @@ INLINE void move(const Problem &problem, const Share &share, int n, int q, Work 
   }
 }
 
-// For row r of a set of rays, compute the weights of the targets, and the products of the weights and the residuals
-// that the middle panel must correct.
+// For row r of a ray set, compute the targets' weights, and their products with the residuals that the middle panel
+// must correct.
 template <int C>
 INLINE void residual(const Problem &problem, const Share &share, int set, int r, Work &work) {
   const int middle = problem.panels / 2;
@@ -349,8 +348,8 @@ INLINE void residual(const Problem &problem, const Share &share, int set, int r,
   clear_outside(problem, share, set, r, span);
 }
 
-// Set each pixel in row q of the middle panel to the mean residual of the rays through the pixel, or to the rest value
-// if there are no rays.
+// Set each pixel in row q of the middle panel to the mean residual of the rays that pass through it, or to the rest
+// value if there are none.
 template <int C>
 INLINE void fill(const Problem &problem, const Share &share, int q, Work &work) {
   const Image &image = problem.panel[problem.panels / 2].last;
@@ -369,7 +368,7 @@ INLINE void fill(const Problem &problem, const Share &share, int q, Work &work) 
 template <int C, int N>
 INLINE void step_rows(const Problem &problem, const Share &share) {
   Work work{};
-  int at[N], ready[N];  // for each panel, the next row to update and the next row to convert to phasors
+  int at[N], ready[N];  // for each panel, the next row to update, and the next to convert to phasors
   std::copy(share.panel_first, share.panel_first + N, at);
   for (int n = 0; n < N; ++n)
     ready[n] = std::max(0, first_until(share.until[n], share.first) - 1);
@@ -396,7 +395,7 @@ INLINE void close_rows(const Problem &problem, const Share &share) {
 
 }  // namespace
 
-// Run part number `part` of a step that is divided into `parts` independent parts.
+// Run part number `part` of a step divided into `parts` independent parts.
 FOR_EVERY_CPU void step(const Problem *problem, int part, int parts) {
   const Share share = share_of(*problem, part, parts, true);
   switch (problem->channels * 10 + problem->panels) {
@@ -411,15 +410,15 @@ FOR_EVERY_CPU void step(const Problem *problem, int part, int parts) {
   }
 }
 
-// Solve the middle panel (`last`) while the other panels stay fixed. The work is divided into `parts` independent
-// parts, of which this call does part number `part`.
+// Solve the middle panel (`last`) with the other panels held fixed. The work is divided into `parts` independent parts,
+// and this call does part number `part`.
 FOR_EVERY_CPU void close_middle(const Problem *problem, int part, int parts) {
   const Share share = share_of(*problem, part, parts, false);
   if (problem->channels == 3) close_rows<3>(*problem, share);
   else close_rows<1>(*problem, share);
 }
 
-// Convert the rows of a panel from `first` to `end` - 1 to opaque RGBA pixels with 8-bit codes.
+// Convert a panel's rows from `first` to `end` - 1 to opaque RGBA pixels with 8-bit codes.
 FOR_EVERY_CPU void show(const Image *panel, int channels, uint32_t *pixels, int64_t stride, int first, int end) {
   for (int r = first; r < end; ++r) {
     const int16_t *row = panel->row(r);

@@ -1,12 +1,12 @@
-// Resample an image to another raster through a homography. The columns of the image and of the raster may be unevenly
-// spaced (ColumnLaw in runtime/model/chain.py).
+// Resample an image to another raster through a homography. The image's and the raster's columns may be unevenly spaced
+// (ColumnLaw in runtime/model/chain.py).
 #include "sampling.hpp"
 
 namespace {
 
-constexpr int BENT_TILE_PX = 64;   // maximum length of a tile in which a parabola approximates unevenly spaced columns
-constexpr int SOURCE_PX = 480;     // maximum width of a tile's source; at the end of a column law, columns are wide
-constexpr double BEYOND = 1e-9;    // minimum argument of the logarithm; no column corresponds to smaller arguments
+constexpr int BENT_TILE_PX = 64;   // maximum length of a tile with unevenly spaced columns, for a close enough parabola
+constexpr int SOURCE_PX = 480;     // maximum width of a tile's source; columns are wide at the end of a column law
+constexpr double BEYOND = 1e-9;    // minimum argument for the logarithm; no column corresponds to smaller arguments
 
 struct Columns {  // for column u, the homography applies to t = middle + (1 - exp(-bend (u - middle))) / bend
   double bend, middle;
@@ -17,7 +17,7 @@ struct Columns {  // for column u, the homography applies to t = middle + (1 - e
 struct Warp {
   double image_from_raster[9];
   Columns image, raster;
-  double reach_px;  // distance outside the image, below EDGE_PX, to which the image's edge is repeated
+  double reach_px;  // how far outwards the image's edge is repeated; less than EDGE_PX
 };
 
 struct WarpedLine {
@@ -28,7 +28,7 @@ struct WarpedLine {
   double y(double u) const { return line.y(t(u)); }
 };
 
-// Return the pixels of a line that are inside an image or at most reach_px outside.
+// Return the pixels on a line that are inside an image or at most reach_px outside it.
 INLINE Span reaches(const WarpedLine &at, int count, const Image &image, double reach_px) {
   const Line &line = at.line;
   const double left = at.image.to(-reach_px), right = at.image.to(image.width + reach_px), below = image.rows + reach_px;
@@ -68,8 +68,8 @@ INLINE void warp_rows(const Image &image, const Image &result, const Warp &warp,
 
 }  // namespace
 
-// Sample rows of the result bilinearly from an image whose elements are within ±8191. Pixels of the result that are
-// outside the image have the value `outside`.
+// Sample the result's rows bilinearly from an image whose elements are within ±8191. Result pixels outside the image
+// are set to `outside`.
 FOR_EVERY_CPU void warp(const Image *image, const Image *result, const Warp *by, int channels, int outside, int first, int end) {
   if (channels == 3) warp_rows<3>(*image, *result, *by, outside, first, end);
   else warp_rows<1>(*image, *result, *by, outside, first, end);

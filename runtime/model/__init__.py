@@ -1,1 +1,1 @@
-"""Predictors, which compute the values of all panels from the target pictures of two eyes."""
+"""Predictors, which compute all panel values from the two eyes' target pictures."""

@@ -1,4 +1,4 @@
-"""Choose the backend that runs the solver: the configured backend or, for `auto`, the faster one."""
+"""Choose the backend to run the solver on: the configured one or, for `auto`, the faster one."""
 
 from __future__ import annotations
 
@@ -23,28 +23,28 @@ if TYPE_CHECKING:
 log = logging.getLogger("phasestack.model")
 
 EYES_M = ((0.6, -0.031, 0.0), (0.6, 0.031, 0.0))
-FIRST_SHARE = 4  # divisor of the panels' columns and rows in the first comparison
-CLEAR = 2.5  # a backend that is this many times as fast in the first comparison wins without a second comparison
-RUNS = 3  # timed runs, of which the fastest counts
+FIRST_SHARE = 4  # the first comparison divides the panels' columns and rows by this
+CLEAR = 2.5  # a backend that is this many times as fast in the first comparison wins without a second one
+RUNS = 3  # timed runs; the fastest counts
 
 Wanted = Literal["auto", "cpu", "gl"]
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Backend, and the reason for choosing it."""
+    """The chosen backend, and the reason for choosing it."""
 
     backend: SolverBackend
     why: str  # one line, including the times if they were measured
 
 
 def choose(wanted: Wanted, predictor: Predictor, context: Callable[[], Any]) -> Choice:
-    """Choose the backend for a loaded model, and log the reason.
+    """Choose a backend for a loaded model, and log the reason.
 
     Args:
-        wanted: Configured backend. For `auto`, both backends are timed, and the processor is used if OpenGL fails.
-        context: Function that returns an OpenGL context that is current on this thread, or raises MissingPart. The
-            function is called only if the context is needed.
+        wanted: Configured backend. If `auto`, both backends are timed, and the processor is used if OpenGL fails.
+        context: Function that returns an OpenGL context current on this thread, or raises MissingPart. Called only if a
+            context is needed.
 
     Raises:
         MissingPart: `wanted` is `gl`, but OpenGL is unavailable.
@@ -94,14 +94,14 @@ def _faster(predictor: Predictor, made: Callable[[], GlBackend]) -> Choice:
 
 
 def solution_ms(predictor: Predictor, stack: PanelStack, backend: SolverBackend, *, runs: int) -> float:
-    """Return the time in ms of the fastest of `runs` solutions.
+    """Return the time taken by the fastest of `runs` solutions, in ms.
 
-    An additional solution before the timed runs compiles the code and allocates the memory.
+    An extra solution is run before these, untimed, to compile code and allocate memory.
     """
     solver = predictor.on_panels(stack)
     assert solver is not None
     solver.set_backend(backend)
-    # Assume that the eyes are known exactly, because a tracking error increases the time equally on every backend.
+    # Assume that the eyes are known exactly, because a tracking error adds the same time on every backend.
     job = replace(drawn_job([_noise(stack, seed) for seed in (0, 1)], np.array(EYES_M), stack), eye_sigma_m=0.0)
     try:
         solver.solve(job)
@@ -116,7 +116,7 @@ def solution_ms(predictor: Predictor, stack: PanelStack, backend: SolverBackend,
 
 
 def _noise(stack: PanelStack, seed: int) -> U8:
-    """Return an (h, w, 4) picture of coloured noise, in which the solver cannot skip any work."""
+    """Return an (h, w, 4) picture of coloured noise, which leaves no work for the solver to skip."""
     noise = np.random.default_rng(seed).integers(0, 256, (stack.height_px, stack.width_px, 4), np.uint8)
     noise[..., 3] = 255
     return noise

@@ -1,4 +1,4 @@
-"""Interface of the models, which compute layers from a job."""
+"""Interface for models, which compute layers from a job."""
 
 from __future__ import annotations
 
@@ -17,58 +17,58 @@ if TYPE_CHECKING:
     from runtime.model.device import SolverBackend
 
 
-STAGES = ("prepare", "inference", "finish", "step")  # inference: only the network; step: all updates of the panels
+STAGES = ("prepare", "inference", "finish", "step")  # inference: only the network; step: all panel updates
 
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """Layers that a model computed for a job, and the work that the computation took."""
+    """The layers that a model computed for a job, and the work done to compute them."""
 
-    layers: U8  # (N, height_px, width_px, 4) RGBA, rear to front, in the size of the job's stack; read-only
-    stage_ms: dict[str, float] = field(default_factory=dict)  # time of each of STAGES
+    layers: U8  # (N, height_px, width_px, 4) RGBA, rear to front, sized like the job's stack; read-only
+    stage_ms: dict[str, float] = field(default_factory=dict)  # time taken by each of STAGES
     savings: Savings = field(default_factory=Savings)
-    steps: int = 0  # updates of all panels, including the updates of earlier solutions that were continued
-    continued_from: int | None = None  # updates of earlier solutions among `steps`; None: no solution was continued
+    steps: int = 0  # updates of all panels, including those made by earlier solutions that were continued
+    continued_from: int | None = None  # how many of `steps` earlier solutions made; None: no solution was continued
 
 
 class Predictor(ABC):
-    """Model that computes the layers of a job. Only one thread may use a predictor."""
+    """Model that computes the layers for a job. A predictor may be used by only one thread."""
 
     name: str
     provider: str
     parameters: int
     precision: str = "fp32"  # precision of the network's weights and arithmetic
     stack: PanelStack  # the display's geometry
-    backend: str = "cpu"  # device for everything except the network
-    trims: bool = False  # True if the model can solve a window of the panels, or a single channel (`trim`)
-    reductions: tuple[int, ...] = (1,)  # supported rasters, as divisors of the display's rows and columns
+    backend: str = "cpu"  # device that runs everything except the network
+    trims: bool = False  # True if the model can solve just a window or a single channel (`trim`)
+    reductions: tuple[int, ...] = (1,)  # supported rasters, given as divisors of the display's rows and columns
     steps: int = 0  # updates of all panels in a solution
-    refined_steps: int = 0  # number of updates up to which a solution can be continued
+    refined_steps: int = 0  # total number of updates that a continued solution can reach
     warmed_ms: Mapping[int, Mapping[str, float]] = MappingProxyType({1: {}})  # stage times of `warm_up`, by reduction
 
     def reads_textures_of(self, context: object) -> bool:
-        """Return True if `solve` accepts pictures in textures of this OpenGL context (`DrawnPicture`)."""
+        """Return True if `solve` accepts pictures held in this OpenGL context's textures (`DrawnPicture`)."""
         return False
 
     def on_panels(self, stack: PanelStack) -> Predictor | None:
-        """Return a copy of the model for panels of another size, which is used to time backends.
+        """Return a copy of the model for panels of another size, used to time backends.
 
-        The result is None if the model runs on only one backend.
+        Returns None if the model runs on only one backend.
         """
         return None
 
     def set_backend(self, backend: SolverBackend) -> None:  # noqa: B027 - most have one
-        """Select the backend that runs everything except the network from the next call on.
+        """Select the backend that is to run everything except the network from the next call on.
 
-        Only the thread that solves may call this method.
+        May only be called by the thread that solves.
         """
 
     @abstractmethod
     def solve(self, job: Job, watch: Stopwatch | None = None) -> Prediction:
-        """Compute the layers of a job.
+        """Compute the layers for a job.
 
         Args:
-            watch: Stopwatch to which the time of each stage is added.
+            watch: Stopwatch to add each stage's time to.
 
         Raises:
             ModelFailure: Inference failed or returned numbers that are not finite.
@@ -76,9 +76,9 @@ class Predictor(ABC):
         """
 
     def warm_up(self, eyes_m: F64) -> None:
-        """Solve grey pictures in one step on every raster, which allocates all memory before the first frame.
+        """Solve grey pictures in one step on every raster, to allocate all memory before the first frame.
 
-        The times of the stages are kept in `warmed_ms`.
+        The stage times are kept in `warmed_ms`.
 
         Args:
             eyes_m: (2, 3) left and right eye in frame `stack`.
@@ -92,4 +92,4 @@ class Predictor(ABC):
         self.warmed_ms = measured
 
     def close(self) -> None:  # noqa: B027 - most hold nothing
-        """Release threads and sessions. The method may be called more than once."""
+        """Release threads and sessions. May be called more than once."""

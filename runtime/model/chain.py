@@ -1,17 +1,16 @@
-"""Raster on which the difference between the eyes splits into small linear systems, called chains.
+"""Raster that splits the difference between the eyes into small linear systems, called chains.
 
-If g is added to the front panel and subtracted from the rear panel, and the parallax is s, the difference between the
-eyes' phases is
+If g is added to the front panel and subtracted from the rear panel, and the parallax is s, the eyes' phases differ by
 
     D(p) = 2·[g(p + s) - g(p - s)].
 
-If the raster's columns are spaced such that s is a whole number K of columns, columns at a distance of 2K form chains
-that do not interact. On every chain, D = A·g with the same bidiagonal matrix A.
+If the raster's columns are spaced so that s is a whole number K of columns, then columns 2K apart form chains that do
+not interact. On every chain, D = A·g with the same bidiagonal matrix A.
 
-If one eye is nearer to the panels than the other, s varies across the raster. Seen on a plane parallel to the panels,
-an outer panel is scaled about the point F where the line through the eyes meets the plane. The scales for the two eyes
-are reciprocal. If the columns are spaced by the logarithm of the distance from F, and the rows run towards F, the
-scaling becomes a shift again.
+If one eye is nearer to the panels than the other, s varies across the raster. Projected onto a plane parallel to the
+panels, an outer panel is scaled about the point F where the line through the eyes meets that plane, and the two eyes'
+scales are reciprocal. If the columns are spaced by the logarithm of their distance from F, and the rows run towards F,
+the scaling becomes a shift again.
 """
 
 from __future__ import annotations
@@ -27,16 +26,17 @@ from numpy.typing import NDArray
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64
 
-CELLS_STEP = 8  # chain lengths are rounded up to a multiple of this, to limit the shapes that a moving viewer causes
-ROWS_STEP = 32  # the number of rows is rounded up to a multiple of this if the eyes are not level
-# Maximum number of rows, relative to level eyes. The limit saves a quarter of the network's time for a walking viewer.
+CELLS_STEP = 8  # chain lengths are rounded up to a multiple of this, so that a moving viewer causes few shapes
+ROWS_STEP = 32  # if the eyes are not level, the number of rows is rounded up to a multiple of this
+# Maximum number of rows, relative to level eyes. For a walking viewer, this limit saves a quarter of the network's
+# time.
 ROWS_SHARE = 1.75
 CELLS_MAX = 1024
-# Maximum width of a column, in panel columns / `reduction`. A limit of 1.2 loses up to 0.25 dB, 0.4 gains nothing.
+# Maximum column width, in panel columns / `reduction`. 1.2 would lose up to 0.25 dB, and 0.4 would gain nothing.
 WIDEST = 0.8
-BLOCK_ROWS = 8  # rows that the network transforms together; the number of rows is a multiple of this
-ROWS_MAX = 1 << 15  # eye positions that would need more rows than this at full height are implausible
-NEAREST_F = 0.8  # maximum ratio of the raster's half width to the distance between its middle and F
+BLOCK_ROWS = 8  # rows that the network transforms together; the number of rows is always a multiple of this
+ROWS_MAX = 1 << 15  # eye positions are implausible if they would need more rows than this at full height
+NEAREST_F = 0.8  # maximum ratio of the raster's half width to the distance from its middle to F
 FARTHEST_F = 0.01  # below this ratio, s varies by less than 1 %, and the columns are evenly spaced
 
 Columns = NDArray[np.floating[Any]]
@@ -44,9 +44,9 @@ Columns = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True, slots=True)
 class ColumnLaw:
-    """Conversion between a raster's columns u and the coordinate t that homographies apply to.
+    """Conversion between a raster's columns u and the coordinate t used by homographies.
 
-    The coordinate is t = middle + (1 - exp(-bend·(u - middle)))/bend. If the bend is 0, then t = u.
+    t = middle + (1 - exp(-bend·(u - middle)))/bend. If the bend is 0, t = u.
     """
 
     bend: float = 0.0  # per column
@@ -65,57 +65,57 @@ class ColumnLaw:
         return np.asarray(self.middle - np.log(np.maximum(1 - self.bend * (t - self.middle), BEYOND_F)) / self.bend)
 
     def mirrored(self, width_px: int) -> ColumnLaw:
-        """Return the law of a raster whose `width_px` columns are in reverse order."""
+        """Return the law for a raster with its `width_px` columns in reverse order."""
         return ColumnLaw(-self.bend, width_px - self.middle) if self.bend else self
 
 
 EVEN_COLUMNS = ColumnLaw()
-BEYOND_F = 1e-9  # lower limit of the argument of the logarithm
+BEYOND_F = 1e-9  # lower limit for the logarithm's argument
 
 
 @dataclass(frozen=True, slots=True)
 class ChainFrame:
-    """Raster on the plane where both outer panels have equal and opposite parallaxes.
+    """Raster on the plane where the two outer panels have equal and opposite parallaxes.
 
     The homographies apply to points (t, v, 1), where v is the row, and `columns` converts the column u to t.
     """
 
-    x_m: float  # x coordinate of the plane in frame `stack`
-    plane_from_raster: F64  # 3x3 map from (t, v, 1) to points (y, z, 1) of the plane; t runs along the line of the eyes
+    x_m: float  # the plane's x coordinate in frame `stack`
+    plane_from_raster: F64  # 3x3 map from (t, v, 1) to points (y, z, 1) on the plane; t runs along the line of the eyes
     columns: ColumnLaw
     cells: int  # chain cells per row; the raster has cells·2K columns
     cell_px: int  # K
     rows: int
-    stretch: float  # height that the rows cover, relative to level eyes
-    middle_m: F64  # (3,) point between the eyes, frame `stack`, relative to which the eyes' parallaxes are opposite
+    stretch: float  # height covered by the rows, relative to level eyes
+    middle_m: F64  # (3,) point between the eyes, frame `stack`; relative to it, the eyes' parallaxes are opposite
 
     @property
     def width_px(self) -> int:
         return self.cells * 2 * self.cell_px
 
     def plane_from_frame(self, eye_m: F64, *, x_m: float) -> F64:
-        """Return the 3x3 map from (t, v, 1) along the rays of an eye (3,) to (y, z, 1) on the plane at `x_m`."""
+        """Return the 3x3 map along a (3,) eye's rays from (t, v, 1) to (y, z, 1) on the plane at `x_m`."""
         t = (x_m - self.x_m) / (eye_m[0] - self.x_m)
         across = np.array([[1 - t, 0.0, eye_m[1] * t], [0.0, 1 - t, eye_m[2] * t], [0.0, 0.0, 1.0]])
         return across @ self.plane_from_raster
 
     def frame_from_plane(self, *, x_m: float) -> F64:
-        """Return the 3x3 map from (y, z, 1) on the plane at `x_m` along rays of `middle_m` to (t, v, 1)."""
+        """Return the 3x3 map from (y, z, 1) on the plane at `x_m` to (t, v, 1), along rays from `middle_m`."""
         inverse = np.linalg.inv(self.plane_from_frame(self.middle_m, x_m=x_m))
         return np.asarray(inverse / inverse[2, 2], np.float64)
 
     def eye_sigma_px(self, stack: PanelStack, *, eye_sigma_m: float, cell_px: int) -> F32:
-        """Return the (3,) lengths that the network needs.
+        """Return the three lengths that the network needs as input, as a (3,) array.
 
-        The first two lengths are the distances, along and across the rows, by which a tracking error of one standard
-        deviation moves the outer panels' pictures. The third length is the parallax of the centre panel relative to the
-        raster's plane, along the rows. The unit along the rows is the outer panels' parallax divided by `cell_px`, the
-        unit across the rows is a row.
+        The first two are how far a tracking error of one standard deviation moves the outer panels' pictures, along and
+        across the rows. The third is the centre panel's parallax relative to the raster's plane, along the rows.
+        Lengths along the rows are in units of the outer panels' parallax divided by `cell_px`, and lengths across the
+        rows are in rows.
 
         Args:
-            stack: Stack of the raster.
+            stack: Stack that the raster was made for.
             eye_sigma_m: Standard deviation of the tracking error.
-            cell_px: Divisor that the model's contract states.
+            cell_px: Divisor stated in the model's contract.
         """
         reach = (stack.x_m[-1] - self.x_m) / (self.middle_m[0] - stack.x_m[-1])
         centre = (self.x_m - stack.x_m[1]) / (self.middle_m[0] - stack.x_m[1])
@@ -132,17 +132,17 @@ class ChainFrame:
 def chain_frame(eyes_m: F64, stack: PanelStack, *, most_cell_px: int, reduction: int) -> ChainFrame:
     """Return the raster for a pair of eyes.
 
-    The raster covers the part of the panels that the eyes see through all panels, plus a margin. The rows are sheared
-    along the line of the eyes. The outer panels' parallax is the smallest whole number of columns whose columns are at
-    most `WIDEST` wide, or `most_cell_px` columns.
+    The raster covers the part of the panels that the eyes see through all of them, plus a margin. Its rows are sheared
+    along the line of the eyes. The outer panels' parallax is the smallest whole number of columns that makes a column
+    at most `WIDEST` wide, but no more than `most_cell_px` columns.
 
     Args:
         eyes_m: (2, 3) left and right eye in frame `stack`.
-        most_cell_px: Maximum parallax of the outer panels in columns of the raster (K).
-        reduction: Height of a row in panel rows. If the eyes are not level, rows may be higher.
+        most_cell_px: The outer panels' maximum parallax, in raster columns (K).
+        reduction: Row height in panel rows. If the eyes are not level, rows may be taller.
 
     Raises:
-        ValueError: The eyes have no horizontal separation, or the raster would be implausibly tall.
+        ValueError: The eyes are not horizontally separated, or the raster would be implausibly tall.
     """
     between_m, half_m = eyes_m.mean(axis=0), (eyes_m[1] - eyes_m[0]) / 2
     plane_m = _equal_parallax_m(stack, between_m[0])
@@ -186,7 +186,7 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, most_cell_px: int, reduction:
 
 @dataclass(frozen=True, slots=True)
 class _Window:
-    """Extent of a raster on its plane, in metres in frame `stack`."""
+    """A raster's extent on its plane, in metres in frame `stack`."""
 
     low_m: float  # along y
     high_m: float
@@ -203,27 +203,27 @@ class _Window:
 
     @property
     def middle_m(self) -> F64:
-        """(2,) centre of the window (y, z)."""
+        """The window's centre (y, z), as a (2,) array."""
         return np.array([self.low_m + self.high_m, self.bottom_m + self.top_m]) / 2
 
 
 @dataclass(frozen=True, slots=True)
 class _LineOfEyes:
-    """Point F in which the line through the eyes meets the raster's plane.
+    """The point F where the line through the eyes meets the raster's plane.
 
     F is at (y, z) = towards_f_m2 / nearer_m. This form remains valid if F is infinitely far away.
     """
 
-    nearer_m: float  # half the difference between the eyes' x, right minus left; 0: F is treated as infinitely far
+    nearer_m: float  # half the difference in x between the eyes, right minus left; 0: F is treated as infinitely far
     towards_f_m2: F64  # (2,) (y, z) of F, times nearer_m
     from_f_m2: F64  # (2,) vector from F to the window's middle, times nearer_m
-    nearness: float  # half width of the window / distance of the window's middle from F; 0 if F is infinitely far
+    nearness: float  # the window's half width / the distance from its middle to F; 0 if F is infinitely far
 
 
 def _line_of_eyes(between_m: F64, half_m: F64, *, plane_m: float, window: _Window) -> _LineOfEyes:
     """Return the point F for eyes at between_m ± half_m.
 
-    If F is too near to the window or too far away, it is treated as infinitely far.
+    If F is too close to the window or too far from it, it is treated as infinitely far.
     """
     nearer_m, ahead_m = float(half_m[0]), between_m[0] - plane_m
     towards = nearer_m * between_m[1:] - ahead_m * half_m[1:]
@@ -231,16 +231,16 @@ def _line_of_eyes(between_m: F64, half_m: F64, *, plane_m: float, window: _Windo
     nearness = window.half_width_m * nearer_m / from_f[0] if from_f[0] else inf
     if abs(nearness) > NEAREST_F:
         return _LineOfEyes(0.0, -from_f, from_f, 0.0)
-    if abs(nearness) < FARTHEST_F:  # keep the rows of level eyes level, because level rows are sampled more accurately
+    if abs(nearness) < FARTHEST_F:  # keep rows level for level eyes, because level rows are sampled more accurately
         level = -ahead_m * half_m[1:]
         return _LineOfEyes(0.0, level, -level, 0.0)
     return _LineOfEyes(nearer_m, towards, from_f, float(nearness))
 
 
 def _equal_parallax_m(stack: PanelStack, eye_x_m: float) -> float:
-    """Return the x coordinate of the plane where both outer panels have equal and opposite parallaxes.
+    """Return x for the plane where the two outer panels have equal and opposite parallaxes.
 
-    For equal gaps a and eyes at a distance e from the centre panel, the plane is a²/e in front of the centre panel.
+    If both gaps are a and the eyes are a distance e from the centre panel, the plane is a²/e in front of that panel.
     """
     rear_m, front_m, far_m = stack.x_m[1] - stack.x_m[0], stack.x_m[2] - stack.x_m[1], eye_x_m - stack.x_m[1]
     ahead = 2 * rear_m * front_m + far_m * (front_m - rear_m)
@@ -248,9 +248,9 @@ def _equal_parallax_m(stack: PanelStack, eye_x_m: float) -> float:
 
 
 def _window_of(middle: F64, stack: PanelStack, *, plane_m: float) -> _Window:
-    """Return the part of the raster's plane that rays from `middle` (3,) through all panels cross.
+    """Return the part of the raster's plane crossed by rays from `middle` (3,) through all panels.
 
-    Its height corresponds to the height of the centre panel. Its width is at least 10 % of the panels' width.
+    Its height corresponds to the centre panel's height. Its width is at least 10 % of the panel width.
     """
 
     def extent(x_m: float, size_m: float, axis: int) -> tuple[float, float]:
@@ -267,11 +267,11 @@ def _window_of(middle: F64, stack: PanelStack, *, plane_m: float) -> _Window:
 
 @lru_cache(maxsize=8)
 def chain_modes(cells: int) -> tuple[F32, F32, F32, F32]:
-    """Return the modes of the chain operators for `cells` equations.
+    """Return the chain operators' modes for `cells` equations.
 
-    The difference operator A (cells, cells + 1), whose rows are [.. -2 2 ..], is U·diag(s)·V^T. The mean operator B,
-    whose rows are [.. 1/2 1/2 ..], is U·diag(cos)·Ũ^T with cos = sqrt(1 - s²/16). The modes are known in closed form.
-    They are sines and cosines of the same frequencies. A maps the first mode of V to 0.
+    The (cells, cells + 1) difference operator A, with rows [.. -2 2 ..], is U·diag(s)·V^T. The mean operator B, with
+    rows [.. 1/2 1/2 ..], is U·diag(cos)·Ũ^T, where cos = sqrt(1 - s²/16). The modes are known in closed form: they are
+    sines and cosines of the same frequencies. A maps the first mode of V to 0.
 
     Returns:
         V (cells + 1, cells + 1), Ũ (cells + 1, cells + 1), s (cells + 1,) and U^T (cells + 1, cells) as float32.
@@ -290,9 +290,9 @@ def chain_modes(cells: int) -> tuple[F32, F32, F32, F32]:
 
 @lru_cache(maxsize=8)
 def cell_waves(cell_px: int) -> tuple[F32, F32]:
-    """Return the orthonormal real Fourier basis (2K, 2K) of a cell's columns, and its frequencies (2K,).
+    """Return the (2K, 2K) orthonormal real Fourier basis on a cell's columns, and its (2K,) frequencies.
 
-    Each row of the basis is one wave. Frequencies are in radians per parallax, which is `cell_px` (K) columns.
+    Each row of the basis is one wave. Frequencies are in radians per parallax, that is, per `cell_px` (K) columns.
     """
     size = 2 * cell_px
     at = np.arange(size)

@@ -1,4 +1,4 @@
-"""Contract that a model file contains (docs/contracts.md). It is checked when the model is loaded."""
+"""Contract in a model file (docs/contracts.md), checked when the model is loaded."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ Steps = Annotated[tuple[Step, ...], Field(max_length=64, description="updates of
 
 
 class TrainedFor(Section):
-    """Range of eye positions and panel gaps that the model was trained on."""
+    """Ranges of eye positions and panel gaps that the model was trained on."""
 
     distance_m: tuple[float, float]
     off_axis_deg: tuple[float, float]
@@ -49,14 +49,14 @@ class TrainedFor(Section):
 
 
 class Port(Section):
-    """Input or output of the network."""
+    """A network input or output."""
 
     name: Annotated[str, Field(min_length=1)]
     axes: Annotated[tuple[str, ...], Field(max_length=8)] = Field(description="what each dimension counts")
 
 
 class Contract(Section):
-    """Properties of a model that its metadata entry `phasestack.contract` declares."""
+    """Properties of a model, as declared in its metadata entry `phasestack.contract`."""
 
     version: Literal[2]
     arch: str
@@ -93,10 +93,10 @@ def parse_contract(metadata: dict[str, str], *, source: str | Path) -> Contract:
     """Return the contract in an ONNX file's metadata.
 
     Args:
-        source: File that an error message names.
+        source: File to name in error messages.
 
     Raises:
-        InputError: The contract is missing, malformed, of another version or invalid.
+        InputError: The contract is missing, malformed, invalid or from another version.
     """
     text = metadata.get(METADATA_KEY)
     if text is None:

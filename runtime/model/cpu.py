@@ -1,4 +1,4 @@
-"""Solver backend on the processor, which updates panels of 16-bit integers with `runtime.kernels`."""
+"""Solver backend for the processor. It updates panels of 16-bit integers with `runtime.kernels`."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F64, I16
 from runtime.support.threads import on_rows, parallel_map
 
-WEIGHT, TAPER = 8191, 32767  # fixed-point values of 1 in the targets' weights and in the tapers
-SAFE = 4 * MARGIN  # additional elements after a panel's rows, because whole vectors are read past the end of a row
+WEIGHT, TAPER = 8191, 32767  # the number 1 in fixed point, in the targets' weights and in the tapers
+SAFE = 4 * MARGIN  # extra elements after a panel's rows, because whole vectors are read past the end of a row
 
 
 class CpuBackend:
-    """Backend that runs the solver on the processor and is always available."""
+    """Backend that runs the solver on the processor. It is always available."""
 
     name = "cpu"
     context: object = None
@@ -38,7 +38,7 @@ class CpuBackend:
 
 
 class CpuState:
-    """`SolverState` on the processor."""
+    """`SolverState` for the processor."""
 
     def __init__(self, stack: PanelStack, *, threads: int) -> None:
         self._stack, self._threads = stack, max(1, threads)
@@ -75,7 +75,8 @@ class CpuState:
 
     def step(self, step: Step) -> None:
         held = self._held
-        # A row may still be read by rays after its update. The first step reads `last`, so it writes to other memory.
+        # Rays may still read a row after it has been updated. The first step reads `last`, so it writes to other
+        # memory.
         ahead, last = (held.last, held.ahead) if self._starts else (held.ahead, held.last)
         panels_from_rays = self._geometry.panels_from_rays(step.places, self._sigma_m)
         problem, _keep = self._problem(panels_from_rays, ahead=ahead, last=last)
@@ -89,7 +90,7 @@ class CpuState:
         if outside is None:
             buffer.outside = None
         elif buffer.outside != (key := (outside, geometry.boxes, geometry.kept)):
-            for n, layer in enumerate(layers):  # write whole pixels instead of single components
+            for n, layer in enumerate(layers):  # write whole pixels rather than components
                 pixel = np.array([*outside_codes(self._stack.count, n, outside), 255], np.uint8)
                 layer.view(np.uint32)[..., 0] = pixel.view(np.uint32)[0]
             buffer.outside = key
@@ -110,7 +111,7 @@ class CpuState:
         self._buffers = {}
 
     def _rest_others(self) -> None:
-        """Set all panels that have not been set to the rest value."""
+        """Reset to the rest value all panels that have not been set."""
         for n in self._resting:
             box = self._geometry.boxes[n]
             self._held.last[n, : box.height_px, : box.width_px * self._channels] = self._rest
@@ -120,7 +121,7 @@ class CpuState:
         parallel_map(lambda part: work(byref(problem), part, self._threads), range(self._threads))
 
     def _problem(self, panels_from_rays: F64, *, ahead: I16, last: I16) -> tuple[Problem, object]:
-        """Return the arguments of the compiled loops, and the arrays that must stay alive during the call."""
+        """Return the arguments for the compiled loops, and the arrays to keep alive during the call."""
         geometry, held, channels = self._geometry, self._held, self._channels
         seen, back = np.ascontiguousarray(panels_from_rays), np.ascontiguousarray(inverse(panels_from_rays))
         if len(seen) > MAX_SETS:
@@ -144,15 +145,15 @@ class CpuState:
 
 @lru_cache(maxsize=8)
 def _packed_table(panels: int) -> NDArray[np.int32]:
-    """Return `target_table` as (256,) integers, with the sum in the lower 16 bits and the weight above."""
+    """Return `target_table` as (256,) integers with the sum in the lower 16 bits and the weight above it."""
     sums, weights = np.rint(target_table(panels) * np.array((1, WEIGHT), np.float32)).astype(np.int32).T
     return np.asarray(sums + (weights << 16), np.int32)
 
 
 class _Buffers:
-    """Values of all panels between steps, for one number of channels.
+    """The panels' values between steps, for one number of channels.
 
-    A panel's box is stored from the first row and element on.
+    Each panel's box is stored starting at the first row and element.
     """
 
     def __init__(self, stack: PanelStack, channels: int) -> None:

@@ -1,7 +1,7 @@
-"""Geometry of a solution: windows of the panels, and homographies from rays to panel pixels.
+"""Solution geometry: windows on the panels, and homographies from rays to panel pixels.
 
-Each ray belongs to one pixel of a picture. Content that is drawn on the middle panel's raster, on a window of this
-raster or on a coarser raster differs from captured photographs only in the homography from the picture to the panel.
+Each ray belongs to one picture pixel. Content may be drawn on the middle panel's raster, on a window of it or on a
+coarser raster; all of these differ from captured photographs only in the homography from picture to panel.
 """
 
 from __future__ import annotations
@@ -22,16 +22,17 @@ from runtime.records import F32, F64, U8
 from runtime.support.gl import DrawnPicture
 
 PAD_PX = 2  # margin around the visible pixels
-ALIGN_PX = 8  # boxes begin and end at multiples of this, which gives rasters of half or quarter size whole pixels
+ALIGN_PX = 8  # boxes begin and end at multiples of this, so that rasters of half or quarter size have whole pixels
 LEAST_PX = 32  # minimum side of a box
-# Minimum homogeneous weight of a window's corner relative to the window's centre. Smaller weights give no usable image.
+# Minimum homogeneous weight at a window's corner, relative to the window's centre. Smaller weights give no usable
+# image.
 MIN_WEIGHT = 0.05
-SNAPPED = 1e-6  # a homography that differs by less than this from a whole-pixel translation is treated as a translation
-# Weight of a ray that misses a panel. The other eye's ray through the same pixel may cross all panels, so the reduced
-# weight gains 2 dB in two of 12 pairs.
+SNAPPED = 1e-6  # a homography this close to a whole-pixel translation is treated as one
+# Weight given to a ray that misses a panel. The other eye's ray through the same pixel may cross all panels, so
+# reducing the weight gains 2 dB in two out of 12 pairs.
 MISSING_WEIGHT = 1 / 8
-KNOWN_PX = 1 / 8  # tracking errors that move an outer panel's picture by less than this are ignored
-TAPERED_SHARE = 1 / 6  # share of a window's taper over which rays fade in; these rays correct the error at its edge
+KNOWN_PX = 1 / 8  # tracking errors are ignored if they move an outer panel's picture by less than this
+TAPERED_SHARE = 1 / 6  # rays fade in over this share of a window's taper; these rays correct the error at its edge
 PLACES: dict[Places, tuple[tuple[float, float], ...]] = {  # head positions (right, up) in standard deviations
     "middle": ((0.0, 0.0),),
     "rising": ((1.0, 1.0), (-1.0, -1.0)),
@@ -41,27 +42,27 @@ PLACES: dict[Places, tuple[tuple[float, float], ...]] = {  # head positions (rig
 
 @dataclass(frozen=True, slots=True)
 class TargetView:
-    """Picture that one eye should see, and the points where its rays cross the middle panel's plane."""
+    """A picture that one eye should see, and where its rays cross the middle panel's plane."""
 
     picture: U8 | DrawnPicture  # (h, w, 3 or 4) RGB or RGBA
-    plane_from_picture: F64  # 3x3 homography from pixels (u, v, 1) of the picture to points (y, z, 1) in metres
+    plane_from_picture: F64  # 3x3 homography from picture pixels (u, v, 1) to points (y, z, 1) in metres
 
     @property
     def pixels(self) -> U8:
-        """Picture as an array. A texture is read back."""
+        """The picture as an array. A texture is read back."""
         return self.picture.pixels() if isinstance(self.picture, DrawnPicture) else self.picture
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """Pixels that one solution computes, and rays that it considers."""
+    """The pixels that one solution computes, and the rays it considers."""
 
     stack: PanelStack
     eyes_m: F64  # (2, 3) left and right, frame `stack`
     boxes: tuple[PixelRect, ...]  # solved pixels of each panel
-    kept: PixelRect  # part of the middle panel's box through which rays pass
-    rays: PixelRect  # pixels of the pictures whose rays pass through `kept`
-    middle_from_rays: F64  # (2, 3, 3) for each eye, from pixels of `rays` to pixels of the middle panel's box
+    kept: PixelRect  # part of the middle panel's box that rays pass through
+    rays: PixelRect  # picture pixels whose rays pass through `kept`
+    middle_from_rays: F64  # (2, 3, 3) for each eye, from pixels in `rays` to pixels in the middle panel's box
     taper_px: tuple[float, float] = (0.0, 0.0)  # width of a window's taper, right and down, in middle-panel pixels
 
     @property
@@ -70,14 +71,14 @@ class Geometry:
 
     @property
     def missing_weight(self) -> float:
-        """Weight, when the middle panel is solved, of rays that miss the box of another panel.
+        """Weight given to rays that miss another panel's box when the middle panel is solved.
 
-        In a tapered window, these rays have their full weight.
+        In a tapered window, these rays keep their full weight.
         """
         return 1.0 if any(self.taper_px) else MISSING_WEIGHT
 
     def is_like(self, other: Geometry) -> bool:
-        """Return True if rays and boxes are equal. Steps may then continue from the other solution."""
+        """Return True if the rays and boxes are equal, so that steps may continue from the other solution."""
         return (
             (self.stack, self.boxes, self.kept, self.rays, self.taper_px)
             == (other.stack, other.boxes, other.kept, other.rays, other.taper_px)
@@ -87,21 +88,21 @@ class Geometry:
 
     @cached_property
     def rasters(self) -> tuple[PlaneRaster, ...]:
-        """Pixel grids of the panels, cropped to their boxes."""
+        """The panels' pixel grids, cropped to their boxes."""
         return tuple(box.cut(self.stack.panel(n)) for n, box in enumerate(self.boxes))
 
     def panels_from_rays(self, places: Places, eye_sigma_m: float) -> F64:
-        """Return the homographies from rays to pixels of the panels' boxes for one step.
+        """Return one step's homographies from rays to pixels in the panels' boxes.
 
-        A step assumes P = 1 or 2 head positions, which alternate from row to row of a picture. Row k of the rays for
-        position p is row P·k + p of the picture.
+        A step assumes P = 1 or 2 head positions, which alternate from one picture row to the next. Row k of the rays
+        for position p is picture row P·k + p.
 
         Args:
-            places: Head positions that the step assumes.
+            places: Head positions assumed by the step.
             eye_sigma_m: Standard deviation of the tracking error.
 
         Returns:
-            (2P, N, 3, 3) homographies. The first axis lists the left and the right eye for each head position.
+            (2P, N, 3, 3) homographies. The first axis lists the left and the right eye, for each head position in turn.
         """
         right, up = stack_from_eye(self.eyes_m.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
         sure = self.rays.height_px == 1 or self._moved_px(eye_sigma_m) < KNOWN_PX
@@ -121,15 +122,15 @@ class Geometry:
         return np.array(homographies)
 
     def _moved_px(self, eye_sigma_m: float) -> float:
-        """Return the largest shift of a panel's picture, in pixels, for an eye movement of `eye_sigma_m`."""
+        """Return the largest shift in any panel's picture, in pixels, if the eyes move by `eye_sigma_m`."""
         pitch_m, middle_x_m = self.stack.panel(self.middle).pitch_u_m, self.stack.x_m[self.middle]
         shares = [abs((x_m - middle_x_m) / (self.eyes_m[:, 0].mean() - middle_x_m)) for x_m in self.stack.x_m]
         return float(eye_sigma_m * max(shares) / pitch_m)
 
     def tapers(self) -> tuple[F32, F32]:
-        """Return the weights of the rays by column (width,) and by row (height,).
+        """Return the rays' weights by column (width,) and by row (height,).
 
-        The weights are 1 inside a window and fall to 0 at its edges, except at edges of the panel.
+        The weights are 1 inside a window and fall to 0 at its edges, except where these are panel edges.
         """
         box, kept, matrix = self.boxes[self.middle], self.kept, self.middle_from_rays.mean(axis=0)
         width_px, height_px = self.rays.width_px, self.rays.height_px
@@ -157,13 +158,13 @@ def geometry_of(
     kept: PixelRect | None = None,
     taper_px: tuple[float, float] = (0.0, 0.0),
 ) -> Geometry:
-    """Return the geometry of the rays of both views that pass through a part of the middle panel.
+    """Return the geometry for those rays of both views that pass through a part of the middle panel.
 
     Args:
         eyes_m: (2, 3) left and right eye in frame `stack`.
-        views: View of the left eye and view of the right eye.
-        boxes: Pixels of each panel to solve.
-        kept: Part of the middle panel through which the rays pass. By default, the middle panel's box.
+        views: The left and the right eye's view.
+        boxes: Pixels to solve on each panel.
+        kept: Part of the middle panel that the rays pass through. By default, the middle panel's box.
         taper_px: Width of a window's taper, right and down, in middle-panel pixels.
     """
     box = boxes[stack.count // 2]
@@ -178,21 +179,21 @@ def geometry_of(
 
 
 def _snapped(homography: F64) -> F64:
-    """Round a homography that is almost a whole-pixel translation, which turns sampling into copying."""
+    """Round a homography that is almost a whole-pixel translation, so that sampling becomes copying."""
     normalised = np.asarray(homography / homography[2, 2], np.float64)
     whole = np.rint(normalised)
     return whole if np.abs(normalised - whole).max() < SNAPPED else normalised
 
 
 def _looked_through(pictures_from_middle: F64, box: PixelRect, shape: tuple[int, ...]) -> PixelRect:
-    """Return the smallest rectangle that contains all picture pixels whose rays pass through a box.
+    """Return the smallest rectangle that contains every picture pixel whose ray passes through a box.
 
     A pixel counts if its ray passes through the box for at least one eye.
 
     Args:
-        pictures_from_middle: For each eye, homography from middle-panel pixels to pixels of the picture.
-        box: Pixels of the middle panel.
-        shape: Shape (h, w, ...) of the pictures.
+        pictures_from_middle: For each eye, the homography from middle-panel pixels to picture pixels.
+        box: Middle-panel pixels.
+        shape: The pictures' shape (h, w, ...).
     """
     height, width = shape[:2]
     corners = np.array([[box.u0, box.u1, box.u0, box.u1], [box.v0, box.v0, box.v1, box.v1], [1.0] * 4])
@@ -211,10 +212,10 @@ def _looked_through(pictures_from_middle: F64, box: PixelRect, shape: tuple[int,
 def panel_from_middle(stack: PanelStack, rasters: Sequence[PlaneRaster], eye_m: F64, n: int) -> F64:
     """Return the 3x3 homography from the middle panel's pixels to panel `n` along an eye's rays.
 
-    The homography is a scale and a shift unless panels are tilted (`optics.tilt`). Its last entry is 1.
+    The homography is a scale and a shift unless the panels are tilted (`optics.tilt`). Its last entry is 1.
 
     Args:
-        rasters: Pixel grid of each panel, which may be a part of the panel.
+        rasters: Each panel's pixel grid, which may cover only a part of the panel.
         eye_m: (3,) eye in frame `stack`.
     """
     source, target = rasters[stack.count // 2], rasters[n]
@@ -227,9 +228,9 @@ def panel_from_middle(stack: PanelStack, rasters: Sequence[PlaneRaster], eye_m: 
 
 
 def visible_boxes(eyes_m: F64, stack: PanelStack) -> tuple[PixelRect, ...]:
-    """Return, for each panel, the padded box of the pixels that an eye sees through all other panels.
+    """Return, for each panel, the padded box of pixels that an eye sees through all the other panels.
 
-    If the eyes see nothing through all panels, there is nothing to solve, and the boxes have the minimum size.
+    If the eyes see nothing through all the panels, there is nothing to solve, and the boxes have the minimum size.
 
     Args:
         eyes_m: (2, 3) left and right eye in frame `stack`.
@@ -268,9 +269,9 @@ def taper(at_px: F64, first: int, last: int, size: int, over_px: float) -> F32:
     The weights reach 1 at a distance of `over_px` from a limit.
 
     Args:
-        at_px: Positions at which the weights are computed.
-        first: Lower limit. If it is the edge of the panel (0), the weights do not fall towards it.
-        last: Upper limit. If it is the edge of the panel (`size`), the weights do not fall towards it.
+        at_px: Positions to compute the weights at.
+        first: Lower limit. If it is the panel's edge (0), the weights do not fall towards it.
+        last: Upper limit. If it is the panel's edge (`size`), the weights do not fall towards it.
     """
     weights = np.ones(len(at_px))
     if over_px > 0 and first > 0:

@@ -1,4 +1,4 @@
-"""Job: the input of one solution, with target pictures, their rays and the pixels to solve."""
+"""Job: the input for one solution, with target pictures, their rays and the pixels to solve."""
 
 from __future__ import annotations
 
@@ -23,47 +23,47 @@ NOWHERE = PixelRect(0, 0, 0, 0)
 
 @dataclass(frozen=True, slots=True)
 class SolveWindow:
-    """Window in which all panels are solved.
+    """A window to solve on all panels.
 
-    Outside the window, the outer panels stay at the rest value, from which the solver starts, and the middle panel
-    shows the picture that both eyes see.
+    Outside the window, the outer panels keep the rest value that the solver starts from, and the middle panel shows the
+    picture that both eyes see.
     """
 
-    box: PixelRect  # pixels of every panel; if empty, nothing is solved
-    kept: PixelRect  # pixels inside `box` that are solved on the middle panel; the others show what both eyes see
-    taper_px: tuple[float, float]  # width (right, down) over which the outer panels fade to the rest value
+    box: PixelRect  # pixels on every panel; if empty, nothing is solved
+    kept: PixelRect  # pixels inside `box` to solve on the middle panel; the others show what both eyes see
+    taper_px: tuple[float, float]  # width (right, down) of the region where the outer panels fade to the rest value
     colour: tuple[int, ...] | None = None  # 8-bit codes of the uniform background outside; None: use the pictures
 
 
 @dataclass(frozen=True)
 class Targets:
-    """Target pictures of both eyes, and the rays of the pictures' pixels through the panels."""
+    """Both eyes' target pictures, and the rays of their pixels through the panels."""
 
-    stack: PanelStack  # panels with the raster to solve, which may be coarser than the display's
+    stack: PanelStack  # the panels, with the raster to solve, which may be coarser than the display's
     eyes_m: F64  # (2, 3) left and right, frame `stack`
     views: tuple[TargetView, TargetView]  # left and right
 
     @cached_property
     def visible(self) -> Geometry:
-        """Geometry of all rays that cross every panel."""
+        """Geometry for all rays that cross every panel."""
         return geometry_of(self.stack, self.eyes_m, self.views, boxes=visible_boxes(self.eyes_m, self.stack))
 
     @cached_property
     def every_pixel(self) -> Geometry:
-        """Geometry in which all pixels of all panels are solved, including those that the eyes do not see."""
+        """Geometry for solving every pixel on every panel, including those that the eyes do not see."""
         whole = PixelRect(0, 0, self.stack.width_px, self.stack.height_px)
         return geometry_of(self.stack, self.eyes_m, self.views, boxes=(whole,) * self.stack.count)
 
     def within(self, window: SolveWindow) -> Geometry:
-        """Return the geometry in which the pixels of a window are solved."""
+        """Return the geometry for solving the pixels in a window."""
         boxes = (window.box,) * self.stack.count
         return geometry_of(self.stack, self.eyes_m, self.views, boxes=boxes, kept=window.kept, taper_px=window.taper_px)
 
     def reduced(self, reduction: int) -> tuple[TargetView, TargetView]:
-        """Return the left and right view averaged down by `reduction` (`reduced_view`). The result is cached."""
+        """Return the left and right views averaged down by `reduction` (`reduced_view`). Cached."""
         if reduction not in self._reduced:
             middle = self.stack.panel(self.stack.count // 2)
-            # Read textures back here, because only the thread of their context can do so.
+            # Read textures back here, because only their context's thread can do so.
             views = [TargetView(view.pixels, view.plane_from_picture) for view in self.views]
             left, right = parallel_map(lambda view: reduced_view(view, middle, reduction), views)
             self._reduced[reduction] = left, right
@@ -76,45 +76,45 @@ class Targets:
 
 @dataclass(frozen=True, slots=True)
 class Savings:
-    """Amount of work that a trimmed job still requires."""
+    """Amount of work that still has to be done for a trimmed job."""
 
-    solved_share: float = 1.0  # share of the panels' pixels that is solved
-    channels: int = 3  # number of colour channels that are solved
+    solved_share: float = 1.0  # share of the panels' pixels that are solved
+    channels: int = 3  # number of colour channels solved
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """Input of one solution. `runtime.model.trim` changes a few fields to make the solution cheaper."""
+    """The input for one solution. `runtime.model.trim` changes a few fields to make it cheaper."""
 
     targets: Targets
-    # Standard deviation along each axis (right and up) of the tracking error, which both eyes share. 0: the eyes are
+    # Standard deviation, along each axis (right and up), of the tracking error, which both eyes share. 0: the eyes are
     # known exactly.
     eye_sigma_m: float = TRACKING_SIGMA_M
-    window: SolveWindow | None = None  # None: solve everything that the eyes see
+    window: SolveWindow | None = None  # None: solve everything the eyes see
     channels: int = 3  # 1: the pictures are grey, and one channel is solved for all three
-    steps: int | None = None  # maximum number of updates of all panels; None: the number that the model specifies
-    continued: bool = False  # start from the panels of the previous solution if its rays were the same
+    steps: int | None = None  # maximum number of updates of all panels; None: as specified by the model
+    continued: bool = False  # start from the previous solution's panels if its rays were the same
     deadline_ns: int | None = None  # no step begins after this time (`time.perf_counter_ns`); None: no limit
     relief: F32 | None = None  # (h, w) relief of the content on the middle panel, for the presenter (`optics.relief`)
 
     @property
     def views(self) -> tuple[TargetView, TargetView]:
-        """Views of the left and right eye."""
+        """The left and right eyes' views."""
         return self.targets.views
 
     @property
     def stack(self) -> PanelStack:
-        """Panels with the raster to solve."""
+        """The panels, with the raster to solve."""
         return self.targets.stack
 
     @property
     def eyes_m(self) -> F64:
-        """Positions (2, 3) of the left and right eye, frame `stack`."""
+        """Left and right eye, (2, 3) in frame `stack`."""
         return self.targets.eyes_m
 
     @property
     def savings(self) -> Savings:
-        """Amount of work that this job requires."""
+        """Amount of work to be done for this job."""
         box = None if self.window is None else self.window.box
         pixels = self.stack.width_px * self.stack.height_px
         return Savings(1.0 if box is None else box.width_px * box.height_px / pixels, self.channels)
@@ -123,11 +123,11 @@ class Job:
 def drawn_views(
     pictures: Sequence[U8 | DrawnPicture], stack: PanelStack, window: SolveWindow | None = None
 ) -> tuple[TargetView, TargetView]:
-    """Return the left and right view of pictures that were drawn on the middle panel's pixels.
+    """Return the left and right views for pictures drawn on the middle panel's pixels.
 
     Args:
         pictures: Left and right (h, w, 3 or 4) picture.
-        window: Window whose pixels the pictures cover. If None, the pictures cover the whole panel.
+        window: Window covered by the pictures. If None, they cover the whole panel.
     """
     raster = stack.panel(stack.count // 2)
     if window is not None:
@@ -137,7 +137,7 @@ def drawn_views(
 
 
 def drawn_job(pictures: Sequence[U8 | DrawnPicture], eyes_m: F64, stack: PanelStack) -> Job:
-    """Return a job without a window for pictures that were drawn on the middle panel's pixels.
+    """Return a job, without a window, for pictures drawn on the middle panel's pixels.
 
     Args:
         pictures: Left and right (h, w, 3 or 4) picture.
@@ -147,7 +147,7 @@ def drawn_job(pictures: Sequence[U8 | DrawnPicture], eyes_m: F64, stack: PanelSt
 
 
 def grey_job(eyes_m: F64, stack: PanelStack) -> Job:
-    """Return a job with uniformly grey pictures, which is used to warm up a model.
+    """Return a job with uniform grey pictures, used to warm up a model.
 
     Args:
         eyes_m: (2, 3) left and right eye in frame `stack`.

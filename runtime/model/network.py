@@ -1,4 +1,4 @@
-"""Proposals for the solver by networks that map the eyes' whole pictures to panel values."""
+"""Proposals for the solver, made by networks that map each eye's whole picture to panel values."""
 
 from __future__ import annotations
 
@@ -21,24 +21,23 @@ from runtime.records import I16, U8
 
 
 class PictureProposal:
-    """Proposals by a model whose `input_frame` is `panel` or `centre`.
+    """Proposals made by a model whose `input_frame` is `panel` or `centre`.
 
-    The network reads one picture per eye for every panel (`panel`) or for the centre panel only (`centre`). The layout
-    is NCHW, and the channels are ordered by panel, then by eye, then by colour. Each picture is warped to the pixels of
-    the panel (EyeReal supplement, (47)). It is black outside the contract's field of view, as in training.
+    The network reads one picture per eye for every panel (`panel`) or only for the centre panel (`centre`). The layout
+    is NCHW, with channels ordered by panel, then by eye, then by colour. Each picture is warped to the panel's pixels
+    (EyeReal supplement, (47)) and is black outside the contract's field of view, as in training.
     """
 
-    any_raster = False  # the network can only propose whole panels of one size
+    any_raster = False  # the network can propose only whole panels of one size
 
     def __init__(self, session: ModelSession, stack: PanelStack, *, source: Path) -> None:
         """Create the proposal.
 
         Args:
-            source: Model file that an error message names.
+            source: Model file to name in error messages.
 
         Raises:
-            InputError: The contract demands another panel size or layout, or the ports of the graph have unexpected
-                shapes.
+            InputError: The contract requires another panel size or layout, or the graph's ports have unexpected shapes.
         """
         contract = session.contract
         self.session, self._stack = session, stack
@@ -81,13 +80,13 @@ class PictureProposal:
         }
 
     def _seen(self, job: Job, n: int, side: int) -> U8:
-        """Warp an eye's picture to the pixels of panel `n`, and make it black outside the field of view.
+        """Warp an eye's picture to panel `n`'s pixels, making it black outside the field of view.
 
         Args:
             side: 0 for the left eye, 1 for the right eye.
 
         Returns:
-            (h, w, 3 or 4) picture. If the contract does not limit the field of view, the picture's edge is repeated
+            An (h, w, 3 or 4) picture. If the contract does not limit the field of view, the picture's edge is repeated
             outwards.
         """
         stack, eye_m, view, middle = self._stack, job.eyes_m[side], job.views[side], self._stack.count // 2
@@ -99,8 +98,7 @@ class PictureProposal:
         picture = picture_on(view, rasters[middle], middle_from_result=mid_from_panel, edge=edge, size=size)
         if not fov_deg:
             return picture
-        # Warp a white picture with this field of view bilinearly, which makes its edge fade over one pixel as in
-        # training.
+        # Warp a white picture with this field of view bilinearly, so that its edge fades over one pixel as in training.
         projection = image_from_stack(eye_m, width_px=size[1], height_px=size[0], fov_deg=fov_deg)
         cover = resample(np.full(size, 255, np.uint8), image_from_raster(projection, rasters[n]), size=size)
         return np.asarray(cv2.min(picture, cv2.merge([cover] * picture.shape[2])), np.uint8)

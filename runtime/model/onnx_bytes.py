@@ -1,6 +1,6 @@
-"""Compute the digest of an ONNX file and find references to other files, without loading the model.
+"""Compute an ONNX file's digest and find references to other files, without loading the model.
 
-The file is a protocol buffer, which is a sequence of tags and values. The field numbers are defined in onnx.proto.
+The file is a protocol buffer, which is a sequence of tags and values. Field numbers are defined in onnx.proto.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import hashlib
 from collections.abc import Iterator
 
 MODEL_METADATA = 14
-# For each type of message, the fields through which a tensor can be reached, with the type of message in the field.
+# For each message type, the fields that can lead to a tensor, with the type of message they contain.
 PARTS: dict[str, dict[int, str]] = {
     "model": {7: "graph", 25: "function"},
     "graph": {1: "node", 5: "tensor", 15: "sparse tensor"},
@@ -20,13 +20,13 @@ PARTS: dict[str, dict[int, str]] = {
 }
 TENSOR_EXTERNAL, TENSOR_LOCATION = 13, 14
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
-DEEPEST = 32  # maximum nesting depth of graphs in attributes of graphs
+DEEPEST = 32  # maximum nesting depth of graphs within graph attributes
 
 
 def fields(data: memoryview) -> Iterator[tuple[int, memoryview, memoryview]]:
-    """Yield the number, the value and the whole bytes of each field of a message.
+    """Yield the number, the value and the full bytes of each field in a message.
 
-    The value of a variable-length integer is empty if the integer is 0.
+    For a variable-length integer of 0, the value is empty.
 
     Raises ValueError if the bytes are not a message.
     """
@@ -54,7 +54,7 @@ def fields(data: memoryview) -> Iterator[tuple[int, memoryview, memoryview]]:
 
 
 def digest(data: bytes) -> str:
-    """Return the SHA-256 of a model without its metadata. Raises ValueError if the model is malformed."""
+    """Return a model's SHA-256, excluding its metadata. Raises ValueError if the model is malformed."""
     digester = hashlib.sha256()
     for number, _, whole in fields(memoryview(data)):
         if number != MODEL_METADATA:
@@ -65,7 +65,7 @@ def digest(data: bytes) -> str:
 def has_external_data(data: bytes) -> bool:
     """Return True if a model stores a tensor in another file.
 
-    Raises ValueError if the model is malformed or nested too deep.
+    Raises ValueError if the model is malformed or nested too deeply.
     """
     return _refers_to_a_file("model", memoryview(data), DEEPEST)
 

@@ -1,4 +1,4 @@
-"""Find and load a model by its name. `runtime.model.base.Predictor` is the interface of all models."""
+"""Find and load models by name. All models implement `runtime.model.base.Predictor`."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from runtime.support.memory import keep_freed_memory
 __all__ = ["SHIPPED", "Prediction", "Predictor", "load_predictor", "model_path"]
 
 SHIPPED = ("fast", "balanced", "best")
-SUMS = "SHA256SUMS"  # file with the digests of the shipped models, in the format of sha256sum
+SUMS = "SHA256SUMS"  # file with the shipped models' digests, in sha256sum format
 
 
 def model_path(name: str) -> Path | None:
-    """Return the file of a model, or None for `sart`, which has no file.
+    """Return a model's file, or None for `sart`, which has no file.
 
-    Raises InputError if the name is neither a known name nor an ONNX file.
+    Raises InputError if `name` is neither a known model nor an ONNX file.
     """
     if name == "sart":
         return None
@@ -37,7 +37,7 @@ def model_path(name: str) -> Path | None:
 def shipped_sha256(name: str) -> str:
     """Return the SHA-256 of a shipped model's file, or an empty string for other models.
 
-    Raises InputError if the list of digests does not contain the shipped model.
+    Raises InputError if the shipped model is missing from the list of digests.
     """
     if name not in SHIPPED:
         return ""
@@ -50,10 +50,10 @@ def shipped_sha256(name: str) -> str:
 
 
 def steps_from_even(steps: int) -> tuple[Step, ...]:
-    """Return the steps for a stack without a network, which start from panels at the rest value.
+    """Return the steps to run without a network, starting from panels at the rest value.
 
     Args:
-        steps: Number of steps that the model runs if it has a network's proposal to start from.
+        steps: Number of steps that the model runs when it can start from its network's proposal.
     """
     in_turn: tuple[Places, ...] = ("rising", "middle", "falling", "middle")
     sizes = (1.2,) * (4 * steps) + (0.8,) * (3 * steps // 2)
@@ -63,20 +63,20 @@ def steps_from_even(steps: int) -> tuple[Step, ...]:
 def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None = None) -> Predictor:
     """Load a model for a stack.
 
-    A shipped network needs three panels whose gaps are equal within `UNEVEN_MOST`. For other stacks, the network is not
-    used: steps start from panels at the rest value, and `Predictor.name` says so.
+    Shipped networks need three panels with gaps that are equal to within `UNEVEN_MOST`. For other stacks, the network
+    is not used: steps start from panels at the rest value, and `Predictor.name` says so.
 
     Args:
-        name: Name of a shipped model, `sart`, or path of an ONNX file.
+        name: Name of a shipped model, `sart`, or the path of an ONNX file.
 
     Raises:
         InputError: The name is unknown, the file is not a valid model, or the model does not support the stack.
-        MissingPart: The compiled kernels or the configured provider of onnxruntime are missing or do not start.
+        MissingPart: The compiled kernels or the configured onnxruntime provider are missing or do not start.
     """
     keep_freed_memory()
     try:
         library()
-    except ImportError as error:  # report the problem now instead of at the first picture
+    except ImportError as error:  # report the problem now rather than at the first picture
         raise MissingPart(str(error)) from None
     settings = settings or ModelSettings()
     path = model_path(name)

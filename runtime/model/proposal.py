@@ -1,8 +1,8 @@
-"""Proposals for the outer panels by a network. The solver's steps start from a proposal.
+"""A network's proposals for the outer panels, which the solver's steps start from.
 
-The network receives the difference between the eyes' pictures on a separate raster (`chain`). The rows of the raster
-are parallel to the line through the eyes, and the parallax is a whole number of columns. The network returns both outer
-panels on the same raster.
+The network is given the difference between the eyes' pictures on a special raster (`chain`). Its rows are parallel to
+the line through the eyes, and the parallax is a whole number of columns. The network returns both outer panels on the
+same raster.
 """
 
 from __future__ import annotations
@@ -39,31 +39,32 @@ INPUTS = (
     "cell_frequencies",
     "eye_sigma_px",
 )
-HALF_BASELINE_M = 0.031  # half of the assumed eye separation if one eye replaces the other; any value works
-EDGE_SHARE = 1 / 40  # a picture's edge pixels are repeated outwards by at most this share of the picture's size
-UNSEEN = -1  # value of pixels that an eye does not see; targets are not negative
-SHARPENED = 0.2  # gain of the sharpening that compensates for the blur of two interpolations
+HALF_BASELINE_M = 0.031  # half the eye separation assumed if one eye replaces the other; any value works
+EDGE_SHARE = 1 / 40  # a picture's edge pixels are repeated outwards by at most this share of its size
+UNSEEN = -1  # value of pixels not seen by an eye; targets are never negative
+SHARPENED = 0.2  # gain of a sharpening filter that compensates for the blur caused by two interpolations
 SHARPENING = np.array([-SHARPENED, 1 + 2 * SHARPENED, -SHARPENED])
-EVEN = rest_of(3)  # rest value of an outer panel in sixteenths of a code
-# A transposed raster samples the pictures less accurately. Its stretch must be below this share of the upright one's.
+EVEN = rest_of(3)  # an outer panel's rest value in sixteenths of a code
+# A transposed raster samples the pictures less accurately, so its stretch must be below this share of the upright
+# one's.
 TRANSPOSED_BELOW = 0.7
-_SWAPPED = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # swaps (y, z, 1) and (-z, -y, 1)
+_SWAPPED = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # swaps (y, z, 1) with (-z, -y, 1)
 
 
 class Proposal(Protocol):
-    """Network that proposes values of panels, from which the solver's steps start."""
+    """Network that proposes panel values for the solver's steps to start from."""
 
-    any_raster: bool  # True if the network can propose panels of any size, and windows of panels
+    any_raster: bool  # True if the network can propose panels of any size, and windows
     session: ModelSession
 
     def panels(self, job: Job, geometry: Geometry, watch: Stopwatch) -> dict[int, I16]:
-        """Return the proposed values in the boxes of the panels.
+        """Return the values proposed for the panels' boxes.
 
         Args:
-            watch: Stopwatch to which the times of the stages "prepare" and "inference" are added.
+            watch: Stopwatch to add the times of the stages "prepare" and "inference" to.
 
         Returns:
-            For each proposed panel, the (rows, columns[, 3]) values of its box in sixteenths of a code. Panels without
+            For each proposed panel, the (rows, columns[, 3]) values in its box, in sixteenths of a code. Panels without
             a proposal stay at the rest value.
 
         Raises:
@@ -74,7 +75,7 @@ class Proposal(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class _Local:
-    """Window of the panels as a separate stack, which may be transposed to make the eyes roughly level."""
+    """A window of the panels as a separate stack, possibly transposed to make the eyes roughly level."""
 
     stack: PanelStack
     eyes_m: F64  # (2, 3) eyes in the window's frame; the first eye is on the left in this frame
@@ -82,13 +83,13 @@ class _Local:
     plane_from_local: F64  # 3x3 map from (y, z, 1) in the window's frame to (y, z, 1) in frame `stack`
 
     def in_stack(self, point_m: F64) -> F64:
-        """Convert a point (3,) from the window's frame to frame `stack`."""
+        """Convert a (3,) point from the window's frame to frame `stack`."""
         y_m, z_m, _ = self.plane_from_local @ (point_m[1], point_m[2], 1.0)
         return np.array([point_m[0], y_m, z_m])
 
 
 class ChainProposal:
-    """Proposals by a network whose `input_frame` is `chain`, for three panels with roughly equal gaps."""
+    """Proposals made by a network with `input_frame` `chain`, for three panels with roughly equal gaps."""
 
     any_raster = True
 
@@ -111,7 +112,7 @@ class ChainProposal:
         )
 
         def residual(side: int) -> I16:
-            """Return half the difference between the eyes' targets, along the rays of eye `side`."""
+            """Return half the difference between the eyes' targets, along the rays from eye `side`."""
             to_plane = local.plane_from_local @ frame.plane_from_frame(local.eyes_m[side], x_m=middle_x_m)
             own, other = (
                 warp(
@@ -122,7 +123,7 @@ class ChainProposal:
             )  # fmt: skip
             return _residual(own, other)
 
-        # Each eye is processed by one thread, because passing small operations between threads would take longer.
+        # Give each eye a single thread, because passing small operations between threads would take longer.
         left, right = parallel_map(residual, (0, 1))
         waves, shifted_waves, spectrum, modes_in = chain_modes(frame.cells)
         cell, cell_frequencies = cell_waves(frame.cell_px)
@@ -148,10 +149,10 @@ class ChainProposal:
         return dict(zip(outer, panels, strict=True))
 
     def _target_codes(self, view: TargetView, channels: int) -> tuple[I16, F64]:
-        """Return the target sum of panel values for each pixel of a view, and the view's inverse homography.
+        """Return the target sum of panel values for each pixel in a view, and the view's inverse homography.
 
-        The sums are in sixteenths of a code and may differ from the true sums by a constant. The inverse homography
-        (3x3) maps points (y, z, 1) of the middle panel's plane to pixels of the view.
+        The sums are in sixteenths of a code and may differ from the true sums by a constant. The 3x3 inverse homography
+        maps points (y, z, 1) on the middle panel's plane to view pixels.
         """
         codes = cv2.LUT(without_alpha(view.pixels, channels), self._codes)
         return np.asarray(codes, np.int16), np.asarray(np.linalg.inv(view.plane_from_picture), np.float64)
@@ -176,9 +177,9 @@ class ChainProposal:
 
 
 def _residual(own: I16, other: I16) -> I16:
-    """Return half the difference between an eye's targets and the other eye's targets, sharpened.
+    """Return half the difference between one eye's targets and the other's, sharpened.
 
-    The result is 0 where one of the eyes sees nothing (`UNSEEN`), except for the effect of the sharpening.
+    Apart from the sharpening, the result is 0 where one of the eyes sees nothing (`UNSEEN`).
     """
     half = np.asarray(cv2.subtract(own, other), np.int16) >> 1
     # Rays outside one eye's picture have no residual.
@@ -187,11 +188,11 @@ def _residual(own: I16, other: I16) -> I16:
 
 
 def _with_raster(geometry: Geometry, *, whole: bool, most_cell_px: int, reduction: int) -> tuple[_Local, ChainFrame]:
-    """Return the panels and their raster, transposed if this shortens the raster's rows considerably.
+    """Return the panels and their raster, transposed if this considerably reduces the raster's height.
 
     Args:
-        geometry: Geometry of the whole panels.
-        whole: Solve the whole panels. If False, solve only the window.
+        geometry: Geometry for the whole panels.
+        whole: True to solve the whole panels, False to solve only the window.
         most_cell_px: As for `chain_frame`.
         reduction: As for `chain_frame`.
 
@@ -231,7 +232,7 @@ def _local(geometry: Geometry, *, whole: bool) -> _Local:
 
 
 def _transposed(local: _Local) -> _Local:
-    """Return the same stack with down (-z) as right (+y)."""
+    """Return the same stack with down (-z) turned into right (+y)."""
     eyes_m = local.eyes_m[list(local.order)]
     eyes_m, order = _left_first(np.stack([eyes_m[:, 0], -eyes_m[:, 2], -eyes_m[:, 1]], axis=1))
     stack = replace(local.stack, tilt=None).transposed()
@@ -239,19 +240,19 @@ def _transposed(local: _Local) -> _Local:
 
 
 def _left_first(eyes_m: F64) -> tuple[F64, tuple[int, int]]:
-    """Return the eyes (2, 3) from left to right, and their indices."""
+    """Return the (2, 3) eyes ordered from left to right, and their indices."""
     order = (0, 1) if eyes_m[1, 1] >= eyes_m[0, 1] else (1, 0)
     return eyes_m[list(order)], order
 
 
 def _wave_taper(geometry: Geometry, raster: PlaneRaster, middle_m: F64) -> F32:
-    """Return the (rows, columns) weights by which the proposal for an outer panel is tapered.
+    """Return the (rows, columns) weights used to taper the proposal for an outer panel.
 
     The weights are 1 inside the window and fall to 0 at its edges. Positions are projected from the outer panel to the
-    centre panel along the rays of `middle_m`.
+    centre panel along rays from `middle_m`.
 
     Args:
-        raster: Pixels of the outer panel's box.
+        raster: Pixels in the outer panel's box.
         middle_m: (3,) point between the eyes in frame `stack`.
     """
     stack, kept = geometry.stack, geometry.kept

@@ -1,8 +1,8 @@
 """SART (simultaneous algebraic reconstruction technique) on one branch of Malus' law, for comparison.
 
 The technique (Andersen and Kak 1984) is the published solver for polarization fields (Lanman et al. 2011). This
-implementation supports 2 to 8 panels. Each iteration corrects all panels simultaneously by equal shares of both eyes'
-residual phases. The relaxation factor is the best value found by trial.
+implementation supports 2 to 8 panels. Each iteration corrects all panels at once, by equal shares of both eyes'
+residual phases. The relaxation factor is the best value found by trial and error.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64
 
 ITERATIONS = 10
-RELAXATION = 1.7  # factor of the eyes' mean residual, found by trial; the iteration diverges for factors of 2 or more
+RELAXATION = 1.7  # factor for the eyes' mean residual, found by trial and error; factors of 2 or more diverge
 
 
 class SartPredictor(Predictor):
-    """Model `sart`, which computes in float32 for any stack and rounds the result to 8 bits."""
+    """The model `sart`, which computes in float32 for any stack and rounds the result to 8 bits."""
 
     name = "sart"
     provider = "numpy"
@@ -73,7 +73,7 @@ class SartPredictor(Predictor):
         return Prediction(layers, watch.stage_ms, job.savings, self.iterations)
 
     def _panel_from_middle(self, eye_m: F64, index: int) -> F64:
-        """Return the 3x3 homography from pixels of the middle panel to pixels of a layer along an eye's rays.
+        """Return the 3x3 homography from middle-panel pixels to layer pixels along an eye's rays.
 
         Pixel centres are at integers, as in OpenCV.
         """

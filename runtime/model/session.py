@@ -1,4 +1,4 @@
-"""Load models, check them, and run them in onnxruntime with buffers that are bound only once."""
+"""Load models, check them, and run them in onnxruntime using buffers that are bound only once."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from runtime.support.onnx_runtime import onnxruntime
 from runtime.support.untrusted_input import LIMITS
 
 FILE_BYTES_MAX = 1 << 30
-MEMORY_MAX = 1 << 30  # memory limit in bytes for loading an untrusted file, in addition to 8 times the file's size
+MEMORY_MAX = 1 << 30  # memory limit in bytes for loading an untrusted file, on top of 8 times its size
 
 log = logging.getLogger("phasestack.model")
 
@@ -37,22 +37,22 @@ TYPES = {"tensor(float)": np.float32, "tensor(int16)": np.int16}
 NEWER_OPSET = re.compile(r"(Opset) (\d+) is under development.*till opset (\d+)")
 NEWER_IR = re.compile(r"(IR version): (\d+), max supported IR version: (\d+)")
 ERROR_KIND = re.compile(r"^\[ONNXRuntimeError\] : \d+ : \w+ : ")
-SOURCE_PLACE = re.compile(r"/\S+\.(cc|h|cpp):\d+ .*\) ")  # reference to onnxruntime's source code in a message
+SOURCE_PLACE = re.compile(r"/\S+\.(cc|h|cpp):\d+ .*\) ")  # reference to onnxruntime's source code within a message
 Shape = tuple[int, ...]
 
 
 class ModelSession:
-    """Loaded model. `run` binds buffers once for each combination of shapes and then reuses them."""
+    """A loaded model. `run` binds buffers once for each combination of shapes and then reuses them."""
 
     def __init__(self, path: Path, *, provider: str = "cpu", threads: int = 2, sha256: str = "") -> None:
         """Load a model and check it.
 
         Args:
             provider: Key of `PROVIDERS`.
-            sha256: Expected digest of the file. If it is empty (unknown), the file is first loaded in a child process.
+            sha256: The file's expected digest. If empty (unknown), the file is first loaded in a child process.
 
         Raises:
-            InputError: The file is not an ONNX model that onnxruntime can load, a digest differs, or the contract is
+            InputError: The file is not an ONNX model that onnxruntime can load, a digest is wrong, or the contract is
                 missing or does not fit the graph.
             MissingPart: The provider is not installed or does not start.
         """
@@ -62,7 +62,7 @@ class ModelSession:
             raise MissingPart(f"model.provider: {provider} is not installed: pip install {package}")
         options = ort.SessionOptions()
         options.intra_op_num_threads = threads
-        # The threads of a spinning pool would take cores from the camera and the renderer.
+        # If the pool's threads were spinning, they would take cores from the camera and the renderer.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.log_severity_level = 3
         options.add_session_config_entry(RECORD_NODES, "1")
@@ -74,11 +74,11 @@ class ModelSession:
             metadata = self._session.get_modelmeta().custom_metadata_map
         except UnicodeDecodeError:
             raise InputError(path, "metadata", "is not valid UTF-8") from None
-        if name not in self._session.get_providers():  # onnxruntime only prints a message and uses another provider
+        if name not in self._session.get_providers():  # onnxruntime only prints a message and uses another one
             problem = f"is installed but does not start: check {package} and its driver"
             raise MissingPart(f"model.provider: {provider} {problem}")
         self.provider: str = provider
-        self.fell_back = nodes_elsewhere(self._session, name)  # nodes of the graph that run on another provider
+        self.fell_back = nodes_elsewhere(self._session, name)  # graph nodes that run on another provider
         if count := len(self.fell_back):
             names = ", ".join((*self.fell_back[:NODES_LOGGED], *(["..."] if count > NODES_LOGGED else [])))
             log.warning("%s leaves %d node%s to another provider: %s", provider, count, "s" * (count != 1), names)
@@ -91,13 +91,13 @@ class ModelSession:
         self._bound: dict[tuple[Any, ...], tuple[Any, dict[str, Any], dict[str, Any]]] = {}
 
     def run(self, feeds: Mapping[str, NDArray[Any]], shapes: Mapping[str, Shape]) -> dict[str, NDArray[Any]]:
-        """Run the model and return its outputs by name.
+        """Run the model and return its outputs, keyed by name.
 
-        The outputs are buffers of the session, whose contents are valid until the next run with the same shapes.
+        The outputs are the session's own buffers. Their contents are valid until the next run with the same shapes.
 
         Args:
-            feeds: Inputs by name.
-            shapes: Shapes of the outputs by name.
+            feeds: Inputs, keyed by name.
+            shapes: Output shapes, keyed by name.
 
         Raises:
             ModelFailure: onnxruntime failed.
@@ -105,7 +105,7 @@ class ModelSession:
         key = (*((name, array.shape) for name, array in feeds.items()), *shapes.items())
         try:
             if key not in self._bound:
-                if len(self._bound) > 8:  # a walking viewer causes only a few shapes
+                if len(self._bound) > 8:  # a walking viewer causes only a few different shapes
                     self._bound.clear()
                 self._bound[key] = self._bind(feeds, shapes)
             binding, values, results = self._bound[key]
@@ -146,17 +146,17 @@ class ModelSession:
                     raise InputError(path, f"{field}.{item.name}", problem)
 
     def check_fits(self, source: Path, feeds: Mapping[str, Shape], answers: Mapping[str, Shape]) -> None:
-        """Check the shapes of the graph's inputs and outputs.
+        """Check the shapes of the graph's inputs and outputs against the expected ones.
 
-        If the graph does not specify all sizes, the model is run once.
+        If the graph does not specify every size, the model is run once to find out.
 
         Args:
-            source: Model file that an error message names.
-            feeds: Expected shapes of the inputs by name.
-            answers: Expected shapes of the outputs by name.
+            source: Model file to name in error messages.
+            feeds: Expected input shapes, keyed by name.
+            answers: Expected output shapes, keyed by name.
 
         Raises:
-            InputError: A shape differs, or the model does not run with these shapes.
+            InputError: A shape is different, or the model does not run with these shapes.
         """
         is_open = False
         for field, items, shapes in (
@@ -185,13 +185,13 @@ class ModelSession:
 
 
 def nodes_elsewhere(session: Any, provider: str) -> tuple[str, ...]:
-    """Return the names of the graph's nodes that do not run on the requested provider.
+    """Return the names of the graph nodes that do not run on the requested provider.
 
-    The nodes are those that remain after onnxruntime's basic optimizations. A node without a name is represented by its
-    operator type.
+    Only nodes left after onnxruntime's basic optimizations are considered. For a node without a name, its operator type
+    is returned.
 
     Args:
-        session: Session of onnxruntime that was created with the option `RECORD_NODES`.
+        session: An onnxruntime session created with the option `RECORD_NODES`.
     """
     return tuple(
         node.name or node.op_type
@@ -218,19 +218,19 @@ def _checked(path: Path, sha256: str) -> bytes:
 def _opened(path: Path, data: bytes, options: Any, provider: str) -> Any:
     try:
         return onnxruntime().InferenceSession(data, options, providers=[provider])
-    except Exception as error:  # onnxruntime raises its own hierarchy of undocumented exceptions
+    except Exception as error:  # onnxruntime has its own hierarchy of undocumented exceptions
         if "bad_alloc" in str(error):
             raise MemoryError from error
         raise InputError(path, "", _why_not_loaded(error)) from None
 
 
-_tried_out: set[bytes] = set()  # digests of files that have been loaded within the limits
+_tried_out: set[bytes] = set()  # digests of the files that have been loaded within the limits
 
 
 def _try_out(path: Path, data: bytes) -> None:
-    """Load a file in a child process with limited memory and time, unless this has succeeded before.
+    """Load a file in a child process with limited memory and time, unless this has already succeeded.
 
-    The limits are necessary because a few bytes of constants can expand while a model is loaded and fill all memory.
+    Limits are necessary because, as a model is loaded, a few bytes of constants can expand and fill all memory.
 
     Raises InputError if the file cannot be loaded within the limits.
     """
@@ -248,9 +248,9 @@ def _tried_here(path: Path, data: bytes) -> None:
 
 
 def _why_not_loaded(error: Exception) -> str:
-    """Return the reason why onnxruntime could not load a model.
+    """Return the reason why onnxruntime failed to load a model.
 
-    If the model is too new, the reason names the model's version and the newest supported version.
+    If the model is too new, the reason gives its version and the newest version supported.
     """
     text = str(error)
     for found in (NEWER_OPSET.search(text), NEWER_IR.search(text)):

@@ -1,7 +1,7 @@
-"""Solver, which proposes the outer panels, solves the middle panel, and then runs steps.
+"""Solver. It gets a proposal for the outer panels, solves the middle panel, and then runs steps.
 
-The algorithm is described in docs/mathematics.md. This module calls the operations in order. The devices (`cpu` and
-`gl`) implement the operations.
+The algorithm is described in docs/mathematics.md. This module calls the operations in order, and the devices
+(`cpu` and `gl`) implement them.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from runtime.model.proposal import Proposal
 from runtime.optics.malus import rest_code
 from runtime.optics.stack import PanelStack
 
-_Done = tuple[int, int | None]  # number of steps, and number of steps by earlier solutions; None: not continued
-REDUCTIONS = (1, 2, 3, 4)  # supported rasters, as divisors of the display's rows and columns
-REFINED_STEPS = 8  # a solution is continued up to this number of steps, which is the number of `best`
+_Done = tuple[int, int | None]  # number of steps, and how many of them earlier solutions made; None: not continued
+REDUCTIONS = (1, 2, 3, 4)  # supported rasters, given as divisors of the display's rows and columns
+REFINED_STEPS = 8  # a solution is continued for up to this many steps in total, as many as `best` has
 REFINING = (Step(size=0.8, places="falling"), Step(size=0.8, places="rising"))  # alternate after the model's steps
 
 
 class StepPredictor(Predictor):
-    """Model that runs steps, starting from a network's proposal or from panels at the rest value."""
+    """Model that runs steps starting from a network's proposal or from panels at the rest value."""
 
     def __init__(
         self,
@@ -43,11 +43,11 @@ class StepPredictor(Predictor):
         """Create the model.
 
         Args:
-            proposal: Network whose proposal the steps start from. If None, all panels start at the rest value.
-            steps: Steps of a solution.
-            name: Name of the model for the user.
-            threads: Number of threads on the processor.
-            backend: Device for everything except the network. By default, the processor.
+            proposal: Network that makes the proposal to start from. If None, all panels start at the rest value.
+            steps: Steps to run for a solution.
+            name: Model name to show to the user.
+            threads: Number of processor threads.
+            backend: Device that runs everything except the network. By default, the processor.
         """
         self.stack, self.name, self._proposal, self._steps = stack, name, proposal, tuple(steps)
         self.provider, self.parameters, self._threads = "cpu", 0, threads
@@ -62,7 +62,7 @@ class StepPredictor(Predictor):
         self.refined_steps = max(self.steps, REFINED_STEPS)
         self._backend: SolverBackend = backend or CpuBackend()
         self._rasters: dict[PanelStack, tuple[SolverState, LayerPool]] = {}
-        # Geometry, channels and number of steps of the newest solution, whose panels the state still holds.
+        # The newest solution's geometry, channels and number of steps; the state still holds its panels.
         self._improved: tuple[Geometry, int, int] | None = None
 
     @property
@@ -89,7 +89,7 @@ class StepPredictor(Predictor):
         state, pool = self._rasters[job.stack]
         buffer, rest, window = pool.take(), rest_code(job.stack.count), job.window
         done: _Done = 0, None
-        if window is None:  # solve everything that the eyes see, or all pixels if the network proposes whole panels
+        if window is None:  # solve everything the eyes see, or all pixels if the network proposes whole panels
             geometry = job.targets.visible if self.any_raster else job.targets.every_pixel
             done = self._improve(job, geometry, state, buffer, watch, outside=rest)
         else:
@@ -113,12 +113,12 @@ class StepPredictor(Predictor):
         *,
         outside: int | tuple[int, ...] | None,
     ) -> _Done:
-        """Run steps from the proposal, or continue the previous solution if the rays are the same.
+        """Run steps starting from the proposal, or continue the previous solution if the rays are the same.
 
         The result is written to `buffer`.
 
         Args:
-            outside: Contents of the middle panel outside its box (`SolverState.write`).
+            outside: What to write to the middle panel outside its box (`SolverState.write`).
         """
         before = self._improved
         resumed = job.continued and before is not None and before[1] == job.channels and geometry.is_like(before[0])

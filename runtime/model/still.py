@@ -1,4 +1,4 @@
-"""Solve a still stereo pair for the command `solve`, the report and the calibration charts."""
+"""Solve a still stereo pair, for the `solve` command, the report and the calibration charts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_raster, image_from_stack
 from runtime.records import F64, U8
 
-RAYS_PX = 0.6, 1.6  # pictures with fewer or more pixels per panel pixel are resized to one pixel per panel pixel
+RAYS_PX = 0.6, 1.6  # pictures with fewer or more pixels per panel pixel are resized to have one
 
 
 def solve_still(
@@ -31,17 +31,17 @@ def solve_still(
     eye_sigma_mm: float = TRACKING_SIGMA_MM,
     trimmed: bool = False,
 ) -> Prediction:
-    """Compute the layers for a stereo pair whose cameras looked at the stack's origin.
+    """Compute the layers for a stereo pair taken by cameras aimed at the stack's origin.
 
-    The cameras were at the positions of the eyes. The solver follows the rays of the pictures' pixels.
+    The cameras must have been at the eye positions. The solver follows the rays of the picture pixels.
 
     Args:
-        left: (h, w, 3 or 4) picture of the left eye.
-        right: (h, w, 3 or 4) picture of the right eye.
+        left: (h, w, 3 or 4) picture for the left eye.
+        right: (h, w, 3 or 4) picture for the right eye.
         eyes_m: (2, 3) left and right eye in frame `stack`.
-        fov_deg: Horizontal field of view of the pictures.
+        fov_deg: The pictures' horizontal field of view.
         eye_sigma_mm: Standard deviation of the tracking error.
-        trimmed: Skip work that the pictures do not need (`trim`), if the model supports it.
+        trimmed: True to skip work that the pictures do not need (`trim`), if the model supports it.
     """
     watch = Stopwatch(*STAGES)
     pictures = [np.ascontiguousarray(picture[..., :3]) for picture in (left, right)]
@@ -56,12 +56,13 @@ def solve_still(
 def captured_views(
     pictures: Sequence[U8], eyes_m: F64, stack: PanelStack, *, fov_deg: float
 ) -> tuple[TargetView, TargetView]:
-    """Return the views of a stereo pair. Pictures whose resolution differs from the panels' are resized.
+    """Return a stereo pair's views. Pictures are resized if their resolution differs from the panels'.
 
     Args:
-        pictures: Left and right (h, w, 3) picture, taken from the eyes' positions towards the stack's origin.
+        pictures: Left and right (h, w, 3) picture, taken from the eye positions with the camera aimed at the stack's
+            origin.
         eyes_m: (2, 3) left and right eye in frame `stack`.
-        fov_deg: Horizontal field of view of the pictures.
+        fov_deg: The pictures' horizontal field of view.
     """
     height, width = pictures[0].shape[:2]
     middle = stack.panel(stack.count // 2)

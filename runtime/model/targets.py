@@ -1,4 +1,4 @@
-"""Tables that convert the 8-bit codes of a picture to target sums of panel values in fixed point."""
+"""Tables that convert a picture's 8-bit codes to target sums of panel values in fixed point."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from runtime.optics.malus import Branch, phase_from_intensity, rest_code, rest_v
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, I16, U8
 
-SLOPE_FLOOR = 0.25  # minimum weight of a ray; the steepest slope of sin² has the weight 1
-COARSE_STEP = 16  # distance in pixels between the samples of a quick test that recognises most coloured pictures
+SLOPE_FLOOR = 0.25  # minimum weight of a ray; at the steepest slope of sin², the weight is 1
+COARSE_STEP = 16  # sample spacing in pixels for a quick test that recognises most coloured pictures
 
 
 def rest_of(panels: int) -> int:
-    """Return the rest value of a panel in sixteenths of a code."""
+    """Return a panel's rest value in sixteenths of a code."""
     return round(rest_value(panels) * FULL)
 
 
 def slope_of(panels: int) -> int:
-    """Return the number, counted from 0, of the slope of sin² that contains the sums of panel values.
+    """Return which slope of sin² contains the sums of panel values, counted from 0.
 
-    Slope 1 is the falling slope for sums from 1 to 2. Slope 2 is the rising slope for sums from 2 to 3.
+    Slope 1 falls, for sums from 1 to 2. Slope 2 rises, for sums from 2 to 3.
     """
     return int(rest_value(panels) * panels)
 
@@ -33,9 +33,9 @@ def slope_of(panels: int) -> int:
 def target_table(panels: int) -> F32:
     """Return the (256, 2) target sums of panel values and their weights.
 
-    The table has a row for each code that an eye should see. Of all sums that show a code, the target is the sum
-    nearest to the panels' rest values. It is in sixteenths of a code. The weight depends on the slope of sin² at the
-    target and is 1 at the steepest slope.
+    The table has a row for each code that an eye may have to see. Of all the sums that show this code, the target is
+    the one nearest to the panels' rest values, in sixteenths of a code. The weight depends on the slope of sin² at the
+    target and is 1 where the slope is steepest.
     """
     intensities = np.arange(256) / 255.0
     slope = slope_of(panels)
@@ -47,16 +47,16 @@ def target_table(panels: int) -> F32:
 
 @lru_cache(maxsize=8)
 def middle_codes(panels: int) -> U8:
-    """Return the (256,) middle-panel codes that show each code if the other panels are at rest."""
+    """Return, for each of 256 codes, the middle-panel code that shows it if the other panels are at rest."""
     codes = (target_table(panels)[:, 0] - (panels - 1) * rest_of(panels)) / SUBCODE
     return np.clip(np.rint(codes), 0, 255).astype(np.uint8)
 
 
 def outside_codes(panels: int, n: int, outside: int | tuple[int, ...]) -> list[int]:
-    """Return the RGB code of panel `n` outside the window.
+    """Return panel `n`'s RGB code outside the window.
 
     Args:
-        outside: Code of the middle panel, or RGB colour that the eyes should see there. Other panels have the rest
+        outside: The middle panel's code, or the RGB colour that the eyes should see there. Other panels have the rest
             code.
     """
     if n != panels // 2:
@@ -66,15 +66,16 @@ def outside_codes(panels: int, n: int, outside: int | tuple[int, ...]) -> list[i
 
 @lru_cache(maxsize=4)
 def phase_codes(branch: Branch = 2) -> I16:
-    """Return the (256,) sums of panel values for each code that an eye should see.
+    """Return the (256,) sums of panel values, one for each code that an eye may have to see.
 
-    The sums are in sixteenths of a code."""
+    The sums are in sixteenths of a code.
+    """
     codes = np.arange(256) / 255.0
     return np.rint(phase_from_intensity(codes, branch) * FULL).astype(np.int16)
 
 
 def is_grey(picture: U8) -> bool:
-    """Return True if red, green and blue are equal in every pixel of an (h, w, 3 or 4) picture."""
+    """Return True if red, green and blue are equal at every pixel of an (h, w, 3 or 4) picture."""
     coarse = picture[::COARSE_STEP, ::COARSE_STEP]
     if (coarse[..., 0] != coarse[..., 1]).any() or (coarse[..., 1] != coarse[..., 2]).any():
         return False
@@ -83,7 +84,7 @@ def is_grey(picture: U8) -> bool:
 
 
 def without_alpha(picture: U8, channels: int) -> U8:
-    """Return a contiguous (h, w, 3) picture. If `channels` is 1, return only its first channel (h, w)."""
+    """Return a contiguous (h, w, 3) picture or, if `channels` is 1, only its first channel (h, w)."""
     if channels == 1:
         return np.asarray(cv2.extractChannel(picture, 0), np.uint8)
     if picture.shape[2] == 3:
@@ -92,10 +93,10 @@ def without_alpha(picture: U8, channels: int) -> U8:
 
 
 def flat_layers(image: U8, stack: PanelStack) -> U8:
-    """Return (N, h, w, 4) layers that show the same (h, w, 4) picture to all eyes."""
+    """Return (N, h, w, 4) layers that show the same (h, w, 4) picture to every eye."""
     middle = stack.count // 2
     layers = np.full((stack.count, stack.height_px, stack.width_px, 4), 255, np.uint8)
-    # The other panels add up to the sum at which the slope begins. The middle panel adds the picture.
+    # The other panels add up to the sum where the slope begins, and the middle panel adds the picture.
     even = slope_of(stack.count) * 255 // (stack.count - 1)
     layers[..., :3] = even
     sums = np.rint(target_table(stack.count)[:, 0] / SUBCODE)

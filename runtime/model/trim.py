@@ -1,9 +1,8 @@
-"""Reduce a job to the window in which the eyes' pictures differ, and to one channel if they are grey.
+"""Reduce a job to the window where the eyes' pictures differ, and to one channel if they are grey.
 
-A window of the panels is equivalent to a smaller stack whose origin is at the window's centre, which shifts the eyes
-accordingly. Outside the window, the outer panels have the rest value, and the centre panel shows the picture. The
-values of the outer panels are tapered towards the rest value at the window's edge (`Geometry.tapers`), which avoids a
-visible seam.
+A window of the panels is equivalent to a smaller stack with its origin at the window's centre and the eyes shifted
+accordingly. Outside the window, the outer panels have the rest value, and the centre panel shows the picture. To avoid
+a visible seam, the outer panels' values are tapered to the rest value at the window's edge (`Geometry.tapers`).
 """
 
 from __future__ import annotations
@@ -23,29 +22,30 @@ from runtime.records import F64, U8
 from runtime.support.gl import DrawnPicture
 from runtime.support.threads import PIECE_ROWS, parallel_map
 
-TOLERANCE_CODES = 2  # smaller differences are ignored; at 40 dB, their error is a tenth of the 8-bit quantisation's
-COARSE_STEP = 16  # distance in pixels between the samples of a quick comparison, which may save an exact comparison
-MAX_SHARE = 0.6  # share of the panel above which a window is as slow as the whole panel
-MAX_SLACK = 1.3  # maximum size of a window kept from the previous solution, relative to the window needed
-WINDOW_SHARES = 16  # sides of windows are whole sixteenths of the panel's, which limits the number of shapes
-# Measured with the shipped models: tapering the outer panels over 14 parallaxes around a differing region costs 0.06 dB
-# on a mid-grey background, where sin² is steepest. Over 6 parallaxes, it costs up to 0.4 dB there, but only 0.02 dB on
-# white or black, where sin² is level. A window must also contain the points where its rays cross the other panels.
-TAPER_PARALLAXES = (6.0, 14.0)  # width of the taper for a steepness of 0 and of 1
+TOLERANCE_CODES = 2  # differences up to this are ignored; at 40 dB, this error is a tenth of the 8-bit quantisation's
+COARSE_STEP = 16  # sample spacing in pixels for a quick comparison, which may make an exact one unnecessary
+MAX_SHARE = 0.6  # a window that covers more than this share of the panel is as slow as the whole panel
+MAX_SLACK = 1.3  # maximum size of a window kept from the previous solution, relative to the one needed
+WINDOW_SHARES = 16  # window sides are whole sixteenths of the panel's, which limits the number of shapes
+# Measured with the shipped models: if the outer panels are tapered over 14 parallaxes around a region where the
+# pictures differ, 0.06 dB is lost on a mid-grey background, where sin² is steepest. Over 6 parallaxes, up to 0.4 dB is
+# lost there, but only 0.02 dB on white or black, where sin² is level. A window must also contain the points where its
+# rays cross the other panels.
+TAPER_PARALLAXES = (6.0, 14.0)  # taper width for a steepness of 0 and for a steepness of 1
 PANEL_CROSSINGS = 2.0
 MARGIN_PX = 16
 EDGE_PX = 2
-COMPARED = 2  # captured pictures are compared on a raster that is this many times as coarse as the panels'
+COMPARED = 2  # captured pictures are compared on a raster this many times as coarse as the panels'
 
 
 def trim(job: Job, before: SolveWindow | None = None) -> Job:
     """Return a job that solves only the necessary window and channels.
 
-    If the job has no window, the window in which the eyes' pictures differ is used. If the pictures are grey there, a
+    If the job has no window, the window where the eyes' pictures differ is used. If the pictures are grey there, a
     single channel is solved.
 
     Args:
-        before: Window of the previous solution, which is kept if it still fits.
+        before: The previous solution's window, which is kept if it still fits.
     """
     window = job.window or differing_window(job, before)
     grey = (window is None or window.box.width_px > 0) and all(_is_grey(view, job, window) for view in job.views)
@@ -55,16 +55,16 @@ def trim(job: Job, before: SolveWindow | None = None) -> Job:
 def extent_window(
     extent: PixelRect, colour: tuple[int, ...], eyes_m: F64, stack: PanelStack, before: SolveWindow | None = None
 ) -> SolveWindow | None:
-    """Return the window for content whose extent is known before the content is drawn.
+    """Return the window for content with an extent that is known before the content is drawn.
 
     Args:
-        extent: Middle-panel pixels outside which both eyes see only the background.
-        colour: 8-bit codes of the background.
+        extent: Middle-panel pixels. Outside them, both eyes see only the background.
+        colour: The background's 8-bit codes.
         eyes_m: (2, 3) left and right eye in frame `stack`.
-        before: Window of the previous solution, which is kept if it still fits.
+        before: The previous solution's window, which is kept if it still fits.
 
     Returns:
-        The window, or None if the extent is empty or solving the whole panel is as fast.
+        The window, or None if the extent is empty or solving the whole panel would be as fast.
     """
     if not extent.width_px:
         return None
@@ -74,9 +74,9 @@ def extent_window(
 
 
 def differing_window(job: Job, before: SolveWindow | None = None) -> SolveWindow | None:
-    """Return the window in which the eyes' pictures differ. The window is empty if the pictures agree.
+    """Return the window where the eyes' pictures differ. It is empty if the pictures agree.
 
-    The result is None if solving the whole panel is as fast or a picture is in a texture.
+    Returns None if solving the whole panel would be as fast, or if a picture is in a texture.
     """
     if any(isinstance(view.picture, DrawnPicture) for view in job.views):
         return None
@@ -92,7 +92,7 @@ def differing_window(job: Job, before: SolveWindow | None = None) -> SolveWindow
         grown = PixelRect(*(first + scale * at for first, at in zip(origin * 2, box.corners)))
         return _window_around(grown, job.eyes_m, stack, before, steep=steepness_beside(left, box))
 
-    # A quick comparison recognises windows that would be too large. Only the other windows need an exact comparison.
+    # A quick comparison recognises windows that would be too large. An exact comparison is needed only for the others.
     box, window = coarse_box(left, right), None
     if box.width_px:
         window = window_of(box)
@@ -103,16 +103,16 @@ def differing_window(job: Job, before: SolveWindow | None = None) -> SolveWindow
 
 
 def _on_middle_panel(view: TargetView, stack: PanelStack) -> bool:
-    """Return True if the pixels of a view's picture coincide with the pixels of the middle panel."""
+    """Return True if a view's picture pixels coincide with the middle panel's pixels."""
     middle = stack.panel(stack.count // 2)
     same_size = view.picture.shape[:2] == (stack.height_px, stack.width_px)
     return same_size and np.allclose(view.plane_from_picture, middle.plane_from_raster(), rtol=0, atol=1e-9)
 
 
 def _compared(job: Job) -> tuple[U8, U8, tuple[int, int]]:
-    """Return the left and the right picture on a coarse raster of the middle panel's visible part.
+    """Return the left and the right picture on a coarse raster over the visible part of the middle panel.
 
-    The third value is the (column, row) of the panel pixel at which the raster begins.
+    The third value is the (column, row) of the panel pixel where the raster begins.
     """
     visible = job.targets.visible
     box, middle = visible.boxes[visible.middle], job.stack.panel(visible.middle)
@@ -132,9 +132,9 @@ def _compared(job: Job) -> tuple[U8, U8, tuple[int, int]]:
 def _window_around(
     box: PixelRect, eyes_m: F64, stack: PanelStack, before: SolveWindow | None, *, steep: float
 ) -> SolveWindow | None:
-    """Return the window for a box in which the eyes' pictures differ.
+    """Return the window for a box where the eyes' pictures differ.
 
-    The result is None if solving the whole panel is as fast.
+    Returns None if solving the whole panel would be as fast.
 
     Args:
         steep: `steepness` of the background around the box.
@@ -145,12 +145,12 @@ def _window_around(
         return None
     if before is not None and still_fits(before.box, window):
         window = before.box
-    # Rays near the window's edge leave the window on another panel, so there is no valid target for the centre panel.
+    # Rays near the window's edge leave the window on another panel, so they give the centre panel no valid target.
     return SolveWindow(window, whole_rays(window, eyes_m, stack), taper_px(eyes_m, stack, parallaxes=parallaxes))
 
 
 def _is_grey(view: TargetView, job: Job, window: SolveWindow | None) -> bool:
-    """Return True if the pixels to solve are grey. A texture counts as grey only if it is marked as grey."""
+    """Return True if the pixels to solve are grey. A texture counts as grey only if it is marked as such."""
     if isinstance(view.picture, DrawnPicture):
         return view.picture.grey
     if window is not None and _on_middle_panel(view, job.stack):
@@ -159,13 +159,13 @@ def _is_grey(view: TargetView, job: Job, window: SolveWindow | None) -> bool:
 
 
 def differing_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES, known: PixelRect = NOWHERE) -> PixelRect:
-    """Return the smallest box that contains all differences between two (h, w, 3 or 4) pictures.
+    """Return the smallest box that contains all the differences between two (h, w, 3 or 4) pictures.
 
     The box is empty if the pictures agree.
 
     Args:
-        tolerance: Largest difference in codes that is ignored.
-        known: Box that the result is known to contain, such as the result of `coarse_box`. Only pixels outside this box
+        tolerance: Largest difference to ignore, in codes.
+        known: Box that is known to be part of the result, such as the result of `coarse_box`. Only pixels outside it
             are compared.
     """
     height, width = left.shape[:2]
@@ -179,9 +179,9 @@ def differing_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES, know
 
 
 def coarse_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES) -> PixelRect:
-    """Return a box inside the result of `differing_box` in a hundredth of the time.
+    """Return a box that lies inside the result of `differing_box`, in a hundredth of the time.
 
-    Only a few pixels are compared. The result shows if the window would be too large to be useful.
+    Only a few pixels are compared, enough to tell if the window would be too large to be useful.
     """
     few = [np.ascontiguousarray(picture[::COARSE_STEP, ::COARSE_STEP]) for picture in (left, right)]
     u0, v0, u1, v1 = (COARSE_STEP * corner for corner in _box(few[0], few[1], tolerance).corners)
@@ -196,31 +196,31 @@ def _box(left: U8, right: U8, tolerance: int) -> PixelRect:
 
 
 def parallax_margin_px(eyes_m: F64, stack: PanelStack) -> F64:
-    """Return the shift, on each panel, of rays through the centre of the middle panel.
+    """Return how far rays through the middle panel's centre are shifted on each panel.
 
     Args:
         eyes_m: (2, 3) left and right eye in frame `stack`.
 
     Returns:
-        (2, N, 2) shifts in pixels. The axes are the eye, the panel, and the direction (right, down). For rays
-        through other points of the middle panel, the shifts are approximate.
+        (2, N, 2) shifts in pixels. The axes are the eye, the panel, and the direction (right, down). For rays through
+        other points on the middle panel, the shifts are approximate.
     """
     return np.asarray(_eyes_px(eyes_m, stack)[:, None] * _weights(eyes_m, stack)[..., None], np.float64)
 
 
 def steepness(codes: U8) -> float:
-    """Return the visibility of phase errors on 8-bit codes, from 0 (black or white) to 1 (mid-grey).
+    """Return how visible phase errors are on 8-bit codes, from 0 (black or white) to 1 (mid-grey).
 
-    The visibility is the root mean square of the slope of sin², 2·sqrt(I·(1 - I)).
+    The result is the root mean square of the slope of sin², 2·sqrt(I·(1 - I)).
     """
     intensities = codes.astype(np.float64) / 255
     return float(np.sqrt((4 * intensities * (1 - intensities)).mean())) if codes.size else 0.0
 
 
 def steepness_beside(picture: U8, box: PixelRect) -> float:
-    """Return the larger `steepness` of the areas to the left and right of a box.
+    """Return the larger `steepness` of the areas to the left and to the right of a box.
 
-    The picture has the shape (h, w, 3 or 4). The outer panels are tapered in these areas.
+    These are the areas where the outer panels are tapered. The picture has the shape (h, w, 3 or 4).
     """
     rows = slice(box.v0, box.v1, COARSE_STEP)
     beside = (picture[rows, : box.u0 : COARSE_STEP, :3], picture[rows, box.u1 :: COARSE_STEP, :3])
@@ -228,13 +228,13 @@ def steepness_beside(picture: U8, box: PixelRect) -> float:
 
 
 def taper_parallaxes(steep: float) -> float:
-    """Return the width, in parallaxes, of the taper on a background with the `steepness` `steep`."""
+    """Return the taper width, in parallaxes, for a background whose `steepness` is `steep`."""
     least, most = TAPER_PARALLAXES
     return least + (most - least) * steep
 
 
 def taper_px(eyes_m: F64, stack: PanelStack, *, parallaxes: float) -> tuple[float, float]:
-    """Return the width (right, down) in pixels of a taper whose width is given in parallaxes.
+    """Convert a taper's width from parallaxes to pixels (right, down).
 
     Args:
         eyes_m: (2, 3) left and right eye in frame `stack`.
@@ -245,10 +245,10 @@ def taper_px(eyes_m: F64, stack: PanelStack, *, parallaxes: float) -> tuple[floa
 
 
 def whole_rays(box: PixelRect, eyes_m: F64, stack: PanelStack) -> PixelRect:
-    """Return the part of a window whose rays stay inside the window on every panel.
+    """Return the part of a window where rays stay inside the window on every panel.
 
-    Rays may leave the window at edges of the panels. The ray from an eye e through the point p of the centre panel
-    meets a panel of weight t (`_weights`) at p(1 - t) + e·t.
+    Rays may leave the window at panel edges. The ray from an eye e through a point p on the centre panel meets a panel
+    of weight t (`_weights`) at p(1 - t) + e·t.
 
     Args:
         box: Window in panel pixels.
@@ -268,24 +268,27 @@ def whole_rays(box: PixelRect, eyes_m: F64, stack: PanelStack) -> PixelRect:
 
 
 def _weights(eyes_m: F64, stack: PanelStack) -> F64:
-    """Return the (2, N) positions of the panels between the centre panel (0) and each eye (1)."""
+    """Return the (2, N) positions of the panels on a scale from the centre panel (0) to each eye (1)."""
     middle_m = stack.x_m[stack.count // 2]
     return np.asarray((np.array(stack.x_m) - middle_m) / (eyes_m[:, :1] - middle_m), np.float64)
 
 
 def _eyes_px(eyes_m: F64, stack: PanelStack) -> F64:
-    """Return the (2, 2) positions (right, down) of the eyes from the panels' centre in pixels."""
+    """Return the positions of the two eyes relative to the panels' centre, in pixels.
+
+    The result is a (2, 2) array of (right, down) rows.
+    """
     return np.asarray(eyes_m[:, 1:] * (stack.width_px / stack.width_m, -stack.height_px / stack.height_m), np.float64)
 
 
 def window_around(box: PixelRect, eyes_m: F64, stack: PanelStack, *, parallaxes: float) -> PixelRect | None:
-    """Return the window that is necessary to solve a box in which the eyes' pictures differ.
+    """Return the window needed to solve a box where the eyes' pictures differ.
 
-    The window includes margins and is rounded up to sixteenths of the panel.
+    The window includes margins, and its sides are rounded up to sixteenths of the panel's.
 
     Args:
         eyes_m: (2, 3) left and right eye in frame `stack`.
-        parallaxes: Width of the taper (`taper_parallaxes`).
+        parallaxes: Taper width (`taper_parallaxes`).
 
     Returns:
         The window, or None if it would cover most of the panel. Solving the whole panel is then as fast.
@@ -293,7 +296,7 @@ def window_around(box: PixelRect, eyes_m: F64, stack: PanelStack, *, parallaxes:
     parallax, weights, eyes_px = parallax_margin_px(eyes_m, stack), _weights(eyes_m, stack), _eyes_px(eyes_m, stack)
     spans: list[tuple[int, int]] = []
     for axis, (start, end, whole) in enumerate(((box.u0, box.u1, stack.width_px), (box.v0, box.v1, stack.height_px))):
-        eyes = eyes_px[:, axis, None]  # relative to the panel's centre, like both ends of the box below
+        eyes = eyes_px[:, axis, None]  # relative to the panel's centre, as both ends of the box are below
         before, after = (weights * (start - whole / 2 - eyes)).max(), (weights * (eyes - (end - whole / 2))).max()
         room = parallaxes * float(np.abs(parallax[0, :, axis] - parallax[1, :, axis]).max()) + MARGIN_PX
         low = max(start - (PANEL_CROSSINGS * max(float(before), 0.0) + room), 0.0)
@@ -308,6 +311,6 @@ def window_around(box: PixelRect, eyes_m: F64, stack: PanelStack, *, parallaxes:
 
 
 def still_fits(held: PixelRect, new: PixelRect) -> bool:
-    """Return True if the window `held` contains `new` and is not much larger, which allows it to be kept."""
+    """Return True if the window `held` contains `new` and is not much larger, so that it can be kept."""
     inside = held.u0 <= new.u0 and held.v0 <= new.v0 and held.u1 >= new.u1 and held.v1 >= new.v1
     return inside and held.width_px * held.height_px <= MAX_SLACK * new.width_px * new.height_px

@@ -17,20 +17,20 @@ from runtime.optics.stack import PlaneRaster
 from runtime.records import F64, I16, U8
 from runtime.support.threads import on_rows
 
-# Minimum side of a resized picture, and minimum number of old pixels per new pixel. Enlarging a picture further adds no
-# information.
+# Minimum width and height of a resized picture, and minimum number of old pixels per new pixel. Enlarging a picture
+# further would add no information.
 LEAST_PX, MIN_SCALE = 16, 0.25
-REACH_PX = EDGE_PX - 1.0  # maximum distance to which an image's edge is repeated outwards
-LARGEST = 8191  # maximum absolute value that the compiled loop can sample
+REACH_PX = EDGE_PX - 1.0  # maximum distance that an image's edge is repeated outwards
+LARGEST = 8191  # largest absolute value that the compiled loop can sample
 _TRANSPOSED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def source_px(image_from_raster: F64, size: tuple[int, int]) -> tuple[float, float]:
-    """Return the numbers of image pixels that a raster pixel spans, to the right and down, at the centre.
+    """Return how many image pixels a raster pixel spans at the centre, to the right and down.
 
     Args:
-        image_from_raster: 3x3 homography from pixels of the raster to pixels of the image.
-        size: Width and height of the raster.
+        image_from_raster: 3x3 homography from raster pixels to image pixels.
+        size: Raster width and height.
     """
     a = image_from_raster
     x, y, w = a @ (size[0] / 2, size[1] / 2, 1.0)
@@ -39,7 +39,7 @@ def source_px(image_from_raster: F64, size: tuple[int, int]) -> tuple[float, flo
 
 
 def resized_px(pixels: int, scale: float) -> int:
-    """Return the number of new pixels for `pixels` old pixels if a new pixel covers `scale` old pixels."""
+    """Return the number of new pixels for `pixels` old pixels if each new pixel covers `scale` old ones."""
     return max(min(pixels, LEAST_PX), round(pixels / max(scale, MIN_SCALE)))
 
 
@@ -47,7 +47,7 @@ def reduced_view(view: TargetView, middle: PlaneRaster, reduction: int) -> Targe
     """Average a view's picture down to about one pixel per `reduction` x `reduction` panel pixels.
 
     Args:
-        middle: Pixel grid of the middle panel.
+        middle: The middle panel's pixel grid.
     """
     picture = view.pixels
     picture_from_middle = np.linalg.inv(view.plane_from_picture) @ middle.plane_from_raster()
@@ -58,7 +58,7 @@ def reduced_view(view: TargetView, middle: PlaneRaster, reduction: int) -> Targe
     )
     if (by_u, by_v) == (1, 1):
         return TargetView(picture, view.plane_from_picture)
-    # Crop to a multiple of the factors, because OpenCV shrinks by whole factors ten times as fast.
+    # Crop to a multiple of the factors, because OpenCV is ten times as fast at shrinking by whole factors.
     cropped = picture[: height // by_v * by_v, : width // by_u * by_u]
     small = cv2.resize(cropped, (width // by_u, height // by_v), interpolation=cv2.INTER_AREA)
     return TargetView(np.asarray(small, np.uint8), view.plane_from_picture @ np.diag([by_u, by_v, 1.0]))
@@ -69,13 +69,13 @@ def picture_on(
 ) -> U8:
     """Resample a view's (rows, columns, 3 or 4) picture to another raster.
 
-    If the picture's pixels already coincide with the raster, the picture is returned unchanged.
+    If the picture's pixels already coincide with the raster's, the picture is returned unchanged.
 
     Args:
-        middle: Pixel grid of the middle panel.
-        middle_from_result: 3x3 homography from pixels of the raster to pixels of the middle panel.
+        middle: The middle panel's pixel grid.
+        middle_from_result: 3x3 homography from pixels on the new raster to middle-panel pixels.
         edge: OpenCV's border mode.
-        size: Rows and columns of the raster.
+        size: Number of rows and columns in the new raster.
     """
     picture_from_result = np.linalg.inv(view.plane_from_picture) @ middle.plane_from_raster() @ middle_from_result
     picture_from_result = picture_from_result / picture_from_result[2, 2]
@@ -87,12 +87,11 @@ def picture_on(
 def resample(
     image: NDArray[Any], image_from_result: F64, *, size: tuple[int, int], edge: int = cv2.BORDER_CONSTANT
 ) -> NDArray[Any]:
-    """Sample an image (h, w[, C]) bilinearly on another raster.
+    """Sample an (h, w[, C]) image bilinearly on another raster.
 
     Args:
-        image_from_result: 3x3 homography from pixels of the raster to pixels of the image. Pixel centres are at
-            half-integers.
-        size: Rows and columns of the raster.
+        image_from_result: 3x3 homography from raster pixels to image pixels. Pixel centres are at half-integers.
+        size: Number of rows and columns in the new raster.
         edge: OpenCV's border mode.
     """
     to_corners = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
@@ -112,28 +111,28 @@ def warp(
     result_columns: ColumnLaw = EVEN_COLUMNS,
     threads: int | None = None,
 ) -> I16:
-    """Resample an int16 image (h, w[, 3]) like `resample`, but several times as fast.
+    """Resample an (h, w[, 3]) int16 image as `resample` does, but several times as fast.
 
     Args:
-        image: Image, whose values are clipped to ±LARGEST.
-        image_from_result: 3x3 homography from columns and rows of the result to columns and rows of the image. The
-            columns of both are the coordinates t that the column laws define (`ColumnLaw`).
-        size: Rows and columns of the result.
-        outside: Value of pixels that are more than `reach_px` outside the image.
-        reach_px: Distance, at most REACH_PX, to which the values at the image's edge are repeated outwards.
-        image_columns: Column law of the image. At least one of the column laws must be even.
-        result_columns: Column law of the result.
-        threads: Number of threads. By default, the number that OpenCV uses.
+        image: Image to resample. Its values are clipped to ±LARGEST.
+        image_from_result: 3x3 homography from the result's columns and rows to the image's. For both, columns are given
+            by the coordinate t that their column law defines (`ColumnLaw`).
+        size: Number of rows and columns in the result.
+        outside: Value for pixels more than `reach_px` outside the image.
+        reach_px: How far the values at the image's edge are repeated outwards, at most REACH_PX.
+        image_columns: The image's column law. At least one of the two column laws must be even.
+        result_columns: The result's column law.
+        threads: Number of threads. By default, as many as OpenCV is configured to use.
     """
     x, y, w = image_from_result @ (result_columns.middle or size[1] / 2, size[0] / 2, 1.0)
     right, down = image_from_result[:2, 0] - np.array([x, y]) / w * image_from_result[2, 0]
-    turned = abs(down) > abs(right)  # the compiled loop requires that the rows of result and image run the same way
+    turned = abs(down) > abs(right)  # the compiled loop requires the result's and the image's rows to run the same way
     if turned and result_columns.bend:
         image, image_from_result, turned = np.swapaxes(image, 0, 1), _TRANSPOSED @ image_from_result, False
     elif turned:
         image_from_result, size = image_from_result @ _TRANSPOSED, size[::-1]
     if _runs_left(image_from_result, result_columns.middle or size[1] / 2, size[0] / 2):
-        # The loop samples tiles of pixels only if the result's columns run to the right in the image.
+        # The loop samples in tiles only if the result's columns run to the right in the image.
         width_px = image.shape[1]
         image = np.asarray(cv2.flip(np.ascontiguousarray(image), 1), np.int16)
         image_from_result = np.array([[-1.0, 0.0, width_px], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) @ image_from_result
@@ -152,6 +151,6 @@ def warp(
 
 
 def _runs_left(image_from_result: F64, u: float, v: float) -> bool:
-    """Return True if the image's column decreases with the result's, at a pixel of the result."""
+    """Return True if, at a given result pixel, the image column decreases as the result column increases."""
     x, _, w = image_from_result @ (u, v, 1.0)
     return bool((image_from_result[0, 0] * w - x * image_from_result[2, 0]) < 0)

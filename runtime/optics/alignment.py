@@ -1,19 +1,19 @@
 """Align layers that were solved for earlier eye positions to the current eye positions.
 
 Seen from one point, two parallel planes are related by a scale and a shift. Let m be the midpoint between the eyes. The
-ray from m through a point c of the reference plane (x = r) meets the panel at x = a at the point c·k + m·(1 - k), where
+ray from m through a point c on the reference plane (x = r) meets the panel at x = a at the point c·k + m·(1 - k), where
 k = (m_x - a) / (m_x - r).
 
-When the midpoint moves from o to n, a point p of the panel is projected along the ray from n onto the reference plane,
-and from the reference plane along the ray from o back onto the panel. Each projection is a scale and a shift, so p maps
-to q = p·s + t. For d = n - o and D = o_x - a, the coefficients are
+When the midpoint moves from o to n, a point p on the panel is projected onto the reference plane along the ray from n,
+and back onto the panel along the ray from o. Each projection is a scale and a shift, so p maps to q = p·s + t. For d =
+n - o and D = o_x - a, the coefficients are
 
     s = 1 + d_x·(r - a) / ((D + d_x)·(o_x - r)),    t = (a - r) / (o_x - r) · (o·d_x - d·D) / (D + d_x).
 
-This form yields s = 1 and t = 0 without rounding error if the midpoint has not moved or the panel is the reference
-plane. The map is exact for rays from the midpoint. It is also exact for the rays of both eyes if the head faces the
-panels and has moved parallel to them. If the head has moved closer or farther away, the layers keep the disparity that
-they were solved with, because a shift cannot change the disparity.
+In this form, s = 1 and t = 0 without any rounding error if the midpoint has not moved or the panel is the reference
+plane. The map is exact for rays from the midpoint. It is also exact for rays from both eyes if the head faces the
+panels and has moved parallel to them. If the head has moved closer or farther away, the layers keep the disparity they
+were solved with, because a shift cannot change it.
 """
 
 from __future__ import annotations
@@ -30,29 +30,29 @@ from runtime.optics.relief import Displacement, displacement, parallax
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8, PanelFrame, Parallax
 
-FARTHEST_M = 1e6  # coordinates beyond this are treated as not finite
+FARTHEST_M = 1e6  # larger coordinates are treated as not finite
 NEAREST_M = 0.01  # minimum distance between an eye and the front panel
 MOST_SHIFT = 0.5  # maximum shift of a panel's centre, in panel widths or heights
-MOST_SCALE = 2.0  # maximum factor by which a panel is enlarged or reduced
-ROWS = 32  # rows per resampled strip; the float32 pixels of a strip fit in a core's cache
+MOST_SCALE = 2.0  # maximum factor for enlarging or reducing a panel
+ROWS = 32  # rows resampled at a time; a strip's float32 pixels fit in a core's cache
 
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Transformation that adapts solved layers to the current eyes."""
+    """Transformation that aligns solved layers to the current eyes."""
 
-    # One (3, 3) matrix per panel: scale and shift from shown pixels to the solved layer's pixels.
+    # For each panel, a (3, 3) scale and shift from shown pixels to the solved layer's pixels.
     solved_from_shown: tuple[F64, ...]
-    limited: str = ""  # reason why the alignment does not reach the current eyes; empty if it reaches them
-    # Motion of content off the middle panel; None if the eyes have not moved or the number of panels is even.
+    limited: str = ""  # why the alignment stops short of the current eyes; empty if it reaches them
+    # Motion of the content off the middle panel; None if the eyes have not moved or the number of panels is even.
     parallax: Parallax | None = None
 
 
 def reference_x_m(stack: PanelStack) -> float:
-    """Return the x coordinate of the reference plane of an alignment.
+    """Return the x coordinate of an alignment's reference plane.
 
-    The reference plane is the plane of the centre panel. If the number of panels is even, it is the plane halfway
-    between the two panels in the middle.
+    The reference plane is the centre panel's plane or, if the number of panels is even, the plane halfway between the
+    two middle panels.
     """
     half = stack.count // 2
     return stack.x_m[half] if stack.count % 2 else (stack.x_m[half - 1] + stack.x_m[half]) / 2
@@ -61,12 +61,12 @@ def reference_x_m(stack: PanelStack) -> float:
 def align(stack: PanelStack, *, solved_for_m: F64, eyes_m: F64) -> Alignment:
     """Align layers that were solved for other eye positions to the current eyes.
 
-    An alignment is limited in three ways: each eye stays at least `NEAREST_M` in front of the front panel, the centre
-    of a panel moves by at most `MOST_SHIFT` of the panel's size, and a panel is enlarged or reduced by at most the
-    factor `MOST_SCALE`. If the current eyes exceed a limit, the layers are aligned to the farthest allowed point on the
+    An alignment has three limits: each eye must be at least `NEAREST_M` in front of the front panel, a panel's centre
+    may move by at most `MOST_SHIFT` of the panel's size, and a panel may be enlarged or reduced by at most a factor of
+    `MOST_SCALE`. If the current eyes exceed a limit, the layers are aligned to the farthest allowed point on the
     straight line from the old eyes to the current eyes, which keeps the alignment continuous.
 
-    The function never raises an exception. If a coordinate is not finite, the layers stay unchanged.
+    Never raises an exception. If a coordinate is not finite, the layers are left unchanged.
 
     Args:
         solved_for_m: (2, 3) eyes that the layers were solved for, in frame `stack`.
@@ -77,7 +77,7 @@ def align(stack: PanelStack, *, solved_for_m: F64, eyes_m: F64) -> Alignment:
     old, new = _middle(solved_for_m), _middle(eyes_m)
     share, limited = 1.0, ""
     for most, least, why in _limits(stack, solved_for_m, eyes_m, old=old, new=new):
-        # Every limit has the form share · most <= least, where `share` is the allowed fraction of the movement.
+        # Each limit allows a fraction `share` of the movement if share · most <= least.
         reach = 0.0 if least < 0.0 else 1.0 if most <= least else least / most
         if reach < share:
             share, limited = reach, why
@@ -89,7 +89,7 @@ def align(stack: PanelStack, *, solved_for_m: F64, eyes_m: F64) -> Alignment:
 
 
 def scale_and_shift(matrix: F64) -> tuple[float, float, float, float]:
-    """Return (scale_u, scale_v, shift_u, shift_v) of a 3x3 matrix that maps pixels to pixels.
+    """Split a 3x3 matrix that maps pixels to pixels into (scale_u, scale_v, shift_u, shift_v).
 
     Raises ValueError if the matrix does anything other than scale and shift.
     """
@@ -100,17 +100,17 @@ def scale_and_shift(matrix: F64) -> tuple[float, float, float, float]:
 
 
 def is_identity(matrix: F64) -> bool:
-    """Return True if a panel's alignment matrix leaves every pixel where it is, which avoids resampling."""
+    """Return True if a panel's alignment matrix leaves every pixel in place and needs no resampling."""
     return scale_and_shift(matrix) == (1.0, 1.0, 0.0, 0.0)
 
 
 def shown_layers(frame: PanelFrame) -> U8:
-    """Return the (N, h, w, 4) layers of a frame before panel curves, rotation and mirroring are applied.
+    """Return a frame's (N, h, w, 4) layers before panel curves, rotation and mirroring are applied.
 
-    This function is the reference for the presentation shader. It samples bilinearly with exact weights; for moved
-    eyes, bicubic sampling was never better by more than 0.05 dB (docs/mathematics.md). A coarse solution is enlarged in
-    the same pass. Pixels outside the layer are filled with the rest code, and the flat picture is mixed in before
-    rounding. If the frame needs none of these operations, its array is returned without a copy.
+    Reference implementation for the presentation shader. Sampling is bilinear with exact weights; for moved eyes,
+    bicubic sampling was never more than 0.05 dB better (docs/mathematics.md). A coarse solution is enlarged in the same
+    pass. Pixels outside the layer are filled with the rest code, and the flat picture is mixed in before rounding. If
+    the frame needs none of these operations, its array is returned without a copy.
 
     Raises ValueError if the frame needs a flat picture but has none.
     """
@@ -162,7 +162,7 @@ def _solved_from_shown(stack: PanelStack, index: int, *, old: F64, step: F64) ->
     shift_m = (raster.x_m - reference_m) / height_m * (old[1:] * step[0] - step[1:] * distance_m) / now_m
     matrix = np.eye(3)
     matrix[0, 0] = matrix[1, 1] = 1.0 + magnified
-    # The origin of the pixel coordinates is the panel's top left corner, not its centre.
+    # Pixel coordinates start at the panel's top left corner, not at its centre.
     matrix[0, 2] = (raster.left_m * magnified + shift_m[0]) / raster.pitch_u_m
     matrix[1, 2] = -(raster.top_m * magnified + shift_m[1]) / raster.pitch_v_m
     matrix += 0.0  # avoids negative zeros
@@ -172,9 +172,10 @@ def _solved_from_shown(stack: PanelStack, index: int, *, old: F64, step: F64) ->
 def _limits(
     stack: PanelStack, solved_for_m: F64, eyes_m: F64, *, old: F64, new: F64
 ) -> Iterator[tuple[float, float, str]]:
-    """Yield (most, least, why) for each limit of an alignment.
+    """Yield (most, least, why) for each of an alignment's limits.
 
-    A fraction `share` of the movement is allowed if share · most <= least. The text `why` describes the excess.
+    A fraction `share` of the movement is allowed if share · most <= least. `why` is the message to report if the limit
+    is exceeded.
     """
     front_m = stack.x_m[-1]
     for name, before, after in zip(("left", "right"), solved_for_m, eyes_m, strict=True):
@@ -199,17 +200,17 @@ def _limits(
 
 
 def _places(count: int, shown: int, *, scale: float, shift: float) -> tuple[NDArray[np.intp], F32]:
-    """Return the source pixels and weights for linear interpolation along one axis.
+    """Return source pixels and weights for linear interpolation along one axis.
 
     Args:
         count: Number of source pixels.
         shown: Number of shown pixels.
         scale: Source pixels per shown pixel.
-        shift: Source position of the shown pixels' left or top edge, in source pixels.
+        shift: Position of the shown pixels' left or top edge, in source pixels.
 
     Returns:
-        For each shown pixel, the index of the last source pixel before its position, and the distance in pixels from
-        the source pixel to the position. The indices refer to a source that is padded by one pixel at both ends.
+        For each shown pixel, the index of the last source pixel before its position, and the distance from that pixel
+        to the position, in pixels. The indices refer to a source that has been padded by one pixel at each end.
     """
     place = np.clip((np.arange(shown) + 0.5) * scale + shift - 0.5, -1.0, count)
     first = np.minimum(np.floor(place), count - 1.0)
@@ -217,17 +218,17 @@ def _places(count: int, shown: int, *, scale: float, shift: float) -> tuple[NDAr
 
 
 def _resampled(layer: U8, matrix: F64, rest: int, *, size: tuple[int, int]) -> Iterator[tuple[slice, F32]]:
-    """Resample a layer and yield the result in strips of rows.
+    """Resample a layer, yielding the result in strips of rows.
 
-    The surroundings of the layer have the code `rest`. A coarse layer is first extended by one pixel on every side,
-    because otherwise its edge would fade into the surroundings.
+    Outside the layer, every pixel has the code `rest`. A coarse layer is first extended by one pixel on each side so
+    that its edge does not fade into these surroundings.
 
     Args:
-        matrix: (3, 3) scale and shift from shown pixels to pixels of the full-size layer.
-        size: Height and width of the shown layer in pixels.
+        matrix: (3, 3) scale and shift from shown pixels to full-size layer pixels.
+        size: Height and width of the shown layer, in pixels.
 
     Yields:
-        The rows of a strip, and their unrounded (rows, w, 4) codes.
+        A strip's rows, as a slice, and their unrounded (rows, w, 4) codes.
     """
     su, sv, tu, tv = scale_and_shift(matrix)
     height, width = layer.shape[:2]
@@ -249,7 +250,7 @@ def _resampled(layer: U8, matrix: F64, rest: int, *, size: tuple[int, int]) -> I
             inside.start - 1 : inside.stop - 1
         ]
         lines = _between(source.take(first - low, axis=0), source.take(first + 1 - low, axis=0), weight)
-        # View each pixel's four floats as a single number, which is faster to gather.
+        # View each pixel's four floats as a single number, because it can be gathered faster.
         pixels = lines.view(np.complex128)[..., 0]
         left, right = (
             pixels.take(columns + k, axis=1).view(np.float32).reshape(*pixels.shape[:1], size[1], 4) for k in (0, 1)
@@ -260,11 +261,11 @@ def _resampled(layer: U8, matrix: F64, rest: int, *, size: tuple[int, int]) -> I
 def _displaced(
     displacement: Displacement, layer: U8, matrix: F64, rest: int, *, size: tuple[int, int]
 ) -> Iterator[tuple[slice, F32]]:
-    """Resample a layer like `_resampled`, but move every pixel by a separate displacement as well."""
+    """Resample a layer as `_resampled` does, but also displace each pixel individually."""
     su, sv, tu, tv = scale_and_shift(matrix)
     height, width = layer.shape[:2]
     by_u, by_v, extended = width / size[1], height / size[0], int((height, width) != size)
-    # Surround the layer with the rest code. A coarse layer is first extended by repeating its edge pixels.
+    # Surround the layer with the rest code, after extending a coarse layer by repeating its edge pixels.
     padded = np.pad(layer, ((extended, extended), (extended, extended), (0, 0)), mode="edge")
     padded = np.pad(padded, ((1, 1), (1, 1), (0, 0)), constant_values=rest).astype(np.float32)
     padded[..., 3] = 255.0
@@ -288,7 +289,7 @@ def _displaced(
 
 
 def _between(low: F32, high: F32, weight: F32) -> F32:
-    """Return low · (1 - weight) + high · weight, computed in `low`. The contents of `high` are lost."""
+    """Return low · (1 - weight) + high · weight, computed in place in `low`. Overwrites `high`."""
     high -= low
     high *= weight
     low += high

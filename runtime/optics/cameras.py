@@ -1,4 +1,4 @@
-"""Resample pictures from arbitrary cameras to views of eyes that look at the stack's origin."""
+"""Resample pictures from arbitrary cameras to the views of eyes that look at the stack's origin."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import stack_from_eye
 from runtime.records import F32, F64, U8
 
-OUTSIDE_MOST = 1 / 3  # warn if a larger share of a picture is outside the panels
-LEAST_PX = 16  # smallest side of a resampled picture
-EXACT = 1e-6  # cameras whose matrices differ by less than this times the picture's width count as equal
-DIGITS = 9  # decimals of metres and degrees; this rounding recovers the values that a camera matrix was built from
+OUTSIDE_MOST = 1 / 3  # warn if more than this share of a picture is outside the panels
+LEAST_PX = 16  # minimum width and height of a resampled picture
+EXACT = 1e-6  # cameras count as equal if their matrices differ by less than this times the picture's width
+DIGITS = 9  # decimals kept in metres and degrees; rounding recovers the values that a camera matrix was built from
 NAMES = ("left", "right")
 Picture = U8 | F32  # (h, w, 3)
 
 
 def as_cameras(matrices: Any) -> tuple[F64, F64]:
-    """Return the projections and positions of two cameras that are given by their 3x4 matrices.
+    """Return the projections and positions of two cameras, given their 3x4 matrices.
 
     Args:
-        matrices: Matrices of the left and right camera, which map metres in frame `stack` to pixels.
+        matrices: The left and right cameras' matrices, which map metres in frame `stack` to pixels.
 
     Returns:
-        The matrices (2, 3, 4), with the sign that makes the third homogeneous coordinate positive in front of the
-        camera, and the positions (2, 3) in metres in frame `stack`.
+        The (2, 3, 4) matrices, with signs chosen so that the third homogeneous coordinate is positive in front of the
+        camera, and the (2, 3) positions in metres in frame `stack`.
 
     Raises:
-        ValueError: `matrices` are not two finite 3x4 matrices, or the left 3x3 part of a matrix has no inverse.
+        ValueError: `matrices` are not two finite 3x4 matrices, or the left 3x3 part of one of them has no inverse.
     """
     try:
         cameras = np.asarray(matrices, np.float64)
@@ -55,12 +55,12 @@ def looking_at_origin(
 ) -> tuple[list[Picture], float]:
     """Resample two cameras' pictures as if the cameras had been aimed at the stack's origin.
 
-    The new pictures cover as much of the panels as both originals allow. Sampling is bicubic. If both cameras are
-    already aimed at the origin, their pictures are returned unchanged.
+    The new pictures cover as much of the panels as both originals allow, and are sampled bicubically. If both cameras
+    are already aimed at the origin, their pictures are returned unchanged.
 
     Args:
-        cameras: (2, 3, 4) projections from frame `stack` to the pictures' pixels (`as_cameras`).
-        eyes_m: (2, 3) positions of the cameras in frame `stack`.
+        cameras: (2, 3, 4) projections from frame `stack` to picture pixels (`as_cameras`).
+        eyes_m: (2, 3) camera positions in frame `stack`.
 
     Returns:
         The resampled (h, w, 3) pictures, and their horizontal field of view in degrees.
@@ -70,7 +70,7 @@ def looking_at_origin(
     """
     height, width = pictures[0].shape[:2]
     turns = [np.diag([1.0, -1.0, -1.0]) @ stack_from_eye(eye_m)[:3, :3].T for eye_m in eyes_m]
-    # These matrices map directions (x, y, 1), relative to a gaze at the origin, to pixels of the pictures.
+    # These matrices map directions (x, y, 1), relative to a gaze at the origin, to picture pixels.
     pixels_from_gaze = [camera[:, :3] @ turn.T for camera, turn in zip(cameras, turns, strict=True)]
     pixels_from_gaze = [matrix / matrix[2, 2] for matrix in pixels_from_gaze]
     focal_px = pixels_from_gaze[0][0, 0]
@@ -111,9 +111,9 @@ def looking_at_origin(
 
 
 def _within(matrix: F64, half: F64, width: int, height: int) -> bool:
-    """Return True if a picture contains every direction (x, y, 1) with |x| <= half[0] and |y| <= half[1].
+    """Return True if a picture covers every direction (x, y, 1) with |x| <= half[0] and |y| <= half[1].
 
-    `matrix` (3x3) maps homogeneous directions to pixels of the picture.
+    `matrix` (3x3) maps homogeneous directions to picture pixels.
     """
     corners = np.array([(x * half[0], y * half[1], 1.0) for x in (-1, 1) for y in (-1, 1)]) @ matrix.T
     if not (corners[:, 2] > 0).all():
@@ -123,7 +123,7 @@ def _within(matrix: F64, half: F64, width: int, height: int) -> bool:
 
 
 def _most(holds: Any, least: float = 0.0) -> float:
-    """Return the largest number between `least` and 1 for which the monotonic condition `holds` is true."""
+    """Return the largest number between `least` and 1 that satisfies the monotonic condition `holds`."""
     most = 1.0
     if holds(most):
         return most
@@ -139,12 +139,12 @@ def _slope(matrix: F64) -> F64:
 
 
 def doubts(eyes_m: ArrayLike, stack: PanelStack, *, fov_deg: float, size: tuple[int, int]) -> list[str]:
-    """Return a one-line warning for each probable mistake in `eyes_m` or `fov_deg`.
+    """Return a one-line warning for each likely mistake in `eyes_m` or `fov_deg`.
 
     Args:
         eyes_m: (2, 3) left and right eye in frame `stack`.
-        fov_deg: Horizontal field of view of the pictures.
-        size: Width and height of the pictures in pixels.
+        fov_deg: The pictures' horizontal field of view.
+        size: Picture width and height in pixels.
     """
     eyes, warnings = np.asarray(eyes_m, np.float64), []
     if fov_deg <= math.pi:

@@ -1,10 +1,10 @@
-"""Carried, expected and light quality of layers at eye positions that they were not solved for.
+"""Carried, expected and light quality of layers seen from eye positions they were not solved for.
 
 The three measures are defined in docs/contracts.md. They treat the picture that the layers were solved for as if it
-were painted on the centre panel: the ray of each pixel is replaced by the ray from the true eye through the same point
-of the centre panel. Ghosts and colour fringes count as errors. The parallax between the nominal and the true eye does
-not count, because no shift of the layers can add it. The age of the view does not count either;
-`evaluation.refresh_quality` measures the error that it causes.
+were painted on the centre panel: each pixel's ray is replaced by the ray from the true eye through the same point on
+the centre panel. Ghosts and colour fringes count as errors. Parallax between the nominal and the true eye does not
+count, because no shift of the layers can add it. Neither does the age of the view; the error that it causes is measured
+by `evaluation.refresh_quality`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import stack_from_eye
 from runtime.records import F32, F64, U8
 
-PLENTY = 3_000_000  # number of values above which a picture is sampled more sparsely
+PLENTY = 3_000_000  # a picture with more values than this is sampled more sparsely
 
 
 def carried_db(
@@ -34,14 +34,14 @@ def carried_db(
     eyes_m: ArrayLike,
     fov_deg: float,
 ) -> float:
-    """Return the PSNR of layers that are seen from `eyes_m`, measured with one ray per pixel.
+    """Return the PSNR of layers seen from `eyes_m`, measured with one ray per pixel.
 
     Args:
         layers: (N, H, W, 3 or 4) code values as the panels receive them, rear to front.
-        drawn: An (h, w, 3) retina picture for each of the eyes `solved_for_m`, as code values or float in [0, 1].
+        drawn: The (h, w, 3) retina picture for each of the eyes `solved_for_m`, as code values or float in [0, 1].
         solved_for_m: (2, 3) eyes that the layers were solved for, in frame `stack`.
         eyes_m: (2, 3) true eyes in frame `stack`.
-        fov_deg: Horizontal field of view of the retina pictures.
+        fov_deg: The retina pictures' horizontal field of view.
 
     Raises:
         ValueError: An eye is not in front of every panel, or the eyes see no part of the panels.
@@ -55,12 +55,12 @@ def carried_db(
 
 
 class AtEyes(TypedDict):
-    """Viewing conditions for which an expected quality is computed."""
+    """Viewing conditions that an expected quality is computed for."""
 
     eyes_m: ArrayLike  # (2, 3) eyes that the layers were solved for, frame `stack`
-    fov_deg: float  # horizontal field of view of the pictures
-    sigmas_mm: Sequence[float]  # standard deviations of the tracking error
-    seen_from_m: NotRequired[ArrayLike | None]  # (2, 3) true positions of the eyes; by default `eyes_m`
+    fov_deg: float  # the pictures' horizontal field of view
+    sigmas_mm: Sequence[float]  # standard deviations of the tracking error to assume
+    seen_from_m: NotRequired[ArrayLike | None]  # (2, 3) true eye positions; by default `eyes_m`
 
 
 def expected_errors(
@@ -71,24 +71,27 @@ def expected_errors(
     sampling: Sampling | None = None,
     **at: Unpack[AtEyes],
 ) -> dict[float, F64]:
-    """Return the carried squared errors that are expected for normally distributed tracking errors.
+    """Return the carried squared errors to expect if tracking errors are normally distributed.
 
-    The expectation is a sum over five eye positions, which is exact for second moments. The position without tracking
-    error has weight 1/2. The positions two standard deviations to the left, right, top and bottom have weight 1/8 each.
+    The expectation is a weighted sum over five eye positions, which reproduces second moments exactly. The position
+    without tracking error has weight 1/2. The positions two standard deviations to the left and right, above and below
+    have weight 1/8 each.
 
-    At these four positions, a quarter of the rays is used, which costs less than 0.02 dB. Large pictures use every
-    second pixel of every second row. Other pictures use two rays across and down each pixel instead of four.
+    At these four positions, only a quarter of the rays are traced, which costs less than 0.02 dB in accuracy. For large
+    pictures, every second pixel in every second row is used. For other pictures, there are two rays across and down
+    each pixel instead of four.
 
     Args:
         layers: (N, H, W, 3 or 4) code values as the panels receive them, rear to front.
         drawn: An (h, w, 3) retina picture for each of the eyes that the layers were solved for, as code values or
             float in [0, 1].
-        sampling: Rays to use. By default `LIGHT`, which measures the figure to quote, but with four times the number of
-            rays per pixel if a picture has at most `PLENTY` values.
+        sampling: Rays to trace. By default `LIGHT`, which gives the figure to quote, but with four times as many rays
+            per pixel if a picture has at most `PLENTY` values.
         **at: Viewing conditions (`AtEyes`).
 
     Returns:
-        For each standard deviation in mm, an array with the error of all rows and the error of each group of rows.
+        For each standard deviation in mm, an array that holds the error over all rows, then the error over each group
+        of rows.
 
     Raises:
         ValueError: An eye is not in front of every panel, or the eyes see no part of the panels.
@@ -126,17 +129,17 @@ def expected_psnrs_db(
     sampling: Sampling | None = None,
     **at: Unpack[AtEyes],
 ) -> dict[float, float]:
-    """Return the PSNRs of `expected_errors` in dB, keyed by the standard deviation in mm."""
+    """Return the `expected_errors` as PSNRs in dB, keyed by standard deviation in mm."""
     errors = expected_errors(layers, drawn, stack, sampling=sampling, **at)
     return {sigma_mm: psnr_db(error[0]) for sigma_mm, error in errors.items()}
 
 
 def standard_error_db(errors: F64) -> float:
-    """Return the standard error in dB of a PSNR, estimated from the scatter between groups of rows.
+    """Return a PSNR's standard error in dB, estimated from the scatter between groups of rows.
 
     Args:
-        errors: (1 + groups,) mean squared errors. The first error covers all rows and determines the PSNR. Each of the
-            other errors covers one group of rows.
+        errors: (1 + groups,) mean squared errors. The first is over all rows and determines the PSNR. Each of the
+            others is over one group of rows.
     """
     groups = errors[1:]
     relative = float(np.std(groups, ddof=1)) / len(groups) ** 0.5 / max(float(errors[0]), 1e-12)

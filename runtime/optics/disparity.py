@@ -1,4 +1,4 @@
-"""Compare the disparity of a pair of pictures with the largest disparity that a stack can show."""
+"""Compare the disparity between two pictures with the largest disparity that a stack can show."""
 
 from __future__ import annotations
 
@@ -15,39 +15,39 @@ from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import image_from_stack
 from runtime.records import F32, F64, U8
 
-WIDTH_PX = 256  # width of the middle panel's raster on which the pictures are compared
+WIDTH_PX = 256  # width of the middle-panel raster used to compare the pictures
 REACH_PX = WIDTH_PX // 4  # largest disparity searched, in either direction
-# Ghosts up to this size are not reported (root mean square relative to full scale). The example pair's other errors are
-# about equally large (37 dB of light), so larger ghosts would cost more than 3 dB.
+# Ghosts up to this size (root mean square, relative to full scale) are not reported. The example pair's other errors
+# are about as large (37 dB of light), so larger ghosts would cost more than 3 dB.
 GHOSTS_MOST = 0.015
-BEYOND_LEAST = 0.1  # minimum share of the matches outside the stack; content inside the stack causes no ghosts
-LARGER, MOST_LARGER = 1.1, 20.0  # ratio of successive gaps that are tried; largest gap relative to the stack's gap
-ROLLED, TURNED = 0.05, 0.2  # largest slopes of the line between the eyes for which picture rows correspond
-LEAST_MATCHED = 0.1  # minimum share of the panel with a match
-LEAST_ONCE = 1 / 3  # minimum share of unambiguous matches; below this share, the picture is repetitive
+BEYOND_LEAST = 0.1  # minimum share of matches outside the stack; content inside the stack causes no ghosts
+LARGER, MOST_LARGER = 1.1, 20.0  # ratio of one gap tried to the one before; largest gap tried, relative to the stack's
+ROLLED, TURNED = 0.05, 0.2  # steepest slopes of the line between the eyes for picture rows to correspond
+LEAST_MATCHED = 0.1  # minimum share of the panel that must have a match
+LEAST_ONCE = 1 / 3  # minimum share of matches that must be unambiguous; otherwise the picture is repetitive
 WINDOW_PX, APART_PX = 21, 4  # side of the cost window; minimum distance between two matches of a pixel
 NO_WORSE = 1.3, 1.0  # a match is ambiguous if another error is at most 1.3 times the smallest error, plus 1 code
 
 
 @dataclass(frozen=True, slots=True)
 class _Compared:
-    """Left and right picture, resampled to a coarse raster of the middle panel and compared there."""
+    """Left and right pictures, resampled to a coarse middle-panel raster for comparison."""
 
     grey: tuple[U8, U8]  # (h, w) each
     inside: tuple[U8, U8]  # 255 where the picture covers the panel
     panel: PlaneRaster
 
     def ghosts(self, unit_m: float) -> float:
-        """Estimate the light that reaches the wrong eye because the panel values are limited.
+        """Estimate how much light reaches the wrong eye because panel values are limited.
 
-        The two eyes' rays through a point of the front panel cross the middle panel at a distance of `unit_m`. The rays
-        through a point of the rear panel cross the middle panel at the same distance, but in reverse order. In panel
-        values, the difference between the eyes' pictures is therefore `unit_m` times the slope of (front - rear), and
-        front - rear is limited to [-1, 1]. Each row is integrated from left to right. Where the integral would leave
-        this range, the difference is lost, and both eyes see the mean.
+        The two eyes' rays through a point on the front panel cross the middle panel `unit_m` apart. Their rays through
+        a point on the rear panel cross it the same distance apart, but in reverse order. In panel values, the
+        difference between the eyes' pictures is therefore `unit_m` times the slope of (front - rear), and front - rear
+        is limited to [-1, 1]. Each row is integrated from left to right. Where the integral would leave this range, the
+        difference is lost, and both eyes see the mean.
 
         Returns:
-            Root mean square of the ghosts, relative to full scale.
+            The ghosts' root mean square, relative to full scale.
         """
         light = np.stack(self.grey) / 255.0
         value = np.arcsin(np.sqrt(light)) / (np.pi / 2)
@@ -65,8 +65,8 @@ class _Compared:
     def disparities_m(self) -> F64:
         """Return the (n,) disparities of all unambiguously matched points, in metres on the middle panel.
 
-        A point in front of the middle panel appears farther right to the left eye than to the right eye and has a
-        positive disparity. The result is empty if most of the picture is repetitive or too few points match.
+        Disparity is positive for a point in front of the middle panel, which appears farther right to the left eye than
+        to the right eye. The result is empty if most of the picture is repetitive or too few points match.
         """
         sides = 0, 0, REACH_PX, REACH_PX
         framed: list[Any] = [
@@ -86,12 +86,12 @@ class _Compared:
 
 
 def _compared(pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, *, fov_deg: float) -> _Compared:
-    """Resample two pictures to a coarse raster of the middle panel.
+    """Resample two pictures to a coarse middle-panel raster.
 
     Args:
         pictures: Left and right (h, w, 3) picture, each from a camera at the eye that is aimed at the stack's origin.
         eyes_m: (2, 3) left and right eye in frame `stack`.
-        fov_deg: Horizontal field of view of the pictures.
+        fov_deg: The pictures' horizontal field of view.
     """
     small = replace(stack, width_px=WIDTH_PX, height_px=max(16, round(WIDTH_PX * stack.height_m / stack.width_m)))
     panel, size = small.panel(stack.count // 2), (WIDTH_PX, small.height_px)
@@ -99,7 +99,7 @@ def _compared(pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, *, f
     for picture, eye_m in zip(pictures, eyes_m, strict=True):
         codes: Any = picture[..., :3] if picture.dtype == np.uint8 else np.rint(255 * picture[..., :3])
         grey = cv2.cvtColor(np.ascontiguousarray(codes, np.uint8), cv2.COLOR_RGB2GRAY)
-        # Without shrinking first, fine textures would differ between the eyes at random.
+        # If the pictures were not shrunk first, fine textures would differ between the eyes at random.
         shrunk = min(1.0, WIDTH_PX / stack.width_m * _width_m(eye_m, fov_deg) / grey.shape[1])
         grey = cv2.resize(grey, None, fx=shrunk, fy=shrunk, interpolation=cv2.INTER_AREA)
         height, width = grey.shape
@@ -109,18 +109,18 @@ def _compared(pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, *, f
 
 
 def _width_m(eye_m: F64, fov_deg: float) -> float:
-    """Return the width in metres that an eye's picture spans at the distance of the stack's origin."""
+    """Return the width, in metres, covered by an eye's picture at the distance of the stack's origin."""
     return float(2 * np.linalg.norm(eye_m) * np.tan(np.radians(fov_deg / 2)))
 
 
 def _is_ambiguous(left: U8, right: U8, matched: F64) -> NDArray[np.bool_]:
-    """Return a mask of pixels whose match is ambiguous, as in a repetitive texture.
+    """Return a mask of the pixels with an ambiguous match, as in a repetitive texture.
 
-    A match is ambiguous if another disparity fits almost equally well. The matcher's own uniqueness test compares
-    ratios of errors and fails if the smallest error is 0.
+    A match is ambiguous if another disparity fits almost as well. The matcher's own uniqueness test compares error
+    ratios, so it fails if the smallest error is 0.
 
     Args:
-        matched: (h, w) disparities in pixels that the matcher found.
+        matched: (h, w) disparities found by the matcher, in pixels.
     """
     there = right.astype(np.float32)
     halves = (there + np.roll(there, 1, 1)) / 2, (there + np.roll(there, -1, 1)) / 2
@@ -140,18 +140,18 @@ def _is_ambiguous(left: U8, right: U8, matched: F64) -> NDArray[np.bool_]:
 def disparity_doubts(
     pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, *, fov_deg: float, parallel: bool = True
 ) -> list[str]:
-    """Return a list with a one-line warning if the pictures will cause ghosts, or an empty list.
+    """Return a one-line warning, in a list, if the pictures will cause ghosts, or an empty list.
 
     Args:
         pictures: Left and right (h, w, 3) picture, each from a camera at the eye that is aimed at the stack's origin.
         eyes_m: (2, 3) left and right eye in frame `stack`.
-        fov_deg: Horizontal field of view of the pictures.
-        parallel: The pictures might be a rectified pair from parallel cameras, passed by mistake. If the disparities
-            suggest a mistake, the warning says so.
+        fov_deg: The pictures' horizontal field of view.
+        parallel: True if the pictures might be a rectified pair from parallel cameras, passed by mistake. The warning
+            says so if the disparities suggest it.
     """
     line = eyes_m[1] - eyes_m[0]
     if line[1] <= 0 or abs(line[2]) > ROLLED * line[1] or abs(line[0]) > TURNED * line[1]:
-        return []  # a point may appear in different rows of the two pictures
+        return []  # a point may appear in different rows in the two pictures
     compared = _compared(pictures, eyes_m, stack, fov_deg=fov_deg)
     apart_m, away_m = float(line[1]), float(eyes_m[:, 0].mean())
     centre_m = stack.x_m[stack.count // 2]

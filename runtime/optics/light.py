@@ -1,13 +1,13 @@
-"""Mean squared error of the light that eyes receive through displayed layers.
+"""Mean squared error of the light that reaches the eyes through the displayed layers.
 
-The section "Error" of docs/contracts.md defines the terms. The error can be measured in two ways:
+The terms are defined in docs/contracts.md, section "Error". The error can be measured in two ways:
 
-* *Light*, the figure to quote, models a panel pixel as a square of one colour. A pixel of the eye's picture receives
-  the mean intensity over the pixel's area and over the pupil, which is focused on the centre panel. This mean is
-  estimated from two independent sets of random rays. The mean product of the two sets' errors is an unbiased estimate
-  of the squared error. The mean square of a single set's errors would include the variance of the rays.
-* *One ray*, which published evaluations use, traces a single ray through the centres of the pixel and the pupil, and
-  samples the panels bilinearly.
+* *Light*, the figure to quote, models each panel pixel as a square of uniform colour. A pixel in the eye's picture
+  receives the mean intensity over its area and over the pupil, which is focused on the centre panel. This mean is
+  estimated from two independent sets of random rays. The squared error is estimated without bias as the mean product of
+  the two sets' errors; the mean square of a single set's errors would include the variance of the rays.
+* *One ray*, the measure used in published evaluations, traces a single ray through the centres of the pixel and the
+  pupil, and samples the panels bilinearly.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from runtime.optics.tilt import layer_from_seen, layer_pixels_from_seen
 from runtime.optics.views import stack_from_eye
 from runtime.records import F32, F64, U8
 
-RINGS = 9  # rings of points on the pupil; their 271 points are as good as a disc
+RINGS = 9  # rings of points on the pupil; these 271 points are as good as a disc
 
 
 class Sampling(NamedTuple):
-    """Selection of the rays along which the squared error is measured."""
+    """Choice of the rays used to measure the squared error."""
 
-    rays: int = 2  # rays across and down a pixel in each of the two sets; 0: a single ray, sampled bilinearly
+    rays: int = 2  # rays across and down a pixel, in each of two sets; 0: a single ray, sampled bilinearly
     pupil_mm: float = PUPIL_MM  # pupil diameter; 0: a pinhole
     step: int = 1  # only every `step`-th pixel of every `step`-th row is measured
-    groups: int = 0  # number of groups of rows, from which the standard error is estimated
+    groups: int = 0  # number of groups of rows, used to estimate the standard error
 
 
 LIGHT = Sampling()
@@ -47,13 +47,13 @@ ONE_RAY = Sampling(rays=0, pupil_mm=0.0)
 
 
 class LightView(NamedTuple):
-    """Target picture of an eye, and the geometry of the rays through the picture's pixels."""
+    """An eye's target picture, and the geometry of the rays through its pixels."""
 
     target: F32  # (h, w, 3) intensities
-    centre_from_image: F64  # (3, 3) homography from pixels of the picture to pixels of the centre panel
-    panels_from_centre: F64  # (pupil points, N, 3, 3) homographies from pixels of the centre panel to each panel's
+    centre_from_image: F64  # (3, 3) homography from picture pixels to centre-panel pixels
+    panels_from_centre: F64  # (pupil points, N, 3, 3) homographies from centre-panel pixels to each panel's
     toward: F64  # (3,) vector whose dot product with (u, v, 1) is negative for rays towards the panels
-    first_ray: int  # number of the view's first ray, which seeds its random positions
+    first_ray: int  # number of the view's first ray, used to seed its random positions
 
 
 def squared_errors(
@@ -66,23 +66,23 @@ def squared_errors(
     fov_deg: float,
     sampling: Sampling,
 ) -> F64:
-    """Return the mean squared errors of the light that eyes receive, compared with carried targets.
+    """Return the mean squared errors of the light that reaches the eyes, compared with carried targets.
 
-    A carried target is a picture that is treated as painted on the centre panel (docs/contracts.md). A pixel counts if
-    all its rays cross every panel at least half a pixel inside the panel's edge.
+    A carried target is a picture treated as if it were painted on the centre panel (docs/contracts.md). A pixel counts
+    if all its rays cross every panel at least half a pixel inside the panel's edge.
 
     Args:
         layers: (N, H, W, 3 or 4) code values, rear to front.
-        targets: (h, w, 3) intensities for each of the eyes `solved_for_m`.
+        targets: (h, w, 3) intensities, for each of the eyes `solved_for_m`.
         solved_for_m: (2, 3) eyes that the layers were solved for, in frame `stack`.
         eyes_m: (2, 3) true eyes in frame `stack`.
-        fov_deg: Horizontal field of view of the targets.
+        fov_deg: The targets' horizontal field of view.
         sampling: Rays to trace.
 
     Returns:
-        (1 + groups,) errors. The first error covers all rows. Each of the other errors covers one of the interleaved
-        groups of rows; the scatter of these errors gives the standard error of the first. For nearly perfect light, an
-        error can be negative because the rays are random.
+        (1 + groups,) errors. The first is over all rows. Each of the others is over one of the interleaved groups of
+        rows; their scatter gives the first one's standard error. If the light is nearly perfect, an error can be
+        negative because the rays are random.
 
     Raises:
         ValueError: An eye is not in front of every panel, or no pixel counts.
@@ -137,18 +137,18 @@ def _squared_error(
 def view_of(
     side: int, nominal_m: F64, true_m: F64, target: F32, stack: PanelStack, *, fov_deg: float, pupil_mm: float
 ) -> LightView:
-    """Return the target and the rays of one eye.
+    """Return one eye's target and rays.
 
     Args:
         side: 0 for the left eye, 1 for the right eye.
-        nominal_m: (3,) eye that the layers were solved for, in frame `stack`.
-        true_m: (3,) true position of the eye in frame `stack`.
+        nominal_m: (3,) eye position that the layers were solved for, in frame `stack`.
+        true_m: (3,) true eye position in frame `stack`.
         target: (h, w, 3) intensities that the nominal eye should see.
-        fov_deg: Horizontal field of view of the target.
-        pupil_mm: Diameter of the pupil. If 0, the eye is a pinhole.
+        fov_deg: The target's horizontal field of view.
+        pupil_mm: Pupil diameter. If 0, the eye is a pinhole.
 
     Raises:
-        ValueError: The nominal eye or a point of the true eye's pupil is not in front of every panel.
+        ValueError: The nominal eye, or a point on the true eye's pupil, is not in front of every panel.
     """
     height, width = target.shape[:2]
     rays = Rays.of_eye(checked_eye(nominal_m, stack), width_px=width, height_px=height, fov_deg=fov_deg)
@@ -159,18 +159,18 @@ def view_of(
 
 
 def first_ray(side: int) -> int:
-    """Return the number of an eye's first ray. Rays of the left (0) and right (1) eye share no number."""
+    """Return the number of an eye's first ray. The left (0) and right (1) eye share no ray numbers."""
     return side << 40
 
 
 def panels_from_centre(true_m: F64, stack: PanelStack) -> F64:
-    """Return the homographies from pixels of the centre panel to pixels of every layer.
+    """Return the homographies from centre-panel pixels to the pixels of every layer.
 
     Args:
         true_m: (..., 3) eyes in frame `stack`.
 
     Returns:
-        (..., N, 3, 3) homographies along the rays of each eye.
+        (..., N, 3, 3) homographies along each eye's rays.
     """
     centre = stack.panel(stack.count // 2)
     x, y, z = np.moveaxis(true_m[..., None], -2, 0)

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 HALF_PI = np.pi / 2
 Branch = Literal[1, 2]
 T = TypeVar("T", bound=np.floating[Any])
-# Panel values before any solving, by the number of panels. The sum over the panels is in the middle of a slope of sin².
+# Panel values before any solving, keyed by the number of panels. They add up to the middle of a slope of sin².
 REST = {2: 0.75, 3: 0.5, 4: 0.375, 5: 0.5}
 
 
 def rest_value(panels: int) -> float:
-    """Return the value in [0, 1] that every panel of a stack of `panels` panels has before any solving."""
+    """Return the value in [0, 1] that every panel has before any solving, in a stack of `panels` panels."""
     return REST.get(panels, 1.5 / panels)
 
 
@@ -25,16 +25,16 @@ def rest_code(panels: int) -> int:
 
 
 def intensity_from_phase(phase: NDArray[T]) -> NDArray[T]:
-    """Return the intensity sin²(π/2·phase), equation (7), for a sum of panel values. The dtype is kept."""
+    """Return the intensity sin²(π/2·phase) for a sum of panel values, equation (7). Keeps the dtype."""
     result: NDArray[T] = np.sin(phase * HALF_PI) ** 2
     return result
 
 
 def phase_from_intensity(intensity: NDArray[T], branch: Branch = 2) -> NDArray[T]:
-    """Return the sum of panel values that produces an intensity, which is clipped to [0, 1].
+    """Return the sum of panel values that produces an intensity. Intensities are clipped to [0, 1].
 
-    The sum is the phase in units of π/2. It is in [0, 1] on branch 1 and in [1, 2] on branch 2. If the stack has three
-    panels, branch 2 keeps the outer panels far from their limits.
+    The sum is the phase in units of π/2, in [0, 1] on branch 1 and in [1, 2] on branch 2. With three panels, branch 2
+    keeps the outer panels far from their limits.
     """
     root = np.arcsin(np.sqrt(np.clip(intensity, 0.0, 1.0))) / HALF_PI
     result: NDArray[T] = root if branch == 1 else 2 - root

@@ -1,4 +1,4 @@
-"""Default pupil diameter and tracking error of an eye (docs/mathematics.md, Light)."""
+"""Default pupil diameter and tracking error (docs/mathematics.md, Light)."""
 
 PUPIL_MM = 4.0  # diameter
-TRACKING_SIGMA_MM = 1.0  # standard deviation along each axis of a good tracker's error, which both eyes share
+TRACKING_SIGMA_MM = 1.0  # standard deviation, along each axis, of a good tracker's error, which both eyes share

@@ -1,4 +1,4 @@
-"""Displayed quality (docs/contracts.md): PSNR and SSIM of the images seen through the layers."""
+"""Displayed quality (docs/contracts.md): PSNR and SSIM of images seen through the layers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from runtime.optics.retina import Mask, strips
 from runtime.records import F32
 
-HALF_WINDOW = 5  # pixels of SSIM's window on each side of its central pixel
+HALF_WINDOW = 5  # pixels on each side of the central pixel in the SSIM window
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,12 +31,12 @@ def psnr_db(mean_squared_error: float) -> float:
 def ssim(a: F32, b: F32, mask: Mask) -> float:
     """Return the mean structural similarity of two images over a mask (Wang et al. 2004).
 
-    The window is an 11x11 Gaussian with a sigma of 1.5 pixels.
+    The window is an 11x11 Gaussian with a standard deviation of 1.5 pixels.
 
     Args:
         a: (h, w, C) image with intensities in [0, 1].
         b: Image of the same shape.
-        mask: (h, w) pixels to average over.
+        mask: (h, w) mask of the pixels to average over.
     """
 
     def blur(x: F32) -> F32:
@@ -47,7 +47,8 @@ def ssim(a: F32, b: F32, mask: Mask) -> float:
     for rows in strips(len(mask)):
         if not mask[rows].any():
             continue
-        # Add half a window at both ends, which completes the windows of all rows. OpenCV mirrors the image's border.
+        # Add half a window at both ends so that every row has a complete window. OpenCV mirrors the image at its
+        # border.
         first = max(rows.start - HALF_WINDOW, 0)
         around, inside = slice(first, rows.stop + HALF_WINDOW), slice(rows.start - first, rows.stop - first)
         x, y = a[around], b[around]
@@ -74,13 +75,13 @@ def quality(seen: Sequence[F32], targets: Sequence[F32], masks: Sequence[Mask], 
     """Return the displayed quality of the images that the eyes see.
 
     Args:
-        seen: (h, w, 3) image of each eye, with intensities in [0, 1].
-        targets: (h, w, 3) picture that each eye should see.
-        masks: (h, w) pixels of each image that count.
-        similarity: Compute the SSIM. If False, the SSIM is NaN.
+        seen: For each eye, the (h, w, 3) image it sees, with intensities in [0, 1].
+        targets: For each eye, the (h, w, 3) picture it should see.
+        masks: For each eye, an (h, w) mask of the pixels that count.
+        similarity: True to compute the SSIM. If False, the SSIM is NaN.
 
     Raises:
-        ValueError: No pixel of an eye's image counts.
+        ValueError: No pixel in one of the images counts.
     """
     errors, weights, per_eye, similarities = 0.0, 0, [], []
     for image, target, mask in zip(seen, targets, masks, strict=True):

@@ -1,4 +1,4 @@
-"""Rectangles of whole pixels, such as the region of a raster that is drawn, solved or shown."""
+"""Rectangles of whole pixels, such as the part of a raster that is drawn, solved or shown."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from runtime.optics.stack import PlaneRaster
 
 @dataclass(frozen=True, slots=True)
 class PixelRect:
-    """Rectangle of the pixels of a raster with u0 <= u < u1 and v0 <= v < v1.
+    """Rectangle of raster pixels, with u0 <= u < u1 and v0 <= v < v1.
 
-    The u axis points right and the v axis down. The rectangle is empty if u1 <= u0 or v1 <= v0.
+    u points right and v points down. The rectangle is empty if u1 <= u0 or v1 <= v0.
     """
 
     u0: int
@@ -34,7 +34,7 @@ class PixelRect:
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """Slices of rows and columns that select this rectangle in an image."""
+        """Row and column slices that select this rectangle in an image."""
         return slice(self.v0, self.v1), slice(self.u0, self.u1)
 
     def beside(self, *, width_px: int, height_px: int) -> list[PixelRect]:
@@ -50,11 +50,11 @@ class PixelRect:
         return [box for box in boxes if box.width_px and box.height_px]
 
     def in_rows(self, rows: int) -> list[PixelRect]:
-        """Split the rectangle into rectangles with at most `rows` rows each."""
+        """Split the rectangle into rectangles of at most `rows` rows each."""
         return [PixelRect(self.u0, v, self.u1, min(v + rows, self.v1)) for v in range(self.v0, self.v1, rows)]
 
     def cut(self, raster: PlaneRaster) -> PlaneRaster:
-        """Return the part of a raster that this rectangle selects."""
+        """Return the part of a raster selected by this rectangle."""
         return replace(
             raster,
             left_m=raster.left_m + self.u0 * raster.pitch_u_m,
@@ -65,9 +65,9 @@ class PixelRect:
 
 
 def union(boxes: Sequence[PixelRect]) -> PixelRect:
-    """Return the smallest rectangle that contains all non-empty rectangles.
+    """Return the smallest rectangle that contains every non-empty rectangle.
 
-    If every rectangle is empty, the result is empty.
+    If all the rectangles are empty, so is the result.
     """
     filled = [box for box in boxes if box.width_px and box.height_px]
     if not filled:

@@ -1,13 +1,14 @@
-"""Relief, the content's depth relative to the middle panel, and its effect when the eyes move.
+"""Relief, which is the content's depth relative to the middle panel, and its effect as the eyes move.
 
 Let o be the midpoint between the eyes, and x = r the plane of the middle panel. Seen from o, a content point at depth x
-appears at a point c of this plane, measured from the plane's origin. The relief of the content point is b = (x - r) /
-(o_x - x). When the midpoint moves to n, the content that now appears at c previously appeared at
+appears at a point c on this plane, measured from the plane's origin. The content point's relief is b = (x - r) / (o_x -
+x). When the midpoint moves to n, the content that now appears at c previously appeared at
 
     c + b·((k·n - o) + (1 - k)·c),    k = (o_x - r) / (n_x - r)        (in y and z only).
 
-Content on the middle panel has relief 0 and does not move; `alignment` treats all content in this way. The ray from the
-old midpoint through the previous point on the middle panel crosses every other panel at the corresponding pixel.
+Content on the middle panel has relief 0 and does not move; `alignment` treats all content as if it were there. On every
+other panel, the corresponding pixel is where the ray from the old midpoint through the previous point on the middle
+panel crosses that panel.
 """
 
 from __future__ import annotations
@@ -23,33 +24,33 @@ from numpy.typing import NDArray
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, Parallax
 
-WIDEST_PX = 480  # maximum number of columns of a relief; more columns do not give finer outlines
-RIM_PX = 2  # relief pixels by which nearer content is dilated to make its outline move with it
-COARSE_RIM_PX = 1  # like RIM_PX, for a coarse raster, whose relief has fewer pixels
+WIDEST_PX = 480  # maximum number of columns in a relief; more columns would not give finer outlines
+RIM_PX = 2  # relief pixels that nearer content is dilated by, so that its outline moves with it
+COARSE_RIM_PX = 1  # RIM_PX for coarse rasters, whose reliefs have fewer pixels
 
 Pixels = NDArray[np.floating[Any]]
 
 
 def block_px(width_px: int) -> int:
-    """Return the side, in raster pixels, of the square block that one relief pixel covers.
+    """Return the side, in raster pixels, of the square block covered by one relief pixel.
 
-    The side is the same for a coarse raster, whose pixels are larger.
+    A coarse raster uses the same number, although its pixels are larger.
 
     Args:
-        width_px: Number of columns of the full raster.
+        width_px: Number of columns in the full raster.
     """
     return -(-width_px // WIDEST_PX)
 
 
 def relief_of(nearness: Sequence[F32], *, distance_m: Sequence[float], rim_px: int = RIM_PX) -> F32:
-    """Combine the depth that the two eyes see into one (h, w) relief.
+    """Combine the depth seen by the two eyes into one (h, w) relief.
 
-    Each pixel takes the eye's relief that has the larger magnitude. The background has relief 0.
+    Each pixel takes whichever eye's relief has the larger magnitude. The background has relief 0.
 
     Args:
-        nearness: For each eye, (h, w) inverse distances from the eye along x in 1/m. The background is 0.
-        distance_m: Distance of each eye from the middle panel along x.
-        rim_px: Number of relief pixels by which nearer content is dilated.
+        nearness: For each eye, the (h, w) inverse distances from the eye along x, in 1/m. The background is 0.
+        distance_m: Each eye's distance from the middle panel along x.
+        rim_px: Number of relief pixels that nearer content is dilated by.
     """
     rim = np.ones((2 * rim_px + 1,) * 2, np.uint8)
     reliefs = []
@@ -61,14 +62,14 @@ def relief_of(nearness: Sequence[F32], *, distance_m: Sequence[float], rim_px: i
 
 
 def parallax(stack: PanelStack, *, old_m: F64, new_m: F64) -> Parallax | None:
-    """Return the motion of the content on the panels when the midpoint between the eyes moves.
+    """Return how the content moves on the panels when the midpoint between the eyes moves.
 
     Args:
         old_m: (3,) midpoint that the layers were solved for, in frame `stack`.
         new_m: (3,) current midpoint in frame `stack`.
 
     Returns:
-        The motion, or None if the midpoint has not moved or the even number of panels leaves no middle panel.
+        The motion, or None if the midpoint has not moved or there is no middle panel (an even number of panels).
     """
     if stack.count % 2 == 0 or np.array_equal(old_m, new_m):
         return None
@@ -79,7 +80,7 @@ def parallax(stack: PanelStack, *, old_m: F64, new_m: F64) -> Parallax | None:
     places, weights = [], []
     for n in range(stack.count):
         raster = stack.panel(n)
-        # Project from this panel to the middle panel along the rays of the new midpoint.
+        # Project from this panel to the middle panel along rays from the new midpoint.
         scale = (new_m[0] - middle.x_m) / (new_m[0] - raster.x_m)
         matrix = np.diag([scale * raster.pitch_u_m / middle.pitch_u_m, scale * raster.pitch_v_m / middle.pitch_v_m, 1])
         y_m, z_m = new_m[1:] + (np.array([raster.left_m, raster.top_m]) - new_m[1:]) * scale
@@ -95,9 +96,9 @@ def parallax(stack: PanelStack, *, old_m: F64, new_m: F64) -> Parallax | None:
 
 @dataclass(frozen=True, slots=True)
 class Displacement:
-    """Correction of a panel's alignment for content off the middle panel.
+    """Correction to a panel's alignment for content off the middle panel.
 
-    The fields are those of `Parallax` for a single panel, and the relief of the content.
+    The fields are the content's relief and the fields of `Parallax` for a single panel.
     """
 
     relief: F32  # (h, w)
@@ -110,12 +111,12 @@ class Displacement:
         """Return the displacements to add to the aligned positions of the panel's pixels.
 
         Args:
-            columns: Horizontal positions of the pixels' centres.
-            rows: Vertical positions of the pixels' centres.
-            size_px: Width and height of the panel in pixels.
+            columns: Horizontal positions of the pixel centres.
+            rows: Vertical positions of the pixel centres.
+            size_px: Panel width and height in pixels.
 
         Returns:
-            Displacements to the right and displacements down, each (rows, columns) in panel pixels.
+            Displacements to the right and displacements down, each with shape (rows, columns), in panel pixels.
         """
         scale_u, scale_v = self.middle_from_shown[0, 0], self.middle_from_shown[1, 1]
         u = columns * scale_u + self.middle_from_shown[0, 2]
@@ -143,9 +144,9 @@ def displacement(relief: F32 | None, parallax: Parallax | None, panel: int) -> D
 
 
 def _between_centres(place: Pixels, count: int) -> tuple[NDArray[np.intp], F32]:
-    """Return the last of `count` pixel centres before each position, and the distance from the centre.
+    """Return the last of `count` pixel centres before each position, and the distance between the two.
 
-    The centre is returned as an index. Positions outside the outermost centres are clamped.
+    The centre is given by its index. Positions beyond the outermost centres are clamped.
     """
     inside = np.clip(place - 0.5, 0.0, count - 1.0)
     low = np.floor(inside)

@@ -1,4 +1,4 @@
-"""Simulate the images that an eye sees through the layers with a pinhole or a finite pupil."""
+"""Simulate the images seen through the layers by an eye with a pinhole or a finite pupil."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from runtime.records import F32, F64, U8
 
 Mask = NDArray[np.bool_]
 
-STRIP_ROWS = 32  # rows that are processed together because they fit in the cache
+STRIP_ROWS = 32  # rows processed together, few enough to fit in the cache
 
 
 @dataclass(frozen=True, slots=True)
 class Retina:
-    """Image that an eye sees, and a mask of the pixels that count in measurements of quality."""
+    """Image seen by an eye, and a mask of the pixels that count when quality is measured."""
 
     image: F32  # (h, w, 3) in [0, 1]
     mask: Mask  # (h, w) True for rays that cross every panel at least half a pixel inside the panel's edge
@@ -35,7 +35,7 @@ class Retina:
 
 
 def strips(rows: int) -> Iterator[slice]:
-    """Return slices of an image's rows that are small enough to stay in the cache between operations."""
+    """Return slices of an image's rows, each small enough to stay in the cache between operations."""
     return (slice(start, min(start + STRIP_ROWS, rows)) for start in range(0, rows, STRIP_ROWS))
 
 
@@ -44,11 +44,11 @@ def _planes(layer: NDArray[np.uint8] | F32) -> list[F32]:
 
 
 class _Samples:
-    """Bilinear sampling at (h, w) positions. Weights and indices are computed once for all channels."""
+    """Bilinear sampler for (h, w) positions. Computes weights and indices once for all channels."""
 
     def __init__(self, u: F32, v: F32, shape: tuple[int, ...]) -> None:
         height, width = shape[:2]
-        # A ray that never meets the panel has the position NaN, which fmax and fmin ignore.
+        # The position is NaN for a ray that never meets the panel. fmax and fmin ignore NaN.
         x = np.fmin(np.fmax(u - np.float32(0.5), np.float32(0)), np.float32(width - 1))
         y = np.fmin(np.fmax(v - np.float32(0.5), np.float32(0)), np.float32(height - 1))
         self._corner = np.empty((*x.shape, 2), np.int16)
@@ -58,7 +58,7 @@ class _Samples:
         self._right, self._below = slice(min(1, width - 1), None), slice(min(1, height - 1), None)
 
     def of(self, plane: F32) -> F32:
-        """Return the (h, w) samples of one channel (H, W) of a layer."""
+        """Return (h, w) samples from one (H, W) channel of a layer."""
         right, below = self._right, self._below
         no_second_map: Any = None  # OpenCV accepts None, but its type stubs do not
         top, top_right, bottom, bottom_right = (
@@ -72,7 +72,7 @@ class _Samples:
 
 
 def _mix(a: F32, b: F32, weight: F32) -> None:
-    """Overwrite `a` with a + (b - a)·weight, and `b` with an intermediate result."""
+    """Overwrite `a` with a + (b - a)·weight. Also overwrites `b`, with an intermediate result."""
     b -= a
     b *= weight
     a += b
@@ -80,15 +80,15 @@ def _mix(a: F32, b: F32, weight: F32) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Rays:
-    """Rays from an eye that looks at the stack's origin, through the centres of its image's pixels."""
+    """Rays from an eye that looks at the stack's origin, through the pixel centres of its image."""
 
     from_stack: F64  # (3, 4) projection from frame `stack` to the image (`image_from_stack`)
-    u: F64  # (w,) horizontal positions of the pixels' centres
-    v: F64  # (h, 1) vertical positions of the pixels' centres
+    u: F64  # (w,) horizontal positions of the pixel centres
+    v: F64  # (h, 1) vertical positions of the pixel centres
 
     @classmethod
     def of_eye(cls, eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg: float) -> Rays:
-        """Create the rays of an eye (3,) in frame `stack`. `fov_deg` is the horizontal field of view."""
+        """Create the rays for an eye at (3,) in frame `stack`. `fov_deg` is the horizontal field of view."""
         return cls(
             image_from_stack(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg),
             np.arange(width_px, dtype=np.float64) + 0.5,
@@ -100,11 +100,11 @@ class Rays:
         return len(self.v), len(self.u)
 
     def on(self, raster: PlaneRaster, rows: slice = slice(None), *, moved: F64 | None = None) -> tuple[F64, F64]:
-        """Return the positions u and v, in raster pixels, at which rays cross a raster (M_RPU).
+        """Return the positions u and v where rays cross a raster, in raster pixels (M_RPU).
 
         Args:
-            rows: Rows of the image whose rays are traced.
-            moved: (3, 3) homography that is applied to the positions afterwards.
+            rows: Image rows whose rays are traced.
+            moved: (3, 3) homography to apply to the positions afterwards.
 
         Returns:
             u and v, each (h, w) for h traced rows.
@@ -118,17 +118,17 @@ class Rays:
             return (h[0, 0] * u + h[0, 1] * v + h[0, 2]) / weight, (h[1, 0] * u + h[1, 1] * v + h[1, 2]) / weight
 
     def toward_panels(self) -> Mask:
-        """Return an (h, w) mask of the rays that go towards the panels rather than away from them."""
+        """Return an (h, w) mask of the rays that point towards the panels rather than away from them."""
         toward = self.toward()
         result: Mask = toward[0] * self.u + toward[1] * self.v + toward[2] < 0.0
         return result
 
     def toward(self) -> F64:
-        """Return the (3,) coefficients of (u, v, 1) whose sum is a ray's x component in frame `stack`.
+        """Return the (3,) vector whose dot product with (u, v, 1) is a ray's x component in frame `stack`.
 
         The x component is negative for rays towards the panels.
         """
-        # The direction of a ray is the inverse of the projection's left 3x3 part times (u, v, 1).
+        # A ray's direction is the inverse of the projection's left 3x3 part, times (u, v, 1).
         return np.asarray(np.linalg.inv(self.from_stack[:, :3])[0])
 
 
@@ -141,16 +141,16 @@ def seen_by(
     width_px: int | None = None,
     height_px: int | None = None,
 ) -> Retina:
-    """Compute the image of a pinhole eye from the sum of panel values along each ray.
+    """Compute the image seen by a pinhole eye from the sum of panel values along each ray.
 
-    The image follows equations (6) and (7) of the supplement.
+    Implements equations (6) and (7) of the supplement.
 
     Args:
         eye_m: (3,) eye in frame `stack`.
         layers: (N, H, W, 3 or 4) layers, rear to front, as code values or float in [0, 1]. A fourth channel is ignored.
-        fov_deg: Horizontal field of view of the image.
-        width_px: Width of the image. By default, the width of the layers.
-        height_px: Height of the image. By default, the height of the layers.
+        fov_deg: The image's horizontal field of view.
+        width_px: Image width. By default, the layers' width.
+        height_px: Image height. By default, the layers' height.
 
     Raises:
         ValueError: The eye is not in front of every panel.
@@ -165,9 +165,9 @@ def seen_by(
 
 
 def _moved(stack: PanelStack, index: int, eye_m: F64) -> F64 | None:
-    """Return the 3x3 homography from pixels of the ideal panel to pixels of the layer, seen from an eye.
+    """Return the 3x3 homography from ideal-panel pixels to layer pixels as seen from an eye.
 
-    The result is None if the panels are parallel, which makes the homography an identity.
+    Returns None if the panels are parallel, because the homography is then the identity.
     """
     if stack.tilt is None:
         return None
@@ -175,7 +175,7 @@ def _moved(stack: PanelStack, index: int, eye_m: F64) -> F64 | None:
 
 
 def checked_eye(eye_m: ArrayLike, stack: PanelStack) -> F64:
-    """Return an eye (3,) as float64. Raises ValueError unless the eye is in front of every panel."""
+    """Return a (3,) eye as float64. Raises ValueError unless the eye is in front of every panel."""
     eye = np.asarray(eye_m, dtype=np.float64)
     if not np.isfinite(eye).all() or eye[0] <= max(stack.x_m):
         raise ValueError("the eye must be in front of every panel")
@@ -185,14 +185,14 @@ def checked_eye(eye_m: ArrayLike, stack: PanelStack) -> F64:
 def through_layers(
     layers: U8 | F32, positions: Callable[[slice], Iterable[tuple[F64, F64]]], mask: Mask, stack: PanelStack
 ) -> Retina:
-    """Compute an image by adding panel values along rays whose positions on each panel are given.
+    """Compute an image by adding up panel values along rays, given their positions on each panel.
 
     Args:
         layers: (N, H, W, 3 or 4) layers, rear to front, as code values or float in [0, 1]. A fourth channel is ignored.
-        positions: Function from a slice of the image's rows to positions u and v on every panel, rear to front, each
-            (h, w) in panel pixels.
-        mask: (h, w) rays that may count. The mask of the result excludes all rays that miss a panel or cross it less
-            than half a pixel inside its edge.
+        positions: Function that maps a slice of image rows to positions u and v on every panel, rear to front, each (h,
+            w) in panel pixels.
+        mask: (h, w) mask of the rays that may count. The result's mask also excludes rays that miss a panel or cross it
+            less than half a pixel inside its edge.
     """
     image, counted = np.empty((*mask.shape, 3), np.float32), mask.copy()
     planes = [_planes(layer[..., :3]) for layer in layers]
@@ -210,14 +210,14 @@ def through_layers(
 
 
 def as_codes(image: F32) -> U8:
-    """Clip intensities (...) to [0, 1] and convert them to 8-bit code values."""
+    """Clip intensities of any shape to [0, 1] and convert them to 8-bit code values."""
     return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def pupil_points(diameter_m: float, rings: int = 2) -> F64:
     """Return (K, 2) points that cover a round pupil evenly.
 
-    A point is an offset to the right and up from the pupil's centre, in metres. The first point is the centre.
+    Each point is an offset (right, up) from the pupil's centre in metres. The first point is the centre.
     """
     points = [(0.0, 0.0)]
     for ring in range(1, rings + 1):
@@ -228,7 +228,7 @@ def pupil_points(diameter_m: float, rings: int = 2) -> F64:
 
 
 def average(images: Iterable[F32]) -> F32:
-    """Return the (h, w, C) mean of the images seen from the points of a finite pupil.
+    """Return the (h, w, C) mean of the images seen from the points on a finite pupil.
 
     Raises ValueError if there are no images.
     """

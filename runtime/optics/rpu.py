@@ -1,6 +1,6 @@
-"""Reverse perspective uniform (RPU), the map from pixels of an eye's image to pixels of a panel.
+"""Reverse perspective uniform (RPU), the map from pixels in an eye's image to panel pixels.
 
-The map is defined by equations (40)-(47) of the supplement, whose misprints are corrected in docs/mathematics.md.
+The map is defined by equations (40)-(47) of the supplement. Their misprints are corrected in docs/mathematics.md.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from runtime.records import F64
 def panel_from_image(image_from_stack: F64, raster: PlaneRaster) -> F64:
     """Return M_RPU (equation (47)), the 3x3 homography from image pixels to panel pixels.
 
-    The homography is computed as an adjugate, which stays accurate at grazing angles, and scaled to a largest magnitude
-    of 1.
+    The homography is computed as an adjugate, which stays accurate at grazing angles, and is scaled so that its largest
+    entry has magnitude 1.
 
     Args:
         image_from_stack: (3, 4) projection from frame `stack` to the eye's image.
@@ -27,7 +27,7 @@ def panel_from_image(image_from_stack: F64, raster: PlaneRaster) -> F64:
     h = image_from_raster(image_from_stack, raster)
     adjugate = np.array([np.cross(h[:, 1], h[:, 2]), np.cross(h[:, 2], h[:, 0]), np.cross(h[:, 0], h[:, 1])])
     scale = np.abs(adjugate).max()
-    # A determinant below `noise` may be nothing but the rounding error of the sum in the last column of h.
+    # A determinant below `noise` may be nothing more than rounding error from the sum in the last column of h.
     terms = np.abs(image_from_stack) @ np.abs([raster.x_m, raster.left_m, raster.top_m, 1.0])
     noise = 64 * np.finfo(np.float64).eps * float(terms @ np.abs(adjugate[2]))
     if not np.isfinite(scale) or scale == 0.0 or abs(adjugate[2] @ h[:, 2]) <= noise:

@@ -1,4 +1,4 @@
-"""Geometry of the stack of panels, and of pixel grids on planes parallel to the panels."""
+"""Geometry of the panel stack, and of pixel grids on planes parallel to the panels."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import numpy as np
 
 from runtime.records import F64
 
-UNEVEN_MOST = 0.15  # maximum of (largest gap - smallest gap) / mean gap for the shipped networks (docs/models.md)
+UNEVEN_MOST = 0.15  # maximum (largest gap - smallest gap) / mean gap for the shipped networks (docs/models.md)
 
 
 @dataclass(frozen=True, slots=True)
 class PlaneRaster:
-    """Pixel grid on the plane x = x_m of frame `stack`. u points along +y (right) and v along -z (down).
+    """Pixel grid on the plane x = x_m in frame `stack`. u points along +y (right) and v along -z (down).
 
-    Pixel coordinates are continuous, and pixel centres are at half-integers. The pixel position (u, v) is at
-    y = left_m + u·pitch_u_m and z = top_m - v·pitch_v_m.
+    Pixel coordinates are continuous, with pixel centres at half-integers. The pixel position (u, v) lies at y = left_m
+    + u·pitch_u_m and z = top_m - v·pitch_v_m.
     """
 
     x_m: float
@@ -32,11 +32,11 @@ class PlaneRaster:
         return np.array([[0.0, 0.0, self.x_m], [self.pitch_u_m, 0.0, self.left_m], [0.0, -self.pitch_v_m, self.top_m]])
 
     def plane_from_raster(self) -> F64:
-        """Return the 3x3 matrix from pixels (u, v, 1) to points (y, z, 1) of the raster's plane."""
+        """Return the 3x3 matrix from pixels (u, v, 1) to points (y, z, 1) on the raster's plane."""
         return np.array([[self.pitch_u_m, 0.0, self.left_m], [0.0, -self.pitch_v_m, self.top_m], [0.0, 0.0, 1.0]])
 
     def raster_from_plane(self) -> F64:
-        """Return the 3x3 matrix from points (y, z, 1) of the raster's plane to pixels (u, v, 1)."""
+        """Return the 3x3 matrix from points (y, z, 1) on the raster's plane to pixels (u, v, 1)."""
         return np.array(
             [
                 [1.0 / self.pitch_u_m, 0.0, -self.left_m / self.pitch_u_m],
@@ -50,13 +50,13 @@ class PlaneRaster:
 class Tilt:
     """Slopes of panels that are not quite parallel, and the position they were registered from."""
 
-    depth: tuple[tuple[float, float, float], ...]  # (d, r, u) of each panel's plane x = x_m + d + r·y + u·z
+    depth: tuple[tuple[float, float, float], ...]  # (d, r, u) for each panel's plane, x = x_m + d + r·y + u·z
     seen_from_m: tuple[float, float, float]  # frame `stack`
 
 
 @dataclass(frozen=True, slots=True)
 class PanelStack:
-    """Geometry of the display: parallel or nearly parallel panels of equal size, from rear to front."""
+    """Display geometry: parallel or nearly parallel panels of equal size, from rear to front."""
 
     width_m: float
     height_m: float
@@ -71,14 +71,14 @@ class PanelStack:
 
     @property
     def is_evenly_spaced(self) -> bool:
-        """True if the gaps between the panels differ little enough for the shipped networks (`UNEVEN_MOST`)."""
+        """True if the gaps between panels are even enough for the shipped networks (`UNEVEN_MOST`)."""
         gaps = np.diff(self.x_m)
         return bool(gaps.size == 0 or np.ptp(gaps) <= UNEVEN_MOST * gaps.mean())
 
     def reduced(self, reduction: int) -> PanelStack:
-        """Return a stack of the same size in metres with fewer pixels.
+        """Return a stack with the same size in metres but fewer pixels.
 
-        The numbers of rows and columns are divided by `reduction`. At least one row and one column remain.
+        The rows and columns are divided by `reduction`, with at least one of each left.
         """
         if reduction == 1:
             return self
@@ -94,7 +94,7 @@ class PanelStack:
         return PanelStack(self.height_m, self.width_m, self.x_m, self.height_px, self.width_px, tilt)
 
     def panel(self, index: int) -> PlaneRaster:
-        """Return the pixel grid of panel `index`, which is treated as parallel to the other panels."""
+        """Return the pixel grid of panel `index`, treating the panel as parallel to the others."""
         return PlaneRaster(
             x_m=self.x_m[index],
             left_m=-self.width_m / 2,

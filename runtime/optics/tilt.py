@@ -1,13 +1,12 @@
-"""Homographies that correct the layers of tilted panels for the position of an eye.
+"""Homographies that correct the layers of tilted panels for an eye's position.
 
-Each panel is modelled by an ideal panel, which is parallel to the others and at the nominal x_m. Registration by
-photographs places every pixel of a layer where an eye at `seen_from_m` sees the pixel on the ideal panel. From any
-other position, including the position of the other eye, the pixels of a tilted panel appear displaced.
+For each panel, there is an ideal panel, which is parallel to the others and lies at the nominal x_m. Registration from
+photographs maps every layer pixel to the point where an eye at `seen_from_m` sees it on the ideal panel. Seen from
+anywhere else, including the other eye's position, the pixels of a tilted panel appear displaced.
 
-A ray of the eye through a point of the ideal panel meets the tilted plane at a point q. The line from `seen_from_m`
-through q meets the ideal panel at the pixel of the layer that the eye sees. Both steps are projections from plane to
-plane, so their composition is a homography. The homography is affine if the eye and `seen_from_m` are equally far from
-the panel.
+A ray from the eye through a point on the ideal panel meets the tilted plane at a point q. The line from `seen_from_m`
+through q meets the ideal panel at the layer pixel that the eye sees. Both steps are projections from one plane to
+another, so together they form a homography. It is affine if the eye and `seen_from_m` are equally far from the panel.
 """
 
 from __future__ import annotations
@@ -20,15 +19,15 @@ from runtime.optics.stack import PanelStack, PlaneRaster, Tilt
 from runtime.records import F64
 
 Triple = tuple[float, float, float]
-UNSEEN_PX = 0.05  # smaller displacements, in panel pixels, are ignored
+UNSEEN_PX = 0.05  # displacements smaller than this, in panel pixels, are ignored
 
 
 def layer_from_seen(stack: PanelStack, index: int, eye_m: F64) -> F64:
     """Return the 3x3 homography from the ideal panel's points (y, z, 1) to the layer's points (y, z, 1).
 
     Args:
-        index: Number of the panel.
-        eye_m: (3,) eye that sees the ideal panel, in frame `stack`.
+        index: Panel number.
+        eye_m: (3,) eye looking at the ideal panel, in frame `stack`.
     """
     if stack.tilt is None or not any(stack.tilt.depth[index]):
         return np.eye(3)
@@ -36,16 +35,16 @@ def layer_from_seen(stack: PanelStack, index: int, eye_m: F64) -> F64:
 
 
 def layer_pixels_from_seen(raster: PlaneRaster, layer_from_seen_m: F64) -> F64:
-    """Convert a homography of `layer_from_seen` from metres to pixels of a raster."""
+    """Convert a `layer_from_seen` homography from metres to raster pixels."""
     return raster.raster_from_plane() @ layer_from_seen_m @ raster.plane_from_raster()
 
 
 def coarse_layer_from_seen(stack: PanelStack, index: int, eye_m: F64) -> F64:
     """Return the simplest map that approximates `layer_from_seen` closely enough.
 
-    The candidates are, in this order, the identity, a scale and a shift (fast to resample), an affine map, and the
-    exact homography. The first candidate is returned that deviates by at most `UNSEEN_PX` at nine points: the corners
-    of the panel, the middles of its edges, and its centre.
+    The candidates are tried in this order: the identity, a scale and shift (fast to resample), an affine map, and the
+    exact homography. The first one that deviates by at most `UNSEEN_PX` at nine points is returned. The points are the
+    panel's corners, the middles of its edges, and its centre.
     """
     if stack.tilt is None or not any(stack.tilt.depth[index]):
         return np.eye(3)
@@ -72,7 +71,7 @@ def _projected(
 ) -> F64:
     """Return the homography that projects the plane x = x_m onto the tilted plane and back.
 
-    The first projection is along the rays of the eye, the second along the rays from `seen_from`.
+    The first projection follows rays from the eye, and the second follows rays from `seen_from`.
     """
     offset_m, right, up = depth
     normal, far = np.array([1.0, -right, -up]), x_m + offset_m
@@ -80,7 +79,7 @@ def _projected(
     ideal = np.array([[0.0, 0.0, x_m], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # (x, y, z) from (y, z, 1)
     weight = normal @ ideal - [0.0, 0.0, normal @ place]
     ray = ideal - np.outer(place, [0.0, 0.0, 1.0])
-    point = np.outer(place, weight) + ray * (far - normal @ place)  # point on the tilted plane times `weight`
+    point = np.outer(place, weight) + ray * (far - normal @ place)  # point on the tilted plane, times `weight`
     ahead = point[0] - origin[0] * weight
     sideways = np.outer(origin[1:], ahead) + (point[1:] - np.outer(origin[1:], weight)) * (x_m - origin[0])
     matrix = np.vstack([sideways, ahead])

@@ -1,6 +1,7 @@
-"""Poses of eyes, and projections onto images and panels.
+"""Eye poses, and projections onto images and panels.
 
-The equations are from sections 2.1 and 3.1 of the EyeReal supplement, corrected as in docs/mathematics.md."""
+The equations come from sections 2.1 and 3.1 of the EyeReal supplement, with the corrections in docs/mathematics.md.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +17,9 @@ from runtime.records import F64
 def stack_from_eye(eye_m: ArrayLike) -> F64:
     """Return the 4x4 pose of an eye that looks at the stack's origin (EyeReal supplement, (10)-(14)).
 
-    The x axis points right and is parallel to the ground, y points up, and z points from the scene towards the eye. The
-    pose of an eye on the vertical axis is the limit from +x (r_x = +y), because the limit depends on the direction of
-    approach.
+    The x axis points right and is parallel to the ground, y points up, and z points from the scene towards the eye. For
+    an eye on the vertical axis, the limit depends on the direction of approach; the pose returned is the limit from +x
+    (r_x = +y).
 
     Raises ValueError if the eye is at the origin or a coordinate is not finite.
     """
@@ -26,7 +27,7 @@ def stack_from_eye(eye_m: ArrayLike) -> F64:
     scale = float(np.abs(eye).max())
     if not np.isfinite(scale) or scale == 0.0:
         raise ValueError(f"an eye at {eye.tolist()} has no direction of gaze")
-    # Scale the eye first, because the squares of 1e-200 and 1e200 exceed the range of float64.
+    # Scale the eye first, because the squares of 1e-200 and 1e200 are outside the float64 range.
     back = eye / scale
     back = back / math.hypot(*back)
     # Use the unscaled eye, because x and y near the vertical axis may be too small to survive the scaling.
@@ -46,10 +47,10 @@ def image_from_camera(*, width_px: int, height_px: int, fov_deg: float) -> F64:
 
 
 def image_from_stack(eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg: float) -> F64:
-    """Return the 3x4 projection from frame `stack` to the image of an eye aimed at the stack's origin.
+    """Return the 3x4 projection from frame `stack` to the image of an eye looking at the stack's origin.
 
     The projection is K·diag(1, -1, -1)·R_e^T·[I | -e] ((31)-(39)). The third homogeneous coordinate is the distance
-    along the gaze in metres, which is positive in front of the eye.
+    along the gaze in metres, positive in front of the eye.
     """
     pose = stack_from_eye(eye_m)
     rotation = np.diag([1.0, -1.0, -1.0]) @ pose[:3, :3].T
@@ -59,10 +60,10 @@ def image_from_stack(eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg
 
 
 def raster_from_stack(eye_m: ArrayLike, raster: PlaneRaster) -> F64:
-    """Return the 3x4 projection from frame `stack`, along an eye's rays, to the pixels of a raster.
+    """Return the 3x4 projection from frame `stack` to raster pixels along an eye's rays.
 
-    The projection equals M_RPU · `image_from_stack` for any image of the eye. The third homogeneous coordinate is the
-    distance along x from the point to the eye, in metres.
+    The projection equals M_RPU · `image_from_stack` for any image seen by the eye. The third homogeneous coordinate is
+    the distance from the point to the eye along x, in metres.
     """
     eye = np.asarray(eye_m, dtype=np.float64)
     depth = raster.x_m - eye[0]
@@ -79,15 +80,15 @@ def raster_from_stack(eye_m: ArrayLike, raster: PlaneRaster) -> F64:
 
 
 def image_from_raster(image_from_stack: F64, raster: PlaneRaster) -> F64:
-    """Return the 3x3 homography from pixels of a raster to pixels of an eye's image (H in (40)-(42))."""
+    """Return the 3x3 homography from raster pixels to pixels in an eye's image (H in (40)-(42))."""
     return image_from_stack[:, :3] @ raster.stack_from_raster() + np.outer(image_from_stack[:, 3], [0.0, 0.0, 1.0])
 
 
 def relative_scale_shift(eye_m: ArrayLike, *, from_x_m: float, to_x_m: float) -> tuple[float, F64]:
-    """Return the scale and the (2,) shift in metres that project a plane onto a parallel plane.
+    """Return the scale, and the (2,) shift in metres, that project a plane onto a parallel plane.
 
-    The ray from the eye through the point p (y, z) of the plane x = from_x_m crosses the plane x = to_x_m at
-    p·scale + shift.
+    The ray from the eye through the point p = (y, z) on the plane x = from_x_m crosses the plane x = to_x_m at p·scale
+    + shift.
 
     Raises ValueError if the eye is in the plane x = from_x_m.
     """

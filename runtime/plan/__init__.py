@@ -1,1 +1,1 @@
-"""Plan which work to skip, measure the savings, and draw the target pictures of a solution."""
+"""Plan which work to skip, measure the savings, and draw target pictures for solutions."""

@@ -1,4 +1,4 @@
-"""Draw the target pictures of a solution. Only this module combines content, views and models."""
+"""Draw the target pictures for a solution. Only this module combines content, views and models."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from runtime.support.gl import DrawnPicture
 
 
 def raster_views(eyes_m: F64, raster: PlaneRaster, *, reduction: int = 1) -> tuple[View, View]:
-    """Return the views in which content is drawn on a raster for the left and the right eye.
+    """Return the left and the right eye's view, used to draw content on a raster.
 
     Args:
         eyes_m: (2, 3) left and right eye in frame `stack`.
-        raster: Pixels to draw on, usually those of the middle panel.
-        reduction: Factor by which the raster has fewer rows and columns than the display's panels.
+        raster: Pixels to draw on, usually the middle panel's.
+        reduction: The panels' number of rows and columns, divided by the raster's.
     """
     left, right = (
         View(eye, side, raster_from_stack(eye, raster), raster.width_px, raster.height_px, reduction)
@@ -35,12 +35,12 @@ def raster_views(eyes_m: F64, raster: PlaneRaster, *, reduction: int = 1) -> tup
 
 
 def retina_view(eye_m: F64, side: int, *, width_px: int, height_px: int, fov_deg: float) -> View:
-    """Return the view in which content is drawn as the image of an eye that looks at the stack's origin.
+    """Return the view used to draw content as seen by an eye that looks at the stack's origin.
 
     Args:
         eye_m: (3,) eye in frame `stack`.
         side: 0 for the left eye, 1 for the right eye.
-        fov_deg: Horizontal field of view of the image.
+        fov_deg: The image's horizontal field of view.
     """
     projection = image_from_stack(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
     return View(eye_m, side, projection, width_px, height_px)
@@ -49,11 +49,11 @@ def retina_view(eye_m: F64, side: int, *, width_px: int, height_px: int, fov_deg
 def retina_pictures(
     content: ContentSource, eyes_m: F64, stack: PanelStack, *, fov_deg: float, time_ns: int
 ) -> tuple[U8, U8]:
-    """Draw the (h, w, 3) pictures that the two eyes should see, in the size of a panel.
+    """Draw the (h, w, 3) pictures that the two eyes should see, with as many pixels as a panel.
 
     Args:
         eyes_m: (2, 3) left and right eye in frame `stack`. Each eye looks at the stack's origin.
-        fov_deg: Horizontal field of view of the pictures.
+        fov_deg: The pictures' horizontal field of view.
         time_ns: Time on the run's clock, for moving content.
     """
     size = {"width_px": stack.width_px, "height_px": stack.height_px}
@@ -74,19 +74,19 @@ def drawn_job(
     before: SolveWindow | None = None,
     in_depth: bool = False,
 ) -> Job:
-    """Draw content for both eyes on the middle panel's pixels, and return a job with these pictures.
+    """Draw content for both eyes on the middle panel's pixels, and return a job with the two pictures.
 
-    Pictures that the content draws with OpenGL stay in textures if the model can read them. Other pictures are arrays
-    that belong to the content source.
+    Pictures that the content draws with OpenGL stay in textures if the model can read them. All other pictures are
+    arrays owned by the content source.
 
     Args:
         eyes_m: (2, 3) left and right eye in frame `stack`.
         time_ns: Time on the run's clock, for moving content.
-        reduction: Factor by which the panels' rows and columns are divided.
-        trimmed: Skip work that the scene does not need (`trim`). If the content knows its extent, the rest of the
-            picture is not even drawn.
-        before: Window of the previous solution, on the same raster.
-        in_depth: Include the relief of the content if the source knows the depth.
+        reduction: Number to divide the panels' rows and columns by.
+        trimmed: True to skip work that the scene does not need (`trim`). If the content knows its extent, the rest of
+            the picture is not even drawn.
+        before: The previous solution's window, on the same raster.
+        in_depth: True to include the content's relief, if the source knows the depth.
 
     Raises:
         ContentFailure: The content could not be drawn.
@@ -106,7 +106,7 @@ def drawn_job(
     content.expect(views, time_ns=time_ns)
     drawn = [_drawn(predictor, content, view, time_ns=time_ns) for view in views]
     relief = _relief(content, views, stack, window, every=block_px(predictor.stack.width_px)) if in_depth else None
-    # Reading back a picture waits until it is complete, so both pictures are drawn before the first is read back.
+    # Reading a picture back waits until it is complete, so draw both pictures before reading either of them back.
     reads_textures = predictor.reads_textures_of(content.draws_in)
     pictures = [p.pixels() if isinstance(p, DrawnPicture) and not reads_textures else p for p in drawn]
     job = Job(Targets(stack, eyes_m, drawn_views(pictures, stack, window)), window=window, relief=relief)
@@ -114,9 +114,9 @@ def drawn_job(
 
 
 def _extent(content: ContentSource, eyes_m: F64, middle: PlaneRaster, *, time_ns: int) -> PixelRect | None:
-    """Return the part of the middle panel outside which both eyes see only the background.
+    """Return the middle-panel box to draw. Outside it, both eyes see only the background.
 
-    The result is None if the content does not know its extent.
+    Returns None if the content does not know its extent.
     """
     views = raster_views(eyes_m, middle)
     boxes = [content.extent(view, time_ns=time_ns) for view in views]
@@ -127,14 +127,14 @@ def _extent(content: ContentSource, eyes_m: F64, middle: PlaneRaster, *, time_ns
 def _relief(
     content: ContentSource, views: tuple[View, View], stack: PanelStack, window: SolveWindow | None, *, every: int
 ) -> F32 | None:
-    """Return the relief on the middle panel of the content that was drawn for both views.
+    """Return the relief, on the middle panel, of the content drawn for both views.
 
-    The result is None if the content source does not know the depth.
+    Returns None if the content source does not know the depth.
 
     Args:
-        views: Views of the left and the right eye.
-        window: Window of the middle panel that was drawn. If None, the whole panel was drawn.
-        every: Side of a relief pixel in panel pixels.
+        views: The left and the right eye's view.
+        window: Window that was drawn on the middle panel. If None, the whole panel was drawn.
+        every: Side of a relief pixel, in panel pixels.
     """
     u0, v0 = (0, 0) if window is None else (window.box.u0, window.box.v0)
     left, right = (content.nearness(view, every=every, first=(u0 % every, v0 % every)) for view in views)
@@ -151,11 +151,11 @@ def _relief(
 
 
 def _drawn(predictor: Predictor, content: ContentSource, view: View, *, time_ns: int) -> U8 | DrawnPicture:
-    """Draw a view and return a texture, or an array if the content does not draw with OpenGL.
+    """Draw a view. Return a texture, or an array if the content does not draw with OpenGL.
 
     Raises:
         ContentFailure: The content could not be drawn.
-        ContextLost: Drawing failed in the OpenGL context that the predictor uses.
+        ContextLost: Drawing failed in the OpenGL context used by the predictor.
     """
     try:
         picture = content.draw(view, time_ns=time_ns)

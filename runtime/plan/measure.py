@@ -1,4 +1,4 @@
-"""Measure the effect of each saving on time and quality, for a scene on this machine."""
+"""Measure each saving's effect on time and quality, for a scene on this machine."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ MAX_DRIFT_M = 0.001  # a resting head may drift this far before its picture is r
 
 
 class TrialResult(NamedTuple):
-    """Time and quality of one method to compute the layers."""
+    """Time and quality of one way to compute the layers."""
 
     frame_ms: float  # median time per frame, including drawing
     psnr_db: float  # displayed quality
 
     def saving_over(self, other: TrialResult) -> Saving:
-        """Return the time saved and the quality lost, relative to a method that skips less work."""
+        """Return the time saved and the quality lost relative to a way that skips less work."""
         return Saving(other.frame_ms - self.frame_ms, other.psnr_db - self.psnr_db)
 
 
 class Measurement(NamedTuple):
-    """Results for a scene with and without the plan. The runs of the two trials alternate."""
+    """Results for a scene with and without the plan. The two trials' runs alternate."""
 
     numbers: Measured
     with_plan: TrialResult
@@ -60,7 +60,7 @@ def measure(predictor: Predictor, content: ContentSource, eyes_m: F64, *, fov_de
 
     Args:
         eyes_m: (2, 3) left and right eye in frame `stack`.
-        fov_deg: Horizontal field of view of the pictures that quality is measured on.
+        fov_deg: Horizontal field of view of the pictures used to measure quality.
     """
     stack = predictor.stack
 
@@ -102,13 +102,13 @@ def measure(predictor: Predictor, content: ContentSource, eyes_m: F64, *, fov_de
 
 
 def plan_for(config: Path | None, *, scene: str | None, model: str | None, scale: float) -> dict[str, Any]:
-    """Measure a scene and return the table that `phasestack plan` prints.
+    """Measure a scene and return the table printed by `phasestack plan`.
 
     Args:
         config: Configuration file. If None, the default configuration is used.
         scene: Scene that replaces the configured scene.
         model: Model that replaces the configured model.
-        scale: Factor by which the panels' rows and columns are multiplied.
+        scale: Factor to multiply the panels' rows and columns by.
 
     Raises:
         PhasestackError: The configuration, the scene or the model cannot be used.
@@ -156,13 +156,13 @@ def plan_for(config: Path | None, *, scene: str | None, model: str | None, scale
 
 
 def _check_viewer(eyes_m: F64, stack: PanelStack, *, fov_deg: float) -> None:
-    """Raise InputError if an eye is not in front of the panels or neither eye sees a part of the display."""
+    """Raise InputError if an eye is not in front of the panels or neither eye sees any of the display."""
     nearest_m = float(eyes_m[:, 0].min())
     if nearest_m <= max(stack.x_m):
         raise InputError(
             "sensor.fixed_eyes_m", "", f"x = {nearest_m:g} m : not in front of the panels (x > {max(stack.x_m):g} m)"
         )
-    # A coarse raster suffices to find out if the display is visible.
+    # A coarse raster is enough to find out if the display is visible.
     coarse = replace(stack, width_px=64, height_px=36)
     blank = np.zeros((stack.count, coarse.height_px, coarse.width_px, 3), np.uint8)
     if not any(seen_by(eye_m, blank, coarse, fov_deg=fov_deg).mask.any() for eye_m in eyes_m):

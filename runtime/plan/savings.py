@@ -20,8 +20,8 @@ OPTIONAL_PARTS = {
     "matplotlib": "reports",
 }
 
-VISIBLE_DEG = 80.0  # an eye at a larger angle from the display's axis cannot see it
-RETURN_MARGIN_DEG = 3.0  # three standard deviations of an eye's direction at 0.2 m, for 3 mm of noise
+VISIBLE_DEG = 80.0  # an eye farther than this from the display's axis cannot see the display
+RETURN_MARGIN_DEG = 3.0  # three standard deviations of an eye's direction at 0.2 m with 3 mm of noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,27 +34,27 @@ class Saving:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Effects of all savings, measured on this machine for one scene."""
+    """The effects of all savings, measured on this machine for one scene."""
 
     reuse: Saving = Saving()  # showing the previous solution again
-    focus: Saving = Saving()  # solving only the window in which the eyes' pictures differ
-    one_channel: Saving = Saving()  # solving one channel of grey pictures
-    one_eye: Saving = Saving()  # solving for the only eye that sees the display
+    focus: Saving = Saving()  # solving only the window where the eyes' pictures differ
+    one_channel: Saving = Saving()  # solving only one channel for grey pictures
+    one_eye: Saving = Saving()  # solving only for the eye that sees the display
     left_out: Savings = field(default_factory=Savings)  # work skipped by the newest job
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Eyes to solve for, and a description of all skipped work for an operator."""
+    """The eyes to solve for, and a description of all skipped work for an operator to read."""
 
-    eyes: tuple[bool, bool]  # (left, right), True for an eye that is solved for
+    eyes: tuple[bool, bool]  # (left, right), True for each eye to solve for
     items: tuple[PlanItem, ...] = field(default=())  # one item for each kind of skipped work
 
 
 def eyes_in_range(eyes_m: F64, *, range_deg: float = VISIBLE_DEG) -> tuple[bool, bool]:
-    """Return, for the left and the right eye, True if the eye can see the display.
+    """Return, for each of the left and the right eye, True if it can see the display.
 
-    An eye can see the display if its direction from the display's centre is within `range_deg` of the display's axis.
+    An eye can see the display if, viewed from the display's centre, it is within `range_deg` of the display's axis.
 
     Args:
         eyes_m: (2, 3) left and right eye in frame `stack`.
@@ -65,10 +65,10 @@ def eyes_in_range(eyes_m: F64, *, range_deg: float = VISIBLE_DEG) -> tuple[bool,
 
 
 def seeing_eyes(eyes_m: F64, before: tuple[bool, bool]) -> tuple[bool, bool]:
-    """Return, for the left and the right eye, True if the eye can see the display, with hysteresis.
+    """Return, for each of the left and the right eye, True if it can see the display, with hysteresis.
 
-    An eye that was excluded before is included again only when it is at least `RETURN_MARGIN_DEG` inside the range.
-    Without hysteresis, noise would switch an eye at the limit of the range on and off.
+    An eye that was excluded is included again only once it is at least `RETURN_MARGIN_DEG` inside the range. Without
+    hysteresis, noise would switch an eye on and off at the limit of the range.
 
     Args:
         eyes_m: (2, 3) left and right eye in frame `stack`.
@@ -81,7 +81,7 @@ def seeing_eyes(eyes_m: F64, before: tuple[bool, bool]) -> tuple[bool, bool]:
 
 
 def selected_eyes(eyes_m: F64, seeing: tuple[bool, bool]) -> F64:
-    """Return the (2, 3) eyes to draw and solve for.
+    """Return the (2, 3) eyes to draw and to solve for.
 
     An eye that cannot see the display is replaced by the eye that can. If neither can, both eyes are returned.
 
@@ -105,14 +105,15 @@ def make_plan(
     measured: Measured | None = None,
     loaded_modules: Collection[str] = (),
 ) -> Plan:
-    """Return the plan for a scene and a viewer, which is valid until the scene or the viewer changes.
+    """Return the plan for a scene and a viewer. It is valid until the scene or the viewer changes.
 
     Args:
         eyes_m: (2, 3) left and right eye in frame `stack`. None if unknown.
-        seeing: For the left and the right eye, True if the eye can see the display (`seeing_eyes`). If None, the result
-            is computed from `eyes_m`.
-        measured: Effects of the savings, which the items quote.
-        loaded_modules: Names of imported modules (`sys.modules`). The plan lists the optional parts not among them.
+        seeing: For the left and the right eye, True if the eye can see the display (`seeing_eyes`). If None, this is
+            computed from `eyes_m`.
+        measured: Effects of the savings, to be quoted in the items.
+        loaded_modules: Names of the modules imported so far (`sys.modules`). The plan lists the optional parts that are
+            not among them.
     """
     on, numbers = settings.plan.enabled, measured or Measured()
     if seeing is None and eyes_m is not None:
@@ -138,7 +139,7 @@ def make_plan(
 
 
 def network_items(info: ContentInfo, numbers: Measured) -> list[PlanItem]:
-    """Return the plan items for the work that the model skipped in the newest job (`Measured.left_out`)."""
+    """Return the plan items for work that the model skipped in the newest job (`Measured.left_out`)."""
     items, share = [], numbers.left_out.solved_share
     if info.flat_x_m is not None and share == 0.0:
         why = "everything lies in the centre panel's plane: both eyes see the same"

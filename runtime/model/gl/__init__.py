@@ -1,1 +1,1 @@
-"""Operations of the solver, implemented as fragment shaders for the core profile of OpenGL 3.3."""
+"""Solver operations, implemented as fragment shaders for the OpenGL 3.3 core profile."""

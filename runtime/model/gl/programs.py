@@ -22,7 +22,7 @@ CONSTANTS = f"FULL {FULL:.1f}", f"EDGE_CLAMP_PX {EDGE_CLAMP_PX:.1f}"
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """Used part of a texture, which begins at the texture's first row and column."""
+    """Part of a texture in use. It starts at the texture's first row and column."""
 
     texture: Any  # moderngl.Texture
     width_px: int
@@ -34,10 +34,10 @@ class Image:
 
 
 def source(name: str, *, defines: Sequence[str] = ()) -> str:
-    """Return the source code of a shader, in which included files are inserted.
+    """Return a shader's source code with its included files inserted.
 
     Args:
-        name: File name of the shader.
+        name: The shader's file name.
         defines: Names to define for the shader's `#ifdef` lines.
     """
 
@@ -49,7 +49,7 @@ def source(name: str, *, defines: Sequence[str] = ()) -> str:
 
 
 class Passes:
-    """Shader programs of one OpenGL context, which `draw` compiles on their first use and runs."""
+    """Shader programs for one OpenGL context. `draw` runs them, compiling each one on first use."""
 
     def __init__(self, context: moderngl.Context) -> None:
         self.context = context
@@ -59,7 +59,7 @@ class Passes:
 
     @contextmanager
     def drawing(self) -> Iterator[None]:
-        """Prepare the context for drawing. Raises ContextLost if OpenGL reports an error meanwhile."""
+        """Prepare the context for drawing. Raises ContextLost if OpenGL reports an error in the meantime."""
         try:
             self.context.enable_only(moderngl.NOTHING)
             yield
@@ -81,15 +81,15 @@ class Passes:
         defines: tuple[str, ...] = (),
         at: tuple[int, int, int, int] | None = None,
     ) -> None:
-        """Run a shader for every pixel of the outputs.
+        """Run a shader for every output pixel.
 
         Args:
-            name: Name of the fragment shader without its suffix.
-            outputs: Images that the shader writes to.
-            inputs: Images by the names that the shader gives them. Images that the shader does not use are ignored.
-            uniforms: Other uniforms by the names that the shader gives them. Unused uniforms are ignored.
+            name: The fragment shader's name, without its suffix.
+            outputs: Images to write to.
+            inputs: Images, keyed by their names in the shader. Images that the shader does not use are ignored.
+            uniforms: Other uniforms, keyed by their names in the shader. Unused ones are ignored.
             defines: Names to define for the shader's `#ifdef` lines.
-            at: First column, first row, width and height of the area to draw. By default, the whole first output.
+            at: First column, first row, width and height of the area to draw. By default, all of the first output.
         """
         raise_if_abandoned()
         program, array, held = self._program(name, defines)
@@ -105,7 +105,7 @@ class Passes:
         array.render(moderngl.TRIANGLES, vertices=3)
 
     def target(self, outputs: Sequence[Image]) -> Any:
-        """Return the framebuffer that draws into the textures of all outputs."""
+        """Return the framebuffer that draws into all the outputs' textures."""
         key = tuple(output.texture.glo for output in outputs)
         if key not in self._targets:
             self._targets[key] = self.context.framebuffer([output.texture for output in outputs])
@@ -113,7 +113,7 @@ class Passes:
 
     def forget(self, texture: Any) -> None:
         """Release a texture and its framebuffers."""
-        # moderngl later binds the framebuffer in use again, which must therefore still exist.
+        # moderngl will bind the framebuffer in use again later, so it must still exist.
         self.context.detect_framebuffer(0).use()
         for key in [key for key in self._targets if texture.glo in key]:
             self._targets.pop(key).release()

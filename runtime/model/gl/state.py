@@ -1,8 +1,8 @@
-"""Solver backend on OpenGL, where panels are textures and steps are passes of fragment shaders.
+"""Solver backend for OpenGL. Panels are textures, and steps are passes of fragment shaders.
 
-All data between steps are 16-bit values from 0 to 1, which every driver can filter and draw into. Their meaning is
-described in `shaders/places.glsl`. If one channel is solved, a texture has one component. Otherwise it has four
-components, one of which is unused, because drivers need not support drawing into textures with three components.
+Between steps, all data are 16-bit values from 0 to 1, which every driver can filter and draw into. Their meaning is
+described in `shaders/places.glsl`. If a single channel is solved, textures have one component. Otherwise they have four
+and one is unused, because drivers need not support drawing into textures with three components.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ PANELS, MIDDLE = 3, 1
 
 
 class GlBackend:
-    """Backend that runs the solver on one OpenGL context.
+    """Backend that runs the solver in one OpenGL context.
 
-    All models of the backend share its shader programs. Only the thread of the context may use the backend.
+    All models that use the backend share its shader programs. Only the context's thread may use the backend.
     """
 
     name = "gl"
@@ -55,7 +55,7 @@ class GlBackend:
 
 
 class GlState:
-    """`SolverState` for three panels. Only the thread of the OpenGL context may use a state."""
+    """`SolverState` for three panels. A state may be used only by the OpenGL context's thread."""
 
     def __init__(self, passes: Passes, stack: PanelStack) -> None:
         """Create the state. Raises InputError if a panel is too large for the driver.
@@ -65,7 +65,7 @@ class GlState:
         check_size(passes.context, stack)
         self._passes, self._stack = passes, stack
         self._textures: dict[tuple[Any, ...], Any] = {}
-        self._names: dict[str, str] = {}  # image that currently has a role, for pairs of images that are swapped
+        self._names: dict[str, str] = {}  # which image currently has each role, for pairs of images that are swapped
         self._closed = False
 
     @contextmanager
@@ -105,7 +105,7 @@ class GlState:
         self._swap("last", "spare", MIDDLE)
 
     def start(self) -> None:
-        self._ahead = "last"  # the first step reads the panels themselves, because there is no momentum yet
+        self._ahead = "last"  # there is no momentum yet, so the first step reads the panels themselves
 
     def step(self, step: Step) -> None:
         seen = self._geometry.panels_from_rays(step.places, self._sigma_m)
@@ -156,9 +156,9 @@ class GlState:
             self._textures = {}
 
     def _loaded(self, view: TargetView, side: int) -> tuple[Image, tuple[int, int]]:
-        """Return the image of an eye's target picture and the (column, row) of the first ray in the image.
+        """Return the image with an eye's target picture, and the (column, row) of the first ray in it.
 
-        A picture that is an array is uploaded to a texture.
+        If the picture is an array, it is uploaded to a texture.
         """
         rays = self._geometry.rays
         if isinstance(view.picture, DrawnPicture):
@@ -190,7 +190,7 @@ class GlState:
         return max(self._stack.width_px, self._stack.height_px, rays.width_px, rays.height_px)
 
     def _panel(self, name: str, n: int) -> Image:
-        """Return the image for a panel's box. Its texture is as large as the panel, so the box may move."""
+        """Return the image for a panel's box. Its texture is as large as the panel, so that the box can move."""
         box, key = self._geometry.boxes[n], (self._names.get(f"{name} {n}", name), n)
         size = self._stack.width_px, self._stack.height_px
         return Image(self._texture(key, size, self._components, dtype="nu2"), box.width_px, box.height_px)
@@ -200,7 +200,7 @@ class GlState:
         self._names[a], self._names[b] = self._names.get(b, other), self._names.get(a, one)
 
     def _rays(self, name: str, places: int = 1) -> Image:
-        """Return the image for one quantity of all rays in a set."""
+        """Return the image that holds one quantity for all rays in a set."""
         image = self._ray_image(name, self._components, "nu2")
         return Image(image.texture, image.width_px, image.height_px // places)
 
@@ -208,7 +208,7 @@ class GlState:
         return Image(self._texture(name, (self._longest, 1), 1, dtype="f4"), self._longest, 1)
 
     def _ray_image(self, name: str, components: int, dtype: str) -> Image:
-        """Return an image with one pixel per ray. A texture that is too small is replaced by a larger one."""
+        """Return an image with one pixel per ray. A texture that is too small is replaced with a larger one."""
         width_px, height_px = self._geometry.rays.width_px, self._geometry.rays.height_px
         size = width_px, height_px
         texture = self._textures.get(key := (name, components, dtype))
@@ -228,7 +228,7 @@ class GlState:
 
 
 def check_size(context: moderngl.Context, stack: PanelStack) -> None:
-    """Raise InputError if a panel is wider or higher than the OpenGL driver allows."""
+    """Raise InputError if the panels are wider or taller than the OpenGL driver allows."""
     most = int(context.info["GL_MAX_TEXTURE_SIZE"])
     most_wide, most_high = (min(most, int(value)) for value in context.info["GL_MAX_VIEWPORT_DIMS"])
     for name, value, limit in (("width_px", stack.width_px, most_wide), ("height_px", stack.height_px, most_high)):
@@ -237,5 +237,5 @@ def check_size(context: moderngl.Context, stack: PanelStack) -> None:
 
 
 def _mat3(matrix: F64) -> tuple[float, ...]:
-    """Return the values of a matrix in column-major order, which OpenGL expects."""
+    """Return a matrix's values in column-major order, as OpenGL expects."""
     return tuple(matrix.T.ravel().tolist())

@@ -1,16 +1,16 @@
 #version 330 core
-// Compute the squared slope, and the error times the slope, for one set of rays (docs/mathematics.md, L1 to L4).
+// Compute the squared slope, and the error times the slope, for one ray set (docs/mathematics.md, L1 to L4).
 uniform vec2 origin;
 #include "places.glsl"
 uniform sampler2D ahead0, ahead1, ahead2, targets, column_taper, row_taper;
 uniform mat3 from_rays0, from_rays1, from_rays2;
 uniform vec2 size0, size1, size2;
-// turn: number of head positions, which alternate from row to row of a picture, and index of this set's position
+// turn: number of head positions, which alternate from one picture row to the next, and index of this set's position
 uniform ivec2 targets_origin, turn;
 layout(location = 0) out vec4 curvature;
 layout(location = 1) out vec4 gradient;
 
-// Compute the mean of exp(i pi x) over a pixel's rays with bilinear weights. The phasors are not stored between draws.
+// Compute the mean of exp(i pi x) over a pixel's rays with bilinear weights. Phasors are not stored between draws.
 void phasor(sampler2D ahead, vec2 at, vec2 size, out vec4 re, out vec4 im) {
     ivec2 last = ivec2(size) - 1;
     vec2 corner = clamp(at, vec2(0.5), size - 0.5) - 0.5, share = fract(corner);

@@ -1,5 +1,5 @@
 #version 330 core
-// Set each pixel of the middle panel to the mean residual of all rays through the pixel.
+// Set each pixel of the middle panel to the mean residual of all the rays that pass through it.
 uniform vec2 origin;
 #include "places.glsl"
 uniform sampler2D last, weight0, residual0, weight1, residual1;

@@ -1,6 +1,6 @@
 #version 330 core
-// Compute the weights of the targets for one eye's rays, and the products of the weights and the residuals that the
-// middle panel must correct.
+// Compute the targets' weights for one eye's rays, and their products with the residuals that the middle panel must
+// correct.
 uniform vec2 origin;
 #include "places.glsl"
 uniform sampler2D last0, last2, targets, table;

@@ -1,5 +1,5 @@
 #version 330 core
-// Convert the box of a panel to 8-bit codes, at the position of the box within the whole panel.
+// Convert a panel's box to 8-bit codes, drawn at its position within the whole panel.
 uniform vec2 origin;
 #include "places.glsl"
 uniform sampler2D last;
