@@ -1,4 +1,4 @@
-"""Read the headers of PLY files, and read elements of binary files as structured arrays.
+"""Read PLY headers, and read the elements in binary PLY files as structured arrays.
 
 No existing library is suitable: plyfile is licensed under the GPL, and trimesh returns only the properties it knows.
 """
@@ -35,14 +35,14 @@ class PlyHeader:
 
     path: Path
     order: str  # byte order of the elements, or `ascii`; a key of ORDERS
-    counts: dict[str, int]  # number of elements of each kind, in the order in which they are stored
-    properties: dict[str, list[tuple[str, str]]]  # (name, type) of the properties of each kind; a type may be `list`
-    starts_at: int  # offset of the first element in bytes
-    size: int  # size of the file in bytes
+    counts: dict[str, int]  # number of elements of each kind, in the order they are stored in
+    properties: dict[str, list[tuple[str, str]]]  # (name, type) of each kind's properties; a type may be `list`
+    starts_at: int  # byte offset of the first element
+    size: int  # file size in bytes
 
     @property
     def kind(self) -> str:
-        """Kind of content, `splats` or `triangles`, which determines the limits for the file."""
+        """Kind of content (`splats` or `triangles`), which determines the limits for the file."""
         return "splats" if SPLAT_MARKS & {name for name, _ in self.properties["vertex"]} else "triangles"
 
     @property
@@ -54,8 +54,8 @@ class PlyHeader:
 def read_header(path: Path) -> PlyHeader:
     """Read the header of a PLY file.
 
-    Raises InputError if the header is missing, incomplete or not understood, or if a number of elements exceeds a limit
-    or the file's size.
+    Raises InputError if the header is missing, incomplete or not understood, or if an element count exceeds a limit or
+    the file's size.
     """
     with untrusted_input.open_regular(path, most_bytes=LIMITS.file_bytes) as file:
         head = file.read(LONGEST_HEADER)
@@ -93,10 +93,10 @@ def read_header(path: Path) -> PlyHeader:
 
 
 def read_elements(header: PlyHeader) -> dict[str, Table]:
-    """Read the elements of a binary PLY file as structured arrays, by name.
+    """Read the elements in a binary PLY file as structured arrays, keyed by name.
 
-    Reading ends at the first kind of element that has a list property. Raises InputError if the file is cut off or in
-    text form, or if the vertices have not been read by then.
+    Reading stops at the first kind of element with a list property. Raises InputError if the file is cut off or in text
+    form, or if the vertices have not been read by then.
     """
     path, place, found = header.path, header.starts_at, dict[str, Table]()
     if header.order == "ascii":
