@@ -115,7 +115,7 @@ def drawable(path: Path, *, centres: F32, log_scales: F32, quaternions: F32, log
         harmonics: Spherical-harmonic coefficients (n, k, 3).
 
     Raises:
-        InputError: No visible splat remains.
+        InputError: No visible splats remain.
     """
     with np.errstate(invalid="ignore"):  # comparisons with NaN are false
         usable = (np.abs(centres) < LARGEST_COORDINATE).all(1) & (quaternions != 0).any(1) & ~np.isnan(logits)
