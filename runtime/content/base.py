@@ -47,7 +47,7 @@ class ContentInfo:
     grey: bool = False
     background: Colour | None = WHITE  # uniform colour behind the scene, or None if the background is not uniform
     flat_x_m: float | None = None  # x coordinate of the plane that contains the whole scene, or None if not flat
-    left_out: tuple[str, ...] = ()  # features of the file that are not drawn
+    left_out: tuple[str, ...] = ()  # features in the file that are not drawn
 
 
 class ContentSource(ABC):
@@ -143,7 +143,7 @@ class ContentSource(ABC):
         return None
 
     def skip(self, *, time_ns: int) -> bool:
-        """Skip to the next entry of a playlist. Return False if no entry follows."""
+        """Skip to a playlist's next entry. Returns False if no entry follows."""
         return False
 
     @property

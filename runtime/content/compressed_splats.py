@@ -88,7 +88,7 @@ def _spz(path: Path) -> Gaussians:
 
 
 def _zstd_blocks(data: bytes, table: int, sizes: list[int]) -> list[bytes]:
-    """Decompress the streams of a version 4 SPZ file. Empty streams may be missing from the file.
+    """Decompress a version 4 SPZ file's streams. Empty streams may be missing from the file.
 
     Args:
         data: The file's contents.

@@ -30,11 +30,11 @@ class Pair:
 
     number: int
     paths: tuple[Path, Path]  # left, right
-    eyes_m: F64  # (2, 3) positions of the left and right eye, frame `stack`
+    eyes_m: F64  # (2, 3) left and right eye positions, frame `stack`
     looks_at_m: F64  # (3,) scene's origin in frame `stack`, where both eyes look; not always on the display
 
     def image_from_stack(self, side: int, *, width_px: int, height_px: int, fov_deg: float) -> F64:
-        """Return the (3, 4) projection from `stack` to pixels of the left (`side` 0) or right (1) picture."""
+        """Return the (3, 4) projection from `stack` to the left (`side` 0) or right (1) picture's pixels."""
         around_origin = np.eye(4)
         around_origin[:3, 3] = -self.looks_at_m
         eye = self.eyes_m[side] - self.looks_at_m
@@ -101,7 +101,7 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
     pairs = read_folder(path, name)
     background = settings.background or WHITE
     make = partial(EyeRealSource, pairs, fov_deg=settings.fov_deg, background=background, name=name)
-    make()  # reports an unreadable picture now
+    make()  # raises now if a picture is unreadable
     return make
 
 

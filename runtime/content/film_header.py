@@ -16,7 +16,7 @@ from runtime.support import untrusted_input
 MOVIE_BYTES, HEAD_BYTES = 32 << 20, 1 << 20  # most bytes read from an MP4's `moov` box and from a Matroska file
 BOXES_MAX = 10_000  # most top-level boxes read from an MP4 file
 ST3D = re.compile(rb"\0\0\0\x0dst3d.{4}([\1\2])", re.DOTALL)
-EQUI = re.compile(rb"\0\0\0\x1cequi.{12}(.{4})(.{4})", re.DOTALL)  # the groups are the crop on the left and right
+EQUI = re.compile(rb"\0\0\0\x1cequi.{12}(.{4})(.{4})", re.DOTALL)  # the groups are the crops on the left and right
 XML_STEREO = re.compile(rb"GSpherical:StereoMode>\s*(left-right|top-bottom)")
 XML_AROUND = re.compile(rb"GSpherical:Spherical>\s*true")
 MULTIVIEW = b"vexu"  # box found in films recorded by headsets and phones

@@ -1,4 +1,4 @@
-"""Open stills, animations, folders of pictures and films as sequences of pictures with layouts."""
+"""Open stills, animations, picture folders and films as sequences of pictures with layouts."""
 
 from __future__ import annotations
 
@@ -226,7 +226,7 @@ def open_frames(path: Path, settings: ContentSettings) -> Frames:
 
 
 def _suggest(path: Path, picture: U8) -> None:
-    """Log a hint if a picture that is shown as a single view probably contains several."""
+    """Log a hint if a picture shown as a single view probably contains several."""
     if "quilt" in path.stem.lower():
         log.warning("%s: if it is a quilt, pass --layout qs8x6a0.75 (columns, rows, aspect ratio of a view)", path)
     elif found := hint(picture):

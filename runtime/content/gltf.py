@@ -1,4 +1,4 @@
-"""Convert the nodes, primitives and materials of a glTF 2.0 scene to parts, without its animations."""
+"""Convert a glTF 2.0 scene's nodes, primitives and materials to parts, without its animations."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class GltfScene:
         return corners // 3 if primitive.get("mode", TRIANGLES) <= TRIANGLES else corners
 
     def _instances(self, node: Table) -> int:
-        """Return the number of instances that EXT_mesh_gpu_instancing declares for a node, or 1."""
+        """Return the number of instances declared for a node by EXT_mesh_gpu_instancing, or 1."""
         own = node.get("extensions", {}).get(INSTANCES, {}).get("attributes", {})
         return min((self.file.count(index) for name, index in own.items() if name in PLACES), default=1)
 
@@ -147,7 +147,7 @@ class GltfScene:
         return np.asarray(stand @ columns[: len(stand)].transpose(0, 2, 1))
 
     def _add(self, primitive: Table, *, weights: list[float], matrices: F64) -> None:
-        """Add the triangles, lines or points of a primitive to the scene.
+        """Add a primitive's triangles, lines or points to the scene.
 
         Args:
             primitive: Primitive as described in the file.
@@ -165,7 +165,7 @@ class GltfScene:
         faces = _faces(corners, mode)
         has_normals = "NORMAL" in primitive["attributes"] and mode >= TRIANGLES
         if has_normals or mode < TRIANGLES:
-            rows, faces = np.unique(faces, return_inverse=True)  # drop vertices that only other primitives use
+            rows, faces = np.unique(faces, return_inverse=True)  # drop vertices used only by other primitives
         else:  # flat shading requires that triangles share no vertices (section 3.7.2.1)
             rows, faces = faces.reshape(-1), np.arange(faces.size).reshape(-1, 3)
 
@@ -254,7 +254,7 @@ class GltfScene:
         return values, np.asarray(decoded.faces).reshape(-1)
 
     def _look(self, index: int | None) -> tuple[dict[str, Any], Table]:
-        """Convert a material to fields of `Part`, with linear colours.
+        """Convert a material to `Part` fields, with linear colours.
 
         Returns:
             The fields, and the material's texture reference, which states which texture coordinates to use.

@@ -64,7 +64,7 @@ class GltfFile:
             untrusted_input.within(elements, most, source=path, field=f"accessors[{number}].count")
 
     def all(self, kind: str) -> list[Table]:
-        """Return all objects of a kind, such as `meshes`. The list is empty if the file contains none."""
+        """Return all objects of a given kind, such as `meshes`. The list is empty if the file has none."""
         objects: list[Table] = self.table.get(kind, [])
         return objects
 
@@ -80,8 +80,8 @@ class GltfFile:
         """Return an accessor's elements (n, ...).
 
         Args:
-            index: Number of the accessor.
-            rows: Indices of the elements to return. All elements are returned by default.
+            index: Accessor number.
+            rows: Indices of the elements to return. By default, all elements are returned.
             as_float: Convert the elements to float32 with `fractions`. If False, numbers are returned as stored.
         """
         accessor = self.item("accessors", index)

@@ -17,7 +17,7 @@ _MINUS_HALF = np.array([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5], [0.0, 0.0, 1.0]])
 
 
 def rgba_from_rgb(rgb: U8) -> U8:
-    """Convert an RGB picture (h, w, 3) to opaque RGBA (h, w, 4), which OpenCV warps in half the time."""
+    """Convert an RGB picture (h, w, 3) to opaque RGBA (h, w, 4). OpenCV warps RGBA in half the time."""
     return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA))
 
 
@@ -34,7 +34,7 @@ def image_from_view(image_from_stack: F64, pixels_from_stack: F64, *, x_m: float
     Returns:
         The homography, or None if the view's eye is in the plane.
     """
-    # The pixel coordinates of this raster are metres along y (u) and -z (v).
+    # This raster's pixel coordinates are metres along y (u) and -z (v).
     plane = PlaneRaster(x_m=x_m, left_m=0.0, top_m=0.0, pitch_u_m=1.0, pitch_v_m=1.0, width_px=1, height_px=1)
     plane_from_view = plane_from_pixels(pixels_from_stack, plane)
     return None if plane_from_view is None else image_from_raster(image_from_stack, plane) @ plane_from_view

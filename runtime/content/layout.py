@@ -47,7 +47,7 @@ ROUGH = 6.0  # least standard deviation in 8-bit values; smoother halves always 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Arrangement of views in a picture. The method `views` splits a picture accordingly."""
+    """A picture's view arrangement. The method `views` splits a picture accordingly."""
 
     kind: str  # mono, rgbd, quilt, side-by-side, top-bottom or anaglyph
     columns: int = 1
@@ -101,7 +101,7 @@ class Layout:
         return self.view_aspect * height_px / width_px if self.view_aspect else 1.0
 
 
-MONO, PAIR = Layout("mono"), Layout("side-by-side", columns=2)  # PAIR is for files that contain two pictures
+MONO, PAIR = Layout("mono"), Layout("side-by-side", columns=2)  # PAIR is for files with two pictures in them
 
 
 def layout_of(path: Path, settings: ContentSettings, *, stated: str = "") -> Layout:

@@ -42,7 +42,7 @@ class MeshData:
     low: F64  # (3,) lowest corner of the bounding box
     high: F64  # (3,) highest corner of the bounding box
     facing: F64  # (3,) area-weighted mean normal; the length is at most 1, and 0 for a closed surface
-    left_out: tuple[str, ...] = ()  # features of the file that are not drawn
+    left_out: tuple[str, ...] = ()  # features in the file that are not drawn
 
 
 def prepare(file: SceneFile) -> Callable[..., ContentSource]:

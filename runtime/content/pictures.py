@@ -44,7 +44,7 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
     """
     frames = open_frames(file.path, file.settings)
     make = partial(PicturesSource, frames, file=file)
-    make()  # reports now if the first picture is too small for its layout
+    make()  # raises now if the first picture is too small for its layout
     return make
 
 

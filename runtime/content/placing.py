@@ -46,8 +46,8 @@ class SceneFile:
         fitted to the display or left unscaled, with its coordinates taken as metres.
 
         Args:
-            low: Lowest corner (3,) of the content.
-            high: Highest corner (3,) of the content.
+            low: The content's lowest corner (3,).
+            high: The content's highest corner (3,).
             custom: Axes (up, towards the viewer) that are usual for the file's format. By default, they depend on the
                 file's suffix.
             facing: Area-weighted mean normal (3,) of the surface. If given, a flat mesh is turned to face the viewer.
@@ -82,8 +82,8 @@ def guessed_axes(low: F64, high: F64) -> tuple[str, str]:
     is taken to be up. Otherwise, the longer axis is.
 
     Args:
-        low: Lowest corner (3,) of the content.
-        high: Highest corner (3,) of the content.
+        low: The content's lowest corner (3,).
+        high: The content's highest corner (3,).
     """
     size = np.maximum(high - low, 1e-30)
     y, z = np.maximum(low / size + 0.5, 0.0)[1:]  # 0 if centred on the origin, 0.5 if it begins there

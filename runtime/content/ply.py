@@ -25,7 +25,7 @@ TYPES = {
     "double": "f8", "float64": "f8",
 }  # fmt: skip
 ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
-PACKED = "packed_position"  # property that marks SuperSplat's compressed splats
+PACKED = "packed_position"  # property that identifies SuperSplat's compressed splats
 SPLAT_MARKS = {"f_dc_0", "scale_0", "rot_0", PACKED}
 
 
@@ -52,7 +52,7 @@ class PlyHeader:
 
 
 def read_header(path: Path) -> PlyHeader:
-    """Read the header of a PLY file.
+    """Read a PLY file's header.
 
     Raises InputError if the header is missing, incomplete or not understood, or if an element count exceeds a limit or
     the file's size.

@@ -20,7 +20,7 @@ Triple = tuple[float, float, float]
 
 @cache
 def preset_file() -> dict[str, Any]:
-    """Return the contents of presets.toml. Comments in the file explain the keys."""
+    """Return the contents of presets.toml. The keys are explained by comments in the file."""
     return tomllib.loads(FILE.read_text(encoding="utf-8"))
 
 

@@ -35,17 +35,17 @@ from runtime.support.background import begin
 log = logging.getLogger("phasestack.content")
 
 HOST = "127.0.0.1"
-ANSWERED_S = 0.4  # time limit for both pictures of a frame
+ANSWERED_S = 0.4  # time limit for both of a frame's pictures
 GIVEN_UP_S = 2.0  # an unanswered frame is abandoned after this time
 IN_FLIGHT_MAX = 2  # largest number of frames requested but not yet answered
 HELLO_S = 5.0  # time limit for a program's greeting
 NEAR_M, FAR_M = 0.05, 100.0
-HEAD = struct.Struct("<II")  # header of an answer: frame number and side (0 left, 1 right)
+HEAD = struct.Struct("<II")  # an answer's header: frame number and side (0 left, 1 right)
 SIDES = ("left", "right")
 
 
 class ProgramOptions(Section):
-    """Options for the scene `program` in [content.options]."""
+    """Options in [content.options] for the scene `program`."""
 
     port: int = Field(0, ge=0, le=65535, description="TCP port to listen on; 0: any free port")
 
@@ -90,7 +90,7 @@ class _Frame:
     """A frame requested from a program, with the pictures received so far."""
 
     views: Sequence[View]
-    asked_s: float  # time of the request on the monotonic clock
+    asked_s: float  # request time on the monotonic clock
     pictures: dict[int, U8] = field(default_factory=dict)  # received pictures, keyed by side
     awaited: bool = True  # True if `answer` may still be called for the frame
 
@@ -181,7 +181,7 @@ class Programs:
         raise ContentFailure(self.problem or f"the program has not answered within {1e3 * ANSWERED_S:.0f} ms")
 
     def done(self, number: int) -> None:
-        """Declare that no more pictures of a frame are needed.
+        """Declare that no more of a frame's pictures are needed.
 
         The frame still counts as in flight until it is answered or abandoned.
         """

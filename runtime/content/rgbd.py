@@ -31,7 +31,7 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8
 
 COLUMNS = 320  # resolution of smooth areas: as fine as a depth camera's, and fast without a GPU
-FINEST_COLUMNS = 1600  # largest resolution at edges
+FINEST_COLUMNS = 1600  # finest resolution at edges
 NOMINAL_DISTANCE_M = 0.6  # viewing distance at which the surface looks exactly like the picture
 TORN_RELATIVE = 0.12  # a step between neighbours is an edge if it exceeds this share of the depth range
 BLURRED_PX = 5  # width over which the depth map's edges may be blurred
@@ -92,7 +92,7 @@ def surfaces(colour: U8, depth: F32, *, stack: PanelStack, depth_m: tuple[float,
 
 
 def sharpened(depth: F32) -> F32:
-    """Sharpen the edges of a depth map (h, w).
+    """Sharpen the edges in a depth map (h, w).
 
     Each pixel in a blurred edge is given the near or the far side's depth, whichever is closer to its previous depth.
     """
@@ -122,7 +122,7 @@ def unmixed(colour: U8, depth: F32) -> U8:
     away, nearest = cKDTree(np.column_stack([there, depth[beside] * far_apart])).query(
         np.column_stack([wanted, depth[mixed] * far_apart]), distance_upper_bound=REACH_PX
     )
-    near = np.isfinite(away)  # parts that are too thin to have a clean inside keep their colours
+    near = np.isfinite(away)  # parts too thin to have a clean inside keep their colours
     result = colour.copy()
     result[tuple(wanted[near].T)] = colour[beside][nearest[near]]
     return result
@@ -202,7 +202,7 @@ def _placed(depth: F32, quads: I32, picture: U8, *, stack: PanelStack, depth_m: 
 
 
 def _edge_to_edge(index: Any, count: int) -> F64:
-    """Return the coordinates of pixel centres, with those of the outermost pixels moved to the edge."""
+    """Return pixel centre coordinates, with those of the outermost pixels moved to the edge."""
     place = index + 0.5
     return np.where(index == 0, 0.0, np.where(index == count - 1, float(count), place))
 

@@ -18,8 +18,8 @@ class Thing:
     """An object in a scene. Lengths are in metres for a display that is 0.2916 m high."""
 
     shape: Shape  # centred on the origin
-    texture: str  # name of a texture, or `plain`
-    centre_m: tuple[float, float, float]  # position of the shape's origin in frame `stack`
+    texture: str  # texture name, or `plain`
+    centre_m: tuple[float, float, float]  # the shape's origin in frame `stack`
     colour: Colour = WHITE  # multiplies the texture's colours
     rotation: F64 | None = None  # 3x3 rotation from the shape's frame to `stack`
     turns_per_s: float = 0.0  # revolutions about the vertical axis, in a moving scene

@@ -75,7 +75,7 @@ def prepare(file: SceneFile) -> Callable[..., SplatSource]:
 
 
 class SplatSource(CanvasSource):
-    """Source that draws a scene of Gaussian splats."""
+    """Source that draws a Gaussian splat scene."""
 
     def __init__(self, gaussians: Gaussians, *, stack_from_scene: F64, context: Any, info: ContentInfo) -> None:
         super().__init__(context, info=info, deep=True)

@@ -108,5 +108,5 @@ TEXTURES = {
 
 
 def texture(name: str) -> U8 | None:
-    """Return a texture (256, 256, 4) by name, or None for `plain`, which stands for a uniform colour."""
+    """Return a texture (256, 256, 4) by name, or None for `plain`, which means a uniform colour."""
     return None if name == "plain" else TEXTURES[name]()

@@ -235,7 +235,7 @@ class _Arrangement:
     """The placements of all of a scene's parts at one time."""
 
     places: list[_Place]  # placement of each part; parts may share a placement
-    points_m: F64  # (n, 3) points whose convex hull contains all parts, frame `stack`
+    points_m: F64  # (n, 3) points in frame `stack`; their convex hull contains all parts
     corners_m: F64  # (p, 8, 3) corners of each part's bounding box, frame `stack`
     nearest_first: NDArray[np.intp]  # (p,) indices of the parts, nearest first
 
@@ -265,7 +265,7 @@ class TriangleSource(CanvasSource):
         super().__init__(context, info=info, samples=samples)
         self.parts, self.stack_from_parts = list(parts), list(stack_from_parts)
         self._with_ramps = samples == 0
-        self._still: _Arrangement | None = None  # arrangement of a static scene
+        self._still: _Arrangement | None = None  # arrangement, if the scene is static
         self._programs: dict[tuple[str, ...], Any] = {}
         self._textures: dict[tuple[int, Sampler], Any] = {}
         self._outlined = [(n, part, part.edges) for n, part in enumerate(self.parts) if part.edges is not None]

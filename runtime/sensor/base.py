@@ -25,7 +25,7 @@ class Capabilities:
     colour: bool = False
     depth: bool = False
     eye_points: bool = False  # the sensor finds the eyes itself, so the eye finder is not used
-    in_stack_frame: bool = False  # eye points are in the frame `stack` and need no calibration
+    in_stack_frame: bool = False  # eye points are in frame `stack` and need no calibration
     may_pause: bool = False  # gaps and constant samples are not faults, for example in a recording
 
 

@@ -262,7 +262,7 @@ def _serial(device: Any) -> str:
 
 
 def _text(error: Exception) -> str:
-    """Return the library's error message without the text that the package adds."""
+    """Return the library's error message without the text added by the package."""
     words = error.args[1] if len(error.args) > 1 else str(error) or type(error).__name__
     return words.decode(errors="replace").strip() if isinstance(words, bytes) else str(words)
 

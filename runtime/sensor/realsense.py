@@ -20,7 +20,7 @@ from runtime.records import U8, U16, Intrinsics, SensorFrame
 from runtime.sensor.base import Capabilities, DeviceClock, Sensor
 
 RATE_HZ = 30
-FILES = (".bag", ".db3")  # old and new recording formats of the SDK
+FILES = (".bag", ".db3")  # the SDK's old and new recording formats
 STAMP_AGE_NS = NS_PER_S  # host timestamps older than this, or in the future, are ignored
 DRAIN_MAX = 32  # maximum number of frames to skip per call
 # Indices of the R, G and B channels in each supported format.
@@ -181,7 +181,7 @@ class RealSenseDriver(Sensor):
         if pipeline is not None:
             try:
                 pipeline.stop()
-            except RuntimeError as error:  # for example an unplugged camera
+            except RuntimeError as error:  # for example, because the camera was unplugged
                 log.debug("RealSense: error while closing: %s", error)
 
 

@@ -183,7 +183,7 @@ class Recording:
     """A recording that is read one sample at a time, because its pictures could fill the memory.
 
     Attributes:
-        path: Path of the file.
+        path: File path.
         is_whole: True unless reading has found the file to be truncated or damaged.
         header: Properties of the whole recording.
         first: First sample.
@@ -192,10 +192,10 @@ class Recording:
     def __init__(self, path: Path) -> None:
         """Read the header and the first sample.
 
-        Raises InputError if the file cannot be read, is not a recording or contains no complete sample.
+        Raises InputError if the file cannot be read, is not a recording or contains no complete samples.
         """
         self.path, self.is_whole = path, True
-        self._written_by = ("", "")  # profile and library in the header of the MCAP file
+        self._written_by = ("", "")  # profile and library in the MCAP file's header
         self.header = self._read_header()
         first = next(self.samples(), None)
         if first is None:
@@ -207,7 +207,7 @@ class Recording:
         return untrusted_input.open_regular(self.path, most_bytes=LIMITS.file_bytes)
 
     def _read_header(self) -> RecordingHeader:
-        """Return the header from the metadata record, which repair tools move to the end of a file.
+        """Return the header from the metadata record, which repair tools move to the file's end.
 
         Raises InputError if the file has no phasestack metadata record, or if the record is not supported.
         """

@@ -19,7 +19,7 @@ SCHEMA_VERSION = 1
 METADATA_NAME = "phasestack.recording"
 EYES_TOPIC, COLOUR_TOPIC, DEPTH_TOPIC, CALIBRATION_TOPIC = "/eyes", "/colour", "/depth", "/camera"
 POSITION_DIGITS = 7  # decimal places of a position in metres: 0.1 µm is far below any sensor's noise
-JPEG_QUALITY = 92  # quality of recorded colour pictures
+JPEG_QUALITY = 92  # JPEG quality of recorded colour pictures
 NUMBER_MAX = 1 << 62  # the sum of two such numbers fits in 64 bits; 146 years in nanoseconds
 COORDINATE_MAX_M = 1e6  # beyond any sensor's range in any unit; the tracker checks plausibility
 IMAGE_SIDE_MAX_PX = 1 << 15  # larger than any camera's pictures
@@ -37,7 +37,7 @@ M = TypeVar("M", bound=BaseModel)
 
 
 class Message(BaseModel):
-    """Base class of messages. Numbers must be finite JSON numbers, not strings or booleans."""
+    """Base class for messages. Numbers must be finite JSON numbers, not strings or booleans."""
 
     model_config = ConfigDict(strict=True, allow_inf_nan=False)
 
@@ -68,7 +68,7 @@ class Stamp(Message):
 
 
 class Stamped(Message):
-    """Base class of messages with a capture time. The fields are those of Foxglove's schemas."""
+    """Base class for messages with a capture time. The fields are the ones in Foxglove's schemas."""
 
     timestamp: Annotated[Stamp, WithJsonSchema({"type": "object"})]
     frame_id: str = "sensor"

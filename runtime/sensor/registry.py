@@ -1,4 +1,4 @@
-"""Registry of sensor drivers. A driver's module and SDK are imported only when the driver is used."""
+"""Sensor driver registry. A driver's module and SDK are imported only when the driver is used."""
 
 from __future__ import annotations
 

@@ -19,14 +19,14 @@ class Samples(ABC):
     """Interface that lets the presenter take samples from a sensor without waiting."""
 
     stale_inputs: int  # number of samples replaced by a newer one before use
-    serial: str  # serial number of the sensor; empty: unknown
+    serial: str  # the sensor's serial number; empty: unknown
 
     @abstractmethod
     def arrived(self, now_ns: int) -> list[SensorFrame]:
         """Return the samples that have arrived since the last call, oldest first.
 
         Raises:
-            EndOfRecording: All samples of the recording have been returned.
+            EndOfRecording: All of the recording's samples have been returned.
             FatalError: The sensor has failed permanently.
         """
 

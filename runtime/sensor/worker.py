@@ -27,7 +27,7 @@ REOPEN_AFTER_S, REOPEN_AFTER_MAX_S = 0.25, 0.5  # delay before a lost sensor is 
 OPEN_TIMEOUT_S = 10.0  # a longer attempt to open the sensor is abandoned and repeated
 HANG_MARGIN_S = 0.5  # a read counts as hung this long after its timeout
 ABANDONED_MAX = 8  # maximum number of abandoned threads
-QUEUE_MAX = 1024  # maximum number of queued samples: four seconds of the fastest sensor
+QUEUE_MAX = 1024  # maximum number of queued samples: four seconds with the fastest sensor
 PICTURES_MAX = 8  # maximum number of queued samples with pictures
 AHEAD_NS = NS_PER_S // 1000  # a capture time more than this after the arrival is on another clock
 BEHIND_NS = 60 * NS_PER_S  # a capture time more than this before the arrival is on another clock
@@ -101,7 +101,7 @@ class SensorWorker(Samples):
         self._untimely = ""  # description of the latest implausible capture time
         self._skipped = 0  # number of samples replaced by newer ones, except those that the current driver counts
         self._driver: Sensor | None = None
-        self.serial = ""  # serial number of the opened device, used to reopen the same device
+        self.serial = ""  # the opened device's serial number, used to reopen the same device
         self.error: FatalError | None = None
 
     def start(self) -> None:
@@ -150,7 +150,7 @@ class SensorWorker(Samples):
 
     @property
     def capabilities(self) -> Capabilities | None:
-        """Capabilities of the driver, or None while no driver is open."""
+        """The driver's capabilities, or None while no driver is open."""
         return self._driver.capabilities if self._driver else None
 
     def close(self, timeout_s: float = 1.0) -> None:

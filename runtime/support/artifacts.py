@@ -25,7 +25,7 @@ STAGING = ".phasestack-staging-"
 
 
 def sync(path: Path) -> None:
-    """Sync the data of a file or the entries of a folder to disk. Raises OSError if syncing fails."""
+    """Sync a file's data or a folder's entries to disk. Raises OSError if syncing fails."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -92,7 +92,7 @@ def to_json(value: Any) -> str:
 
 
 def _listed(item: Any) -> Any:
-    """Convert NumPy arrays and scalars for the JSON encoder, which does not know them."""
+    """Convert NumPy arrays and scalars for the JSON encoder, which does not support them."""
     if isinstance(item, np.ndarray | np.generic):
         return item.tolist()
     raise TypeError(f"objects of type {type(item).__name__} cannot be written as JSON")
@@ -169,7 +169,7 @@ class OutputFolder:
         for folder in self._made:
             if folder.is_dir() and not any(folder.iterdir()):
                 folder.rmdir()
-        # In messages, name the final file instead of the staged file.
+        # In messages, name the final file instead of the staged one.
         if isinstance(error, InputError) and error.source.startswith(str(self.staging)):
             file = self.target / Path(error.source).relative_to(self.staging)
             raise InputError(file, error.field, error.problem) from None
@@ -224,7 +224,7 @@ def _check_free(place: Path, *, within: Path) -> None:
     """Raise InputError if a folder exists where a file must go, or a file where a folder must go.
 
     Args:
-        place: Final path of a file.
+        place: A file's final path.
         within: Output folder that contains `place`. This folder is not checked.
     """
     for folder in place.parents:

@@ -70,8 +70,8 @@ def abandon(thread: threading.Thread) -> None:
 def raise_if_abandoned() -> None:
     """Raise ThreadAbandoned if the calling thread has been abandoned.
 
-    Background work calls this function between operations such as drawing. An asynchronous exception is no alternative,
-    because it could arrive during a call to moderngl, which would crash.
+    Background work calls this function between operations such as drawing. An asynchronous exception is not an
+    alternative, because it could arrive during a call to moderngl, which would then crash.
     """
     if _abandoned and threading.current_thread() in _abandoned:
         raise ThreadAbandoned
@@ -145,7 +145,7 @@ def set_niceness(niceness: int, thread: threading.Thread | None = None) -> None:
     Has no effect if the system does not allow the change.
 
     Args:
-        niceness: Niceness from -20 to 19. A lower value has precedence.
+        niceness: Niceness from -20 to 19. Lower values take precedence.
         thread: Thread to change, by default the calling thread.
     """
     with suppress(OSError):

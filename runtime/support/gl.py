@@ -75,7 +75,7 @@ class DrawnPicture:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of the pixels, (h, w, 4)."""
+        """Shape of the pixel array, (h, w, 4)."""
         return self.held.shape
 
     def pixels(self) -> U8:

@@ -1,4 +1,4 @@
-"""Import ONNX Runtime with telemetry disabled. No other module of `runtime` imports onnxruntime."""
+"""Import ONNX Runtime with telemetry disabled. No other module in `runtime` imports onnxruntime."""
 
 from __future__ import annotations
 

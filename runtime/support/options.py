@@ -11,7 +11,7 @@ import typer
 from runtime.errors import InputError
 from runtime.support.ranges import EYE_MOST_M, refusal
 
-OPTION_OF = {("content", "scene"): "scene", ("model", "name"): "model"}  # options that set a setting
+OPTION_OF = {("content", "scene"): "scene", ("model", "name"): "model"}  # options, keyed by the setting they set
 
 
 def number(low: float, high: float, unit: str = "", *, help: str) -> Any:
@@ -38,7 +38,7 @@ def blame_option(command: str, **options: Any) -> Iterator[None]:
     """Make any InputError raised in the block name the command-line option that set the faulty setting.
 
     Args:
-        command: Name of the command.
+        command: Command name.
         options: Values of the options in OPTION_OF, keyed by name. None: the option was not given.
     """
     try:

@@ -1,4 +1,4 @@
-"""Read the headers of picture files, and check them against the limits before decoding."""
+"""Read picture file headers, and check them against the limits before decoding."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ SIDE_MAX_PX = 1 << 16  # maximum width and height that a header may declare
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "PPM", "TGA", "AVIF")
 ANIMATED = ("GIF", "PNG", "WEBP", "AVIF")
 ORIENTATION = 0x0112  # EXIF tag
-TURNED = (5, 6, 7, 8)  # EXIF orientations with a quarter turn, which exchanges width and height
+TURNED = (5, 6, 7, 8)  # EXIF orientations with a quarter turn, which swaps width and height
 MP_ENTRIES, MP_NUMBER = 0xB002, 0xB101  # MPO tags: list of pictures, and a picture's viewpoint (counted from the left)
 DISPARITY, UNDEFINED = "Multi-Frame Image: (Disparity)", "Undefined"
 JPS, JPS_BYTES = b"_JPSJPS_", 14  # marker and minimum length of a stereo header
 JPS_LAYOUTS = {2: "side-by-side", 3: "top-bottom", 4: "anaglyph"}
 JPS_HALF_HEIGHT, JPS_HALF_WIDTH, JPS_LEFT_FIRST = 1, 2, 4
-GAIN_MAP = (b"hdrgm", b"21496-1")  # markers of a gain map, a second picture that contains only brightness
+GAIN_MAP = (b"hdrgm", b"21496-1")  # markers of a gain map, a second picture that holds only brightness
 HEAD_BYTES = 512  # number of bytes at the beginning of a file used to identify its kind
 UNDECODED = "is not an image that can be decoded"
 ANOTHER = "save it as PNG, JPEG or AVIF"
@@ -113,7 +113,7 @@ def _formats() -> tuple[str, ...]:
 
 
 def _header_of(path: Path, coded: bytes | IO[bytes]) -> Header:
-    """Read the header of a picture.
+    """Read a picture's header.
 
     Args:
         path: Picture file. A second picture of undefined type counts as an eye's view only if the suffix is .mpo.
@@ -242,7 +242,7 @@ def _viewpoint(image: Any) -> int | None:
 
 
 def picture_size(coded: bytes) -> tuple[int, int]:
-    """Return the stored width and height of an encoded picture, without applying the EXIF orientation.
+    """Return an encoded picture's stored width and height, without applying the EXIF orientation.
 
     Raises ValueError if the header cannot be decoded.
     """
@@ -261,7 +261,7 @@ def undecodable(data: bytes, error: Exception | None = None) -> str:
 
     Args:
         data: Encoded picture.
-        error: Exception that Pillow raised, or None if the picture was not opened.
+        error: Exception raised by Pillow, or None if the picture was not opened.
     """
     from PIL import UnidentifiedImageError
 
@@ -341,7 +341,7 @@ def check_size(
         width_px: Picture width.
         height_px: Picture height.
         source: File to name in messages.
-        field: Field of the file to name in messages.
+        field: Field in the file to name in messages.
         name: Name of the picture within the file.
         head: First bytes of the encoded picture, used to detect 16 bits per channel.
 
@@ -361,7 +361,7 @@ def decoded_picture(coded: bytes, *, source: str | Path, field: str, name: str) 
     Args:
         coded: Encoded picture.
         source: File to name in messages.
-        field: Field of the file to name in messages.
+        field: Field in the file to name in messages.
         name: Name of the picture within the file.
 
     Raises:

@@ -61,7 +61,7 @@ def plugin_class(name: str, base: type, *, field: str) -> Any:
 def strict(options: type[BaseModel]) -> type[BaseModel]:
     """Return a variant of a plugin's options that rejects unknown keys.
 
-    A class whose model configuration sets `extra` is returned unchanged.
+    If a class's model configuration sets `extra`, the class is returned unchanged.
     """
     if "extra" in options.model_config:
         return options

@@ -26,7 +26,7 @@ def tell(what: str, done: int, total: int | None = None) -> None:
     """Report progress to the listener, if there is one. Exceptions raised by the listener propagate.
 
     Args:
-        what: Name of the task. An empty name reports the end of the task.
+        what: Task name. An empty name reports that the task has ended.
         done: Number of finished steps.
         total: Total number of steps, or None if unknown.
     """
@@ -42,9 +42,9 @@ def task(what: str, *, seconds: float, too_slow: Exception) -> Iterator[None]:
     An outer listener still receives all reports.
 
     Args:
-        what: Name of the task.
+        what: Task name.
         seconds: Time limit.
-        too_slow: Exception that `tell` raises within the block after the time limit.
+        too_slow: Exception that `tell` raises within the block once the time limit has passed.
     """
     end, outer = time.monotonic() + seconds, _LISTENER.get()
 
@@ -64,7 +64,7 @@ def task(what: str, *, seconds: float, too_slow: Exception) -> Iterator[None]:
 
 @contextmanager
 def listening(listener: Listener) -> Iterator[None]:
-    """Send the progress reports of this thread to a listener within the block."""
+    """Send this thread's progress reports to a listener within the block."""
     token = _LISTENER.set(listener)
     try:
         yield
@@ -77,7 +77,7 @@ def progress_bar(title: str) -> Iterator[Callable[[int, int], None]]:
     """Yield a function that reports a task's finished steps and total steps.
 
     Args:
-        title: Name of the task, shown next to the progress bar.
+        title: Task name, shown next to the progress bar.
     """
     try:
         yield lambda done, total: tell(title, done, total)
@@ -87,10 +87,10 @@ def progress_bar(title: str) -> Iterator[Callable[[int, int], None]]:
 
 @contextmanager
 def status_line(title: str) -> Iterator[Callable[[str], None]]:
-    """Yield a function that reports a text as the current step of a task.
+    """Yield a function that reports a text as a task's current step.
 
     Args:
-        title: Name of the task, shown before the text.
+        title: Task name, shown before the text.
     """
     try:
         yield lambda text: tell(f"{title}: {text}", 0)
@@ -99,7 +99,7 @@ def status_line(title: str) -> Iterator[Callable[[str], None]]:
 
 
 def tracked(title: str, items: Sequence[T]) -> Iterator[T]:
-    """Yield the items of a sequence, and report progress after each item."""
+    """Yield a sequence's items, and report progress after each one."""
     with progress_bar(title) as update:
         for number, item in enumerate(items, start=1):
             yield item

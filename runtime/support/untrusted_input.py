@@ -32,12 +32,12 @@ class Limits:
     triangles: int = 2_000_000  # number of triangles in a scene, summed over all instances
     splats: int = 3_000_000
     instances: int = 2000  # number of placed meshes in a glTF scene
-    json_values: int = 4_000_000  # number of values in one JSON text, which take a gigabyte in Python
-    depth: int = 64  # nesting depth of JSON or of a glTF scene
+    json_values: int = 4_000_000  # number of values in one JSON text; this many take a gigabyte in Python
+    depth: int = 64  # nesting depth in JSON or in a glTF scene
     load_s: float = 120.0  # time for loading one piece of content
     start_s: float = 600.0  # time for startup, which loads the content and the model
     recording_s: float = 21_600.0  # length of a replayed recording
-    chunk_bytes: int = 32 << 20  # unpacked size of one chunk or message of a recording
+    chunk_bytes: int = 32 << 20  # unpacked size of one chunk or message in a recording
 
 
 LIMITS = Limits()  # not configurable; tests lower them
